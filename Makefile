@@ -1,0 +1,63 @@
+# `make` alone lists the targets.
+
+PYTHON ?= python3
+VENV   ?= .venv
+BIN    := $(VENV)/bin
+STAMP  := $(VENV)/.installed
+CONFIG ?= tune_configs/smoke.yaml
+PYTEST_ARGS ?=
+
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+.DEFAULT_GOAL := help
+.PHONY: help venv sweep test test-unit lint type bench clean
+
+help:  ## list the targets
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@echo
+	@echo "  PYTHON=python3.12    the interpreter for the virtual environment (>= 3.11)"
+	@echo "  CONFIG=my.yaml       the sweep for 'make sweep' (default $(CONFIG))"
+	@echo "  PYTEST_ARGS='-k q'   more arguments for pytest"
+
+venv: $(STAMP)  ## create .venv and install everything, once
+
+# torch goes first and alone: with its exact version in place the second, much larger resolution
+# cannot wander to another build of it, each of which is a download of gigabytes.
+$(STAMP): pyproject.toml constraints.txt
+	@command -v "$(PYTHON)" >/dev/null || \
+	  { echo "There is no '$(PYTHON)' here. Install Python >= 3.11, or say 'make PYTHON=/path/to/python'." >&2; exit 1; }
+	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "music_rllib needs Python >= 3.11; '$(PYTHON)' is $$("$(PYTHON)" -V 2>&1). Say 'make PYTHON=/path/to/python'." >&2; exit 1; }
+	@"$(PYTHON)" -c 'import venv, ensurepip' 2>/dev/null || \
+	  { echo "'$(PYTHON)' has no venv module (on Debian and Ubuntu: apt-get install python3-venv)." >&2; exit 1; }
+	@echo "[1/3] creating $(VENV) with $$("$(PYTHON)" -V 2>&1)"
+	@"$(PYTHON)" -m venv "$(VENV)"
+	@echo "[2/3] installing torch"
+	@$(BIN)/python -m pip install -qq -c constraints.txt torch
+	@echo "[3/3] installing Ray, MuJoCo, MLflow and the rest (a few minutes)"
+	@$(BIN)/python -m pip install -qq -c constraints.txt -e '.[dev]'
+	@touch $@
+	@echo "$(VENV) is ready"
+
+sweep: venv  ## train the smoke sweep: MUSIC-u, then MUSIC-r over q, on FetchPush
+	@$(BIN)/python -m music_rllib.sweep $(CONFIG)
+
+test: venv  ## run the whole suite (CI=true: a missing service is a failure, not a skip)
+	@$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+test-unit: venv  ## run the quick tests (under a minute)
+	@$(BIN)/python -m pytest tests/unit $(PYTEST_ARGS)
+
+lint: venv  ## ruff: rules and formatting
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+
+type: venv  ## mypy --strict
+	@$(BIN)/mypy
+
+bench: venv  ## the learner's cost against a raw torch loop, both measured in this run
+	@$(BIN)/python -m benchmarks.learner
+
+clean:  ## remove caches and build output (keeps .venv and results)
+	@rm -rf build dist *.egg-info .pytest_cache .hypothesis .mypy_cache .ruff_cache
+	@find . -name __pycache__ -type d -not -path './$(VENV)/*' -prune -exec rm -rf {} +

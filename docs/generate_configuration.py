@@ -1,0 +1,314 @@
+"""Writes docs/configuration.md from the settings' own types, defaults and docstrings.
+
+python docs/generate_configuration.py            # writes it
+python docs/generate_configuration.py --check    # exit code 1 where it is out of date
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import json
+import sys
+import textwrap
+import types
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+import annotated_types
+from pydantic import AfterValidator, BaseModel, BeforeValidator
+from pydantic.fields import FieldInfo
+
+from music_rllib.envs.registry import Task
+from music_rllib.estimator.settings import MusicSettings
+from music_rllib.experiment.model import (
+    Header,
+    InitFrom,
+    MlflowSettings,
+    Resources,
+    StageHeader,
+)
+from music_rllib.experiment.settings import VARIANTS, Evaluation, RunSettings
+from music_rllib.replay.settings import ReplaySettings
+from music_rllib.schedules import Linear, Piecewise
+from music_rllib.tac.settings import GaussianNoise, LearnedAlpha, TACSettings
+
+TARGET = Path(__file__).with_name("configuration.md")
+
+INTRODUCTION = """\
+# Configuration
+
+A sweep is one YAML file. This page lists every key; it is written by
+`docs/generate_configuration.py` from the settings' definitions, so that it cannot differ from them.
+[algorithms.md](algorithms.md) says what the settings mean in formulas,
+[add_an_environment.md](add_an_environment.md) how to declare a task.
+
+```yaml
+name: my_sweep
+tasks: [FetchPush]
+seeds: [0, 1, 2]
+defaults:                    # what every stage begins with
+  env_steps: 250000
+  tac: {alpha: 0.05, gamma: 0.95, tau: 0.05}
+stages:
+  - name: pretrain
+    variant: music-u
+    env_steps: 50000
+  - name: finetune
+    variant: music-r
+    init_from: pretrain
+    replay: {hindsight_k: 4}
+    grid:
+      tac.entropic_index: [1.0, 1.5, 2.0]
+```
+
+Settings are laid over each other, later ones winning: what the variant brings along, the `preset`,
+`defaults`, the stage, the point of its `grid`. The groups `evaluation`, `tac`, `music` and `replay`
+are merged field by field. Whatever is wrong is reported before anything starts, all of it at once,
+each with file, line, key, rule and value. YAML is read by the rules of YAML 1.2 (`1e-3` is a
+number, `no` is text), keys may not repeat, and unknown keys are errors.
+
+[tune_configs/presets](../tune_configs/presets) has `small` (for two cores), `paper`, `music-2021`
+and `tac-2020`; each file says where its numbers come from.
+"""
+
+PRESET_MEANING = (
+    "Settings that lie below `defaults`: a file of `presets/` beside the sweep's, without `.yaml`, "
+    "or any YAML file by its path from there."
+)
+
+VARIANTS_TEXT = """\
+## Variants
+
+`variant` fixes some settings of `music`; to contradict it is an error. What it takes over comes
+from the run that `init_from` names. MUSIC-u's `music.mi_reward_weight` is 1 unless set, MUSIC-r's
+the task's `mi_reward_weight`.
+"""
+
+SCHEDULES_TEXT = """\
+## Schedules
+
+Where a type says *schedule*, a number stands for a constant, and a mapping with `schedule` for a
+value that changes with the environment steps of the run. After its end a schedule holds its last
+value: `{schedule: linear, start: 1.0, end: 2.0}`,
+`{schedule: piecewise, points: [[0, 1.0], [50000, 0.0]], interpolation: hold}`.
+"""
+
+# --- the document ------------------------------------------------------------------------------
+
+
+def document() -> str:
+    """The whole page."""
+    parts = [
+        INTRODUCTION,
+        "## The file",
+        table(
+            [
+                *rows(Header, "", skip=("mlflow", "resources")),
+                *rows(MlflowSettings, "mlflow."),
+                *rows(Resources, "resources."),
+                ("preset", "text", "none", PRESET_MEANING),
+                ("environments", "mapping", "`{}`", "Tasks of your own, [below](#environments)."),
+                ("defaults", "mapping", "`{}`", "[Settings](#settings) of every stage."),
+                ("stages", "list", "required", "What is trained, in order; [below](#stages)."),
+            ]
+        ),
+        "## Stages",
+        "Beside these keys a stage has any of the [settings](#settings).",
+        table([*rows(StageHeader, "", skip=("init_from",)), *init_from()]),
+        VARIANTS_TEXT,
+        variants(),
+        "## Settings",
+        "In `defaults` and in a stage as they stand here; in a `grid` with dots (`tac.lr`).",
+        table(
+            [
+                *rows(RunSettings, "", only=("env_steps", "num_envs")),
+                *rows(Evaluation, "evaluation."),
+            ]
+        ),
+        "### tac",
+        table(rows(TACSettings, "tac.")),
+        "A learned `tac.alpha`:",
+        table(rows(LearnedAlpha, "tac.alpha.")),
+        "A `tac.behaviour` with noise:",
+        table(rows(GaussianNoise, "tac.behaviour.")),
+        "### music",
+        table(rows(MusicSettings, "music.")),
+        "### replay",
+        table(rows(ReplaySettings, "replay.")),
+        SCHEDULES_TEXT,
+        table(rows(Linear, "")),
+        table(rows(Piecewise, "")),
+        "## Environments",
+        "`environments` maps a task's name to its definition:",
+        table(rows(Task, "", skip=("name",))),
+    ]
+    return "\n\n".join(part.strip() for part in parts) + "\n"
+
+
+Row = tuple[str, str, str, str]
+
+
+def table(cells: Iterator[Row] | list[Row]) -> str:
+    """A table of settings."""
+    lines = ["| key | type | default | meaning |", "|---|---|---|---|"]
+    for key, kind, default, meaning in cells:
+        escaped = (cell.replace("|", r"\|") for cell in (f"`{key}`", kind, default, meaning))
+        lines.append(f"| {' | '.join(escaped)} |")
+    return "\n".join(lines)
+
+
+def variants() -> str:
+    """The table of variants."""
+    sources = {
+        "scratch": "nothing",
+        "estimator": "the estimator",
+        "agent": "policy, critics, value, their averages, and the observation normaliser",
+    }
+    lines = ["| variant | fixes | takes over |", "|---|---|---|"]
+    for name, rules in VARIANTS.items():
+        fixed = ", ".join(f"`{key}: {json.dumps(value)}`" for key, value in rules.fixed.items())
+        lines.append(f"| `{name}` | {fixed} | {sources[rules.starts_from]} |")
+    return "\n".join(lines)
+
+
+def init_from() -> Iterator[Row]:
+    """`init_from` and its keys; the YAML takes a bare name too, which the model does not know."""
+    field = StageHeader.model_fields["init_from"]
+    kind = "name, mapping or null"
+    yield "init_from", kind, default_of(field), docstrings(StageHeader)["init_from"]
+    yield from rows(InitFrom, "init_from.")
+
+
+def rows(
+    model: type[BaseModel], prefix: str, *, skip: tuple[str, ...] = (), only: tuple[str, ...] = ()
+) -> Iterator[Row]:
+    """One row for each field of `model`, or for those of `only`.
+
+    Raises:
+        ValueError: a field has no docstring.
+    """
+    meanings = docstrings(model)
+    for name, field in model.model_fields.items():
+        if name not in skip and (not only or name in only):
+            if name not in meanings:
+                raise ValueError(f"{model.__name__}.{name} must have a docstring below it")
+            kind = _annotated(field.annotation, tuple(field.metadata))
+            yield f"{prefix}{name}", kind, default_of(field), meanings[name]
+
+
+def default_of(field: FieldInfo) -> str:
+    """The default as it would stand in YAML."""
+    if field.is_required():
+        return "required"
+    value = field.get_default(call_default_factory=True)
+    return f"`{json.dumps(value)}`"
+
+
+# --- types in words ----------------------------------------------------------------------------
+
+_PLAIN = {
+    bool: "true or false",
+    int: "integer",
+    float: "number",
+    str: "text",
+    type(None): "null",
+    Any: "anything",
+}
+_SIGNS = (
+    (annotated_types.Gt, ">", "gt"),
+    (annotated_types.Ge, ">=", "ge"),
+    (annotated_types.Lt, "<", "lt"),
+    (annotated_types.Le, "<=", "le"),
+)
+
+
+def type_of(annotation: Any) -> str:
+    """An annotation in a person's words, with the bounds that it carries."""
+    origin, arguments = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        return _annotated(arguments[0], arguments[1:])
+    if annotation in _PLAIN:
+        return _PLAIN[annotation]
+    if origin is Literal:
+        return " or ".join(f"`{json.dumps(value).strip(chr(34))}`" for value in arguments)
+    if origin in (Union, types.UnionType):
+        return _union(arguments)
+    if origin is dict:
+        return "mapping"
+    if origin is list or (origin is tuple and arguments[-1] is ...):
+        return f"list of {type_of(arguments[0])}"
+    if origin is tuple:
+        return f"[{', '.join(type_of(argument) for argument in arguments)}]"
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return "mapping"
+    return "anything"  # JsonValue
+
+
+def _annotated(inner: Any, metadata: tuple[Any, ...]) -> str:
+    rules = []
+    for item in _flat(metadata):
+        if isinstance(item, BeforeValidator) and item.json_schema_input_type is not Any:
+            inner = item.json_schema_input_type
+        if isinstance(item, AfterValidator) and (item.func.__doc__ or "").startswith("Rule: "):
+            rules.append(str(item.func.__doc__).removeprefix("Rule: "))
+        for kind, sign, key in _SIGNS:
+            if isinstance(item, kind):
+                rules.append(f"{sign} {getattr(item, key):.10g}")
+    words = type_of(inner)
+    separator = ", " if " or " in words else " "
+    return separator.join(filter(None, (words, " and ".join(rules))))
+
+
+def _flat(metadata: tuple[Any, ...]) -> Iterator[Any]:
+    """What is annotated, with the constraints inside of pydantic's `Field(...)` taken out."""
+    for item in metadata:
+        yield from item.metadata if isinstance(item, FieldInfo) else (item,)
+
+
+def _union(members: tuple[Any, ...]) -> str:
+    bare = {_bare(member) for member in members}
+    words = [type_of(member) for member in members if _bare(member) not in (Linear, Piecewise)]
+    if Linear in bare:
+        words.append("[schedule](#schedules)")
+    separator = ", or " if any(", >" in word for word in words) else " or "
+    return separator.join(dict.fromkeys(words))
+
+
+def _bare(annotation: Any) -> Any:
+    return get_args(annotation)[0] if get_origin(annotation) is Annotated else annotation
+
+
+# --- docstrings --------------------------------------------------------------------------------
+
+
+def docstrings(model: type[BaseModel]) -> dict[str, str]:
+    """The text under each field of a class, on one line."""
+    (definition,) = ast.parse(textwrap.dedent(inspect.getsource(model))).body
+    assert isinstance(definition, ast.ClassDef)
+    found = {}
+    for field, below in zip(definition.body, definition.body[1:], strict=False):
+        if (
+            isinstance(field, ast.AnnAssign)
+            and isinstance(field.target, ast.Name)
+            and isinstance(below, ast.Expr)
+            and isinstance(below.value, ast.Constant)
+        ):
+            found[field.target.id] = " ".join(str(below.value.value).split())
+    return found
+
+
+def main() -> int:
+    """Write the page, or check it; the exit code."""
+    if sys.argv[1:] == ["--check"]:
+        if TARGET.read_text(encoding="utf-8") == document():
+            return 0
+        print(f"{TARGET.name} is out of date: run python docs/{Path(__file__).name}")
+        return 1
+    TARGET.write_text(document(), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,41 @@
+"""Tsallis actor-critic (TAC) with MUSIC on RLlib, and a sweeper that compares entropic indices.
+
+The names below are loaded on first use (PEP 562): ``import music_rllib`` itself loads neither
+torch nor ray, so the command line answers at once and the pure-maths modules stay usable alone.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from music_rllib.tac.algorithm import TAC
+    from music_rllib.tac.config import TACConfig
+    from music_rllib.tac.learner import TACLearner
+    from music_rllib.tac.module import TACModule
+
+__version__ = "0.1.0"
+
+__all__ = ["TAC", "TACConfig", "TACLearner", "TACModule", "__version__"]
+
+_HOMES = {
+    "TAC": "music_rllib.tac.algorithm",
+    "TACConfig": "music_rllib.tac.config",
+    "TACLearner": "music_rllib.tac.learner",
+    "TACModule": "music_rllib.tac.module",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Load a public name from its home and keep it, so that this runs once per name."""
+    home = _HOMES.get(name)
+    if home is None:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(home), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(set(globals()) | set(__all__))

@@ -1,0 +1,1 @@
+"""Tasks: which environment, its horizon, and its split into agent and surrounding state."""

@@ -1,0 +1,161 @@
+"""Making environments, and asking them what the learner needs to know."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from music_rllib._quiet import drop_farama_notice
+from music_rllib.replay.buffer import GoalReward
+
+__all__ = [
+    "Env",
+    "check_action_space",
+    "episode_limit",
+    "goal_reward_of",
+    "is_gymnasium_id",
+    "make_env",
+    "observation_sizes",
+]
+
+Env = gym.Env[Any, Any]
+
+
+@functools.cache
+def _register_robotics() -> None:
+    """Makes the Fetch tasks known to Gymnasium, without the package's notice on another hand."""
+    drop_farama_notice()
+    import gymnasium_robotics
+
+    gym.register_envs(gymnasium_robotics)
+
+
+def make_env(env_id: str, **kwargs: Any) -> Env:
+    """A Gymnasium environment by its id; the robotics tasks are registered on the way.
+
+    Raises:
+        gymnasium.error.Error: unknown id or arguments.
+    """
+    _register_robotics()
+    # The checker would cost a tenth of every step and only speaks to an environment's authors.
+    return gym.make(env_id, disable_env_checker=True, **kwargs)
+
+
+def is_gymnasium_id(env: object) -> bool:
+    """Whether `env` is a Gymnasium id (`module:` in front or not), not one of Ray's, or a class."""
+    _register_robotics()
+    return isinstance(env, str) and (":" in env or env in gym.registry)
+
+
+def observation_sizes(space: gym.Space[Any]) -> tuple[int, int]:
+    """Features of the observation and of the goal (0 without goals).
+
+    Raises:
+        ValueError: neither a flat Box nor a goal dictionary of flat boxes.
+    """
+    if _is_flat(space):
+        return int(space.shape[0]), 0  # type: ignore[index]
+    if isinstance(space, spaces.Dict):
+        parts = {name: space.spaces.get(name) for name in _GOAL_KEYS}
+        if all(_is_flat(part) for part in parts.values()):
+            sizes = [int(part.shape[0]) for part in parts.values()]  # type: ignore[union-attr,index]
+            if sizes[1] == sizes[2]:
+                return sizes[0], sizes[1]
+    raise ValueError(
+        "environment: the observation space must be a one-dimensional Box, or a Dict with "
+        f"one-dimensional {', '.join(_GOAL_KEYS)} (goals of equal size), got {space}"
+    )
+
+
+_GOAL_KEYS = ("observation", "desired_goal", "achieved_goal")
+
+
+def _is_flat(space: gym.Space[Any] | None) -> bool:
+    return isinstance(space, spaces.Box) and len(space.shape) == 1
+
+
+def check_action_space(space: gym.Space[Any]) -> spaces.Box:
+    """The space, if TAC can act in it.
+
+    Raises:
+        ValueError: not a bounded one-dimensional Box.
+    """
+    if not (isinstance(space, spaces.Box) and len(space.shape) == 1 and space.is_bounded("both")):
+        raise ValueError(
+            f"environment: the action space must be a bounded one-dimensional Box, got {space}"
+        )
+    return space
+
+
+def episode_limit(env: Env, setting: int | None) -> int:
+    """Steps of the longest episode: the smaller of the environment's limit and the setting.
+
+    Raises:
+        ValueError: neither is given.
+    """
+    limits = [setting, env.spec.max_episode_steps if env.spec is not None else None]
+    given = [limit for limit in limits if limit is not None]
+    if not given:
+        raise ValueError(
+            "tac.max_episode_steps must be set: the environment has no time limit of its own"
+        )
+    return min(given)
+
+
+def goal_reward_of(env: Env) -> GoalReward:
+    """The environment's reward as a function of achieved and desired goals, vectorised.
+
+    Whether it is one is tried out, which resets `env` and takes one step in it: HER would learn
+    from wrong rewards without any sign of it (HandManipulatePen of Gymnasium-Robotics 1.4.2 mixes
+    up the rows of a batch).
+
+    Raises:
+        ValueError: no such function, or one that is not a function of each row's goals alone.
+    """
+    compute = getattr(env.unwrapped, "compute_reward", None)
+    if compute is None or not isinstance(env.observation_space, spaces.Dict):
+        raise ValueError(
+            "replay.hindsight_k must be 0 without a goal environment: "
+            f"{_name(env)} has no goals with a compute_reward"
+        )
+
+    def reward(achieved: NDArray[np.float32], desired: NDArray[np.float32]) -> NDArray[Any]:
+        return np.asarray(compute(achieved, desired, {}), dtype=np.float32)
+
+    try:
+        sound = _is_vectorised(reward, env)
+    except Exception as error:
+        raise ValueError(_not_vectorised(env, f"it raises {error!r}")) from error
+    if not sound:
+        raise ValueError(_not_vectorised(env, "rewards change with the batch or the simulator"))
+    return reward
+
+
+def _is_vectorised(reward: GoalReward, env: Env) -> bool:
+    """Whether goals around the first achieved one are worth the same alone and in a batch."""
+    rng, rows = np.random.default_rng(0), 256
+    start = np.asarray(env.reset(seed=0)[0]["achieved_goal"], np.float32)
+    achieved = np.tile(start, (rows, 1))
+    # From within any threshold to far beyond it, in random subsets of the goal's entries.
+    offsets = np.geomspace(1e-3, 1.0, rows)[:, None] * rng.standard_normal(achieved.shape)
+    desired = (achieved + offsets * rng.integers(0, 2, achieved.shape)).astype(np.float32)
+    together = reward(achieved, desired)
+    env.step(check_action_space(env.action_space).low)
+    alone = [reward(achieved[i : i + 1], desired[i : i + 1]) for i in range(rows)]
+    return together.shape == (rows,) and np.allclose(together, np.concatenate(alone))
+
+
+def _not_vectorised(env: Env, reason: str) -> str:
+    return (
+        "replay.hindsight_k must be 0 where compute_reward does not price every row of a batch by "
+        f"itself: with {_name(env)}, {reason}"
+    )
+
+
+def _name(env: Env) -> str:
+    return env.spec.id if env.spec is not None else type(env.unwrapped).__name__

@@ -1,0 +1,1 @@
+"""MUSIC's mutual-information estimator: network, loss and intrinsic reward (pure torch)."""

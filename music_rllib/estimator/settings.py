@@ -1,0 +1,51 @@
+"""Named, validated settings of MUSIC (paper III-A)."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from music_rllib.schedules import Schedule, bounded
+
+__all__ = ["MusicSettings"]
+
+
+class MusicSettings(BaseModel):
+    """The intrinsic reward, its estimator, and what the agent sees of goals and task reward."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    estimator: Literal["none", "trained", "frozen"] = "none"
+    """No mutual information; an estimator trained along; or one that was handed over, unchanged."""
+    mi_reward_weight: Annotated[Schedule, bounded(">= 0", lambda w: w >= 0)] = 0.0
+    """Weight of the intrinsic reward in the reward of a minibatch."""
+    task_reward: bool = True
+    """Whether the environment's reward counts."""
+    goals: Literal["environment", "zero"] = "environment"
+    """Desired goals in training: the environment's, or zeros (MUSIC-u). Evaluation: always real."""
+    reward_scale: float = Field(5000.0, gt=0)
+    """Factor on the bound before it is clipped to [0, 1] and shifted by -1."""
+    shuffle: Literal["independent", "random"] = "independent"
+    """Time shuffle: every trajectory its own permutation and two frames always swapped; or the
+    original's one permutation a minibatch, which is the identity half the time on two frames."""
+    hidden_size: int = Field(128, gt=0)
+    """Hidden units of the estimator."""
+    lr: float = Field(1e-3, gt=0)
+    """Adam's step size for the estimator."""
+    prioritise_replay: bool = False
+    """MUSIC-p: draw trajectories by the rank of their summed, clipped bounds."""
+    batch_trajectories: int = Field(32, gt=0)
+    """Trajectories per estimator update; one estimator update follows each policy update."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.estimator == "none" and self.mi_reward_weight != 0.0:
+            raise ValueError(
+                "mi_reward_weight needs an estimator (trained or frozen), got estimator: none"
+            )
+        if self.prioritise_replay and self.estimator == "none":
+            raise ValueError("prioritise_replay: true needs an estimator, got estimator: none")
+        if not self.task_reward and self.estimator == "none":
+            raise ValueError("task_reward: false without an estimator leaves no reward at all")
+        return self

@@ -1,0 +1,1 @@
+"""Experiments: typed configuration, the plan of nodes, their store, and handoffs between them."""

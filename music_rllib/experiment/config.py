@@ -1,0 +1,248 @@
+"""A sweep's YAML file, read and validated as a whole before anything starts.
+
+:func:`load_sweep` reports all problems at once, each as ``file:line: key rule, got value``. What it
+returns is resolved: every stage has, for every point of its grid and every task, the complete
+settings of a run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from music_rllib.envs.registry import (
+    BUILT_IN_TASKS,
+    Task,
+    TaskRegistry,
+    UnknownTaskError,
+    closest,
+)
+from music_rllib.experiment.layers import LAYER_KEYS, SECTIONS, known_settings
+from music_rllib.experiment.model import (
+    RESERVED_NAMES,
+    Checkpoint,
+    Header,
+    MlflowSettings,
+    Point,
+    Resources,
+    Source,
+    Stage,
+    SweepConfig,
+)
+from music_rllib.experiment.presets import with_preset
+from music_rllib.experiment.problems import (
+    ConfigError,
+    Findings,
+    Problem,
+    from_json,
+    in_words,
+    lookup,
+    shown,
+)
+from music_rllib.experiment.problems import Path as KeyPath
+from music_rllib.experiment.settings import Evaluation, RunSettings, Variant
+from music_rllib.experiment.stages import resolve_stage
+from music_rllib.experiment.yaml_file import YamlFile, read_yaml
+
+__all__ = [
+    "Checkpoint",
+    "ConfigError",
+    "Evaluation",
+    "MlflowSettings",
+    "Point",
+    "Resources",
+    "RunSettings",
+    "Source",
+    "Stage",
+    "SweepConfig",
+    "Variant",
+    "load_sweep",
+]
+
+
+def load_sweep(
+    path: str | Path, *, name: str | None = None, storage: str | None = None
+) -> SweepConfig:
+    """Read and validate a sweep.
+
+    Args:
+        path: The YAML file.
+        name: Replaces the file's `name`.
+        storage: Replaces the file's `storage`.
+
+    Raises:
+        ConfigError: With one line per problem.
+    """
+    file = read_yaml(Path(path))
+    options = {key: value for key, value in (("name", name), ("storage", storage)) if value}
+    document = with_preset(file, _preset_mistakes) | options
+    findings = Findings()
+    config = _resolve(file, document, findings)
+    if config is None:
+        raise ConfigError(_lines(findings.problems, file, document, options))
+    return config
+
+
+def _preset_mistakes(preset: YamlFile) -> list[str]:
+    """What is wrong with a preset by itself, in its own lines."""
+    findings = Findings()
+    _defaults({"defaults": preset.data}, findings)
+    problems = [Problem(problem.path[1:], problem.rule) for problem in findings.problems]
+    return _lines(problems, preset, preset.data, {})
+
+
+def _resolve(file: YamlFile, document: dict[str, Any], findings: Findings) -> SweepConfig | None:
+    """The sweep; None, with the problems in `findings`, if there are any."""
+    registry = _registry(document, findings)
+    header = _header(document, findings)
+    defaults = _defaults(document, findings)
+    names = document.get("tasks")
+    names = [name for name in names if isinstance(name, str)] if isinstance(names, list) else []
+    known_tasks = _tasks(names, ("tasks",), registry, document, findings)
+    seed = header.seeds[0] if header else 0
+    stages: dict[str, Stage | None] = {}
+    for index, raw in _raw_stages(document, findings):
+        stage = resolve_stage(
+            raw,
+            ("stages", index),
+            defaults=defaults,
+            seed=seed,
+            sweep_tasks=known_tasks,
+            find_tasks=lambda names, path: _tasks(names, path, registry, document, findings),
+            earlier=stages,
+            findings=findings,
+        )
+        stages[stage.name if stage else str(raw.get("name"))] = stage
+    if findings.problems or header is None:
+        return None
+    return SweepConfig(
+        path=file.path,
+        text=file.text,
+        document=document,
+        name=header.name,
+        seeds=header.seeds,
+        storage=header.storage,
+        mlflow=header.mlflow,
+        resources=header.resources,
+        stages=tuple(stage for stage in stages.values() if stage is not None),
+    )
+
+
+def _registry(document: dict[str, Any], findings: Findings) -> TaskRegistry:
+    tasks = []
+    environments = document.get("environments") or {}
+    if not isinstance(environments, dict):
+        findings.add(("environments",), f"must be a mapping, got {shown(environments)}")
+        environments = {}
+    for name, raw in environments.items():
+        path = ("environments", name)
+        if name in BUILT_IN_TASKS:
+            findings.add(path, "is a built-in task; choose another name")
+        elif not isinstance(raw, dict) or "name" in raw:
+            findings.add(path, f"must be a mapping without a name of its own, got {shown(raw)}")
+        elif task := findings.validate(Task, raw | {"name": name}, path):
+            tasks.append(task)
+    return TaskRegistry(tasks)
+
+
+def _header(document: dict[str, Any], findings: Findings) -> Header | None:
+    known = {*Header.model_fields, "preset", "environments", "defaults", "stages"}
+    for key in document.keys() - known:
+        findings.add((key,), f"is not a known setting{closest(key, known)}")
+    values = {key: value for key, value in document.items() if key in Header.model_fields}
+    header = findings.validate(Header, values, ())
+    if header and header.name in RESERVED_NAMES:
+        findings.add(("name",), f"must not be {header.name!r}, which the storage uses itself")
+    for key in ("tasks", "seeds"):
+        findings.forbid_repeats(values.get(key), (key,))
+    return header
+
+
+def _defaults(document: dict[str, Any], findings: Findings) -> dict[str, Any]:
+    """`defaults`, with what can be said of them alone; the rest shows where they are merged."""
+    defaults = document.get("defaults") or {}
+    if not isinstance(defaults, dict):
+        findings.add(("defaults",), f"must be a mapping, got {shown(defaults)}")
+        return {}
+    for key, value in defaults.items():
+        if key not in LAYER_KEYS:
+            findings.add(("defaults", key), f"is not a known setting{closest(key, LAYER_KEYS)}")
+        elif not (key in SECTIONS and value is None):
+            _check_fields(key, value, findings)
+    return defaults
+
+
+def _check_fields(key: str, value: Any, findings: Findings) -> None:
+    """Validate fields one by one: rules between them depend on the variant."""
+    field = RunSettings.model_fields[key]
+    try:
+        from_json(field.rebuild_annotation(), value)
+    except ValidationError as error:
+        for found in in_words(error, value, lambda at: known_settings((key, *at))):
+            if found.path or not isinstance(value, dict):
+                findings.add(("defaults", key, *found.path), found.rule)
+
+
+def _tasks(
+    names: Iterable[str],
+    path: KeyPath,
+    registry: TaskRegistry,
+    document: dict[str, Any],
+    findings: Findings,
+) -> tuple[Task, ...]:
+    tasks = []
+    declared = document.get("environments") or {}
+    for position, name in enumerate(names):
+        try:
+            tasks.append(registry[name])
+        except UnknownTaskError as error:
+            # One that was declared with a mistake isn't unknown, and the mistake is reported.
+            if not isinstance(declared, dict) or name not in declared:
+                findings.add((*path, position), str(error))
+    return tuple(tasks)
+
+
+def _raw_stages(document: dict[str, Any], findings: Findings) -> list[tuple[int, dict[str, Any]]]:
+    raw = document.get("stages")
+    if not isinstance(raw, list) or not raw:
+        findings.add(("stages",), f"must be a list of at least one stage, got {shown(raw)}")
+        return []
+    for index, stage in enumerate(raw):
+        if not isinstance(stage, dict):
+            findings.add(("stages", index), f"must be a mapping, got {shown(stage)}")
+    return [(index, stage) for index, stage in enumerate(raw) if isinstance(stage, dict)]
+
+
+def _lines(
+    problems: Iterable[Problem], file: YamlFile, document: Any, options: Mapping[str, str]
+) -> list[str]:
+    """One line per different problem, in the order of the file."""
+
+    def line(problem: Problem) -> str:
+        if len(problem.path) == 1 and problem.path[0] in options:
+            return f"--{problem.path[0]} {problem.rule}"
+        key = _dotted(problem.path, document)
+        separator = " " if problem.rule.startswith(("must ", "is ", "has ", "needs ")) else ": "
+        return f"{file.place(problem.path)}: {key}{separator if key else ''}{problem.rule}"
+
+    in_order = sorted(problems, key=lambda problem: file.line(problem.path) or 0)
+    return list(dict.fromkeys(line(problem) for problem in in_order))
+
+
+def _dotted(path: KeyPath, document: Any) -> str:
+    """`stages.finetune.tac.lr`: stages by name, positions in other lists in brackets."""
+    text = ""
+    for position, part in enumerate(path):
+        if isinstance(part, str):
+            text += f".{part}" if text else part
+            continue
+        try:
+            name = lookup(document, (*path[: position + 1], "name"))
+        except LookupError:
+            name = None
+        by_name = path[0] == "stages" and position == 1 and isinstance(name, str)
+        text += f".{name}" if by_name else f"[{part}]"
+    return text

@@ -1,0 +1,56 @@
+"""Small files, written so that a crash leaves the old content or the new one, never half of it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+__all__ = ["canonical_json", "content_key", "sync_folder", "write_atomically"]
+
+
+def canonical_json(value: Any) -> str:
+    """JSON with one spelling per value: sorted keys, no spaces, shortest floats, no NaN.
+
+    Raises:
+        ValueError: `value` holds NaN or infinity.
+    """
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
+
+
+def content_key(value: Any) -> str:
+    """80 bits of the hash of `value`'s canonical JSON, the same on every machine."""
+    return hashlib.sha256(canonical_json(value).encode()).hexdigest()[:20]
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Replace `path` by `data`: beside it, flushed to the disk, then renamed.
+
+    Raises:
+        OSError: With the path in its message, also where the disk is full.
+    """
+    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        Path(name).replace(path)
+    except BaseException as error:
+        Path(name).unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename is None:
+            raise OSError(error.errno, error.strerror, str(path)) from error
+        raise
+    sync_folder(path.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Flush a folder's entries, so that a rename in it outlives a power cut."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -1,0 +1,171 @@
+"""One training run: a `TAC` algorithm built from `RunSettings`, advanced report by report."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+from numpy.typing import NDArray
+from ray.rllib.core import DEFAULT_MODULE_ID
+from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, EPISODE_RETURN_MEAN, LEARNER_RESULTS
+
+from music_rllib.experiment.settings import RunSettings
+from music_rllib.tac.algorithm import TAC
+from music_rllib.tac.config import TACConfig
+from music_rllib.tac.env_runner import DISPLACEMENT, MOVED, SUCCESS_ANY, SUCCESS_LAST
+from music_rllib.tracking import names
+
+__all__ = ["TrainingRun", "algorithm_config"]
+
+REPORT_INTERVAL = 1_000
+"""Environment steps between two reports, where evaluations are not more frequent."""
+
+_NEVER = 10**9
+
+_TRAINING = {
+    SUCCESS_LAST: names.TRAIN_SUCCESS,
+    SUCCESS_ANY: names.TRAIN_SUCCESS_ANY,
+    EPISODE_RETURN_MEAN: names.TRAIN_RETURN,
+    DISPLACEMENT: names.TRAIN_DISPLACEMENT,
+}
+_EVALUATION = {
+    SUCCESS_LAST: names.EVAL_SUCCESS,
+    SUCCESS_ANY: names.EVAL_SUCCESS_ANY,
+    EPISODE_RETURN_MEAN: names.EVAL_RETURN,
+    DISPLACEMENT: names.EVAL_DISPLACEMENT,
+    MOVED: names.EVAL_TOUCHED,
+}
+
+
+def algorithm_config(run: RunSettings) -> TACConfig:
+    """The RLlib config of a run: every setting in it comes from `run`."""
+    config = TACConfig()
+    config.environment(run.task.env_id, env_config=dict(run.task.env_kwargs))
+    config.env_runners(num_env_runners=0, num_envs_per_env_runner=run.num_envs)
+    config.training(**dict(run.tac), total_env_steps=run.env_steps)
+    config.max_episode_steps = min(run.tac.max_episode_steps or run.task.horizon, run.task.horizon)
+    config.music(
+        agent_indices=run.task.agent_indices,
+        surrounding_indices=run.task.surrounding_indices,
+        **dict(run.music),
+    )
+    config.replay(**dict(run.replay))
+    config.success_key = run.task.success_key
+    # Evaluations are asked for by `TrainingRun`, at given environment steps.
+    config.evaluation(
+        evaluation_interval=_NEVER,
+        evaluation_duration=run.evaluation.episodes,
+        evaluation_duration_unit="episodes",
+        evaluation_config=TACConfig.overrides(explore=False),
+    )
+    # One iteration is one episode in every sub-environment; reports are put together here.
+    config.reporting(min_sample_timesteps_per_iteration=1)
+    config.debugging(seed=run.seed)
+    return config
+
+
+class TrainingRun:
+    """Trains one run to its budget.
+
+    Args:
+        run: the settings.
+        handoff: weights to start from, by module name (`TAC.set_parts`).
+
+    Raises:
+        ValueError: settings or weights that do not fit the environment.
+    """
+
+    def __init__(
+        self,
+        run: RunSettings,
+        handoff: Mapping[str, Mapping[str, NDArray[Any]]] | None = None,
+    ) -> None:
+        self.run = run
+        self.algorithm: TAC = algorithm_config(run).build_algo()
+        if handoff:
+            self.algorithm.set_parts(handoff)
+        self._process = psutil.Process()
+        self._process.cpu_percent()  # the first call only starts the measurement
+
+    @property
+    def env_steps(self) -> int:
+        """Environment steps done."""
+        return self.algorithm.env_steps
+
+    @property
+    def finished(self) -> bool:
+        """Whether the budget is spent."""
+        return self.env_steps >= self.run.env_steps
+
+    def advance(self) -> dict[str, float]:
+        """Trains until the next report is due.
+
+        Returns:
+            Means since the last report, by the names of `tracking.names`; evaluation metrics
+            where an evaluation was due. Metrics that do not exist yet are left out.
+        """
+        evaluation_at = _next_multiple(self.env_steps, self.run.evaluation.interval)
+        report_at = _next_multiple(self.env_steps, REPORT_INTERVAL)
+        goal = min(report_at, evaluation_at, self.run.env_steps)
+        rounds: defaultdict[str, list[float]] = defaultdict(list)
+        while self.env_steps < goal:
+            for name, value in _training_metrics(self.algorithm.train()):
+                rounds[name].append(value)
+        metrics = {name: float(np.mean(values)) for name, values in rounds.items()}
+        if self.env_steps >= evaluation_at or self.finished:
+            metrics |= self.evaluate()
+        return metrics | self._counters() | self._system()
+
+    def evaluate(self) -> dict[str, float]:
+        """Deterministic episodes with fresh goals; the same ones for every run of this seed."""
+        results = self.algorithm.evaluate()[ENV_RUNNER_RESULTS]
+        metrics = {name: float(results[key]) for key, name in _EVALUATION.items() if key in results}
+        return metrics | {names.EVAL_EPISODES: float(self.run.evaluation.episodes)}
+
+    def _counters(self) -> dict[str, float]:
+        return {
+            names.ENV_STEPS: float(self.env_steps),
+            names.GRAD_UPDATES: float(self.algorithm.grad_updates),
+        }
+
+    def _system(self) -> dict[str, float]:
+        return {
+            names.SYSTEM_CPU: self._process.cpu_percent(),
+            names.SYSTEM_MEMORY: self._process.memory_info().rss / 2**20,
+        }
+
+    def modules(self) -> dict[str, dict[str, NDArray[Any]]]:
+        """Plain weights of every network, by module name, as a handoff carries them."""
+        return self.algorithm.get_parts()
+
+    def save(self, folder: Path) -> None:
+        """Writes everything that `restore` needs to continue exactly from here."""
+        self.algorithm.save_to_path(folder.resolve())
+
+    def restore(self, folder: Path) -> None:
+        """Continues from what `save` wrote. Only for the run's own storage: it unpickles."""
+        self.algorithm.restore_from_path(folder.resolve())
+
+    def close(self) -> None:
+        """Releases environments and networks."""
+        self.algorithm.stop()
+
+
+def _next_multiple(steps: int, interval: int) -> int:
+    return (steps // interval + 1) * interval
+
+
+def _training_metrics(result: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
+    """Of an RLlib result, what is ours, by its public name."""
+    episodes = result.get(ENV_RUNNER_RESULTS, {})
+    for key, name in _TRAINING.items():
+        if key in episodes:
+            yield name, float(episodes[key])
+    learner = result.get(LEARNER_RESULTS, {}).get(DEFAULT_MODULE_ID, {})
+    for key, value in learner.items():
+        if key in names.LEARNER or key.startswith(names.PER_DIMENSION):
+            yield key, float(value)

@@ -1,0 +1,347 @@
+"""Replay of whole trajectories in one array, seen as transitions or as trajectories.
+
+All frames (states) of all trajectories lie behind each other in one float32 ring, a frame's
+observation, desired goal and achieved goal side by side: a transition is two neighbouring rows.
+A trajectory of n steps takes n + 1 frames and is never split by the ring's end, so a replay of
+capacity C holds exactly C transitions of full episodes, fewer where episodes end early.
+
+Memory, h being the longest episode: ``(4 (D + 2G + A + 1) + 1) bytes * C (h + 1)/h`` plus 16 bytes
+a trajectory, claimed from the system as it fills. A million FetchPush transitions: 148 MB.
+Prioritised replay by TD error adds 8 bytes a frame and a tree of 16 to 32.
+
+Shape legend: B transitions, N trajectories, T frames, D observation, G goal, A action.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from music_rllib.replay.priorities import TDPriorities, rank_weights
+
+__all__ = ["ReplayLayout", "Trajectory", "TrajectoryReplay", "Transitions"]
+
+Floats = NDArray[np.float32]
+Rows = NDArray[np.int64]
+GoalReward = Callable[[Floats, Floats], NDArray[Any]]
+"""(achieved [B, G], desired [B, G]) -> [B] rewards, without touching a simulator."""
+
+
+@dataclass(frozen=True)
+class ReplayLayout:
+    """Sizes of what is stored."""
+
+    observation: int
+    action: int
+    goal: int
+    horizon: int
+    """Steps of the longest episode."""
+
+    @property
+    def frame(self) -> int:
+        return self.observation + 2 * self.goal
+
+    @property
+    def network_input(self) -> int:
+        """Observation and desired goal: the first columns of a frame."""
+        return self.observation + self.goal
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """One finished episode of n steps."""
+
+    frames: Floats
+    """[n+1, D + 2G]: observation, desired goal, achieved goal."""
+    actions: Floats
+    """[n, A] in [-1, 1]."""
+    rewards: Floats
+    """[n] the environment's."""
+    terminated: bool
+    """Whether it ended in a terminal state (a truncated one keeps its bootstrap)."""
+
+    def __len__(self) -> int:
+        return len(self.actions)
+
+
+@dataclass(frozen=True)
+class Transitions:
+    """A minibatch, or several behind each other."""
+
+    inputs: Floats
+    """[B, D + G] observation and desired goal."""
+    actions: Floats
+    """[B, A]"""
+    rewards: Floats
+    """[B] task reward, recomputed where the goal was relabelled."""
+    discounts: Floats
+    """[B] 0 where the episode terminated, else 1."""
+    next_inputs: Floats
+    """[B, D + G]"""
+    weights: Floats | None = None
+    """[B] importance weights in (0, 1] where transitions are drawn by TD error."""
+    rows: Rows | None = None
+    """[B] where they lie, for `update_priorities`."""
+
+
+class TrajectoryReplay:
+    """Ring of trajectories with uniform transition sampling, hindsight, and a trajectory view.
+
+    Args:
+        layout: sizes of a frame and an action, and the longest episode.
+        capacity: transitions of full episodes held at most, rounded down to whole episodes.
+        rng: all sampling is drawn from it.
+        goal_reward: recomputes rewards of relabelled transitions; needed for hindsight.
+        hindsight_k: HER `future` (Andrychowicz et al. 2017): a share k/(1+k) of transitions gets
+            a goal that their trajectory achieved later on.
+        td_exponent: PER (Schaul et al. 2016): draw transitions with probability proportional to
+            their absolute TD error to this power. None: uniformly.
+
+    Raises:
+        ValueError: no room for one episode, or hindsight without goals.
+    """
+
+    def __init__(
+        self,
+        layout: ReplayLayout,
+        capacity: int,
+        rng: np.random.Generator,
+        *,
+        goal_reward: GoalReward | None = None,
+        hindsight_k: float = 0.0,
+        td_exponent: float | None = None,
+    ) -> None:
+        if capacity < layout.horizon:
+            raise ValueError(
+                f"replay.capacity must hold an episode of {layout.horizon} steps, got {capacity}"
+            )
+        if hindsight_k > 0 and (goal_reward is None or layout.goal == 0):
+            raise ValueError(
+                f"replay.hindsight_k must be 0 without a goal environment, got {hindsight_k:g}"
+            )
+        self.layout, self.rng = layout, rng
+        self._goal_reward = goal_reward
+        self._hindsight_share = hindsight_k / (1.0 + hindsight_k)
+        ring = capacity // layout.horizon * (layout.horizon + 1)
+        # Untouched pages of zeros cost nothing: the system hands them out as they are written.
+        self._frames = np.zeros((ring, layout.frame), np.float32)
+        self._actions = np.zeros((ring, layout.action), np.float32)
+        self._rewards = np.zeros(ring, np.float32)
+        self._terminal = np.zeros(ring, np.bool_)
+        self._starts = np.zeros(0, np.int64)
+        self._lengths = np.zeros(0, np.int64)
+        self._priorities = np.zeros(0, np.float64)
+        self._ranks = np.zeros(0, np.float64)
+        self._write = 0
+        self._used = 0
+        self.trajectories_added = 0
+        self._td = None if td_exponent is None else TDPriorities(ring, td_exponent)
+
+    def __len__(self) -> int:
+        """Transitions held."""
+        return int(self._lengths.sum())
+
+    @property
+    def trajectories(self) -> int:
+        """Trajectories held."""
+        return len(self._lengths)
+
+    @property
+    def longest(self) -> int:
+        """Steps of the longest trajectory held; 0 if there is none."""
+        return int(self._lengths.max(initial=0))
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the arrays when full."""
+        arrays = (self._frames, self._actions, self._rewards, self._terminal)
+        return sum(array.nbytes for array in arrays)
+
+    # -- storing --------------------------------------------------------------------------
+
+    def extend(
+        self, trajectories: Sequence[Trajectory], priorities: NDArray[np.float64] | None = None
+    ) -> None:
+        """Stores finished episodes in place of the oldest ones.
+
+        Args:
+            priorities: [N] MUSIC-p: episodes are drawn by the rank of these. Given always or never.
+        """
+        for i, trajectory in enumerate(trajectories):
+            self._store(trajectory)
+            if priorities is not None:
+                self._priorities = np.append(self._priorities, priorities[i])
+        if priorities is not None:
+            self._ranks = np.cumsum(rank_weights(self._priorities))
+
+    def _store(self, trajectory: Trajectory) -> None:
+        steps = len(trajectory)
+        if not 0 < steps <= self.layout.horizon:
+            raise ValueError(f"an episode must have 1 to {self.layout.horizon} steps, got {steps}")
+        start = self._make_room(steps + 1)
+        end = start + steps
+        self._frames[start : end + 1] = trajectory.frames
+        self._actions[start:end] = trajectory.actions
+        self._rewards[start:end] = trajectory.rewards
+        self._terminal[start : end + 1] = False
+        self._terminal[end - 1] = trajectory.terminated
+        self._starts = np.append(self._starts, start)
+        self._lengths = np.append(self._lengths, steps)
+        if self._td is not None:
+            self._td.add(start, steps)
+        self._write = end + 1
+        self._used = max(self._used, self._write)
+        self.trajectories_added += 1
+
+    def _make_room(self, frames: int) -> int:
+        """Start of `frames` free consecutive frames; the oldest trajectories there are dropped."""
+        stale, held = 0, len(self._starts)
+        if self._write + frames > len(self._frames):
+            # What lies between here and the ring's end is the oldest: it goes, and the ring wraps.
+            while stale < held and self._starts[stale] >= self._write:
+                stale += 1
+            self._write = 0
+        end = self._write + frames
+        while stale < held and self._write <= self._starts[stale] < end:
+            stale += 1
+        if self._td is not None:
+            for start, steps in zip(self._starts[:stale], self._lengths[:stale], strict=True):
+                self._td.remove(start, steps)
+        self._starts, self._lengths = self._starts[stale:], self._lengths[stale:]
+        self._priorities = self._priorities[stale:]
+        return self._write
+
+    # -- the view of TAC: transitions -----------------------------------------------------
+
+    def sample_transitions(self, count: int, *, importance_exponent: float = 0.0) -> Transitions:
+        """`count` transitions with replacement: uniform over all, or by priority where set.
+
+        Args:
+            importance_exponent: PER's beta, for the importance weights.
+
+        Raises:
+            ValueError: the replay is empty.
+        """
+        start, step, length = self._draw(count)
+        row = start + step
+        frames, following = self._frames[row], self._frames[row + 1]
+        width = self.layout.network_input
+        inputs, next_inputs = frames[:, :width].copy(), following[:, :width].copy()
+        rewards = self._rewards[row]
+        if self._hindsight_share > 0:
+            chosen = np.flatnonzero(self.rng.random(count) < self._hindsight_share)
+            later = self._later_step(step[chosen], length[chosen])
+            goals = self._frames[start[chosen] + later, width:]
+            inputs[chosen, self.layout.observation :] = goals
+            next_inputs[chosen, self.layout.observation :] = goals
+            assert self._goal_reward is not None
+            rewards[chosen] = self._goal_reward(following[chosen, width:], goals)
+        discounts = 1.0 - self._terminal[row].astype(np.float32)
+        weights = None
+        if self._td is not None:
+            weights = self._td.importance_weights(row, len(self), importance_exponent)
+        return Transitions(
+            inputs, self._actions[row], rewards, discounts, next_inputs, weights, row
+        )
+
+    def update_priorities(self, rows: Rows, errors: Floats) -> None:
+        """PER: takes over the absolute TD errors [B] of transitions drawn from `rows` [B]."""
+        assert self._td is not None
+        self._td.update(rows, errors)
+
+    def _draw(self, count: int) -> tuple[Rows, Rows, Rows]:
+        """First frame, step and length of their trajectory, of `count` transitions; [B] each."""
+        total = len(self)
+        if total == 0:
+            raise ValueError("cannot sample from an empty replay: collect an episode first")
+        if self._td is not None:
+            return self._td.draw(self.rng.random(count))
+        if len(self._ranks):
+            which = np.searchsorted(
+                self._ranks, self.rng.random(count) * self._ranks[-1], side="right"
+            )
+            length = self._lengths[which]
+            return self._starts[which], (self.rng.random(count) * length).astype(np.int64), length
+        drawn = self.rng.integers(0, total, count)
+        shortest, longest = self._lengths.min(), self._lengths.max()
+        if shortest == longest:
+            which, step = np.divmod(drawn, longest)
+        else:
+            ends = np.cumsum(self._lengths)
+            which = np.searchsorted(ends, drawn, side="right")
+            step = drawn - (ends - self._lengths)[which]
+        return self._starts[which], step, self._lengths[which]
+
+    def _later_step(self, step: NDArray[np.int64], length: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Uniform over the states that follow: step + 1 to the episode's last one."""
+        return step + 1 + (self.rng.random(len(step)) * (length - step)).astype(np.int64)
+
+    # -- the view of MUSIC: trajectories --------------------------------------------------
+
+    def sample_trajectories(self, count: int, steps: int) -> Floats:
+        """Observations of `count` trajectories of `steps` steps, [N, steps + 1, D].
+
+        Uniform over the trajectories of at least that length, with replacement; of a longer one,
+        a random stretch.
+
+        Raises:
+            ValueError: no trajectory is that long.
+        """
+        long_enough = np.flatnonzero(self._lengths >= steps)
+        if len(long_enough) == 0:
+            raise ValueError(f"no trajectory of {steps} steps is in the replay")
+        which = long_enough[self.rng.integers(0, len(long_enough), count)]
+        slack = self._lengths[which] - steps + 1
+        offset = (self.rng.random(count) * slack).astype(np.int64)
+        rows = (self._starts[which] + offset)[:, None] + np.arange(steps + 1)
+        return self._frames[rows, : self.layout.observation]
+
+    # -- checkpoints ----------------------------------------------------------------------
+
+    def state(self) -> dict[str, Any]:
+        """Everything that sampling and storing depend on, as arrays and plain values."""
+        used = self._used
+        return {
+            "frames": self._frames[:used].copy(),
+            "actions": self._actions[:used].copy(),
+            "rewards": self._rewards[:used].copy(),
+            "terminal": self._terminal[:used].copy(),
+            "starts": self._starts.copy(),
+            "lengths": self._lengths.copy(),
+            "priorities": self._priorities.copy(),
+            "td": None if self._td is None else self._td.state(),
+            "write": self._write,
+            "trajectories_added": self.trajectories_added,
+            "rng": self.rng.bit_generator.state,
+        }
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Continues exactly where `state()` was taken.
+
+        Raises:
+            ValueError: the state comes from a replay of other sizes.
+        """
+        frames = np.asarray(state["frames"])
+        if frames.shape[1] != self.layout.frame or len(frames) > len(self._frames):
+            raise ValueError(
+                f"the replay holds {len(self._frames)} frames of {self.layout.frame} numbers, "
+                f"the checkpoint has {frames.shape[0]} of {frames.shape[1]}"
+            )
+        self._used = used = len(frames)
+        self._frames[:used] = frames
+        self._actions[:used] = state["actions"]
+        self._rewards[:used] = state["rewards"]
+        self._terminal[:used] = state["terminal"]
+        self._starts = np.array(state["starts"], np.int64)
+        self._lengths = np.array(state["lengths"], np.int64)
+        self._priorities = np.array(state["priorities"], np.float64)
+        self._ranks = np.cumsum(rank_weights(self._priorities))
+        if self._td is not None:
+            self._td.load_state(state["td"])
+        self._write = int(state["write"])
+        self.trajectories_added = int(state["trajectories_added"])
+        self.rng.bit_generator.state = state["rng"]

@@ -1,0 +1,143 @@
+"""Sampling by priority: dense ranks of trajectories (MUSIC-p), TD errors of transitions (PER).
+
+Shape legend: B draws, N trajectories.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["SumTree", "TDPriorities", "rank_weights"]
+
+Indices = NDArray[np.int64]
+Weights = NDArray[np.float64]
+
+SMALLEST_ERROR = 1e-6
+"""Added to every TD error, so that no transition is lost for ever (Schaul et al. 2016, 3.3)."""
+
+
+def rank_weights(priorities: Weights) -> Weights:
+    """[N] -> [N]: dense rank - 1, so that the least is never drawn (Zhao et al. 2021's code).
+
+    Where all are equal there is nothing to prefer: every weight is 1.
+    """
+    ranks = np.unique(priorities, return_inverse=True)[1].astype(np.float64)
+    return ranks if ranks.any() else np.ones(len(priorities))
+
+
+class SumTree:
+    """Weights over 0..size-1 with vectorised updates and proportional draws in O(log size).
+
+    A complete binary tree in one array: node i has children 2i and 2i + 1, leaves come last.
+    """
+
+    def __init__(self, size: int) -> None:
+        self._leaves = 1 << max(size - 1, 1).bit_length()
+        self._tree = np.zeros(2 * self._leaves, np.float64)
+
+    @property
+    def total(self) -> float:
+        """Sum of all weights."""
+        return float(self._tree[1])
+
+    def __getitem__(self, indices: Indices) -> Weights:
+        return self._tree[indices + self._leaves]
+
+    def set(self, indices: Indices, weights: Weights | float) -> None:
+        """Sets weights >= 0; of an index named twice the last one counts."""
+        nodes = np.asarray(indices, np.int64) + self._leaves
+        self._tree[nodes] = weights
+        while len(nodes) and nodes[0] > 1:
+            nodes = np.unique(nodes >> 1)
+            self._tree[nodes] = self._tree[2 * nodes] + self._tree[2 * nodes + 1]
+
+    def draw(self, uniform: Weights) -> Indices:
+        """[B] numbers in [0, 1) -> [B] indices, each with probability weight / total."""
+        mass = uniform * self._tree[1]
+        nodes = np.ones(len(mass), np.int64)
+        while nodes[0] < self._leaves:
+            nodes *= 2
+            left = self._tree[nodes]
+            # An empty right half is never entered, also where rounding would lead there.
+            right = (mass >= left) & (self._tree[nodes + 1] > 0)
+            mass = np.where(right, mass - left, mass)
+            nodes += right
+        return nodes - self._leaves
+
+    def state(self) -> Weights:
+        """The leaves, from which `load_state` rebuilds all sums."""
+        return self._tree[self._leaves :].copy()
+
+    def load_state(self, leaves: Weights) -> None:
+        """Takes over the leaves of an equal tree."""
+        self._tree[self._leaves :] = leaves
+        level = self._leaves
+        while level > 1:
+            level >>= 1
+            pairs = self._tree[2 * level : 4 * level].reshape(level, 2)
+            self._tree[level : 2 * level] = pairs[:, 0] + pairs[:, 1]
+
+
+class TDPriorities:
+    """Proportional prioritised replay over the rows of a ring of trajectories.
+
+    Schaul et al. 2016, "Prioritized Experience Replay", section 3.3-3.4. New transitions get the
+    largest priority seen so far.
+    """
+
+    def __init__(self, rows: int, exponent: float) -> None:
+        self._tree = SumTree(rows)
+        self._exponent = exponent
+        self._largest = 1.0
+        self._start = np.zeros(rows, np.int32)
+        self._length = np.zeros(rows, np.int32)
+
+    def add(self, start: int, steps: int) -> None:
+        """A trajectory was stored in `steps` rows from `start` on."""
+        rows = np.arange(start, start + steps)
+        self._tree.set(rows, self._largest)
+        self._start[rows], self._length[rows] = start, steps
+
+    def remove(self, start: int, steps: int) -> None:
+        """The trajectory in these rows is gone."""
+        self._tree.set(np.arange(start, start + steps), 0.0)
+
+    def draw(self, uniform: Weights) -> tuple[Indices, Indices, Indices]:
+        """[B] numbers in [0, 1) -> trajectory's first row, step, and trajectory's length, [B]."""
+        rows = self._tree.draw(uniform)
+        start = self._start[rows].astype(np.int64)
+        return start, rows - start, self._length[rows].astype(np.int64)
+
+    def importance_weights(
+        self, rows: Indices, transitions: int, exponent: float
+    ) -> NDArray[np.float32]:
+        """[B] (N P(i))^-beta, divided by the largest of them."""
+        probability = self._tree[rows] / self._tree.total
+        weights: Weights = (transitions * probability) ** -exponent
+        scaled: NDArray[np.float32] = (weights / weights.max()).astype(np.float32)
+        return scaled
+
+    def update(self, rows: Indices, errors: NDArray[np.float32]) -> None:
+        """[B] absolute TD errors become the priorities of [B] rows."""
+        priorities = (errors.astype(np.float64) + SMALLEST_ERROR) ** self._exponent
+        self._tree.set(rows, priorities)
+        self._largest = max(self._largest, float(priorities.max()))
+
+    def state(self) -> dict[str, Any]:
+        """Everything draws depend on."""
+        return {
+            "leaves": self._tree.state(),
+            "largest": self._largest,
+            "start": self._start.copy(),
+            "length": self._length.copy(),
+        }
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Continues where `state()` was taken."""
+        self._tree.load_state(state["leaves"])
+        self._largest = float(state["largest"])
+        self._start[:] = state["start"]
+        self._length[:] = state["length"]

@@ -1,0 +1,28 @@
+"""Named, validated settings of the trajectory replay."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from music_rllib.schedules import Schedule, bounded
+
+__all__ = ["ReplaySettings"]
+
+
+class ReplaySettings(BaseModel):
+    """Size of the replay, and hindsight relabelling (Andrychowicz et al. 2017)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    capacity: int = Field(1_000_000, gt=0)
+    """Transitions kept; the oldest trajectories go first."""
+    hindsight_k: float = Field(0.0, ge=0)
+    """HER, `future` strategy: k relabelled transitions for each one kept as it was. 0: off."""
+    priority: Literal["uniform", "td_error"] = "uniform"
+    """Transitions drawn uniformly, or by their TD error (PER, Schaul et al. 2016, proportional)."""
+    priority_exponent: float = Field(0.6, gt=0)
+    """PER: how strongly TD errors count (alpha in the paper; 0 would be uniform)."""
+    importance_exponent: Annotated[Schedule, bounded("in [0, 1]", lambda b: 0 <= b <= 1)] = 0.4
+    """PER: strength of the importance weights that undo its bias (beta; 1 undoes it fully)."""

@@ -1,0 +1,176 @@
+"""A sweep as a folder of plain tables, readable without MLflow and without this package.
+
+`sweep.json`
+    the sweep's own run: name, status, tags, configuration.
+`runs.csv` or `runs.parquet`
+    one row per run: its number, MLflow's id, and a column per tag (`tag.`) and param (`param.`).
+`metrics.csv` or `metrics.parquet`
+    one row per value: the run's number, metric, environment steps, value, time in ms.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+import pyarrow as pa
+from pyarrow import csv, parquet
+
+from music_rllib.reports.data import Column, ReportError, RunRecord, Sweep
+
+__all__ = ["Format", "is_archive", "read_archive", "write_archive"]
+
+Format = Literal["csv", "parquet"]
+VERSION = 1
+_HEADER = "sweep.json"
+_OWN_FIELDS = ("name", "status", "run_id", "experiment_id", "started", "source", "tags", "config")
+_RUN_FIELDS = ("run_id", "name", "status", "started", "ended")
+_METRICS = {
+    "run": pa.int64(),
+    "metric": pa.string(),
+    "env_steps": pa.int64(),
+    "value": pa.float64(),
+    "time_ms": pa.int64(),
+}
+
+
+def is_archive(folder: Path) -> bool:
+    """Whether `folder` holds an exported sweep."""
+    return (folder / _HEADER).is_file()
+
+
+def write_archive(sweep: Sweep, folder: Path, file_format: Format = "parquet") -> None:
+    """Write `sweep` into `folder`; a sweep that was exported there before is replaced.
+
+    Raises:
+        ReportError: where the folder is not writable.
+    """
+    header = {"version": VERSION, "format": file_format}
+    header |= {name: getattr(sweep, name) for name in _OWN_FIELDS}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for stale in get_args(Format):
+            for table in ("runs", "metrics"):
+                (folder / f"{table}.{stale}").unlink(missing_ok=True)
+        _write(_runs_table(sweep.runs), folder / f"runs.{file_format}")
+        _write(_metrics_table(sweep), folder / f"metrics.{file_format}")
+        text = json.dumps(header, indent=1, ensure_ascii=False) + "\n"
+        (folder / _HEADER).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise ReportError(f"{folder} must be writable: {error}") from error
+
+
+def read_archive(folder: Path) -> Sweep:
+    """Inverse of :func:`write_archive`.
+
+    Raises:
+        ReportError: where something is missing or is not what was written.
+    """
+    try:
+        header = json.loads((folder / _HEADER).read_text("utf-8"))
+        if header["version"] != VERSION:
+            raise ValueError(f"version must be {VERSION}, got {header['version']!r}")
+        own = {name: header[name] for name in _OWN_FIELDS}
+        runs = _read(folder / f"runs.{header['format']}")
+        metrics = _read(folder / f"metrics.{header['format']}", _METRICS)
+        return Sweep(**own, runs=_records(runs), history=_history(metrics, runs.num_rows))
+    except (OSError, KeyError, TypeError, ValueError, pa.ArrowException) as error:
+        raise ReportError(f"{folder} must hold an exported sweep: {error}") from error
+
+
+def _runs_table(runs: Sequence[RunRecord]) -> pa.Table:
+    table: dict[str, Any] = {"run": pa.array(range(len(runs)), pa.int64())}
+    for name in _RUN_FIELDS:
+        kind = pa.int64() if name in ("started", "ended") else pa.string()
+        table[name] = pa.array([getattr(run, name) for run in runs], kind)
+    table |= _wide("tag.", [run.tags for run in runs])
+    table |= _wide("param.", [run.params for run in runs])
+    return pa.table(table)
+
+
+def _wide(prefix: str, rows: Sequence[Mapping[str, str]]) -> dict[str, Any]:
+    keys: Iterable[str] = sorted({key for row in rows for key in row})
+    return {prefix + key: pa.array([row.get(key) for row in rows], pa.string()) for key in keys}
+
+
+def _metrics_table(sweep: Sweep) -> pa.Table:
+    columns = sweep.history
+    metric = [pa.repeat(name, len(found.run)) for name, found in columns.items()]
+    return pa.table(
+        {
+            "run": _concatenated([found.run for found in columns.values()], np.int64),
+            "metric": pa.chunked_array(metric, pa.string()),
+            "env_steps": _concatenated([found.step for found in columns.values()], np.int64),
+            "value": _concatenated([found.value for found in columns.values()], np.float64),
+            "time_ms": _concatenated([found.time for found in columns.values()], np.int64),
+        }
+    )
+
+
+def _concatenated(parts: Sequence[Any], dtype: type) -> Any:
+    return np.concatenate(parts) if parts else np.empty(0, dtype=dtype)
+
+
+def _write(table: pa.Table, file: Path) -> None:
+    if file.suffix == ".csv":
+        csv.write_csv(table, file)
+    else:
+        parquet.write_table(table, file, compression="zstd")
+
+
+def _read(file: Path, kinds: Mapping[str, Any] | None = None) -> pa.Table:
+    if file.suffix != ".csv":
+        return parquet.read_table(file)
+    known = {"run": pa.int64(), "started": pa.int64(), "ended": pa.int64()}
+    names = csv.open_csv(file).schema.names
+    convert = csv.ConvertOptions(
+        column_types=kinds or {name: known.get(name, pa.string()) for name in names},
+        # An empty field is nothing, an empty text in quotes is a text, and nan is a number.
+        null_values=[""],
+        strings_can_be_null=True,
+        quoted_strings_can_be_null=False,
+    )
+    # A failure's text has line breaks.
+    return csv.read_csv(
+        file, convert_options=convert, parse_options=csv.ParseOptions(newlines_in_values=True)
+    )
+
+
+def _records(table: pa.Table) -> list[RunRecord]:
+    return [
+        RunRecord(
+            **{name: row[name] for name in _RUN_FIELDS},
+            params=_narrow("param.", row),
+            tags=_narrow("tag.", row),
+        )
+        for row in table.to_pylist()
+    ]
+
+
+def _narrow(prefix: str, row: Mapping[str, Any]) -> dict[str, str]:
+    return {
+        name.removeprefix(prefix): value
+        for name, value in row.items()
+        if name.startswith(prefix) and value is not None
+    }
+
+
+def _history(table: pa.Table, runs: int) -> dict[str, Column]:
+    metrics = table["metric"].combine_chunks().dictionary_encode()
+    codes = metrics.indices.to_numpy(zero_copy_only=False)
+    run, step, value, time = (
+        table[name].to_numpy() for name in ("run", "env_steps", "value", "time_ms")
+    )
+    if len(run) and not 0 <= run.min() <= run.max() < runs:
+        raise ValueError(f"a metric's run must be one of {runs}, got {run.min()} to {run.max()}")
+    history = {}
+    for code, name in enumerate(metrics.dictionary.to_pylist()):
+        chosen = np.flatnonzero(codes == code)
+        order = chosen[np.lexsort((step[chosen], run[chosen]))]
+        history[name] = Column(
+            run=run[order], step=step[order], value=value[order], time=time[order]
+        )
+    return history

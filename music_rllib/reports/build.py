@@ -1,0 +1,107 @@
+"""From a sweep to its report on disk: the page, its figures and its numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from music_rllib.reports.analysis import analyse
+from music_rllib.reports.data import ReportError, Sweep
+from music_rllib.reports.figures import METRICS, files
+from music_rllib.reports.gallery import Drawing, stage_drawings
+from music_rllib.reports.missing import missing
+from music_rllib.reports.page import Report, render
+from music_rllib.reports.tables import (
+    Table,
+    improvement_table,
+    runs_table,
+    success_table,
+    waits_table,
+)
+from music_rllib.tracking import names
+
+__all__ = ["PAGE", "WANTED", "build_report", "write_report"]
+
+PAGE = "report.html"
+WANTED = (*(metric.name for metric in METRICS), names.ENV_STEPS)
+"""Metrics that a report reads."""
+_CURVE_COLUMNS = (
+    *("stage", "task", "condition", "metric", "env_steps", "runs", "iqm", "lower", "upper"),
+)
+
+
+def build_report(
+    sweep: Sweep,
+    rng: np.random.Generator,
+    *,
+    difference: float,
+    undelivered: int = 0,
+    command: str = "",
+) -> Report:
+    """Compute and arrange everything.
+
+    Args:
+        sweep: with the metrics of `WANTED`.
+        rng: for the bootstraps and the permutations.
+        difference: in success rate, which the reader would want to be able to see.
+        undelivered: runs of which MLflow does not have everything yet.
+        command: that makes this report.
+    """
+    analyses = analyse(sweep, rng)
+    return Report(
+        sweep=sweep,
+        analyses=analyses,
+        drawings=[d for analysis in analyses for d in stage_drawings(sweep, analysis, rng)],
+        missing=missing(sweep, analyses, undelivered),
+        difference=difference,
+        command=command,
+    )
+
+
+def write_report(report: Report, folder: Path) -> Path:
+    """Write the page, `figures/*.png`, `figures/*.svg` and `tables/*.csv` into `folder`.
+
+    Figures of an earlier report that this one does not have are removed.
+
+    Returns:
+        The page.
+
+    Raises:
+        ReportError: where the folder is not writable.
+    """
+    figures, tables = folder / "figures", folder / "tables"
+    try:
+        for part in (figures, tables):
+            part.mkdir(parents=True, exist_ok=True)
+        _remove_others(figures, {drawing.name for drawing in report.drawings})
+        for drawing in report.drawings:
+            for kind, content in files(drawing.panels, drawing.legend).items():
+                (figures / f"{drawing.name}.{kind}").write_bytes(content)
+        for table in _tables(report):
+            (tables / f"{table.name}.csv").write_text(table.to_csv(), encoding="utf-8")
+        page = folder / PAGE
+        page.write_text(render(report), encoding="utf-8")
+    except OSError as error:
+        raise ReportError(f"{folder} must be writable: {error}") from error
+    return page
+
+
+def _tables(report: Report) -> Iterable[Table]:
+    yield success_table(report.analyses)
+    yield waits_table(report.analyses)
+    yield improvement_table(report.analyses)
+    yield runs_table(report.sweep)
+    yield _curves_table(report.drawings)
+
+
+def _curves_table(drawings: Iterable[Drawing]) -> Table:
+    rows = [row for drawing in drawings for row in drawing.values]
+    return Table(name="curves", columns=_CURVE_COLUMNS, rows=rows)
+
+
+def _remove_others(folder: Path, kept: set[str]) -> None:
+    for file in folder.iterdir():
+        if file.suffix in (".png", ".svg") and file.stem not in kept:
+            file.unlink()

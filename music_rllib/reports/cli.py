@@ -1,0 +1,152 @@
+"""The command line of reports."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from music_rllib.reports.data import ReportError
+from music_rllib.tracking.errors import TrackingError
+from music_rllib.tracking.redaction import redact
+
+if TYPE_CHECKING:
+    from music_rllib.reports.locate import Found
+
+__all__ = ["app"]
+
+app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
+
+BAD_INPUT = 2
+EPILOG = """
+**Examples**
+
+    python -m music_rllib.report results/smoke
+        report on the sweep in that folder, while it runs or afterwards
+
+    python -m music_rllib.report smoke --tracking-uri http://mlflow:5000 --output reports/smoke
+        a sweep that was logged to a server, from any machine
+
+    python -m music_rllib.report results/smoke --export published/smoke --format csv
+        its runs and metrics as plain tables; `report published/smoke` reads them again
+
+**Exit codes**: 0 the report is written, whatever state the sweep is in; 2 there is no such sweep.
+"""
+
+
+class TableFormat(StrEnum):
+    """Of exported tables."""
+
+    csv = "csv"
+    parquet = "parquet"
+
+
+@app.command(epilog=EPILOG)
+def report(
+    sweep: Annotated[
+        str,
+        typer.Argument(
+            help="A sweep's folder, an exported one, or a sweep's name.", metavar="SWEEP"
+        ),
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option(help="Folder for the report; `report` in the sweep's folder by default."),
+    ] = None,
+    storage: Annotated[
+        str, typer.Option(help="Where a sweep's name is looked for, as in the sweep's YAML file.")
+    ] = "results",
+    tracking_uri: Annotated[
+        str | None, typer.Option(help="Read from this MLflow instead of the sweep's own.")
+    ] = None,
+    difference: Annotated[
+        float,
+        typer.Option(
+            min=0.001,
+            max=1.0,
+            help="Difference in success rate that you would want to see: the report says how many "
+            "seeds would likely show it.",
+        ),
+    ] = 0.1,
+    seed: Annotated[int, typer.Option(min=0, help="Of the bootstrap and the permutations.")] = 0,
+    attach: Annotated[
+        bool, typer.Option("--attach", help="Also keep the report with the sweep's run in MLflow.")
+    ] = False,
+    export: Annotated[
+        Path | None,
+        typer.Option(help="Write the sweep as tables into this folder instead of a report."),
+    ] = None,
+    format_: Annotated[
+        TableFormat, typer.Option("--format", help="Of the exported tables.")
+    ] = TableFormat.parquet,
+) -> None:
+    """One self-contained page about a sweep, with its figures (PNG, SVG) and numbers (CSV)."""
+    try:
+        if export is not None:
+            _export(sweep, storage, tracking_uri, export, format_)
+        else:
+            _report(sweep, storage, tracking_uri, output, difference, seed, attach=attach)
+    except (ReportError, TrackingError) as error:
+        typer.echo(f"error: {redact(str(error))}", err=True)
+        raise typer.Exit(BAD_INPUT) from error
+
+
+def _export(
+    place: str, storage: str, tracking_uri: str | None, folder: Path, table_format: TableFormat
+) -> None:
+    from music_rllib.reports.archive import write_archive
+    from music_rllib.reports.locate import find_sweep
+
+    found = find_sweep(place, storage=storage, tracking_uri=tracking_uri)
+    write_archive(found.sweep, folder, table_format.value)
+    values = sum(len(column.run) for column in found.sweep.history.values())
+    typer.echo(f"{len(found.sweep.runs)} runs, {values} values: {folder}")
+
+
+def _report(
+    place: str,
+    storage: str,
+    tracking_uri: str | None,
+    output: Path | None,
+    difference: float,
+    seed: int,
+    *,
+    attach: bool,
+) -> None:
+    import numpy as np
+
+    from music_rllib.reports.build import WANTED, build_report, write_report
+    from music_rllib.reports.locate import find_sweep
+    from music_rllib.reports.verdict import verdict
+
+    found = find_sweep(place, storage=storage, tracking_uri=tracking_uri, metrics=WANTED)
+    made = build_report(
+        found.sweep,
+        np.random.default_rng(seed),
+        difference=difference,
+        undelivered=found.undelivered,
+        command=redact(shlex.join(["python", "-m", "music_rllib.report", *sys.argv[1:]])),
+    )
+    page = write_report(made, output or found.folder / "report")
+    for note in made.missing:
+        typer.echo(f"missing: {note}")
+    for analysis in made.analyses:
+        for line in verdict(analysis.scopes[0], difference):
+            typer.echo(f"{analysis.stage.name}: {line}")
+    if attach:
+        _attach(found, page.parent)
+    typer.echo(f"Report: {page.absolute()}")
+
+
+def _attach(found: Found, folder: Path) -> None:
+    from music_rllib.reports.query import attach
+
+    if found.store is None:
+        raise ReportError("--attach needs a sweep that is read from MLflow, got an exported one")
+    attach(found.store, found.sweep.run_id, folder, "report")
+    where = found.sweep.url(found.sweep.run_id) or f"run {found.sweep.run_id}"
+    typer.echo(f"Attached to the sweep's run in MLflow: {where}")

@@ -1,0 +1,125 @@
+"""Which figures a sweep gets."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from music_rllib.reports.analysis import Curve, StageAnalysis, curve
+from music_rllib.reports.conditions import Stage
+from music_rllib.reports.data import Sweep
+from music_rllib.reports.figures import (
+    METRICS,
+    Legend,
+    Metric,
+    Panel,
+    curve_panel,
+    finals_panel,
+    profile_panel,
+)
+from music_rllib.reports.palette import style_of
+
+__all__ = ["CURVES", "FINALS", "PROFILES", "Drawing", "slug", "stage_drawings"]
+
+FINALS, PROFILES = "Final success rate", "Performance profile"
+CURVES = tuple(metric.title for metric in METRICS)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drawing:
+    """One figure of one stage: a panel per task, and its values as a table."""
+
+    stage: str
+    title: str
+    caption: str
+    panels: tuple[Panel, ...]
+    legend: Legend
+    values: tuple[tuple[object, ...], ...] = ()
+    """(stage, task, condition, metric, env_steps, runs, iqm, lower, upper) rows."""
+
+    @property
+    def name(self) -> str:
+        """Of its files, and of its place in the page."""
+        return slug(f"{self.stage}-{self.title}")
+
+
+def slug(text: str) -> str:
+    """`text` as a file name."""
+    return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")
+
+
+def stage_drawings(
+    sweep: Sweep, analysis: StageAnalysis, rng: np.random.Generator
+) -> Iterator[Drawing]:
+    """The figures for which there is something to draw or to compare."""
+    stage = analysis.stage
+    for metric in METRICS:
+        drawing = _curves(sweep, stage, metric, rng)
+        if drawing is not None:
+            yield drawing
+    scopes = [scope for scope in analysis.scopes if len(scope.finals) > 1]
+    if not scopes:
+        return
+    legend = _legend(stage)
+    yield Drawing(
+        stage=stage.name,
+        title=FINALS,
+        caption="Large marks: interquartile mean; bars: 95 % intervals; small ticks: single runs.",
+        panels=tuple(finals_panel(scope, stage.conditions) for scope in scopes),
+        legend=legend,
+    )
+    yield Drawing(
+        stage=stage.name,
+        title=PROFILES,
+        caption="Share of finished runs that end above each success rate, with 95 % bands. A line "
+        "that is above another everywhere is better at every standard.",
+        panels=tuple(profile_panel(scope, stage.conditions, rng) for scope in scopes),
+        legend=legend,
+    )
+
+
+def _curves(sweep: Sweep, stage: Stage, metric: Metric, rng: np.random.Generator) -> Drawing | None:
+    panels, values = [], []
+    for task in stage.tasks:
+        found = [curve(sweep, c, task, metric.name, rng) for c in stage.conditions]
+        curves = [one for one in found if one is not None]
+        if not curves:
+            continue
+        panels.append(curve_panel(metric, task, curves, stage.conditions))
+        for one in curves:
+            head = (stage.name, task, one.condition.label, metric.name)
+            values += [(*head, *row) for row in _rows(one)]
+    if not panels:
+        return None
+    return Drawing(
+        stage=stage.name,
+        title=metric.title,
+        caption=_caption(stage, metric),
+        panels=tuple(panels),
+        legend=_legend(stage),
+        values=tuple(values),
+    )
+
+
+def _rows(one: Curve) -> Iterator[tuple[object, ...]]:
+    columns = (one.steps, one.runs, one.estimate.value, one.estimate.lower, one.estimate.upper)
+    for step, runs, *numbers in zip(*columns, strict=True):
+        yield int(step), int(runs), *(float(number) for number in numbers)
+
+
+def _caption(stage: Stage, metric: Metric) -> str:
+    seeds = len(stage.seeds)
+    if seeds == 1:
+        band = "A single seed: each line is one run, and there is no band."
+    else:
+        band = f"Interquartile mean over up to {seeds} seeds with its 95 % bootstrap band."
+    thin = "A line is thin where some of its runs had ended."
+    target = "" if metric.target is None else f" Dotted: {metric.target * 100:.0f} %."
+    return f"{band} {thin}{target}"
+
+
+def _legend(stage: Stage) -> Legend:
+    return [(c.label, style_of(c, stage.conditions)) for c in stage.conditions]

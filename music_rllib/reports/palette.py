@@ -1,0 +1,79 @@
+"""How an entropic index looks: the same q has the same colour and marker in every figure.
+
+The values that the paper compares have colours of Okabe and Ito's palette, which colour-blind
+readers tell apart, darkened or lightened until each stands out from white and from black paper.
+Between them the colour is mixed, so any q has one, by a function of q alone.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+
+from music_rllib.reports.conditions import Condition
+
+__all__ = ["DARK", "LIGHT", "Style", "colour_of", "marker_of", "style_of"]
+
+LIGHT, DARK = "#ffffff", "#14171c"
+"""The two papers."""
+
+_ANCHORS = (
+    (0.5, "#b07aa1"),
+    (1.0, "#1f7fc4"),
+    (1.5, "#d55e00"),
+    (2.0, "#009e73"),
+    (3.0, "#a0522d"),
+)
+_UNKNOWN = "#808080"
+_MARKERS = "osD^vPX"
+
+Line = Literal["solid", "dashed", "dashdot", "dotted"]
+_LINES: tuple[Line, ...] = get_args(Line)
+
+
+class Style(NamedTuple):
+    """How a condition is drawn."""
+
+    colour: str
+    marker: str
+    line: Line
+
+
+def colour_of(entropic_index: str) -> str:
+    """Colour of a q in words; a schedule has that of its last value."""
+    q = _number(entropic_index)
+    if q is None:
+        return _UNKNOWN
+    at = [anchor for anchor, _ in _ANCHORS]
+    channels = np.array([_channels(colour) for _, colour in _ANCHORS])
+    mixed = [round(float(np.interp(q, at, channels[:, channel]))) for channel in range(3)]
+    return "#{:02x}{:02x}{:02x}".format(*mixed)
+
+
+def marker_of(entropic_index: str) -> str:
+    """Marker of a q in words, different for neighbours on a grid of quarters."""
+    q = _number(entropic_index)
+    return "*" if q is None else _MARKERS[(round(4 * q) - 4) % len(_MARKERS)]
+
+
+def style_of(condition: Condition, siblings: tuple[Condition, ...]) -> Style:
+    """Colour and marker by q; the line tells conditions of the same q apart."""
+    colour = colour_of(condition.entropic_index)
+    same = [other for other in siblings if colour_of(other.entropic_index) == colour]
+    return Style(
+        colour=colour,
+        marker=marker_of(condition.entropic_index),
+        line=_LINES[same.index(condition) % len(_LINES)],
+    )
+
+
+def _number(entropic_index: str) -> float | None:
+    try:
+        return float(entropic_index.split(" (")[0].rpartition(" ")[2])
+    except ValueError:
+        return None
+
+
+def _channels(colour: str) -> tuple[int, int, int]:
+    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)

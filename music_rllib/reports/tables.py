@@ -1,0 +1,142 @@
+"""The report's numbers as CSV files, unrounded."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from music_rllib.reports.analysis import StageAnalysis
+from music_rllib.reports.data import Sweep
+from music_rllib.tracking import names
+
+__all__ = ["Table", "improvement_table", "runs_table", "success_table", "waits_table"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """One CSV file."""
+
+    name: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[object]]
+
+    def to_csv(self) -> str:
+        """With a header; NaN is `nan`, infinity `inf`."""
+        buffer = io.StringIO()
+        writer = csv.writer(buffer, lineterminator="\n")
+        writer.writerow(self.columns)
+        writer.writerows(self.rows)
+        return buffer.getvalue()
+
+
+def success_table(analyses: Iterable[StageAnalysis]) -> Table:
+    """Final success rate of each condition."""
+    return Table(
+        name="final_success",
+        columns=("stage", "tasks", "condition", "runs", "seeds", "iqm", "lower", "upper"),
+        rows=[
+            (
+                analysis.stage.name,
+                scope.name,
+                final.condition.label,
+                final.runs,
+                final.seeds,
+                float(final.estimate.value),
+                float(final.estimate.lower),
+                float(final.estimate.upper),
+            )
+            for analysis in analyses
+            for scope in analysis.scopes
+            for final in scope.finals
+        ],
+    )
+
+
+def improvement_table(analyses: Iterable[StageAnalysis]) -> Table:
+    """Probability of improvement of each pair of conditions."""
+    return Table(
+        name="probability_of_improvement",
+        columns=(
+            *("stage", "tasks", "first", "second", "probability_first_higher", "lower", "upper"),
+            *("p_value_holm", "intervals_overlap", "decided"),
+        ),
+        rows=[
+            (
+                analysis.stage.name,
+                scope.name,
+                pair.first.condition.label,
+                pair.second.condition.label,
+                float(pair.estimate.value),
+                float(pair.estimate.lower),
+                float(pair.estimate.upper),
+                pair.p_value,
+                pair.overlaps,
+                pair.decided,
+            )
+            for analysis in analyses
+            for scope in analysis.scopes
+            for pair in scope.comparisons
+        ],
+    )
+
+
+def waits_table(analyses: Iterable[StageAnalysis]) -> Table:
+    """Environment steps to each success rate."""
+    return Table(
+        name="steps_to_threshold",
+        columns=(
+            *("stage", "task", "condition", "threshold", "runs", "reached"),
+            *("median_env_steps", "lower", "upper"),
+        ),
+        rows=[
+            (
+                analysis.stage.name,
+                wait.task,
+                wait.condition.label,
+                wait.threshold,
+                wait.runs,
+                wait.reached,
+                wait.median,
+                wait.lower,
+                wait.upper,
+            )
+            for analysis in analyses
+            for wait in analysis.waits
+        ],
+    )
+
+
+def runs_table(sweep: Sweep) -> Table:
+    """Every run."""
+    return Table(
+        name="runs",
+        columns=(
+            *("run_id", "name", "stage", "task", "entropic_index", "seed", "status", "env_steps"),
+            *("budget", "seconds", "success_rate", "failure"),
+        ),
+        rows=[
+            (
+                run.run_id,
+                run.name,
+                run.stage,
+                run.task,
+                run.entropic_index,
+                run.seed,
+                run.status,
+                sweep.last_step(position),
+                run.budget,
+                run.seconds,
+                last_success(sweep, position),
+                run.failure,
+            )
+            for position, run in enumerate(sweep.runs)
+        ],
+    )
+
+
+def last_success(sweep: Sweep, run: int) -> float | None:
+    """Success rate of a run's last evaluation."""
+    values = sweep.series(run, names.EVAL_SUCCESS)[1]
+    return float(values[-1]) if len(values) else None

@@ -1,0 +1,96 @@
+"""Who waits for whom: the state of every node of a plan while a sweep runs. Knows no Ray."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from enum import StrEnum
+
+from music_rllib.experiment.plan import Node, Plan
+
+__all__ = ["Board", "Status"]
+
+
+class Status(StrEnum):
+    """Where a node stands."""
+
+    WAITING = "waiting"
+    """For its input, or for its turn."""
+    STARTED = "started"
+    """Handed out to be computed."""
+    FINISHED = "finished"
+    REUSED = "reused"
+    """Was in the store before this sweep started."""
+    FAILED = "failed"
+    SKIPPED = "skipped"
+    """What it starts from failed or was skipped."""
+
+
+_DONE = frozenset({Status.FINISHED, Status.REUSED})
+
+
+class Board:
+    """The nodes of a plan and their states."""
+
+    def __init__(self, plan: Plan, finished: Collection[str]) -> None:
+        """Start with the nodes whose keys are in `finished` done, and all others waiting."""
+        self._nodes = {node.key: node for node in plan.nodes}
+        self._status = {
+            key: Status.REUSED if key in finished else Status.WAITING for key in self._nodes
+        }
+
+    def __getitem__(self, key: str) -> Status:
+        return self._status[key]
+
+    def node(self, key: str) -> Node:
+        """The node with this key."""
+        return self._nodes[key]
+
+    def having(self, *statuses: Status) -> list[Node]:
+        """Nodes in one of these states, in the order of the plan."""
+        return [node for key, node in self._nodes.items() if self._status[key] in statuses]
+
+    @property
+    def all_handed_out(self) -> bool:
+        """Whether no node waits any more."""
+        return Status.WAITING not in self._status.values()
+
+    @property
+    def complete(self) -> bool:
+        """Whether nothing is waiting or being computed."""
+        return self.all_handed_out and Status.STARTED not in self._status.values()
+
+    def next_ready(self) -> Node | None:
+        """The first waiting node, in the order of the plan, whose input is there."""
+        ready = (node for node in self.having(Status.WAITING) if self._input_is_there(node))
+        return next(ready, None)
+
+    def _input_is_there(self, node: Node) -> bool:
+        if node.input is None or node.input.checkpoint is not None:
+            return True
+        return self._status[node.input.key] in _DONE
+
+    def start(self, key: str) -> None:
+        """The node is handed out."""
+        self._move(key, Status.WAITING, Status.STARTED)
+
+    def finish(self, key: str) -> None:
+        """The node is in the store."""
+        self._move(key, Status.STARTED, Status.FINISHED)
+
+    def fail(self, key: str) -> list[Node]:
+        """The node failed; those that depend on it are skipped, and returned."""
+        self._move(key, Status.STARTED, Status.FAILED)
+        dependants = list(self._dependants({key}))
+        for node in dependants:
+            self._move(node.key, Status.WAITING, Status.SKIPPED)
+        return dependants
+
+    def _dependants(self, lost: set[str]) -> Iterator[Node]:
+        for node in self._nodes.values():  # every node comes after its input
+            if node.input is not None and node.input.key in lost:
+                lost.add(node.key)
+                yield node
+
+    def _move(self, key: str, before: Status, after: Status) -> None:
+        assert self._status[key] is before, f"{key} is {self._status[key]}, not {before}"
+        self._status[key] = after

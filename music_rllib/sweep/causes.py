@@ -1,0 +1,52 @@
+"""Why a run failed, in a line or two."""
+
+from __future__ import annotations
+
+import re
+
+from ray.exceptions import RayActorError, RayError, RayTaskError
+
+__all__ = ["cause_of"]
+
+_DETAIL = re.compile(r"Worker exit detail: (.*?)(?: Some common causes include|$)", re.MULTILINE)
+_PLACE = re.compile(r"^\s*(pid|ip): (\S+)$", re.MULTILINE)
+
+
+def cause_of(error: BaseException | None, text: str, limit: int = 300) -> str:
+    """One or two lines that say why.
+
+    Args:
+        error: What Ray raised in the driver, if that could be read.
+        text: Its traceback, of which the last line is taken otherwise.
+        limit: Characters per line.
+    """
+    if isinstance(error, RayTaskError) and isinstance(error.cause, BaseException):
+        error = error.cause
+    if error is None:
+        lines = _non_empty(text)[-1:]
+    elif isinstance(error, RayActorError):
+        lines = _death(str(error))
+    elif isinstance(error, RayError):
+        lines = _non_empty(str(error))[:2]
+    else:
+        first, *rest = _non_empty(str(error)) or ["(no message)"]
+        lines = [f"{type(error).__name__}: {first}", *rest[:1]]
+    return "\n".join(line if len(line) <= limit else line[: limit - 3] + "..." for line in lines)
+
+
+def _non_empty(text: str) -> list[str]:
+    return [line for line in text.splitlines() if line.strip()]
+
+
+def _death(text: str) -> list[str]:
+    """A worker process that is gone, or never came up because its first task raised."""
+    if "creation task" in text:
+        return _non_empty(text)[-1:]
+    place = ", ".join(f"{name} {value}" for name, value in _PLACE.findall(text))
+    detail = _DETAIL.search(text)
+    return [
+        f"The worker process died{f' ({place})' if place else ''}: "
+        f"{detail[1] if detail else _non_empty(text)[-1]}",
+        "Often the system killed it for lack of memory. The same command again continues from "
+        "the last checkpoint.",
+    ]

@@ -1,0 +1,173 @@
+"""A running sweep on the screen: a live table on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+from music_rllib.experiment.plan import Node, Plan
+from music_rllib.experiment.result import Report, RunResult
+from music_rllib.sweep.board import Board, Status
+from music_rllib.sweep.listener import Failure, Listener
+from music_rllib.sweep.pace import Pace
+from music_rllib.sweep.words import clock, percent
+from music_rllib.tracking import names
+
+__all__ = ["Display"]
+
+REFRESH_SECONDS = 0.5
+QUIET_SECONDS = 30.0
+"""Without a terminal, a line at least this often for each run, if it has something new."""
+
+
+class Display(Listener):
+    """Shows what runs, how fast, how long still; keeps a line of what ended."""
+
+    def __init__(
+        self,
+        console: Console,
+        plan: Plan,
+        board: Board,
+        now: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Show on `console`; `now` is a clock in seconds."""
+        self._console = console
+        self._plan = plan
+        self._board = board
+        self._now = now
+        self._began = now()
+        self._running: dict[str, tuple[Node, Pace]] = {}
+        self._said: dict[str, float] = {}
+        self._refreshed = self._began
+        self._live = (
+            Live(console=console, auto_refresh=False, transient=True)
+            if console.is_terminal
+            else None
+        )
+
+    def __enter__(self) -> Self:
+        if self._live:
+            self._live.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._live:
+            self._live.stop()
+
+    def say(self, text: str, style: str = "") -> None:
+        """A line that stays."""
+        passed = clock(self._now() - self._began)
+        self._console.print(Text(f"[{passed:>6}] {text}", style=style), soft_wrap=True)
+
+    def started(self, node: Node) -> None:
+        self._running[node.key] = (node, self._new_pace(node))
+        self.say(f"{node.label}: started")
+
+    def _new_pace(self, node: Node) -> Pace:
+        return Pace(node.run.env_steps, node.run.tac.random_steps, self._now())
+
+    def reported(self, node: Node, reports: list[Report]) -> None:
+        _, pace = self._running.setdefault(node.key, (node, self._new_pace(node)))
+        pace.hear(reports, self._now())
+        evaluated = any(names.EVAL_EPISODES in report.metrics for report in reports)
+        quiet = self._now() - self._said.get(node.key, self._began) >= QUIET_SECONDS
+        if self._live is None and (evaluated or quiet) and not self._is_over(node, pace):
+            self._said[node.key] = self._now()
+            self.say(f"{node.label}: {self._progress_in_words(pace)}")
+
+    @staticmethod
+    def _is_over(node: Node, pace: Pace) -> bool:
+        return pace.env_steps >= node.run.env_steps  # `finished` says it better
+
+    def noted(self, node: Node, text: str) -> None:
+        self.say(f"{node.label}: {text}")
+
+    def finished(self, node: Node, result: RunResult) -> None:
+        self._running.pop(node.key, None)
+        self.say(
+            f"{node.label}: finished, {_success(result.metrics)}, "
+            f"{result.env_steps:,} env steps in {clock(result.seconds)}",
+            "green",
+        )
+
+    def failed(self, node: Node, failure: Failure) -> None:
+        self._running.pop(node.key, None)
+        cause = failure.cause.replace("\n", "\n" + " " * 13)
+        self.say(f"{node.label}: FAILED: {cause}", "red")
+        self.say(f"    whole traceback: {failure.log}")
+
+    def skipped(self, node: Node, because: Node) -> None:
+        self.say(f"{node.label}: skipped, it starts from {because.label}", "yellow")
+
+    def tick(self) -> None:
+        if self._live and self._now() - self._refreshed >= REFRESH_SECONDS:
+            self._refreshed = self._now()
+            self._live.update(self._view(), refresh=True)
+
+    def _view(self) -> Group:
+        table = Table(box=None, pad_edge=False)
+        table.add_column("running")
+        table.add_column("", width=16)
+        for name in ("env steps", "steps/s", "left", "success"):
+            table.add_column(name, justify="right")
+        for node, pace in self._running.values():
+            rate = pace.steps_per_second
+            table.add_row(
+                node.label,
+                ProgressBar(total=pace.budget, completed=pace.env_steps, width=16),
+                f"{pace.env_steps:,} / {pace.budget:,}" if pace.env_steps else "preparing",
+                "-" if rate is None else f"{rate:.0f}",
+                clock(pace.seconds_left(self._now())),
+                percent(pace.metrics.get(names.EVAL_SUCCESS)),
+            )
+        return Group(table, Text(self._summary(), style="dim"))
+
+    def _summary(self) -> str:
+        """`1 of 4 runs done, 8,000 of 24,000 env steps, 1:02 passed, about 2:10 left`."""
+        done = self._board.having(Status.FINISHED, Status.REUSED)
+        steps = sum(node.run.env_steps for node in done)
+        steps += sum(pace.env_steps for _, pace in self._running.values())
+        text = (
+            f"{len(done)} of {len(self._plan.nodes)} runs done, "
+            f"{steps:,} of {self._plan.env_steps:,} env steps, "
+            f"{clock(self._now() - self._began)} passed"
+        )
+        left = self._seconds_left()
+        return text if left is None else f"{text}, about {clock(left)} left"
+
+    def _seconds_left(self) -> float | None:
+        """As if what waits went as fast as what runs, and never waited for each other."""
+        paces = [pace for _, pace in self._running.values()]
+        rates = [rate for pace in paces if (rate := pace.steps_per_second) is not None]
+        if not rates or len(rates) < len(paces):
+            return None
+        to_do = self._board.having(Status.WAITING, Status.STARTED)
+        steps = sum(node.run.env_steps for node in to_do) - sum(pace.env_steps for pace in paces)
+        return max(steps / sum(rates), *(pace.seconds_left(self._now()) or 0.0 for pace in paces))
+
+    def _progress_in_words(self, pace: Pace) -> str:
+        parts = [f"{pace.env_steps:,} of {pace.budget:,} env steps"]
+        rate, left = pace.steps_per_second, pace.seconds_left(self._now())
+        if rate is not None:
+            parts += [f"{rate:.0f} steps/s", f"{clock(left)} left"]
+        if names.EVAL_SUCCESS in pace.metrics:
+            parts.append(_success(pace.metrics))
+        return ", ".join(parts)
+
+
+def _success(metrics: dict[str, float]) -> str:
+    last, some = metrics.get(names.EVAL_SUCCESS), metrics.get(names.EVAL_SUCCESS_ANY)
+    return f"success {percent(last)} (any step {percent(some)})"

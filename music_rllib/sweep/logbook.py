@@ -1,0 +1,125 @@
+"""A sweep's runs into MLflow: names, tags and settings of each, and its reports as they come."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from music_rllib.experiment.files import content_key
+from music_rllib.experiment.plan import Node
+from music_rllib.experiment.result import Report, RunResult
+from music_rllib.experiment.sealed import DamagedError
+from music_rllib.experiment.settings import RunSettings
+from music_rllib.experiment.store import NodeStore
+from music_rllib.schedules import Linear, Piecewise, value_at
+from music_rllib.sweep.listener import Failure, Listener
+from music_rllib.sweep.words import in_words
+from music_rllib.tac.settings import LearnedAlpha
+from music_rllib.tracking import names
+from music_rllib.tracking.errors import TrackingError
+from music_rllib.tracking.tracker import Point, RunInfo, Tracker
+
+__all__ = ["Logbook", "run_info"]
+
+
+def _at_start(value: float | Linear | Piecewise | LearnedAlpha, run: RunSettings) -> float:
+    return value.initial if isinstance(value, LearnedAlpha) else value_at(value, 0, run.env_steps)
+
+
+def run_info(node: Node) -> RunInfo:
+    """A node as MLflow shows it."""
+    run = node.run
+    config: dict[str, Any] = run.model_dump(mode="json")
+    q, alpha, weight = run.tac.entropic_index, run.tac.alpha, run.music.mi_reward_weight
+    return RunInfo(
+        node_key=node.key,
+        name=node.label,
+        config=config,
+        tags={
+            names.TAG_STAGE: node.stage,
+            names.TAG_TRIAL: node.trial,
+            names.TAG_VARIANT: run.variant,
+            names.TAG_TASK: run.task.name,
+            names.TAG_SEED: run.seed,
+            names.TAG_ENTROPIC_INDEX: in_words(q),
+            names.TAG_ALPHA: in_words(alpha),
+            names.TAG_MI_REWARD_WEIGHT: in_words(weight),
+            names.TAG_CONFIG_HASH: content_key(config),
+            names.TAG_SOURCE_NODE: node.input.key if node.input else None,
+        },
+        settings={
+            names.SETTING_ENTROPIC_INDEX: _at_start(q, run),
+            names.SETTING_ALPHA: _at_start(alpha, run),
+            names.SETTING_MI_REWARD_WEIGHT: _at_start(weight, run),
+        },
+        source_node=node.input.key if node.input and not node.input.checkpoint else None,
+    )
+
+
+class Logbook(Listener):
+    """Passes on what happens to the tracker; where that can't keep it, training goes on."""
+
+    def __init__(self, tracker: Tracker, complain: Callable[[str], None]) -> None:
+        """Tell `complain` once where the tracker can't write."""
+        self._tracker = tracker
+        self._complain = complain
+        self._open: set[str] = set()
+        """Nodes whose run the tracker has begun."""
+        self._complained = False
+
+    def reused(self, node: Node, store: NodeStore) -> None:
+        """Log a node of an earlier sweep with its history, if it isn't there yet."""
+        try:
+            history = store.history(node.key)
+        except DamagedError as error:
+            self._complain(f"MLflow gets nothing of {node.label}: {error}")
+            return
+        points = [
+            Point(
+                env_steps=report.env_steps,
+                timestamp=report.timestamp_ms / 1000,
+                metrics=report.metrics,
+            )
+            for report in history
+        ]
+        self._try(lambda: self._tracker.log_history(run_info(node), points))
+
+    def started(self, node: Node) -> None:
+        """Open the node's MLflow run, or go on with the one it has."""
+        if self._try(lambda: self._tracker.start(run_info(node))):
+            self._open.add(node.key)
+
+    def reported(self, node: Node, reports: list[Report]) -> None:
+        """Log metrics with their original time, so that repeats are the same."""
+
+        def log() -> None:
+            for report in reports:
+                self._tracker.log(
+                    node.key, report.metrics, report.env_steps, report.timestamp_ms / 1000
+                )
+
+        if node.key in self._open:
+            self._try(log)
+
+    def finished(self, node: Node, result: RunResult) -> None:
+        """Close the run."""
+        if node.key in self._open:
+            self._try(lambda: self._tracker.finish(node.key, "FINISHED"))
+
+    def failed(self, node: Node, failure: Failure) -> None:
+        """Close the run with its cause."""
+        if node.key not in self._open:  # its worker didn't even come up
+            self.started(node)
+        if node.key in self._open:
+            self._try(lambda: self._tracker.finish(node.key, "FAILED", failure=failure.cause))
+
+    def _try(self, log: Callable[[], object]) -> bool:
+        """Log; False, with a complaint the first time, where the tracker can't."""
+        try:
+            log()
+        except TrackingError as error:
+            if not self._complained:
+                self._complain(f"MLflow gets nothing from here on, training goes on: {error}")
+            self._complained = True
+            return False
+        return True

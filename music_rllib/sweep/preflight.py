@@ -1,0 +1,146 @@
+"""What can be found out before anything is trained, so that it doesn't fail an hour later."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+from music_rllib.envs.registry import BUILT_IN_TASKS, Task, closest
+from music_rllib.experiment.handoff import open_handoff, read_handoff
+from music_rllib.experiment.plan import Input, Plan
+from music_rllib.experiment.settings import RunSettings
+from music_rllib.experiment.store import NodeStore
+from music_rllib.sweep.board import Board, Status
+
+if TYPE_CHECKING:  # the environments are heavy, and most sweeps have none of their own
+    from music_rllib.envs.make import Env
+
+__all__ = ["TaskError", "check_environments", "import_checkpoints", "verify_inputs"]
+
+
+class TaskError(ValueError):
+    """A task whose environment can't be made, or isn't as the task says."""
+
+
+def check_environments(plan: Plan) -> None:
+    """Make each user's environment once, and look whether its task fits it.
+
+    Raises:
+        TaskError: One doesn't; with one line per problem.
+    """
+    runs: dict[str, list[RunSettings]] = {}
+    for node in plan.nodes:
+        if node.run.task.name not in BUILT_IN_TASKS:
+            runs.setdefault(node.run.task.name, []).append(node.run)
+    problems = []
+    for name, of_task in runs.items():
+        hindsight = any(run.replay.hindsight_k > 0 for run in of_task)
+        misfits = _misfits(of_task[0].task, hindsight=hindsight)
+        problems += [f"environments.{name}: {line}" for line in misfits]
+    if problems:
+        raise TaskError("\n".join(problems))
+
+
+def _misfits(task: Task, *, hindsight: bool) -> list[str]:
+    from music_rllib.envs.make import make_env
+
+    try:
+        env = make_env(task.env_id, **task.env_kwargs)
+    except Exception as error:  # a user's environment may raise anything
+        return [f"env_id must name an environment that can be made, got {task.env_id!r}: {error}"]
+    try:
+        return _misfits_of(task, env, hindsight=hindsight)
+    except Exception as error:
+        return [f"env_id must name an environment that can be played, got {error!r}"]
+    finally:
+        env.close()
+
+
+def _misfits_of(task: Task, env: Env, *, hindsight: bool) -> list[str]:
+    from music_rllib.envs.make import check_action_space, goal_reward_of, observation_sizes
+
+    try:
+        check_action_space(env.action_space)
+        size, goal_size = observation_sizes(env.observation_space)
+    except ValueError as error:
+        return [str(error).removeprefix("environment: ")]
+    problems = _split_outside(task, size)
+    limit = env.spec.max_episode_steps if env.spec is not None else None
+    if limit is not None and task.horizon > limit:
+        problems.append(
+            f"horizon must be <= {limit}, the environment's own limit, got {task.horizon}; "
+            f"env_kwargs: {{max_episode_steps: {task.horizon}}} would raise that"
+        )
+    if task.success_key is not None and task.success_key not in (known := _info_keys(task, env)):
+        problems.append(
+            f"success_key must be null or a key of info ({', '.join(sorted(known)) or 'none'}), "
+            f"got {task.success_key!r}{closest(task.success_key, known)}"
+        )
+    if hindsight and not goal_size:
+        problems.append("must have goals for replay.hindsight_k > 0, its observations have none")
+    elif hindsight:
+        try:
+            goal_reward_of(env)
+        except ValueError as error:
+            problems.append(str(error))
+    return problems
+
+
+def _info_keys(task: Task, env: Env) -> set[str]:
+    """Keys of `info` until the success key has come, in an episode of random actions."""
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    keys: set[str] = set()
+    for _ in range(task.horizon):
+        *_, terminated, truncated, info = env.step(env.action_space.sample())
+        keys.update(info)
+        if task.success_key in keys or terminated or truncated:
+            break
+    return keys
+
+
+def _split_outside(task: Task, size: int) -> list[str]:
+    return [
+        f"{name} must be < {size}, the size of the observation, got {max(indices)}"
+        for name in ("agent_indices", "surrounding_indices")
+        if (indices := getattr(task, name)) and max(indices) >= size
+    ]
+
+
+def import_checkpoints(plan: Plan, store: NodeStore) -> None:
+    """Put handoffs from outside into the store, where workers on any machine find them.
+
+    Raises:
+        HandoffError: One is damaged.
+        StorageError: The store can't be written.
+    """
+    for source in plan.imports:
+        if not store.is_finished(source.key):
+            _import(source, store)
+
+
+def _import(source: Input, store: NodeStore) -> None:
+    assert source.checkpoint is not None
+    folder, manifest = open_handoff(source.checkpoint.folder)
+    read_handoff(folder, list(manifest.modules), manifest.info.task)
+    with TemporaryDirectory() as temporary:
+        target = Path(temporary, "handoff")
+        target.mkdir()
+        for file in ("handoff.json", *(module.file for module in manifest.modules.values())):
+            shutil.copyfile(folder / file, target / file)
+        store.publish(source.key, Path(temporary))
+
+
+def verify_inputs(board: Board, store: NodeStore) -> None:
+    """Read what waiting nodes start from and an earlier sweep has left.
+
+    Raises:
+        DamagedError: A node isn't what its manifest says.
+    """
+    waiting = board.having(Status.WAITING)
+    wanted = dict.fromkeys(node.input.key for node in waiting if node.input)
+    for key in wanted:
+        if store.is_finished(key):
+            store.verify(key)

@@ -1,0 +1,180 @@
+"""Runs a sweep: what is left of its plan as trials of one Tune run, and what came of it."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import shutil
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from types import FrameType
+from typing import Any
+
+from ray import tune
+from ray.tune.experiment import Trial
+
+from music_rllib.sweep.board import Status
+from music_rllib.sweep.cluster import cluster
+from music_rllib.sweep.dag_searcher import DagSearcher
+from music_rllib.sweep.listener import Listener
+from music_rllib.sweep.session import Sweep
+from music_rllib.sweep.trainable import NodeJob, RunTrainable
+from music_rllib.sweep.tune_events import TuneEvents
+
+__all__ = ["Outcome", "compute"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """How computing ended."""
+
+    stopped_by: int | None
+    """The signal that stopped it; None if it went to its end."""
+
+
+def compute(sweep: Sweep, listeners: Sequence[Listener], on_stop: Callable[[], None]) -> Outcome:
+    """Compute the waiting nodes.
+
+    Args:
+        sweep: Its board says afterwards what became of each node.
+        listeners: Are told what happens.
+        on_stop: Called, in a signal handler, when the user asks to stop.
+
+    Raises:
+        ClusterError: Ray can't be reached or can't hold a run.
+    """
+    resources = sweep.config.resources
+    stopping = StopSignals(on_stop)
+    events = TuneEvents(sweep.board, sweep.store, listeners, sweep.folder / "failures")
+    searcher = DagSearcher(
+        sweep.board,
+        lambda node: NodeJob.of(node, sweep.storage, resources.cpus_per_run).to_tune(),
+    )
+    with cluster(resources) as slots, _tune_folder(sweep) as place, _quiet_tune(slots), stopping:
+        tuner = tune.Tuner(
+            RunTrainable,
+            tune_config=tune.TuneConfig(
+                search_alg=searcher,
+                num_samples=len(sweep.board.having(Status.WAITING)),
+                trial_name_creator=_trial_name,
+                trial_dirname_creator=_trial_name,
+            ),
+            run_config=tune.RunConfig(
+                name="tune",
+                storage_path=place,
+                verbose=0,
+                callbacks=[events, stopping],
+                failure_config=tune.FailureConfig(max_failures=0),
+                # Checkpoints are the trainable's own; Tune's would hold nothing.
+                checkpoint_config=tune.CheckpointConfig(checkpoint_at_end=False),
+            ),
+        )
+        tuner.fit()
+    return Outcome(stopped_by=None if sweep.board.complete else stopping.received)
+
+
+def _trial_name(trial: Trial) -> str:
+    return NodeJob.from_tune(trial.config).key
+
+
+@contextlib.contextmanager
+def _tune_folder(sweep: Sweep) -> Iterator[str]:
+    """Where all nodes of the cluster can write what Tune wants to write and nobody reads."""
+    if "://" in sweep.storage:
+        yield f"{sweep.storage.rstrip('/')}/{sweep.plan.name}"
+        return
+    yield str(sweep.folder)
+    shutil.rmtree(sweep.folder / "tune", ignore_errors=True)
+
+
+class _Expected(logging.Filter):
+    """What Tune says when it is stopped or a trial failed; the sweep says it itself."""
+
+    BEGINNINGS = (
+        "Stop signal received",
+        "Experiment has been interrupted",
+        "Trials did not complete",
+        "Could not fetch metrics",
+        "Failed to fetch metrics",
+    )
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        return not record.getMessage().startswith(self.BEGINNINGS)
+
+
+class _quiet_tune:  # noqa: N801
+    """Settings that Tune takes from the environment only, for one run, and its log filtered."""
+
+    LOGGERS = ("ray.tune.tune", "ray.tune.analysis.experiment_analysis")
+
+    def __init__(self, slots: int) -> None:
+        self._settings = {
+            # As many trials waiting for an actor as can run: they start side by side.
+            "TUNE_MAX_PENDING_TRIALS_PG": str(slots),
+            "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",
+            "TUNE_PRINT_ALL_TRIAL_ERRORS": "0",
+            # Relative paths in a user's environment keep their meaning.
+            "RAY_CHDIR_TO_TRIAL_DIR": "0",
+            # Nobody reads Tune's snapshots.
+            "TUNE_GLOBAL_CHECKPOINT_S": "3600",
+        }
+        self._filter = _Expected()
+
+    def __enter__(self) -> None:
+        self._before = {name: os.environ.get(name) for name in self._settings}
+        os.environ.update(self._settings)
+        for name in self.LOGGERS:
+            logging.getLogger(name).addFilter(self._filter)
+
+    def __exit__(self, *_: object) -> None:
+        for name, value in self._before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+        for name in self.LOGGERS:
+            logging.getLogger(name).removeFilter(self._filter)
+
+
+class StopSignals(tune.Callback):
+    """Ctrl-C and SIGTERM end Tune's loop in good order; a second Ctrl-C ends it at once."""
+
+    SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+    def __init__(self, on_stop: Callable[[], None]) -> None:
+        """Call `on_stop` at the first signal."""
+        self.received: int | None = None
+        self._on_stop = on_stop
+        self._before: dict[int, Any] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {}
+
+    def __enter__(self) -> StopSignals:
+        if threading.current_thread() is threading.main_thread():
+            # After `ray.init`, which sets handlers of its own.
+            self._before = {number: signal.getsignal(number) for number in self.SIGNALS}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def setup(self, **info: Any) -> None:
+        """Tune has just set its handler of SIGINT: go before it, and give SIGTERM the same."""
+        if not self._before:
+            return
+        tunes_handler = signal.getsignal(signal.SIGINT)
+
+        def stop(number: int, frame: FrameType | None) -> None:
+            self.received = number
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+            if callable(tunes_handler):
+                tunes_handler(number, frame)
+            self._on_stop()
+
+        for number in self.SIGNALS:
+            signal.signal(number, stop)

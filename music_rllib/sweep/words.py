@@ -1,0 +1,36 @@
+"""Values in a few characters, for tables, lines and tags."""
+
+from __future__ import annotations
+
+from music_rllib.experiment.plan import short
+from music_rllib.schedules import Linear, Piecewise
+from music_rllib.tac.settings import LearnedAlpha
+
+__all__ = ["clock", "in_words", "percent"]
+
+
+def percent(value: float | None) -> str:
+    """`35 %`, or `-` for None."""
+    return "-" if value is None else f"{100 * value:.0f} %"
+
+
+def clock(seconds: float | None) -> str:
+    """`1:02:03`, `2:03`, or `-` for None."""
+    if seconds is None:
+        return "-"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+def in_words(value: float | Linear | Piecewise | LearnedAlpha) -> str:
+    """A constant, a schedule or a learned coefficient in a few characters: `1.5`, `1 to 2`."""
+    match value:
+        case Linear():
+            return f"{value.start:g} to {value.end:g}"
+        case Piecewise():
+            return " to ".join(f"{point:g}" for _, point in value.points)
+        case LearnedAlpha():
+            return "learned"
+        case _:
+            return short(float(value))

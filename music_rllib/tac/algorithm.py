@@ -1,0 +1,305 @@
+"""`TAC`: collect episodes, store them, learn from the replay, hand the weights back."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import weakref
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from ray.rllib.algorithms.algorithm import Algorithm
+from ray.rllib.core import DEFAULT_MODULE_ID
+from ray.rllib.core.columns import Columns
+from ray.rllib.policy.sample_batch import MultiAgentBatch, SampleBatch
+from ray.rllib.utils.checkpoints import Checkpointable
+from ray.rllib.utils.metrics import (
+    ENV_RUNNER_RESULTS,
+    ENV_RUNNER_SAMPLING_TIMER,
+    LEARNER_RESULTS,
+    LEARNER_UPDATE_TIMER,
+    NUM_ENV_STEPS_SAMPLED_LIFETIME,
+    REPLAY_BUFFER_SAMPLE_TIMER,
+    SYNCH_WORKER_WEIGHTS_TIMER,
+    TIMERS,
+)
+from ray.rllib.utils.typing import StateDict
+
+from music_rllib.envs.make import goal_reward_of
+from music_rllib.replay.buffer import TrajectoryReplay, Transitions
+from music_rllib.schedules import value_at
+from music_rllib.tac.config import TACConfig
+from music_rllib.tac.env_runner import Episode, TrajectoryEnvRunner, seed_or_entropy
+from music_rllib.tac.module import ESTIMATOR_MODULE
+
+__all__ = ["TAC"]
+
+UPDATES_PER_CALL = 100
+"""Updates whose minibatches are sampled and sent together: few enough to stay in the cache."""
+
+
+class TAC(Algorithm):
+    """Tsallis Actor-Critic (paper Fig. 3), with MUSIC's intrinsic reward where configured."""
+
+    @classmethod
+    def get_default_config(cls) -> TACConfig:
+        return TACConfig()
+
+    def setup(self, config: TACConfig) -> None:
+        super().setup(config)
+        self._settings = self.config.tac_settings()
+        self._music = self.config.music_settings()
+        self._replay_settings = self.config.replay_settings()
+        self.env_steps = 0
+        """Environment steps collected so far, by all runners."""
+        self.grad_updates = 0
+        """Gradient updates done so far."""
+        self.replay = self._make_replay()
+
+    def _make_replay(self) -> TrajectoryReplay:
+        settings = self._replay_settings
+        runner = self._a_runner_with_environments()
+        return TrajectoryReplay(
+            runner.layout,
+            settings.capacity,
+            np.random.default_rng((seed_or_entropy(self.config.seed), _REPLAY_STREAM)),
+            goal_reward=goal_reward_of(runner.env) if settings.hindsight_k > 0 else None,
+            hindsight_k=settings.hindsight_k,
+            td_exponent=settings.priority_exponent if self._by_td_error else None,
+        )
+
+    @property
+    def _by_td_error(self) -> bool:
+        return self._replay_settings.priority == "td_error"
+
+    def _a_runner_with_environments(self) -> TrajectoryEnvRunner:
+        """The local runner; with remote ones it has no environments yet, and needs one now."""
+        runner: TrajectoryEnvRunner = self.env_runner
+        if not runner.envs:
+            runner.config = runner.config.copy(copy_frozen=False).env_runners(
+                num_envs_per_env_runner=1
+            )
+            runner.make_env()
+        return runner
+
+    def _setup_logdir(self) -> None:
+        """Outside Tune, a temporary folder instead of a new one in the user's home every time."""
+        if self._storage is not None:
+            super()._setup_logdir()
+        else:
+            self._logdir = tempfile.mkdtemp(prefix="tac-")
+            weakref.finalize(self, shutil.rmtree, self._logdir, ignore_errors=True)
+
+    # -- one step of the algorithm --------------------------------------------------------
+
+    def training_step(self) -> None:
+        explored = self.env_steps >= self._settings.random_steps
+        with self.metrics.log_time((TIMERS, ENV_RUNNER_SAMPLING_TIMER)):
+            episodes = self._collect(random_actions=not explored)
+        self._observe_inputs(episodes)
+        if explored:
+            self.learner_group.foreach_learner(lambda learner: learner.diagnose(episodes))
+        self.replay.extend(episodes, self._trajectory_priorities(episodes))
+        for updates in self._updates_due():
+            with self.metrics.log_time((TIMERS, REPLAY_BUFFER_SAMPLE_TIMER)):
+                drawn = self._draw(updates)
+                batch = self._batch_of(drawn, updates)
+            with self.metrics.log_time((TIMERS, LEARNER_UPDATE_TIMER)):
+                results = self.learner_group.update(
+                    batch=batch, timesteps={NUM_ENV_STEPS_SAMPLED_LIFETIME: self.env_steps}
+                )
+            self.grad_updates += updates
+            self.metrics.aggregate(results, key=LEARNER_RESULTS)
+            if drawn.rows is not None and self._by_td_error:
+                self.replay.update_priorities(drawn.rows, self._td_errors())
+        with self.metrics.log_time((TIMERS, SYNCH_WORKER_WEIGHTS_TIMER)):
+            self.env_runner_group.sync_weights(
+                from_worker_or_learner_group=self.learner_group, inference_only=True
+            )
+
+    def _collect(self, *, random_actions: bool) -> list[Episode]:
+        """One episode in every sub-environment."""
+        group = self.env_runner_group
+        remote = group.num_healthy_remote_workers() > 0
+        samples = group.foreach_env_runner(
+            lambda runner: (runner.sample(random_actions=random_actions), runner.get_metrics()),
+            local_env_runner=not remote,
+        )
+        if not samples:
+            raise RuntimeError("no environment runner is alive to collect episodes")
+        self.metrics.aggregate([metrics for _, metrics in samples], key=ENV_RUNNER_RESULTS)
+        episodes = [episode for sampled, _ in samples for episode in sampled]
+        self.env_steps += sum(len(episode) for episode in episodes)
+        return episodes
+
+    def _observe_inputs(self, episodes: list[Episode]) -> None:
+        """Shows the new states to the normaliser, also with the goals that hindsight will use."""
+        width, layout = self.replay.layout.network_input, self.replay.layout
+        frames = np.concatenate([episode.frames for episode in episodes])
+        inputs = frames[:, :width]
+        if self._replay_settings.hindsight_k > 0:
+            achieved = np.concatenate([frames[:, : layout.observation], frames[:, width:]], axis=1)
+            inputs = np.concatenate([inputs, achieved])
+        self.learner_group.foreach_learner(lambda learner: learner.observe_inputs(inputs))
+
+    def _trajectory_priorities(self, episodes: list[Episode]) -> NDArray[np.float64] | None:
+        """MUSIC-p: how the frozen estimator values each of the episodes."""
+        if not self._music.prioritise_replay:
+            return None
+        priorities: NDArray[np.float64] = self._ask_learner(
+            lambda learner: learner.trajectory_priorities(episodes)
+        )
+        return priorities
+
+    def _td_errors(self) -> NDArray[np.float32]:
+        errors: NDArray[np.float32] = self._ask_learner(lambda learner: learner.take_td_errors())
+        return errors
+
+    def _ask_learner(self, question: Callable[[Any], Any]) -> Any:
+        return next(iter(self.learner_group.foreach_learner(question))).get()
+
+    def _updates_due(self) -> list[int]:
+        """Updates to catch up with the replay ratio, in calls of at most `UPDATES_PER_CALL`."""
+        learned_from = self.env_steps - self._settings.random_steps
+        due = int(learned_from * self._settings.replay_ratio) - self.grad_updates
+        full, rest = divmod(max(due, 0), UPDATES_PER_CALL)
+        return [UPDATES_PER_CALL] * full + ([rest] if rest else [])
+
+    def sample_batch(self, updates: int) -> MultiAgentBatch:
+        """All minibatches of `updates` updates behind each other, as `TACLearner` takes them."""
+        return self._batch_of(self._draw(updates), updates)
+
+    def _draw(self, updates: int) -> Transitions:
+        beta = value_at(
+            self._replay_settings.importance_exponent,
+            self.env_steps,
+            self.config.total_env_steps or 0,
+        )
+        rows = updates * self._settings.batch_size
+        return self.replay.sample_transitions(rows, importance_exponent=beta)
+
+    def _batch_of(self, drawn: Transitions, updates: int) -> MultiAgentBatch:
+        columns = {
+            Columns.OBS: drawn.inputs,
+            Columns.ACTIONS: drawn.actions,
+            Columns.REWARDS: drawn.rewards,
+            "discounts": drawn.discounts,
+            Columns.NEXT_OBS: drawn.next_inputs,
+        }
+        if drawn.weights is not None:
+            columns["weights"] = drawn.weights
+        batches = {DEFAULT_MODULE_ID: SampleBatch(columns)}
+        if self._music.estimator == "trained":
+            trajectories = self.replay.sample_trajectories(
+                updates * self._music.batch_trajectories, self.replay.longest
+            )
+            batches[ESTIMATOR_MODULE] = SampleBatch({Columns.OBS: trajectories})
+        return MultiAgentBatch(batches, env_steps=len(drawn.rewards))
+
+    # -- plain weights --------------------------------------------------------------------
+
+    def get_parts(self) -> dict[str, dict[str, NDArray[Any]]]:
+        """Plain arrays of each network: policy, critics, value, value_target, normaliser, ..."""
+        state = self.learner_group.get_state(components="learner/rl_module")["learner"]["rl_module"]
+        parts: dict[str, dict[str, NDArray[Any]]] = {}
+        for name, array in state[DEFAULT_MODULE_ID].items():
+            part, _, rest = name.partition(".")
+            parts.setdefault(part, {})[rest or part] = np.asarray(array)
+        if ESTIMATOR_MODULE in state:
+            prefix = "estimator."
+            parts[ESTIMATOR_MODULE] = {
+                name.removeprefix(prefix): np.asarray(array)
+                for name, array in state[ESTIMATOR_MODULE].items()
+            }
+        return parts
+
+    def set_parts(self, parts: Mapping[str, Mapping[str, NDArray[Any]]]) -> None:
+        """Loads networks by name, as `get_parts` gives them; all others stay as they are.
+
+        Raises:
+            ValueError: an unknown network, or tensors that are missing, unknown or of other shape.
+        """
+        own = self.get_parts()
+        for part, arrays in parts.items():
+            _check_same_tensors(part, own.get(part), arrays)
+        modules: dict[str, dict[str, NDArray[Any]]] = {}
+        for part, arrays in parts.items():
+            module = ESTIMATOR_MODULE if part == ESTIMATOR_MODULE else DEFAULT_MODULE_ID
+            prefix = "estimator" if part == ESTIMATOR_MODULE else part
+            for name, array in arrays.items():
+                modules.setdefault(module, {})[f"{prefix}.{name}"] = array
+        self.learner_group.foreach_learner(
+            lambda learner: [learner.module[mid].set_state(state) for mid, state in modules.items()]
+        )
+        self._push_weights()
+
+    def _push_weights(self) -> None:
+        for group in (self.env_runner_group, self.eval_env_runner_group):
+            if group is not None:
+                group.sync_weights(
+                    from_worker_or_learner_group=self.learner_group, inference_only=True
+                )
+
+    # -- checkpoints ----------------------------------------------------------------------
+
+    def get_checkpointable_components(self) -> list[tuple[str, Checkpointable]]:
+        return [*super().get_checkpointable_components(), (_REPLAY, _ReplayComponent(self.replay))]
+
+    def get_state(
+        self, components: Any = None, *, not_components: Any = None, **kw: Any
+    ) -> StateDict:
+        state = super().get_state(components, not_components=not_components, **kw)
+        if self._check_component(_REPLAY, components, not_components):
+            state[_REPLAY] = _ReplayComponent(self.replay).get_state()
+        state[_COUNTERS] = {"env_steps": self.env_steps, "grad_updates": self.grad_updates}
+        return state
+
+    def set_state(self, state: StateDict) -> None:
+        super().set_state(state)
+        if _REPLAY in state:
+            self.replay.load_state(state[_REPLAY])
+        if _COUNTERS in state:
+            self.env_steps = state[_COUNTERS]["env_steps"]
+            self.grad_updates = state[_COUNTERS]["grad_updates"]
+
+
+_REPLAY, _COUNTERS = "replay", "tac_counters"
+_REPLAY_STREAM = 101
+"""Keeps the replay's random stream apart from the environment runners'."""
+
+
+class _ReplayComponent(Checkpointable):
+    """The replay as RLlib checkpoints want their parts."""
+
+    def __init__(self, replay: TrajectoryReplay) -> None:
+        self._replay = replay
+
+    def get_state(
+        self, components: Any = None, *, not_components: Any = None, **kw: Any
+    ) -> StateDict:
+        return self._replay.state()
+
+    def set_state(self, state: StateDict) -> None:
+        self._replay.load_state(state)
+
+    def get_ctor_args_and_kwargs(self) -> tuple[tuple[Any, ...], dict[str, Any]]:
+        return (), {}
+
+
+def _check_same_tensors(
+    part: str,
+    own: Mapping[str, NDArray[Any]] | None,
+    given: Mapping[str, NDArray[Any]],
+) -> None:
+    if own is None:
+        raise ValueError(f"{part}: this algorithm has no such network")
+    if own.keys() != given.keys():
+        missing, unknown = sorted(own.keys() - given.keys()), sorted(given.keys() - own.keys())
+        raise ValueError(
+            f"{part}: tensors missing: {missing or 'none'}, unknown: {unknown or 'none'}"
+        )
+    for name, array in given.items():
+        if array.shape != own[name].shape:
+            raise ValueError(f"{part}.{name}: shape must be {own[name].shape}, got {array.shape}")

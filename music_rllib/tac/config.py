@@ -1,0 +1,285 @@
+"""`TACConfig`: an ordinary RLlib config whose own settings are those of TAC, MUSIC and replay."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Self, TypeVar
+
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
+from ray.rllib.algorithms.algorithm_config import AlgorithmConfig, NotProvided
+from ray.rllib.core import DEFAULT_MODULE_ID
+from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
+from ray.rllib.core.rl_module.rl_module import RLModuleSpec
+from ray.tune.search.sample import Domain
+
+from music_rllib._quiet import quiet_third_parties
+from music_rllib.estimator.settings import MusicSettings
+from music_rllib.replay.settings import ReplaySettings
+from music_rllib.schedules import Linear
+from music_rllib.tac.module import ESTIMATOR_MODULE, EstimatorModule, TACModule
+from music_rllib.tac.settings import TACSettings
+
+__all__ = ["TACConfig"]
+
+_Settings = TypeVar("_Settings", TACSettings, MusicSettings, ReplaySettings)
+
+
+class TACConfig(AlgorithmConfig):
+    """Configures TAC, with or without MUSIC, on any continuous-action Gymnasium environment.
+
+    Every field of `TACSettings` is an attribute and an argument of `training()`, every field of
+    `MusicSettings` (prefixed `music_`) of `music()`, every field of `ReplaySettings` (prefixed
+    `replay_`) of `replay()`. They are plain attributes, so `tune.grid_search` works on them; they
+    are validated together by `validate()`.
+
+        >>> config = (
+        ...     TACConfig()
+        ...     .environment("Pendulum-v1")
+        ...     .training(entropic_index=1.5, alpha=0.2)
+        ... )
+        >>> algo = config.build_algo()
+    """
+
+    def __init__(self, algo_class: type | None = None) -> None:
+        from music_rllib.tac.algorithm import TAC
+        from music_rllib.tac.env_runner import TrajectoryEnvRunner
+
+        # RLlib's notices about its own API stack are nothing that a user of TAC can act on.
+        quiet_third_parties()
+        super().__init__(algo_class=algo_class or TAC)
+        for settings, prefix in _OWNED:
+            for name, field in settings.model_fields.items():
+                setattr(self, prefix + name, field.default)
+        self.total_env_steps: int | None = None
+        self.torch_threads = 1
+        self.agent_indices: tuple[int, ...] = ()
+        self.surrounding_indices: tuple[int, ...] = ()
+        self.success_key: str | None = "is_success"
+        self.framework_str = "torch"
+        self.env_runner_cls = TrajectoryEnvRunner
+        # One iteration is one episode per sub-environment, and what is learned from it.
+        self.min_time_s_per_iteration = None
+        self.min_sample_timesteps_per_iteration = 1_000
+        # NaNs are looked for once an update call, with a message; not in every gradient.
+        self.torch_skip_nan_gradients = True
+        # TAC pushes weights itself; there are no connector states to synchronise.
+        self._dont_auto_sync_env_runner_states = True
+
+    def __setattr__(self, key: str, value: Any) -> None:
+        # At once, because RLlib later takes every -1 for "not set" and would run the default.
+        if key in _CHECKS and not _is_search_space(value):
+            _checked(key, lambda: _CHECKS[key].validate_python(value))
+        super().__setattr__(key, value)
+
+    # -- setting --------------------------------------------------------------------------
+
+    def training(
+        self,
+        *,
+        total_env_steps: int | None = NotProvided,
+        torch_threads: int = NotProvided,
+        **settings: Any,
+    ) -> Self:
+        """Sets TAC's hyper-parameters.
+
+        Args:
+            total_env_steps: budget of the run, which `linear` schedules are fractions of.
+            torch_threads: threads of the Learner's process. More than one gains nothing on
+                networks of this size, and changes results in the last digits.
+            **settings: fields of `TACSettings`, or arguments of `AlgorithmConfig.training`.
+
+        Raises:
+            TypeError: an unknown setting.
+        """
+        own = {name: settings.pop(name) for name in list(settings) if name in _TAC_FIELDS}
+        super().training(**settings)
+        self._set(own, "")
+        if total_env_steps is not NotProvided:
+            self.total_env_steps = total_env_steps
+        if torch_threads is not NotProvided:
+            self.torch_threads = torch_threads
+        return self
+
+    def music(
+        self,
+        *,
+        agent_indices: Sequence[int] = NotProvided,
+        surrounding_indices: Sequence[int] = NotProvided,
+        **settings: Any,
+    ) -> Self:
+        """Switches MUSIC's intrinsic reward on and sets it up.
+
+        Args:
+            agent_indices: where the agent's state lies in the observation.
+            surrounding_indices: where the surrounding state lies in the observation.
+            **settings: fields of `MusicSettings`.
+
+        Raises:
+            TypeError: an unknown setting.
+        """
+        _reject_unknown("music", settings, MusicSettings)
+        self._set(settings, "music_")
+        if agent_indices is not NotProvided:
+            self.agent_indices = tuple(agent_indices)
+        if surrounding_indices is not NotProvided:
+            self.surrounding_indices = tuple(surrounding_indices)
+        return self
+
+    def replay(self, **settings: Any) -> Self:
+        """Sets fields of `ReplaySettings`; an unknown one raises TypeError."""
+        _reject_unknown("replay", settings, ReplaySettings)
+        self._set(settings, "replay_")
+        return self
+
+    def _set(self, settings: Mapping[str, Any], prefix: str) -> None:
+        for name, value in settings.items():
+            setattr(self, prefix + name, value)
+
+    def update_from_dict(self, config_dict: Any) -> Self:
+        """As RLlib's, which takes a mistyped key for a new attribute; here it is an error."""
+        # RLlib also reads what it writes under names that are no attributes, and Tune adds its own
+        # in double underscores.
+        known = {*self.to_dict(), "multiagent"}
+        unknown = [
+            key
+            for key in config_dict
+            if not hasattr(self, key) and key not in known and not key.startswith("__")
+        ]
+        if unknown:
+            raise ValueError(f"unknown settings in the config: {', '.join(sorted(unknown))}")
+        return super().update_from_dict(config_dict)  # type: ignore[no-any-return]
+
+    # -- reading --------------------------------------------------------------------------
+
+    def tac_settings(self) -> TACSettings:
+        """The validated settings of TAC; raises ValueError naming what is wrong."""
+        return self._collect(TACSettings, "")
+
+    def music_settings(self) -> MusicSettings:
+        """The validated settings of MUSIC; raises ValueError naming what is wrong."""
+        return self._collect(MusicSettings, "music_")
+
+    def replay_settings(self) -> ReplaySettings:
+        """The validated settings of the replay; raises ValueError naming what is wrong."""
+        return self._collect(ReplaySettings, "replay_")
+
+    def _collect(self, model: type[_Settings], prefix: str) -> _Settings:
+        values = {name: getattr(self, prefix + name) for name in model.model_fields}
+        return _checked(prefix, lambda: model.model_validate(values))
+
+    def validate(self) -> None:
+        super().validate()
+        tac, music, replay = self.tac_settings(), self.music_settings(), self.replay_settings()
+        if self.in_evaluation:
+            return
+        if self.num_learners > 1:
+            self._value_error(
+                f"num_learners must be 0 or 1, got {self.num_learners}: one update of TAC is too "
+                "small to be split. Run more trials instead."
+            )
+        if self._env_to_module_connector or self._module_to_env_connector:
+            self._value_error("TAC's env runner runs no connectors; wrap the environment instead")
+        if music.prioritise_replay and replay.priority != "uniform":
+            self._value_error(
+                "replay_priority must be 'uniform' with music_prioritise_replay, "
+                f"got {replay.priority!r}: one of them decides what is replayed"
+            )
+        if music.goals == "zero" and replay.hindsight_k > 0:
+            self._value_error(
+                "replay_hindsight_k must be 0 with music_goals='zero' (hindsight would put "
+                f"achieved goals in place of the zeros), got {replay.hindsight_k:g}"
+            )
+        schedules = (
+            tac.entropic_index,
+            tac.alpha,
+            music.mi_reward_weight,
+            replay.importance_exponent,
+        )
+        if any(isinstance(s, Linear) for s in schedules) and not self.total_env_steps:
+            self._value_error(
+                "a linear schedule needs the budget: set training(total_env_steps=...)"
+            )
+        if music.estimator != "none" and not (self.agent_indices and self.surrounding_indices):
+            self._value_error(
+                "MUSIC needs to know the agent's and the surrounding state: set "
+                "music(agent_indices=[...], surrounding_indices=[...])"
+            )
+
+    # -- what RLlib builds from it --------------------------------------------------------
+
+    def get_default_rl_module_spec(self) -> RLModuleSpec:
+        settings = self.tac_settings().model_dump(mode="json")
+        return RLModuleSpec(module_class=TACModule, model_config={"tac": settings})
+
+    def get_multi_rl_module_spec(
+        self, *, inference_only: bool = False, **kwargs: Any
+    ) -> MultiRLModuleSpec:
+        spec = super().get_multi_rl_module_spec(inference_only=inference_only, **kwargs)
+        music = self.music_settings()
+        if music.estimator != "none" and not inference_only:
+            policy = spec.rl_module_specs[DEFAULT_MODULE_ID]
+            estimator = RLModuleSpec(
+                module_class=EstimatorModule,
+                observation_space=policy.observation_space,
+                action_space=policy.action_space,
+                model_config={
+                    "agent_indices": self.agent_indices,
+                    "surrounding_indices": self.surrounding_indices,
+                    "hidden_size": music.hidden_size,
+                    "reward_scale": music.reward_scale,
+                },
+                learner_only=True,
+            )
+            spec.add_modules({ESTIMATOR_MODULE: estimator})
+        return spec
+
+    def get_default_learner_class(self) -> type:
+        from music_rllib.tac.learner import TACLearner
+
+        return TACLearner
+
+
+_OWNED: tuple[tuple[type[BaseModel], str], ...] = (
+    (TACSettings, ""),
+    (MusicSettings, "music_"),
+    (ReplaySettings, "replay_"),
+)
+_TAC_FIELDS = frozenset(TACSettings.model_fields)
+_CHECKS: dict[str, TypeAdapter[Any]] = {
+    prefix + name: TypeAdapter(field.rebuild_annotation(), config=ConfigDict(allow_inf_nan=False))
+    for settings, prefix in _OWNED
+    for name, field in settings.model_fields.items()
+}
+"""The rule of each field by itself; rules between fields are checked by `validate()`."""
+_KINDS = frozenset(
+    {"constant", "linear", "piecewise", "scheduled", "learned", "policy", "gaussian_noise"}
+)
+"""Members of unions, which pydantic puts into an error's place."""
+_T = TypeVar("_T")
+
+
+def _checked(place: str, validation: Callable[[], _T]) -> _T:
+    """What `validation` returns, its errors as one ValueError that names field, rule and value."""
+    try:
+        return validation()
+    except ValidationError as error:
+        problems = []
+        for problem in error.errors():
+            inside = [str(part) for part in problem["loc"] if part not in _KINDS]
+            where = place + ("." if place in _CHECKS and inside else "") + ".".join(inside)
+            rule = problem["msg"].removeprefix("Value error, ")
+            value = "" if "got " in rule else f", got {problem['input']!r}"
+            problems.append(f"{where}: {rule}{value}" if where else f"{rule}{value}")
+        raise ValueError("; ".join(problems)) from None
+
+
+def _is_search_space(value: Any) -> bool:
+    """A value that Tune has yet to choose."""
+    return isinstance(value, Domain) or (isinstance(value, dict) and "grid_search" in value)
+
+
+def _reject_unknown(method: str, settings: Mapping[str, Any], model: type[BaseModel]) -> None:
+    unknown = sorted(set(settings) - set(model.model_fields))
+    if unknown:
+        known = ", ".join(model.model_fields)
+        raise TypeError(f"{method}() has no setting {', '.join(unknown)}; it has: {known}")

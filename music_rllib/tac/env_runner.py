@@ -1,0 +1,369 @@
+"""Collects whole episodes into arrays, a few sub-environments in step with each other.
+
+RLlib's SingleAgentEnvRunner spends more than half of its time in connectors and episode objects,
+resets to the same goal again and again under a seed, and never seeds random actions. This runner
+plays one episode per sub-environment and call, seeds every reset by (seed, worker, episode), and
+between calls holds no simulator state: a checkpoint of a few integers resumes it exactly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import ray
+import torch
+from numpy.typing import NDArray
+from ray.rllib.core import COMPONENT_RL_MODULE, DEFAULT_AGENT_ID, DEFAULT_MODULE_ID
+from ray.rllib.env import INPUT_ENV_SPACES
+from ray.rllib.env.env_context import EnvContext
+from ray.rllib.env.env_runner import EnvRunner
+from ray.rllib.utils.checkpoints import Checkpointable
+from ray.rllib.utils.metrics import (
+    EPISODE_LEN_MEAN,
+    EPISODE_RETURN_MEAN,
+    NUM_AGENT_STEPS_SAMPLED,
+    NUM_ENV_STEPS_SAMPLED,
+    NUM_ENV_STEPS_SAMPLED_LIFETIME,
+    NUM_EPISODES,
+    NUM_EPISODES_LIFETIME,
+    WEIGHTS_SEQ_NO,
+)
+from ray.rllib.utils.typing import StateDict
+
+from music_rllib._quiet import quiet_third_parties
+from music_rllib.envs.make import (
+    Env,
+    check_action_space,
+    episode_limit,
+    is_gymnasium_id,
+    make_env,
+    observation_sizes,
+)
+from music_rllib.replay.buffer import ReplayLayout, Trajectory
+from music_rllib.tac.module import TACModule
+from music_rllib.tac.settings import GaussianNoise, TACSettings
+
+__all__ = [
+    "DISPLACEMENT",
+    "MOVED",
+    "SUCCESS_ANY",
+    "SUCCESS_LAST",
+    "Episode",
+    "TrajectoryEnvRunner",
+    "seed_or_entropy",
+]
+
+SUCCESS_LAST, SUCCESS_ANY = "success_last_step", "success_any_step"
+DISPLACEMENT, MOVED = "object_displacement", "object_moved"
+"""Metrics of an episode beside RLlib's own."""
+
+MOVED_THRESHOLD = 0.01
+"""Distance (metres in the Fetch tasks) from its start beyond which the object counts as moved."""
+
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Episode(Trajectory):
+    """A finished episode, and whether each of its steps was a success."""
+
+    successes: NDArray[np.bool_] | None
+    """[n]; None where the environment does not say."""
+
+    def env_steps(self) -> int:
+        return len(self)
+
+    def agent_steps(self) -> int:
+        return len(self)
+
+
+class _Recording:
+    """Arrays of an episode that is being played."""
+
+    def __init__(self, layout: ReplayLayout, *, zero_goal: bool) -> None:
+        self._layout, self._zero_goal = layout, zero_goal
+        self._frames = np.zeros((layout.horizon + 1, layout.frame), np.float32)
+        self._actions = np.zeros((layout.horizon, layout.action), np.float32)
+        self._rewards = np.zeros(layout.horizon, np.float32)
+        self._successes: list[bool] = []
+        self.steps = 0
+
+    def see(self, observation: Any) -> None:
+        frame, layout = self._frames[self.steps], self._layout
+        if layout.goal == 0:
+            frame[:] = observation
+            return
+        frame[: layout.observation] = observation["observation"]
+        if not self._zero_goal:
+            frame[layout.observation : layout.network_input] = observation["desired_goal"]
+        frame[layout.network_input :] = observation["achieved_goal"]
+
+    @property
+    def network_input(self) -> Floats:
+        return self._frames[self.steps, : self._layout.network_input]
+
+    def step(self, action: Floats, reward: float, success: float | None, observation: Any) -> None:
+        self._actions[self.steps] = action
+        self._rewards[self.steps] = reward
+        if success is not None:
+            self._successes.append(bool(success))
+        self.steps += 1
+        self.see(observation)
+
+    def finish(self, terminated: bool) -> Episode:
+        n = self.steps
+        return Episode(
+            self._frames[: n + 1],
+            self._actions[:n],
+            self._rewards[:n],
+            terminated,
+            np.array(self._successes) if self._successes else None,
+        )
+
+
+class TrajectoryEnvRunner(EnvRunner, Checkpointable):
+    """EnvRunner whose `sample()` returns finished `Episode`s. Connectors are not run."""
+
+    def __init__(self, *, config: Any, **kwargs: Any) -> None:
+        quiet_third_parties()  # a remote runner is a process of its own
+        super().__init__(config=config, **kwargs)
+        self.worker_index: int = self.worker_index or 0
+        self._env_creator = kwargs.get("env_creator")
+        self._spaces = kwargs.get("spaces")
+        self._settings: TACSettings = self.config.tac_settings()
+        music = self.config.music_settings()
+        self._zero_goals = music.goals == "zero" and not self.config.in_evaluation
+        self._success_key: str | None = self.config.success_key
+        # Training and evaluation draw from unrelated streams, and so do the workers.
+        self._entropy = (
+            seed_or_entropy(self.config.seed),
+            int(self.config.in_evaluation),
+            self.worker_index,
+        )
+        self._rng = np.random.default_rng(self._entropy)
+        self._episodes_started = 0
+        self._weights_seq_no = 0
+        self.envs: list[Env] = []
+        if self.worker_index > 0 or self.config.num_env_runners == 0 or self._spaces is None:
+            self.make_env()
+        self.make_module()
+
+    # -- construction ---------------------------------------------------------------------
+
+    def make_env(self) -> None:
+        self.close_envs()
+        self.envs = [self._make_one(i) for i in range(self.config.num_envs_per_env_runner)]
+        self.env = self.envs[0]
+        self._action_space = check_action_space(self.env.action_space)
+        observation, goal = observation_sizes(self.env.observation_space)
+        self.layout = ReplayLayout(
+            observation=observation,
+            action=int(self._action_space.shape[0]),
+            goal=goal,
+            horizon=episode_limit(self.env, self._settings.max_episode_steps),
+        )
+
+    def _make_one(self, vector_index: int) -> Env:
+        context = EnvContext(
+            self.config.env_config,
+            worker_index=self.worker_index,
+            vector_index=vector_index,
+            num_workers=self.num_workers,
+        )
+        if is_gymnasium_id(self.config.env):
+            return make_env(self.config.env, **context)
+        assert self._env_creator is not None
+        return self._env_creator(context)  # type: ignore[no-any-return]
+
+    def make_module(self) -> None:
+        spec = self.config.get_rl_module_spec(spaces=self.get_spaces(), inference_only=True)
+        self.module: TACModule = spec.build()
+
+    def get_spaces(self) -> dict[str, Any]:
+        if not self.envs:
+            assert self._spaces is not None
+            return dict(self._spaces)
+        pair = (self.env.observation_space, self.env.action_space)
+        return {INPUT_ENV_SPACES: pair, DEFAULT_MODULE_ID: pair}
+
+    # -- playing --------------------------------------------------------------------------
+
+    def sample(
+        self,
+        *,
+        num_timesteps: int | None = None,
+        num_episodes: int | None = None,
+        explore: bool | None = None,
+        random_actions: bool = False,
+        force_reset: bool = False,
+        **kwargs: Any,
+    ) -> list[Episode]:
+        """Plays whole episodes.
+
+        Args:
+            num_timesteps: play until at least so many steps are done.
+            num_episodes: play exactly so many. Neither: one per sub-environment.
+            explore: act by the training behaviour instead of deterministically.
+            random_actions: act uniformly.
+            force_reset: accepted for RLlib; every call begins with fresh episodes anyway.
+        """
+        if explore is None:
+            explore = bool(self.config.explore)
+        episodes: list[Episode] = []
+        steps = 0
+        while True:
+            count = len(self.envs)
+            if num_episodes is not None:
+                count = min(count, num_episodes - len(episodes))
+            played = self._play(count, explore=explore, random_actions=random_actions)
+            episodes += played
+            steps += sum(len(episode) for episode in played)
+            if num_episodes is not None and len(episodes) < num_episodes:
+                continue
+            if num_timesteps is not None and steps < num_timesteps:
+                continue
+            break
+        self._log(episodes, steps)
+        return episodes
+
+    def _play(self, count: int, *, explore: bool, random_actions: bool) -> list[Episode]:
+        """One episode in each of the first `count` sub-environments."""
+        recordings = [self._begin(env) for env in self.envs[:count]]
+        finished: dict[int, Episode] = {}
+        while len(finished) < count:
+            playing = [i for i in range(count) if i not in finished]
+            inputs = np.stack([recordings[i].network_input for i in playing])
+            actions = self._act(inputs, explore=explore, random_actions=random_actions)
+            for i, action in zip(playing, actions, strict=True):
+                if (terminated := self._step(self.envs[i], recordings[i], action)) is not None:
+                    finished[i] = recordings[i].finish(terminated)
+        return [finished[i] for i in range(count)]
+
+    def _begin(self, env: Env) -> _Recording:
+        seed = np.random.SeedSequence((*self._entropy, self._episodes_started))
+        self._episodes_started += 1
+        observation, _ = env.reset(seed=int(seed.generate_state(1)[0]))
+        recording = _Recording(self.layout, zero_goal=self._zero_goals)
+        recording.see(observation)
+        return recording
+
+    def _step(self, env: Env, recording: _Recording, action: Floats) -> bool | None:
+        """One step; at the episode's end whether it terminated, before that None."""
+        observation, reward, terminated, truncated, info = env.step(self._to_env(action))
+        success = info.get(self._success_key) if self._success_key else None
+        recording.step(action, float(reward), success, observation)
+        if terminated or truncated or recording.steps == self.layout.horizon:
+            return bool(terminated)
+        return None
+
+    def _to_env(self, action: Floats) -> Floats:
+        """From [-1, 1] to the environment's bounds."""
+        low, high = self._action_space.low, self._action_space.high
+        scaled = low + (action + 1.0) * 0.5 * (high - low)
+        clipped: Floats = np.clip(scaled, low, high).astype(self._action_space.dtype)
+        return clipped
+
+    def _act(self, inputs: Floats, *, explore: bool, random_actions: bool) -> Floats:
+        """[B, I] -> [B, A] in [-1, 1]."""
+        shape = (len(inputs), self.layout.action)
+        if random_actions:
+            return self._rng.uniform(-1.0, 1.0, shape).astype(np.float32)
+        states = torch.from_numpy(inputs)
+        behaviour = self._settings.behaviour
+        if not explore:
+            return self.module.act(states).numpy()
+        noise = self._rng.standard_normal(shape, dtype=np.float32)
+        if not isinstance(behaviour, GaussianNoise):
+            return self.module.act(states, torch.from_numpy(noise)).numpy()
+        actions = np.clip(self.module.act(states).numpy() + behaviour.std * noise, -1.0, 1.0)
+        uniform = self._rng.uniform(-1.0, 1.0, shape).astype(np.float32)
+        chosen = self._rng.random((len(inputs), 1)) < behaviour.random_share
+        return np.where(chosen, uniform, actions)
+
+    # -- metrics, state, end --------------------------------------------------------------
+
+    def _log(self, episodes: list[Episode], steps: int) -> None:
+        log = self.metrics.log_value
+        log(NUM_ENV_STEPS_SAMPLED, steps, reduce="sum")
+        log((NUM_AGENT_STEPS_SAMPLED, DEFAULT_AGENT_ID), steps, reduce="sum")
+        log(NUM_EPISODES, len(episodes), reduce="sum")
+        log(NUM_ENV_STEPS_SAMPLED_LIFETIME, steps, reduce="lifetime_sum", with_throughput=True)
+        log(NUM_EPISODES_LIFETIME, len(episodes), reduce="lifetime_sum")
+        # The mean over an iteration: RLlib does not carry a window over from one to the next.
+        window = max(len(episodes), self.config.metrics_num_episodes_for_smoothing)
+        for episode in episodes:
+            for name, value in self._episode_metrics(episode):
+                log(name, value, window=window)
+
+    def _episode_metrics(self, episode: Episode) -> Iterator[tuple[str, float]]:
+        yield EPISODE_LEN_MEAN, float(len(episode))
+        yield EPISODE_RETURN_MEAN, float(episode.rewards.sum())
+        if episode.successes is not None:
+            yield SUCCESS_LAST, float(episode.successes[-1])
+            yield SUCCESS_ANY, float(episode.successes.any())
+        if self.config.surrounding_indices:
+            surrounding = episode.frames[:, list(self.config.surrounding_indices)]
+            moved = np.linalg.norm(surrounding - surrounding[0], axis=-1)
+            yield DISPLACEMENT, float(moved[-1])
+            yield MOVED, float(moved.max() > MOVED_THRESHOLD)
+
+    def get_metrics(self) -> Any:
+        return self.metrics.reduce()
+
+    def get_state(
+        self,
+        components: str | Collection[str] | None = None,
+        *,
+        not_components: str | Collection[str] | None = None,
+        **kwargs: Any,
+    ) -> StateDict:
+        state: StateDict = {
+            "episodes_started": self._episodes_started,
+            "rng": self._rng.bit_generator.state,
+        }
+        if self._check_component(COMPONENT_RL_MODULE, components, not_components):
+            state[COMPONENT_RL_MODULE] = self.module.get_state(**kwargs)
+            state[WEIGHTS_SEQ_NO] = self._weights_seq_no
+        return state
+
+    def set_state(self, state: StateDict) -> None:
+        if "rng" in state:
+            self._episodes_started = int(state["episodes_started"])
+            self._rng.bit_generator.state = state["rng"]
+        if COMPONENT_RL_MODULE in state:
+            # Always taken: RLlib's runner skips weights with an older sequence number, which
+            # leaves it stale when an earlier checkpoint is restored in the same process.
+            module_state = state[COMPONENT_RL_MODULE]
+            if isinstance(module_state, ray.ObjectRef):
+                module_state = ray.get(module_state)
+            self.module.set_state(module_state.get(DEFAULT_MODULE_ID, module_state))
+            self._weights_seq_no = int(state.get(WEIGHTS_SEQ_NO, 0))
+
+    def get_ctor_args_and_kwargs(self) -> tuple[tuple[Any, ...], dict[str, Any]]:
+        return (), {"config": self.config}
+
+    def get_checkpointable_components(self) -> list[tuple[str, Checkpointable]]:
+        return [(COMPONENT_RL_MODULE, self.module)]
+
+    def assert_healthy(self) -> None:
+        assert self.module is not None
+
+    def close_envs(self) -> None:
+        for env in self.envs:
+            env.close()
+        self.envs = []
+
+    def stop(self) -> None:
+        self.close_envs()
+
+
+def seed_or_entropy(seed: int | None) -> int:
+    """The seed, or fresh entropy from the system where none is set."""
+    if seed is not None:
+        return seed
+    entropy = np.random.SeedSequence().entropy
+    assert isinstance(entropy, int)
+    return entropy

@@ -1,0 +1,420 @@
+"""The Learner: TAC's losses, MUSIC's estimator and intrinsic reward, many updates a call.
+
+A call of `update()` carries K minibatches behind each other, one row each (B transitions,
+N trajectories, T frames, I network inputs, D observation, A actions):
+
+- module `default_policy`: OBS [K*B, I], ACTIONS [K*B, A], REWARDS [K*B] (the task's),
+  "discounts" [K*B], NEXT_OBS [K*B, I], and "weights" [K*B] where the replay is prioritised
+- module `mi_estimator`, where it is trained: OBS [K*N, T, D] whole trajectories
+
+Each of the K updates prices its transitions with the current estimator, and then takes one step
+of every network and one of the estimator.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from ray.rllib.core import ALL_MODULES, DEFAULT_MODULE_ID
+from ray.rllib.core.columns import Columns
+from ray.rllib.core.learner.torch.torch_learner import TorchLearner
+from ray.rllib.core.learner.training_data import TrainingData
+from ray.rllib.policy.sample_batch import MultiAgentBatch
+from ray.rllib.utils.metrics import NUM_ENV_STEPS_SAMPLED_LIFETIME
+from ray.rllib.utils.typing import ModuleID, ResultDict, StateDict
+from torch import Tensor
+
+from music_rllib._quiet import quiet_third_parties
+from music_rllib.mutual_information import time_permutations
+from music_rllib.replay.buffer import Trajectory
+from music_rllib.schedules import value_at
+from music_rllib.tac import diagnostics, losses
+from music_rllib.tac.forward import Bootstrap, TACForward
+from music_rllib.tac.module import ESTIMATOR_MODULE, EstimatorModule, TACModule, choose_action
+from music_rllib.tac.networks import RunningNormaliser
+from music_rllib.tac.settings import LearnedAlpha, TACSettings
+from music_rllib.tracking import names
+from music_rllib.tsallis import ln_q_of_policy
+
+__all__ = ["GRAD_UPDATES", "NonFiniteLossError", "TACLearner"]
+
+GRAD_UPDATES = "grad_updates"
+PRIORITY_CLIP = 2e-4
+"""MUSIC-p: largest bound (nats) of one step that counts for its trajectory's priority."""
+Minibatch = dict[ModuleID, dict[str, Tensor]]
+
+
+class NonFiniteLossError(RuntimeError):
+    """A loss became infinite or NaN; the message names it and the update."""
+
+
+class TACLearner(TorchLearner):
+    """Tsallis actor-critic updates (paper III-B), with MUSIC's reward (III-A) where configured."""
+
+    # -- construction ---------------------------------------------------------------------
+
+    def build(self) -> None:
+        quiet_third_parties()  # a remote Learner is a process of its own
+        self._settings: TACSettings = self.config.tac_settings()
+        self._music = self.config.music_settings()
+        # A driver-side algorithm would otherwise use every core for 256-row products, and with
+        # another trial beside it run twenty times slower; the sums would also change.
+        torch.set_num_threads(self.config.torch_threads)
+        super().build()
+        seed = self.config.seed if self.config.seed is not None else torch.seed()
+        self._generator = torch.Generator(device=self._device).manual_seed(seed + 7919)
+        self._grad_updates = 0
+        self._aux: dict[str, Tensor] = {}
+        self._td_errors: list[Tensor] = []
+        self._set_schedules(0)
+        self._target_entropy = self._resolve_target_entropy()
+        pairs = self._policy_module.get_target_network_pairs()
+        self._online: list[Tensor] = [p for online, _ in pairs for p in online.parameters()]
+        self._targets: list[Tensor] = [p for _, target in pairs for p in target.parameters()]
+
+    @property
+    def _policy_module(self) -> TACModule:
+        return self.module[DEFAULT_MODULE_ID].unwrapped()  # type: ignore[no-any-return]
+
+    @property
+    def _input_size(self) -> int:
+        """Features of a network input: the first columns of a frame."""
+        return self._policy_module.input_size
+
+    @property
+    def _estimator(self) -> EstimatorModule | None:
+        if ESTIMATOR_MODULE not in self.module:
+            return None
+        return self.module[ESTIMATOR_MODULE].unwrapped()  # type: ignore[no-any-return]
+
+    def configure_optimizers_for_module(self, module_id: ModuleID, config: Any = None) -> None:
+        named = dict(self.module[module_id].named_parameters())
+        log_alpha = named.pop("log_alpha", None)
+        weights = [p for p in named.values() if p.requires_grad]
+        if module_id == ESTIMATOR_MODULE:
+            if self._music.estimator == "trained":
+                self._register(module_id, "estimator", weights, self._music.lr)
+            return
+        self._register(module_id, "networks", weights, self._settings.lr)
+        if log_alpha is not None:
+            assert isinstance(self._settings.alpha, LearnedAlpha)
+            self._register(module_id, "alpha", [log_alpha], self._settings.alpha.lr)
+
+    def _register(self, module_id: ModuleID, name: str, params: list[Tensor], lr: float) -> None:
+        self.register_optimizer(
+            module_id=module_id,
+            optimizer_name=name,
+            optimizer=torch.optim.Adam(params, lr=lr, fused=True),
+            params=params,
+            lr_or_lr_schedule=lr,
+        )
+
+    def _resolve_target_entropy(self) -> float:
+        alpha = self._settings.alpha
+        if not isinstance(alpha, LearnedAlpha) or alpha.target_entropy != "auto":
+            return float(getattr(alpha, "target_entropy", 0.0))
+        # S_q of a density of e per dimension: -1 nat each at q = 1, as SAC has it.
+        ones = torch.ones(1, self._policy_module.action_size)
+        q, form = self._entropic_index, self._settings.entropy_form
+        return -float(ln_q_of_policy(ones, q, form))
+
+    # -- the update loop ------------------------------------------------------------------
+
+    def before_gradient_based_update(self, *, timesteps: dict[str, Any]) -> None:
+        super().before_gradient_based_update(timesteps=timesteps)
+        self._set_schedules(int(timesteps.get(NUM_ENV_STEPS_SAMPLED_LIFETIME, 0)))
+
+    def _set_schedules(self, env_steps: int) -> None:
+        total = self.config.total_env_steps or 0
+        settings = self._settings
+        self._entropic_index = value_at(settings.entropic_index, env_steps, total)
+        self._mi_reward_weight = value_at(self._music.mi_reward_weight, env_steps, total)
+        if not isinstance(settings.alpha, LearnedAlpha):
+            self._alpha: Tensor | float = value_at(settings.alpha, env_steps, total)
+        else:
+            self._target_entropy = self._resolve_target_entropy()
+
+    def update(
+        self,
+        batch: MultiAgentBatch | None = None,
+        *,
+        training_data: TrainingData | None = None,
+        timesteps: dict[str, Any] | None = None,
+        **kwargs: Any,
+    ) -> ResultDict:
+        """Runs all minibatches of the batch; metrics are their means, logged once.
+
+        Raises:
+            NonFiniteLossError: a loss is not finite any more.
+        """
+        self._check_is_built()
+        self.before_gradient_based_update(timesteps=timesteps or {})
+        if training_data is not None:
+            training_data.solve_refs()
+            batch = training_data.batch
+        assert batch is not None
+        self._weights_seq_no += 1
+        history: list[dict[str, Tensor]] = []
+        for minibatch in self._minibatches(self._convert_batch_type(batch)):
+            self._aux = {}
+            self._update(self._priced(minibatch))
+            self._grad_updates += 1
+            if self._grad_updates % self._settings.target_update_interval == 0:
+                torch._foreach_lerp_(self._targets, self._online, self._settings.tau)
+            history.append(self._aux)
+        self._log_history(history)
+        self.after_gradient_based_update(timesteps=timesteps or {})
+        return self.metrics.reduce()
+
+    def _minibatches(self, batch: MultiAgentBatch) -> Iterator[Minibatch]:
+        """Cuts the batch up; random numbers of all its updates are drawn here, in one go."""
+        columns: Minibatch = {mid: dict(b) for mid, b in batch.policy_batches.items()}
+        rows = {DEFAULT_MODULE_ID: self._settings.batch_size}
+        policy = columns[DEFAULT_MODULE_ID]
+        policy |= self._policy_noise(policy[Columns.ACTIONS])
+        updates = len(policy[Columns.ACTIONS]) // self._settings.batch_size
+        if self._music.shuffle == "random":
+            policy["swapped"] = self._coin_per_minibatch(updates)
+        if ESTIMATOR_MODULE in columns:
+            rows[ESTIMATOR_MODULE] = self._music.batch_trajectories
+            trajectories = columns[ESTIMATOR_MODULE]
+            trajectories["permutations"] = self._permutations(trajectories[Columns.OBS], updates)
+        for k in range(updates):
+            yield {
+                mid: {name: values[k * n : (k + 1) * n] for name, values in columns[mid].items()}
+                for mid, n in rows.items()
+            }
+
+    def _policy_noise(self, actions: Tensor) -> dict[str, Tensor]:
+        """Standard normal numbers for the policy's actions, and the next ones where needed."""
+        if self._settings.policy == "deterministic":
+            return {}
+        wanted = ["noise"] if self._settings.bootstrap == "value" else ["noise", "next_noise"]
+        return {name: self._normal(actions.shape) for name in wanted}
+
+    def _normal(self, shape: tuple[int, ...]) -> Tensor:
+        return torch.randn(shape, generator=self._generator, device=self._device)
+
+    def _coin_per_minibatch(self, updates: int) -> Tensor:
+        """[K*B] the original's shuffle of two frames: for a whole minibatch swapped or not."""
+        coins = torch.rand(updates, generator=self._generator, device=self._device) < 0.5
+        return coins.repeat_interleave(self._settings.batch_size)
+
+    def _permutations(self, trajectories: Tensor, updates: int) -> Tensor:
+        rows, frames = trajectories.shape[:2]
+        if self._music.shuffle == "independent":
+            return time_permutations(rows, frames, self._generator)
+        per_minibatch = time_permutations(updates, frames, self._generator)
+        return per_minibatch.repeat_interleave(rows // updates, dim=0)
+
+    def _priced(self, minibatch: Minibatch) -> Minibatch:
+        """The minibatch with the reward that is learned from: task and intrinsic, weighted."""
+        estimator = self._estimator
+        if estimator is None:
+            return minibatch
+        policy = minibatch[DEFAULT_MODULE_ID]
+        swapped = bool(policy["swapped"][0]) if "swapped" in policy else True
+        intrinsic = estimator.reward(policy[Columns.OBS], policy[Columns.NEXT_OBS], swapped=swapped)
+        reward = self._total_reward(policy[Columns.REWARDS], intrinsic)
+        self._aux |= diagnostics.of_intrinsic_reward(intrinsic)
+        return {**minibatch, DEFAULT_MODULE_ID: {**policy, Columns.REWARDS: reward}}
+
+    def _total_reward(self, task: Tensor, intrinsic: Tensor) -> Tensor:
+        weighted = self._mi_reward_weight * intrinsic
+        return task + weighted if self._music.task_reward else weighted
+
+    # -- losses ---------------------------------------------------------------------------
+
+    def compute_loss_for_module(
+        self, *, module_id: ModuleID, config: Any, batch: dict[str, Any], fwd_out: dict[str, Any]
+    ) -> Tensor:
+        forward: TACForward = fwd_out["tac"]
+        settings, alpha = self._settings, self._current_alpha()
+        target = losses.critic_target(
+            batch[Columns.REWARDS],
+            batch["discounts"],
+            self._soft_value(forward.next),
+            settings.gamma,
+            settings.target_bounds,
+        )
+        ln_q_pi = self._ln_q(forward.log_density)
+        critic = losses.critic_loss(forward.q_values, target, batch.get("weights"))
+        improved = losses.policy_value(forward.q_of_policy, settings.policy_critic)
+        policy = losses.policy_loss(improved, ln_q_pi, alpha)
+        if settings.action_l2 > 0:
+            policy = policy + settings.action_l2 * forward.mean.square().mean()
+        total = critic + policy
+        if forward.value is not None:
+            value = losses.value_loss(forward.value, forward.q_of_policy, ln_q_pi, alpha)
+            total = total + value
+            self._aux[names.VALUE_LOSS] = value.detach()
+        if isinstance(settings.alpha, LearnedAlpha):
+            log_alpha = self._policy_module.log_alpha
+            total = total + losses.alpha_loss(log_alpha, -ln_q_pi.mean(), self._target_entropy)
+        self._observe(forward, target, critic=critic, policy=policy)
+        return total
+
+    def _ln_q(self, log_density: Tensor | None) -> Tensor:
+        """[B, A] -> [B] ln_q of the policy's density; 0 for a deterministic policy."""
+        if log_density is None:
+            return torch.zeros((), device=self._device)
+        return ln_q_of_policy(log_density, self._entropic_index, self._settings.entropy_form)
+
+    def _soft_value(self, bootstrap: Bootstrap) -> Tensor:
+        """[B] value of the states, the policy's entropy there included."""
+        if bootstrap.log_density is None:
+            return bootstrap.value
+        return bootstrap.value - self._current_alpha() * self._ln_q(bootstrap.log_density)
+
+    def _current_alpha(self) -> Tensor | float:
+        if isinstance(self._settings.alpha, LearnedAlpha):
+            return self._policy_module.log_alpha.detach().exp()
+        return self._alpha
+
+    # -- metrics --------------------------------------------------------------------------
+
+    def _observe(
+        self, forward: TACForward, target: Tensor, *, critic: Tensor, policy: Tensor
+    ) -> None:
+        """Keeps one minibatch's metrics as tensors: reading them out here would wait for them."""
+        settings = self._settings
+        self._aux |= {
+            names.CRITIC_LOSS: critic.detach(),
+            names.POLICY_LOSS: policy.detach(),
+            names.Q_MEAN: forward.q_values.detach().mean(),
+        }
+        self._aux |= diagnostics.of_targets(target, settings.target_bounds)
+        self._aux |= diagnostics.of_policy(
+            forward, self._entropic_index, settings.entropy_form, settings.log_std_bounds
+        )
+        if self.config.replay_priority == "td_error":
+            self._td_errors.append((forward.q_values.detach() - target).abs().mean(0))
+
+    def observe_bound(self, bound: Tensor) -> None:
+        """Called by the estimator's module with the mean bound of its minibatch, in nats."""
+        self._aux[names.MI_BOUND] = bound
+
+    def _log_history(self, history: list[dict[str, Tensor]]) -> None:
+        if not history:
+            return
+        keys = list(history[0])
+        table = torch.stack([torch.stack([step[key].float() for key in keys]) for step in history])
+        self._check_finite(keys, table)
+        log = self.metrics.log_value
+        for key, mean in zip(keys, table.mean(0).tolist(), strict=True):
+            log((DEFAULT_MODULE_ID, key), mean, window=1)
+        log((DEFAULT_MODULE_ID, names.ENTROPIC_INDEX), self._entropic_index, window=1)
+        log((DEFAULT_MODULE_ID, names.MI_REWARD_WEIGHT), self._mi_reward_weight, window=1)
+        log((DEFAULT_MODULE_ID, names.ALPHA), float(self._current_alpha()), window=1)
+        log((ALL_MODULES, GRAD_UPDATES), self._grad_updates, window=1)
+
+    def _check_finite(self, keys: list[str], table: Tensor) -> None:
+        """A NaN never leaves the networks again, so looking once a call is enough."""
+        bad = ~torch.isfinite(table)
+        if not bad.any():
+            return
+        step = int(bad.any(1).nonzero()[0])
+        culprits = [key for key, is_bad in zip(keys, bad[step].tolist(), strict=True) if is_bad]
+        update = self._grad_updates - len(table) + step + 1
+        raise NonFiniteLossError(
+            f"{', '.join(culprits)} not finite at gradient update {update} "
+            f"(entropic_index {self._entropic_index:g}, alpha {float(self._current_alpha()):g}). "
+            "The run stops here; its last checkpoint is good. Try a smaller tac.lr or tac.alpha, "
+            "or an entropic_index nearer to 1."
+        )
+
+    # -- fresh episodes, td errors --------------------------------------------------------
+
+    @torch.no_grad()
+    def diagnose(self, episodes: Sequence[Trajectory]) -> None:
+        """Measures fresh episodes of the policy, before anything is learned from them.
+
+        Logs the critics' bias at their first steps, and the estimator's bound on them.
+        """
+        module, width = self._policy_module, self._input_size
+        lengths = [len(episode) for episode in episodes]
+        states = self._tensor([episode.frames[:-1, :width] for episode in episodes])
+        followers = self._tensor([episode.frames[1:, :width] for episode in episodes])
+        actions = self._tensor([episode.actions for episode in episodes])
+        rewards = self._tensor([episode.rewards for episode in episodes])
+        first = np.cumsum([0, *lengths[:-1]])
+        last = np.cumsum(lengths) - 1
+        if (estimator := self._estimator) is not None:
+            rewards = self._total_reward(rewards, estimator.reward(states, followers))
+            self._log_held_out_bound(episodes, estimator)
+        noise = self._policy_noise(actions)
+        mean, log_std = module.policy_parameters(module.normaliser(states))
+        entropy = -self._ln_q(choose_action(mean, log_std, noise.get("noise"))[1]).expand(
+            len(rewards)
+        )
+        earned = (rewards + float(self._current_alpha()) * entropy).cpu().numpy().astype(float)
+        # The first action is what the critic is asked about: its entropy is not in its value.
+        earned[first] = rewards.cpu().numpy()[first]
+        ends = {Columns.NEXT_OBS: followers[last]}
+        ends |= {name: values[last] for name, values in noise.items()}
+        tail = self._soft_value(module.forward_target(ends)).cpu().numpy()
+        bootstrapped = np.array([not episode.terminated for episode in episodes])
+        gamma = self._settings.gamma
+        realised = diagnostics.discounted_returns(earned, lengths, gamma)
+        realised += bootstrapped * gamma ** np.array(lengths) * tail
+        asked = torch.cat([module.normaliser(states[first]), actions[first]], -1)
+        predicted = module.critics(asked).amin(0).cpu().numpy()
+        bias = float((predicted - realised).mean())
+        self.metrics.log_value((DEFAULT_MODULE_ID, names.Q_BIAS), bias, window=1)
+
+    def _log_held_out_bound(
+        self, episodes: Sequence[Trajectory], estimator: EstimatorModule
+    ) -> None:
+        longest = max(len(episode) for episode in episodes)
+        whole = [e.frames[:, : self._input_size] for e in episodes if len(e) == longest]
+        trajectories = torch.as_tensor(np.stack(whole), device=self._device)
+        count, frames = trajectories.shape[:2]
+        permutations = time_permutations(count, frames, self._generator)
+        bound = float(estimator.bound(trajectories, permutations).mean())
+        self.metrics.log_value((DEFAULT_MODULE_ID, names.HELD_OUT_BOUND), bound, window=1)
+
+    @torch.no_grad()
+    def trajectory_priorities(self, episodes: Sequence[Trajectory]) -> NDArray[np.float64]:
+        """MUSIC-p: the sum of each episode's per-step bounds, each clipped to [0, 2e-4] nats."""
+        estimator = self._estimator
+        assert estimator is not None
+        frames = [torch.as_tensor(e.frames, device=self._device) for e in episodes]
+        sums = [estimator.transition_bounds(f).clamp(0.0, PRIORITY_CLIP).sum() for f in frames]
+        return torch.stack(sums).cpu().numpy().astype(np.float64)
+
+    def take_td_errors(self) -> NDArray[np.float32]:
+        """[K*B] absolute TD errors of the last call's transitions, for prioritised replay."""
+        errors = torch.cat(self._td_errors).cpu().numpy()
+        self._td_errors = []
+        return errors
+
+    def _tensor(self, arrays: Sequence[NDArray[Any]]) -> Tensor:
+        return torch.as_tensor(np.concatenate(arrays), device=self._device)
+
+    # -- normaliser, state ----------------------------------------------------------------
+
+    def observe_inputs(self, inputs: Any) -> None:
+        """Takes [B, I] new network inputs (numpy) into the running normaliser."""
+        normaliser = self._policy_module.normaliser
+        if isinstance(normaliser, RunningNormaliser):
+            normaliser.update(torch.as_tensor(inputs, device=self._device))
+
+    def get_state(self, *args: Any, **kwargs: Any) -> StateDict:
+        state = super().get_state(*args, **kwargs)
+        state["tac"] = {
+            "generator": self._generator.get_state().numpy(),
+            GRAD_UPDATES: self._grad_updates,
+        }
+        return state
+
+    def set_state(self, state: StateDict) -> None:
+        # RLlib keeps newer weights over older ones; restoring means what the state says.
+        self._weights_seq_no = 0
+        super().set_state(state)
+        if "tac" in state:
+            self._generator.set_state(torch.from_numpy(state["tac"]["generator"].copy()))
+            self._grad_updates = int(state["tac"][GRAD_UPDATES])

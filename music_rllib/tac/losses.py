@@ -1,0 +1,82 @@
+"""Losses of the Tsallis actor-critic, paper III-B. Each is a mean over the minibatch.
+
+Shape legend: B batch, A action dimensions, C critics (two, DDPG one).
+"""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+__all__ = [
+    "alpha_loss",
+    "critic_loss",
+    "critic_target",
+    "policy_loss",
+    "policy_value",
+    "value_loss",
+]
+
+
+def critic_target(
+    reward: Tensor,
+    discount: Tensor,
+    next_value: Tensor,
+    gamma: float,
+    bounds: tuple[float, float] | None = None,
+) -> Tensor:
+    """What both critics learn (paper eq. 9), with the terminal mask that the paper leaves out.
+
+    Args:
+        reward: [B]
+        discount: [B] 0 where the episode terminated, else 1 (truncation is not termination).
+        next_value: [B] the target network's value of the next state.
+        bounds: the range that returns can have; targets are clipped to it.
+
+    Returns:
+        [B], without gradient.
+    """
+    target = (reward + gamma * discount * next_value).detach()
+    return target if bounds is None else target.clamp(*bounds)
+
+
+def critic_loss(q_values: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:
+    """Paper eq. 9, summed over the critics.
+
+    Args:
+        q_values: [C, B] of the batch's actions.
+        target: [B]
+        weights: [B] importance weights of prioritised replay.
+    """
+    squares = (q_values - target).square()
+    if weights is not None:
+        squares = squares * weights
+    return 0.5 * squares.mean(-1).sum()
+
+
+def value_loss(
+    value: Tensor, q_of_policy: Tensor, ln_q_pi: Tensor, alpha: Tensor | float
+) -> Tensor:
+    """Paper eq. 8, with the action drawn from the policy as its Algorithm has it.
+
+    Args:
+        value: [B]
+        q_of_policy: [C, B] critics at the policy's action; the smaller one counts.
+        ln_q_pi: [B] ln_q of the policy's density at that action.
+    """
+    target = (q_of_policy.amin(0) - alpha * ln_q_pi).detach()
+    return 0.5 * (value - target).square().mean()
+
+
+def policy_value(q_of_policy: Tensor, policy_critic: str) -> Tensor:
+    """[C, B] -> [B]: the critic that the policy improves on, `first` or `min`."""
+    return q_of_policy[0] if policy_critic == "first" else q_of_policy.amin(0)
+
+
+def policy_loss(value_of_policy: Tensor, ln_q_pi: Tensor, alpha: Tensor | float) -> Tensor:
+    """Paper eq. 10: E[alpha ln_q pi(a|s) - Q(s, a)], a reparameterised. Both inputs [B]."""
+    return (alpha * ln_q_pi - value_of_policy).mean()
+
+
+def alpha_loss(log_alpha: Tensor, entropy: Tensor, target_entropy: float) -> Tensor:
+    """Drives S_q of the policy ([] nats at q = 1) to its target (Haarnoja et al. 2018b, eq. 18)."""
+    return log_alpha * (entropy.detach() - target_entropy)

@@ -1,0 +1,120 @@
+"""The networks of TAC: multi-layer perceptrons, twin critics as one batched network, normaliser.
+
+Shape legend: B batch, I input features, C critics.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+__all__ = ["Critics", "RunningNormaliser", "mlp"]
+
+
+def mlp(inputs: int, hidden_sizes: Sequence[int], outputs: int) -> nn.Sequential:
+    """A perceptron with ReLU between its layers and a linear output."""
+    layers: list[nn.Module] = []
+    for size in hidden_sizes:
+        layers += [nn.Linear(inputs, size), nn.ReLU()]
+        inputs = size
+    layers.append(nn.Linear(inputs, outputs))
+    return nn.Sequential(*layers)
+
+
+class Critics(nn.Module):
+    """Q1 and Q2 of equal shape, evaluated together: one batched matrix product a layer.
+
+    The first layer of both reads the same input, so it is a single product.
+
+    Args:
+        count: C, two unless the algorithm has a single critic (DDPG).
+    """
+
+    def __init__(self, inputs: int, hidden_sizes: Sequence[int], count: int = 2) -> None:
+        super().__init__()
+        self.count = count
+        sizes = [inputs, *hidden_sizes, 1]
+        self.weights = nn.ParameterList()
+        self.biases = nn.ParameterList()
+        for fan_in, fan_out in pairwise(sizes):
+            reach = 1.0 / math.sqrt(fan_in)  # nn.Linear's own initialisation, once per critic
+            self.weights.append(
+                nn.Parameter(torch.empty(count, fan_in, fan_out).uniform_(-reach, reach))
+            )
+            self.biases.append(nn.Parameter(torch.empty(count, 1, fan_out).uniform_(-reach, reach)))
+
+    def forward(self, inputs: Tensor, *, frozen: bool = False) -> Tensor:
+        """[B, I] -> [C, B].
+
+        Args:
+            frozen: gradients reach the inputs only. The policy's step needs just those, and a
+                third of its work is saved.
+        """
+        layers = list(self._layers(frozen))
+        first_weight, first_bias = layers[0]
+        _, fan_in, width = first_weight.shape
+        stacked = first_weight.transpose(0, 1).reshape(fan_in, self.count * width)
+        hidden = (inputs @ stacked).view(-1, self.count, width).transpose(0, 1) + first_bias
+        for weight, bias in layers[1:]:
+            hidden = torch.baddbmm(bias, F.relu(hidden), weight)
+        return hidden.squeeze(-1)
+
+    def _layers(self, frozen: bool) -> Iterator[tuple[Tensor, Tensor]]:
+        for weight, bias in zip(self.weights, self.biases, strict=True):
+            yield (weight.detach(), bias.detach()) if frozen else (weight, bias)
+
+
+_ROUNDING = 1e-12
+"""Variance, as a share of the squared mean, below which it is only float64's rounding."""
+
+
+class RunningNormaliser(nn.Module):
+    """Running mean and standard deviation per feature; clips what it normalises.
+
+    The moments live in float64 buffers, so they are part of the module's state: environment
+    runners, checkpoints and handoffs get them with the weights.
+    """
+
+    count: Tensor
+    total: Tensor
+    total_square: Tensor
+    mean: Tensor
+    inverse_std: Tensor
+
+    def __init__(self, features: int, *, epsilon: float, clip: float) -> None:
+        super().__init__()
+        self.epsilon, self.clip = epsilon, clip
+        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
+        self.register_buffer("total", torch.zeros(features, dtype=torch.float64))
+        self.register_buffer("total_square", torch.zeros(features, dtype=torch.float64))
+        self.register_buffer("mean", torch.zeros(features))
+        self.register_buffer("inverse_std", torch.ones(features))
+
+    def forward(self, values: Tensor) -> Tensor:
+        """[..., I] -> [..., I]: (x - mean) / max(std, epsilon), clipped to plus/minus `clip`.
+
+        0 for a feature that has been the same in all observations.
+        """
+        return ((values - self.mean) * self.inverse_std).clamp(-self.clip, self.clip)
+
+    @torch.no_grad()
+    def update(self, values: Tensor) -> None:
+        """Takes [B, I] more observations into the moments."""
+        values = values.to(self.total)
+        self.count += values.shape[0]
+        self.total += values.sum(0)
+        self.total_square += values.square().sum(0)
+        mean = self.total / self.count
+        variance = (self.total_square / self.count - mean.square()).clamp(min=0.0)
+        scale = 1.0 / variance.sqrt().clamp(min=self.epsilon)
+        # What was constant so far taught the networks nothing: it becomes 0 whatever it is later.
+        # MUSIC-u is trained on goals of 0 and evaluated with real ones, which would otherwise enter
+        # as -5 or 5, through weights that were never learned.
+        constant = variance <= _ROUNDING * mean.square()
+        self.mean.copy_(mean)
+        self.inverse_std.copy_(torch.where(constant, 0.0, scale))

@@ -1,0 +1,140 @@
+"""Named, validated settings of TAC. Declared once here; YAML and `TACConfig` both use them."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
+
+from music_rllib.schedules import Schedule, bounded
+
+__all__ = ["GaussianNoise", "LearnedAlpha", "TACSettings"]
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class LearnedAlpha(_Frozen):
+    """Entropy coefficient learned towards a target entropy (Haarnoja et al. 2018b, eq. 18)."""
+
+    learned: Literal[True]
+    """Says that alpha is learned."""
+    initial: float = Field(0.2, gt=0)
+    """Alpha at first."""
+    target_entropy: float | Literal["auto"] = "auto"
+    """Target for S_q of the policy. `auto`: the S_q of a density of e per action dimension, which
+    is SAC's usual minus-the-number-of-dimensions at q = 1."""
+    lr: float = Field(3e-4, gt=0)
+    """Adam's step size for log alpha."""
+
+
+class GaussianNoise(_Frozen):
+    """Behaviour of the original MUSIC: tanh(mean) plus noise, some actions uniformly random."""
+
+    kind: Literal["gaussian_noise"]
+    """Says which kind of behaviour this is."""
+    std: float = Field(0.2, ge=0)
+    """Standard deviation in units of the action space scaled to [-1, 1]."""
+    random_share: float = Field(0.3, ge=0, le=1)
+    """Share of actions drawn uniformly instead."""
+
+
+def _alpha_kind(value: object) -> str:
+    learned = isinstance(value, LearnedAlpha) or (isinstance(value, dict) and "learned" in value)
+    return "learned" if learned else "scheduled"
+
+
+Alpha = Annotated[
+    Annotated[Schedule, bounded(">= 0", lambda alpha: alpha >= 0), Tag("scheduled")]
+    | Annotated[LearnedAlpha, Tag("learned")],
+    Discriminator(_alpha_kind),
+]
+"""Entropy coefficient: a constant, a schedule, or learned."""
+
+
+def _behaviour_kind(value: object) -> str:
+    return "gaussian_noise" if isinstance(value, dict | GaussianNoise) else "policy"
+
+
+Behaviour = Annotated[
+    Annotated[Literal["policy"], Tag("policy")] | Annotated[GaussianNoise, Tag("gaussian_noise")],
+    Discriminator(_behaviour_kind),
+]
+"""How training episodes are acted."""
+
+
+class TACSettings(_Frozen):
+    """Settings of the Tsallis actor-critic (paper III-B, Fig. 3)."""
+
+    entropic_index: Annotated[Schedule, bounded("> 0", lambda q: q > 0)] = 1.0
+    """q of ln_q. 1 is SAC, 2 the sparse Tsallis entropy."""
+    alpha: Alpha = 0.2
+    """Entropy coefficient: a constant, a schedule, or `{learned: true, ...}`."""
+    entropy_form: Literal["per_dimension", "joint"] = "per_dimension"
+    """ln_q summed over action dimensions (the TAC authors), or of the joint density (the paper)."""
+    policy: Literal["stochastic", "deterministic"] = "stochastic"
+    """Squashed Gaussian, or tanh(mean) only: with `bootstrap: critics` that is DDPG."""
+    bootstrap: Literal["value", "critics"] = "value"
+    """What follows a transition is worth: the averaged value network (the paper), or averaged
+    critics at the policy's next action (SAC with twin targets; with one critic, DDPG)."""
+    policy_critic: Literal["first", "min"] = "min"
+    """Which critic the policy improves on: Q1 (the TAC authors) or min(Q1, Q2) (SAC practice)."""
+    hidden_sizes: tuple[Annotated[int, Field(gt=0)], ...] = Field((256, 256, 256), min_length=1)
+    """Hidden layers (ReLU) of policy, value and critics."""
+    log_std_bounds: tuple[float, float] = (-20.0, 2.0)
+    """The policy's log standard deviation is clamped to this range."""
+    lr: float = Field(1e-3, gt=0)
+    """Adam's step size for policy, value and critics."""
+    gamma: float = Field(0.99, ge=0, lt=1)
+    """Discount."""
+    tau: float = Field(0.005, gt=0, le=1)
+    """Moving-average ratio of the target networks."""
+    target_update_interval: int = Field(1, gt=0)
+    """Gradient updates between two moves of the target networks."""
+    target_bounds: tuple[float, float] | None = None
+    """Critic targets are clipped to this range (original MUSIC: -1/(1-gamma), 0)."""
+    batch_size: int = Field(256, gt=0)
+    """Transitions per update."""
+    replay_ratio: float = Field(1.0, gt=0)
+    """Gradient updates per environment step."""
+    random_steps: int = Field(1_000, ge=0)
+    """First environment steps: uniformly random actions, and no updates before they are over."""
+    normalise_observations: bool = True
+    """Running mean and standard deviation of observations and goals in front of every network."""
+    observation_clip: float = Field(5.0, gt=0)
+    """Normalised observations are clipped to plus/minus this."""
+    normaliser_epsilon: float = Field(1e-2, gt=0)
+    """Smallest standard deviation that the normaliser divides by."""
+    behaviour: Behaviour = "policy"
+    """Acting during training: sample the policy, or the original MUSIC's noise."""
+    action_l2: float = Field(0.0, ge=0)
+    """Weight of the mean squared pre-tanh action in the policy's loss (original MUSIC: 1.0)."""
+    max_episode_steps: int | None = Field(None, gt=0)
+    """Truncate episodes here; needed where the environment has no time limit of its own."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        low, high = self.log_std_bounds
+        if low >= high:
+            raise ValueError(f"log_std_bounds must be increasing, got {low:g}, {high:g}")
+        if self.target_bounds is not None and self.target_bounds[0] >= self.target_bounds[1]:
+            raise ValueError(f"target_bounds must be increasing, got {list(self.target_bounds)}")
+        return self
+
+    @model_validator(mode="after")
+    def _deterministic_is_whole(self) -> Self:
+        if self.policy == "stochastic":
+            return self
+        if self.alpha != 0.0:
+            raise ValueError(
+                f"alpha must be 0 for policy: deterministic (it has no entropy), got {self.alpha}"
+            )
+        if self.bootstrap != "critics":
+            raise ValueError("bootstrap must be 'critics' for policy: deterministic, got 'value'")
+        if self.behaviour == "policy":
+            raise ValueError(
+                "behaviour must be gaussian_noise for policy: deterministic, which would not "
+                "explore, got 'policy'"
+            )
+        return self

@@ -1,0 +1,208 @@
+"""The few MLflow calls that tracking makes, and which of their failures can pass.
+
+The only module that talks to MLflow.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import warnings
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TypeVar
+from urllib.parse import quote
+
+from filelock import FileLock
+from mlflow import MlflowClient
+from mlflow.entities import Metric, Param, RunTag
+from mlflow.exceptions import MlflowException
+
+from music_rllib.tracking import names
+from music_rllib.tracking.errors import TrackingError
+from music_rllib.tracking.redaction import redact
+from music_rllib.tracking.spool import Metrics, Status
+from music_rllib.tracking.store import TrackingStore
+
+MAX_METRICS = 1000
+"""MLflow's limit for the metrics of one ``log_batch``."""
+MAX_PARAMS = 100
+"""MLflow's limit for the params, and for the tags, of one ``log_batch``."""
+REQUEST_SECONDS = 30
+"""How long a server may take for one request, unless MLFLOW_HTTP_REQUEST_TIMEOUT says else."""
+SCHEMA_SECONDS = 120.0
+"""How long to wait for another process that sets up the same sqlite file."""
+
+_LASTING_ERRORS = frozenset(
+    {
+        "INVALID_PARAMETER_VALUE",
+        "BAD_REQUEST",
+        "INVALID_STATE",
+        "RESOURCE_DOES_NOT_EXIST",
+        "NOT_FOUND",
+        "ENDPOINT_NOT_FOUND",
+    }
+)
+_Item = TypeVar("_Item")
+
+
+def is_lasting(error: Exception) -> bool:
+    """Whether repeating the call cannot help: a refused value, or a run that was deleted."""
+    return isinstance(error, MlflowException) and error.error_code in _LASTING_ERRORS
+
+
+class Experiment:
+    """One MLflow experiment: finds, creates and feeds its runs. Every call may raise."""
+
+    def __init__(self, store: TrackingStore, name: str) -> None:
+        """Connect, and create the experiment where it does not exist.
+
+        Raises:
+            TrackingError: where the store refuses that.
+        """
+        self.store = store
+        self._name = name
+        _configure_mlflow()
+        try:
+            self._client = _open_client(store)
+            self.id = self._find_or_create()
+        except TrackingError:
+            raise
+        except Exception as error:
+            raise TrackingError(
+                f"MLflow at {store.public_uri} must accept the experiment {name!r}, "
+                f"it answered: {first_line(error)}"
+            ) from error
+
+    def find_run(self, tags: Mapping[str, str]) -> str | None:
+        """Id of the oldest run with all these tags; None where there is none."""
+        wanted = " and ".join(f"tags.`{key}` = '{value}'" for key, value in tags.items())
+        found = self._client.search_runs(
+            [self.id], wanted, max_results=1, order_by=["attributes.start_time ASC"]
+        )
+        return found[0].info.run_id if found else None
+
+    def create_run(self, name: str, time: int, tags: Mapping[str, str]) -> str:
+        """Id of a new run that began at ``time`` (ms since the epoch)."""
+        run = self._client.create_run(self.id, start_time=time, tags=dict(tags), run_name=name)
+        return str(run.info.run_id)
+
+    def last_steps(self, run_id: str) -> dict[str, int]:
+        """Last step of every metric that the run has."""
+        metrics = self._client.get_run(run_id).data.metrics
+        return {
+            name: max(point.step for point in self._client.get_metric_history(run_id, name))
+            for name in metrics
+        }
+
+    def begin_run(self, run_id: str, tags: Mapping[str, str], params: Mapping[str, str]) -> None:
+        """Mark the run as running, for the first time or again, with these tags and params.
+
+        MLflow's params are immutable, and a sweep that is continued with more seeds has others:
+        a changed param becomes a tag. The tag of an earlier failure goes.
+        """
+        run = self._client.get_run(run_id)
+        known = run.data.params
+        changed = {
+            names.TAG_CHANGED_PREFIX + key: value
+            for key, value in params.items()
+            if known.get(key, value) != value or names.TAG_CHANGED_PREFIX + key in run.data.tags
+        }
+        self.set_tags(run_id, {**tags, **changed})
+        fresh = [Param(key, value) for key, value in params.items() if key not in known]
+        for chunk in _chunks(fresh, MAX_PARAMS):
+            self._client.log_batch(run_id, params=chunk, synchronous=True)
+        if names.TAG_FAILURE in run.data.tags:
+            self._client.delete_tag(run_id, names.TAG_FAILURE)
+        if run.info.status != "RUNNING":
+            self._client.update_run(run_id, status="RUNNING")
+
+    def set_tags(self, run_id: str, tags: Mapping[str, str]) -> None:
+        """Set tags, over those of the same names."""
+        for chunk in _chunks([RunTag(*item) for item in tags.items()], MAX_PARAMS):
+            self._client.log_batch(run_id, tags=chunk, synchronous=True)
+
+    def log_metrics(self, run_id: str, records: Iterable[Metrics]) -> None:
+        """Send ``records`` with their own times and steps; sending them twice changes nothing."""
+        metrics = [
+            Metric(name, value, record.time, record.step)
+            for record in records
+            for name, value in record.values.items()
+        ]
+        for chunk in _chunks(metrics, MAX_METRICS):
+            self._client.log_batch(run_id, metrics=chunk, synchronous=True)
+
+    def end_run(self, run_id: str, status: Status, time: int) -> None:
+        """Mark the run as ended at ``time`` (ms since the epoch)."""
+        self._client.set_terminated(run_id, status=status, end_time=time)
+
+    def upload(self, run_id: str, name: str, file: Path) -> None:
+        """Store ``file`` as the artefact ``name`` (its last part is the file's name)."""
+        folder = name.rpartition("/")[0]
+        self._client.log_artifact(run_id, str(file), folder or None)
+
+    def _find_or_create(self) -> str:
+        experiment = self._client.get_experiment_by_name(self._name)
+        if experiment is None:
+            try:
+                return self._client.create_experiment(self._name, self._artefact_location())
+            except MlflowException as error:
+                if error.error_code != "RESOURCE_ALREADY_EXISTS":
+                    raise
+                experiment = self._client.get_experiment_by_name(self._name)
+        if experiment is None or experiment.lifecycle_stage != "active":
+            raise TrackingError(
+                f"the experiment {self._name!r} at {self.store.public_uri} must not be deleted. "
+                "Restore it (mlflow experiments restore) or give the sweep another name."
+            )
+        return str(experiment.experiment_id)
+
+    def _artefact_location(self) -> str | None:
+        root = self.store.artefact_root
+        return None if root is None else f"{root}/{quote(self._name)}"
+
+
+def first_line(error: Exception) -> str:
+    """The first line of an error, without passwords."""
+    lines = str(error).strip().splitlines() or [type(error).__name__]
+    return redact(lines[0])
+
+
+def _configure_mlflow() -> None:
+    """Leave repeating to the sender, and MLflow's chatter off the screen.
+
+    MLflow's own repeating would block for minutes, and could create a run twice where an answer
+    got lost: the sender looks for the run first.
+    """
+    os.environ["MLFLOW_HTTP_REQUEST_MAX_RETRIES"] = "0"
+    os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", str(REQUEST_SECONDS))
+    os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
+    # MLflow's own use of SQLAlchemy, met when its database code is imported.
+    warnings.filterwarnings("ignore", r"The ``noload`` loader strategy", DeprecationWarning)
+    for chatty in ("mlflow.store.db.utils", "alembic"):
+        logging.getLogger(chatty).setLevel(logging.WARNING)
+
+
+def _open_client(store: TrackingStore) -> MlflowClient:
+    """A client; for an embedded file its tables are made by one process at a time.
+
+    Opening a fresh sqlite file from several processes crashes MLflow's migration.
+    """
+    if store.database is None:
+        return MlflowClient(store.uri)
+    try:
+        store.database.parent.mkdir(parents=True, exist_ok=True)
+        with FileLock(f"{store.database}.lock", timeout=SCHEMA_SECONDS):
+            client = MlflowClient(store.uri)
+            client.search_experiments(max_results=1)
+            return client
+    except (OSError, TimeoutError) as error:
+        raise TrackingError(
+            f"{store.database} must be writable for the local MLflow store: {error}. "
+            "Choose another storage folder or name a server in mlflow.tracking_uri."
+        ) from error
+
+
+def _chunks(items: Sequence[_Item], size: int) -> Iterator[Sequence[_Item]]:
+    for begin in range(0, len(items), size):
+        yield items[begin : begin + size]

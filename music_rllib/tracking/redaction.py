@@ -1,0 +1,76 @@
+"""What may be written down: settings as flat params, and text without passwords."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Mapping
+
+MAX_PARAM_LENGTH = 6000
+"""MLflow's limit for the value of a param, in characters."""
+
+_USER_INFO = re.compile(r"(?P<scheme>[A-Za-z][A-Za-z0-9+.\-]*://)[^/?#\s'\"]*@")
+_QUERY_SECRET = re.compile(
+    r"(?P<name>[?&](?:password|passwd|pwd|sslpassword|token|secret|access_key)=)[^&\s'\"]*", re.I
+)
+_SECRET_KEY = re.compile(r"password|passwd|secret|token|api_?key|credential", re.I)
+_NOT_IN_A_NAME = re.compile(r"[^\w./\- ]")
+
+
+def redact(text: str) -> str:
+    """``text`` without the ``user:password@`` and ``?password=`` parts of the URIs in it."""
+    text = _USER_INFO.sub(lambda match: match["scheme"], text)
+    return _QUERY_SECRET.sub(lambda match: match["name"] + "***", text)
+
+
+def without_secrets(settings: Mapping[str, object]) -> dict[str, object]:
+    """A copy of nested ``settings`` with redacted URIs and without keys that name a secret.
+
+    A key names a secret where it contains ``password``, ``token``, ``secret``, ``api_key`` or
+    ``credential``. The input is not changed.
+    """
+    return {
+        str(key): _clean(value)
+        for key, value in settings.items()
+        if not _SECRET_KEY.search(str(key))
+    }
+
+
+def _clean(value: object) -> object:
+    if isinstance(value, Mapping):
+        return without_secrets(value)
+    if isinstance(value, (list, tuple)):
+        return [_clean(item) for item in value]
+    return redact(value) if isinstance(value, str) else value
+
+
+def flat_params(settings: Mapping[str, object]) -> dict[str, str]:
+    """Nested ``settings`` as MLflow params: dotted names, scalars as text.
+
+    A list of scalars is one param (JSON text). Left out, since the whole configuration is an
+    artefact anyway: secrets, lists of records, and values above ``MAX_PARAM_LENGTH`` characters.
+    """
+    flat = {}
+    for name, value in _leaves(without_secrets(settings), ""):
+        text = _param_text(value)
+        if text is not None and len(text) <= MAX_PARAM_LENGTH:
+            flat[_NOT_IN_A_NAME.sub("_", name)[:250]] = text
+    return flat
+
+
+def _leaves(settings: Mapping[str, object], prefix: str) -> Iterator[tuple[str, object]]:
+    for key, value in settings.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def _param_text(value: object) -> str | None:
+    if isinstance(value, list):
+        return None if any(isinstance(item, (Mapping, list)) for item in value) else _json(value)
+    return str(value)
+
+
+def _json(value: object) -> str:
+    return json.dumps(value, default=str)

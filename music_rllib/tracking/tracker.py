@@ -1,0 +1,380 @@
+"""The sweep driver's one way to MLflow: log and go on; the rest happens behind.
+
+After the constructor nothing here waits for a server: every call appends to a spool in the
+sweep's folder (:mod:`music_rllib.tracking.spool`), and a thread delivers it.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import yaml
+
+from music_rllib.tracking import names
+from music_rllib.tracking.provenance import provenance_tags
+from music_rllib.tracking.redaction import flat_params, redact, without_secrets
+from music_rllib.tracking.sender import Backlog
+from music_rllib.tracking.session import Session, SweepRecord, new_sweep_id, relative_storage
+from music_rllib.tracking.spool import Finish, Metrics, Record, Spool, Start, Status
+from music_rllib.tracking.store import check_reachable, local_folder, resolve_store
+
+MAX_FAILURE_LENGTH = 1000
+"""Characters of a failure's cause that are kept as a tag; the rest is in the run's log."""
+
+_PART = r"(?!\.{1,2}(?:/|$))[\w.\-: ]+"
+_METRIC_NAME = re.compile(rf"{_PART}(?:/{_PART})*")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunInfo:
+    """One run of the sweep, as MLflow shows it."""
+
+    node_key: str
+    """The node's content hash; the run is found again by it."""
+    name: str
+    """Shown in MLflow's lists, for example ``finetune/q=1.5/FetchPush/seed=0``."""
+    config: Mapping[str, object]
+    """Everything that determines the run: becomes params and the artefact ``config/run.yaml``."""
+    tags: Mapping[str, object] = field(default_factory=dict)
+    """``names.TAG_*`` to values; None is left out."""
+    settings: Mapping[str, float] = field(default_factory=dict)
+    """``names.SETTING_*`` to numbers, logged as metrics at step 0, so that MLflow compares them."""
+    source_node: str | None = None
+    """Node key of the run whose handoff this one starts from."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Point:
+    """Metrics of a finished run at one number of environment steps."""
+
+    env_steps: int
+    timestamp: float
+    """When they were measured, in seconds since the epoch."""
+    metrics: Mapping[str, float]
+
+
+class Tracker:
+    """Logs one sweep: an experiment, a parent run, and a child run per node.
+
+    Opening it again on the same sweep continues the same runs: a value whose step was logged
+    before is left out, so a run that repeats steps after a resume shows each step once.
+    Calls may come from several threads; only one process at a time can track a sweep.
+    """
+
+    def __init__(
+        self,
+        *,
+        sweep_name: str,
+        storage: str,
+        config: Mapping[str, object],
+        tracking_uri: str | None = None,
+        sweep_folder: Path | None = None,
+        sweep_id: str | None = None,
+        tags: Mapping[str, object] | None = None,
+    ) -> None:
+        """Check the store, create the experiment and the parent run, begin to deliver.
+
+        Args:
+            sweep_name: also the experiment's name.
+            storage: the sweep's storage, a folder or a bucket URI.
+            config: the whole sweep's settings: params and the artefact ``config/sweep.yaml``
+                of the parent run.
+            tracking_uri: ``mlflow.tracking_uri``; None for a sqlite file in ``storage``.
+            sweep_folder: local folder of the spools; ``<storage>/<sweep_name>`` by default,
+                needed where the storage is a bucket.
+            sweep_id: what tells this sweep from others of its name on the same server; kept in
+                the sweep's folder, so it is needed only where that folder does not outlive the
+                machine (a bucket).
+            tags: tags of the parent run.
+
+        Raises:
+            TrackingError: where the store is not reachable or refuses, where the folder is not
+                writable, or where another process tracks this sweep.
+            ValueError: where ``sweep_folder`` is missing.
+        """
+        store = resolve_store(tracking_uri, storage)
+        check_reachable(store)
+        folder = sweep_folder or _default_folder(storage, sweep_name)
+        known = SweepRecord.read(folder)
+        record = SweepRecord(
+            sweep_name=sweep_name,
+            sweep_id=sweep_id or (known.sweep_id if known else new_sweep_id()),
+            tracking_uri=None if tracking_uri is None else store.public_uri,
+            storage=relative_storage(storage, folder),
+        )
+        self.sweep_folder = folder
+        self.store = store
+        self._provenance = provenance_tags()
+        self._session = Session(folder, store, record)
+        self._sweep_tags = {names.TAG_SWEEP: sweep_name, names.TAG_SWEEP_ID: record.sweep_id}
+        self._open: dict[str, Spool] = {}
+        self._checked_names: set[str] = set()
+        self._left: Backlog | None = None
+        try:
+            self._begin(sweep_name, config, tags or {})
+        except BaseException:
+            self._session.abandon()
+            raise
+
+    @property
+    def experiment_id(self) -> str:
+        """MLflow's id of the sweep's experiment."""
+        return self._session.experiment.id
+
+    @property
+    def parent_run_id(self) -> str:
+        """MLflow's id of the sweep's own run."""
+        run_id = self._session.parent.run_id
+        assert run_id is not None, "the constructor creates the parent run"
+        return run_id
+
+    def start(self, run: RunInfo) -> None:
+        """A run begins, or goes on after a resume.
+
+        Raises:
+            ValueError: where a name or key is not one that MLflow accepts.
+            TrackingError: where its spool cannot be written.
+        """
+        self._append(run.node_key, self._opening(run, time.time()))
+        self._open[run.node_key].put_artefact(names.ARTEFACT_RUN_CONFIG, _yaml(run.config))
+        self._session.wake()
+
+    def log(
+        self,
+        node_key: str,
+        metrics: Mapping[str, float],
+        env_steps: int,
+        timestamp: float | None = None,
+    ) -> None:
+        """Metrics of a started run at ``env_steps``; values of a step logged before are left out.
+
+        Args:
+            node_key: the run.
+            metrics: ``names.*`` to numbers; NaN and infinities are kept.
+            env_steps: environment steps of the run so far; rises from call to call.
+            timestamp: when they were measured, in seconds since the epoch; now by default.
+
+        Raises:
+            ValueError: where the run was not started, or a metric's name or value is not one
+                that MLflow accepts.
+            TrackingError: where the spool cannot be written.
+        """
+        self._started(node_key)
+        when = time.time() if timestamp is None else timestamp
+        self._append(node_key, [self._metrics(metrics, env_steps, when)])
+        self._session.wake()
+
+    def finish(
+        self,
+        node_key: str,
+        status: Status,
+        *,
+        artefacts: Mapping[str, Path] | None = None,
+        failure: str | None = None,
+    ) -> None:
+        """A started run ended; its learning curve is drawn and kept as an artefact.
+
+        Args:
+            node_key: the run.
+            status: FINISHED, FAILED, or KILLED for one that was stopped and can go on.
+            artefacts: names in MLflow to files, which are copied at once.
+            failure: the cause, where it failed; its beginning becomes a tag.
+
+        Raises:
+            ValueError: where the run was not started.
+            TrackingError: where an artefact cannot be read or the spool cannot be written.
+        """
+        spool = self._started(node_key)
+        for name, file in (artefacts or {}).items():
+            spool.put_artefact(name, file)
+        self._append(node_key, [_finish(status, time.time(), failure)])
+        del self._open[node_key]
+        self._session.wake()
+
+    def log_history(
+        self, run: RunInfo, history: Iterable[Point], artefacts: Mapping[str, Path] | None = None
+    ) -> bool:
+        """A run that an earlier sweep finished, in one go; nothing where it is already here.
+
+        Returns:
+            Whether something was added.
+
+        Raises:
+            ValueError: where a name, key or value is not one that MLflow accepts.
+            TrackingError: where the spool cannot be written.
+        """
+        spool = self._session.open_run(run.node_key)
+        if spool.finished == "FINISHED":
+            return False
+        points = sorted(history, key=lambda point: point.env_steps)
+        first = min((point.timestamp for point in points), default=time.time())
+        last = max((point.timestamp for point in points), default=first)
+        records = [
+            *self._opening(run, first, {names.TAG_REUSED: "true"}),
+            *(self._metrics(point.metrics, point.env_steps, point.timestamp) for point in points),
+            _finish("FINISHED", last, None),
+        ]
+        spool.put_artefact(names.ARTEFACT_RUN_CONFIG, _yaml(run.config))
+        for name, file in (artefacts or {}).items():
+            spool.put_artefact(name, file)
+        spool.append(records)
+        self._session.wake()
+        return True
+
+    def put_sweep_artefact(self, name: str, content: str | bytes | Path) -> None:
+        """An artefact of the parent run: text, bytes, or a file, which is copied at once."""
+        self._session.parent.spool.put_artefact(name, content)
+        self._session.wake()
+
+    def run_id(self, node_key: str) -> str | None:
+        """MLflow's id of a run; None until the server has it (see :meth:`flush`)."""
+        return self._session.run_id(node_key)
+
+    def run_url(self, node_key: str) -> str | None:
+        """The page of a run; None without a server, or until the server has the run."""
+        run_id = self.run_id(node_key)
+        return None if run_id is None else self.store.run_url(self.experiment_id, run_id)
+
+    def ui_command(self) -> str:
+        """What opens MLflow's pages: a command, or a server's address."""
+        return self.store.ui_command()
+
+    def backlog(self) -> Backlog:
+        """What MLflow does not have yet, and why; for a progress display."""
+        return self._left or self._session.backlog()
+
+    def flush(self, timeout: float) -> bool:
+        """Wait until MLflow has everything; False where that takes more than ``timeout`` s."""
+        return self._session.flush(timeout)
+
+    def close(self, status: Status = "FINISHED", timeout: float = 20.0) -> Backlog:
+        """End the sweep's run, deliver for at most ``timeout`` s, and say what is left over.
+
+        Runs that were started and not finished are marked KILLED; a later sweep continues them.
+        The second call only repeats the first one's answer.
+        """
+        if self._left is None:
+            for node_key in list(self._open):
+                self.finish(node_key, "KILLED")
+            self._session.parent.spool.append([_finish(status, time.time(), None)])
+            self._left = self._session.close(timeout)
+        return self._left
+
+    def undelivered_message(self) -> str | None:
+        """What did not arrive, where it is kept and how to send it; None where all arrived."""
+        left = self.backlog()
+        if not left:
+            return None
+        command = shlex.join(["python", "-m", "music_rllib.tracking", "deliver"])
+        return (
+            f"{left.records} records and {left.artefacts} artefacts did not reach MLflow at "
+            f"{self.store.public_uri} ({left.error or 'there was no time left'}). They are kept "
+            f"in {self._session.folder}; send them with:\n"
+            f"  {command} {shlex.quote(str(self.sweep_folder))}"
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if kind is None:
+            self.close("FINISHED")
+        else:
+            self.close("FAILED" if issubclass(kind, Exception) else "KILLED")
+
+    def _begin(
+        self, sweep_name: str, config: Mapping[str, object], tags: Mapping[str, object]
+    ) -> None:
+        self._session.begin(
+            Start(
+                time=_milliseconds(time.time()),
+                name=sweep_name,
+                tags={**self._provenance, **self._sweep_tags, **_texts(tags)},
+                params=flat_params(config),
+            )
+        )
+        self.put_sweep_artefact(names.ARTEFACT_SWEEP_CONFIG, _yaml(config))
+
+    def _opening(
+        self, run: RunInfo, when: float, more: Mapping[str, str] | None = None
+    ) -> list[Record]:
+        tags = {**self._provenance, **self._sweep_tags, **_texts(run.tags), **(more or {})}
+        start = Start(
+            time=_milliseconds(when),
+            name=run.name,
+            tags=tags,
+            params=flat_params(run.config),
+            source_node=run.source_node,
+        )
+        return [start, self._metrics(run.settings, 0, when)] if run.settings else [start]
+
+    def _append(self, node_key: str, records: Iterable[Record]) -> None:
+        if node_key not in self._open:
+            self._open[node_key] = self._session.open_run(node_key)
+        self._open[node_key].append(records)
+
+    def _started(self, node_key: str) -> Spool:
+        if node_key not in self._open:
+            raise ValueError(f"start(...) must come before log and finish, for node {node_key!r}")
+        return self._open[node_key]
+
+    def _metrics(self, metrics: Mapping[str, float], env_steps: int, when: float) -> Metrics:
+        for name in metrics:
+            if name not in self._checked_names:
+                _check_metric_name(name)
+                self._checked_names.add(name)
+        values = {name: _number(name, value) for name, value in metrics.items()}
+        return Metrics(time=_milliseconds(when), step=int(env_steps), values=values)
+
+
+def _default_folder(storage: str, sweep_name: str) -> Path:
+    folder = local_folder(storage)
+    if folder is None:
+        raise ValueError(f"sweep_folder must be given where storage is a bucket, got {storage}")
+    return folder / sweep_name
+
+
+def _check_metric_name(name: str) -> None:
+    if len(name) > 250 or not _METRIC_NAME.fullmatch(name):
+        raise ValueError(
+            "a metric's name must have at most 250 letters, digits, '_', '-', '.', ':', spaces, "
+            f"and single slashes between them, got {name!r}"
+        )
+
+
+def _number(name: str, value: float) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"metric {name} must be a number, got {value!r}") from error
+
+
+def _finish(status: Status, when: float, failure: str | None) -> Finish:
+    tags = {} if failure is None else {names.TAG_FAILURE: redact(failure)[:MAX_FAILURE_LENGTH]}
+    return Finish(time=_milliseconds(when), status=status, tags=tags)
+
+
+def _texts(tags: Mapping[str, object]) -> dict[str, str]:
+    return {key: redact(str(value)) for key, value in tags.items() if value is not None}
+
+
+def _yaml(settings: Mapping[str, object]) -> str:
+    plain = json.loads(json.dumps(without_secrets(settings), default=str))
+    return str(yaml.safe_dump(plain, sort_keys=False, allow_unicode=True))
+
+
+def _milliseconds(seconds: float) -> int:
+    return round(seconds * 1000)

@@ -1,0 +1,105 @@
+"""What every test stands on: a fixed environment, the tiers' markers, services, a local Ray."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+# Before anything imports Ray, torch or MLflow: they read these while they are imported, and the
+# programs that tests start inherit them.
+os.environ.update(
+    {
+        # Explicit, because Ray's default depends on what else was run on the machine before.
+        "RAY_AUTH_MODE": "disabled",
+        # More threads change the sums' order and are slower on busy machines.
+        "OMP_NUM_THREADS": "1",
+        "NO_COLOR": "1",
+    }
+)
+for _name in ("FORCE_COLOR", "RAY_ADDRESS", "MLFLOW_TRACKING_URI", "MLFLOW_RUN_ID"):
+    # A test must never reach the developer's own cluster or tracking server.
+    os.environ.pop(_name, None)
+
+import hypothesis
+import pytest
+
+from music_rllib._quiet import prepare_environment, quiet_third_parties
+
+prepare_environment()
+quiet_third_parties()
+
+# No deadline: the machine is shared. Reproducible where a failure cannot be replayed from the
+# local example database.
+hypothesis.settings.register_profile("here", deadline=None)
+hypothesis.settings.register_profile("ci", deadline=None, derandomize=True, print_blob=True)
+_IN_CI = os.environ.get("CI", "").lower() in ("1", "true")
+hypothesis.settings.load_profile("ci" if _IN_CI else "here")
+
+_TESTS = Path(__file__).parent
+_TIERS = {"unit": "unit", "contract": "unit", "integration": "integration", "e2e": "e2e"}
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark each test with its folder's tier, so that ``-m`` works without markers in every file."""
+    for item in items:
+        if item.path.is_relative_to(_TESTS):
+            tier = _TIERS.get(item.path.relative_to(_TESTS).parts[0])
+            if tier is not None:
+                item.add_marker(tier)
+
+
+# Service -> where its program may be: a name on PATH, or a pattern below the root folder.
+_SERVICES = {
+    "postgresql": ("postgres", "usr/lib/postgresql/*/bin/postgres"),
+    "prometheus": ("prometheus",),
+    "chromium": ("chromium", "chromium-browser"),
+}
+
+
+def _find_program(service: str) -> Path | None:
+    for place in _SERVICES[service]:
+        found = shutil.which(place)
+        if found is not None:
+            return Path(found)
+        versions = sorted(Path("/").glob(place)) if "/" in place else []
+        if versions:
+            return versions[-1]
+    return None
+
+
+@pytest.fixture(scope="session")
+def require_service() -> Callable[[str], Path]:
+    """``require_service("postgresql")`` gives the program's path.
+
+    Where it is not installed the test is skipped with the reason; with ``CI=true`` it fails, so
+    that a suite never turns green by leaving things out.
+    """
+
+    def require(service: str) -> Path:
+        program = _find_program(service)
+        if program is not None:
+            return program
+        reason = f"{service} is not installed (Debian: apt-get install {service})"
+        if _IN_CI:
+            pytest.fail(f"{reason}; with CI=true every service must be there", pytrace=False)
+        pytest.skip(reason)
+
+    return require
+
+
+@pytest.fixture(scope="session")
+def local_ray() -> Iterator[None]:
+    """A local Ray with two CPUs, shared by all tests of the session that ask for it."""
+    import ray
+
+    ray.init(
+        address="local",  # never one that happens to run on this machine
+        num_cpus=2,
+        include_dashboard=False,
+        log_to_driver=True,
+        runtime_env={"worker_process_setup_hook": quiet_third_parties},
+    )
+    yield
+    ray.shutdown()

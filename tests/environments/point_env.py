@@ -1,0 +1,66 @@
+"""An environment that costs next to nothing: a point that pushes another one to a goal."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+Array = NDArray[np.float32]
+
+
+class Point(gym.Env[dict[str, Array], Array]):
+    """Observation: agent (2), object (2), which drifts with the agent's actions.
+
+    Args:
+        fail_at: the environment's lifetime step at which it raises; for tests of failures.
+    """
+
+    def __init__(self, fail_at: int | None = None) -> None:
+        self.observation_space = spaces.Dict(
+            {
+                "observation": spaces.Box(-2, 2, (4,), np.float32),
+                "achieved_goal": spaces.Box(-2, 2, (2,), np.float32),
+                "desired_goal": spaces.Box(-2, 2, (2,), np.float32),
+            }
+        )
+        self.action_space = spaces.Box(-1, 1, (2,), np.float32)
+        self._state = np.zeros(4, np.float32)
+        self._goal = np.zeros(2, np.float32)
+        self._fail_at = fail_at
+        self._steps = 0
+
+    def compute_reward(self, achieved: Array, desired: Array, info: Any) -> Array:
+        distance = np.linalg.norm(achieved - desired, axis=-1)
+        return -np.asarray(distance > 0.3, np.float32)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Array], dict[str, Any]]:
+        super().reset(seed=seed)
+        self._state = self.np_random.uniform(-1, 1, 4).astype(np.float32)
+        self._goal = self.np_random.uniform(-1, 1, 2).astype(np.float32)
+        return self._observation(), {}
+
+    def step(self, action: Array) -> tuple[dict[str, Array], float, bool, bool, dict[str, Any]]:
+        self._steps += 1
+        if self._steps == self._fail_at:
+            raise RuntimeError("the gripper fell off\nlook at the second screw")
+        moved = self._state + np.concatenate([0.1 * action, 0.05 * action])
+        self._state = np.clip(moved, -2, 2).astype(np.float32)
+        observation = self._observation()
+        reward = float(self.compute_reward(observation["achieved_goal"], self._goal, {}))
+        return observation, reward, False, False, {"is_success": float(reward == 0)}
+
+    def _observation(self) -> dict[str, Array]:
+        return {
+            "observation": self._state.copy(),
+            "achieved_goal": self._state[2:].copy(),
+            "desired_goal": self._goal.copy(),
+        }
+
+
+gym.register("Point-v0", "point_env:Point", max_episode_steps=20)

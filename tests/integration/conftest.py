@@ -1,0 +1,135 @@
+"""A sweep as a user starts it, on an environment that costs next to nothing."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+REPOSITORY = Path(__file__).parents[2]
+ENVIRONMENTS = Path(__file__).parents[1] / "environments"
+
+POINT: dict[str, Any] = {
+    "env_id": "point_env:Point-v0",
+    "horizon": 20,
+    "agent_indices": [0, 1],
+    "surrounding_indices": [2, 3],
+}
+SWEEP: dict[str, Any] = {
+    "name": "points",
+    "tasks": ["Point"],
+    "storage": "results",
+    "resources": {"num_cpus": 2},
+    "environments": {"Point": POINT},
+    "defaults": {
+        "env_steps": 1200,
+        "num_envs": 2,
+        "evaluation": {"interval": 400, "episodes": 2},
+        "tac": {"random_steps": 200, "hidden_sizes": [16], "batch_size": 16, "replay_ratio": 0.2},
+        "music": {"batch_trajectories": 4, "hidden_size": 16},
+    },
+    "stages": [
+        {"name": "pretrain", "variant": "music-u"},
+        {
+            "name": "finetune",
+            "variant": "music-r",
+            "init_from": "pretrain",
+            "grid": {"tac.entropic_index": [1.0, 2.0]},
+        },
+    ],
+}
+"""A small whole sweep; tests change what they are about."""
+
+
+@dataclass
+class Program:
+    """`python -m music_rllib.sweep` in a folder of its own."""
+
+    folder: Path
+    environment: dict[str, str]
+
+    def write(self, document: dict[str, Any]) -> None:
+        """Put `document` where the program reads it."""
+        (self.folder / "sweep.yaml").write_text(yaml.safe_dump(document, sort_keys=False))
+
+    def start(self, *options: str) -> subprocess.Popen[str]:
+        """Start it, in a process group of its own."""
+        return subprocess.Popen(
+            [sys.executable, "-m", "music_rllib.sweep", "sweep.yaml", *options],
+            cwd=self.folder,
+            env=self.environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+
+    def run(self, *options: str, timeout: float = 240) -> tuple[int, str, str]:
+        """Run it to its end: exit code, standard output, standard error."""
+        process = self.start(*options)
+        try:
+            output, errors = process.communicate(timeout=timeout)
+        finally:
+            end(process)
+        return process.returncode, output, errors
+
+    def start_until(self, wanted: str, timeout: float = 120) -> subprocess.Popen[str]:
+        """Start it and wait for a line with `wanted` in it."""
+        process = self.start()
+        assert process.stdout is not None
+        deadline, seen = time.monotonic() + timeout, []
+        for line in process.stdout:
+            seen.append(line)
+            if wanted in line:
+                return process
+            if time.monotonic() > deadline:
+                break
+        end(process)
+        pytest.fail(f"no {wanted!r} in:\n{''.join(seen)}{process.communicate()[1]}")
+
+
+def end(process: subprocess.Popen[str]) -> None:
+    """End what `Program.start` started, and its children."""
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+
+
+@pytest.fixture
+def sweep_document() -> dict[str, Any]:
+    """A small whole sweep, to change."""
+    return yaml.safe_load(yaml.safe_dump(SWEEP))  # type: ignore[no-any-return]
+
+
+@pytest.fixture
+def sweep_program(tmp_path: Path) -> Program:
+    """The program, with the test environments importable in driver and workers."""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (REPOSITORY, ENVIRONMENTS)))}
+    return Program(tmp_path, environment)
+
+
+@pytest.fixture
+def mlflow_runs(tmp_path: Path) -> Callable[[], dict[str, Any]]:
+    """All runs in the embedded MLflow of `sweep_program`, by name."""
+
+    def runs() -> dict[str, Any]:
+        from mlflow import MlflowClient
+
+        client = MlflowClient(f"sqlite:///{tmp_path}/results/mlflow.db")
+        (experiment,) = [e for e in client.search_experiments() if e.name == "points"]
+        found = client.search_runs([experiment.experiment_id])
+        by_name = {run.info.run_name: run for run in found}
+        assert len(by_name) == len(found), "a run is there twice"
+        return by_name
+
+    return runs

@@ -1,0 +1,154 @@
+"""The episode runner on real environments: whole episodes, seeds, goals, action bounds."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from music_rllib.tac.config import TACConfig
+from music_rllib.tac.env_runner import TrajectoryEnvRunner
+
+
+class Countdown(gym.Env[Any, Any]):
+    """Terminates after a number of steps that its seed determines; its bounds are not -1 and 1."""
+
+    observation_space = gym.spaces.Box(-100.0, 100.0, (2,))
+    action_space = gym.spaces.Box(
+        np.array([-3.0, 10.0], np.float32), np.array([1.0, 30.0], np.float32)
+    )
+
+    def __init__(self, config: Any = None) -> None:
+        self.seen: list[np.ndarray] = []
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.left = int(self.np_random.integers(2, 9))
+        return np.array([self.left, 0.0], np.float32), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.seen.append(action)
+        self.left -= 1
+        return np.array([self.left, 1.0], np.float32), 1.0, self.left == 0, False, {}
+
+
+def runner(
+    env: Any = "FetchPush-v4", *, evaluation: bool = False, seed: int = 0, **settings: Any
+) -> TrajectoryEnvRunner:
+    config = TACConfig().environment(env).debugging(seed=seed)
+    config.env_runners(num_envs_per_env_runner=settings.pop("num_envs", 2))
+    config.music(**{k: settings.pop(k) for k in list(settings) if k in ("goals",)})
+    config.surrounding_indices = (3, 4, 5) if env == "FetchPush-v4" else ()
+    config.training(hidden_sizes=(8,), **settings)
+    config.in_evaluation = evaluation
+    return TrajectoryEnvRunner(
+        config=config, worker_index=0, num_workers=0, env_creator=lambda context: env(context)
+    )
+
+
+def test_fetch_episodes_are_whole_and_aligned() -> None:
+    first, second = runner().sample(random_actions=True)
+    for episode in (first, second):
+        assert episode.frames.shape == (51, 31)
+        assert episode.actions.shape == (50, 4)
+        assert not episode.terminated
+        assert episode.successes is not None
+        # The achieved goal of FetchPush is the object's position, observation[3:6].
+        np.testing.assert_allclose(episode.frames[:, 28:], episode.frames[:, 3:6], atol=1e-6)
+        # The reward after step t belongs to the state t+1 and its goals.
+        distance = np.linalg.norm(episode.frames[1:, 28:] - episode.frames[1:, 25:28], axis=1)
+        np.testing.assert_array_equal(episode.rewards, np.where(distance > 0.05, -1.0, 0.0))
+    assert not np.allclose(first.frames[0, 25:28], second.frames[0, 25:28])
+
+
+def test_every_episode_has_fresh_goals_and_one_seed_fixes_them_all() -> None:
+    def goals(seed: int, evaluation: bool) -> np.ndarray:
+        made = runner(seed=seed, evaluation=evaluation)
+        episodes = made.sample(num_episodes=5) + made.sample(num_episodes=3)
+        return np.stack([episode.frames[0, 25:28] for episode in episodes])
+
+    ours = goals(0, evaluation=False)
+    assert len(np.unique(ours, axis=0)) == 8
+    np.testing.assert_array_equal(ours, goals(0, evaluation=False))
+    for other in (goals(1, evaluation=False), goals(0, evaluation=True)):
+        assert len(np.unique(np.concatenate([ours, other]), axis=0)) == 16
+
+
+def test_music_u_sees_no_goals_in_training_but_real_ones_in_evaluation() -> None:
+    training, evaluating = runner(goals="zero"), runner(goals="zero", evaluation=True)
+    assert all((e.frames[:, 25:28] == 0).all() for e in training.sample())
+    assert all((e.frames[:, 25:28] != 0).any() for e in evaluating.sample())
+
+
+def test_state_between_calls_is_all_there_is() -> None:
+    one, other = runner(), runner()
+    one.sample()
+    other.set_state(one.get_state())
+    for ours, theirs in zip(one.sample(), other.sample(), strict=True):
+        np.testing.assert_array_equal(ours.frames, theirs.frames)
+        np.testing.assert_array_equal(ours.actions, theirs.actions)
+
+
+def test_terminated_episodes_of_different_lengths_and_foreign_action_bounds() -> None:
+    made = runner(Countdown, num_envs=3, max_episode_steps=6)
+    episodes = made.sample(num_episodes=40)
+    assert len(episodes) == 40
+    assert {len(episode) for episode in episodes} == {2, 3, 4, 5, 6}
+    for episode in episodes:
+        started = int(episode.frames[0, 0])
+        assert len(episode) == min(started, 6)
+        assert episode.terminated == (started <= 6)  # longer ones are cut, which is no terminal
+        assert (np.abs(episode.actions) <= 1).all()
+        assert episode.successes is None
+    seen = np.concatenate([env.seen for env in made.envs if isinstance(env, Countdown)])
+    assert (seen >= Countdown.action_space.low).all()
+    assert (seen <= Countdown.action_space.high).all()
+    lowest, highest = seen.min(0), seen.max(0)
+    assert (
+        highest - lowest > 0.5 * (Countdown.action_space.high - Countdown.action_space.low)
+    ).all()
+
+
+def test_number_of_timesteps_and_episodes_are_honoured() -> None:
+    made = runner(Countdown, num_envs=2, max_episode_steps=10)
+    assert len(made.sample(num_episodes=5)) == 5
+    assert sum(map(len, made.sample(num_timesteps=30))) >= 30
+    assert len(made.sample()) == 2
+
+
+def test_noise_of_the_original_music() -> None:
+    noise = {"kind": "gaussian_noise", "std": 0.05, "random_share": 0.3}
+    made = runner(Countdown, num_envs=8, max_episode_steps=10, behaviour=noise)
+    inputs = np.zeros((6000, 2), np.float32)
+    actions = made._act(inputs, explore=True, random_actions=False)
+    mean = made._act(inputs[:1], explore=False, random_actions=False)
+    far = np.abs(actions - mean).max(1) > 5 * 0.05
+    # A uniform action is that near with probability (0.25)^2 at most.
+    assert 0.25 < far.mean() < 0.32
+    assert (actions - mean)[~far].std() == pytest.approx(0.05, abs=0.01)
+    assert (np.abs(actions) <= 1).all()
+
+
+@pytest.mark.parametrize(
+    ("space", "message"),
+    [
+        (gym.spaces.Discrete(3), "must be a bounded one-dimensional Box, got Discrete"),
+        (gym.spaces.Box(-np.inf, np.inf, (2,)), "must be a bounded one-dimensional Box"),
+    ],
+)
+def test_unusable_action_spaces_are_named(space: Any, message: str) -> None:
+    class Odd(Countdown):
+        action_space = space
+
+    with pytest.raises(ValueError, match=message):
+        runner(Odd, max_episode_steps=5)
+
+
+def test_unusable_observations_and_missing_time_limit_are_named() -> None:
+    class Picture(Countdown):
+        observation_space = gym.spaces.Box(0, 255, (8, 8, 3))
+
+    with pytest.raises(ValueError, match="must be a one-dimensional Box, or a Dict"):
+        runner(Picture, max_episode_steps=5)
+    with pytest.raises(ValueError, match=r"max_episode_steps must be set: the environment has no"):
+        runner(Countdown)

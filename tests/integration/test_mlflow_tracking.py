@@ -1,0 +1,509 @@
+"""Tracking against real MLflow stores: an sqlite file, and servers that are killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+from urllib.request import urlopen
+
+import pytest
+from mlflow import MlflowClient
+from mlflow.entities import Run
+from typer.testing import CliRunner
+
+from music_rllib.tracking import Point, RunInfo, Tracker, TrackingError, deliver, names
+from music_rllib.tracking.__main__ import app
+
+MakeTracker = Callable[..., Tracker]
+STEPS = list(range(2000, 22_000, 2000))
+
+
+def values(step: int) -> dict[str, float]:
+    return {
+        names.EVAL_SUCCESS: step / 100_000,
+        names.EVAL_SUCCESS_ANY: step / 50_000,
+        names.MI_BOUND: step / 200_000,
+        names.SYSTEM_MEMORY: 900.0,
+    }
+
+
+def run_info(node_key: str, **changes: object) -> RunInfo:
+    fields: dict[str, object] = {
+        "node_key": node_key,
+        "name": f"finetune/{node_key}",
+        "config": {"tac": {"entropic_index": 1.5}, "seed": 0},
+        "tags": {names.TAG_TASK: "FetchPush", names.TAG_SEED: 0, names.TAG_TRIAL: None},
+        "settings": {names.SETTING_ENTROPIC_INDEX: 1.5},
+    }
+    return RunInfo(**{**fields, **changes})  # type: ignore[arg-type]
+
+
+class FreshStore(NamedTuple):
+    """A store that a first sweep made, and what a user saw of that."""
+
+    database: Path
+    screen: str
+
+
+@pytest.fixture(scope="module")
+def fresh_store(tmp_path_factory: pytest.TempPathFactory) -> FreshStore:
+    """Made once: MLflow's tables take seconds, copying the file does not."""
+    folder = tmp_path_factory.mktemp("first")
+    code = (
+        "import sys; from music_rllib.tracking import Tracker; "
+        "Tracker(sweep_name='first', storage=sys.argv[1], config={}).close()"
+    )
+    command = [sys.executable, "-c", code, str(folder)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    return FreshStore(folder / "mlflow.db", done.stdout + done.stderr)
+
+
+@pytest.fixture
+def storage(tmp_path: Path, fresh_store: FreshStore) -> Path:
+    folder = tmp_path / "results"
+    folder.mkdir()
+    shutil.copy(fresh_store.database, folder)
+    return folder
+
+
+@pytest.fixture
+def tracker_on(storage: Path) -> Iterator[MakeTracker]:
+    """Opens trackers on the test's storage, and lets go of those that a test left open."""
+    opened: list[Tracker] = []
+
+    def make(**changes: object) -> Tracker:
+        fields: dict[str, object] = {
+            "sweep_name": "smoke",
+            "storage": str(storage),
+            "config": {"name": "smoke", "seeds": [0]},
+        }
+        opened.append(Tracker(**{**fields, **changes}))  # type: ignore[arg-type]
+        return opened[-1]
+
+    yield make
+    for tracker in opened:
+        tracker.close(timeout=0.0)
+
+
+def client_of(storage: Path) -> MlflowClient:
+    return MlflowClient(f"sqlite:///{storage}/mlflow.db")
+
+
+def runs_of(client: MlflowClient, experiment: str = "smoke") -> dict[str, Run]:
+    """The experiment's runs by name; a run that is there twice is a failure."""
+    found = client.get_experiment_by_name(experiment)
+    assert found is not None
+    runs = list(client.search_runs([found.experiment_id]))
+    by_name = {run.info.run_name: run for run in runs}
+    assert len(by_name) == len(runs), [run.info.run_name for run in runs]
+    return by_name
+
+
+def logged_steps(client: MlflowClient, run: Run, metric: str = names.EVAL_SUCCESS) -> list[int]:
+    return [point.step for point in client.get_metric_history(run.info.run_id, metric)]
+
+
+def artefacts_of(client: MlflowClient, run: Run, folder: str | None = None) -> set[str]:
+    return {item.path for item in client.list_artifacts(run.info.run_id, folder)}
+
+
+# An embedded store ------------------------------------------------------------------------------
+
+
+def test_a_sweep_as_mlflow_shows_it(storage: Path, tracker_on: MakeTracker, tmp_path: Path) -> None:
+    result = tmp_path / "result.json"
+    result.write_text("{}")
+    tracker = tracker_on(
+        config={"seeds": [0], "mlflow": {"tracking_uri": "http://me:hunter2@mlflow"}},
+        tags={names.TAG_CONFIG_HASH: "c0ffee"},
+    )
+    tracker.start(run_info("pre"))
+    tracker.log("pre", values(2000), env_steps=2000, timestamp=1_700_000_000.25)
+    tracker.finish("pre", "FINISHED", artefacts={"result.json": result})
+    tracker.start(run_info("fine", source_node="pre"))
+    tracker.finish("fine", "FAILED", failure="ValueError: http://me:hunter2@host is down")
+    assert tracker.flush(20.0)
+    assert tracker.run_id("fine") is not None
+    assert not tracker.close("FAILED")
+
+    client = client_of(storage)
+    runs = runs_of(client)
+    parent, pre, fine = runs["smoke"], runs["finetune/pre"], runs["finetune/fine"]
+    assert [run.info.status for run in (parent, pre, fine)] == ["FAILED", "FINISHED", "FAILED"]
+    assert {run.data.tags[names.TAG_PARENT_RUN] for run in (pre, fine)} == {parent.info.run_id}
+    assert parent.data.tags[names.TAG_CONFIG_HASH] == "c0ffee"
+    assert pre.data.params == {"tac.entropic_index": "1.5", "seed": "0"}
+    assert pre.data.tags[names.TAG_TASK] == "FetchPush"
+    assert pre.data.tags[names.TAG_VERSION_PREFIX + "torch"]
+    assert pre.data.metrics == {**values(2000), names.SETTING_ENTROPIC_INDEX: 1.5}
+    (point,) = client.get_metric_history(pre.info.run_id, names.EVAL_SUCCESS)
+    assert (point.step, point.timestamp) == (2000, 1_700_000_000_250)
+    assert fine.data.tags[names.TAG_SOURCE_RUN] == pre.info.run_id
+    assert artefacts_of(client, pre) == {"config", names.ARTEFACT_LEARNING_CURVE, "result.json"}
+    assert artefacts_of(client, parent, "config") == {names.ARTEFACT_SWEEP_CONFIG}
+
+    assert (storage / "mlartifacts" / "smoke" / pre.info.run_id).is_dir()
+    assert fine.data.tags[names.TAG_FAILURE] == "ValueError: http://host is down"
+    for path in storage.rglob("*"):
+        assert path.is_dir() or b"hunter2" not in path.read_bytes(), path
+
+
+def test_a_resumed_sweep_continues_its_runs(storage: Path, tracker_on: MakeTracker) -> None:
+    first = tracker_on()
+    first.start(run_info("a"))
+    for step in STEPS[:6]:
+        first.log("a", values(step), step)
+    first.close("KILLED")
+    client = client_of(storage)
+    cut = runs_of(client)["finetune/a"]
+    assert cut.info.status == "KILLED"
+
+    second = tracker_on(config={"name": "smoke", "seeds": [0, 1]})
+    second.start(run_info("a"))
+    for step in STEPS[3:]:  # from its last checkpoint
+        second.log("a", values(step), step)
+    assert second.flush(20.0)
+    assert {run.info.status for run in runs_of(client).values()} == {"RUNNING"}
+    second.finish("a", "FINISHED")
+    second.close()
+
+    runs = runs_of(client)
+    assert runs["finetune/a"].info.run_id == cut.info.run_id
+    assert runs["finetune/a"].info.status == "FINISHED"
+    for metric in values(0):
+        assert logged_steps(client, runs["finetune/a"], metric) == STEPS
+    assert runs["smoke"].data.params["seeds"] == "[0]"
+    assert runs["smoke"].data.tags[names.TAG_CHANGED_PREFIX + "seeds"] == "[0, 1]"
+
+
+@pytest.mark.parametrize("lost", ["offset", "delivered.json", "spool.jsonl", "everything"])
+def test_what_was_lost_makes_neither_a_second_run_nor_a_second_value(
+    storage: Path, tracker_on: MakeTracker, lost: str
+) -> None:
+    """As on another machine, where only the bucket and the server are the same."""
+    first = tracker_on(sweep_id="in-the-bucket")
+    first.start(run_info("a"))
+    for step in STEPS[:6]:
+        first.log("a", values(step), step)
+    first.close("KILLED")
+    spools = storage / "smoke" / "tracking"
+    if lost == "everything":
+        shutil.rmtree(spools)
+    elif lost == "offset":  # a driver that is killed between sending and remembering
+        delivered = spools / "runs" / "a" / "delivered.json"
+        run_id = json.loads(delivered.read_text())["run_id"]
+        delivered.write_text(json.dumps({"run_id": run_id, "offset": 0, "records": 0}))
+    else:
+        (spools / "runs" / "a" / lost).unlink()
+
+    second = tracker_on(sweep_id="in-the-bucket")
+    second.start(run_info("a"))
+    for step in STEPS:
+        second.log("a", values(step), step)
+    second.finish("a", "FINISHED")
+    assert not second.close()
+
+    client = client_of(storage)
+    run = runs_of(client)["finetune/a"]
+    assert logged_steps(client, run) == STEPS
+    assert logged_steps(client, run, names.SETTING_ENTROPIC_INDEX) == [0]
+
+
+def test_a_failed_run_that_succeeds_later_shows_no_failure(
+    storage: Path, tracker_on: MakeTracker
+) -> None:
+    tracker = tracker_on()
+    for status, failure in (("FAILED", "no luck"), ("FINISHED", None)):
+        tracker.start(run_info("a"))
+        tracker.finish("a", status, failure=failure)  # type: ignore[arg-type]
+        assert tracker.flush(20.0)
+    run = runs_of(client_of(storage))["finetune/a"]
+    assert run.info.status == "FINISHED"
+    assert names.TAG_FAILURE not in run.data.tags
+
+
+def test_a_sweep_that_was_deleted_and_begun_anew_has_runs_of_its_own(
+    storage: Path, tracker_on: MakeTracker
+) -> None:
+    parents = []
+    for _ in range(2):
+        tracker = tracker_on()
+        parents.append(tracker.parent_run_id)
+        tracker.close()
+        shutil.rmtree(storage / "smoke")
+    assert parents[0] != parents[1]
+
+
+def test_a_reused_node_comes_with_its_history_once(storage: Path, tracker_on: MakeTracker) -> None:
+    history = [Point(env_steps=s, timestamp=1.7e9 + s, metrics=values(s)) for s in STEPS]
+    tracker = tracker_on()
+    assert tracker.log_history(run_info("old"), history)
+    assert not tracker.log_history(run_info("old"), history)
+    tracker.start(run_info("new", source_node="old"))
+    tracker.finish("new", "FINISHED")
+    tracker.close()
+    again = tracker_on()
+    assert not again.log_history(run_info("old"), history)
+    again.close()
+
+    client = client_of(storage)
+    runs = runs_of(client)
+    old = runs["finetune/old"]
+    assert logged_steps(client, old) == STEPS
+    assert (old.info.start_time, old.info.end_time) == (1_700_002_000_000, 1_700_020_000_000)
+    assert old.data.tags[names.TAG_REUSED] == "true"
+    assert runs["finetune/new"].data.tags[names.TAG_SOURCE_RUN] == old.info.run_id
+
+
+def test_more_metrics_than_one_request_may_hold(storage: Path, tracker_on: MakeTracker) -> None:
+    tracker = tracker_on()
+    tracker.start(run_info("a", config={f"p{i:03}": i for i in range(150)}))
+    for step in range(1, 8):
+        tracker.log("a", {f"group/{i:03}": float(step) for i in range(400)}, step)
+    tracker.log("a", {f"wide/{i:04}": 1.0 for i in range(1500)}, 8)
+    tracker.log("a", {"odd/nan": float("nan")}, 9)
+    assert not tracker.close()
+    client = client_of(storage)
+    run = runs_of(client)["finetune/a"]
+    assert len(run.data.params) == 150
+    assert len(run.data.metrics) == 400 + 1500 + 1 + 1
+    assert logged_steps(client, run, "group/399") == list(range(1, 8))
+
+
+def test_several_threads_may_log(storage: Path, tracker_on: MakeTracker) -> None:
+    tracker = tracker_on()
+
+    def one_run(node_key: str) -> None:
+        tracker.start(run_info(node_key))
+        for step in STEPS:
+            tracker.log(node_key, values(step), step)
+        tracker.finish(node_key, "FINISHED")
+
+    threads = [threading.Thread(target=one_run, args=(key,)) for key in "abcd"]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    tracker.close()
+    client = client_of(storage)
+    runs = runs_of(client)
+    for key in "abcd":
+        assert logged_steps(client, runs[f"finetune/{key}"]) == STEPS
+
+
+def test_a_deleted_run_does_not_hold_up_the_others(
+    storage: Path, tracker_on: MakeTracker, caplog: pytest.LogCaptureFixture
+) -> None:
+    tracker = tracker_on()
+    for key in ("gone", "kept"):
+        tracker.start(run_info(key))
+        tracker.log(key, values(2000), 2000)
+    assert tracker.flush(20.0)
+    client = client_of(storage)
+    client.delete_run(runs_of(client)["finetune/gone"].info.run_id)
+    for key in ("gone", "kept"):
+        tracker.log(key, values(4000), 4000)
+        tracker.finish(key, "FINISHED")
+    left = tracker.close(timeout=20.0)
+    assert left.records == 2  # the values and the end of the deleted run
+    assert "refuses" in caplog.text
+    message = tracker.undelivered_message()
+    assert message is not None
+    assert "python -m music_rllib.tracking deliver" in message
+
+    assert not deliver(storage / "smoke", None, 20.0)  # it gets a new run, with all it had
+    runs = runs_of(client)
+    assert logged_steps(client, runs["finetune/kept"]) == [2000, 4000]
+    assert logged_steps(client, runs["finetune/gone"]) == [2000, 4000]
+
+
+def test_a_second_driver_is_refused_until_the_first_lets_go(tracker_on: MakeTracker) -> None:
+    first = tracker_on()
+    with pytest.raises(TrackingError, match="one process at a time"):
+        tracker_on()
+    first.close()
+    tracker_on().close()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "rule"),
+    [
+        ("a@b", 1.0, "letters"),
+        ("/a", 1.0, "letters"),
+        ("a/../b", 1.0, "letters"),
+        ("a", "x", "number"),
+    ],
+)
+def test_what_mlflow_would_refuse_later_is_refused_at_once(
+    tracker_on: MakeTracker, name: str, value: float, rule: str
+) -> None:
+    tracker = tracker_on()
+    tracker.start(run_info("a"))
+    with pytest.raises(ValueError, match=rule):
+        tracker.log("a", {name: value}, 1)
+    with pytest.raises(ValueError, match="must come before"):
+        tracker.log("b", {"a": 1.0}, 1)
+
+
+def test_a_newcomers_screen_stays_clean(fresh_store: FreshStore) -> None:
+    assert fresh_store.screen == ""
+
+
+# A driver that is killed ------------------------------------------------------------------------
+
+DRIVER = """
+import sys, time
+from music_rllib.tracking import Tracker, RunInfo, names
+tracker = Tracker(sweep_name="smoke", storage=sys.argv[1], config={"name": "smoke", "seeds": [0]})
+tracker.start(RunInfo(node_key="a", name="finetune/a", config={"seed": 0}))
+for step in range(1, 10_000):
+    tracker.log("a", {names.EVAL_SUCCESS: float(step)}, step)
+    print(step, flush=True)
+    time.sleep(0.002)
+"""
+
+
+def test_a_killed_driver_leaves_neither_gaps_nor_duplicates(
+    storage: Path, tracker_on: MakeTracker
+) -> None:
+    command = [sys.executable, "-c", DRIVER, str(storage)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as driver:
+        assert driver.stdout is not None
+        reached = next(int(line) for line in driver.stdout if int(line) >= 300)
+        driver.kill()  # SIGKILL, with a request under way as likely as not
+
+    tracker = tracker_on()
+    tracker.start(run_info("a", config={"seed": 0}, settings={}))
+    for step in range(reached - 100, reached + 50):
+        tracker.log("a", {names.EVAL_SUCCESS: float(step)}, step)
+    tracker.finish("a", "FINISHED")
+    assert not tracker.close()
+    client = client_of(storage)
+    points = client.get_metric_history(
+        runs_of(client)["finetune/a"].info.run_id, names.EVAL_SUCCESS
+    )
+    last = max(point.step for point in points)
+    assert last >= reached + 49
+    assert [point.step for point in points] == list(range(1, last + 1))
+    assert all(point.value == point.step for point in points)
+
+
+# A server that is killed ------------------------------------------------------------------------
+
+
+class Server:
+    """``mlflow server`` on a fixed port, which can be killed and started again."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            self.port = probe.getsockname()[1]
+        self.uri = f"http://127.0.0.1:{self.port}"
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> None:
+        command = [sys.executable, "-m", "mlflow", "server", "--workers", "1"]
+        command += ["--host", "127.0.0.1", "--port", str(self.port)]
+        command += ["--backend-store-uri", f"sqlite:///{self.folder}/mlflow.db"]
+        command += ["--artifacts-destination", str(self.folder / "artefacts")]
+        with (self.folder / "server.log").open("ab") as log:
+            self._process = subprocess.Popen(
+                command,
+                env={**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"},
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+            )
+
+    def signal(self, number: signal.Signals) -> None:
+        """To the server and its worker: the group of the process that was started here."""
+        if self._process is None:
+            return
+        os.killpg(self._process.pid, number)
+        if number == signal.SIGKILL:
+            self._process.wait()
+            self._process = None
+
+    def wait(self) -> None:
+        """Until it answers."""
+        deadline = time.monotonic() + 60
+        while time.monotonic() < deadline:
+            assert self._process is not None
+            if self._process.poll() is not None:
+                break
+            try:
+                with urlopen(f"{self.uri}/health", timeout=2):
+                    return
+            except OSError:
+                time.sleep(0.1)
+        pytest.fail("the server did not start: " + (self.folder / "server.log").read_text())
+
+
+@pytest.fixture(scope="module", autouse=True)
+def server(tmp_path_factory: pytest.TempPathFactory, fresh_store: FreshStore) -> Iterator[Server]:
+    """Started before the first test, since it takes long to come up; the last test waits."""
+    folder = tmp_path_factory.mktemp("server")
+    shutil.copy(fresh_store.database, folder)
+    server = Server(folder)
+    server.start()
+    yield server
+    server.signal(signal.SIGKILL)
+
+
+def test_a_server_killed_while_logging_loses_and_doubles_nothing(
+    server: Server, tracker_on: MakeTracker, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Killed and started again mid-way; later it hangs, and the rest is sent by command."""
+    server.wait()
+    tracker = tracker_on(tracking_uri=server.uri)
+    tracker.start(run_info("a"))
+    steps = list(range(1, 401))
+    for step in steps[:100]:
+        tracker.log("a", values(step), step)
+        time.sleep(0.005)
+    server.signal(signal.SIGKILL)
+    for step in steps[100:200]:
+        tracker.log("a", values(step), step)
+    tracker.start(run_info("b"))  # a run whose first word meets a dead server
+    tracker.log("b", values(1), 1)
+    assert not tracker.flush(1.0)
+    assert tracker.backlog().error is not None
+
+    server.start()
+    server.wait()
+    assert tracker.flush(30.0), tracker.backlog()
+    assert caplog.text.count("does not accept records") == 1
+    url = tracker.run_url("a")
+    assert url is not None
+    assert url.startswith(f"{server.uri}/#/experiments/")
+
+    server.signal(signal.SIGSTOP)
+    for step in steps[200:]:
+        tracker.log("a", values(step), step)
+    for key in ("a", "b"):
+        tracker.finish(key, "FINISHED")
+    left = tracker.close(timeout=1.0)
+    assert left.records > 0
+    server.signal(signal.SIGCONT)
+    done = CliRunner().invoke(app, ["deliver", str(tracker.sweep_folder)])
+    everything = f"MLflow has everything of {tracker.sweep_folder}\n"
+    assert (done.exit_code, done.output) == (0, everything)
+
+    client = MlflowClient(server.uri)
+    runs = runs_of(client)
+    assert {run.info.status for run in runs.values()} == {"FINISHED"}
+    for metric in values(0):
+        assert logged_steps(client, runs["finetune/a"], metric) == steps
+    assert logged_steps(client, runs["finetune/b"]) == [1]
+    assert names.ARTEFACT_LEARNING_CURVE in artefacts_of(client, runs["finetune/a"])

@@ -1,0 +1,357 @@
+"""Reports on a sweep that was logged to a real MLflow store, and their page in a real browser."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, get_args
+from urllib.request import urlopen
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from music_rllib.experiment.config import load_sweep
+from music_rllib.experiment.plan import Node, make_plan
+from music_rllib.reports.archive import Format, read_archive
+from music_rllib.reports.build import PAGE
+from music_rllib.reports.cli import app
+from music_rllib.reports.data import Sweep
+from music_rllib.reports.locate import find_sweep
+from music_rllib.reports.query import read_mlflow
+from music_rllib.sweep.logbook import run_info
+from music_rllib.tracking import Tracker, names, resolve_store
+
+STEPS = range(20_000, 100_001, 20_000)
+CONFIG = """
+name: tiny
+tasks: [FetchPush]
+seeds: [0, 1]
+storage: unused
+defaults:
+  env_steps: 100000
+  evaluation: {interval: 20000, episodes: 10}
+stages:
+  - name: pretrain
+    variant: music-u
+  - name: finetune
+    variant: music-r
+    init_from: pretrain
+    grid: {tac.entropic_index: [1.0, 1.5]}
+"""
+FAILED = 3
+"""Position of the run that failed."""
+FAILURE = "ValueError: the <simulation> broke"
+
+
+def values(node: Node, step: int) -> dict[str, float]:
+    final = {"finetune": 0.9, "pretrain": 0.1}[node.stage] - 0.05 * node.run.seed
+    return {
+        names.EVAL_SUCCESS: final * step / STEPS[-1],
+        names.EVAL_SUCCESS_ANY: min(1.0, final * step / STEPS[-1] + 0.05),
+        names.MI_BOUND: 0.5 * step / STEPS[-1],
+        names.MI_REWARD: -0.5,
+        names.ENTROPY: 1.0 - step / 2e5,
+        names.SHANNON_ENTROPY: 2.0 - step / 2e5,
+        names.ENV_STEPS: float(step),
+        names.Q_MEAN: [np.nan, np.inf, -np.inf, 1e-300, -0.1][STEPS.index(step)],
+    }
+
+
+@pytest.fixture(scope="module")
+def nodes(tmp_path_factory: pytest.TempPathFactory) -> list[Node]:
+    file = tmp_path_factory.mktemp("config") / "tiny.yaml"
+    file.write_text(CONFIG)
+    return list(make_plan(load_sweep(file)).nodes)
+
+
+@pytest.fixture(scope="module")
+def sweep_folder(nodes: list[Node], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sweep of two stages; of its six runs one failed and the last has not begun."""
+    storage = tmp_path_factory.mktemp("results")
+    file = storage / "tiny.yaml"
+    file.write_text(CONFIG)
+    with Tracker(
+        sweep_name="tiny", storage=str(storage), config=load_sweep(file).document
+    ) as tracker:
+        for node in nodes[:-1]:
+            failed = node is nodes[FAILED]
+            tracker.start(run_info(node))
+            for step in STEPS[:2] if failed else STEPS:
+                tracker.log(node.key, values(node, step), step, 1.7e9 + step)
+            if failed:
+                tracker.finish(node.key, "FAILED", failure=FAILURE)
+            else:
+                tracker.finish(node.key, "FINISHED")
+    return storage / "tiny"
+
+
+@pytest.fixture(scope="module")
+def page(sweep_folder: Path) -> Path:
+    """As a user makes it."""
+    done = subprocess.run(
+        [sys.executable, "-m", "music_rllib.report", str(sweep_folder)],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    assert not done.stderr
+    path = sweep_folder / "report" / PAGE
+    assert done.stdout.splitlines()[-1] == f"Report: {path}"
+    assert "missing: 1 run not begun: finetune/FetchPush/" in done.stdout
+    assert "finetune: No winner on FetchPush" in done.stdout
+    return path
+
+
+def run(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def check_content(sweep: Sweep, nodes: list[Node]) -> None:
+    """Everything that was logged, and nothing else."""
+    assert [record.node_key for record in sweep.runs] == [node.key for node in nodes[:-1]]
+    assert [record.status for record in sweep.runs[FAILED:]] == ["FAILED", "FINISHED"]
+    assert sweep.runs[FAILED].failure == FAILURE
+    assert sweep.runs[0].budget == 100_000
+    assert "init_from: pretrain" in str(sweep.config)
+    for position, node in enumerate(nodes[:-1]):
+        logged = STEPS[:2] if position == FAILED else STEPS
+        for metric in values(node, STEPS[0]):
+            steps, found = sweep.series(position, metric)
+            assert steps.tolist() == list(logged)
+            np.testing.assert_array_equal(found, [values(node, step)[metric] for step in logged])
+        assert sweep.last_step(position) == logged[-1]
+    assert sweep.history[names.EVAL_SUCCESS].time[0] == round((1.7e9 + STEPS[0]) * 1000)
+
+
+# Reading ----------------------------------------------------------------------------------------
+
+
+def test_what_was_logged_is_what_is_read(sweep_folder: Path, nodes: list[Node]) -> None:
+    check_content(find_sweep(str(sweep_folder)).sweep, nodes)
+    by_name = find_sweep("tiny", storage=str(sweep_folder.parent), metrics=[names.MI_BOUND])
+    assert set(by_name.sweep.history) == {names.MI_BOUND}
+    assert by_name.undelivered == 0
+
+
+@pytest.mark.parametrize("table_format", get_args(Format))
+def test_an_exported_sweep_is_the_same_sweep(
+    table_format: str, sweep_folder: Path, nodes: list[Node], tmp_path: Path
+) -> None:
+    exported = tmp_path / "published"
+    assert run(sweep_folder, "--export", exported, "--format", table_format).exit_code == 0
+    check_content(read_archive(exported), nodes)
+    original, again = find_sweep(str(sweep_folder)).sweep, read_archive(exported)
+    assert [vars(record) for record in again.runs] == [vars(record) for record in original.runs]
+    assert {f"metrics.{table_format}", f"runs.{table_format}", "sweep.json"} == {
+        path.name for path in exported.iterdir()
+    }
+    (exported / f"metrics.{table_format}").unlink()
+    broken = run(exported)
+    assert broken.exit_code == 2
+    assert f"{exported} must hold an exported sweep" in broken.stderr
+
+
+def test_a_report_needs_neither_ray_nor_mlflow_for_an_exported_sweep(
+    sweep_folder: Path, page: Path, tmp_path: Path
+) -> None:
+    exported = tmp_path / "published"
+    run(sweep_folder, "--export", exported)
+    code = (
+        "import sys; sys.modules['ray'] = sys.modules['mlflow'] = None\n"
+        "from music_rllib.reports.cli import app; app(sys.argv[1:], standalone_mode=False)"
+    )
+    command = [sys.executable, "-c", code, str(exported)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 0, done.stderr
+    for name in ("final_success", "runs", "curves"):
+        tables = (page.parent, exported / "report")
+        one, other = ((folder / "tables" / f"{name}.csv").read_text() for folder in tables)
+        assert one == other
+
+
+def test_the_report_is_attached_to_the_sweep_s_run(sweep_folder: Path, page: Path) -> None:
+    """`page` is made first: both write the same files."""
+    done = run(sweep_folder, "--attach")
+    sweep = find_sweep(str(sweep_folder)).sweep
+    assert f"Attached to the sweep's run in MLflow: run {sweep.run_id}" in done.stdout
+    kept = sweep_folder.parent / "mlartifacts" / "tiny" / sweep.run_id / "artifacts" / "report"
+    assert (kept / PAGE).read_bytes() == page.read_bytes()
+    assert (kept / "figures" / "finetune-success-rate.svg").is_file()
+
+
+def test_there_is_no_such_sweep(sweep_folder: Path, tmp_path: Path) -> None:
+    other = run("other", "--storage", sweep_folder.parent)
+    assert other.exit_code == 2
+    assert "'other' must be a sweep in MLflow at sqlite:///" in other.stderr
+    assert "It has: tiny." in other.stderr
+    nothing = run("tiny", "--storage", tmp_path)
+    assert nothing.exit_code == 2
+    assert f"{tmp_path}/mlflow.db must be the sqlite file" in nothing.stderr
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture
+def server(sweep_folder: Path) -> Iterator[str]:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    command = [sys.executable, "-m", "mlflow", "server", "--port", str(port), "--workers", "1"]
+    store = f"sqlite:///{sweep_folder.parent}/mlflow.db"
+    process = subprocess.Popen(
+        [*command, "--backend-store-uri", store],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"},
+        start_new_session=True,
+    )
+    url = f"http://127.0.0.1:{port}"
+    try:
+        for _ in range(600):
+            try:
+                urlopen(f"{url}/health", timeout=1).close()
+                break
+            except OSError:
+                assert process.poll() is None
+                time.sleep(0.1)
+        yield url
+    finally:
+        os.killpg(process.pid, signal.SIGTERM)
+        process.wait(20)
+
+
+def test_a_server_gives_the_same_as_its_database(server: str, nodes: list[Node]) -> None:
+    sweep = read_mlflow(resolve_store(server, "unused"), "tiny")
+    check_content(sweep, nodes)
+    assert sweep.url(sweep.run_id) == f"{server}/#/experiments/{sweep.experiment_id}/runs/" + (
+        sweep.run_id
+    )
+
+
+# In a browser -----------------------------------------------------------------------------------
+
+MEASURE = """<script>
+addEventListener("load", () => {
+  const sizes = [...document.querySelectorAll(".panels svg")].map((svg) => {
+    const box = svg.getBoundingClientRect();
+    const texts = [...svg.querySelectorAll("text")].map((t) => t.getBoundingClientRect());
+    return {
+      width: box.width,
+      text: Math.min(...texts.map((t) => Math.min(t.height, t.width))),
+      outside: texts.filter((t) => t.left < box.left - 1 || t.right > box.right + 1).length,
+    };
+  });
+  const ink = getComputedStyle(document.querySelector(".panels svg text")).fill;
+  const seen = { page: document.documentElement.scrollWidth, sizes, ink };
+  parent.postMessage(JSON.stringify(seen), "*");
+});
+</script>"""
+# A headless window is never narrower than 500 px; a frame is.
+FRAME = """<iframe src="measured.html" style="width: {width}px; height: 2000px; border: 0"></iframe>
+<script>
+addEventListener("message", (event) => {{ document.body.dataset.seen = event.data; }});
+</script>
+"""
+
+
+_OWN = "not an origin"
+
+
+class Browser:
+    """Headless Chromium, each time with a profile of its own."""
+
+    def __init__(self, program: Path, folder: Path) -> None:
+        self._program = program
+        self._folder = folder
+
+    def open(self, page: Path, *, dark: bool = False) -> str:
+        """The page's elements once it is loaded; `console` and `requests` say what happened."""
+        shutil.rmtree(self._folder / "profile", ignore_errors=True)
+        log = self._folder / "net.json"
+        done = subprocess.run(
+            [
+                self._program,
+                *("--headless", "--no-sandbox", "--disable-gpu", "--no-first-run"),
+                *("--disable-background-networking", "--disable-component-update"),
+                *("--disable-sync", "--hide-scrollbars", "--enable-logging=stderr"),
+                f"--user-data-dir={self._folder / 'profile'}",
+                f"--log-net-log={log}",
+                # Whatever asks for the network gets no answer.
+                "--host-resolver-rules=MAP * ~NOTFOUND",
+                "--window-size=1300,2400",
+                f"--blink-settings=preferredColorScheme={0 if dark else 1}",
+                "--dump-dom",
+                page.as_uri(),
+            ],
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=60,
+        )
+        self.console = [line for line in done.stderr.splitlines() if "CONSOLE" in line]
+        self.requests = {
+            found["url"]
+            for event in json.loads(log.read_text())["events"]
+            if not (found := event.get("params", {})).get("url", "file:").startswith("file:")
+            # Chromium asks for its own updates, whatever its options say.
+            and found.get("initiator", _OWN) != _OWN
+        }
+        return done.stdout
+
+
+@pytest.fixture
+def browser(require_service: Callable[[str], Path], tmp_path: Path) -> Browser:
+    return Browser(require_service("chromium"), tmp_path)
+
+
+def test_the_page_opens_without_an_error_and_without_the_network(
+    browser: Browser, page: Path
+) -> None:
+    dom = browser.open(page)
+    assert not browser.console
+    assert not browser.requests
+    for title in ("success-rate", "mutual-information-bound", "tsallis-entropy-of-the-policy"):
+        assert f'<figure id="finetune-{title}"' in dom
+    assert "the &lt;simulation&gt; broke" in dom
+
+
+def test_the_console_and_the_network_are_watched(browser: Browser, tmp_path: Path) -> None:
+    """The test above could not fail otherwise."""
+    bad = tmp_path / "bad.html"
+    bad.write_text('<img src="http://127.0.0.1:9/x.png"><script>nothing.there()</script>')
+    browser.open(bad)
+    assert any("nothing is not defined" in line for line in browser.console)
+    assert browser.requests == {"http://127.0.0.1:9/x.png"}
+
+
+@pytest.mark.parametrize("width, dark", [(400, False), (1200, True)])
+def test_figures_are_readable(
+    browser: Browser, page: Path, tmp_path: Path, width: int, dark: bool
+) -> None:
+    """Nothing is wider than the window, no text of a figure is cut or too small."""
+    copy = tmp_path / "measured.html"
+    html = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", page.read_text())
+    copy.write_text(html.replace("</body>", f"{MEASURE}</body>"))
+    frame = tmp_path / "frame.html"
+    frame.write_text(FRAME.format(width=width))
+    dom = browser.open(frame, dark=dark)
+    found = re.search(r'data-seen="([^"]*)"', dom)
+    assert found is not None
+    seen: dict[str, Any] = json.loads(found[1].replace("&quot;", '"'))
+    assert seen["page"] <= width
+    assert len(seen["sizes"]) >= 8
+    assert all(size["width"] >= 330 for size in seen["sizes"])
+    assert min(size["text"] for size in seen["sizes"]) >= 5  # a lone digit is narrow
+    assert not any(size["outside"] for size in seen["sizes"])
+    assert seen["ink"] == ("rgb(230, 230, 230)" if dark else "rgb(26, 26, 26)")

@@ -1,0 +1,181 @@
+"""A whole sweep with a local Ray and an embedded MLflow, as a user starts it."""
+
+import json
+import re
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mlflow import MlflowClient
+
+from music_rllib.tracking import names
+
+pytestmark = pytest.mark.integration
+
+Document = dict[str, Any]
+Runs = Callable[[], dict[str, Any]]
+
+
+EXPECTED = re.compile(
+    r"\[ *\d+:\d\d\] (pretrain/|finetune/|starting a local Ray$)"
+    r"|[│┃┏┡└]|Sweep |Results |Storage: |3 runs, |Open MLflow's pages with: "
+)
+"""Lines of a sweep in which nothing goes wrong."""
+
+
+def rows(output: str) -> list[list[str]]:
+    """Cells of the table of results."""
+    table = output[output.index("Results of") :]
+    lines = [line for line in table.splitlines() if line.startswith("│")]
+    return [[cell.strip() for cell in line.strip("│").split("│")] for line in lines]
+
+
+def metric_steps(folder: Path, run: Any, name: str = names.ENV_STEPS) -> list[int]:
+    client = MlflowClient(f"sqlite:///{folder}/results/mlflow.db")
+    return [metric.step for metric in client.get_metric_history(run.info.run_id, name)]
+
+
+def test_a_sweep_from_the_plan_to_mlflow_and_then_a_finer_one(
+    sweep_program: Any, sweep_document: Document, mlflow_runs: Runs, tmp_path: Path
+) -> None:
+    sweep_program.write(sweep_document)
+    code, output, errors = sweep_program.run()
+    assert (code, errors) == (0, "")
+    assert "3 runs, 3,600 env steps in all." in output
+    assert output.index("Sweep points") < output.index(": started") < output.index("Results of")
+    unexpected = [line for line in output.splitlines() if not EXPECTED.match(line)]
+    assert unexpected == [], "the newcomer's screen"
+    found = rows(output)
+    assert [row[:4] for row in found] == [
+        ["pretrain", "Point", "0", "1"],
+        ["finetune", "Point", "0", "1"],
+        ["finetune", "Point", "0", "2"],
+    ]
+    assert {row[-1] for row in found} == {"finished"}
+    assert {row[7] for row in found} == {"1,200"}
+    assert "mlflow ui --backend-store-uri" in output
+    check_mlflow(mlflow_runs(), tmp_path, found)
+
+    sweep_document["stages"][1]["grid"]["tac.entropic_index"] = [1.0, 1.5, 2.0]
+    sweep_program.write(sweep_document)
+    code, output, errors = sweep_program.run()
+    assert (code, errors) == (0, "")
+    assert "3 finished earlier and reused, 1,200 env steps left" in output
+    again = rows(output)
+    assert [row[-1] for row in again] == ["reused", "reused", "finished", "reused"]
+    assert [row[:-1] for row in again if row[-1] == "reused"] == [row[:-1] for row in found]
+    assert len(mlflow_runs()) == 1 + 4
+
+    code, output, errors = sweep_program.run("--name", "other")
+    assert (code, errors) == (0, "")
+    assert [row[-1] for row in rows(output)] == ["reused"] * 4
+    assert {row[-2] for row in rows(output)}.isdisjoint({row[-2] for row in again})
+    assert "-" not in {row[-2] for row in rows(output)}
+
+
+def check_mlflow(runs: dict[str, Any], folder: Path, found: list[list[str]]) -> None:
+    assert set(runs) == {
+        "points",
+        "pretrain/Point/seed0",
+        "finetune/Point/tac.entropic_index=1/seed0",
+        "finetune/Point/tac.entropic_index=2/seed0",
+    }
+    parent, pretrain = runs["points"], runs["pretrain/Point/seed0"]
+    for run in runs.values():
+        assert run.info.status == "FINISHED"
+    for q in (1, 2):
+        run = runs[f"finetune/Point/tac.entropic_index={q}/seed0"]
+        tags = run.data.tags
+        assert tags[names.TAG_PARENT_RUN] == parent.info.run_id
+        assert tags[names.TAG_SOURCE_RUN] == pretrain.info.run_id
+        assert (tags[names.TAG_VARIANT], tags[names.TAG_TASK]) == ("music-r", "Point")
+        assert tags[names.TAG_ENTROPIC_INDEX] == str(q)
+        assert run.data.metrics[names.SETTING_ENTROPIC_INDEX] == q
+        assert run.data.params["tac.entropic_index"] == f"{q}.0"
+        assert metric_steps(folder, run) == [400, 800, 1200]
+        assert metric_steps(folder, run, names.EVAL_SUCCESS) == [400, 800, 1200]
+    ids = [run.info.run_id[:8] for name, run in sorted(runs.items()) if name != "points"]
+    assert sorted(ids) == sorted(row[-2] for row in found)
+
+
+def test_a_failure_is_explained_and_the_others_finish(
+    sweep_program: Any, sweep_document: Document, mlflow_runs: Runs, tmp_path: Path
+) -> None:
+    point = sweep_document["environments"]["Point"]
+    sweep_document["environments"]["Broken"] = point | {"env_kwargs": {"fail_at": 300}}
+    sweep_document["tasks"] = ["Broken", "Point"]
+    sweep_document["stages"][1].pop("grid")
+    sweep_program.write(sweep_document)
+    code, output, errors = sweep_program.run()
+    assert (code, errors) == (1, "")
+    assert "pretrain/Broken/seed0: FAILED: RuntimeError: the gripper fell off" in output
+    assert "look at the second screw" in output
+    assert "finetune/Broken/seed0: skipped, it starts from pretrain/Broken/seed0" in output
+    assert [(row[1], row[-1]) for row in rows(output)] == [
+        ("Broken", "failed"),
+        ("Point", "finished"),
+        ("Broken", "skipped"),
+        ("Point", "finished"),
+    ]
+    log = Path(re.findall(r"whole traceback: (.*)", output)[0])
+    text = log.read_text()
+    assert 'raise RuntimeError("the gripper fell off' in text
+    assert "point_env.py" in text
+    failed = mlflow_runs()["pretrain/Broken/seed0"]
+    assert failed.info.status == "FAILED"
+    assert failed.data.tags[names.TAG_FAILURE].startswith("RuntimeError: the gripper fell off")
+    assert "finetune/Broken/seed0" not in mlflow_runs()
+
+
+def test_stopped_killed_and_continued(
+    sweep_program: Any, sweep_document: Document, mlflow_runs: Runs, tmp_path: Path
+) -> None:
+    sweep_document["defaults"]["env_steps"] = 4000
+    sweep_document["stages"] = sweep_document["stages"][:1]
+    sweep_program.write(sweep_document)
+
+    process = sweep_program.start_until(" 1,200 of 4,000 env steps")
+    process.send_signal(signal.SIGINT)
+    output, errors = process.communicate(timeout=60)
+    assert (process.returncode, errors) == (130, "")
+    assert "continue with: python -m music_rllib.sweep sweep.yaml" in output
+    assert [row[-1] for row in rows(output)] == ["interrupted"]
+
+    process = sweep_program.start_until(": continues at ")
+    for line in process.stdout:
+        if "2,400 of" in line:
+            break
+    process.kill()
+    process.communicate()
+
+    code, output, errors = sweep_program.run()
+    assert (code, errors) == (0, "")
+    (continued,) = re.findall(r"continues at ([\d,]+) env steps", output)
+    assert int(continued.replace(",", "")) >= 2000
+    assert [row[-1] for row in rows(output)] == ["finished"]
+    assert metric_steps(tmp_path, mlflow_runs()["pretrain/Point/seed0"]) == list(
+        range(400, 4001, 400)
+    )
+    assert list((tmp_path / "results" / "work").iterdir()) == []
+    (node,) = (tmp_path / "results" / "nodes").iterdir()
+    history = [json.loads(line) for line in (node / "history.jsonl").read_text().splitlines()]
+    assert [report["env_steps"] for report in history] == list(range(400, 4001, 400))
+    seconds = [report["seconds"] for report in history]
+    assert seconds == sorted(seconds)
+
+
+def test_a_second_driver_is_refused_and_sigterm_stops_the_first_in_good_order(
+    sweep_program: Any, sweep_document: Document
+) -> None:
+    sweep_document["defaults"]["env_steps"] = 12_000
+    sweep_program.write(sweep_document)
+    first = sweep_program.start_until(": started")
+    code, _, errors = sweep_program.run()
+    assert code == 2
+    assert "must be used by one process at a time" in errors
+    first.send_signal(signal.SIGTERM)
+    output, _ = first.communicate(timeout=60)
+    assert first.returncode == 128 + signal.SIGTERM
+    assert "continue with: python -m music_rllib.sweep sweep.yaml" in output

@@ -1,0 +1,188 @@
+"""One node as a trial: every variant, from its source, and continued after a cut."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from ray.tune.trainable import trainable
+
+from music_rllib.envs.registry import Task
+from music_rllib.experiment.handoff import read_handoff
+from music_rllib.experiment.plan import node_key
+from music_rllib.experiment.result import from_json_lines
+from music_rllib.experiment.settings import RunSettings, Variant, handed_over, preset
+from music_rllib.experiment.store import NodeStore
+from music_rllib.sweep.trainable import NOTES, REPORTS, NodeJob, RunTrainable
+from music_rllib.tracking import names
+
+pytestmark = pytest.mark.integration
+
+ENVIRONMENTS = Path(__file__).parents[1] / "environments"
+POINT = Task(
+    name="Point",
+    env_id="point_env:Point-v0",
+    horizon=20,
+    agent_indices=(0, 1),
+    surrounding_indices=(2, 3),
+)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def point_environment() -> Iterator[None]:
+    """The environment can be imported, and torch has one thread."""
+    import torch
+
+    sys.path.insert(0, str(ENVIRONMENTS))
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+    sys.path.remove(str(ENVIRONMENTS))
+
+
+@pytest.fixture(autouse=True)
+def nothing_in_the_home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Outside Tune, a trainable's folder would be made below the user's home."""
+    monkeypatch.setattr(trainable, "DEFAULT_STORAGE_PATH", str(tmp_path))
+
+
+def settings(variant: Variant, **changes: Any) -> RunSettings:
+    base = {
+        "task": POINT,
+        "variant": variant,
+        "seed": 3,
+        "env_steps": 600,
+        "num_envs": 2,
+        "evaluation": {"interval": 200, "episodes": 2},
+        "tac": {"random_steps": 100, "hidden_sizes": [16], "batch_size": 16, "replay_ratio": 0.2},
+        "music": preset(variant, POINT) | {"hidden_size": 16, "batch_trajectories": 4},
+    }
+    return RunSettings.model_validate(base | changes)
+
+
+def job(storage: Path, run: RunSettings, source: NodeJob | None = None) -> NodeJob:
+    source_key = source.key if source else None
+    return NodeJob(
+        key=node_key(run, source_key),
+        label=run.variant,
+        run=run,
+        source_key=source_key,
+        source_task=POINT if source else None,
+        storage=str(storage),
+        cpus=1,
+    )
+
+
+def compute(node: NodeJob, steps: int | None = None) -> list[dict[str, Any]]:
+    """Results of a trial that makes so many steps, or goes to its end."""
+    trial = RunTrainable(config=node.to_tune())
+    results: list[dict[str, Any]] = []
+    try:
+        while not (results and results[-1]["done"]) and len(results) != steps:
+            results.append(trial.train())
+    finally:
+        trial.stop()
+    return results
+
+
+def numbers(storage: Path, node: NodeJob) -> list[dict[str, float]]:
+    """A finished node's metrics, report by report, without what depends on the machine's mood."""
+    return [
+        {name: value for name, value in report.metrics.items() if not name.startswith("system/")}
+        for report in NodeStore(str(storage)).history(node.key)
+    ]
+
+
+@pytest.mark.usefixtures("local_ray")
+def test_every_variant_trains_from_its_source(tmp_path: Path) -> None:
+    store = NodeStore(str(tmp_path))
+    source = job(tmp_path, settings("music-u"))
+    compute(source)
+    variants: list[Variant] = ["tac", "music-r", "music-f", "music-p"]
+    for variant in variants:
+        node = job(tmp_path, settings(variant), source if variant != "tac" else None)
+        assert compute(node)[-1]["done"]
+        result = store.result(node.key)
+        assert result is not None
+        assert result.env_steps == 600
+        assert names.EVAL_SUCCESS in result.metrics
+        store.verify(node.key)
+        if variant in {"music-r", "music-p"}:
+            before, after = (estimator(store, key) for key in (source.key, node.key))
+            assert before.keys() == after.keys()
+            for name, array in before.items():
+                np.testing.assert_array_equal(after[name], array, "it must be frozen")
+
+
+def estimator(store: NodeStore, key: str) -> dict[str, Any]:
+    return read_handoff(Path(store.path(key)), ["mi_estimator"], POINT)["mi_estimator"]
+
+
+@pytest.mark.usefixtures("local_ray")
+def test_music_f_begins_with_the_agent_that_it_was_handed(tmp_path: Path) -> None:
+    source = job(tmp_path, settings("music-u"))
+    compute(source)
+    node = job(tmp_path, settings("music-f"), source)
+    trial = RunTrainable(config=node.to_tune())
+    begun = trial._begin(NodeStore(str(tmp_path)))
+    folder = Path(NodeStore(str(tmp_path)).path(source.key))
+    expected = read_handoff(folder, handed_over(node.run), POINT)
+    assert set(expected) == {"policy", "critics", "value", "value_target", "normaliser"}
+    found = begun.modules()
+    for module, arrays in expected.items():
+        for name, array in arrays.items():
+            np.testing.assert_array_equal(found[module][name], array)
+    begun.close()
+
+
+@pytest.mark.usefixtures("local_ray")
+@pytest.mark.parametrize("variant", ["music-u", "tac"])
+def test_a_cut_run_ends_with_the_numbers_of_an_unbroken_one(
+    tmp_path: Path, variant: Variant
+) -> None:
+    unbroken = job(tmp_path / "a", settings(variant, env_steps=800))
+    compute(unbroken)
+    cut = job(tmp_path / "b", settings(variant, env_steps=800))
+    assert cut.key == unbroken.key
+    assert [result["done"] for result in compute(cut, steps=2)] == [False, False]
+    # What it did after its last checkpoint is lost, as after a kill.
+    results = compute(cut)
+    assert results[0][NOTES] == ["continues at 400 env steps"]
+    told = [report.env_steps for r in results for report in from_json_lines(r[REPORTS].encode())]
+    assert told == [200, 400, 600, 800], "the driver may not have heard of the first ones"
+    assert numbers(tmp_path / "b", cut) == numbers(tmp_path / "a", unbroken)
+    assert NodeStore(str(tmp_path / "b")).work_folder(cut.key).names() == []
+
+
+@pytest.mark.usefixtures("local_ray")
+def test_a_finished_node_is_not_trained_again(tmp_path: Path) -> None:
+    node = job(tmp_path, settings("tac"))
+    compute(node)
+    manifest = Path(NodeStore(str(tmp_path)).path(node.key)) / "manifest.json"
+    before = manifest.stat().st_mtime_ns
+    (result,) = compute(node)
+    assert result["done"]
+    assert [report.env_steps for report in from_json_lines(result[REPORTS].encode())] == [
+        200,
+        400,
+        600,
+    ]
+    assert manifest.stat().st_mtime_ns == before
+
+
+@pytest.mark.usefixtures("local_ray")
+def test_a_damaged_checkpoint_is_skipped_and_said(tmp_path: Path) -> None:
+    node = job(tmp_path, settings("tac"))
+    compute(node, steps=2)
+    work = tmp_path / "work" / node.key
+    newest = max(path.name for path in work.iterdir())
+    (work / newest / "history.jsonl").write_bytes(b"")
+    notes = compute(node, steps=1)[0][NOTES]
+    assert len(notes) == 2
+    assert newest in notes[0]
+    assert notes[1] == "continues at 200 env steps"

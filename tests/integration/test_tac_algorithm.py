@@ -1,0 +1,295 @@
+"""TAC as an RLlib algorithm: same seed, same numbers; exact resume; no dead settings."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from ray import tune
+
+from music_rllib import TACConfig
+from music_rllib.estimator.settings import MusicSettings
+from music_rllib.replay.settings import ReplaySettings
+from music_rllib.tac.algorithm import TAC
+from music_rllib.tac.settings import TACSettings
+from music_rllib.tracking import names
+
+pytestmark = pytest.mark.usefixtures("local_ray")
+
+HER: dict[str, Any] = {"replay.hindsight_k": 4.0}
+SMALL: dict[str, Any] = {
+    "hidden_sizes": (32, 32),
+    "batch_size": 32,
+    "random_steps": 100,
+    "replay_ratio": 0.2,
+}
+
+
+def build(
+    task: str = "FetchReach-v4",
+    *,
+    music: dict[str, Any] | None = None,
+    where: dict[str, int] | None = None,
+    **settings: Any,
+) -> TAC:
+    replay = {
+        name.removeprefix("replay."): settings.pop(name)
+        for name in list(settings)
+        if name.startswith("replay.")
+    }
+    config = TACConfig().environment(task)
+    config.env_runners(
+        num_envs_per_env_runner=2, num_env_runners=(where or {}).get("num_env_runners", 0)
+    )
+    config.learners(num_learners=(where or {}).get("num_learners", 0))
+    config.reporting(min_sample_timesteps_per_iteration=1)
+    config.training(**{**SMALL, "total_env_steps": 1_000, **settings})
+    config.replay(**{"capacity": 10_000, **replay})
+    if music is not None:
+        config.music(agent_indices=range(3), surrounding_indices=range(3, 6), **music)
+    config.evaluation(evaluation_interval=10**9, evaluation_duration=2)
+    config.debugging(seed=0)
+    algo: TAC = config.build_algo()
+    return algo
+
+
+def fingerprint(algo: TAC, iterations: int) -> list[dict[str, float]]:
+    """Everything that a run's numbers are made of, iteration by iteration, and its weights."""
+    rows = []
+    for _ in range(iterations):
+        result = algo.train()
+        learner = result.get("learners", {}).get("default_policy", {})
+        rows.append(
+            {k: float(v) for k, v in learner.items() if "/" in k}
+            | {"return": float(result["env_runners"]["episode_return_mean"])}
+        )
+    evaluation = algo.evaluate()["env_runners"]
+    rows.append({"evaluation": float(evaluation["episode_return_mean"])})
+    return [*rows, weight_sums(algo)]
+
+
+def weight_sums(algo: TAC) -> dict[str, float]:
+    parts = algo.get_parts()
+    return {
+        f"{part}.{name}": float(np.sum(array, dtype=np.float64))
+        for part, arrays in parts.items()
+        for name, array in arrays.items()
+    }
+
+
+MUSIC_U = {"estimator": "trained", "mi_reward_weight": 1.0, "task_reward": False, "goals": "zero"}
+MUSIC_R = {"estimator": "frozen", "mi_reward_weight": 0.5}
+
+
+@pytest.mark.parametrize("music", [None, MUSIC_U])
+def test_same_seed_gives_bit_identical_metrics_and_weights(music: dict[str, Any] | None) -> None:
+    settings = HER if music is None else {}
+    first = fingerprint(build(music=music, **settings), 3)
+    second = fingerprint(build(music=music, **settings), 3)
+    assert first == second
+    assert first[-3]["loss/critics"] > 0
+
+
+@pytest.mark.parametrize("alpha", [0.1, {"learned": True}])
+def test_a_restored_checkpoint_continues_with_the_same_numbers(alpha: Any, tmp_path: Path) -> None:
+    unbroken = build(music=MUSIC_U, alpha=alpha)
+    fingerprint(unbroken, 2)
+    unbroken.save_to_path(tmp_path / "checkpoint")
+    expected = fingerprint(unbroken, 2)
+    resumed = build(music=MUSIC_U, alpha=alpha)
+    resumed.restore_from_path(tmp_path / "checkpoint")
+    assert fingerprint(resumed, 2) == expected
+    # Also in the process that has gone on since: RLlib's own runners would keep newer weights.
+    unbroken.restore_from_path(tmp_path / "checkpoint")
+    assert fingerprint(unbroken, 2) == expected
+
+
+DDPG: dict[str, Any] = {
+    "policy": "deterministic",
+    "bootstrap": "critics",
+    "alpha": 0.0,
+    "behaviour": {"kind": "gaussian_noise"},
+    "target_bounds": (-50.0, 0.0),
+}
+ANNEALED = {"schedule": "linear", "start": 0.4, "end": 1.0}
+PER: dict[str, Any] = {"replay.priority": "td_error", "replay.importance_exponent": ANNEALED}
+
+# A changed value for every setting, and what else both runs that are compared need for it.
+CHANGES: dict[str, tuple[Any, dict[str, Any]]] = {
+    "entropic_index": (1.5, {}),
+    "alpha": (0.5, {}),
+    "entropy_form": ("joint", {}),
+    "policy": ("deterministic", DDPG | {"policy": "stochastic"}),
+    "bootstrap": ("critics", {}),
+    "policy_critic": ("first", {}),
+    "hidden_sizes": ((32, 16), {}),
+    "log_std_bounds": ((-1.0, -0.5), {}),
+    "lr": (3e-4, {}),
+    "gamma": (0.9, {}),
+    "tau": (0.5, {}),
+    "target_update_interval": (3, {}),
+    "target_bounds": ((-1.0, 0.0), {}),
+    "batch_size": (48, {}),
+    "replay_ratio": (0.5, {}),
+    "random_steps": (200, {}),
+    "normalise_observations": (False, {}),
+    "observation_clip": (0.5, {}),
+    "normaliser_epsilon": (0.3, {}),
+    "behaviour": ({"kind": "gaussian_noise"}, {}),
+    "action_l2": (1.0, {}),
+    "max_episode_steps": (20, {}),
+    "replay.capacity": (200, {}),
+    "replay.hindsight_k": (1.0, {}),
+    "replay.priority": ("td_error", {}),
+    "replay.priority_exponent": (1.0, PER),
+    "replay.importance_exponent": (1.0, PER),
+    "music.mi_reward_weight": (0.1, {}),
+    "music.task_reward": (False, {}),
+    "music.goals": ("zero", {"replay.hindsight_k": 0.0}),
+    "music.reward_scale": (50.0, {}),
+    "music.shuffle": ("random", {}),
+    "music.hidden_size": (16, {}),
+    "music.lr": (1e-2, {}),
+    "music.batch_trajectories": (8, {}),
+    "music.prioritise_replay": (True, {}),
+    "music.estimator": ("frozen", {}),
+}
+
+
+def last_weights(settings: dict[str, Any]) -> dict[str, float]:
+    """Sums of all weights after three iterations with HER and a trained estimator."""
+    chosen: dict[str, Any] = {**HER, "entropic_index": 1.2, **settings}
+    music: dict[str, Any] = {"estimator": "trained", "mi_reward_weight": 1.0}
+    for name in [name for name in chosen if name.startswith("music.")]:
+        music[name.removeprefix("music.")] = chosen.pop(name)
+    algo = build(music=music, **chosen)
+    for _ in range(3):
+        algo.train()
+    return weight_sums(algo)
+
+
+@pytest.fixture(scope="module")
+def bases() -> dict[str, dict[str, float]]:
+    """The runs that changes are compared with, one for each different base."""
+    return {}
+
+
+def test_every_setting_is_listed() -> None:
+    fields = set(TACSettings.model_fields)
+    fields |= {f"music.{name}" for name in MusicSettings.model_fields}
+    fields |= {f"replay.{name}" for name in ReplaySettings.model_fields}
+    assert fields == set(CHANGES)
+
+
+@pytest.mark.parametrize("setting", CHANGES)
+def test_no_setting_is_dead(setting: str, bases: dict[str, dict[str, float]]) -> None:
+    value, base = CHANGES[setting]
+    if repr(base) not in bases:
+        bases[repr(base)] = last_weights(base)
+    assert last_weights({**base, setting: value}) != bases[repr(base)]
+
+
+@pytest.mark.parametrize(
+    "settings", [DDPG, {"bootstrap": "critics"}, PER], ids=["ddpg", "sac", "per"]
+)
+def test_other_backbones_and_per_resume_exactly_too(
+    settings: dict[str, Any], tmp_path: Path
+) -> None:
+    unbroken = build(**HER, **settings)
+    fingerprint(unbroken, 2)
+    unbroken.save_to_path(tmp_path / "checkpoint")
+    resumed = build(**HER, **settings)
+    resumed.restore_from_path(tmp_path / "checkpoint")
+    assert fingerprint(resumed, 1) == fingerprint(unbroken, 1)
+
+
+def test_q_bias_is_what_its_definition_says() -> None:
+    """With critics that say 3 and a target value of -7, the bias can be computed by hand."""
+    algo = build(music=None, alpha=0.0, gamma=0.9)
+    learner = algo.learner_group._learner
+    module = learner.module["default_policy"]
+    for parameter in module.parameters():
+        parameter.data.zero_()
+    module.critics.biases[-1].data.fill_(3.0)
+    module.value_target[-1].bias.data.fill_(-7.0)
+    learner.metrics.reduce()
+    episodes = algo.env_runner.sample(random_actions=True)
+    learner.diagnose(episodes)
+    returns = [sum(r * 0.9**t for t, r in enumerate(e.rewards)) - 7 * 0.9**50 for e in episodes]
+    logged = learner.metrics.peek(("default_policy", names.Q_BIAS))
+    assert logged == pytest.approx(3.0 - np.mean(returns), rel=1e-5)
+
+
+@pytest.mark.parametrize("where", [{"num_env_runners": 1}, {"num_learners": 1}], ids=str)
+def test_remote_runners_and_learner_learn_and_resume_like_local_ones(
+    where: dict[str, int], tmp_path: Path
+) -> None:
+    def remote() -> TAC:
+        return build(music=MUSIC_U, where=where)
+
+    algo = remote()
+    first = [algo.train() for _ in range(3)][-1]
+    assert first["env_runners"]["num_env_steps_sampled_lifetime"] == 300
+    assert np.isfinite(first["learners"]["default_policy"]["loss/critics"])
+    assert algo.grad_updates == 40
+    before = weight_sums(algo)
+    algo.save_to_path(tmp_path / "checkpoint")
+    resumed = remote()
+    resumed.restore_from_path(tmp_path / "checkpoint")
+    assert weight_sums(resumed) == before
+    resumed.train()
+    assert weight_sums(resumed) != before
+    assert (resumed.env_steps, resumed.grad_updates) == (400, 60)
+    assert algo.evaluate()["env_runners"]["episode_return_mean"] <= 0
+    for one in (algo, resumed):
+        one.stop()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"entropic_index": -1.0}, r"^entropic_index: must be > 0, got -1$"),
+        ({"alpha": -1}, r"^alpha: must be >= 0, got -1$"),
+        ({"alpha": {"learned": True, "lr": -1}}, r"^alpha\.lr: .*greater than 0, got -1$"),
+        ({"gamma": 1.0}, r"^gamma: .*less than 1, got 1.0$"),
+        ({"lr": float("nan")}, r"^lr: .*finite number, got nan$"),
+        ({"behaviour": "greedy"}, r"^behaviour: .*'policy', got 'greedy'$"),
+        ({"entropic_indx": 2.0}, r"unexpected keyword argument 'entropic_indx'"),
+    ],
+)
+def test_a_bad_setting_is_refused_where_it_is_made(settings: dict[str, Any], message: str) -> None:
+    # Not only when built: RLlib drops every setting of -1, and would run the default.
+    with pytest.raises((ValueError, TypeError), match=message):
+        TACConfig().training(**settings)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda c: c.training(policy="deterministic"), "alpha must be 0 for policy: deterministic"),
+        (lambda c: c.music(estimator="trained", mi_reward_weight=1.0), "set music.agent_indices"),
+        (lambda c: c.music(goals="zero").replay(hindsight_k=4.0), "hindsight_k must be 0 with"),
+        (lambda c: c.learners(num_learners=2), "num_learners must be 0 or 1, got 2"),
+        (
+            lambda c: c.training(entropic_index={"schedule": "linear", "start": 1.0, "end": 2.0}),
+            "a linear schedule needs the budget",
+        ),
+    ],
+)
+def test_settings_that_contradict_each_other_are_refused(make: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make(TACConfig().environment("Pendulum-v1")).validate()
+
+
+def test_tune_searches_tacs_settings_as_those_of_any_algorithm(tmp_path: Path) -> None:
+    config = TACConfig().environment("Pendulum-v1").env_runners(num_envs_per_env_runner=1)
+    config.training(**{**SMALL, "entropic_index": tune.grid_search([1.0, 1.5])})
+    stop = {"training_iteration": 1}
+    run_config = tune.RunConfig(stop=stop, storage_path=str(tmp_path), verbose=0)
+    results = tune.Tuner(TAC, param_space=config, run_config=run_config).fit()
+    used = [
+        result.metrics["learners"]["default_policy"][names.ENTROPIC_INDEX] for result in results
+    ]
+    assert sorted(used) == [1.0, 1.5]
+    with pytest.raises(ValueError, match="unknown settings in the config: entropic_indx"):
+        TACConfig().update_from_dict({"entropic_indx": 2.0})

@@ -1,0 +1,108 @@
+"""Documentation and code say the same: settings, metrics, tasks, links and examples."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from music_rllib.envs.registry import BUILT_IN_TASKS
+from music_rllib.experiment.config import load_sweep
+from music_rllib.tracking import names
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
+TEXTS = {path.name: path.read_text(encoding="utf-8") for path in PAGES}
+
+
+def blocks(text: str, language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+
+
+def test_configuration_page_is_up_to_date() -> None:
+    script = DOCS / "generate_configuration.py"
+    done = subprocess.run(
+        [sys.executable, str(script), "--check"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+EXAMPLES = [
+    pytest.param(block, id=f"{name}-{position}")
+    for name, text in TEXTS.items()
+    for position, block in enumerate(blocks(text, "yaml"))
+    if re.search(r"^stages:", block, re.MULTILINE)
+]
+
+
+@pytest.mark.parametrize("example", EXAMPLES)
+def test_sweeps_in_the_documentation_are_valid(example: str, tmp_path: Path) -> None:
+    path = tmp_path / "example.yaml"
+    path.write_text(example, encoding="utf-8")
+    assert load_sweep(path).stages
+
+
+def anchors(text: str) -> set[str]:
+    """Of a page's headings, as GitHub makes them."""
+    headings = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=[path.name for path in PAGES])
+def test_links_between_pages_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)\s]+)\)", TEXTS[page.name]):
+        if re.match(r"[a-z]+:", target):
+            continue
+        file, _, anchor = target.partition("#")
+        path = (page.parent / file).resolve() if file else page
+        assert path.exists(), f"{page.name}: {target}"
+        if anchor:
+            assert anchor in anchors(path.read_text(encoding="utf-8")), f"{page.name}: {target}"
+
+
+def test_every_built_in_task_is_described_as_it_is() -> None:
+    for task in BUILT_IN_TASKS.values():
+        (row,) = re.findall(
+            rf"^\| `{re.escape(task.name)}` \|.*$", TEXTS["add_an_environment.md"], re.MULTILINE
+        )
+        cells = [cell.strip() for cell in row.strip("|").split("|")]
+        assert cells[1:3] == [f"`{task.env_id}`", str(task.horizon)]
+        for cell, indices in zip(
+            cells[3:5], (task.agent_indices, task.surrounding_indices), strict=True
+        ):
+            written = re.match(r"(\d+):(\d+)", cell)
+            expected = range(int(written[1]), int(written[2])) if written else range(0)
+            assert indices == tuple(expected), row
+
+
+METRICS = {
+    value
+    for key, value in vars(names).items()
+    if key.isupper()
+    and isinstance(value, str)
+    and not key.startswith(("TAG_", "KIND_", "ARTEFACT_"))
+}
+
+
+def test_every_metric_is_described() -> None:
+    described = set(re.findall(r"^\| `([\w/]+?)(?:<i>)?` \|", TEXTS["algorithms.md"], re.MULTILINE))
+    assert described >= METRICS, METRICS - described
+    assert {name for name in described if "/" in name} <= METRICS, "described, but not there"
+
+
+def test_tests_that_the_documentation_names_exist() -> None:
+    code = "\n".join(path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("*.py"))
+    defined = set(re.findall(r"^def (test_\w+)", code, re.MULTILINE))
+    for name, text in TEXTS.items():
+        for file in re.findall(r"tests/\w+/\w+\.py", text):
+            assert (ROOT / file).is_file(), f"{name}: {file}"
+        mentioned = set(re.findall(r"`(test_\w+)`", text))
+        assert mentioned <= defined, f"{name}: {mentioned - defined}"

@@ -1,0 +1,196 @@
+"""The package as a stranger gets it: the wheel, a bare import, the exact versions."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+from packaging.version import Version
+
+ROOT = Path(__file__).parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+
+
+def _run_python(
+    *arguments: str, cwd: Path, path: Path | None = None
+) -> subprocess.CompletedProcess[str]:
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    if path is not None:
+        environment["PYTHONPATH"] = str(path)
+    return subprocess.run(
+        [sys.executable, *arguments],
+        cwd=cwd,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+# --- the wheel -----------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Build the wheel from a copy (setuptools leaves files behind), without a network."""
+    source = tmp_path_factory.mktemp("source")
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    shutil.copytree(
+        ROOT / "music_rllib", source / "music_rllib", ignore=shutil.ignore_patterns("__pycache__")
+    )
+    built = _run_python(
+        "-W", "ignore", "-m", "build", "--wheel", "--no-isolation", "--outdir", "dist", cwd=source
+    )
+    assert built.returncode == 0, built.stdout + built.stderr
+    (path,) = (source / "dist").glob("*.whl")
+    return path
+
+
+@pytest.fixture(scope="module")
+def unpacked(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("unpacked")
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(folder)
+    return folder
+
+
+def test_wheel_holds_the_whole_package_and_nothing_else(unpacked: Path) -> None:
+    wanted = {
+        path.relative_to(ROOT).as_posix()
+        for path in (ROOT / "music_rllib").rglob("*")
+        if path.suffix in {".css", ".py", ".yaml"} or path.name == "py.typed"
+    }
+    packed = {path.relative_to(unpacked) for path in unpacked.rglob("*") if path.is_file()}
+    assert {path.as_posix() for path in packed if path.parts[0] == "music_rllib"} == wanted
+    others = {path.parts[0] for path in packed} - {"music_rllib"}
+    assert all(name.endswith(".dist-info") for name in others), others
+
+
+def test_wheel_states_version_licence_and_python(unpacked: Path) -> None:
+    (metadata,) = unpacked.glob("*.dist-info/METADATA")
+    text = metadata.read_text()
+    assert re.search(r"^Version: \d+\.\d+\.\d+$", text, re.MULTILINE)
+    assert "License-Expression: Apache-2.0" in text
+    assert "Requires-Python: >=3.11" in text
+    assert (metadata.parent / "licenses" / "LICENSE").is_file()
+
+
+def test_wheel_alone_plans_its_default_sweep(unpacked: Path, tmp_path: Path) -> None:
+    """Without a file the program uses a default that must have travelled in the wheel."""
+    shown = _run_python(
+        "-m", "music_rllib.sweep", "--dry-run", "--storage", "results", cwd=tmp_path, path=unpacked
+    )
+    assert shown.returncode == 0, shown.stdout + shown.stderr
+    assert "FetchPush" in shown.stdout
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- importing it --------------------------------------------------------------------------
+
+
+def test_import_is_silent_light_and_leaves_nothing(tmp_path: Path) -> None:
+    heavy = ("ray", "torch", "mlflow", "numpy", "gymnasium", "pydantic")
+    code = (
+        "import music_rllib, sys, threading\n"
+        f"loaded = [name for name in {heavy!r} if name in sys.modules]\n"
+        "assert not loaded, loaded\n"
+        "assert threading.active_count() == 1\n"
+    )
+    done = _run_python("-W", "error", "-c", code, cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_every_public_name_loads_and_others_do_not(tmp_path: Path) -> None:
+    code = (
+        "import music_rllib\n"
+        "for name in music_rllib.__all__:\n"
+        "    assert getattr(music_rllib, name) is not None\n"
+        "    assert name in dir(music_rllib)\n"
+        "print(music_rllib.TACConfig.__name__)\n"
+        "music_rllib.TACConfi\n"
+    )
+    done = _run_python("-c", code, cwd=tmp_path)
+    assert done.stdout.strip() == "TACConfig", done.stderr
+    assert "module 'music_rllib' has no attribute 'TACConfi'" in done.stderr
+
+
+# --- exact versions ------------------------------------------------------------------------
+
+
+def _constraints() -> dict[str, Requirement]:
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    wanted = [Requirement(line) for line in lines if line and not line.startswith("#")]
+    named: dict[str, Requirement] = {}
+    for requirement in wanted:
+        assert named.setdefault(canonicalize_name(requirement.name), requirement) is requirement, (
+            f"{requirement.name} is listed twice"
+        )
+    return named
+
+
+def _direct_requirements() -> list[Requirement]:
+    groups = [PROJECT["dependencies"], *PROJECT["optional-dependencies"].values()]
+    return [Requirement(text) for group in groups for text in group]
+
+
+def test_every_constraint_is_one_exact_version() -> None:
+    for requirement in _constraints().values():
+        (specifier,) = requirement.specifier
+        assert specifier.operator == "==", requirement
+        # A wildcard is no exact version; a local label (+cpu) or a URL binds to one index.
+        assert "*" not in specifier.version, requirement
+        assert Version(specifier.version).local is None, requirement
+        assert requirement.url is None, requirement
+
+
+def test_constraints_satisfy_the_declared_ranges() -> None:
+    constraints = _constraints()
+    for requirement in _direct_requirements():
+        exact = constraints[canonicalize_name(requirement.name)]
+        (specifier,) = exact.specifier
+        assert requirement.specifier.contains(specifier.version), (requirement, exact)
+
+
+def _requirements_of(name: str, extras: set[str]) -> Iterator[Requirement]:
+    for text in importlib.metadata.requires(name) or ():
+        requirement = Requirement(text)
+        environments = [{"extra": extra} for extra in (extras or {""})]
+        if requirement.marker is None or any(
+            requirement.marker.evaluate(environment) for environment in environments
+        ):
+            yield requirement
+
+
+def test_constraints_pin_everything_that_is_pulled_in() -> None:
+    """Whatever the declared dependencies need, at any depth, has its exact version."""
+    constraints = _constraints()
+    queue = _direct_requirements()
+    seen: set[tuple[str, frozenset[str]]] = set()
+    missing: set[str] = set()
+    while queue:
+        requirement = queue.pop()
+        name = canonicalize_name(requirement.name)
+        key = (name, frozenset(requirement.extras))
+        # A CUDA build of torch pins its own libraries exactly; they differ from build to build.
+        if key in seen or name.startswith(("nvidia-", "cuda-", "triton")):
+            continue
+        seen.add(key)
+        if name not in constraints:
+            missing.add(name)
+            continue
+        queue.extend(_requirements_of(name, requirement.extras))
+    assert not missing, f"add to constraints.txt: {sorted(missing)}"

@@ -1,0 +1,72 @@
+"""Presets: laid below everything that a sweep says itself, and every shipped one is sound."""
+
+from pathlib import Path
+
+import pytest
+
+from music_rllib.experiment.config import load_sweep
+from music_rllib.experiment.problems import ConfigError
+
+SHIPPED = Path(__file__).parents[2] / "tune_configs" / "presets"
+SWEEP = """
+name: one
+tasks: [FetchPush]
+preset: {preset}
+defaults: {{env_steps: 123456, tac: {{lr: 0.0005}}}}
+stages:
+  - {{name: pretrain, variant: music-u, tac: {{gamma: 0.9}}}}
+  - {{name: finetune, variant: music-r, init_from: pretrain}}
+"""
+
+
+def sweep(folder: Path, preset: str, content: str | None = None) -> Path:
+    if content is not None:
+        (folder / "presets").mkdir(exist_ok=True)
+        (folder / "presets" / "mine.yaml").write_text(content)
+    path = folder / "sweep.yaml"
+    path.write_text(SWEEP.format(preset=preset))
+    return path
+
+
+def test_the_sweeps_own_settings_lie_above_the_preset(tmp_path: Path) -> None:
+    preset = "env_steps: 9000\nnum_envs: 3\ntac: {lr: 0.1, gamma: 0.5, tau: 0.25}\n"
+    config = load_sweep(sweep(tmp_path, "mine", preset))
+    pretrain, finetune = (stage.points[0].runs["FetchPush"] for stage in config.stages)
+    assert (pretrain.env_steps, pretrain.num_envs) == (123456, 3)
+    assert (pretrain.tac.lr, pretrain.tac.gamma, pretrain.tac.tau) == (0.0005, 0.9, 0.25)
+    assert finetune.tac.gamma == 0.5
+
+
+def test_hindsight_of_a_preset_does_not_reach_music_u(tmp_path: Path) -> None:
+    config = load_sweep(sweep(tmp_path, "mine", "replay: {hindsight_k: 4}"))
+    pretrain, finetune = (stage.points[0].runs["FetchPush"] for stage in config.stages)
+    assert (pretrain.replay.hindsight_k, finetune.replay.hindsight_k) == (0, 4)
+    path = tmp_path / "sweep.yaml"
+    own = path.read_text().replace("tac: {gamma: 0.9}", "replay: {hindsight_k: 4}")
+    path.write_text(own)
+    with pytest.raises(ConfigError, match=r"pretrain.replay.hindsight_k has no effect with"):
+        load_sweep(path)
+
+
+@pytest.mark.parametrize("preset", sorted(path.stem for path in SHIPPED.glob("*.yaml")))
+def test_every_shipped_preset_makes_a_sound_sweep(preset: str, tmp_path: Path) -> None:
+    (tmp_path / "presets").symlink_to(SHIPPED)
+    config = load_sweep(sweep(tmp_path, preset))
+    assert all(point.runs for stage in config.stages for point in stage.points)
+
+
+@pytest.mark.parametrize(
+    ("preset", "content", "message"),
+    [
+        ("mime", "env_steps: 1000", r"sweep.yaml:4: preset must be one of mine, got .mime."),
+        ("3", "env_steps: 1000", r"sweep.yaml:4: preset must be a preset's name or a file, got 3"),
+        ("other.yaml", None, r"other.yaml: must be an existing file"),
+        ("mine", "tac: {entropic_index: -1}", r"mine.yaml:1: tac.entropic_index must be > 0, got"),
+        ("mine", "env_steps: 1000\nstages: []", r"mine.yaml:2: stages is not a known setting"),
+    ],
+)
+def test_mistakes_are_named_where_they_are(
+    preset: str, content: str | None, message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ConfigError, match=message):
+        load_sweep(sweep(tmp_path, preset, content))

@@ -1,0 +1,245 @@
+"""The replay against a plain list of episodes."""
+
+from collections import deque
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from music_rllib.replay.buffer import ReplayLayout, Trajectory, TrajectoryReplay
+from music_rllib.replay.priorities import SumTree, rank_weights
+
+LAYOUT = ReplayLayout(observation=3, action=2, goal=1, horizon=5)
+
+
+def episode(number: int, steps: int, *, terminated: bool = False) -> Trajectory:
+    """Every number in it tells episode and step: observation = (number, step, 0)."""
+    frames = np.zeros((steps + 1, LAYOUT.frame), np.float32)
+    frames[:, 0] = number
+    frames[:, 1] = np.arange(steps + 1)
+    frames[:, 3] = -1.0  # desired
+    frames[:, 4] = 100 * number + np.arange(steps + 1)  # achieved
+    actions = np.stack([np.full(steps, number), np.arange(steps)], 1).astype(np.float32)
+    return Trajectory(frames, actions, np.full(steps, -1.0, np.float32), terminated)
+
+
+def matches(achieved: np.ndarray, desired: np.ndarray) -> np.ndarray:
+    return np.where(achieved[:, 0] == desired[:, 0], 0.0, -1.0)
+
+
+def replay(capacity: int, **settings: float) -> TrajectoryReplay:
+    return TrajectoryReplay(
+        LAYOUT, capacity, np.random.default_rng(0), goal_reward=matches, **settings
+    )
+
+
+@given(lengths=st.lists(st.integers(1, 5), min_size=1, max_size=40))
+@settings(deadline=None)
+def test_keeps_the_newest_whole_episodes_whatever_their_lengths(lengths: list[int]) -> None:
+    buffer, model = replay(12), deque[tuple[int, int]]()
+    for number, steps in enumerate(lengths):
+        buffer.extend([episode(number, steps, terminated=steps < 5)])
+        model.append((number, steps))
+        held = list(model)[-buffer.trajectories :]
+        assert len(buffer) == sum(steps for _, steps in held)
+        batch = buffer.sample_transitions(200)
+        seen = set(zip(batch.actions[:, 0], batch.actions[:, 1], strict=True))
+        assert seen <= {(n, t) for n, length in held for t in range(length)}
+        # A transition is one step of one episode, and its flags are that step's.
+        np.testing.assert_array_equal(batch.inputs[:, :2], batch.actions)
+        np.testing.assert_array_equal(batch.next_inputs[:, 0], batch.actions[:, 0])
+        np.testing.assert_array_equal(batch.next_inputs[:, 1], batch.actions[:, 1] + 1)
+        last = {n: length - 1 for n, length in held if length < 5}
+        ends = [last.get(int(n)) == t for n, t in batch.actions]
+        np.testing.assert_array_equal(batch.discounts == 0, ends)
+    assert buffer.trajectories >= 1
+    if all(steps == 5 for steps in lengths):
+        assert buffer.trajectories == min(len(lengths), 12 // 5)
+
+
+def test_full_episodes_fill_the_capacity_exactly() -> None:
+    buffer = replay(20)
+    buffer.extend([episode(n, 5) for n in range(11)])
+    assert len(buffer) == 20
+    assert set(buffer.sample_transitions(500).actions[:, 0]) == {7, 8, 9, 10}
+
+
+def test_transitions_are_drawn_uniformly_over_unequal_episodes() -> None:
+    buffer = replay(100)
+    buffer.extend([episode(0, 5), episode(1, 1), episode(2, 2)])
+    batch = buffer.sample_transitions(80_000)
+    counts = np.unique(batch.actions, axis=0, return_counts=True)[1]
+    assert len(counts) == 8
+    # 10,000 expected each, standard deviation 94.
+    assert (abs(counts - 10_000) < 5 * 94).all()
+
+
+def test_hindsight_takes_goals_achieved_later_and_recomputes_rewards() -> None:
+    buffer = replay(100, hindsight_k=4.0)
+    buffer.extend([episode(n, 5) for n in range(4)])
+    batch = buffer.sample_transitions(20_000)
+    goal, step, number = batch.inputs[:, 3], batch.inputs[:, 1], batch.inputs[:, 0]
+    relabelled = goal >= 0
+    assert relabelled.mean() == pytest.approx(0.8, abs=0.02)
+    later = goal[relabelled] - 100 * number[relabelled]
+    assert (later > step[relabelled]).all()
+    assert (later <= 5).all()
+    np.testing.assert_array_equal(batch.next_inputs[:, 3], goal)
+    reached = later == step[relabelled] + 1
+    np.testing.assert_array_equal(batch.rewards[relabelled], np.where(reached, 0.0, -1.0))
+    assert (batch.rewards[~relabelled] == -1.0).all()
+    # `future` is uniform over what follows: from step 0, each of the five later states.
+    first = later[step[relabelled] == 0]
+    assert np.bincount(first.astype(int), minlength=6)[1:].min() > 0.17 * len(first)
+    # Sampling never writes into the store.
+    assert (buffer.state()["frames"][:, 3] == -1.0).all()
+
+
+def test_trajectories_come_whole_and_in_order() -> None:
+    buffer = replay(100)
+    buffer.extend([episode(0, 5), episode(1, 2), episode(2, 5)])
+    stretches = buffer.sample_trajectories(50, 5)
+    assert stretches.shape == (50, 6, 3)
+    assert set(stretches[:, 0, 0]) == {0.0, 2.0}
+    assert (stretches[:, :, 1] == np.arange(6)).all()
+    shorter = buffer.sample_trajectories(300, 2)
+    assert set(shorter[:, 0, 1]) == {0.0, 1.0, 2.0, 3.0}
+    assert (np.diff(shorter[:, :, 1], axis=1) == 1).all()
+
+
+@given(lengths=st.lists(st.integers(1, 5), min_size=1, max_size=12))
+@settings(deadline=None, max_examples=30)
+def test_restored_replay_is_the_same_and_goes_on_the_same(lengths: list[int]) -> None:
+    original, restored = replay(12, hindsight_k=4.0), replay(12, hindsight_k=4.0)
+    original.extend([episode(n, steps) for n, steps in enumerate(lengths)])
+    original.sample_transitions(7)
+    state = original.state()
+    restored.load_state(state)
+    for name, value in restored.state().items():
+        np.testing.assert_equal(value, state[name])
+    for buffer in (original, restored):
+        buffer.extend([episode(50, 4)])
+    ours, theirs = original.sample_transitions(64), restored.sample_transitions(64)
+    for field in ("inputs", "actions", "rewards", "discounts", "next_inputs"):
+        np.testing.assert_array_equal(getattr(ours, field), getattr(theirs, field))
+
+
+def test_memory_is_what_the_documentation_says() -> None:
+    layout = ReplayLayout(observation=25, action=4, goal=3, horizon=50)
+    buffer = TrajectoryReplay(layout, 1_000_000, np.random.default_rng(0))
+    assert buffer.nbytes == pytest.approx(148e6, rel=0.005)
+
+
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (lambda: replay(4), "capacity must hold an episode of 5 steps, got 4"),
+        (lambda: replay(10).sample_transitions(1), "empty replay"),
+        (lambda: replay(10).sample_trajectories(1, 5), "no trajectory of 5 steps"),
+        (lambda: replay(10).extend([episode(0, 6)]), "1 to 5 steps, got 6"),
+        (
+            lambda: TrajectoryReplay(LAYOUT, 10, np.random.default_rng(0), hindsight_k=4),
+            "hindsight_k must be 0",
+        ),
+    ],
+)
+def test_bad_use_is_refused(make: Callable[[], object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+# -- by priority --------------------------------------------------------------------------------
+
+
+@given(
+    size=st.integers(1, 70),
+    writes=st.lists(st.tuples(st.integers(0, 69), st.floats(0, 10)), min_size=1, max_size=60),
+)
+def test_tree_holds_the_weights_and_draws_in_proportion(
+    size: int, writes: list[tuple[int, float]]
+) -> None:
+    tree, weights = SumTree(size), np.zeros(size)
+    for start in range(0, len(writes), 5):
+        part = [(index % size, weight) for index, weight in writes[start : start + 5]]
+        indices, values = (np.array(column) for column in zip(*part, strict=True))
+        tree.set(indices, values)
+        weights[indices] = values
+    np.testing.assert_allclose(tree[np.arange(size)], weights)
+    assert tree.total == pytest.approx(weights.sum())
+    if weights.sum() > 1e-6:
+        uniform = (np.arange(2000) + 0.5) / 2000
+        drawn = np.bincount(tree.draw(uniform), minlength=size)
+        # Evenly spread uniform numbers: every count is its expectation, but for rounding.
+        assert (abs(drawn - 2000 * weights / weights.sum()) < 2).all()
+        assert not drawn[weights == 0].any()
+    copy = SumTree(size)
+    copy.load_state(tree.state())
+    assert copy.total == tree.total
+
+
+def test_dense_ranks_leave_the_least_out_and_share_ties() -> None:
+    np.testing.assert_array_equal(rank_weights(np.array([0.3, 0.1, 0.3, 0.7])), [1, 0, 1, 2])
+    np.testing.assert_array_equal(rank_weights(np.array([0.2, 0.2])), [1, 1])
+
+
+def test_music_p_draws_episodes_by_the_rank_of_their_priority() -> None:
+    replay = TrajectoryReplay(LAYOUT, 20, np.random.default_rng(0))
+    replay.extend([episode(n, 5) for n in range(4)], np.array([0.4, 0.1, 0.9, 0.4]))
+    drawn = replay.sample_transitions(60_000).actions
+    share = np.bincount(drawn[:, 0].astype(int), minlength=4) / 60_000
+    np.testing.assert_allclose(share, [0.25, 0.0, 0.5, 0.25], atol=0.01)
+    steps = np.bincount(drawn[:, 1].astype(int)) / 60_000
+    np.testing.assert_allclose(steps, 0.2, atol=0.01)
+    # The oldest episode makes room, and its rank goes with it.
+    replay.extend([episode(4, 5)], np.array([0.2]))
+    drawn = replay.sample_transitions(60_000).actions[:, 0].astype(int)
+    share = np.bincount(drawn, minlength=5) / 60_000
+    np.testing.assert_allclose(share, [0, 0, 3 / 6, 2 / 6, 1 / 6], atol=0.01)
+
+
+def test_per_draws_by_td_error_and_weights_undo_it() -> None:
+    replay = TrajectoryReplay(LAYOUT, 20, np.random.default_rng(0), td_exponent=0.5)
+    replay.extend([episode(0, 5), episode(1, 3)])
+    first = replay.sample_transitions(8_000)
+    assert first.rows is not None
+    assert first.weights is not None
+    np.testing.assert_allclose(np.bincount(first.rows)[first.rows], 1000, rtol=0.15)
+    rows = np.unique(first.rows)
+    errors = np.array([0, 1, 4, 9, 16, 25, 36, 49], np.float32)
+    replay.update_priorities(rows, errors)
+    batch = replay.sample_transitions(56_000, importance_exponent=1.0)
+    assert batch.rows is not None
+    assert batch.weights is not None
+    drawn = np.array([(batch.rows == row).sum() for row in rows])
+    np.testing.assert_allclose(drawn, 2000 * np.sqrt(errors), rtol=0.1, atol=20)
+    # Weighted by beta = 1, every transition with a positive error counts the same.
+    counted = np.array([batch.weights[batch.rows == row].sum() for row in rows[1:]])
+    np.testing.assert_allclose(counted / counted.mean(), 1.0, rtol=0.1)
+    assert batch.weights.max() == 1.0
+
+
+def test_per_forgets_what_was_overwritten_and_keeps_hindsight_inside_its_episode() -> None:
+    replay = TrajectoryReplay(
+        LAYOUT, 10, np.random.default_rng(0), goal_reward=matches, hindsight_k=4, td_exponent=0.6
+    )
+    for number, steps in enumerate([5, 2, 4, 3, 5, 1, 1, 5]):
+        replay.extend([episode(number, steps)])
+        batch = replay.sample_transitions(500)
+        held = set(batch.actions[:, 0].astype(int))
+        assert max(held) == number
+        assert len(held) <= replay.trajectories
+        np.testing.assert_array_equal(batch.next_inputs[:, 1], batch.actions[:, 1] + 1)
+        goal = batch.inputs[:, 3]
+        later = goal[goal >= 0] - 100 * batch.actions[goal >= 0, 0]
+        assert (later > batch.actions[goal >= 0, 1]).all()
+    assert batch.rows is not None
+    replay.update_priorities(batch.rows, np.ones(500, np.float32))
+    restored = TrajectoryReplay(
+        LAYOUT, 10, np.random.default_rng(1), goal_reward=matches, hindsight_k=4, td_exponent=0.6
+    )
+    restored.load_state(replay.state())
+    np.testing.assert_array_equal(
+        replay.sample_transitions(50).inputs, restored.sample_transitions(50).inputs
+    )

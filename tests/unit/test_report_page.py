@@ -1,0 +1,424 @@
+"""Reports on sweeps in every state, from runs in memory: what is said, drawn and left open."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from html.parser import HTMLParser
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from music_rllib.reports.analysis import THRESHOLDS, Scope, analyse
+from music_rllib.reports.build import build_report, write_report
+from music_rllib.reports.conditions import find_stages
+from music_rllib.reports.data import Points, RunRecord, Sweep, columns
+from music_rllib.reports.missing import planned_runs
+from music_rllib.reports.page import Report, render
+from music_rllib.reports.palette import DARK, LIGHT, colour_of, marker_of
+from music_rllib.reports.verdict import verdict
+from music_rllib.tracking import names
+
+STEPS = range(20_000, 200_001, 20_000)
+CONFIG = """
+name: smoke
+tasks: [FetchPush]
+seeds: [0]
+stages:
+  - name: finetune
+    variant: tac
+    grid: {tac.entropic_index: [1.0, 1.5]}
+"""
+
+
+def one_run(
+    q: str,
+    seed: int,
+    *,
+    task: str = "FetchPush",
+    stage: str = "finetune",
+    status: str = "FINISHED",
+    params: Mapping[str, str] | None = None,
+    **tags: str,
+) -> RunRecord:
+    key = f"{stage}-{task}-{q}-{seed}-{sorted((params or {}).items())}-{sorted(tags.items())}"
+    return RunRecord(
+        run_id=f"id-{key}",
+        name=f"{stage}/{task}/q={q}/seed{seed}",
+        status=status,
+        started=0,
+        ended=60_000 if status == "FINISHED" else None,
+        params={
+            "seed": str(seed),
+            "env_steps": "200000",
+            "tac.entropic_index": q,
+            "task.name": task,
+            "music.mi_reward_weight": "0.5" if task == "FetchSlide" else "1.0",
+            **(params or {}),
+        },
+        tags={
+            names.TAG_NODE_KEY: key,
+            names.TAG_STAGE: stage,
+            names.TAG_VARIANT: "music-r",
+            names.TAG_TASK: task,
+            names.TAG_SEED: str(seed),
+            names.TAG_ENTROPIC_INDEX: q,
+            names.TAG_MI_REWARD_WEIGHT: "0.5" if task == "FetchSlide" else "1",
+            **tags,
+        },
+    )
+
+
+def climbing(final: float, upto: int = 200_000) -> Points:
+    """Success rises in a straight line to `final` at the end of the budget."""
+    steps = [step for step in STEPS if step <= upto]
+    values = [final * step / STEPS[-1] for step in steps]
+    return Points([names.EVAL_SUCCESS] * len(steps), steps, steps, values)
+
+
+def sweep_of(
+    runs: Sequence[tuple[RunRecord, Points]], *, status: str = "FINISHED", config: str | None = None
+) -> Sweep:
+    return Sweep(
+        name="smoke",
+        status=status,
+        run_id="parent",
+        experiment_id="1",
+        started=0,
+        source="sqlite:////results/mlflow.db",
+        tags={names.TAG_GIT_COMMIT: "c0ffee"},
+        config=config,
+        runs=[run for run, _ in runs],
+        history=columns(points for _, points in runs),
+    )
+
+
+def compared(finals: Mapping[str, Sequence[float]], **changes: str) -> Sweep:
+    return sweep_of(
+        [
+            (one_run(q, seed, **changes), climbing(final))  # type: ignore[arg-type]
+            for q, values in finals.items()
+            for seed, final in enumerate(values)
+        ]
+    )
+
+
+def report_on(sweep: Sweep) -> Report:
+    return build_report(sweep, np.random.default_rng(0), difference=0.1)
+
+
+def first_scope(sweep: Sweep) -> Scope:
+    return analyse(sweep, np.random.default_rng(0))[0].scopes[0]
+
+
+def said_about(sweep: Sweep) -> str:
+    return " ".join(verdict(first_scope(sweep), 0.1))
+
+
+# What is said -----------------------------------------------------------------------------------
+
+
+def test_a_clear_winner_is_named() -> None:
+    said = said_about(
+        compared({"1": [0.3, 0.32, 0.35, 0.31, 0.3], "1.5": [0.9, 0.92, 0.88, 0.95, 0.9]})
+    )
+    assert said.startswith(
+        "q = 1.5 is ahead on FetchPush: q = 1.5 with 0.91 (0.89 to 0.93, 5 seeds)"
+    )
+    assert "No winner" not in said
+
+
+def test_no_winner_where_intervals_overlap_and_how_many_seeds_would_tell() -> None:
+    said = said_about(
+        compared({"1": [0.5, 0.9, 0.6, 0.8], "1.5": [0.6, 0.95, 0.7, 0.8], "2": [0.1, 0.2, 0.1, 0]})
+    )
+    assert "No winner on FetchPush: q = 1.5" in said
+    assert "the interval overlaps with that of q = 1." in said
+    # Squares .1 + .0675 (rounded) + .02 over 9 degrees of freedom: .146; 35 seeds by the t test.
+    assert re.search(r"differ by 0\.1[45] .* about 3\d seeds per condition .* 3\d more than", said)
+
+
+def test_two_seeds_far_apart_are_no_evidence() -> None:
+    """Their bootstrap intervals do not overlap; that alone would name a winner."""
+    scope = first_scope(compared({"1": [0.1, 0.12], "1.5": [0.9, 0.95]}))
+    (pair,) = scope.comparisons
+    assert not pair.overlaps
+    assert not pair.decided
+    assert "may be chance (p = 0.3" in " ".join(verdict(scope, 0.1))
+
+
+@pytest.mark.parametrize(
+    "finals, expected",
+    [
+        ({"1.5": [0.5, 0.6]}, "Only one condition has finished"),
+        ({"1": [0.1], "1.5": [0.9]}, "every condition has a single seed, so there is no interval"),
+        ({"1": [0.1, 0.1], "1.5": [0.1, 0.1]}, "All seeds ended alike"),
+    ],
+)
+def test_too_little_is_said_to_be_too_little(finals: dict[str, list[float]], expected: str) -> None:
+    assert expected in said_about(compared(finals))
+
+
+def test_a_run_that_failed_has_no_final_rate_but_counts_as_waiting() -> None:
+    failed = one_run("1", 1, status="FAILED")
+    sweep = sweep_of([(one_run("1", 0), climbing(0.9)), (failed, climbing(0.9, upto=60_000))])
+    (analysis,) = analyse(sweep, np.random.default_rng(0))
+    (final,) = analysis.scopes[0].finals
+    assert final.seeds == 1
+    assert float(final.estimate.value) == pytest.approx(0.9)
+    half = next(wait for wait in analysis.waits if wait.threshold == THRESHOLDS[0])
+    assert (half.reached, half.runs, half.median) == (1, 2, 120_000)
+
+
+def test_over_all_tasks_only_seeds_that_finished_on_each_count() -> None:
+    """Otherwise a condition whose failures are on the hard task would look better."""
+    runs = [
+        (one_run("1", seed, task=task), climbing(final))
+        for task, finals in (("FetchPush", [0.9, 0.8]), ("FetchSlide", [0.3]))
+        for seed, final in enumerate(finals)
+    ]
+    over_all, push, _ = analyse(sweep_of(runs), np.random.default_rng(0))[0].scopes
+    assert float(over_all.finals[0].estimate.value) == pytest.approx(0.6)
+    assert (over_all.finals[0].seeds, over_all.finals[0].runs) == (1, 2)
+    assert push.finals[0].seeds == 2
+
+
+# Which runs are compared ------------------------------------------------------------------------
+
+
+def labels(sweep: Sweep, stage: int = 0) -> list[str]:
+    return [condition.label for condition in find_stages(sweep)[stage].conditions]
+
+
+def test_tasks_with_their_own_settings_share_a_condition() -> None:
+    """MUSIC-r's weight is 1, and .5 on FetchSlide: that is no difference between conditions."""
+    runs = [
+        (one_run(q, seed, task=task), climbing(0.5))
+        for task in ("FetchPush", "FetchSlide")
+        for q in ("2", "1.5", "10")
+        for seed in (0, 1)
+    ]
+    assert labels(sweep_of(runs)) == ["q = 1.5", "q = 2", "q = 10"]
+
+
+def test_other_settings_and_the_source_tell_conditions_apart() -> None:
+    sources = [one_run(q, 0, stage="pretrain") for q in ("1", "2")]
+    runs = [
+        one_run("1.5", 0, params={"tac.lr": lr}, source_node=source.node_key)
+        for lr in ("0.001", "0.0003")
+        for source in sources
+    ]
+    sweep = sweep_of([(run, climbing(0.5)) for run in (*sources, *runs)])
+    assert labels(sweep, 1) == [
+        "q = 1.5, tac.lr = 0.0003, pretrain: q = 1",
+        "q = 1.5, tac.lr = 0.0003, pretrain: q = 2",
+        "q = 1.5, tac.lr = 0.001, pretrain: q = 1",
+        "q = 1.5, tac.lr = 0.001, pretrain: q = 2",
+    ]
+
+
+def test_schedules_with_the_same_words_are_not_one_condition() -> None:
+    runs = [
+        one_run("1 to 2", seed, params={"tac.entropic_index.begin": begin})
+        for begin in ("0.1", "0.3")
+        for seed in (0, 1)
+    ]
+    found = labels(sweep_of([(run, climbing(0.5)) for run in runs]))
+    assert len(found) == 2
+    assert all(label.startswith("q = 1 to 2 (") for label in found)
+
+
+# The page ---------------------------------------------------------------------------------------
+
+
+class Page(HTMLParser):
+    """Text, ids and whatever a browser would fetch."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.text = ""
+        self.ids: list[str] = []
+        self.fetched: list[str] = []
+        self.open: list[str] = []
+        self.feed(html)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        found = dict(attrs)
+        self.ids += [str(found["id"])] if "id" in found else []
+        for name in ("src", "href", "xlink:href", "srcset", "data"):
+            if tag != "a" and not str(found.get(name, "#")).startswith("#"):
+                self.fetched.append(f"{tag} {name}={found[name]}")
+        if tag not in ("meta", "br", "img", "link"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def partial() -> Sweep:
+    failure = "ValueError: <b>state</b> is NaN\n  in step"
+    return sweep_of(
+        [
+            (one_run("1", 0), climbing(0.9)),
+            (
+                one_run("1", 1, status="FAILED", failure=failure),
+                climbing(0.4, 40_000),
+            ),
+            (one_run("1.5", 0, status="RUNNING"), climbing(0.9, 100_000)),
+            (one_run("1.5", 1, status="KILLED"), Points((), (), (), ())),
+        ],
+        status="RUNNING",
+    )
+
+
+SWEEPS: dict[str, Callable[[], tuple[Sweep, Sequence[str]]]] = {
+    "empty": lambda: (
+        sweep_of([], status="RUNNING", config=CONFIG),
+        ["No run has begun", "2 runs not begun", "Sweeprunning"],
+    ),
+    "nothing evaluated": lambda: (
+        sweep_of([(one_run("1", 0, status="RUNNING"), Points((), (), (), ()))]),
+        [
+            "Nothing was evaluated yet",
+            "No condition has finished on FetchPush",
+            "1 run still running",
+        ],
+    ),
+    "partial": lambda: (
+        partial(),
+        [
+            "1 run failed",
+            "1 run still running",
+            "1 run stopped before the end",
+            "What failed and why",
+            "ValueError: <b>state</b> is NaN",
+            "The configuration is not in MLflow",
+            "no run of q = 1.5 has finished",
+        ],
+    ),
+    "single seed": lambda: (
+        compared({"1": [0.5], "1.5": [0.6]}),
+        ["has a single seed (0)", "no interval", "No winner"],
+    ),
+    "single q": lambda: (
+        compared({"1.5": [0.5, 0.6, 0.7]}),
+        ["a single condition (q = 1.5): no comparison", "0.60"],
+    ),
+    "odd name": lambda: (compared({"1.5": [0.5]}, task="My<Task>&"), ["My<Task>&"]),
+    "NaN": lambda: (
+        sweep_of(
+            [(one_run("1", 0), Points([names.EVAL_SUCCESS] * 2, [1, 2], [1, 2], [0.5, np.nan]))]
+        ),
+        ["No condition has finished"],
+    ),
+}
+
+
+@pytest.mark.parametrize("state", SWEEPS)
+def test_any_state_of_a_sweep_has_a_page(state: str) -> None:
+    sweep, expected = SWEEPS[state]()
+    shown = Page(render(report_on(sweep)))
+    for words in expected:
+        assert words in shown.text
+    assert not shown.fetched
+    assert not shown.open
+    assert len(shown.ids) == len(set(shown.ids))
+    assert "nan" not in re.findall(r"[a-z]+", shown.text.replace("NaN", ""))
+
+
+def test_figures_of_an_earlier_report_go_and_the_same_sweep_is_the_same_file(
+    tmp_path: Path,
+) -> None:
+    made = []
+    for name in ("one", "two"):
+        stale = tmp_path / name / "figures" / "old-stage-success-rate.png"
+        stale.parent.mkdir(parents=True)
+        stale.touch()
+        write_report(report_on(compared({"1": [0.5]})), tmp_path / name)
+        figures = sorted((tmp_path / name / "figures").iterdir())
+        assert [path.name for path in figures] == [
+            f"finetune-success-rate.{kind}" for kind in ("png", "svg")
+        ]
+        made.append(figures[1].read_bytes())
+    assert made[0] == made[1]
+
+
+def test_runs_link_to_a_server_s_pages() -> None:
+    sweep = compared({"1": [0.5]})
+    assert "<a href" not in render(report_on(sweep))
+    served = Sweep(**{**sweep.__dict__, "source": "http://mlflow:5000"})
+    assert f'<a href="http://mlflow:5000/#/experiments/1/runs/{sweep.runs[0].run_id}">' in (
+        render(report_on(served))
+    )
+
+
+def test_planned_runs_of_a_configuration() -> None:
+    planned = planned_runs(CONFIG)
+    assert planned is not None
+    assert len(planned) == 2
+    assert planned_runs("name: [") is None
+
+
+# Colours ----------------------------------------------------------------------------------------
+
+COMPARED = ("0.5", "1", "1.5", "2", "3")
+# Machado, Oliveira and Fernandes 2009, severity 1.0, on linear RGB.
+VISION = {
+    "ordinary": np.eye(3),
+    "protanopia": np.array(
+        [
+            [0.152286, 1.052583, -0.204868],
+            [0.114503, 0.786281, 0.099216],
+            [-0.003882, -0.048116, 1.051998],
+        ]
+    ),
+    "deuteranopia": np.array(
+        [
+            [0.367322, 0.860646, -0.227968],
+            [0.280085, 0.672501, 0.047413],
+            [-0.01182, 0.04294, 0.968881],
+        ]
+    ),
+}
+
+
+def linear(colour: str) -> np.ndarray:
+    channels = np.array([int(colour[at : at + 2], 16) / 255 for at in (1, 3, 5)])
+    return np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
+
+
+def lab(rgb: np.ndarray) -> np.ndarray:
+    to_xyz = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
+    x, y, z = np.cbrt(np.clip(np.array(to_xyz) @ rgb, 0, None) / [0.9505, 1.0, 1.089])
+    return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
+
+
+def contrast(one: str, other: str) -> float:
+    light, dark = sorted(float(linear(c) @ [0.2126, 0.7152, 0.0722]) for c in (one, other))[::-1]
+    return (light + 0.05) / (dark + 0.05)
+
+
+@pytest.mark.parametrize("vision", VISION)
+def test_the_paper_s_values_of_q_are_told_apart(vision: str) -> None:
+    seen = {q: lab(np.clip(VISION[vision] @ linear(colour_of(q)), 0, 1)) for q in COMPARED}
+    for one, other in combinations(COMPARED, 2):
+        assert np.linalg.norm(seen[one] - seen[other]) > 15, (one, other)
+
+
+@pytest.mark.parametrize("q", [*COMPARED, "1.25", "1.75", "learned"])
+@pytest.mark.parametrize("paper", [LIGHT, DARK])
+def test_every_colour_stands_out_from_the_paper(q: str, paper: str) -> None:
+    """WCAG 2.1 asks for 3:1 of graphics."""
+    assert contrast(colour_of(q), paper) >= 3
+
+
+def test_a_colour_depends_on_q_alone() -> None:
+    assert colour_of("1.5") == colour_of("1.50") == colour_of("1 to 1.5")
+    assert len({colour_of(str(q)) for q in np.arange(0.5, 3.01, 0.25)}) == 11
+    grid = ("1", "1.25", "1.5", "1.75", "2")
+    assert len({marker_of(q) for q in grid}) == len(grid)

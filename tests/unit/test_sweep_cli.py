@@ -1,0 +1,255 @@
+"""Bad input at the command line: exit code 2, a clear message, and nothing begun."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from typer.testing import CliRunner, Result
+
+from music_rllib.envs.registry import BUILT_IN_TASKS
+from music_rllib.experiment.handoff import HandoffInfo, write_handoff
+from music_rllib.experiment.settings import RunSettings, preset
+from music_rllib.sweep import cli
+from music_rllib.sweep.session import Sweep, open_sweep
+
+Document = dict[str, Any]
+Program = Callable[..., Result]
+
+REPOSITORY = Path(__file__).parents[2]
+PRETRAIN: Document = {"name": "pretrain", "variant": "music-u"}
+
+
+@pytest.fixture
+def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Program:
+    """`python -m music_rllib.sweep` in a folder of its own, up to where a sweep would begin."""
+    monkeypatch.chdir(tmp_path)
+
+    def begun(*_: object) -> int:
+        raise AssertionError("the sweep began")
+
+    monkeypatch.setattr(cli, "_compute_and_report", begun)
+
+    def run(document: Document | None = None, *options: str) -> Result:
+        arguments = list(options)
+        if document is not None:
+            (tmp_path / "sweep.yaml").write_text(yaml.safe_dump(document))
+            arguments.insert(0, "sweep.yaml")
+        return CliRunner().invoke(cli.app, arguments)
+
+    return run
+
+
+def document(**changes: Any) -> Document:
+    base: Document = {
+        "name": "s",
+        "tasks": ["FetchPush"],
+        "resources": {"num_cpus": 1},
+        "stages": [PRETRAIN],
+    }
+    return base | changes
+
+
+def from_checkpoint(folder: Path) -> Document:
+    source = {"checkpoint": str(folder)}
+    return document(stages=[{"name": "f", "variant": "music-r", "init_from": source}])
+
+
+def test_a_dry_run_shows_the_plan_and_leaves_nothing(program: Program, tmp_path: Path) -> None:
+    result = program(document(), "--dry-run")
+    assert result.exit_code == 0
+    assert "1 runs, 200,000 env steps in all." in result.output
+    assert f"Storage: {tmp_path}/results" in result.output
+    assert [path.name for path in tmp_path.iterdir()] == ["sweep.yaml"]
+
+
+def test_without_a_file_the_packaged_sweep_runs(program: Program) -> None:
+    result = program(None, "--dry-run")
+    assert result.exit_code == 0
+    assert "No CONFIG given" in result.output
+    assert "tac.entropic_index: 1, 1.5, 2" in result.output
+
+
+def test_options_replace_name_and_storage(program: Program, tmp_path: Path) -> None:
+    result = program(document(), "--dry-run", "--name", "other", "--storage", "elsewhere")
+    assert "Sweep other" in result.output
+    assert f"Storage: {tmp_path}/elsewhere" in result.output
+
+
+def test_the_packaged_sweep_is_the_smoke_sweep() -> None:
+    assert cli.DEFAULT_CONFIG.read_text() == (REPOSITORY / "tune_configs/smoke.yaml").read_text()
+
+
+BAD: list[tuple[Document, str]] = [
+    (document(colour="red"), "sweep.yaml:1: colour is not a known setting"),
+    (
+        document(stages=[PRETRAIN | {"tac": {"entropic_index": 0}}]),
+        "stages.pretrain.tac.entropic_index must be > 0, got 0",
+    ),
+    (
+        document(stages=[PRETRAIN | {"tac": {"entropic_index": float("nan")}}]),
+        "stages.pretrain.tac.entropic_index must be a finite number, got nan",
+    ),
+    (document(tasks=["FetchPusch"]), "got 'FetchPusch' (did you mean 'FetchPush'?)"),
+    (document(tasks=["FetchReach"]), "got FetchReach, which has none"),
+    (document(resources={"num_cpus": 4096}), "resources.num_cpus must be <= "),
+    (
+        document(mlflow={"tracking_uri": "http://127.0.0.1:9"}),
+        "mlflow.tracking_uri must name an MLflow server that answers, got http://127.0.0.1:9",
+    ),
+    (document(storage="ftp://host/x"), "storage must be a folder or an s3:// or gs:// URI"),
+    (document(storage="/dev/null/x"), "must be writable: Not a directory"),
+    (from_checkpoint(Path("nowhere")), "nowhere must hold a handoff"),
+    (
+        document(
+            tasks=["Mine"],
+            environments={"Mine": {"env_id": "Nope-v7", "horizon": 5}},
+            stages=[{"name": "a", "variant": "tac"}],
+        ),
+        "environments.Mine: env_id must name an environment that can be made, got 'Nope-v7'",
+    ),
+    (
+        document(
+            tasks=["Swing"],
+            environments={
+                "Swing": {
+                    "env_id": "Pendulum-v1",
+                    "horizon": 200,
+                    "agent_indices": [0],
+                    "surrounding_indices": [3],
+                    "success_key": None,
+                }
+            },
+        ),
+        "environments.Swing: surrounding_indices must be < 3, the size of the observation, got 3",
+    ),
+]
+
+
+@pytest.mark.parametrize(("bad", "message"), BAD, ids=[message[:30] for _, message in BAD])
+def test_bad_input_is_refused_before_anything_starts(
+    program: Program, tmp_path: Path, bad: Document, message: str
+) -> None:
+    result = program(bad)
+    assert result.exit_code == 2, result.output
+    assert message in result.stderr
+    assert result.stderr.startswith("error: ")
+    assert not (tmp_path / "results" / "nodes").exists()
+
+
+def test_files_that_are_none(program: Program, tmp_path: Path) -> None:
+    result = program(None, "missing.yaml")
+    assert (result.exit_code, "missing.yaml: must be an existing file" in result.stderr) == (
+        2,
+        True,
+    )
+    (tmp_path / "torn.yaml").write_text("name: [")
+    result = program(None, "torn.yaml")
+    assert (result.exit_code, "torn.yaml:1: must be valid YAML" in result.stderr) == (2, True)
+
+
+def handoff(folder: Path, task_name: str) -> Path:
+    task = BUILT_IN_TASKS[task_name]
+    run = RunSettings.model_validate(
+        {"task": task, "variant": "music-u", "seed": 0, "music": preset("music-u", task)}
+    )
+    weights = {"mi_estimator": {"w": np.zeros((4, 4), np.float32)}}
+    write_handoff(folder, weights, HandoffInfo.of(run, "0" * 20, 1))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("task", "tamper", "message"),
+    [
+        ("FetchSlide", lambda _: None, "must be of task FetchPush, got one of FetchSlide"),
+        ("FetchPush", lambda data: data[:-3], "must have 136 bytes, it has 133"),
+        ("FetchPush", lambda data: data[:-1] + b"x", "its content has changed"),
+    ],
+    ids=["foreign", "truncated", "flipped"],
+)
+def test_checkpoints_that_do_not_fit(
+    program: Program,
+    tmp_path: Path,
+    task: str,
+    tamper: Callable[[bytes], bytes | None],
+    message: str,
+) -> None:
+    folder = handoff(tmp_path / "handoff", task)
+    weights = folder / "mi_estimator.safetensors"
+    weights.write_bytes(tamper(weights.read_bytes()) or weights.read_bytes())
+    result = program(from_checkpoint(folder))
+    assert result.exit_code == 2
+    assert "stages.f.init_from" in result.stderr
+    assert message in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("address", "message"),
+    [
+        ("127.0.0.1:9", "RAY_ADDRESS must be HOST:PORT of a Ray cluster that answers"),
+        ("http://127.0.0.1:8265", "an http address is for 'ray job submit'"),
+        ("nonsense", "RAY_ADDRESS must be HOST:PORT of a Ray cluster that answers"),
+    ],
+)
+def test_a_cluster_that_is_not_there(
+    program: Program, monkeypatch: pytest.MonkeyPatch, address: str, message: str
+) -> None:
+    monkeypatch.setenv("RAY_ADDRESS", address)
+    result = program(document())
+    assert result.exit_code == 2
+    assert message in result.stderr
+
+
+def test_a_damaged_node_that_others_start_from(
+    program: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    finetune = {"name": "f", "variant": "music-r", "init_from": "pretrain"}
+    opened: list[Sweep] = []
+
+    def remember(*arguments: Any) -> Sweep:
+        opened.append(open_sweep(*arguments))
+        return opened[-1]
+
+    monkeypatch.setattr("music_rllib.sweep.cli.open_sweep", remember)
+    program(document(stages=[PRETRAIN, finetune]), "--dry-run")
+    key = opened[-1].plan.nodes[0].key
+    produced = tmp_path / "produced"
+    handoff(produced / "handoff", "FetchPush")
+    opened[-1].store.publish(key, produced)
+    node = tmp_path / "results" / "nodes" / key
+    (node / "handoff" / "handoff.json").write_text("{}")
+    result = program(document(stages=[PRETRAIN, finetune]))
+    assert result.exit_code == 2
+    assert f"Delete {node} to train it again" in result.stderr
+    (node / "manifest.json").write_text("{}")
+    result = program(document(stages=[PRETRAIN, finetune]), "--dry-run")
+    assert result.exit_code == 2
+    assert f"{node}/manifest.json must be a manifest" in result.stderr
+    assert f"Delete {node} to train it again" in result.stderr
+
+
+def test_help_answers_at_once_and_shows_how_it_is_used() -> None:
+    code = (
+        "import json, sys; from typer.testing import CliRunner; from music_rllib.sweep import cli;"
+        "result = CliRunner().invoke(cli.app, ['--help']);"
+        "heavy = [name for name in ('ray', 'torch', 'mlflow', 'gymnasium') if name in sys.modules];"
+        "print(json.dumps([result.exit_code, result.output, heavy]))"
+    )
+    found = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        check=True,
+        text=True,
+        env=os.environ | {"COLUMNS": "200"},
+    )
+    exit_code, text, heavy = json.loads(found.stdout)
+    assert exit_code == 0
+    assert heavy == []
+    for part in ("--dry-run", "--storage", "--name", "Examples", "ray job submit", "Exit codes"):
+        assert part in text

@@ -1,0 +1,115 @@
+"""Distribution, networks and normaliser of TAC, each against an independent computation."""
+
+import numpy as np
+import pytest
+import torch
+from scipy import integrate
+from torch import nn
+
+from music_rllib.tac.distribution import deterministic_action, sample_squashed
+from music_rllib.tac.networks import Critics, RunningNormaliser, mlp
+
+
+@pytest.mark.parametrize(("mean", "log_std"), [(0.0, -1.0), (0.8, 0.0), (-1.5, 0.5)])
+def test_squashed_density_integrates_to_one(mean: float, log_std: float) -> None:
+    def density(action: float) -> float:
+        raw = np.arctanh(action)
+        noise = torch.tensor([(raw - mean) / np.exp(log_std)], dtype=torch.float64)
+        mu, log_sigma = torch.tensor([[mean], [log_std]], dtype=torch.float64)
+        sample = sample_squashed(mu, log_sigma, noise)
+        assert float(sample.action) == pytest.approx(action, abs=1e-9)
+        return float(sample.log_density.exp())
+
+    total, _ = integrate.quad(density, -1 + 1e-12, 1 - 1e-12, limit=400)
+    assert total == pytest.approx(1.0, abs=1e-5)
+
+
+def test_log_density_keeps_its_digits_where_tanh_saturates() -> None:
+    mean = torch.tensor([[12.0]], requires_grad=True)
+    sample = sample_squashed(mean, torch.zeros(1, 1), torch.zeros(1, 1))
+    exact = -0.5 * np.log(2 * np.pi) - 2 * (np.log(2) - 12.0 - np.log1p(np.exp(-24.0)))
+    assert float(sample.log_density.detach()) == pytest.approx(exact, rel=1e-6)
+    sample.log_density.sum().backward()
+    assert mean.grad is not None
+    assert float(mean.grad) == pytest.approx(2.0, rel=1e-5)
+
+
+def test_deterministic_action_is_the_sample_without_noise() -> None:
+    mean = torch.randn(5, 3)
+    sample = sample_squashed(mean, torch.zeros(5, 3), torch.zeros(5, 3))
+    torch.testing.assert_close(deterministic_action(mean), sample.action)
+
+
+def as_two_perceptrons(critics: Critics, sizes: list[int]) -> list[nn.Sequential]:
+    copies = []
+    for which in range(2):
+        copy = mlp(sizes[0], sizes[1:], 1)
+        linears = [layer for layer in copy if isinstance(layer, nn.Linear)]
+        for layer, weight, bias in zip(linears, critics.weights, critics.biases, strict=True):
+            layer.weight.data = weight[which].T.clone()
+            layer.bias.data = bias[which, 0].clone()
+        copies.append(copy)
+    return copies
+
+
+@pytest.mark.parametrize("sizes", [[7, 16], [7, 16, 16, 8]])
+def test_twin_critics_are_two_separate_perceptrons(sizes: list[int]) -> None:
+    torch.manual_seed(0)
+    critics = Critics(sizes[0], sizes[1:])
+    inputs = torch.randn(11, 7, requires_grad=True)
+    values = critics(inputs)
+    expected = torch.stack(
+        [copy(inputs).squeeze(-1) for copy in as_two_perceptrons(critics, sizes)]
+    )
+    torch.testing.assert_close(values, expected)
+    (gradient,) = torch.autograd.grad(values.square().sum(), inputs, retain_graph=True)
+    (reference,) = torch.autograd.grad(expected.square().sum(), inputs)
+    torch.testing.assert_close(gradient, reference)
+    assert not torch.allclose(values[0], values[1])
+
+
+def test_frozen_critics_pass_gradients_to_their_inputs_only() -> None:
+    critics = Critics(5, [8, 8])
+    inputs = torch.randn(3, 5, requires_grad=True)
+    values = critics(inputs, frozen=True)
+    torch.testing.assert_close(values, critics(inputs))
+    values.sum().backward()
+    assert inputs.grad is not None
+    assert inputs.grad.abs().sum() > 0
+    assert all(parameter.grad is None for parameter in critics.parameters())
+
+
+def test_normaliser_has_the_moments_of_all_it_has_seen() -> None:
+    rng = np.random.default_rng(0)
+    data = rng.normal([3.0, -200.0, 0.5], [0.1, 30.0, 1e-9], size=(1000, 3))
+    normaliser = RunningNormaliser(3, epsilon=0.01, clip=5.0)
+    for part in np.array_split(data, 7):
+        normaliser.update(torch.from_numpy(part))
+    expected = (data - data.mean(0)) / np.maximum(data.std(0), 0.01)
+    got = normaliser(torch.from_numpy(data).float()).numpy()
+    np.testing.assert_allclose(got, np.clip(expected, -5, 5), atol=2e-3)
+    assert float(normaliser(torch.tensor([1e9, 0.0, 0.0]))[0]) == 5.0
+
+
+def test_a_feature_that_never_varied_says_nothing_later() -> None:
+    normaliser = RunningNormaliser(3, epsilon=0.01, clip=5.0)
+    for size in (7, 1000, 13):
+        seen = torch.tensor([0.0, 1.34, 0.0]).repeat(size, 1)
+        seen[:, 2] = torch.linspace(-1, 1, size) if size > 1 else 0.5
+        normaliser.update(seen)
+    assert normaliser(torch.tensor([1.3, 0.7, 0.0])).tolist()[:2] == [0.0, 0.0]
+    assert float(normaliser(torch.tensor([0.0, 1.34, 0.9]))[2]) > 1
+    normaliser.update(torch.tensor([[1.3, 0.7, 0.0]]))
+    assert (normaliser(torch.tensor([1.3, 0.7, 0.0]))[:2].abs() > 1).all()
+
+
+def test_normaliser_is_part_of_the_state_and_changes_nothing_before_its_first_update() -> None:
+    fresh = RunningNormaliser(2, epsilon=0.01, clip=5.0)
+    torch.testing.assert_close(fresh(torch.tensor([1.0, -2.0])), torch.tensor([1.0, -2.0]))
+    fresh.update(torch.randn(10, 2))
+    copy = RunningNormaliser(2, epsilon=0.01, clip=5.0)
+    copy.load_state_dict(fresh.state_dict())
+    more = torch.randn(5, 2)
+    fresh.update(more)
+    copy.update(more)
+    torch.testing.assert_close(fresh.mean, copy.mean, rtol=0, atol=0)
