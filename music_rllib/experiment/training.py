@@ -108,8 +108,9 @@ class TrainingRun:
             Means since the last report, by the names of `tracking.names`; evaluation metrics
             where an evaluation was due. Metrics that do not exist yet are left out.
         """
-        evaluation_at = _next_multiple(self.env_steps, self.run.evaluation.interval)
-        report_at = _next_multiple(self.env_steps, REPORT_INTERVAL)
+        interval = self.run.evaluation.interval
+        evaluation_at = _next_multiple(self.env_steps, interval)
+        report_at = _next_multiple(self.env_steps, min(interval, REPORT_INTERVAL))
         goal = min(report_at, evaluation_at, self.run.env_steps)
         rounds: defaultdict[str, list[float]] = defaultdict(list)
         while self.env_steps < goal:
