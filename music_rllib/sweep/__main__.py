@@ -6,7 +6,9 @@ from music_rllib._quiet import prepare_environment, quiet_third_parties
 prepare_environment()
 quiet_third_parties()
 
-from music_rllib.sweep.cli import app  # noqa: E402
+import sys  # noqa: E402
+
+from music_rllib.sweep.cli import main  # noqa: E402
 
 if __name__ == "__main__":
-    app(prog_name="python -m music_rllib.sweep")
+    sys.exit(main())

@@ -1,25 +1,35 @@
 """Bad input at the command line: exit code 2, a clear message, and nothing begun."""
 
-import json
 import os
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
-from typer.testing import CliRunner, Result
 
 from music_rllib.envs.registry import BUILT_IN_TASKS
 from music_rllib.experiment.handoff import HandoffInfo, write_handoff
 from music_rllib.experiment.settings import RunSettings, preset
-from music_rllib.sweep import cli
+from music_rllib.sweep import cli, driver
 from music_rllib.sweep.session import Sweep, open_sweep
 
 Document = dict[str, Any]
+
+
+@dataclass
+class Result:
+    """What the program did."""
+
+    exit_code: int
+    output: str
+    stderr: str
+
+
 Program = Callable[..., Result]
 
 REPOSITORY = Path(__file__).parents[2]
@@ -27,21 +37,26 @@ PRETRAIN: Document = {"name": "pretrain", "variant": "music-u"}
 
 
 @pytest.fixture
-def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Program:
+def program(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Program:
     """`python -m music_rllib.sweep` in a folder of its own, up to where a sweep would begin."""
     monkeypatch.chdir(tmp_path)
 
     def begun(*_: object) -> int:
         raise AssertionError("the sweep began")
 
-    monkeypatch.setattr(cli, "_compute_and_report", begun)
+    monkeypatch.setattr(driver, "_compute_and_report", begun)
 
     def run(document: Document | None = None, *options: str) -> Result:
         arguments = list(options)
         if document is not None:
             (tmp_path / "sweep.yaml").write_text(yaml.safe_dump(document))
             arguments.insert(0, "sweep.yaml")
-        return CliRunner().invoke(cli.app, arguments)
+        capsys.readouterr()
+        code = cli.main(arguments or ["run"])
+        output, errors = capsys.readouterr()
+        return Result(code, output + errors, errors)
 
     return run
 
@@ -83,7 +98,7 @@ def test_options_replace_name_and_storage(program: Program, tmp_path: Path) -> N
 
 
 def test_the_packaged_sweep_is_the_smoke_sweep() -> None:
-    assert cli.DEFAULT_CONFIG.read_text() == (REPOSITORY / "tune_configs/smoke.yaml").read_text()
+    assert driver.DEFAULT_CONFIG.read_text() == (REPOSITORY / "tune_configs/smoke.yaml").read_text()
 
 
 BAD: list[tuple[Document, str]] = [
@@ -216,7 +231,7 @@ def test_a_damaged_node_that_others_start_from(
         opened.append(open_sweep(*arguments))
         return opened[-1]
 
-    monkeypatch.setattr("music_rllib.sweep.cli.open_sweep", remember)
+    monkeypatch.setattr("music_rllib.sweep.driver.open_sweep", remember)
     program(document(stages=[PRETRAIN, finetune]), "--dry-run")
     key = opened[-1].plan.nodes[0].key
     produced = tmp_path / "produced"
@@ -234,22 +249,31 @@ def test_a_damaged_node_that_others_start_from(
     assert f"Delete {node} to train it again" in result.stderr
 
 
-def test_help_answers_at_once_and_shows_how_it_is_used() -> None:
+@pytest.mark.parametrize("command", ["", *sorted(cli._commands())])
+def test_help_answers_at_once_and_shows_how_it_is_used(command: str) -> None:
     code = (
-        "import json, sys; from typer.testing import CliRunner; from music_rllib.sweep import cli;"
-        "result = CliRunner().invoke(cli.app, ['--help']);"
-        "heavy = [name for name in ('ray', 'torch', 'mlflow', 'gymnasium') if name in sys.modules];"
-        "print(json.dumps([result.exit_code, result.output, heavy]))"
+        "import contextlib, sys; from music_rllib.sweep import cli\n"
+        "with contextlib.suppress(SystemExit): cli.main([*sys.argv[1:], '--help'])\n"
+        "heavy = {'ray', 'torch', 'mlflow', 'gymnasium', 'optuna', 'pydantic'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
     )
     found = subprocess.run(
-        [sys.executable, "-c", code],
+        [sys.executable, "-c", code, *filter(None, [command])],
         capture_output=True,
         check=True,
         text=True,
         env=os.environ | {"COLUMNS": "200"},
     )
-    exit_code, text, heavy = json.loads(found.stdout)
-    assert exit_code == 0
-    assert heavy == []
-    for part in ("--dry-run", "--storage", "--name", "Examples", "ray job submit", "Exit codes"):
-        assert part in text
+    parts = ["examples:", "python -m music_rllib.sweep"]
+    parts += ["--json"] if command else ["ray job submit", "exit codes", *cli._commands()]
+    for part in parts:
+        assert part in found.stdout
+
+
+def test_a_mistyped_option_is_bad_input(
+    program: Program, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        program(document(), "--dryrun")
+    assert stopped.value.code == 2
+    assert "unrecognized arguments: --dryrun" in capsys.readouterr().err

@@ -1,0 +1,184 @@
+"""The driver of a sweep: checks, plans, computes, and shows what came of it."""
+
+from __future__ import annotations
+
+import shlex
+import signal
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.text import Text
+
+from music_rllib.experiment.config import load_sweep
+from music_rllib.experiment.model import SweepConfig
+from music_rllib.experiment.plan import make_plan
+from music_rllib.sweep.board import Status
+from music_rllib.sweep.frame import FAILED
+from music_rllib.sweep.local import (
+    check_cpus,
+    check_reachable,
+    cluster_address,
+)
+from music_rllib.sweep.places import resolve_storage, sweep_folder
+from music_rllib.sweep.preflight import (
+    check_environments,
+    import_checkpoints,
+    verify_inputs,
+)
+from music_rllib.sweep.session import Sweep, keep_record, open_sweep
+from music_rllib.sweep.tables import plan_view, results_table
+from music_rllib.tracking.redaction import redact
+
+if TYPE_CHECKING:
+    from music_rllib.sweep.display import Display
+    from music_rllib.sweep.logbook import Logbook
+    from music_rllib.tracking.tracker import Tracker
+
+__all__ = ["DEFAULT_CONFIG", "run_sweep"]
+
+DEFAULT_CONFIG = Path(__file__).with_name("default.yaml")
+NAMED = 10
+"""Reused runs that are listed by name."""
+
+
+def run_sweep(
+    console: Console,
+    config: Path | None,
+    *,
+    dry_run: bool = False,
+    storage: str | None = None,
+    name: str | None = None,
+) -> int:
+    """Train every run of a sweep, compare them, and log them to MLflow.
+
+    Args:
+        console: Where progress and results are shown.
+        config: The sweep's file; None for the packaged one.
+        dry_run: Check everything and show the plan; run nothing.
+        storage: Replaces the file's `storage`.
+        name: Replaces the file's `name`.
+
+    Returns:
+        The exit code.
+
+    Raises:
+        BadInputError: Nothing was started; as other errors that say what to change.
+    """
+    try:
+        return _sweep(
+            console, config or DEFAULT_CONFIG, dry_run=dry_run, storage=storage, name=name
+        )
+    except KeyboardInterrupt:
+        _say_how_to_continue(console)
+        return 128 + signal.SIGINT
+
+
+def _sweep(
+    console: Console, path: Path, *, dry_run: bool, storage: str | None, name: str | None
+) -> int:
+    """Run the whole program.
+
+    Returns:
+        The exit code.
+
+    Raises:
+        BadInputError: Nothing was started.
+    """
+    opened = _open(console, load_sweep(path, name=name, storage=storage))
+    if dry_run:
+        console.print("Dry run: the configuration is sound, nothing was started.")
+        return 0
+    keep_record(opened)
+    import_checkpoints(opened.plan, opened.store)
+    verify_inputs(opened.board, opened.store)
+    if not opened.board.complete and (address := cluster_address()) is not None:
+        check_reachable(address)
+    tracker = _open_tracker(opened)
+    with tracker:
+        return _compute_and_report(console, opened, tracker)
+
+
+def _open(console: Console, config: SweepConfig) -> Sweep:
+    """Check what can be checked without starting anything, and show the plan."""
+    if config.path == DEFAULT_CONFIG:
+        console.print(f"No CONFIG given: running the packaged sweep {DEFAULT_CONFIG}.")
+    plan = make_plan(config)
+    check_environments(plan)
+    check_cpus(config.resources)
+    storage, remark = resolve_storage(config.storage)
+    opened = open_sweep(config, plan, storage, sweep_folder(storage, config.name))
+    console.print(plan_view(config, plan, opened.finished))
+    console.print(Text(f"Storage: {redact(storage)}"), soft_wrap=True)
+    if remark:
+        console.print(Text(remark, style="yellow"), soft_wrap=True)
+    return opened
+
+
+def _open_tracker(opened: Sweep) -> Tracker:
+    from music_rllib.tracking.tracker import Tracker
+
+    return Tracker(
+        sweep_name=opened.config.name,
+        storage=opened.storage,
+        config=opened.config.document,
+        tracking_uri=opened.config.mlflow.tracking_uri,
+        sweep_folder=opened.folder,
+    )
+
+
+def _compute_and_report(console: Console, opened: Sweep, tracker: Tracker) -> int:
+    from music_rllib.sweep.display import Display
+    from music_rllib.sweep.logbook import Logbook
+
+    with Display(console, opened.plan, opened.board) as display:
+        logbook = Logbook(tracker, lambda text: display.say(text, "yellow"))
+        _take_over(opened, display, logbook)
+        stopped_by = _compute(opened, display, logbook)
+    failed = bool(opened.board.having(Status.FAILED, Status.SKIPPED)) or (
+        stopped_by is None and not opened.board.complete
+    )
+    tracker.close("KILLED" if stopped_by else "FAILED" if failed else "FINISHED")
+    console.print(
+        results_table(opened.plan, opened.board.__getitem__, opened.results(), tracker.run_id)
+    )
+    if undelivered := tracker.undelivered_message():
+        console.print(Text(undelivered, style="yellow"), soft_wrap=True)
+    console.print(Text(f"Open MLflow's pages with: {tracker.ui_command()}"), soft_wrap=True)
+    if stopped_by is not None:
+        _say_how_to_continue(console)
+        return 128 + stopped_by
+    return FAILED if failed else 0
+
+
+def _take_over(opened: Sweep, display: Display, logbook: Logbook) -> None:
+    """Say which runs are reused, and give MLflow those that it doesn't have."""
+    reused = opened.board.having(Status.REUSED)
+    for node in reused[:NAMED]:
+        display.say(f"{node.label}: finished earlier, reused")
+    if len(reused) > NAMED:
+        display.say(f"{len(reused) - NAMED} more: finished earlier, reused")
+    for node in reused:
+        logbook.reused(node, opened.store)
+
+
+def _compute(opened: Sweep, display: Display, logbook: Logbook) -> int | None:
+    """Compute what is left, if anything; the signal that stopped it."""
+    if opened.board.complete:
+        return None
+    from music_rllib.sweep.runner import compute
+
+    address = cluster_address()
+    display.say("starting a local Ray" if address is None else f"connecting to Ray at {address}")
+
+    def on_stop() -> None:
+        display.say("stopping, this takes a few seconds; Ctrl-C again stops at once", "yellow")
+
+    return compute(opened, [logbook, display], on_stop).stopped_by
+
+
+def _say_how_to_continue(console: Console) -> None:
+    command = shlex.join(["python", "-m", "music_rllib.sweep", *sys.argv[1:]])
+    text = f"Stopped. Finished runs and the last checkpoints are kept; continue with: {command}"
+    console.print(Text(text), soft_wrap=True)

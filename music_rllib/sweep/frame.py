@@ -1,0 +1,81 @@
+"""What sub-commands have in common: exit codes, their parsers, what they write where."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+__all__ = [
+    "BAD_INPUT",
+    "FAILED",
+    "BadInputError",
+    "Commands",
+    "Formatter",
+    "add_json",
+    "add_place",
+    "console_for",
+    "print_json",
+]
+
+FAILED, BAD_INPUT = 1, 2
+WIDTH = 160
+"""Columns where there is no terminal to ask."""
+
+Commands = Any  # argparse._SubParsersAction, which is private
+
+
+class Formatter(argparse.RawDescriptionHelpFormatter):
+    """Keeps the lines of examples as they are."""
+
+
+class BadInputError(Exception):
+    """Something that the user must change; nothing has been started."""
+
+
+def add_json(parser: argparse.ArgumentParser) -> None:
+    """`--json`: one document on standard output, everything else on standard error."""
+    parser.add_argument(
+        "--json", action="store_true", help="One JSON document on stdout, messages on stderr."
+    )
+
+
+def add_place(parser: argparse.ArgumentParser, what: str = "A sweep") -> None:
+    """`SWEEP` and the options that say where it lies."""
+    parser.add_argument(
+        "sweep",
+        metavar="SWEEP",
+        help=f"{what}: its folder (results/smoke, s3://bucket/results/smoke), its name in "
+        "--storage, or its YAML file.",
+    )
+    parser.add_argument(
+        "--storage", metavar="PLACE", help="Folder or URI of results, where SWEEP is a name."
+    )
+
+
+def console_for(arguments: argparse.Namespace) -> Console:
+    """Where text for people goes: standard output, or standard error beside a JSON document."""
+    from rich.console import Console
+
+    stderr = bool(getattr(arguments, "json", False))
+    terminal = (sys.stderr if stderr else sys.stdout).isatty()
+    return Console(highlight=False, stderr=stderr, width=None if terminal else WIDTH)
+
+
+def print_json(document: Any) -> None:
+    """One JSON document on standard output; NaN and infinities, which JSON lacks, are null."""
+    print(json.dumps(_plain(document), indent=2, ensure_ascii=False, default=str))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _plain(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(inner) for inner in value]
+    if isinstance(value, float) and (value != value or value in (float("inf"), float("-inf"))):
+        return None
+    return value
