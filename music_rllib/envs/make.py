@@ -38,12 +38,18 @@ def _register_robotics() -> None:
 def make_env(env_id: str, **kwargs: Any) -> Env:
     """A Gymnasium environment by its id; the robotics tasks are registered on the way.
 
+    The Fetch tasks take a faster step with the same results (`music_rllib.envs.fetch`).
+
     Raises:
         gymnasium.error.Error: unknown id or arguments.
     """
     _register_robotics()
     # The checker would cost a tenth of every step and only speaks to an environment's authors.
-    return gym.make(env_id, disable_env_checker=True, **kwargs)
+    env = gym.make(env_id, disable_env_checker=True, **kwargs)
+    from music_rllib.envs.fetch import speed_up  # not before the notice is dropped
+
+    speed_up(env)
+    return env
 
 
 def is_gymnasium_id(env: object) -> bool:

@@ -113,7 +113,7 @@ class _Recording:
         self.steps += 1
         self.see(observation)
 
-    def finish(self, terminated: bool) -> Episode:
+    def finish(self, *, terminated: bool) -> Episode:
         n = self.steps
         return Episode(
             self._frames[: n + 1],
@@ -237,9 +237,10 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
             playing = [i for i in range(count) if i not in finished]
             inputs = np.stack([recordings[i].network_input for i in playing])
             actions = self._act(inputs, explore=explore, random_actions=random_actions)
-            for i, action in zip(playing, actions, strict=True):
-                if (terminated := self._step(self.envs[i], recordings[i], action)) is not None:
-                    finished[i] = recordings[i].finish(terminated)
+            for i, action, scaled in zip(playing, actions, self._to_env(actions), strict=True):
+                ended = self._step(self.envs[i], recordings[i], action, scaled)
+                if ended is not None:
+                    finished[i] = recordings[i].finish(terminated=ended)
         return [finished[i] for i in range(count)]
 
     def _begin(self, env: Env) -> _Recording:
@@ -250,19 +251,19 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
         recording.see(observation)
         return recording
 
-    def _step(self, env: Env, recording: _Recording, action: Floats) -> bool | None:
+    def _step(self, env: Env, recording: _Recording, action: Floats, scaled: Floats) -> bool | None:
         """One step; at the episode's end whether it terminated, before that None."""
-        observation, reward, terminated, truncated, info = env.step(self._to_env(action))
+        observation, reward, terminated, truncated, info = env.step(scaled)
         success = info.get(self._success_key) if self._success_key else None
         recording.step(action, float(reward), success, observation)
         if terminated or truncated or recording.steps == self.layout.horizon:
             return bool(terminated)
         return None
 
-    def _to_env(self, action: Floats) -> Floats:
-        """From [-1, 1] to the environment's bounds."""
+    def _to_env(self, actions: Floats) -> Floats:
+        """[B, A] from [-1, 1] to the environment's bounds."""
         low, high = self._action_space.low, self._action_space.high
-        scaled = low + (action + 1.0) * 0.5 * (high - low)
+        scaled = low + (actions + 1.0) * 0.5 * (high - low)
         clipped: Floats = np.clip(scaled, low, high).astype(self._action_space.dtype)
         return clipped
 
