@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -144,7 +145,17 @@ class RunTrainable(Trainable):
             with store.work_folder(self._job.key).new_checkpoint(training.env_steps) as folder:
                 training.save(folder / "state")
                 (folder / HISTORY).write_bytes(to_json_lines(self._history))
+                self._write_policy(training, folder)
         return training.finished
+
+    def _write_policy(self, training: TrainingRun, folder: Path) -> None:
+        """What acts, as plain weights: `load_policy` unpickles nothing."""
+        modules = training.modules()
+        acting = {name: modules[name] for name in ("policy", "normaliser") if name in modules}
+        info = HandoffInfo.of(self._job.run, self._job.key, training.env_steps)
+        (folder / "run.json").write_text(self._job.run.model_dump_json(indent=1))
+        with contextlib.suppress(ValueError):  # diverged: the end of the run will say so
+            write_handoff(folder / "handoff", acting, info)
 
     def _publish(self, training: TrainingRun, store: NodeStore) -> None:
         last = self._history[-1]

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from ray.tune.trainable import trainable
 
 from music_rllib.envs.registry import Task
@@ -17,6 +18,7 @@ from music_rllib.experiment.plan import node_key
 from music_rllib.experiment.result import from_json_lines
 from music_rllib.experiment.settings import RunSettings, Variant, handed_over, preset
 from music_rllib.experiment.store import NodeStore
+from music_rllib.policy import find_policy, load_policy
 from music_rllib.sweep.trainable import NOTES, REPORTS, NodeJob, RunTrainable
 from music_rllib.tracking import names
 
@@ -35,8 +37,6 @@ POINT = Task(
 @pytest.fixture(scope="module", autouse=True)
 def point_environment() -> Iterator[None]:
     """The environment can be imported, and torch has one thread."""
-    import torch
-
     sys.path.insert(0, str(ENVIRONMENTS))
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -186,3 +186,18 @@ def test_a_damaged_checkpoint_is_skipped_and_said(tmp_path: Path) -> None:
     assert len(notes) == 2
     assert newest in notes[0]
     assert notes[1] == "continues at 200 env steps"
+
+
+@pytest.mark.usefixtures("local_ray")
+def test_a_checkpoint_has_the_policy_that_it_would_go_on_with(tmp_path: Path) -> None:
+    node = job(tmp_path, settings("tac"))
+    trial = RunTrainable(config=node.to_tune())
+    trial.train()
+    assert trial._training is not None
+    module = trial._training.algorithm.env_runner.module
+    inputs = np.random.default_rng(0).normal(size=(5, 6)).astype(np.float32)
+    expected = module.act(torch.from_numpy(inputs)).numpy()
+    trial.stop()
+    policy = load_policy(find_policy(node.key, str(tmp_path)))
+    assert (policy.env_steps, policy.max_episode_steps) == (200, 20)
+    np.testing.assert_allclose(policy.act(inputs), expected, atol=1e-6)

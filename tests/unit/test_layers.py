@@ -19,11 +19,12 @@ PACKAGE = Path(__file__).parents[2] / "music_rllib"
 
 # From the bottom up. A module may import its own part of the package and what stands lower.
 LAYERS: tuple[tuple[str, ...], ...] = (
-    ("_quiet", "tsallis", "mutual_information", "schedules", "tracking.names"),
+    ("_quiet", "tsallis", "mutual_information", "schedules", "tracking.names", "policy.network"),
     ("estimator", "replay", "tracking"),
     ("envs",),
     ("tac",),
     ("experiment",),
+    ("policy",),
     ("sweep", "reports"),
     ("report",),
 )

@@ -1,0 +1,90 @@
+"""Finding a run's policy by what a person knows of the run: a key, a label, or a place."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pyarrow.fs as pafs
+
+from music_rllib.experiment.sealed import SealedFolders, open_storage
+from music_rllib.policy.policy import PolicyError
+
+__all__ = ["find_policy"]
+
+_SHORTEST_KEY = 4
+_NAMED = 8
+
+
+def find_policy(wanted: str, storage: str) -> str:
+    """Where `load_policy` finds the policy that is meant.
+
+    Args:
+        wanted: a place (folder, file, URI), the key of a run or its beginning, or a run's label
+            as the sweep shows it (`finetune/q=1.5/FetchPush/seed=0`).
+        storage: the sweeps' storage, a folder or a URI, in which keys and labels are looked up.
+
+    Returns:
+        The finished node; for a run that isn't finished its newest checkpoint; or the place.
+
+    Raises:
+        PolicyError: nothing fits, or several runs do; says what there is.
+    """
+    if "://" in wanted or wanted.startswith(("models:/", "runs:/")) or Path(wanted).exists():
+        return wanted
+    filesystem, root = open_storage(storage)
+    labels = dict(_labels(filesystem, root))
+    nodes = SealedFolders(filesystem, f"{root}/nodes")
+    finished = nodes.names()
+    unfinished = [key for key in _folders(filesystem, f"{root}/work") if key not in finished]
+    keys = _matching(wanted, [*finished, *unfinished], labels)
+    if not keys:
+        known = [labels.get(key, key) for key in finished][:_NAMED]
+        there = f"finished there: {', '.join(known)}" if known else "no run is finished there"
+        raise PolicyError(
+            f"{wanted!r} must be a folder, or the key or label of a run in {storage}; {there}"
+        )
+    if len(keys) > 1:
+        raise PolicyError(
+            f"{wanted!r} must mean one run, it fits {', '.join(keys[:_NAMED])}; give a longer key"
+        )
+    prefix = storage.rstrip("/")
+    if keys[0] in finished:
+        return f"{prefix}/nodes/{keys[0]}"
+    checkpoints = SealedFolders(filesystem, f"{root}/work/{keys[0]}").names()
+    if not checkpoints:
+        raise PolicyError(f"{wanted!r} must have a checkpoint, it has none in {storage} yet")
+    return f"{prefix}/work/{keys[0]}/{checkpoints[-1]}"
+
+
+def _matching(wanted: str, keys: list[str], labels: dict[str, str]) -> list[str]:
+    by_label = [key for key in keys if labels.get(key) == wanted]
+    if by_label:
+        return by_label
+    if wanted in keys:
+        return [wanted]
+    long_enough = len(wanted) >= _SHORTEST_KEY
+    return [key for key in keys if long_enough and key.startswith(wanted)]
+
+
+def _labels(filesystem: pafs.FileSystem, root: str) -> Iterator[tuple[str, str]]:
+    """Key and label of every run that a sweep with its folder in this storage has planned."""
+    for name in _folders(filesystem, root):
+        plan = f"{root}/{name}/plan.json"
+        if filesystem.get_file_info(plan).type != pafs.FileType.File:
+            continue
+        with filesystem.open_input_stream(plan) as stream:
+            document = json.loads(stream.read())
+        for node in document.get("nodes", ()):
+            yield node["key"], node["label"]
+
+
+def _folders(filesystem: pafs.FileSystem, root: str) -> list[str]:
+    selector = pafs.FileSelector(root, allow_not_found=True)
+    found = filesystem.get_file_info(selector)
+    return sorted(
+        info.base_name
+        for info in found
+        if info.type == pafs.FileType.Directory and not info.base_name.startswith(".")
+    )

@@ -1,0 +1,203 @@
+"""A trained policy as plain arrays: from observations to actions, in numpy.
+
+Shape legend: B batch, O observation features, G goal features (0 without goals), I = O + G,
+A action dimensions.
+
+This file stands alone (numpy and safetensors): it is copied into the MLflow models of policies,
+which therefore act where nothing else of this package is installed. A policy is one safetensors
+file: its arrays, and in its header a JSON text about them. Reading it can't execute anything.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import safetensors
+from safetensors.numpy import save as save_safetensors
+
+__all__ = ["PolicyFileError", "PolicyNetwork"]
+
+FORMAT = "music_rllib policy 1"
+_HEADER = "music_rllib_policy"
+
+Floats = npt.NDArray[np.float32]
+
+
+class PolicyFileError(ValueError):
+    """A file that isn't a policy; says which and why."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PolicyNetwork:
+    """A deterministic policy: normaliser, perceptron, tanh, the environment's bounds."""
+
+    weights: tuple[Floats, ...]
+    """[outputs, inputs] of each layer, as torch keeps them."""
+    biases: tuple[Floats, ...]
+    """[outputs] of each layer; the last has A, or 2 A of which the first half are means."""
+    mean: Floats
+    """[I] taken from the inputs."""
+    inverse_std: Floats
+    """[I] multiplies what is left."""
+    clip: float
+    """Normalised inputs are cut to plus/minus this."""
+    low: Floats
+    """[A] the environment's lowest actions."""
+    high: Floats
+    """[A] the environment's highest actions."""
+    goal_size: int
+    """G, 0 for an environment without goals."""
+    about: Mapping[str, Any] = field(default_factory=dict)
+    """Where it comes from: JSON values, of no influence on actions."""
+
+    def __post_init__(self) -> None:
+        """Check that the arrays fit together.
+
+        Raises:
+            ValueError: they don't.
+        """
+        sizes = [self.input_size, *(len(bias) for bias in self.biases)]
+        shapes = [(out, into) for into, out in pairwise(sizes)]
+        if not self.weights or [weight.shape for weight in self.weights] != shapes:
+            raise ValueError(
+                f"a policy's layers must fit together, got weights of "
+                f"{[weight.shape for weight in self.weights]} for sizes {sizes}"
+            )
+        if sizes[-1] not in (self.action_size, 2 * self.action_size):
+            raise ValueError(
+                f"a policy's last layer must have {self.action_size} or {2 * self.action_size} "
+                f"outputs for {self.action_size} actions, got {sizes[-1]}"
+            )
+        if not 0 <= self.goal_size < self.input_size or self.low.shape != self.high.shape:
+            raise ValueError("a policy's goal must be a part of its inputs, its bounds of one size")
+        arrays = (*self.weights, *self.biases, self.mean, self.inverse_std, self.low, self.high)
+        if not all(np.isfinite(array).all() for array in arrays):
+            raise ValueError("a policy's arrays must be finite")
+
+    @property
+    def input_size(self) -> int:
+        """I: features of observation and goal."""
+        return len(self.mean)
+
+    @property
+    def observation_size(self) -> int:
+        """O: features of the observation alone."""
+        return self.input_size - self.goal_size
+
+    @property
+    def action_size(self) -> int:
+        """A."""
+        return len(self.low)
+
+    def act(self, observation: Any) -> Floats:
+        """The deterministic action.
+
+        Args:
+            observation: a dictionary with `observation` [O] and `desired_goal` [G] (more is
+                ignored), or an array [I] of both side by side; or batches of them, [B, ...].
+
+        Returns:
+            [A], or [B, A] for a batch, within the environment's bounds.
+
+        Raises:
+            ValueError: something is missing, of another size, or not finite.
+        """
+        inputs = self._inputs(observation)
+        hidden = np.clip((inputs - self.mean) * self.inverse_std, -self.clip, self.clip)
+        last = len(self.weights) - 1
+        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            hidden = hidden @ weight.T + bias
+            if i < last:
+                hidden = np.maximum(hidden, 0.0)
+        action = np.tanh(hidden[..., : self.action_size])
+        scaled = self.low + (action + 1.0) * 0.5 * (self.high - self.low)
+        bounded: Floats = np.clip(scaled, self.low, self.high).astype(np.float32)
+        return bounded
+
+    def _inputs(self, observation: Any) -> Floats:
+        if isinstance(observation, Mapping):
+            parts = [self._part(observation, "observation", self.observation_size)]
+            if self.goal_size:
+                parts.append(self._part(observation, "desired_goal", self.goal_size))
+            if len({part.shape[:-1] for part in parts}) > 1:
+                raise ValueError(
+                    "observation and desired_goal must be batches of one size, got shapes "
+                    + " and ".join(str(part.shape) for part in parts)
+                )
+            return np.concatenate(parts, axis=-1)
+        what = f"observation ({self.observation_size})"
+        if self.goal_size:
+            what += f" and desired_goal ({self.goal_size}) side by side"
+        return _numbers(observation, what, self.input_size)
+
+    def _part(self, observation: Mapping[str, Any], name: str, size: int) -> Floats:
+        if name not in observation:
+            raise ValueError(f"the observation must have {name!r}, it has {sorted(observation)}")
+        return _numbers(observation[name], name, size)
+
+    def to_bytes(self) -> bytes:
+        """The content of a policy's file."""
+        arrays: dict[str, npt.NDArray[Any]] = {}
+        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            arrays |= {f"layer.{i}.weight": weight, f"layer.{i}.bias": bias}
+        arrays |= {"normaliser.mean": self.mean, "normaliser.inverse_std": self.inverse_std}
+        arrays |= {"action.low": self.low, "action.high": self.high}
+        header = {
+            "format": FORMAT,
+            "clip": self.clip,
+            "goal_size": self.goal_size,
+            "about": dict(self.about),
+        }
+        return save_safetensors(
+            {name: np.ascontiguousarray(array, np.float32) for name, array in arrays.items()},
+            metadata={_HEADER: json.dumps(header)},
+        )
+
+    @classmethod
+    def from_file(cls, path: Path) -> PolicyNetwork:
+        """Inverse of `to_bytes`.
+
+        Raises:
+            PolicyFileError: the file isn't there or isn't a policy.
+        """
+        try:
+            with safetensors.safe_open(path, framework="numpy") as file:
+                header = json.loads((file.metadata() or {}).get(_HEADER, "null"))
+                arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            if not isinstance(header, dict) or header.get("format") != FORMAT:
+                raise ValueError(f"its header must say {FORMAT!r}")
+            count = sum(name.endswith(".bias") for name in arrays)
+            return cls(
+                weights=tuple(arrays[f"layer.{i}.weight"] for i in range(count)),
+                biases=tuple(arrays[f"layer.{i}.bias"] for i in range(count)),
+                mean=arrays["normaliser.mean"],
+                inverse_std=arrays["normaliser.inverse_std"],
+                clip=float(header["clip"]),
+                low=arrays["action.low"],
+                high=arrays["action.high"],
+                goal_size=int(header["goal_size"]),
+                about=header["about"],
+            )
+        except KeyError as error:
+            raise PolicyFileError(f"{path} must be a policy, it lacks {error}") from None
+        except (OSError, ValueError, TypeError, safetensors.SafetensorError) as error:
+            raise PolicyFileError(f"{path} must be a policy: {error}") from None
+
+
+def _numbers(values: Any, name: str, size: int) -> Floats:
+    try:
+        array = np.asarray(values, np.float32)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be numbers, got {type(values).__name__}") from None
+    if array.ndim not in (1, 2) or array.shape[-1] != size:
+        raise ValueError(f"{name} must have shape [{size}] or [batch, {size}], got {array.shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} must be finite, it is not")
+    return array
