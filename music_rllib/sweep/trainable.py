@@ -151,7 +151,9 @@ class RunTrainable(Trainable):
     def _write_policy(self, training: TrainingRun, folder: Path) -> None:
         """What acts, as plain weights: `load_policy` unpickles nothing."""
         modules = training.modules()
-        acting = {name: modules[name] for name in ("policy", "normaliser") if name in modules}
+        acting: dict[str, Any] = {
+            name: modules[name] for name in ("policy", "normaliser") if name in modules
+        }
         info = HandoffInfo.of(self._job.run, self._job.key, training.env_steps)
         (folder / "run.json").write_text(self._job.run.model_dump_json(indent=1))
         with contextlib.suppress(ValueError):  # diverged: the end of the run will say so
