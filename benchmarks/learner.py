@@ -25,6 +25,7 @@ from rich.table import Table  # noqa: E402
 
 from benchmarks.raw_torch import RawUpdate  # noqa: E402
 from music_rllib import TACConfig  # noqa: E402
+from music_rllib._allocator import keep_freed_memory  # noqa: E402
 from music_rllib.tac.algorithm import TAC  # noqa: E402
 
 UPDATES = 100
@@ -89,6 +90,7 @@ def main() -> None:
     quiet_third_parties()
     ray.init(num_cpus=2, include_dashboard=False, logging_level="error")
     torch.set_num_threads(1)
+    keep_freed_memory()  # the raw loop gets it too
     raw = raw_updates(RawUpdate(inputs=28, actions=4, batch=256, q=1.5, alpha=0.05))
     table = Table(title=f"One update, batch 256, 3 x 256 networks ({UPDATES} updates a turn)")
     for column in ("path", "updates/s", "raw torch/s", "ratio", "range of ratios"):

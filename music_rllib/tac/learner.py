@@ -28,6 +28,7 @@ from ray.rllib.utils.metrics import NUM_ENV_STEPS_SAMPLED_LIFETIME
 from ray.rllib.utils.typing import ModuleID, ResultDict, StateDict
 from torch import Tensor
 
+from music_rllib._allocator import keep_freed_memory
 from music_rllib._quiet import quiet_third_parties
 from music_rllib.mutual_information import time_permutations
 from music_rllib.replay.buffer import Trajectory
@@ -59,6 +60,7 @@ class TACLearner(TorchLearner):
 
     def build(self) -> None:
         quiet_third_parties()  # a remote Learner is a process of its own
+        keep_freed_memory()
         self._settings: TACSettings = self.config.tac_settings()
         self._music = self.config.music_settings()
         # A driver-side algorithm would otherwise use every core for 256-row products, and with
