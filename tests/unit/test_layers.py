@@ -19,7 +19,15 @@ PACKAGE = Path(__file__).parents[2] / "music_rllib"
 
 # From the bottom up. A module may import its own part of the package and what stands lower.
 LAYERS: tuple[tuple[str, ...], ...] = (
-    ("_quiet", "tsallis", "mutual_information", "schedules", "tracking.names", "policy.network"),
+    (
+        "_allocator",
+        "_quiet",
+        "tsallis",
+        "mutual_information",
+        "schedules",
+        "tracking.names",
+        "policy.network",
+    ),
     ("estimator", "replay", "tracking"),
     ("envs",),
     ("tac",),
@@ -40,7 +48,7 @@ MAY_LOAD_RAY = (
     "sweep",
 )
 # torch and numpy only: no environments, no tracking.
-PURE = ("tsallis", "mutual_information", "schedules", "estimator", "replay")
+PURE = ("_allocator", "tsallis", "mutual_information", "schedules", "estimator", "replay")
 # Read by the command line before anything heavy is needed.
 LIGHT = ("", "_quiet", "tracking.names")
 
