@@ -33,7 +33,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("tac",),
     ("experiment",),
     ("policy",),
-    ("sweep", "reports"),
+    ("sweep", "reports", "serve"),
     ("report",),
 )
 
@@ -45,6 +45,7 @@ MAY_LOAD_RAY = (
     "tac.learner",
     "tac.module",
     "experiment.training",
+    "serve.application",
     "sweep",
 )
 # torch and numpy only: no environments, no tracking.

@@ -1,0 +1,186 @@
+"""Load test of the served policy on loopback: requests per second and latencies.
+
+`python -m benchmarks.serve [POLICY]` starts the service as a user does, lets clients send
+observations one after the other without a pause, and compares every hundredth answer with the
+policy itself. Without POLICY the weights are random, which costs the same.
+`python -m benchmarks.serve --help`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import aiohttp
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from music_rllib.envs.registry import BUILT_IN_TASKS
+from music_rllib.policy import Policy, PolicyNetwork, load_policy
+
+START_SECONDS = 120
+CHECKED = 100
+"""Every so many answers one is compared with the policy."""
+
+
+@dataclass
+class Load:
+    """What one combination of clients and rows gave."""
+
+    clients: int
+    rows: int
+    seconds: float = 0.0
+    latencies: list[float] = field(default_factory=list)
+    """Seconds of each request that was answered with 200."""
+    errors: int = 0
+    """Other statuses, and connections that broke."""
+    wrong: int = 0
+    """Actions that are not the policy's."""
+
+
+def random_policy(task: str = "FetchPush", hidden: int = 256) -> bytes:
+    """A policy's file with random weights, of the sizes of FetchPush."""
+    rng = np.random.default_rng(0)
+    observation, goal, action = 25, 3, 4
+    sizes = [observation + goal, hidden, hidden, hidden, 2 * action]
+    about = {
+        "task": BUILT_IN_TASKS[task].model_dump(mode="json"),
+        "variant": "tac",
+        "seed": 0,
+        "node_key": "random",
+        "env_steps": 0,
+        "max_episode_steps": 50,
+    }
+    return PolicyNetwork(
+        weights=tuple(
+            rng.normal(0, into**-0.5, (out, into)).astype(np.float32)
+            for into, out in pairwise(sizes)
+        ),
+        biases=tuple(np.zeros(out, np.float32) for out in sizes[1:]),
+        mean=np.zeros(sizes[0], np.float32),
+        inverse_std=np.ones(sizes[0], np.float32),
+        clip=5.0,
+        low=-np.ones(action, np.float32),
+        high=np.ones(action, np.float32),
+        goal_size=goal,
+        about=about,
+    ).to_bytes()
+
+
+@contextmanager
+def service(policy: str, replicas: int) -> Iterator[str]:
+    """`python -m music_rllib.serve` on a free port of loopback; gives its URL."""
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
+    arguments = ["--port", str(port), "--replicas", str(replicas)]
+    process = subprocess.Popen(  # noqa: S603 - this project's own program
+        [sys.executable, "-m", "music_rllib.serve", policy, *arguments],
+        stdout=subprocess.PIPE,
+        text=True,
+        env={name: value for name, value in os.environ.items() if name != "RAY_ADDRESS"},
+    )
+    try:
+        assert process.stdout is not None
+        if not process.stdout.readline().startswith("Serving"):
+            raise SystemExit("the service did not start")
+        yield f"http://127.0.0.1:{port}"
+    finally:
+        process.terminate()
+        process.wait(timeout=START_SECONDS)
+
+
+async def measure(url: str, policy: Policy, load: Load, seconds: float) -> None:
+    """Let `load.clients` clients send requests for so long."""
+    began = time.perf_counter()
+    until = began + seconds
+    connector = aiohttp.TCPConnector(limit=load.clients)
+    async with aiohttp.ClientSession(url, connector=connector) as session:
+        await asyncio.gather(
+            *(_client(session, policy, load, seed, until) for seed in range(load.clients))
+        )
+    load.seconds = time.perf_counter() - began
+
+
+async def _client(
+    session: aiohttp.ClientSession, policy: Policy, load: Load, seed: int, until: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    shape = () if load.rows == 1 else (load.rows,)
+    observation: dict[str, Any] = {
+        "observation": rng.normal(size=(*shape, policy.observation_size)).tolist()
+    }
+    if policy.goal_size:
+        observation["desired_goal"] = rng.normal(size=(*shape, policy.goal_size)).tolist()
+    expected = policy.act(observation)
+    count = 0
+    while (began := time.perf_counter()) < until:
+        try:
+            async with session.post("/act", json=observation) as answer:
+                body = await answer.json()
+        except aiohttp.ClientError:
+            load.errors += 1
+            continue
+        if answer.status != 200:
+            load.errors += 1
+            continue
+        load.latencies.append(time.perf_counter() - began)
+        count += 1
+        if count % CHECKED == 1:
+            load.wrong += not np.allclose(body["action"], expected, atol=1e-5)
+
+
+def table(loads: list[Load]) -> Table:
+    """One row per combination."""
+    shown = Table("clients", "rows", "requests/s", "actions/s", "median ms", "95 %", "99 %", "bad")
+    for load in loads:
+        rate = len(load.latencies) / load.seconds
+        quantiles = np.quantile(load.latencies or [np.nan], [0.5, 0.95, 0.99]) * 1000
+        shown.add_row(
+            str(load.clients),
+            str(load.rows),
+            f"{rate:,.0f}",
+            f"{rate * load.rows:,.0f}",
+            *(f"{value:.1f}" for value in quantiles),
+            str(load.errors + load.wrong),
+        )
+    return shown
+
+
+def main() -> int:
+    """Measure, print, and fail if an answer was an error or wrong."""
+    parser = argparse.ArgumentParser(description=__doc__, prog="python -m benchmarks.serve")
+    parser.add_argument("policy", nargs="?", help="folder, URI or file of a policy")
+    parser.add_argument("--seconds", type=float, default=5.0, help="per combination (5)")
+    parser.add_argument("--clients", type=int, nargs="+", default=[1, 8, 32])
+    parser.add_argument("--rows", type=int, nargs="+", default=[1, 64], help="per request (1 64)")
+    parser.add_argument("--replicas", type=int, default=1)
+    arguments = parser.parse_args()
+    loads = [Load(clients, rows) for rows in arguments.rows for clients in arguments.clients]
+    with TemporaryDirectory() as folder:
+        place = arguments.policy
+        if place is None:
+            place = str(Path(folder, "policy.safetensors"))
+            Path(place).write_bytes(random_policy())
+        policy = load_policy(place)
+        with service(place, arguments.replicas) as url:
+            for load in loads:
+                asyncio.run(measure(url, policy, load, arguments.seconds))
+    Console().print(table(loads))
+    return int(any(load.errors or load.wrong or not load.latencies for load in loads))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,5 @@
+"""A trained policy behind HTTP: `python -m music_rllib.serve NODE`.
+
+`protocol` says what requests and answers look like, `api` is the web application (no Ray),
+`application` puts it on Ray Serve, `command` is the command line.
+"""

@@ -1,0 +1,186 @@
+"""The web application around a policy: validation, token, errors. Knows no Ray."""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+from collections.abc import Awaitable, Callable, Mapping
+from typing import Annotated, Any
+
+import numpy as np
+from fastapi import Body, Depends, FastAPI, HTTPException, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+from starlette.exceptions import HTTPException as StarletteHTTPException
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+import music_rllib
+from music_rllib.serve.protocol import (
+    Answer,
+    Array,
+    Failure,
+    Health,
+    PolicyFacts,
+    Problem,
+    Rows,
+    request_model,
+)
+
+__all__ = ["make_api", "token_hash"]
+
+Act = Callable[[Rows], Awaitable[Array]]
+"""Rows of one request to their actions [B, A]."""
+
+Failures = dict[int | str, dict[str, Any]]
+"""Status to what FastAPI is told of it."""
+
+SHOWN = 10
+"""Problems of a request that are listed."""
+
+DESCRIPTION = """
+Send `POST /act` what the environment observes; the answer is the policy's deterministic action
+in the environment's scale. Vectors are one observation; lists of vectors are a batch, one action
+for each row. Requests that arrive together are computed together.
+"""
+
+
+def token_hash(token: str) -> str:
+    """What is handed around in place of the token itself."""
+    return hashlib.sha256(token.encode()).hexdigest()
+
+
+def make_api(facts: PolicyFacts, act: Act, token_sha256: str | None = None) -> FastAPI:
+    """The application.
+
+    Args:
+        facts: Of the policy; its sizes are those that requests must have.
+        act: Called once per valid request.
+        token_sha256: `token_hash` of what clients must send as bearer token; None: nothing.
+    """
+    body = request_model(facts)
+    api = FastAPI(
+        title="music_rllib policy",
+        summary=f"Actions for {facts.task}",
+        description=DESCRIPTION,
+        version=music_rllib.__version__,
+        redoc_url=None,
+    )
+    api.add_middleware(_BodyLimit, limit=body.max_bytes)
+    api.add_exception_handler(RequestValidationError, _invalid)
+    api.add_exception_handler(StarletteHTTPException, _refused)
+    protected = [Depends(_bearer(token_sha256))] if token_sha256 else []
+    failures: Failures = {
+        400: {"model": Failure, "description": "The body is not JSON"},
+        413: {"model": Failure, "description": "The body is longer than any valid one"},
+        422: {"model": Failure, "description": "The observation is not one of this task"},
+    }
+    if token_sha256:
+        failures[401] = {"model": Failure, "description": "The token is missing or wrong"}
+
+    @api.get("/health")
+    async def health() -> Health:
+        """Whether the policy is loaded and can act."""
+        return Health(task=facts.task)
+
+    @api.get("/policy", dependencies=protected, responses=_only(failures, 401))
+    async def policy() -> PolicyFacts:
+        """Task and sizes."""
+        return facts
+
+    async def act_on(request: Any) -> Answer:
+        """The actions for an observation or a batch of them."""
+        actions = await act(request.rows())
+        if not np.isfinite(actions).all():
+            raise HTTPException(422, "the policy has no finite action for these numbers")
+        answer: Answer = request.answer(actions)
+        return answer
+
+    # The body's type is made at run time, so it can't stand in the signature.
+    act_on.__annotations__["request"] = Annotated[
+        body.annotation, Body(openapi_examples={"zeros": {"value": body.example}})
+    ]
+    api.post("/act", dependencies=protected, responses=failures)(act_on)
+    return api
+
+
+def _only(
+    failures: dict[int | str, dict[str, Any]], *codes: int
+) -> dict[int | str, dict[str, Any]]:
+    return {code: failure for code, failure in failures.items() if code in codes}
+
+
+_SCHEME = HTTPBearer(auto_error=False)
+"""Of this module, as FastAPI looks up annotations there."""
+
+
+def _bearer(expected: str) -> Callable[..., None]:
+    def check(given: Annotated[HTTPAuthorizationCredentials | None, Depends(_SCHEME)]) -> None:
+        if given is None or not hmac.compare_digest(token_hash(given.credentials), expected):
+            raise HTTPException(
+                401, "a valid bearer token is needed", headers={"WWW-Authenticate": "Bearer"}
+            )
+
+    return check
+
+
+def _failure(status: int, failure: Failure, headers: Any = None) -> JSONResponse:
+    return JSONResponse(failure.model_dump(), status_code=status, headers=headers)
+
+
+async def _refused(_: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, StarletteHTTPException)
+    return _failure(error.status_code, Failure(error=str(error.detail)), error.headers)
+
+
+async def _invalid(_: Request, error: Exception) -> JSONResponse:
+    """Say what is wrong, without repeating what was sent: that may be NaN, or megabytes."""
+    assert isinstance(error, RequestValidationError)
+    findings = error.errors()
+    if findings and findings[0]["type"] == "json_invalid":
+        return _failure(400, Failure(error="the body must be JSON"))
+    problems = [_problem(finding) for finding in findings[:SHOWN]]
+    more = f" (the first {SHOWN} of {len(findings)} problems)" if len(findings) > SHOWN else ""
+    return _failure(
+        422, Failure(error=f"the body must be an observation of this task{more}", problems=problems)
+    )
+
+
+def _problem(finding: Mapping[str, Any]) -> Problem:
+    # Before the place in the body stand "body" and the kind of request.
+    place = ".".join(map(str, finding["loc"][2:]))
+    return Problem(place=place, rule=finding["msg"].removeprefix("Value error, "))
+
+
+class _BodyLimit:
+    """Refuses bodies that are too long, before they are held in memory and parsed."""
+
+    def __init__(self, app: ASGIApp, limit: int) -> None:
+        self._app = app
+        self._limit = limit
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        received = 0
+
+        async def counting() -> Message:
+            nonlocal received
+            message = await receive()
+            received += len(message.get("body", b""))
+            if received > self._limit:
+                raise HTTPException(413, f"the body must be <= {self._limit} bytes")
+            return message
+
+        if _announced(scope) > self._limit:
+            failure = Failure(error=f"the body must be <= {self._limit} bytes")
+            await _failure(413, failure)(scope, receive, send)
+            return
+        await self._app(scope, counting, send)
+
+
+def _announced(scope: Scope) -> int:
+    """Length of the body by its header; 0 where that says nothing."""
+    value = dict(scope["headers"]).get(b"content-length", b"")
+    return int(value) if value.isdigit() else 0

@@ -1,0 +1,96 @@
+"""The policy as a Ray Serve application: replicas that compute waiting requests together.
+
+`app` builds it, for `python -m music_rllib.serve`, `serve run` and the configuration of
+`serve deploy` (cluster/serve.yaml).
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+from ray import serve
+from ray.serve import Application
+
+from music_rllib.policy import PolicyNetwork, find_policy, load_policy
+from music_rllib.serve.api import make_api, token_hash
+from music_rllib.serve.protocol import TOKEN_VARIABLE, Array, PolicyFacts, Rows, compute
+
+__all__ = ["ServeSettings", "app"]
+
+TOGETHER = 64
+"""Requests that are computed together at most."""
+WAIT_SECONDS = 0.002
+"""How long the first one waits for more."""
+
+
+class ServeSettings(BaseModel):
+    """What is served; the arguments of `app`."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    policy: str = Field(min_length=1)
+    """Folder or URI of a finished node, an exported policy, or a run's key or label."""
+    storage: str = "results"
+    """Where keys and labels are looked up."""
+    replicas: int = Field(1, ge=1)
+    """Processes that compute actions."""
+    cpus_per_replica: float = Field(1.0, gt=0)
+    """CPUs reserved for each."""
+
+
+def app(settings: ServeSettings) -> Application:
+    """Load the policy once and give its weights to every replica, so that all act the same.
+
+    Raises:
+        PolicyError: There is no such policy.
+    """
+    policy = load_policy(find_policy(settings.policy, settings.storage))
+    token = os.environ.get(TOKEN_VARIABLE)
+    deployment: Any = PolicyServer
+    # The token's hash: a deployment's arguments are kept by Ray and may be shown.
+    return deployment.options(
+        num_replicas=settings.replicas,
+        ray_actor_options={"num_cpus": settings.cpus_per_replica},
+    ).bind(policy.to_bytes(), policy.task.name, token_hash(token) if token else None)
+
+
+@serve.deployment(name="policy", max_ongoing_requests=2 * TOGETHER)
+@serve.ingress()
+class PolicyServer:
+    """A replica."""
+
+    def __init__(self, weights: bytes, task: str, token_sha256: str | None) -> None:
+        """Take a policy's bytes (`Policy.to_bytes`) for the task of this name."""
+        with TemporaryDirectory() as folder:
+            file = Path(folder, "policy.safetensors")
+            file.write_bytes(weights)
+            self._policy = PolicyNetwork.from_file(file)
+        self._facts = PolicyFacts.of(task, self._policy)
+        self._token_sha256 = token_sha256
+
+    def __serve_build_asgi_app__(self) -> Any:
+        """Called by Serve when the replica is there."""
+        return make_api(self._facts, self._act, self._token_sha256)
+
+    def check_health(self) -> None:
+        """Called by Serve now and then; a replica that can't act is replaced.
+
+        Raises:
+            RuntimeError: The policy gives no finite action for zeros.
+        """
+        zeros = {name: np.zeros((1, n), np.float32) for name, n in self._facts.parts.items()}
+        if not np.isfinite(compute(self._policy, [zeros])[0]).all():
+            raise RuntimeError("the policy has no finite action for an observation of zeros")
+
+    async def _act(self, rows: Rows) -> Array:
+        actions: Array = await self._act_together(rows)
+        return actions
+
+    @serve.batch(max_batch_size=TOGETHER, batch_wait_timeout_s=WAIT_SECONDS)
+    async def _act_together(self, waiting: list[Rows]) -> list[Array]:
+        return compute(self._policy, waiting)

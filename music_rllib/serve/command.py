@@ -1,0 +1,223 @@
+"""The command that serves a policy until it is stopped."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Sequence
+from ipaddress import ip_address
+from typing import TYPE_CHECKING, Any
+
+from music_rllib.serve.protocol import TOKEN_VARIABLE
+
+if TYPE_CHECKING:
+    from music_rllib.serve.application import ServeSettings
+
+__all__ = ["main"]
+
+BAD_INPUT = 2
+DESCRIPTION = """\
+Serve a trained policy over HTTP with Ray Serve: POST /act takes a goal observation, or a batch of
+them, and answers with actions; GET /health, GET /policy; GET /docs is the OpenAPI page.
+"""
+EPILOG = f"""\
+examples:
+  python -m music_rllib.serve results/nodes/KEY
+  python -m music_rllib.serve finetune/q=1.5/FetchPush/seed=0 --storage results
+  curl -s localhost:8000/act -H 'Content-Type: application/json' \\
+    -d '{{"observation": [1.3, ...25 numbers], "desired_goal": [1.4, 0.7, 0.5]}}'
+
+{TOKEN_VARIABLE} in the environment makes clients send it as 'Authorization: Bearer ...'.
+To listen on other addresses than loopback it must be set. RAY_ADDRESS chooses a Ray cluster.
+
+exit codes: 0 stopped by Ctrl-C or SIGTERM, 1 serving failed, 2 bad input
+"""
+
+
+class _BadInputError(Exception):
+    """Something that the user must change."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; its exit code."""
+    arguments = _parser().parse_args(argv)
+    try:
+        _check_exposure(arguments.host)
+        _check_port(arguments.host, arguments.port)
+        return _serve(arguments)
+    except _BadInputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return BAD_INPUT
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m music_rllib.serve",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "policy",
+        metavar="POLICY",
+        help="Folder or URI of a finished run or an exported policy, or a run's key or label.",
+    )
+    parser.add_argument(
+        "--storage", default="results", help="Where keys and labels are looked up (results)."
+    )
+    parser.add_argument("--host", default="127.0.0.1", help="Address to listen on (127.0.0.1).")
+    parser.add_argument("--port", type=_port, default=8000, help="Port to listen on (8000).")
+    parser.add_argument(
+        "--replicas", type=_positive, default=1, help="Processes that compute actions (1)."
+    )
+    return parser
+
+
+def _port(text: str) -> int:
+    port = int(text)
+    if not 0 < port < 2**16:
+        raise argparse.ArgumentTypeError(f"must be in 1..65535, got {port}")
+    return port
+
+
+def _positive(text: str) -> int:
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"must be >= 1, got {number}")
+    return number
+
+
+def _check_exposure(host: str) -> None:
+    try:
+        loopback = host == "localhost" or ip_address(host).is_loopback
+    except ValueError:
+        loopback = False
+    if not loopback and not os.environ.get(TOKEN_VARIABLE):
+        raise _BadInputError(
+            f"--host must be a loopback address unless {TOKEN_VARIABLE} is set, got {host!r}: "
+            "without a token anyone who reaches that address can use the policy"
+        )
+
+
+def _check_port(host: str, port: int) -> None:
+    """Ray Serve itself would say so only in a worker's log."""
+    if os.environ.get("RAY_ADDRESS"):
+        return  # it will be another machine that listens
+    try:
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+        with socket.socket(family, socket.SOCK_STREAM) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind((host, port))
+    except OSError as error:
+        raise _BadInputError(
+            f"--host and --port must name a free port of this machine, got {host}:{port}: "
+            f"{error.strerror}"
+        ) from error
+
+
+def _serve(arguments: argparse.Namespace) -> int:
+    try:
+        from ray import serve
+    except ImportError as error:
+        raise _BadInputError(
+            f"Ray Serve must be installed (pip install 'music_rllib[serve]'): {error}"
+        ) from error
+    from music_rllib.policy import PolicyError
+    from music_rllib.serve.application import ServeSettings, app
+
+    settings = ServeSettings(
+        policy=arguments.policy, storage=arguments.storage, replicas=arguments.replicas
+    )
+    try:
+        application = app(settings)
+    except PolicyError as error:
+        raise _BadInputError(str(error)) from error
+    if not os.environ.get("RAY_ADDRESS"):
+        _check_room(settings, [len(os.sched_getaffinity(0))])
+    stop = _stop_signal()
+    _connect(settings)
+    try:
+        _run(application, arguments, serve)
+        stop.wait()
+    finally:
+        _shut_down(serve)
+    return 0
+
+
+def _stop_signal() -> threading.Event:
+    """Set by Ctrl-C and SIGTERM."""
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    return stop
+
+
+def _connect(settings: ServeSettings) -> None:
+    """A local Ray, or the cluster of the environment; refuses replicas that can never start."""
+    import ray
+
+    from music_rllib._quiet import quiet_third_parties
+
+    options: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.WARNING}
+    address = os.environ.get("RAY_ADDRESS")
+    if not address:
+        options |= {"address": "local", "include_dashboard": False}
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        ray.init(runtime_env={"worker_process_setup_hook": quiet_third_parties}, **options)
+    except (ConnectionError, RuntimeError, ValueError) as error:
+        if not address:
+            raise
+        raise _BadInputError(
+            f"RAY_ADDRESS must be a Ray cluster that can be reached, got {address!r}: "
+            f"{str(error).strip().splitlines()[0]}"
+        ) from error
+    finally:
+        # Ray sets one of its own for SIGTERM, which would end the process at once.
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    nodes = [node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"]]
+    try:
+        _check_room(settings, nodes)
+    except _BadInputError:
+        ray.shutdown()
+        raise
+
+
+def _check_room(settings: ServeSettings, cpus_of_nodes: Sequence[float]) -> None:
+    """Ray would wait for ever for more replicas than can be placed."""
+    room = sum(int(cpus // settings.cpus_per_replica) for cpus in cpus_of_nodes)
+    if settings.replicas > room:
+        raise _BadInputError(
+            f"--replicas must be <= {room}, as many as there are CPUs, got {settings.replicas}"
+        )
+
+
+def _run(application: Any, arguments: argparse.Namespace, serve: Any) -> None:
+    host, port = arguments.host, arguments.port
+    quiet = {"enable_access_log": False, "log_level": "WARNING"}
+    logging.getLogger("ray.serve").setLevel(logging.WARNING)
+    serve.start(
+        proxy_location="HeadOnly",
+        http_options={"host": host, "port": port},
+        logging_config=quiet,
+    )
+    serve.run(application, name="policy", route_prefix="/", logging_config=quiet)
+    shown = f"[{host}]" if ":" in host else host
+    print(f"Serving {arguments.policy} at http://{shown}:{port}", flush=True)
+    print(f"POST /act, GET /health, GET /policy; try it at http://{shown}:{port}/docs", flush=True)
+
+
+def _shut_down(serve: Any) -> None:
+    import ray
+
+    # Others may serve on a cluster too; a local Ray ends with all that runs on it.
+    if os.environ.get("RAY_ADDRESS"):
+        serve.delete("policy")
+    ray.shutdown()
+    print("Stopped.", flush=True)

@@ -1,0 +1,151 @@
+"""`python -m music_rllib.serve` as a user starts it: one service on loopback for all tests."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+import requests
+
+from benchmarks.serve import random_policy
+from music_rllib.policy import Policy, load_policy
+
+TOKEN = "a-planted-token"
+
+
+class Service(NamedTuple):
+    """A running service."""
+
+    url: str
+    policy: Policy
+    process: subprocess.Popen[str]
+    file: Path
+
+
+def start(*arguments: str, token: str | None = None) -> subprocess.Popen[str]:
+    environment = {**os.environ, **({"MUSIC_RLLIB_SERVE_TOKEN": token} if token else {})}
+    return subprocess.Popen(
+        [sys.executable, "-m", "music_rllib.serve", *arguments],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    file = tmp_path_factory.mktemp("serve") / "policy.safetensors"
+    file.write_bytes(random_policy(hidden=32))
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
+    process = start(str(file), "--port", str(port), token=TOKEN)
+    assert process.stdout is not None
+    assert process.stderr is not None
+    try:
+        line = process.stdout.readline()
+        assert line == f"Serving {file} at http://127.0.0.1:{port}\n", process.stderr.read()
+        yield Service(f"http://127.0.0.1:{port}", load_policy(file), process, file)
+    finally:
+        process.terminate()
+        output, errors = process.communicate(timeout=120)
+    assert (process.returncode, errors) == (0, "")
+    assert output.endswith("Stopped.\n")
+
+
+def act(service: Service, body: Any, token: str = TOKEN) -> requests.Response:
+    headers = {"Authorization": f"Bearer {token}"}
+    return requests.post(f"{service.url}/act", json=body, headers=headers, timeout=120)
+
+
+def test_actions_are_the_policys(service: Service) -> None:
+    """Requests of one and of many rows, side by side, so that they are computed together."""
+    rng = np.random.default_rng(1)
+
+    def ask(rows: int) -> None:
+        shape = (rows,) if rows else ()
+        body = {
+            "observation": rng.normal(size=(*shape, 25)).tolist(),
+            "desired_goal": rng.normal(size=(*shape, 3)).tolist(),
+        }
+        answer = act(service, body)
+        assert answer.status_code == 200, answer.text
+        np.testing.assert_allclose(answer.json()["action"], service.policy.act(body), atol=1e-6)
+
+    with ThreadPoolExecutor(16) as pool:
+        list(pool.map(ask, [0, 1, 3, 64] * 25))
+
+
+def test_a_request_that_is_refused_harms_no_other(service: Service) -> None:
+    good = {"observation": [0.5] * 25, "desired_goal": [0.5] * 3}
+    bad = [{"observation": [1.0] * 24, "desired_goal": [0.0] * 3}, "nonsense", None]
+
+    with ThreadPoolExecutor(16) as pool:
+        statuses = pool.map(lambda body: act(service, body).status_code, [good, *bad] * 10)
+    assert list(statuses) == [200, 422, 422, 422] * 10
+
+
+def test_the_token_is_needed_and_kept_out_of_sight(service: Service) -> None:
+    assert act(service, {}, token="wrong").status_code == 401
+    assert requests.get(f"{service.url}/policy", timeout=60).status_code == 401
+    health = requests.get(f"{service.url}/health", timeout=60)
+    assert health.json() == {"status": "ok", "task": "FetchPush"}
+    # What Ray notes of this session: arguments of deployments, environments, logs.
+    (session,) = Path("/tmp/ray").glob(f"session_*_{service.process.pid}")
+    notes = [path for path in session.rglob("*") if path.is_file()]
+    assert len(notes) > 10
+    for path in notes:
+        assert TOKEN.encode() not in path.read_bytes(), path
+
+
+def test_fuzzing_finds_no_server_error(service: Service, tmp_path: Path) -> None:
+    """Fewer examples than on the application itself: this is about what Serve adds."""
+    program = str(Path(sys.executable).with_name("schemathesis"))
+    command = [
+        *(program, "run", f"{service.url}/openapi.json"),
+        *("--header", f"Authorization: Bearer {TOKEN}", "--phases", "examples,fuzzing"),
+        *("--checks", "all", "--exclude-checks", "positive_data_acceptance"),
+        *("--max-examples", "25", "--seed", "1", "--no-color", "--generation-database", "none"),
+    ]
+    done = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, timeout=250, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["{policy}", "--host", "0.0.0.0"], "must be a loopback address unless"),
+        (["{policy}", "--port", "{taken}"], "must name a free port"),
+        (["{policy}", "--replicas", "5000"], "--replicas must be <= "),
+        (["{folder}"], "must hold a policy"),
+        (["no-such-run", "--storage", "{folder}"], "no run is finished there"),
+    ],
+)
+def test_bad_input_is_one_line(
+    service: Service, arguments: list[str], message: str, tmp_path: Path
+) -> None:
+    taken = service.url.rpartition(":")[2]
+    places = {"policy": service.file, "folder": tmp_path, "taken": taken}
+    if "--port" not in arguments:
+        with socket.create_server(("127.0.0.1", 0)) as probe:
+            arguments += ["--port", str(probe.getsockname()[1])]
+    process = start(*(argument.format(**places) for argument in arguments))
+    try:
+        output, errors = process.communicate(timeout=120)
+    finally:
+        process.kill()
+    assert (process.returncode, output) == (2, "")
+    assert message in errors
+    assert errors.startswith("error: ")
+    assert errors.count("\n") == 1
