@@ -11,7 +11,7 @@ from torch import Tensor
 
 from music_rllib.tac import losses
 from music_rllib.tac.distribution import sample_squashed
-from music_rllib.tac.networks import Critics, RunningNormaliser, mlp
+from music_rllib.tac.networks import Critics, Perceptron, RunningNormaliser
 from music_rllib.tsallis import ln_q_of_policy
 
 HIDDEN = (256, 256, 256)
@@ -23,9 +23,9 @@ class RawUpdate:
     def __init__(self, inputs: int, actions: int, batch: int, *, q: float, alpha: float) -> None:
         torch.manual_seed(0)
         self.q, self.alpha = q, alpha
-        self.policy = mlp(inputs, HIDDEN, 2 * actions)
+        self.policy = Perceptron(inputs, HIDDEN, 2 * actions)
         self.critics = Critics(inputs + actions, HIDDEN)
-        self.value, self.target = mlp(inputs, HIDDEN, 1), mlp(inputs, HIDDEN, 1)
+        self.value, self.target = Perceptron(inputs, HIDDEN, 1), Perceptron(inputs, HIDDEN, 1)
         self.target.requires_grad_(False)
         self.normaliser = RunningNormaliser(inputs, epsilon=0.01, clip=5.0)
         self.normaliser.update(torch.randn(1000, inputs))

@@ -37,6 +37,7 @@ from music_rllib.tac import diagnostics, losses
 from music_rllib.tac.forward import Bootstrap, TACForward
 from music_rllib.tac.module import ESTIMATOR_MODULE, EstimatorModule, TACModule, choose_action
 from music_rllib.tac.networks import RunningNormaliser
+from music_rllib.tac.precision import check_precision
 from music_rllib.tac.settings import LearnedAlpha, TACSettings
 from music_rllib.tracking import names
 from music_rllib.tsallis import ln_q_of_policy
@@ -67,6 +68,7 @@ class TACLearner(TorchLearner):
         # another trial beside it run twenty times slower; the sums would also change.
         torch.set_num_threads(self.config.torch_threads)
         super().build()
+        check_precision(self._settings.precision, self._device)
         seed = self.config.seed if self.config.seed is not None else torch.seed()
         self._generator = torch.Generator(device=self._device).manual_seed(seed + 7919)
         self._grad_updates = 0

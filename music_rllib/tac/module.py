@@ -16,7 +16,7 @@ from music_rllib.envs.make import observation_sizes
 from music_rllib.estimator.network import MutualInformationEstimator, intrinsic_reward
 from music_rllib.tac.distribution import deterministic_action, sample_squashed
 from music_rllib.tac.forward import Bootstrap, TACForward
-from music_rllib.tac.networks import Critics, RunningNormaliser, mlp
+from music_rllib.tac.networks import Critics, Perceptron, RunningNormaliser
 from music_rllib.tac.settings import LearnedAlpha, TACSettings
 
 __all__ = [
@@ -48,10 +48,14 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
         sizes = settings.hidden_sizes
         self.input_size, self.action_size = inputs, actions
         self.deterministic = settings.policy == "deterministic"
-        self.policy = mlp(inputs, sizes, actions if self.deterministic else 2 * actions)
-        self.critics = Critics(inputs + actions, sizes, count=1 if self.deterministic else 2)
+        # Acting is a few rows at a time, on machines of any kind.
+        bf16 = settings.precision == "bf16" and not self.inference_only
+        outputs = actions if self.deterministic else 2 * actions
+        self.policy = Perceptron(inputs, sizes, outputs, bf16=bf16)
+        count = 1 if self.deterministic else 2
+        self.critics = Critics(inputs + actions, sizes, count, bf16=bf16)
         if settings.bootstrap == "value":
-            self.value = mlp(inputs, sizes, 1)
+            self.value = Perceptron(inputs, sizes, 1, bf16=bf16)
         self.normaliser: nn.Module = nn.Identity()
         if settings.normalise_observations:
             self.normaliser = RunningNormaliser(

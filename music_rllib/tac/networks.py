@@ -1,6 +1,9 @@
 """The networks of TAC: multi-layer perceptrons, twin critics as one batched network, normaliser.
 
-Shape legend: B batch, I input features, C critics.
+Shape legend: B batch, I input features, O outputs, C critics.
+
+With `bf16` the products of all layers but the last are in bfloat16, which has eight significant
+bits: enough for activations, too few for values, densities and weights.
 """
 
 from __future__ import annotations
@@ -13,17 +16,35 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-__all__ = ["Critics", "RunningNormaliser", "mlp"]
+__all__ = ["Critics", "Perceptron", "RunningNormaliser"]
 
 
-def mlp(inputs: int, hidden_sizes: Sequence[int], outputs: int) -> nn.Sequential:
-    """A perceptron with ReLU between its layers and a linear output."""
-    layers: list[nn.Module] = []
-    for size in hidden_sizes:
-        layers += [nn.Linear(inputs, size), nn.ReLU()]
-        inputs = size
-    layers.append(nn.Linear(inputs, outputs))
-    return nn.Sequential(*layers)
+class Perceptron(nn.Sequential):
+    """ReLU between its layers, a linear output; [..., I] -> [..., O] in float32."""
+
+    def __init__(
+        self, inputs: int, hidden_sizes: Sequence[int], outputs: int, *, bf16: bool = False
+    ) -> None:
+        layers: list[nn.Module] = []
+        for size in hidden_sizes:
+            layers += [nn.Linear(inputs, size), nn.ReLU()]
+            inputs = size
+        super().__init__(*layers, nn.Linear(inputs, outputs))
+        self.bf16 = bf16
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        if not self.bf16:
+            return super().forward(inputs)  # type: ignore[no-any-return, no-untyped-call]
+        *hidden_layers, last = self
+        hidden = inputs
+        with _in_bf16(inputs):
+            for layer in hidden_layers:
+                hidden = layer(hidden)
+        return last(hidden.float())  # type: ignore[no-any-return]
+
+
+def _in_bf16(inputs: Tensor) -> torch.autocast:
+    return torch.autocast(inputs.device.type, torch.bfloat16)
 
 
 class Critics(nn.Module):
@@ -35,9 +56,11 @@ class Critics(nn.Module):
         count: C, two unless the algorithm has a single critic (DDPG).
     """
 
-    def __init__(self, inputs: int, hidden_sizes: Sequence[int], count: int = 2) -> None:
+    def __init__(
+        self, inputs: int, hidden_sizes: Sequence[int], count: int = 2, *, bf16: bool = False
+    ) -> None:
         super().__init__()
-        self.count = count
+        self.count, self.bf16 = count, bf16
         sizes = [inputs, *hidden_sizes, 1]
         self.weights = nn.ParameterList()
         self.biases = nn.ParameterList()
@@ -55,14 +78,23 @@ class Critics(nn.Module):
             frozen: gradients reach the inputs only. The policy's step needs just those, and a
                 third of its work is saved.
         """
-        layers = list(self._layers(frozen))
-        first_weight, first_bias = layers[0]
+        *hidden_layers, (weight, bias) = self._layers(frozen)
+        if self.bf16:
+            with _in_bf16(inputs):
+                hidden = self._hidden(inputs, hidden_layers)
+        else:
+            hidden = self._hidden(inputs, hidden_layers)
+        return torch.baddbmm(bias, F.relu(hidden).float(), weight).squeeze(-1)
+
+    def _hidden(self, inputs: Tensor, layers: list[tuple[Tensor, Tensor]]) -> Tensor:
+        """[B, I] -> [C, B, H], before the last layer's ReLU."""
+        (first_weight, first_bias), *others = layers
         _, fan_in, width = first_weight.shape
         stacked = first_weight.transpose(0, 1).reshape(fan_in, self.count * width)
         hidden = (inputs @ stacked).view(-1, self.count, width).transpose(0, 1) + first_bias
-        for weight, bias in layers[1:]:
+        for weight, bias in others:
             hidden = torch.baddbmm(bias, F.relu(hidden), weight)
-        return hidden.squeeze(-1)
+        return hidden
 
     def _layers(self, frozen: bool) -> Iterator[tuple[Tensor, Tensor]]:
         for weight, bias in zip(self.weights, self.biases, strict=True):

@@ -98,6 +98,9 @@ class TACSettings(_Frozen):
     """Transitions per update."""
     replay_ratio: float = Field(1.0, gt=0)
     """Gradient updates per environment step."""
+    precision: Literal["float32", "bf16"] = "float32"
+    """Of the hidden layers' products while learning; weights, outputs and acting stay float32.
+    `bf16` is refused on hardware without it."""
     random_steps: int = Field(1_000, ge=0)
     """First environment steps: uniformly random actions, and no updates before they are over."""
     normalise_observations: bool = True

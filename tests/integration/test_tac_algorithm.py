@@ -11,6 +11,7 @@ from music_rllib import TACConfig
 from music_rllib.estimator.settings import MusicSettings
 from music_rllib.replay.settings import ReplaySettings
 from music_rllib.tac.algorithm import TAC
+from music_rllib.tac.precision import PrecisionError, has_bf16
 from music_rllib.tac.settings import TACSettings
 from music_rllib.tracking import names
 
@@ -131,6 +132,7 @@ CHANGES: dict[str, tuple[Any, dict[str, Any]]] = {
     "target_bounds": ((-1.0, 0.0), {}),
     "batch_size": (48, {}),
     "replay_ratio": (0.5, {}),
+    "precision": ("bf16", {}),
     "random_steps": (200, {}),
     "normalise_observations": (False, {}),
     "observation_clip": (0.5, {}),
@@ -184,6 +186,10 @@ def test_every_setting_is_listed() -> None:
 @pytest.mark.parametrize("setting", CHANGES)
 def test_no_setting_is_dead(setting: str, bases: dict[str, dict[str, float]]) -> None:
     value, base = CHANGES[setting]
+    if setting == "precision" and not has_bf16():
+        with pytest.raises(PrecisionError):
+            last_weights({setting: value})
+        return
     if repr(base) not in bases:
         bases[repr(base)] = last_weights(base)
     assert last_weights({**base, setting: value}) != bases[repr(base)]

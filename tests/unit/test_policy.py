@@ -16,7 +16,7 @@ from music_rllib.experiment.sealed import SealedFolders, open_storage
 from music_rllib.experiment.settings import RunSettings
 from music_rllib.policy import PolicyError, PolicyNetwork, find_policy, load_policy
 from music_rllib.policy.network import PolicyFileError
-from music_rllib.tac.networks import RunningNormaliser, mlp
+from music_rllib.tac.networks import Perceptron, RunningNormaliser
 
 REACH = BUILT_IN_TASKS["FetchReach"]
 KEY, OTHER = "0123456789abcdef0123", "0123ffffffffffffffff"
@@ -35,7 +35,7 @@ class Trained:
         torch.manual_seed(0)
         self.deterministic = run.tac.policy == "deterministic"
         outputs = ACTIONS if self.deterministic else 2 * ACTIONS
-        self.policy = mlp(INPUTS, run.tac.hidden_sizes, outputs)
+        self.policy = Perceptron(INPUTS, run.tac.hidden_sizes, outputs)
         self.normaliser = RunningNormaliser(INPUTS, epsilon=0.01, clip=CLIP)
         self.normaliser.update(torch.randn(50, INPUTS) * 3 + 1)
         self.run = run

@@ -7,7 +7,7 @@ from scipy import integrate
 from torch import nn
 
 from music_rllib.tac.distribution import deterministic_action, sample_squashed
-from music_rllib.tac.networks import Critics, RunningNormaliser, mlp
+from music_rllib.tac.networks import Critics, Perceptron, RunningNormaliser
 
 
 @pytest.mark.parametrize(("mean", "log_std"), [(0.0, -1.0), (0.8, 0.0), (-1.5, 0.5)])
@@ -40,10 +40,10 @@ def test_deterministic_action_is_the_sample_without_noise() -> None:
     torch.testing.assert_close(deterministic_action(mean), sample.action)
 
 
-def as_two_perceptrons(critics: Critics, sizes: list[int]) -> list[nn.Sequential]:
+def as_two_perceptrons(critics: Critics, sizes: list[int]) -> list[Perceptron]:
     copies = []
     for which in range(2):
-        copy = mlp(sizes[0], sizes[1:], 1)
+        copy = Perceptron(sizes[0], sizes[1:], 1)
         linears = [layer for layer in copy if isinstance(layer, nn.Linear)]
         for layer, weight, bias in zip(linears, critics.weights, critics.biases, strict=True):
             layer.weight.data = weight[which].T.clone()
