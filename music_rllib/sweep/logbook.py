@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+import dataclasses
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from music_rllib.experiment.files import content_key
 from music_rllib.experiment.plan import Node
 from music_rllib.experiment.result import Report, RunResult
-from music_rllib.experiment.sealed import DamagedError
+from music_rllib.experiment.sealed import DamagedError, StorageError
 from music_rllib.experiment.settings import RunSettings
 from music_rllib.experiment.store import NodeStore
+from music_rllib.policy.policy import policy_from_folder
 from music_rllib.schedules import Linear, Piecewise, value_at
 from music_rllib.sweep.listener import Failure, Listener
 from music_rllib.sweep.words import in_words
@@ -38,6 +43,7 @@ def run_info(node: Node) -> RunInfo:
         tags={
             names.TAG_STAGE: node.stage,
             names.TAG_TRIAL: node.trial,
+            names.TAG_PART: node.part or None,
             names.TAG_VARIANT: run.variant,
             names.TAG_TASK: run.task.name,
             names.TAG_SEED: run.seed,
@@ -59,10 +65,13 @@ def run_info(node: Node) -> RunInfo:
 class Logbook(Listener):
     """Passes on what happens to the tracker; where that can't keep it, training goes on."""
 
-    def __init__(self, tracker: Tracker, complain: Callable[[str], None]) -> None:
-        """Tell `complain` once where the tracker can't write."""
+    def __init__(
+        self, tracker: Tracker, complain: Callable[[str], None], store: NodeStore | None = None
+    ) -> None:
+        """Tell `complain` once where the tracker can't write; log final policies from `store`."""
         self._tracker = tracker
         self._complain = complain
+        self._store = store
         self._open: set[str] = set()
         """Nodes whose run the tracker has begun."""
         self._complained = False
@@ -82,7 +91,8 @@ class Logbook(Listener):
             )
             for report in history
         ]
-        self._try(lambda: self._tracker.log_history(run_info(node), points))
+        with self._policy(node) as artefacts:
+            self._try(lambda: self._tracker.log_history(run_info(node), points, artefacts))
 
     def started(self, node: Node) -> None:
         """Open the node's MLflow run, or go on with the one it has."""
@@ -102,9 +112,25 @@ class Logbook(Listener):
             self._try(log)
 
     def finished(self, node: Node, result: RunResult) -> None:
-        """Close the run."""
-        if node.key in self._open:
-            self._try(lambda: self._tracker.finish(node.key, "FINISHED"))
+        """Close the run, with its policy."""
+        if node.key not in self._open:
+            return
+        with self._policy(node) as artefacts:
+            self._try(lambda: self._tracker.finish(node.key, "FINISHED", artefacts=artefacts))
+
+    @contextlib.contextmanager
+    def _policy(self, node: Node) -> Iterator[dict[str, Path]]:
+        """The finished node's policy as one file, for this `with`; nothing where it has none."""
+        with TemporaryDirectory() as temporary:
+            folder, packed = Path(temporary, "node"), Path(temporary, names.ARTEFACT_POLICY)
+            try:
+                if self._store is not None:
+                    folder.mkdir()
+                    self._store.fetch(node.key, folder)
+                    packed.write_bytes(policy_from_folder(folder).to_bytes())
+            except (OSError, ValueError, StorageError) as error:
+                self._complain(f"MLflow gets no policy of {node.label}: {error}")
+            yield {names.ARTEFACT_POLICY: packed} if packed.exists() else {}
 
     def failed(self, node: Node, failure: Failure) -> None:
         """Close the run with its cause."""
@@ -112,6 +138,16 @@ class Logbook(Listener):
             self.started(node)
         if node.key in self._open:
             self._try(lambda: self._tracker.finish(node.key, "FAILED", failure=failure.cause))
+
+    def pruned(self, node: Node, reason: str) -> None:
+        """Close a run that isn't computed any further, and say why."""
+        if node.key not in self._open:
+            return
+        info = run_info(node)
+        told = dataclasses.replace(info, tags={**info.tags, names.TAG_PRUNED: reason})
+        self._try(lambda: self._tracker.start(told))
+        self._try(lambda: self._tracker.finish(node.key, "KILLED"))
+        self._open.discard(node.key)
 
     def _try(self, log: Callable[[], object]) -> bool:
         """Log; False, with a complaint the first time, where the tracker can't."""

@@ -78,7 +78,10 @@ class Delivery:
             if self._cancelled:
                 return
             run_id = self.attach()
-            self.spool.send_artefact(name, partial(self._experiment.upload, run_id, name))
+            send = self._experiment.upload
+            if name == names.ARTEFACT_POLICY:
+                send = self._experiment.log_policy
+            self.spool.send_artefact(name, partial(send, run_id, name))
 
     def cancel(self) -> None:
         """Send nothing more after the request that is under way."""

@@ -10,16 +10,25 @@ import os
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TypeVar
 from urllib.parse import quote
 
 from filelock import FileLock
 from mlflow import MlflowClient
-from mlflow.entities import Metric, Param, RunTag
+from mlflow.entities import (
+    LoggedModel,
+    LoggedModelOutput,
+    LoggedModelStatus,
+    Metric,
+    Param,
+    RunTag,
+)
 from mlflow.exceptions import MlflowException
 
 from music_rllib.tracking import names
 from music_rllib.tracking.errors import TrackingError
+from music_rllib.tracking.policy_model import MODEL_NAME, write_model
 from music_rllib.tracking.redaction import redact
 from music_rllib.tracking.spool import Metrics, Status
 from music_rllib.tracking.store import TrackingStore
@@ -141,6 +150,48 @@ class Experiment:
         folder = name.rpartition("/")[0]
         self._client.log_artifact(run_id, str(file), folder or None)
 
+    def log_policy(self, run_id: str, name: str, file: Path) -> None:
+        """Store the policy in `file` as the run's logged model; a finished one stays as it is.
+
+        A server that knows no logged models (MLflow 2) keeps the file as the artefact `name`.
+        """
+        try:
+            model = self._policy_model(run_id)
+        except MlflowException as error:
+            if error.error_code != "ENDPOINT_NOT_FOUND":
+                raise
+            self.upload(run_id, name, file)
+            return
+        if model.status == LoggedModelStatus.READY:
+            return
+        with TemporaryDirectory() as temporary:
+            folder = Path(temporary, "model")
+            policy = write_model(file, folder, run_id=run_id, model_id=model.model_id)
+            self._client.log_model_artifacts(model.model_id, str(folder))
+        steps = int(policy.about.get("env_steps", 0))
+        outputs = self._client.get_run(run_id).outputs
+        if not outputs or model.model_id not in [o.model_id for o in outputs.model_outputs]:
+            self._client.log_outputs(run_id, [LoggedModelOutput(model.model_id, steps)])
+        self._client.finalize_logged_model(model.model_id, LoggedModelStatus.READY)
+
+    def _policy_model(self, run_id: str) -> LoggedModel:
+        """The run's logged model: a new one, or the one that a delivery before has begun."""
+        found = self._client.search_logged_models(
+            [self.id], f"tags.`{names.TAG_SOURCE_RUN}` = '{run_id}'", max_results=1
+        )
+        if found:
+            return found[0]
+        tags = self._client.get_run(run_id).data.tags
+        shown = {key: tags[key] for key in names.TAGS_OF_A_MODEL if key in tags}
+        return self._client.create_logged_model(
+            self.id,
+            name=MODEL_NAME,
+            source_run_id=run_id,
+            tags={**shown, names.TAG_SOURCE_RUN: run_id},
+            params=shown,
+            model_type=MODEL_NAME,
+        )
+
     def _find_or_create(self) -> str:
         experiment = self._client.get_experiment_by_name(self._name)
         if experiment is None:
@@ -177,8 +228,11 @@ def _configure_mlflow() -> None:
     os.environ["MLFLOW_HTTP_REQUEST_MAX_RETRIES"] = "0"
     os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", str(REQUEST_SECONDS))
     os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
+    os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
     # MLflow's own use of SQLAlchemy, met when its database code is imported.
     warnings.filterwarnings("ignore", r"The ``noload`` loader strategy", DeprecationWarning)
+    # And of its own type hints, met when its model code is imported.
+    warnings.filterwarnings("ignore", r".*Any type hint is inferred as AnyType", UserWarning)
     for chatty in ("mlflow.store.db.utils", "alembic"):
         logging.getLogger(chatty).setLevel(logging.WARNING)
 

@@ -133,6 +133,11 @@ TAG_SOURCE_NODE = "source_node"
 """Node key, or checkpoint hash, of what this run starts from."""
 TAG_REUSED = "reused"
 """``true`` where the node was finished by an earlier sweep and its history was copied here."""
+TAG_PART = "part"
+"""Of a searched stage: ``trialN`` for a run that trials were chosen by, ``finalN`` for one on the
+fresh seeds of the final ranking. Never mixed in one estimate: the first are biased by the choice."""
+TAG_PRUNED = "pruned"
+"""Why a run was stopped early, together with its trial."""
 TAG_FAILURE = "failure"
 """First lines of the cause of a failed run."""
 TAG_GIT_COMMIT = "git_commit"
@@ -141,10 +146,28 @@ TAG_VERSION_PREFIX = "version."
 """Followed by a package or ``python``: ``version.ray``."""
 TAG_CHANGED_PREFIX = "changed."
 """Followed by a param: its newer value (MLflow params never change) after a sweep was changed."""
+TAGS_OF_A_MODEL = (
+    TAG_SWEEP,
+    TAG_SWEEP_ID,
+    TAG_NODE_KEY,
+    TAG_STAGE,
+    TAG_TRIAL,
+    TAG_VARIANT,
+    TAG_TASK,
+    TAG_SEED,
+    TAG_ENTROPIC_INDEX,
+    TAG_ALPHA,
+    TAG_MI_REWARD_WEIGHT,
+)
+"""What a logged policy is tagged with, besides ``source_run``: the run's own values."""
 TAG_MLFLOW_SOURCE_NAME = "mlflow.source.name"
 """MLflow's own tag behind its *Source* column."""
 
 # Artefacts --------------------------------------------------------------------------------------
 ARTEFACT_SWEEP_CONFIG = "config/sweep.yaml"
+ARTEFACT_SEARCH = "search/search.json"
+"""Trials, values, reasons, importance and the ranking on fresh seeds of a sweep's searches."""
 ARTEFACT_RUN_CONFIG = "config/run.yaml"
 ARTEFACT_LEARNING_CURVE = "learning_curve.png"
+ARTEFACT_POLICY = "policy.safetensors"
+"""The final policy on its way to MLflow, where it becomes the run's logged model."""

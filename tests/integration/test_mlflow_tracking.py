@@ -16,11 +16,13 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.request import urlopen
 
+import numpy as np
 import pytest
 from mlflow import MlflowClient
 from mlflow.entities import Run
 from typer.testing import CliRunner
 
+from music_rllib.policy import PolicyNetwork
 from music_rllib.tracking import Point, RunInfo, Tracker, TrackingError, deliver, names
 from music_rllib.tracking.__main__ import app
 
@@ -265,6 +267,69 @@ def test_a_reused_node_comes_with_its_history_once(storage: Path, tracker_on: Ma
     assert runs["finetune/new"].data.tags[names.TAG_SOURCE_RUN] == old.info.run_id
 
 
+@pytest.fixture
+def policy(tmp_path: Path) -> Path:
+    """A policy's file: one layer that passes the first two of three inputs on."""
+    network = PolicyNetwork(
+        weights=(np.eye(2, 3, dtype=np.float32),),
+        biases=(np.zeros(2, np.float32),),
+        mean=np.zeros(3, np.float32),
+        inverse_std=np.ones(3, np.float32),
+        clip=5.0,
+        low=-np.ones(2, np.float32),
+        high=np.ones(2, np.float32),
+        goal_size=1,
+        about={"env_steps": 20_000},
+    )
+    file = tmp_path / "packed.safetensors"
+    file.write_bytes(network.to_bytes())
+    return file
+
+
+# Loads the model where this package can't be imported, and acts.
+ELSEWHERE = """
+import sys, warnings
+sys.modules["music_rllib"] = None
+warnings.simplefilter("ignore")
+import mlflow, numpy
+mlflow.set_tracking_uri(sys.argv[1])
+model = mlflow.pyfunc.load_model(sys.argv[2])
+dictionary = {"observation": numpy.array([0.5, 9.0]), "desired_goal": numpy.zeros(1)}
+batch = numpy.array([[0.0, -0.5, 1.0]])
+print([model.predict(dictionary).tolist(), model.predict(batch).tolist()])
+"""
+
+
+def test_a_final_policy_is_a_model_that_loads_and_acts(
+    storage: Path, tracker_on: MakeTracker, policy: Path
+) -> None:
+    tracker = tracker_on()
+    tracker.start(run_info("a"))
+    tracker.finish("a", "FINISHED", artefacts={names.ARTEFACT_POLICY: policy})
+    assert tracker.flush(60.0), tracker.backlog()
+    # As after a crash before the outbox was emptied: the same again.
+    tracker._session.open_run("a").put_artefact(names.ARTEFACT_POLICY, policy)
+    assert not tracker.close(timeout=60.0)
+    client = client_of(storage)
+    run = runs_of(client)["finetune/a"]
+    (model,) = client.search_logged_models([run.info.experiment_id])
+    assert (model.name, model.status, model.source_run_id) == ("policy", "READY", run.info.run_id)
+    assert model.tags[names.TAG_TASK] == "FetchPush"
+    assert run.outputs is not None
+    assert [output.model_id for output in run.outputs.model_outputs] == [model.model_id]
+    files = [path for path in (storage / "mlartifacts").rglob("*") if path.is_file()]
+    assert not [path for path in files if path.suffix in {".pkl", ".pt", ".pickle"}]
+    done = subprocess.run(
+        [sys.executable, "-c", ELSEWHERE, f"sqlite:///{storage}/mlflow.db", model.model_uri],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    single, batch = json.loads(done.stdout)
+    np.testing.assert_allclose(single, np.tanh([0.5, 5.0]), atol=1e-6)
+    np.testing.assert_allclose(batch, [np.tanh([0.0, -0.5])], atol=1e-6)
+
+
 def test_more_metrics_than_one_request_may_hold(storage: Path, tracker_on: MakeTracker) -> None:
     tracker = tracker_on()
     tracker.start(run_info("a", config={f"p{i:03}": i for i in range(150)}))
@@ -462,7 +527,7 @@ def server(tmp_path_factory: pytest.TempPathFactory, fresh_store: FreshStore) ->
 
 
 def test_a_server_killed_while_logging_loses_and_doubles_nothing(
-    server: Server, tracker_on: MakeTracker, caplog: pytest.LogCaptureFixture
+    server: Server, tracker_on: MakeTracker, policy: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Killed and started again mid-way; later it hangs, and the rest is sent by command."""
     server.wait()
@@ -492,7 +557,7 @@ def test_a_server_killed_while_logging_loses_and_doubles_nothing(
     for step in steps[200:]:
         tracker.log("a", values(step), step)
     for key in ("a", "b"):
-        tracker.finish(key, "FINISHED")
+        tracker.finish(key, "FINISHED", artefacts={names.ARTEFACT_POLICY: policy})
     left = tracker.close(timeout=1.0)
     assert left.records > 0
     server.signal(signal.SIGCONT)
@@ -507,3 +572,9 @@ def test_a_server_killed_while_logging_loses_and_doubles_nothing(
         assert logged_steps(client, runs["finetune/a"], metric) == steps
     assert logged_steps(client, runs["finetune/b"]) == [1]
     assert names.ARTEFACT_LEARNING_CURVE in artefacts_of(client, runs["finetune/a"])
+    models = client.search_logged_models([runs["finetune/a"].info.experiment_id])
+    assert {model.source_run_id for model in models} == {
+        run.info.run_id for name, run in runs.items() if name.startswith("finetune/")
+    }
+    assert len(models) == 2
+    assert {model.status for model in models} == {"READY"}
