@@ -127,6 +127,7 @@ def _resolve(file: YamlFile, document: dict[str, Any], findings: Findings) -> Sw
         storage=header.storage,
         mlflow=header.mlflow,
         resources=header.resources,
+        checkpoints=header.checkpoints,
         stages=tuple(stage for stage in stages.values() if stage is not None),
     )
 

@@ -16,6 +16,7 @@ from music_rllib.experiment.settings import RunSettings, Variant
 __all__ = [
     "RESERVED_NAMES",
     "Checkpoint",
+    "Checkpoints",
     "Header",
     "InitFrom",
     "MlflowSettings",
@@ -59,6 +60,17 @@ class Resources(_Strict):
         return self
 
 
+class Checkpoints(_Strict):
+    """What is kept of runs that aren't finished; no run's result depends on it."""
+
+    keep: int = Field(2, gt=0)
+    """Checkpoints of a run that are kept; older ones serve where the newest is damaged."""
+    minutes: float = Field(10.0, gt=0)
+    """A run is saved at each evaluation, and when the last time is so long ago."""
+    grace_seconds: float = Field(30.0, ge=0)
+    """How long a sweep that is told to stop waits for its runs to be saved."""
+
+
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=80)]
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
 
@@ -76,6 +88,7 @@ class Header(_Strict):
     """Folder or bucket (`s3://`, `gs://`); the sweep's own folder is `<storage>/<name>`."""
     mlflow: MlflowSettings = MlflowSettings()
     resources: Resources = Resources()
+    checkpoints: Checkpoints = Checkpoints()
 
 
 class InitFrom(_Strict):
@@ -166,4 +179,5 @@ class SweepConfig:
     storage: str
     mlflow: MlflowSettings
     resources: Resources
+    checkpoints: Checkpoints
     stages: tuple[Stage, ...]

@@ -9,6 +9,7 @@ the manifest, which names it, is uploaded at the end. A folder without a manifes
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import os
 import shutil
@@ -27,6 +28,7 @@ __all__ = ["DamagedError", "Manifest", "SealedFolders", "StorageError", "open_st
 
 MANIFEST = "manifest.json"
 _CHUNK = 1 << 20
+_CANNOT_WRITE = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO}
 
 
 class StorageError(RuntimeError):
@@ -158,7 +160,13 @@ class SealedFolders:
                     folder = Path(cleaning.enter_context(tempfile.TemporaryDirectory()))
             except OSError as error:
                 raise _unwritable(self.path(name), error) from error
-            yield folder
+            try:
+                yield folder
+            except OSError as error:
+                # What the caller writes goes into the same disk; its error often names no path.
+                if error.errno in _CANNOT_WRITE:
+                    raise _unwritable(self.path(name), error) from error
+                raise
             try:
                 if self._local:
                     self._rename(name, folder, meta)
@@ -248,6 +256,16 @@ class SealedFolders:
             self._fs.delete_file(f"{self.path(name)}/{MANIFEST}")
         with contextlib.suppress(FileNotFoundError):
             self._fs.delete_dir(self.path(name))
+
+    def tidy(self, name: str | None = None) -> None:
+        """Delete what killed attempts have left on a disk, at sealing `name` or anything here.
+
+        Only for who knows that nobody else is sealing that.
+        """
+        if self._local:
+            pattern = ".*" if name is None else f".{name}"
+            for folder in Path(self._root).glob(f"{pattern}.{'[0-9a-f]' * 32}"):
+                shutil.rmtree(folder, ignore_errors=True)
 
     def remove_all(self) -> None:
         """Delete all there is below the root, also what was never sealed."""

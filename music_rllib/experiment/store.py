@@ -4,6 +4,8 @@ Below one storage folder or bucket, shared by all sweeps in it::
 
     nodes/<key>/      a finished run: handoff/, history.jsonl, run.json, manifest.json last
     work/<key>/<n>/   checkpoints of a run that isn't finished, each with its manifest
+    work/<key>/parts/ what checkpoints share, such as old trajectories
+    work/<key>/lease.json   who is computing the run, and until when that holds
 
 The store, not Tune's snapshot, says what is finished.
 """
@@ -14,14 +16,23 @@ import contextlib
 import shutil
 import uuid
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
 
+import pyarrow.fs as pafs
+
+from music_rllib.experiment.lease import LeaseFile
 from music_rllib.experiment.result import HISTORY, Report, RunResult, from_json_lines
-from music_rllib.experiment.sealed import DamagedError, SealedFolders, open_storage
+from music_rllib.experiment.sealed import DamagedError, Manifest, SealedFolders, open_storage
 
-__all__ = ["NodeStore", "WorkFolder"]
+__all__ = ["KEEP", "Draft", "NodeStore", "Saved", "WorkFolder"]
+
+FORMAT = "music_rllib checkpoint 2"
+KEEP = 2
+"""Checkpoints of a run that are kept, unless a sweep says else."""
+LEASE = "lease.json"
 
 
 class NodeStore:
@@ -78,6 +89,10 @@ class NodeStore:
         with self._nodes.sealing(key, meta) as staging:
             shutil.copytree(folder, staging, dirs_exist_ok=True)
 
+    def tidy(self, key: str) -> None:
+        """Delete what killed attempts at publishing `key` have left: for its lease's holder."""
+        self._nodes.tidy(key)
+
     def fetch(self, key: str, folder: Path) -> None:
         """Copy a finished node's files into `folder`, verified.
 
@@ -102,51 +117,89 @@ class NodeStore:
         except DamagedError as error:
             raise DamagedError(f"{error}. Delete {self.path(key)} to train it again") from error
 
-    def work_folder(self, key: str) -> WorkFolder:
-        """Where a run that isn't finished keeps its checkpoints."""
-        return WorkFolder(SealedFolders(self._fs, f"{self._root}/work/{key}"))
+    def work_folder(self, key: str, keep: int = KEEP) -> WorkFolder:
+        """Where a run that isn't finished keeps its newest `keep` checkpoints."""
+        return WorkFolder(self._fs, f"{self._root}/work/{key}", keep)
 
 
 class WorkFolder:
-    """Checkpoints of one run, numbered by environment steps."""
+    """Checkpoints of one run, numbered by environment steps.
 
-    def __init__(self, checkpoints: SealedFolders, keep: int = 2) -> None:
-        """Keep the newest `keep` of `checkpoints`."""
-        self._checkpoints = checkpoints
+    Content that doesn't change any more (old trajectories) is in *parts* of their own, below
+    ``parts/``: a checkpoint names those that it needs, and a later one needs them too.
+    """
+
+    def __init__(self, filesystem: pafs.FileSystem, root: str, keep: int = KEEP) -> None:
+        """Look at `root`; keep the newest `keep` checkpoints, and the parts that they need."""
+        self.root = root
+        self.lease = LeaseFile(filesystem, f"{root}/{LEASE}")
+        self._checkpoints = SealedFolders(filesystem, root)
+        self._parts = SealedFolders(filesystem, f"{root}/parts")
         self._keep = keep
 
     @contextlib.contextmanager
-    def new_checkpoint(self, env_steps: int) -> Iterator[Path]:
-        """Give a folder to save into; it becomes the newest checkpoint when the `with` ends.
+    def new_checkpoint(self, env_steps: int) -> Iterator[Draft]:
+        """Give a draft to fill; it becomes the newest checkpoint when the `with` ends.
 
         Raises:
             StorageError: The storage can't be written; older checkpoints are intact.
         """
         # Two attempts may reach the same step, the second one because the first is damaged.
         name = f"{env_steps:012d}-{uuid.uuid4().hex[:8]}"
-        with self._checkpoints.sealing(name, {}) as folder:
-            yield folder
-        for name in self._checkpoints.names()[: -self._keep]:
+        meta: dict[str, Any] = {"format": FORMAT}
+        with self._checkpoints.sealing(name, meta) as folder:
+            draft = Draft(folder, self._parts)
+            yield draft
+            meta["parts"] = draft.needs
+        self._prune()
+
+    def _prune(self) -> None:
+        names = self._checkpoints.names()
+        for name in names[: -self._keep]:
             self._checkpoints.remove(name)
+        needed: set[str] = set()
+        for name in names[-self._keep :]:
+            # One whose manifest is damaged can't be used, whatever it needs.
+            with contextlib.suppress(DamagedError):
+                needed.update(_needs(self._checkpoints.manifest(name)))
+        for name in set(self._parts.names()) - needed:
+            self._parts.remove(name)
 
     @contextlib.contextmanager
-    def newest(self, warn: Callable[[str], None] = warnings.warn) -> Iterator[Path | None]:
+    def newest(self, warn: Callable[[str], None] = warnings.warn) -> Iterator[Saved | None]:
         """A verified local copy of the newest sound checkpoint, or None, for this `with`.
 
         Args:
             warn: Is told about each damaged checkpoint that is skipped.
         """
-        with TemporaryDirectory() as above:
-            for name in reversed(self._checkpoints.names()):
-                folder = Path(above, name)
+        for name in reversed(self._checkpoints.names()):
+            with TemporaryDirectory() as above:
                 try:
-                    self._checkpoints.fetch(name, folder)
+                    saved = self._fetch(name, Path(above))
                 except DamagedError as error:
                     warn(f"a damaged checkpoint is skipped: {error}")
                     continue
-                yield folder
+                yield saved
                 return
-            yield None
+        yield None
+
+    def _fetch(self, name: str, above: Path) -> Saved:
+        manifest = self._checkpoints.fetch(name, above / "checkpoint")
+        if manifest.meta.get("format") != FORMAT:
+            raise DamagedError(
+                f"{self._checkpoints.path(name)} must be a {FORMAT!r}, "
+                f"got {manifest.meta.get('format')!r}"
+            )
+        parts = {}
+        for part in _needs(manifest):
+            parts[part] = above / "parts" / part
+            self._parts.fetch(part, parts[part])
+        return Saved(above / "checkpoint", parts)
+
+    def tidy(self) -> None:
+        """Delete what killed attempts have left. Only for who holds the lease."""
+        self._checkpoints.tidy()
+        self._parts.tidy()
 
     def names(self) -> list[str]:
         """The checkpoints there are, oldest first."""
@@ -154,4 +207,42 @@ class WorkFolder:
 
     def clear(self) -> None:
         """Delete all checkpoints: the run is finished."""
+        self._parts.remove_all()
         self._checkpoints.remove_all()
+
+
+def _needs(manifest: Manifest) -> list[str]:
+    parts = manifest.meta.get("parts", [])
+    return [str(part) for part in parts] if isinstance(parts, list) else []
+
+
+class Saved(NamedTuple):
+    """A checkpoint, on the local disk and verified."""
+
+    folder: Path
+    parts: Mapping[str, Path]
+    """Name to folder of what it shares with other checkpoints."""
+
+
+class Draft:
+    """A checkpoint that is being written."""
+
+    def __init__(self, folder: Path, parts: SealedFolders) -> None:
+        """Let `folder` be filled, and parts be added to `parts`."""
+        self.folder = folder
+        self.needs: list[str] = []
+        """Names of the parts that belong to it: new ones and those of earlier checkpoints."""
+        self._parts = parts
+
+    @contextlib.contextmanager
+    def new_part(self, label: str) -> Iterator[tuple[str, Path]]:
+        """Give the name of a new part, and a folder to fill with it.
+
+        Raises:
+            StorageError: The storage can't be written.
+        """
+        # Never the name of one that is there: that one may be damaged.
+        name = f"{label}-{uuid.uuid4().hex[:8]}"
+        with self._parts.sealing(name, {}) as folder:
+            yield name, folder
+        self.needs.append(name)

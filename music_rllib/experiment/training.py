@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
-from pathlib import Path
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -13,18 +12,22 @@ from numpy.typing import NDArray
 from ray.rllib.core import DEFAULT_MODULE_ID
 from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, EPISODE_RETURN_MEAN, LEARNER_RESULTS
 
+from music_rllib.experiment.plain_state import read_arrays, read_state, write_arrays, write_state
 from music_rllib.experiment.settings import RunSettings
+from music_rllib.experiment.store import Draft, Saved
+from music_rllib.replay.segments import Segment, load_segments, new_segments
 from music_rllib.tac.algorithm import TAC
 from music_rllib.tac.config import TACConfig
 from music_rllib.tac.env_runner import DISPLACEMENT, MOVED, SUCCESS_ANY, SUCCESS_LAST
 from music_rllib.tracking import names
 
-__all__ = ["TrainingRun", "algorithm_config"]
+__all__ = ["Paused", "TrainingRun", "algorithm_config"]
 
 REPORT_INTERVAL = 1_000
 """Environment steps between two reports, where evaluations are not more frequent."""
 
 _NEVER = 10**9
+_TRAJECTORIES = "trajectories.safetensors"
 
 _TRAINING = {
     SUCCESS_LAST: names.TRAIN_SUCCESS,
@@ -68,6 +71,10 @@ def algorithm_config(run: RunSettings) -> TACConfig:
     return config
 
 
+class Paused(Exception):  # noqa: N818  not an error
+    """Training stopped between two reports."""
+
+
 class TrainingRun:
     """Trains one run to its budget.
 
@@ -88,6 +95,10 @@ class TrainingRun:
         self.algorithm: TAC = algorithm_config(run).build_algo()
         if handoff:
             self.algorithm.set_parts(handoff)
+        self._rounds: defaultdict[str, list[float]] = defaultdict(list)
+        """What has been measured since the last report."""
+        self._segments: list[Segment] = []
+        """Files of this run's checkpoints that hold trajectories."""
         self._process = psutil.Process()
         self._process.cpu_percent()  # the first call only starts the measurement
 
@@ -101,22 +112,31 @@ class TrainingRun:
         """Whether the budget is spent."""
         return self.env_steps >= self.run.env_steps
 
-    def advance(self) -> dict[str, float]:
+    def advance(self, pause: Callable[[], bool] = lambda: False) -> dict[str, float]:
         """Trains until the next report is due.
+
+        Args:
+            pause: asked often; where it says so, training pauses at once.
 
         Returns:
             Means since the last report, by the names of `tracking.names`; evaluation metrics
             where an evaluation was due. Metrics that do not exist yet are left out.
+
+        Raises:
+            Paused: as it was asked to. `save` keeps what has been measured so far, so that the
+                report will be as if there had been no pause.
         """
         interval = self.run.evaluation.interval
         evaluation_at = _next_multiple(self.env_steps, interval)
         report_at = _next_multiple(self.env_steps, min(interval, REPORT_INTERVAL))
         goal = min(report_at, evaluation_at, self.run.env_steps)
-        rounds: defaultdict[str, list[float]] = defaultdict(list)
         while self.env_steps < goal:
+            if pause():
+                raise Paused
             for name, value in _training_metrics(self.algorithm.train()):
-                rounds[name].append(value)
-        metrics = {name: float(np.mean(values)) for name, values in rounds.items()}
+                self._rounds[name].append(value)
+        metrics = {name: float(np.mean(values)) for name, values in self._rounds.items()}
+        self._rounds.clear()
         if self.env_steps >= evaluation_at or self.finished:
             metrics |= self.evaluate()
         return metrics | self._counters() | self._system()
@@ -143,13 +163,48 @@ class TrainingRun:
         """Plain weights of every network, by module name, as a handoff carries them."""
         return self.algorithm.get_parts()
 
-    def save(self, folder: Path) -> None:
-        """Writes everything that `restore` needs to continue exactly from here."""
-        self.algorithm.save_to_path(folder.resolve())
+    def save(self, draft: Draft) -> None:
+        """Writes everything that `restore` needs to continue exactly from here.
 
-    def restore(self, folder: Path) -> None:
-        """Continues from what `save` wrote. Only for the run's own storage: it unpickles."""
-        self.algorithm.restore_from_path(folder.resolve())
+        Of the replay, only trajectories that no earlier checkpoint of this run has.
+
+        Raises:
+            StorageError: the storage cannot be written.
+        """
+
+        def write(label: str, arrays: Mapping[str, NDArray[Any]]) -> str:
+            with draft.new_part(label) as (name, folder):
+                write_arrays(folder / _TRAJECTORIES, arrays)
+            return name
+
+        replay = self.algorithm.replay
+        self._segments = new_segments(replay, self._segments, write)
+        draft.needs = [segment.name for segment in self._segments]
+        state = {
+            "algorithm": self.algorithm.get_state(not_components=TAC.REPLAY),
+            "replay": replay.index(),
+            "segments": [(segment.name, segment.first, segment.end) for segment in self._segments],
+            "rounds": dict(self._rounds),
+        }
+        write_state(draft.folder, state)
+
+    def restore(self, saved: Saved) -> None:
+        """Continues from what `save` wrote. Only before the first `advance`.
+
+        Raises:
+            StateError: it is no checkpoint.
+            ValueError: it is one of other settings.
+        """
+        state = read_state(saved.folder)
+        self.algorithm.set_state(state["algorithm"])
+        self._segments = [Segment(*segment) for segment in state["segments"]]
+        load_segments(
+            self.algorithm.replay,
+            state["replay"],
+            self._segments,
+            lambda name: read_arrays(saved.parts[name] / _TRAJECTORIES),
+        )
+        self._rounds = defaultdict(list, state["rounds"])
 
     def close(self) -> None:
         """Releases environments and networks."""

@@ -10,13 +10,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["SumTree", "TDPriorities", "rank_weights"]
+__all__ = ["SumTree", "TDPriorities", "ranges", "rank_weights"]
 
 Indices = NDArray[np.int64]
 Weights = NDArray[np.float64]
 
 SMALLEST_ERROR = 1e-6
 """Added to every TD error, so that no transition is lost for ever (Schaul et al. 2016, 3.3)."""
+
+
+def ranges(starts: Indices, lengths: Indices) -> Indices:
+    """[N], [N] -> [sum of lengths]: start, start + 1, ... of each, behind each other."""
+    ends = np.cumsum(lengths)
+    total = int(ends[-1]) if len(ends) else 0
+    return np.repeat(starts - (ends - lengths), lengths) + np.arange(total)
 
 
 def rank_weights(priorities: Weights) -> Weights:
@@ -141,3 +148,16 @@ class TDPriorities:
         self._largest = float(state["largest"])
         self._start[:] = state["start"]
         self._length[:] = state["length"]
+
+    def packed(self, rows: Indices) -> dict[str, Any]:
+        """Everything draws depend on, where `rows` are those of the trajectories held."""
+        return {"leaves": self._tree[rows], "largest": self._largest}
+
+    def load_packed(self, starts: Indices, lengths: Indices, state: dict[str, Any]) -> None:
+        """Continues where `packed` was taken of these trajectories. For an empty one only."""
+        rows = ranges(starts, lengths)
+        if len(rows):
+            self._tree.set(rows, np.asarray(state["leaves"], np.float64))
+        self._start[rows] = np.repeat(starts, lengths)
+        self._length[rows] = np.repeat(lengths, lengths)
+        self._largest = float(state["largest"])

@@ -6,12 +6,9 @@ import contextlib
 import logging
 import os
 import shutil
-import signal
-import threading
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from types import FrameType
-from typing import Any
 
 from ray import tune
 from ray.tune.experiment import Trial
@@ -20,9 +17,11 @@ from music_rllib.sweep.board import Status
 from music_rllib.sweep.cluster import cluster
 from music_rllib.sweep.dag_searcher import DagSearcher
 from music_rllib.sweep.listener import Listener
+from music_rllib.sweep.local import cluster_address
 from music_rllib.sweep.session import Sweep
+from music_rllib.sweep.stopping import StopSignals
 from music_rllib.sweep.trainable import NodeJob, RunTrainable
-from music_rllib.sweep.tune_events import TuneEvents
+from music_rllib.sweep.tune_events import RESTARTS, TuneEvents
 
 __all__ = ["Outcome", "compute"]
 
@@ -47,11 +46,18 @@ def compute(sweep: Sweep, listeners: Sequence[Listener], on_stop: Callable[[], N
         ClusterError: Ray can't be reached or can't hold a run.
     """
     resources = sweep.config.resources
-    stopping = StopSignals(on_stop)
+    stopping = StopSignals(on_stop, sweep.config.checkpoints.grace_seconds)
     events = TuneEvents(sweep.board, sweep.store, listeners, sweep.folder / "failures")
     searcher = DagSearcher(
         sweep.board,
-        lambda node: NodeJob.of(node, sweep.storage, resources.cpus_per_run).to_tune(),
+        lambda node: NodeJob.of(
+            node,
+            sweep.storage,
+            resources.cpus_per_run,
+            checkpoints=sweep.config.checkpoints,
+            sweep=sweep.plan.name,
+            stop_key=stopping.flag.key,
+        ).to_tune(),
     )
     with cluster(resources) as slots, _tune_folder(sweep) as place, _quiet_tune(slots), stopping:
         tuner = tune.Tuner(
@@ -67,7 +73,8 @@ def compute(sweep: Sweep, listeners: Sequence[Listener], on_stop: Callable[[], N
                 storage_path=place,
                 verbose=0,
                 callbacks=[events, stopping],
-                failure_config=tune.FailureConfig(max_failures=0),
+                # For workers that die; one that raises says so in its result.
+                failure_config=tune.FailureConfig(max_failures=RESTARTS),
                 # Checkpoints are the trainable's own; Tune's would hold nothing.
                 checkpoint_config=tune.CheckpointConfig(checkpoint_at_end=False),
             ),
@@ -83,6 +90,11 @@ def _trial_name(trial: Trial) -> str:
 @contextlib.contextmanager
 def _tune_folder(sweep: Sweep) -> Iterator[str]:
     """Where all nodes of the cluster can write what Tune wants to write and nobody reads."""
+    if cluster_address() is None:
+        # Not in the storage: a full one must not end the runs that have no need of it.
+        with tempfile.TemporaryDirectory(prefix="music-tune-", ignore_cleanup_errors=True) as place:
+            yield place
+        return
     if "://" in sweep.storage:
         yield f"{sweep.storage.rstrip('/')}/{sweep.plan.name}"
         return
@@ -137,44 +149,3 @@ class _quiet_tune:  # noqa: N801
                 os.environ[name] = value
         for name in self.LOGGERS:
             logging.getLogger(name).removeFilter(self._filter)
-
-
-class StopSignals(tune.Callback):
-    """Ctrl-C and SIGTERM end Tune's loop in good order; a second Ctrl-C ends it at once."""
-
-    SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
-    def __init__(self, on_stop: Callable[[], None]) -> None:
-        """Call `on_stop` at the first signal."""
-        self.received: int | None = None
-        self._on_stop = on_stop
-        self._before: dict[int, Any] = {}
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {}
-
-    def __enter__(self) -> StopSignals:
-        if threading.current_thread() is threading.main_thread():
-            # After `ray.init`, which sets handlers of its own.
-            self._before = {number: signal.getsignal(number) for number in self.SIGNALS}
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-    def setup(self, **info: Any) -> None:
-        """Tune has just set its handler of SIGINT: go before it, and give SIGTERM the same."""
-        if not self._before:
-            return
-        tunes_handler = signal.getsignal(signal.SIGINT)
-
-        def stop(number: int, frame: FrameType | None) -> None:
-            self.received = number
-            signal.signal(signal.SIGTERM, signal.SIG_DFL)
-            if callable(tunes_handler):
-                tunes_handler(number, frame)
-            self._on_stop()
-
-        for number in self.SIGNALS:
-            signal.signal(number, stop)

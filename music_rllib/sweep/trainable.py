@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import time
+import traceback
+from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -13,6 +15,8 @@ from ray.tune import PlacementGroupFactory, Trainable
 
 from music_rllib.envs.registry import Task
 from music_rllib.experiment.handoff import HandoffInfo, Weights, read_handoff, write_handoff
+from music_rllib.experiment.lease import HeldLease, Lease
+from music_rllib.experiment.model import Checkpoints
 from music_rllib.experiment.plan import Node
 from music_rllib.experiment.result import (
     HISTORY,
@@ -22,17 +26,28 @@ from music_rllib.experiment.result import (
     last_values,
     to_json_lines,
 )
+from music_rllib.experiment.sealed import StorageError
 from music_rllib.experiment.settings import RunSettings, handed_over
-from music_rllib.experiment.store import NodeStore
+from music_rllib.experiment.store import NodeStore, WorkFolder
+from music_rllib.sweep.causes import cause_of
+from music_rllib.sweep.stop_flag import StopWatch
 from music_rllib.tracking import names
 
 if TYPE_CHECKING:
     from music_rllib.experiment.training import TrainingRun
 
-__all__ = ["NOTES", "REPORTS", "NodeJob", "RunTrainable"]
+__all__ = ["CAUSE", "NOTES", "REPORTS", "STOPPED", "TRACEBACK", "NodeJob", "RunTrainable"]
 
 REPORTS, NOTES = "reports", "notes"
 """Keys of a Tune result: reports as JSON lines, and what a person should be told."""
+STOPPED = "stopped"
+"""Key of a Tune result: True from a run that has kept its state, as it was asked to stop."""
+CAUSE, TRACEBACK = "cause", "traceback"
+"""Keys of a Tune result: why the run failed. Tune would start one that raises again."""
+SECONDS = "seconds"
+"""File in a checkpoint: training time so far."""
+WAIT_SECONDS = 1.0
+"""Between two looks at what somebody else is computing."""
 
 
 class NodeJob(BaseModel):
@@ -47,11 +62,28 @@ class NodeJob(BaseModel):
     source_task: Task | None
     storage: str
     cpus: int
+    checkpoints: Checkpoints = Checkpoints()
+    sweep: str = ""
+    """Name of the sweep, for messages."""
+    stop_key: str | None = None
+    """Where to look whether to stop; None: nowhere."""
 
     @classmethod
-    def of(cls, node: Node, storage: str, cpus: int) -> NodeJob:
+    def of(
+        cls,
+        node: Node,
+        storage: str,
+        cpus: int,
+        *,
+        checkpoints: Checkpoints | None = None,
+        sweep: str = "",
+        stop_key: str | None = None,
+    ) -> NodeJob:
         """The job that computes `node` in the storage at this URI on so many CPUs."""
         return cls(
+            checkpoints=checkpoints or Checkpoints(),
+            sweep=sweep,
+            stop_key=stop_key,
             key=node.key,
             label=node.label,
             run=node.run,
@@ -74,8 +106,9 @@ class NodeJob(BaseModel):
 class RunTrainable(Trainable):
     """Trains a node from its newest checkpoint, or from scratch, to its budget.
 
-    A step is the time between two reports. After each evaluation there is a checkpoint; at the
-    end the handoff, the history and the settings are published and the checkpoints deleted.
+    A step is the time between two reports. After each evaluation there is a checkpoint, and where
+    evaluations are rare after some minutes; at the end the handoff, the history and the settings
+    are published and the checkpoints deleted. Whoever does this holds the node's lease.
     """
 
     @classmethod
@@ -86,38 +119,88 @@ class RunTrainable(Trainable):
     def setup(self, config: dict[str, Any]) -> None:
         """Only what can't fail: errors in a step are reported with their cause."""
         self._job = NodeJob.from_tune(config)
+        self._stop = StopWatch(self._job.stop_key)
         self._training: TrainingRun | None = None
+        self._held: HeldLease | None = None
         self._history: list[Report] = []
         self._notes: list[str] = []
-        self._seconds_before = self._began = 0.0
+        self._stopped = self._waits = False
+        self._seconds_before = self._began = self._saved = 0.0
         self._unsent = 0
         """Position in the history up to which the driver has been told."""
 
     def step(self) -> dict[str, Any]:
         """Go on to the next report."""
-        store = NodeStore(self._job.storage)
-        if store.is_finished(self._job.key):
-            # Another sweep, or a worker that outlived its driver, was faster.
-            self._history = store.history(self._job.key)
-            return self._result(done=True)
+        try:
+            return self._step(NodeStore(self._job.storage))
+        except Exception as error:
+            text = traceback.format_exc()
+            self._release()
+            return self._result(done=True) | {CAUSE: cause_of(error, text), TRACEBACK: text}
+
+    def _step(self, store: NodeStore) -> dict[str, Any]:
+        if self._stopped:
+            time.sleep(WAIT_SECONDS)
+            return self._result(done=False)
         if self._training is None:
+            if store.is_finished(self._job.key):
+                return self._finished_elsewhere(store)
+            if self._stop.asked():
+                self._stopped = True
+                return self._result(done=False)
+            if not self._hold(store):
+                time.sleep(WAIT_SECONDS)
+                return self._result(done=False)
+            if store.is_finished(self._job.key):  # in the meantime
+                return self._finished_elsewhere(store)
             self._training = self._begin(store)
             if self._history:
                 return self._result(done=False)
         done = self._advance(self._training, store)
         return self._result(done=done)
 
+    def _finished_elsewhere(self, store: NodeStore) -> dict[str, Any]:
+        """Another sweep, or a worker that outlived its driver, was faster."""
+        self._history = store.history(self._job.key)
+        self._release()
+        return self._result(done=True)
+
+    def _work(self, store: NodeStore) -> WorkFolder:
+        return store.work_folder(self._job.key, self._job.checkpoints.keep)
+
+    def _hold(self, store: NodeStore) -> bool:
+        """Acquire the node's lease; False while somebody else has it."""
+        work = self._work(store)
+        lease = Lease.of_this_process(f"sweep {self._job.sweep!r}" if self._job.sweep else "a run")
+        holder = work.lease.acquire(lease)
+        if holder is None:
+            self._held = HeldLease(work.lease, lease)
+            work.tidy()
+            return True
+        if not self._waits:
+            self._waits = True
+            self._notes.append(
+                f"waits, as it is being computed by {holder}; goes on when that ends, or is "
+                f"not heard of for {holder.seconds:.0f} s"
+            )
+        return False
+
+    def _release(self) -> None:
+        if self._held is not None:
+            self._held.release()
+            self._held = None
+
     def _begin(self, store: NodeStore) -> TrainingRun:
         from music_rllib.experiment.training import TrainingRun
 
         training = TrainingRun(self._job.run, self._weights(store))
-        with store.work_folder(self._job.key).newest(self._notes.append) as folder:
-            if folder is not None:
-                training.restore(folder / "state")
-                self._history = from_json_lines((folder / HISTORY).read_bytes())
+        with self._work(store).newest(self._notes.append) as saved:
+            if saved is not None:
+                training.restore(saved)
+                self._history = from_json_lines((saved.folder / HISTORY).read_bytes())
+                self._seconds_before = float((saved.folder / SECONDS).read_text())
                 self._notes.append(f"continues at {training.env_steps:,} env steps")
-        self._seconds_before = self._history[-1].seconds if self._history else 0.0
-        self._began = time.monotonic()
+        self._began = self._saved = time.monotonic()
         return training
 
     def _weights(self, store: NodeStore) -> Weights | None:
@@ -128,45 +211,71 @@ class RunTrainable(Trainable):
             store.fetch(job.source_key, Path(folder))
             return read_handoff(Path(folder), handed_over(job.run), job.source_task)
 
+    @property
+    def _seconds(self) -> float:
+        """Training time so far, over all attempts."""
+        return self._seconds_before + time.monotonic() - self._began
+
     def _advance(self, training: TrainingRun, store: NodeStore) -> bool:
         """Train to the next report; whether the run is over."""
-        metrics = training.advance()
+        from music_rllib.experiment.training import Paused
+
+        try:
+            metrics = training.advance(pause=self._stop.asked)
+        except Paused:
+            self._pause(training, store)
+            return False
         self._history.append(
             Report(
                 env_steps=training.env_steps,
-                seconds=self._seconds_before + time.monotonic() - self._began,
+                seconds=self._seconds,
                 timestamp_ms=round(time.time() * 1000),
                 metrics=metrics,
             )
         )
         if training.finished:
             self._publish(training, store)
-        elif names.EVAL_EPISODES in metrics:
-            with store.work_folder(self._job.key).new_checkpoint(training.env_steps) as folder:
-                training.save(folder / "state")
-                (folder / HISTORY).write_bytes(to_json_lines(self._history))
-                self._write_policy(training, folder)
+        elif names.EVAL_EPISODES in metrics or self._is_late():
+            self._checkpoint(training, store)
         return training.finished
 
-    def _write_policy(self, training: TrainingRun, folder: Path) -> None:
-        """What acts, as plain weights: `load_policy` unpickles nothing."""
-        modules = training.modules()
-        acting: dict[str, Any] = {
-            name: modules[name] for name in ("policy", "normaliser") if name in modules
-        }
-        info = HandoffInfo.of(self._job.run, self._job.key, training.env_steps)
-        (folder / "run.json").write_text(self._job.run.model_dump_json(indent=1))
-        with contextlib.suppress(ValueError):  # diverged: the end of the run will say so
-            write_handoff(folder / "handoff", acting, info)
+    def _is_late(self) -> bool:
+        return time.monotonic() - self._saved >= 60.0 * self._job.checkpoints.minutes
+
+    def _checkpoint(self, training: TrainingRun, store: NodeStore) -> None:
+        assert self._held is not None
+        self._held.check()
+        with self._work(store).new_checkpoint(training.env_steps) as draft:
+            training.save(draft)
+            (draft.folder / SECONDS).write_text(repr(self._seconds))
+            # What acts, for `load_policy`.
+            modules = training.modules()
+            acting: dict[str, Any] = {
+                name: modules[name] for name in ("policy", "normaliser") if name in modules
+            }
+            with contextlib.suppress(ValueError):  # diverged: the end of the run will say so
+                self._write_outcome(draft.folder, acting, training.env_steps)
+        self._saved = time.monotonic()
+
+    def _pause(self, training: TrainingRun, store: NodeStore) -> None:
+        """Keep what there is, where that can be, and let others have the node."""
+        try:
+            self._checkpoint(training, store)
+        except StorageError as error:
+            self._notes.append(f"could not be saved, it will go on from an older state: {error}")
+        else:
+            self._notes.append(f"saved at {training.env_steps:,} env steps")
+        self._stopped = True
+        self._release()
 
     def _publish(self, training: TrainingRun, store: NodeStore) -> None:
+        assert self._held is not None
+        self._held.check()
         last = self._history[-1]
+        store.tidy(self._job.key)
         with TemporaryDirectory() as temporary:
             folder = Path(temporary)
-            info = HandoffInfo.of(self._job.run, self._job.key, training.env_steps)
-            write_handoff(folder / "handoff", training.modules(), info)
-            (folder / HISTORY).write_bytes(to_json_lines(self._history))
-            (folder / "run.json").write_text(self._job.run.model_dump_json(indent=1))
+            self._write_outcome(folder, training.modules(), training.env_steps)
             result = RunResult(
                 label=self._job.label,
                 env_steps=last.env_steps,
@@ -174,7 +283,22 @@ class RunTrainable(Trainable):
                 metrics=last_values(self._history),
             )
             store.publish(self._job.key, folder, result)
-        store.work_folder(self._job.key).clear()
+        self._held.end()  # a renewal would make the folder again
+        self._held = None
+        self._work(store).clear()
+
+    def _write_outcome(
+        self, folder: Path, modules: Mapping[str, Mapping[str, Any]], env_steps: int
+    ) -> None:
+        """What others may read: weights, history, settings. In nodes and in checkpoints.
+
+        Raises:
+            ValueError: The weights are not finite.
+        """
+        (folder / HISTORY).write_bytes(to_json_lines(self._history))
+        (folder / "run.json").write_text(self._job.run.model_dump_json(indent=1))
+        info = HandoffInfo.of(self._job.run, self._job.key, env_steps)
+        write_handoff(folder / "handoff", modules, info)
 
     def _result(self, *, done: bool) -> dict[str, Any]:
         """What the driver hasn't been told yet.
@@ -185,9 +309,12 @@ class RunTrainable(Trainable):
         reports = to_json_lines(self._history[self._unsent :]).decode()
         self._unsent = len(self._history)
         notes, self._notes = self._notes, []
-        return {REPORTS: reports, NOTES: notes, "done": done}
+        return {REPORTS: reports, NOTES: notes, STOPPED: self._stopped, "done": done}
 
     def cleanup(self) -> None:
-        """Release environments and networks."""
+        """Release environments, networks and the node."""
+        self._stop.end()
+        with contextlib.suppress(StorageError):
+            self._release()
         if self._training is not None:
             self._training.close()

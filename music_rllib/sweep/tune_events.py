@@ -19,10 +19,18 @@ from music_rllib.experiment.store import NodeStore
 from music_rllib.sweep.board import Board
 from music_rllib.sweep.causes import cause_of
 from music_rllib.sweep.listener import Failure, Listener
-from music_rllib.sweep.trainable import NOTES, REPORTS, NodeJob
+from music_rllib.sweep.trainable import (
+    CAUSE,
+    NOTES,
+    REPORTS,
+    TRACEBACK,
+    NodeJob,
+)
 
-__all__ = ["TuneEvents"]
+__all__ = ["RESTARTS", "TuneEvents"]
 
+RESTARTS = 3
+"""So often a run whose worker died is started again; one that raises an error fails at once."""
 
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 
@@ -77,6 +85,9 @@ class TuneEvents(Callback):
     ) -> None:
         """The trial says that it is done; the store has the last word."""
         node = self._node(trial)
+        if (cause := trial.last_result.get(CAUSE)) is not None:
+            self._fail(node, cause, trial.last_result[TRACEBACK])
+            return
         try:
             result = self._store.result(node.key)
         except DamagedError as error:
@@ -90,16 +101,32 @@ class TuneEvents(Callback):
     def on_trial_error(
         self, iteration: int, trials: list[Trial], trial: Trial, **info: Any
     ) -> None:
-        """The trial's step raised, or its actor died."""
+        """The trial's worker died, or never came up, and was not to be started again."""
         error = _error_of(trial)
         text = "".join(traceback.format_exception(error)) if error else _text_of(trial)
         text = _COLOUR.sub("", text)
         self._fail(self._node(trial), cause_of(error, text), text)
 
+    def on_trial_recover(
+        self, iteration: int, trials: list[Trial], trial: Trial, **info: Any
+    ) -> None:
+        """The trial's worker died, and another one goes on."""
+        error = _error_of(trial)
+        cause = cause_of(error, _COLOUR.sub("", _text_of(trial))).splitlines()[0]
+        for listener in self._listeners:
+            listener.noted(
+                self._node(trial),
+                f"{cause} Another worker goes on from the last checkpoint "
+                f"({trial.run_metadata.num_failures} of {RESTARTS} times).",
+            )
+
     def _fail(self, node: Node, cause: str, text: str) -> None:
         log = self._failures / f"{re.sub(r'[^A-Za-z0-9._=,-]+', '_', node.label)}-{node.key}.txt"
-        log.parent.mkdir(parents=True, exist_ok=True)
-        log.write_text(f"{node.label} (node {node.key})\n\n{text}\n", encoding="utf-8")
+        try:
+            log.parent.mkdir(parents=True, exist_ok=True)
+            log.write_text(f"{node.label} (node {node.key})\n\n{text}\n", encoding="utf-8")
+        except OSError as error:  # perhaps the very reason of the failure: the others go on
+            cause += f"\n(the traceback could not be kept: {error})"
         dependants = self._board.fail(node.key)
         for listener in self._listeners:
             listener.failed(node, Failure(cause, log))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from ray.rllib.algorithms.algorithm import Algorithm
-from ray.rllib.core import DEFAULT_MODULE_ID
+from ray.rllib.core import COMPONENT_EVAL_ENV_RUNNER, DEFAULT_MODULE_ID
 from ray.rllib.core.columns import Columns
 from ray.rllib.policy.sample_batch import MultiAgentBatch, SampleBatch
 from ray.rllib.utils.checkpoints import Checkpointable
@@ -42,6 +42,9 @@ UPDATES_PER_CALL = 100
 
 class TAC(Algorithm):
     """Tsallis Actor-Critic (paper Fig. 3), with MUSIC's intrinsic reward where configured."""
+
+    REPLAY = "replay"
+    """Name of the component with the trajectories, for `get_state` and `save_to_path`."""
 
     @classmethod
     def get_default_config(cls) -> TACConfig:
@@ -245,27 +248,33 @@ class TAC(Algorithm):
     # -- checkpoints ----------------------------------------------------------------------
 
     def get_checkpointable_components(self) -> list[tuple[str, Checkpointable]]:
-        return [*super().get_checkpointable_components(), (_REPLAY, _ReplayComponent(self.replay))]
+        return [
+            *super().get_checkpointable_components(),
+            (self.REPLAY, _ReplayComponent(self.replay)),
+        ]
 
     def get_state(
         self, components: Any = None, *, not_components: Any = None, **kw: Any
     ) -> StateDict:
         state = super().get_state(components, not_components=not_components, **kw)
-        if self._check_component(_REPLAY, components, not_components):
-            state[_REPLAY] = _ReplayComponent(self.replay).get_state()
+        if self._check_component(self.REPLAY, components, not_components):
+            state[self.REPLAY] = _ReplayComponent(self.replay).get_state()
         state[_COUNTERS] = {"env_steps": self.env_steps, "grad_updates": self.grad_updates}
         return state
 
     def set_state(self, state: StateDict) -> None:
         super().set_state(state)
-        if _REPLAY in state:
-            self.replay.load_state(state[_REPLAY])
+        if COMPONENT_EVAL_ENV_RUNNER in state and self.eval_env_runner is not None:
+            # RLlib gives it the training runner's state.
+            self.eval_env_runner.set_state(state[COMPONENT_EVAL_ENV_RUNNER])
+        if self.REPLAY in state:
+            self.replay.load_state(state[self.REPLAY])
         if _COUNTERS in state:
             self.env_steps = state[_COUNTERS]["env_steps"]
             self.grad_updates = state[_COUNTERS]["grad_updates"]
 
 
-_REPLAY, _COUNTERS = "replay", "tac_counters"
+_COUNTERS = "tac_counters"
 _REPLAY_STREAM = 101
 """Keeps the replay's random stream apart from the environment runners'."""
 

@@ -179,9 +179,8 @@ def test_a_finished_node_is_not_trained_again(tmp_path: Path) -> None:
 def test_a_damaged_checkpoint_is_skipped_and_said(tmp_path: Path) -> None:
     node = job(tmp_path, settings("tac"))
     compute(node, steps=2)
-    work = tmp_path / "work" / node.key
-    newest = max(path.name for path in work.iterdir())
-    (work / newest / "history.jsonl").write_bytes(b"")
+    newest = NodeStore(str(tmp_path)).work_folder(node.key).names()[-1]
+    (tmp_path / "work" / node.key / newest / "history.jsonl").write_bytes(b"")
     notes = compute(node, steps=1)[0][NOTES]
     assert len(notes) == 2
     assert newest in notes[0]

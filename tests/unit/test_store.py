@@ -219,11 +219,11 @@ def test_checkpoints_are_kept_newest_first_and_pruned(store: NodeStore) -> None:
     with work.newest() as newest:
         assert newest is None
     for env_steps in (1000, 2000, 10_000):
-        with work.new_checkpoint(env_steps) as folder:
-            (folder / "state").write_text(str(env_steps))
+        with work.new_checkpoint(env_steps) as draft:
+            (draft.folder / "state").write_text(str(env_steps))
     with work.newest() as newest:
         assert newest is not None
-        assert (newest / "state").read_text() == "10000"
+        assert (newest.folder / "state").read_text() == "10000"
     assert [int(name.split("-")[0]) for name in work.names()] == [2000, 10_000]
     work.clear()
     with work.newest() as newest:
@@ -232,40 +232,40 @@ def test_checkpoints_are_kept_newest_first_and_pruned(store: NodeStore) -> None:
 
 def test_a_save_that_fails_leaves_the_older_checkpoint(store: NodeStore) -> None:
     work = store.work_folder(KEY)
-    with work.new_checkpoint(1000) as folder:
-        (folder / "state").write_text("good")
+    with work.new_checkpoint(1000) as draft:
+        (draft.folder / "state").write_text("good")
 
     def save_half() -> None:
-        with work.new_checkpoint(2000) as folder:
-            (folder / "state").write_text("half")
+        with work.new_checkpoint(2000) as draft:
+            (draft.folder / "state").write_text("half")
             raise RuntimeError("boom")
 
     with pytest.raises(RuntimeError, match="boom"):
         save_half()
     with work.newest() as newest:
         assert newest is not None
-        assert (newest / "state").read_text() == "good"
+        assert (newest.folder / "state").read_text() == "good"
 
 
 def test_a_damaged_checkpoint_is_skipped_aloud(tmp_path: Path) -> None:
     work = local_store(tmp_path).work_folder(KEY)
     for env_steps in (1000, 2000):
-        with work.new_checkpoint(env_steps) as folder:
-            (folder / "state").write_text(str(env_steps))
+        with work.new_checkpoint(env_steps) as draft:
+            (draft.folder / "state").write_text(str(env_steps))
     newest_name = work.names()[-1]
     (tmp_path / "storage" / "work" / KEY / newest_name / "state").write_text("2001")
     warnings: list[str] = []
     with work.newest(warnings.append) as newest:
         assert newest is not None
-        assert (newest / "state").read_text() == "1000"
+        assert (newest.folder / "state").read_text() == "1000"
     assert len(warnings) == 1
     assert newest_name in warnings[0]
     # The run gets there again, and this time it counts.
-    with work.new_checkpoint(2000) as folder:
-        (folder / "state").write_text("2000")
+    with work.new_checkpoint(2000) as draft:
+        (draft.folder / "state").write_text("2000")
     with work.newest(warnings.append) as newest:
         assert newest is not None
-        assert (newest / "state").read_text() == "2000"
+        assert (newest.folder / "state").read_text() == "2000"
 
 
 def test_storage_that_cannot_be(tmp_path: Path) -> None:

@@ -1,0 +1,122 @@
+"""Nested plain values and arrays in two files that nothing can hide code in.
+
+``state.json`` has the nesting, the names and the plain values; ``state.safetensors`` the arrays.
+Reading gives back equal values of equal types, and writing those again gives equal bytes.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import safetensors
+from safetensors.numpy import load as load_safetensors
+from safetensors.numpy import save as save_safetensors
+
+__all__ = ["StateError", "read_arrays", "read_state", "write_arrays", "write_state"]
+
+TREE, ARRAYS = "state.json", "state.safetensors"
+
+
+class StateError(ValueError):
+    """Files that hold no state; the message names them."""
+
+
+def write_state(folder: Path, state: Any) -> None:
+    """Write `state` into `folder`, which exists.
+
+    Args:
+        folder: Where.
+        state: None, booleans, numbers, texts, numpy arrays and scalars, in dicts (with texts or
+            integers as keys), lists and tuples, nested as they like.
+
+    Raises:
+        TypeError: There is something else in it; names the place.
+        OSError: The folder can't be written.
+    """
+    arrays: dict[str, npt.NDArray[Any]] = {}
+    tree = _encode(state, "state", arrays)
+    write_arrays(folder / ARRAYS, arrays)
+    (folder / TREE).write_text(json.dumps(tree, separators=(",", ":")), encoding="utf-8")
+
+
+def read_state(folder: Path) -> Any:
+    """Inverse of `write_state`.
+
+    Raises:
+        StateError: There is no state, or what is there is none.
+    """
+    arrays = read_arrays(folder / ARRAYS)
+    try:
+        return _decode(json.loads((folder / TREE).read_text(encoding="utf-8")), arrays)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise StateError(f"{folder / TREE} must be a saved state: {error}") from error
+
+
+def write_arrays(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
+    """Write named arrays as a safetensors file.
+
+    Raises:
+        OSError: With the path, where it can't be written.
+    """
+    # C order, because safetensors writes the memory as it lies and ignores strides.
+    path.write_bytes(save_safetensors({k: np.asarray(a, order="C") for k, a in arrays.items()}))
+
+
+def read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
+    """Inverse of `write_arrays`.
+
+    Raises:
+        StateError: There is no such file, or it is no safetensors file.
+    """
+    try:
+        return load_safetensors(path.read_bytes())
+    except (OSError, safetensors.SafetensorError, ValueError, KeyError, TypeError) as error:
+        raise StateError(f"{path} must be a safetensors file: {error}") from error
+
+
+def _encode(value: Any, place: str, arrays: dict[str, npt.NDArray[Any]]) -> Any:
+    """As JSON: plain values are themselves, everything else a list that begins with its kind."""
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if isinstance(value, np.ndarray | np.generic):
+        kind = "array" if isinstance(value, np.ndarray) else "scalar"
+        if value.dtype.kind not in "biuf":
+            raise TypeError(f"{place} must be numbers to be saved, got {value.dtype}")
+        name = str(len(arrays))
+        arrays[name] = np.asarray(value)
+        return [kind, name]
+    if isinstance(value, float):
+        return value
+    if isinstance(value, Mapping):
+        for key in value:
+            if not isinstance(key, str | int):
+                raise TypeError(f"{place} must have texts or integers as keys, got {key!r}")
+        pairs = [[key, _encode(inner, f"{place}.{key}", arrays)] for key, inner in value.items()]
+        return ["dict", *pairs]
+    if isinstance(value, list | tuple):
+        kind = "tuple" if isinstance(value, tuple) else "list"
+        return [kind, *(_encode(inner, f"{place}[{i}]", arrays) for i, inner in enumerate(value))]
+    raise TypeError(f"{place} must be a plain value to be saved, got {type(value).__name__}")
+
+
+def _decode(tree: Any, arrays: Mapping[str, npt.NDArray[Any]]) -> Any:
+    if not isinstance(tree, list):
+        return tree
+    kind, *content = tree
+    match kind:
+        case "array":
+            return arrays[content[0]]
+        case "scalar":
+            return arrays[content[0]][()]
+        case "dict":
+            return {key: _decode(inner, arrays) for key, inner in content}
+        case "list":
+            return [_decode(inner, arrays) for inner in content]
+        case "tuple":
+            return tuple(_decode(inner, arrays) for inner in content)
+    raise ValueError(f"there is no kind {kind!r}")

@@ -1,0 +1,144 @@
+"""Signals: the first lets runs save themselves and ends the sweep, the second ends it at once."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sys
+import threading
+import time
+import uuid
+from collections.abc import Callable
+from types import FrameType
+from typing import Any
+
+from ray import tune
+from ray.tune.experiment import Trial
+
+from music_rllib.sweep.stop_flag import StopFlag
+from music_rllib.sweep.trainable import STOPPED
+
+__all__ = ["StopSignals"]
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class StopSignals(tune.Callback):
+    """Ctrl-C and SIGTERM end Tune's loop in good order: when every run has saved its state.
+
+    That takes as long as a round of training, some seconds at most; after the grace time the loop
+    ends in any case, and what has not been saved is computed again later.
+    """
+
+    def __init__(
+        self,
+        on_stop: Callable[[], None],
+        grace_seconds: float = 30.0,
+        now: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Call `on_stop` at the first signal, and wait for runs so long at most."""
+        self.received: int | None = None
+        self.flag = StopFlag(f"stop-{uuid.uuid4().hex}")
+        self._on_stop = on_stop
+        self._grace = grace_seconds
+        self._now = now
+        self._asked_at = 0.0
+        self._running: set[str] = set()
+        """Trials with something to save."""
+        self._before: dict[int, Any] = {}
+        self._end_loop: Callable[[], None] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {}
+
+    def __enter__(self) -> StopSignals:
+        if threading.current_thread() is threading.main_thread():
+            # After `ray.init`, which sets handlers of its own.
+            self._before = {number: signal.getsignal(number) for number in SIGNALS}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        if self.received is not None:
+            with contextlib.suppress(Exception):
+                self.flag.clear()
+
+    # -- Tune tells -----------------------------------------------------------------------
+
+    def setup(self, **info: Any) -> None:
+        """Tune has just set its handler of SIGINT, which ends its loop: keep it for later."""
+        if not self._before:
+            return
+        tunes_handler = signal.getsignal(signal.SIGINT)
+
+        def end_loop() -> None:
+            if callable(tunes_handler):
+                tunes_handler(signal.SIGINT, None)
+            for number in SIGNALS:  # Tune has set the one that was there before
+                signal.signal(number, self._stop_at_once)
+
+        self._end_loop = end_loop
+        for number in SIGNALS:
+            signal.signal(number, self._stop)
+
+    def on_trial_start(
+        self, iteration: int, trials: list[Trial], trial: Trial, **info: Any
+    ) -> None:
+        self._running.add(trial.trial_id)
+
+    def on_trial_result(
+        self,
+        iteration: int,
+        trials: list[Trial],
+        trial: Trial,
+        result: dict[str, Any],
+        **info: Any,
+    ) -> None:
+        if result.get(STOPPED):
+            self._running.discard(trial.trial_id)
+
+    def on_trial_complete(
+        self, iteration: int, trials: list[Trial], trial: Trial, **info: Any
+    ) -> None:
+        self._running.discard(trial.trial_id)
+
+    def on_trial_error(
+        self, iteration: int, trials: list[Trial], trial: Trial, **info: Any
+    ) -> None:
+        self._running.discard(trial.trial_id)
+
+    def on_trial_recover(
+        self, iteration: int, trials: list[Trial], trial: Trial, **info: Any
+    ) -> None:
+        self._running.discard(trial.trial_id)
+
+    def on_step_end(self, iteration: int, trials: list[Trial], **info: Any) -> None:
+        """Tune's loop went round once: end it where everything is saved or time is up."""
+        if self.received is None or self._end_loop is None:
+            return
+        if not self._running or self._now() - self._asked_at >= self._grace:
+            end_loop, self._end_loop = self._end_loop, None
+            end_loop()
+
+    # -- the user tells -------------------------------------------------------------------
+
+    def _stop(self, number: int, frame: FrameType | None) -> None:
+        self.received, self._asked_at = number, self._now()
+        for each in SIGNALS:
+            signal.signal(each, self._stop_at_once)
+        # Not in here: the main thread may be in the middle of talking to Ray.
+        threading.Thread(target=self._tell_workers, daemon=True).start()
+        self._on_stop()
+
+    def _tell_workers(self) -> None:
+        with contextlib.suppress(Exception):
+            self.flag.set()
+
+    def _stop_at_once(self, number: int, frame: FrameType | None) -> None:
+        """As `kill -9` would, which a sweep survives; Ray's processes end with their driver."""
+        show_cursor = b"\x1b[?25h\n" if sys.stdout.isatty() else b""
+        with contextlib.suppress(OSError):
+            os.write(sys.stdout.fileno(), show_cursor)
+        os._exit(128 + number)
