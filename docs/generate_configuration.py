@@ -23,6 +23,7 @@ from pydantic.fields import FieldInfo
 from music_rllib.envs.registry import Task
 from music_rllib.estimator.settings import MusicSettings
 from music_rllib.experiment.model import (
+    Checkpoints,
     Header,
     InitFrom,
     MlflowSettings,
@@ -30,6 +31,17 @@ from music_rllib.experiment.model import (
     StageHeader,
 )
 from music_rllib.experiment.settings import VARIANTS, Evaluation, RunSettings
+from music_rllib.experiment.space import (
+    Choice,
+    Final,
+    FloatRange,
+    IntRange,
+    Objective,
+    Pruning,
+    Rung,
+    SearchSettings,
+    WarmStart,
+)
 from music_rllib.replay.settings import ReplaySettings
 from music_rllib.schedules import Linear, Piecewise
 from music_rllib.tac.settings import GaussianNoise, LearnedAlpha, TACSettings
@@ -78,6 +90,14 @@ PRESET_MEANING = (
     "or any YAML file by its path from there."
 )
 
+SEARCH_TEXT = """\
+### Search
+
+A stage with `search` in place of `grid` finds its trials itself; [search.md](search.md) says which
+way
+answers which question.
+"""
+
 VARIANTS_TEXT = """\
 ## Variants
 
@@ -105,9 +125,10 @@ def document() -> str:
         "## The file",
         table(
             [
-                *rows(Header, "", skip=("mlflow", "resources")),
+                *rows(Header, "", skip=("mlflow", "resources", "checkpoints")),
                 *rows(MlflowSettings, "mlflow."),
                 *rows(Resources, "resources."),
+                *rows(Checkpoints, "checkpoints."),
                 ("preset", "text", "none", PRESET_MEANING),
                 ("environments", "mapping", "`{}`", "Tasks of your own, [below](#environments)."),
                 ("defaults", "mapping", "`{}`", "[Settings](#settings) of every stage."),
@@ -117,6 +138,22 @@ def document() -> str:
         "## Stages",
         "Beside these keys a stage has any of the [settings](#settings).",
         table([*rows(StageHeader, "", skip=("init_from",)), *init_from()]),
+        SEARCH_TEXT,
+        table(rows(SearchSettings, "search.")),
+        "Each entry of `search.space` is one of these:",
+        table(dimensions()),
+        "An entry of `search.objective`:",
+        table(rows(Objective, "objective.")),
+        "The other groups:",
+        table(
+            [
+                *rows(Pruning, "pruning.", skip=("rungs",)),
+                ("pruning.rungs", "list", "required", docstrings(Pruning)["rungs"]),
+                *rows(Rung, "pruning.rungs[]."),
+                *rows(Final, "final."),
+                *rows(WarmStart, "warm_start."),
+            ]
+        ),
         VARIANTS_TEXT,
         variants(),
         "## Settings",
@@ -148,6 +185,18 @@ def document() -> str:
 
 
 Row = tuple[str, str, str, str]
+
+
+def dimensions() -> Iterator[Row]:
+    """The kinds of entries of a space; what several have in common stands once."""
+    seen = set()
+    for kind in (FloatRange, IntRange, Choice):
+        for row in rows(kind, "", skip=("when",)):
+            if row[0] not in seen:
+                seen.add(row[0])
+                yield row
+    when = docstrings(FloatRange.__mro__[1])["when"]
+    yield "when", "mapping", "`{}`", when
 
 
 def table(cells: Iterator[Row] | list[Row]) -> str:
@@ -195,7 +244,7 @@ def rows(
             if name not in meanings:
                 raise ValueError(f"{model.__name__}.{name} must have a docstring below it")
             kind = _annotated(field.annotation, tuple(field.metadata))
-            yield f"{prefix}{name}", kind, default_of(field), meanings[name]
+            yield f"{prefix}{field.alias or name}", kind, default_of(field), meanings[name]
 
 
 def default_of(field: FieldInfo) -> str:
@@ -203,6 +252,8 @@ def default_of(field: FieldInfo) -> str:
     if field.is_required():
         return "required"
     value = field.get_default(call_default_factory=True)
+    if isinstance(value, BaseModel):
+        value = value.model_dump(mode="json", exclude_none=True)
     return f"`{json.dumps(value)}`"
 
 

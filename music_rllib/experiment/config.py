@@ -7,6 +7,8 @@ settings of a run.
 
 from __future__ import annotations
 
+import itertools
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -44,6 +46,7 @@ from music_rllib.experiment.problems import (
 )
 from music_rllib.experiment.problems import Path as KeyPath
 from music_rllib.experiment.settings import Evaluation, RunSettings, Variant
+from music_rllib.experiment.space import FINAL_SEED
 from music_rllib.experiment.stages import resolve_stage
 from music_rllib.experiment.yaml_file import YamlFile, read_yaml
 
@@ -64,7 +67,11 @@ __all__ = [
 
 
 def load_sweep(
-    path: str | Path, *, name: str | None = None, storage: str | None = None
+    path: str | Path,
+    *,
+    name: str | None = None,
+    storage: str | None = None,
+    seeds: str | None = None,
 ) -> SweepConfig:
     """Read and validate a sweep.
 
@@ -72,18 +79,36 @@ def load_sweep(
         path: The YAML file.
         name: Replaces the file's `name`.
         storage: Replaces the file's `storage`.
+        seeds: Replaces the file's `seeds`: how many (the file's first, then the smallest that it
+            hasn't), or a list with commas.
 
     Raises:
         ConfigError: With one line per problem.
     """
     file = read_yaml(Path(path))
-    options = {key: value for key, value in (("name", name), ("storage", storage)) if value}
-    document = with_preset(file, _preset_mistakes) | options
+    options: dict[str, Any] = {
+        key: value for key, value in (("name", name), ("storage", storage)) if value
+    }
+    document = with_preset(file, _preset_mistakes)
+    if seeds:
+        options["seeds"] = _seeds(seeds, document.get("seeds"))
+    document |= options
     findings = Findings()
     config = _resolve(file, document, findings)
     if config is None:
         raise ConfigError(_lines(findings.problems, file, document, options))
     return config
+
+
+def _seeds(text: str, given: Any) -> list[int]:
+    """`10`, or `0,1,7`."""
+    if not re.fullmatch(r"\d+(,\d+)*,?", text) or text in {"0", ""}:
+        raise ConfigError([f"--seeds must be a number of seeds or a list like 0,1,7, got {text!r}"])
+    if "," in text:
+        return [int(seed) for seed in text.split(",") if seed]
+    known = [seed for seed in given if isinstance(seed, int)] if isinstance(given, list) else [0]
+    others = (seed for seed in itertools.count() if seed not in known)
+    return [*known, *itertools.islice(others, max(int(text) - len(known), 0))][: int(text)]
 
 
 def _preset_mistakes(preset: YamlFile) -> list[str]:
@@ -116,6 +141,11 @@ def _resolve(file: YamlFile, document: dict[str, Any], findings: Findings) -> Sw
             findings=findings,
         )
         stages[stage.name if stage else str(raw.get("name"))] = stage
+    if header and any(stage and stage.search for stage in stages.values()):
+        for position, one in enumerate(header.seeds):
+            if one >= FINAL_SEED:
+                rule = f"must be < {FINAL_SEED} in a search, whose fresh seeds begin there, got {one}"
+                findings.add(("seeds", position), rule)
     if findings.problems or header is None:
         return None
     return SweepConfig(
@@ -218,12 +248,12 @@ def _raw_stages(document: dict[str, Any], findings: Findings) -> list[tuple[int,
 
 
 def _lines(
-    problems: Iterable[Problem], file: YamlFile, document: Any, options: Mapping[str, str]
+    problems: Iterable[Problem], file: YamlFile, document: Any, options: Mapping[str, Any]
 ) -> list[str]:
     """One line per different problem, in the order of the file."""
 
     def line(problem: Problem) -> str:
-        if len(problem.path) == 1 and problem.path[0] in options:
+        if problem.path and problem.path[0] in options:
             return f"--{problem.path[0]} {problem.rule}"
         key = _dotted(problem.path, document)
         separator = " " if problem.rule.startswith(("must ", "is ", "has ", "needs ")) else ": "

@@ -89,7 +89,7 @@ def merge(
     defaults: Mapping[str, Any],
     stage: Mapping[str, Any],
     stage_path: Path,
-    point: Mapping[str, tuple[int, Any]],
+    point: Mapping[str, tuple[Path, Any]],
 ) -> tuple[Layers, list[Problem]]:
     """Lay preset, defaults, stage and one point of the stage's grid over each other.
 
@@ -99,7 +99,7 @@ def merge(
         defaults: The sweep's `defaults`.
         stage: The stage's own settings, keys of `LAYER_KEYS` only.
         stage_path: The stage's place in the document.
-        point: Dotted key to (position in the grid's list, value).
+        point: Dotted key to (place of the value below the stage, value).
 
     Returns:
         The merged settings, and what is wrong with how they were laid.
@@ -111,10 +111,10 @@ def merge(
     layers.lay(_with_effect(stage, without_effect), stage_path)
     idle = [(*stage_path, *key.split(".")) for key in _idle(stage, without_effect)]
     problems = []
-    for dotted, (position, value) in point.items():
-        place = (*stage_path, "grid", dotted, position)
+    for dotted, (below, value) in point.items():
+        place = (*stage_path, *below)
         if dotted in without_effect:
-            idle.append(place[:-1])
+            idle.append(place[: place.index(dotted) + 1])
         elif problem := layers.lay_point(dotted, value, place):
             problems.append(problem)
     problems += [Problem(place, f"has no effect with variant {variant}") for place in idle]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from music_rllib.envs.registry import Task
 from music_rllib.experiment.handoff import HandoffManifest
 from music_rllib.experiment.settings import RunSettings, Variant
+from music_rllib.experiment.space import SearchSettings
 
 __all__ = [
     "RESERVED_NAMES",
@@ -121,6 +122,8 @@ class StageHeader(_Strict):
     """What its runs start from. A bare name is short for `{stage: NAME}`."""
     grid: dict[str, Annotated[list[Any], Field(min_length=1)]] = Field(default_factory=dict)
     """Dotted setting to the values it takes; the product of all lists is the stage's trials."""
+    search: SearchSettings | None = None
+    """In place of `grid`: the trials are searched for (docs/search.md)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,6 +157,9 @@ class Point:
     """Task name to complete settings, with the sweep's first seed."""
 
 
+Resolve = Callable[[Mapping[str, Any]], Point]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Stage:
     """One stage, resolved."""
@@ -163,6 +169,10 @@ class Stage:
     tasks: tuple[Task, ...]
     source: Source | None
     points: tuple[Point, ...]
+    """The grid's; for a searched stage one, which stands for all: what is the same in each."""
+    search: SearchSettings | None = None
+    resolve: Resolve = field(compare=False, repr=False)
+    """Makes a point of dotted settings laid over this stage's; raises ConfigError."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,13 +7,14 @@ within a sweep and between sweeps.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from music_rllib.envs.registry import Task
 from music_rllib.experiment.files import content_key
 from music_rllib.experiment.model import Checkpoint, Point, Source, Stage, SweepConfig
+from music_rllib.experiment.searched import of_stage, stages_in
 from music_rllib.experiment.settings import RunSettings
 from music_rllib.tac.version import ALGORITHM_VERSION
 
@@ -46,12 +47,15 @@ class Run:
     seed: int
     key: str
     """The node that computes it."""
+    part: str = ""
+    """Of a searched stage: `trial7`, or `final7` on fresh seeds."""
 
     @property
     def label(self) -> str:
         """`finetune/FetchPush/tac.alpha=0.1,tac.entropic_index=1.5/seed0`, unique in a sweep."""
         values = ",".join(f"{name}={short(value)}" for name, value in self.values.items())
-        return "/".join(filter(None, (self.stage, self.task, values, f"seed{self.seed}")))
+        parts = (self.stage, self.task, self.part, values, f"seed{self.seed}")
+        return "/".join(filter(None, parts))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,16 +69,31 @@ class Node:
     """Of the first run that wants it, as are `trial` and `label`."""
     trial: int
     label: str
+    part: str = ""
 
 
-@dataclass(frozen=True, kw_only=True)
 class Plan:
-    """All that a sweep asks for."""
+    """All that a sweep asks for; searched stages get their runs as their trials are chosen."""
 
-    name: str
-    runs: tuple[Run, ...]
-    nodes: tuple[Node, ...]
-    """In an order in which every node comes after its input."""
+    def __init__(self, name: str, seeds: Sequence[int] = ()) -> None:
+        """An empty plan of a sweep with these seeds."""
+        self.name = name
+        self.seeds = tuple(seeds)
+        self.runs: list[Run] = []
+        self._known: set[tuple[str, str]] = set()
+        self._nodes: dict[str, Node] = {}
+        self._by_cell: dict[tuple[str, int, str, int], Run] = {}
+        self._stages: dict[str, Stage] = {}
+
+    @property
+    def nodes(self) -> Sequence[Node]:
+        """In an order in which every node comes after its input."""
+        return list(self._nodes.values())
+
+    @property
+    def searched(self) -> tuple[Stage, ...]:
+        """Stages whose trials are searched for."""
+        return tuple(stage for stage in self._stages.values() if stage.search is not None)
 
     @property
     def env_steps(self) -> int:
@@ -86,6 +105,147 @@ class Plan:
         """Checkpoints from outside that nodes start from, each once."""
         inputs = {node.input.key: node.input for node in self.nodes if node.input}
         return tuple(source for source in inputs.values() if source.checkpoint)
+
+    def add_stage(self, stage: Stage, *, alone: bool = True) -> None:
+        """Plan a stage whose source, if it is a stage, is planned already.
+
+        Args:
+            stage: One without a search has its runs planned, another one is only made known.
+            alone: Whether it has runs of its own, and not only those that trials start from.
+        """
+        self._stages[stage.name] = stage
+        if stage.search is not None or not alone:
+            return
+        trial = 0
+        for source_trial in self._source_trials(stage.source):
+            for point in stage.points:
+                for task in stage.tasks:
+                    for seed in self.seeds:
+                        self._add_run(stage, trial, source_trial, point, task, seed)
+                trial += 1
+
+    def add_trial(
+        self, stage: str, trial: int, values: Mapping[str, Any], seeds: Sequence[int], part: str
+    ) -> list[Run]:
+        """Plan a trial of a searched stage, with what it starts from; what is there stays.
+
+        Args:
+            stage: The stage's name.
+            trial: The trial's number.
+            values: Dotted settings; those of its source as `STAGE:setting`.
+            seeds: To run it with.
+            part: What the trial is called in labels.
+
+        Returns:
+            Its runs, those with the same seed together.
+
+        Raises:
+            ConfigError: The values make no sound settings.
+        """
+        searched = self._stages[stage]
+        point = searched.resolve(_own(values))
+        runs = []
+        for seed in seeds:
+            for task in searched.tasks:
+                node_input = self._trial_input(searched.source, values, task, seed)
+                settings = point.runs[task.name].model_copy(update={"seed": seed})
+                run = Run(
+                    stage=stage,
+                    trial=trial,
+                    values=dict(values),
+                    task=task.name,
+                    seed=seed,
+                    key=node_key(settings, node_input.key if node_input else None),
+                    part=part,
+                )
+                self._add(run, settings, node_input)
+                runs.append(run)
+        return runs
+
+    def _trial_input(
+        self, source: Source | None, values: Mapping[str, Any], task: Task, seed: int
+    ) -> Input | None:
+        """The node that a trial's run starts from, planned if it isn't yet."""
+        if source is None or source.stage is None:
+            return self._input(source, 0, task, seed)[0]
+        task = source.task or task
+        stage = self._stages[source.stage]
+        theirs = of_stage(values, stage.name)
+        node_input = self._trial_input(stage.source, values, task, seed)
+        settings = stage.resolve(theirs).runs[task.name].model_copy(update={"seed": seed})
+        run = Run(
+            stage=stage.name,
+            trial=0,
+            values=theirs,
+            task=task.name,
+            seed=seed,
+            key=node_key(settings, node_input.key if node_input else None),
+        )
+        self._add(run, settings, node_input)
+        return Input(key=run.key, task=task)
+
+    def _add(self, run: Run, settings: RunSettings, node_input: Input | None) -> None:
+        if (run.label, run.key) not in self._known:
+            self._known.add((run.label, run.key))
+            self.runs.append(run)
+        node = Node(
+            key=run.key,
+            run=settings,
+            input=node_input,
+            stage=run.stage,
+            trial=run.trial,
+            label=run.label,
+            part=run.part,
+        )
+        self._nodes.setdefault(run.key, node)
+
+    def node(self, key: str) -> Node:
+        """The node with this key."""
+        return self._nodes[key]
+
+    def _source_trials(self, source: Source | None) -> list[int]:
+        """Each trial of a source stage gives one to every point: two grids multiply."""
+        if source is None or source.stage is None:
+            return [0]
+        return sorted({run.trial for run in self.runs if run.stage == source.stage})
+
+    def _add_run(
+        self, stage: Stage, trial: int, source_trial: int, point: Point, task: Task, seed: int
+    ) -> None:
+        settings = point.runs[task.name].model_copy(update={"seed": seed})
+        node_input, values = self._input(stage.source, source_trial, task, seed)
+        key = node_key(settings, node_input.key if node_input else None)
+        run = Run(
+            stage=stage.name,
+            trial=trial,
+            values={**values, **point.values},
+            task=task.name,
+            seed=seed,
+            key=key,
+        )
+        self._by_cell[stage.name, trial, task.name, seed] = run
+        self._add(run, settings, node_input)
+
+    def _input(
+        self, source: Source | None, source_trial: int, task: Task, seed: int
+    ) -> tuple[Input | None, dict[str, Any]]:
+        """What a run starts from, and what its source's trial was told apart by."""
+        if source is None:
+            return None, {}
+        task = source.task or task
+        if source.checkpoint is not None:
+            key = f"handoff-{source.checkpoint.manifest.content_hash}"
+            return Input(key=key, task=task, checkpoint=source.checkpoint), {}
+        run = self._by_cell[str(source.stage), source_trial, task.name, seed]
+        values = {
+            name if ":" in name else f"{run.stage}:{name}": value
+            for name, value in run.values.items()
+        }
+        return Input(key=run.key, task=task), values
+
+
+def _own(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in values.items() if ":" not in name}
 
 
 def short(value: Any) -> str:
@@ -111,74 +271,19 @@ def node_key(run: RunSettings, source: str | None) -> str:
 
 def make_plan(config: SweepConfig) -> Plan:
     """Lay out a valid sweep."""
-    planner = _Planner(config)
+    plan = Plan(config.name, config.seeds)
+    varied = {
+        stage.source.stage
+        for stage in config.stages
+        if stage.search is not None and stage.source is not None
+        if stage.source.stage in stages_in(stage.search)
+    }
+    used = {
+        stage.source.stage
+        for stage in config.stages
+        if stage.source is not None and stage.source.stage not in (varied if stage.search else ())
+    }
     for stage in config.stages:
-        planner.add(stage)
-    return Plan(name=config.name, runs=tuple(planner.runs), nodes=tuple(planner.nodes.values()))
-
-
-class _Planner:
-    def __init__(self, config: SweepConfig) -> None:
-        self._seeds = config.seeds
-        self.runs: list[Run] = []
-        self.nodes: dict[str, Node] = {}
-        self._by_cell: dict[tuple[str, int, str, int], Run] = {}
-
-    def add(self, stage: Stage) -> None:
-        """Plan a stage whose source, if it is a stage, is planned already."""
-        trial = 0
-        for source_trial in self._source_trials(stage.source):
-            for point in stage.points:
-                for task in stage.tasks:
-                    for seed in self._seeds:
-                        self._add_run(stage, trial, source_trial, point, task, seed)
-                trial += 1
-
-    def _source_trials(self, source: Source | None) -> list[int]:
-        """Each trial of a source stage gives one to every point: two grids multiply."""
-        if source is None or source.stage is None:
-            return [0]
-        return sorted({run.trial for run in self.runs if run.stage == source.stage})
-
-    def _add_run(
-        self, stage: Stage, trial: int, source_trial: int, point: Point, task: Task, seed: int
-    ) -> None:
-        settings = point.runs[task.name].model_copy(update={"seed": seed})
-        node_input, values = self._input(stage.source, source_trial, task, seed)
-        key = node_key(settings, node_input.key if node_input else None)
-        run = Run(
-            stage=stage.name,
-            trial=trial,
-            values={**values, **point.values},
-            task=task.name,
-            seed=seed,
-            key=key,
-        )
-        self.runs.append(run)
-        self._by_cell[stage.name, trial, task.name, seed] = run
-        node = Node(
-            key=key,
-            run=settings,
-            input=node_input,
-            stage=stage.name,
-            trial=trial,
-            label=run.label,
-        )
-        self.nodes.setdefault(key, node)
-
-    def _input(
-        self, source: Source | None, source_trial: int, task: Task, seed: int
-    ) -> tuple[Input | None, dict[str, Any]]:
-        """What a run starts from, and what its source's trial was told apart by."""
-        if source is None:
-            return None, {}
-        task = source.task or task
-        if source.checkpoint is not None:
-            key = f"handoff-{source.checkpoint.manifest.content_hash}"
-            return Input(key=key, task=task, checkpoint=source.checkpoint), {}
-        run = self._by_cell[str(source.stage), source_trial, task.name, seed]
-        values = {
-            name if ":" in name else f"{run.stage}:{name}": value
-            for name, value in run.values.items()
-        }
-        return Input(key=run.key, task=task), values
+        # A stage that only trials start from, each with settings of its own for it, has no others.
+        plan.add_stage(stage, alone=stage.name not in varied - used)
+    return plan

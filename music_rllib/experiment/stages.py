@@ -20,8 +20,15 @@ from music_rllib.experiment.model import (
     Stage,
     StageHeader,
 )
-from music_rllib.experiment.problems import Findings, from_json, in_words, shown
+from music_rllib.experiment.problems import (
+    ConfigError,
+    Findings,
+    from_json,
+    in_words,
+    shown,
+)
 from music_rllib.experiment.problems import Path as KeyPath
+from music_rllib.experiment.searched import check_search
 from music_rllib.experiment.settings import VARIANTS, RunSettings, Variant, handed_over
 
 __all__ = ["resolve_stage"]
@@ -68,19 +75,44 @@ def resolve_stage(
         tasks = find_tasks(header.tasks, (*path, "tasks"))
     tasks = _with_split(tasks, header, path, findings)
     settings = {key: raw[key] for key in LAYER_KEYS if key in raw}
-    points = tuple(
-        _resolve_point(header.variant, point, tasks, defaults, settings, seed, path, findings)
-        for point in _grid_points(header.grid)
-    )
+
+    def resolve_at(point: Mapping[str, tuple[KeyPath, Any]], found: Findings) -> Point:
+        return _resolve_point(header.variant, point, tasks, defaults, settings, seed, path, found)
+
+    points = tuple(resolve_at(point, findings) for point in _grid_points(header.grid))
     if len(findings.problems) == problems_before:
         _forbid_equal_points(points, path, findings)
     source = _source(header, path, find_tasks, findings)
+    if header.search is not None:
+        check_search(header, source, earlier, resolve_at, path, findings)
     stage = Stage(
-        name=header.name, variant=header.variant, tasks=tasks, source=source, points=points
+        name=header.name,
+        variant=header.variant,
+        tasks=tasks,
+        source=source,
+        points=points,
+        search=header.search,
+        resolve=_resolver(resolve_at),
     )
     if source is not None:
         _check_source(stage, source, earlier, (*path, "init_from"), findings)
     return stage
+
+
+def _resolver(
+    resolve_at: Callable[[Mapping[str, tuple[KeyPath, Any]], Findings], Point],
+) -> Callable[[Mapping[str, Any]], Point]:
+    """`Stage.resolve`: the values' place is their own name."""
+
+    def resolve(values: Mapping[str, Any]) -> Point:
+        found = Findings()
+        point = resolve_at({name: ((name,), value) for name, value in values.items()}, found)
+        if found.problems:
+            lines = [f"{problem.path[-1]} {problem.rule}" for problem in found.problems]
+            raise ConfigError(list(dict.fromkeys(lines)))
+        return point
+
+    return resolve
 
 
 def _header(raw: dict[str, Any], path: KeyPath, findings: Findings) -> StageHeader | None:
@@ -114,15 +146,18 @@ def _with_split(
     return tuple(task for task in tasks if task.has_split)
 
 
-def _grid_points(grid: Mapping[str, list[Any]]) -> list[dict[str, tuple[int, Any]]]:
-    """Cartesian product, the last key varying fastest; positions are kept for messages."""
-    axes = [[(position, value) for position, value in enumerate(grid[key])] for key in grid]
+def _grid_points(grid: Mapping[str, list[Any]]) -> list[dict[str, tuple[KeyPath, Any]]]:
+    """Cartesian product, the last key varying fastest; places are kept for messages."""
+    axes = [
+        [(("grid", key, position), value) for position, value in enumerate(grid[key])]
+        for key in grid
+    ]
     return [dict(zip(grid, combination, strict=True)) for combination in itertools.product(*axes)]
 
 
 def _resolve_point(
     variant: Variant,
-    point: Mapping[str, tuple[int, Any]],
+    point: Mapping[str, tuple[KeyPath, Any]],
     tasks: tuple[Task, ...],
     defaults: Mapping[str, Any],
     settings: Mapping[str, Any],
@@ -205,7 +240,13 @@ def _check_source(
         known = f" (one of {', '.join(earlier)})" if earlier else ""
         hint = closest(str(source.stage), earlier)
         findings.add(place, f"must be an earlier stage{known}, got {source.stage!r}{hint}")
-    elif (above := earlier[str(source.stage)]) is not None:
+    elif (above := earlier[str(source.stage)]) is not None and above.search is not None:
+        findings.add(
+            place,
+            f"must be a stage whose runs are known beforehand, got {above.name!r}, which is "
+            "searched; start from its best trial's handoff with {checkpoint: FOLDER}",
+        )
+    elif above is not None:
         _check_stage(stage, source, above, place, findings)
 
 

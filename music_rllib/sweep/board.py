@@ -23,6 +23,10 @@ class Status(StrEnum):
     FAILED = "failed"
     SKIPPED = "skipped"
     """What it starts from failed or was skipped."""
+    PAUSED = "paused"
+    """Computed as far as its trial is looked at next, and kept."""
+    PRUNED = "pruned"
+    """Not wanted any further: its trial was stopped early, or failed."""
 
 
 _DONE = frozenset({Status.FINISHED, Status.REUSED})
@@ -34,12 +38,19 @@ class Board:
     def __init__(self, plan: Plan, finished: Collection[str]) -> None:
         """Start with the nodes whose keys are in `finished` done, and all others waiting."""
         self._nodes = {node.key: node for node in plan.nodes}
+        self._until: dict[str, int] = {}
+        self.changes = 0
+        """Grows whenever something changes."""
         self._status = {
             key: Status.REUSED if key in finished else Status.WAITING for key in self._nodes
         }
 
     def __getitem__(self, key: str) -> Status:
         return self._status[key]
+
+    def knows(self, key: str) -> bool:
+        """Whether the node is on the board."""
+        return key in self._nodes
 
     def node(self, key: str) -> Node:
         """The node with this key."""
@@ -69,6 +80,56 @@ class Board:
             return True
         return self._status[node.input.key] in _DONE
 
+    def want(self, node: Node, until: int | None, *, finished: bool) -> None:
+        """The search asks for a node, or for more of it.
+
+        Args:
+            node: It, and what it starts from must be on the board already.
+            until: As far as so many environment steps; None: to its end.
+            finished: Whether it is in the store; of importance for a node that is new here.
+        """
+        key = node.key
+        if key not in self._nodes:
+            self._nodes[key] = node
+            self._status[key] = Status.REUSED if finished else Status.WAITING
+            if until is not None:
+                self._until[key] = until
+            self.changes += 1
+            if not finished and node.input is not None and self._is_lost(node.input.key):
+                self._status[key] = Status.SKIPPED
+            return
+        before = self._until.get(key)
+        if until is None:
+            self._until.pop(key, None)
+        elif before is not None:
+            self._until[key] = max(before, until)
+        further = before is not None and (until is None or until > before)
+        if self._status[key] is Status.PRUNED or (self._status[key] is Status.PAUSED and further):
+            if self._status[key] is Status.PRUNED and until is not None:
+                self._until[key] = until
+            self._status[key] = Status.WAITING
+            self.changes += 1
+
+    def _is_lost(self, key: str) -> bool:
+        return self._status.get(key) in (Status.FAILED, Status.SKIPPED)
+
+    def until(self, key: str) -> int | None:
+        """As far as the node is to be computed for now; None: to its end."""
+        return self._until.get(key)
+
+    def pause(self, key: str, env_steps: int) -> None:
+        """The node has been computed that far; it waits again if more is wanted by now."""
+        until = self._until.get(key)
+        more = until is None or until > env_steps
+        self._move(key, Status.STARTED, Status.WAITING if more else Status.PAUSED)
+
+    def withdraw(self, key: str) -> bool:
+        """The node isn't wanted any more; whether that changes anything."""
+        if self._status[key] not in (Status.WAITING, Status.PAUSED):
+            return False
+        self._move(key, self._status[key], Status.PRUNED)
+        return True
+
     def start(self, key: str) -> None:
         """The node is handed out."""
         self._move(key, Status.WAITING, Status.STARTED)
@@ -94,3 +155,4 @@ class Board:
     def _move(self, key: str, before: Status, after: Status) -> None:
         assert self._status[key] is before, f"{key} is {self._status[key]}, not {before}"
         self._status[key] = after
+        self.changes += 1

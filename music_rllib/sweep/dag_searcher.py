@@ -17,25 +17,43 @@ class DagSearcher(Searcher):
     """Suggests each waiting node once, when it can run.
 
     Tune asks again and again. `None` makes it go on with the trials it has, and while it has none
-    it would block: that can't happen, as a node only waits for one that is being computed.
-    `FINISHED` makes it ask no more. Failures never stop the others.
+    it asks once a second: that happens only where a search waits for another driver's trials, as a
+    node only waits for one that is being computed. `FINISHED` makes it ask no more. Failures never
+    stop the others.
 
     Nothing of this is restored from Tune's snapshots; the node store says what is finished.
     """
 
-    def __init__(self, board: Board, config_of: Callable[[Node], dict[str, Any]]) -> None:
-        """Hand out the nodes on `board`, each as the Tune config that `config_of` makes of it."""
+    def __init__(
+        self,
+        board: Board,
+        config_of: Callable[[Node], dict[str, Any]],
+        advance: Callable[[], bool] = lambda: False,
+        stopped: Callable[[], bool] = lambda: False,
+    ) -> None:
+        """Hand out the nodes on `board`.
+
+        Args:
+            board: Where they are.
+            config_of: Makes a Tune config of a node.
+            advance: Lets a search put more on the board; whether more may come later.
+            stopped: Whether nothing more is to be handed out.
+        """
         super().__init__()
         self._board = board
         self._config_of = config_of
+        self._advance = advance
+        self._stopped = stopped
 
     def suggest(self, trial_id: str) -> dict[str, Any] | str | None:
         """The config of a node that can run, None for "not now", or `FINISHED`."""
-        if self._board.all_handed_out:
+        if self._stopped():
             return str(Searcher.FINISHED)
+        more = self._advance()
         node = self._board.next_ready()
         if node is None:
-            return None
+            done = self._board.all_handed_out and not more
+            return str(Searcher.FINISHED) if done else None
         self._board.start(node.key)
         return self._config_of(node)
 

@@ -112,6 +112,12 @@ class Display(Listener):
     def skipped(self, node: Node, because: Node) -> None:
         self.say(f"{node.label}: skipped, it starts from {because.label}", "yellow")
 
+    def paused(self, node: Node) -> None:
+        self._running.pop(node.key, None)
+
+    def pruned(self, node: Node, reason: str) -> None:
+        self._running.pop(node.key, None)
+
     def tick(self) -> None:
         if self._live and self._now() - self._refreshed >= REFRESH_SECONDS:
             self._refreshed = self._now()

@@ -6,7 +6,7 @@ import shlex
 import signal
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.text import Text
@@ -16,6 +16,7 @@ from music_rllib.experiment.model import SweepConfig
 from music_rllib.experiment.plan import make_plan
 from music_rllib.sweep.board import Status
 from music_rllib.sweep.frame import FAILED
+from music_rllib.sweep.listener import Listener
 from music_rllib.sweep.local import (
     check_cpus,
     check_reachable,
@@ -27,11 +28,14 @@ from music_rllib.sweep.preflight import (
     import_checkpoints,
     verify_inputs,
 )
+from music_rllib.sweep.records import SEARCH, as_json, keep
 from music_rllib.sweep.session import Sweep, keep_record, open_sweep
-from music_rllib.sweep.tables import plan_view, results_table
+from music_rllib.sweep.tables import plan_view, results_table, search_views
+from music_rllib.tracking import names
 from music_rllib.tracking.redaction import redact
 
 if TYPE_CHECKING:
+    from music_rllib.sweep.campaign import Campaign
     from music_rllib.sweep.display import Display
     from music_rllib.sweep.logbook import Logbook
     from music_rllib.tracking.tracker import Tracker
@@ -50,6 +54,7 @@ def run_sweep(
     dry_run: bool = False,
     storage: str | None = None,
     name: str | None = None,
+    seeds: str | None = None,
 ) -> int:
     """Train every run of a sweep, compare them, and log them to MLflow.
 
@@ -59,6 +64,7 @@ def run_sweep(
         dry_run: Check everything and show the plan; run nothing.
         storage: Replaces the file's `storage`.
         name: Replaces the file's `name`.
+        seeds: Replaces the file's `seeds`: how many, or a list with commas.
 
     Returns:
         The exit code.
@@ -67,17 +73,15 @@ def run_sweep(
         BadInputError: Nothing was started; as other errors that say what to change.
     """
     try:
-        return _sweep(
-            console, config or DEFAULT_CONFIG, dry_run=dry_run, storage=storage, name=name
-        )
+        path = config or DEFAULT_CONFIG
+        loaded = load_sweep(path, name=name, storage=storage, seeds=seeds)
+        return _sweep(console, loaded, dry_run=dry_run)
     except KeyboardInterrupt:
         _say_how_to_continue(console)
         return 128 + signal.SIGINT
 
 
-def _sweep(
-    console: Console, path: Path, *, dry_run: bool, storage: str | None, name: str | None
-) -> int:
+def _sweep(console: Console, config: SweepConfig, *, dry_run: bool) -> int:
     """Run the whole program.
 
     Returns:
@@ -86,7 +90,7 @@ def _sweep(
     Raises:
         BadInputError: Nothing was started.
     """
-    opened = _open(console, load_sweep(path, name=name, storage=storage))
+    opened = _open(console, config)
     if dry_run:
         console.print("Dry run: the configuration is sound, nothing was started.")
         return 0
@@ -95,6 +99,10 @@ def _sweep(
     verify_inputs(opened.board, opened.store)
     if not opened.board.complete and (address := cluster_address()) is not None:
         check_reachable(address)
+    if opened.plan.searched:
+        from music_rllib.sweep.searches import check_storages
+
+        check_storages(config)
     tracker = _open_tracker(opened)
     with tracker:
         return _compute_and_report(console, opened, tracker)
@@ -133,16 +141,20 @@ def _compute_and_report(console: Console, opened: Sweep, tracker: Tracker) -> in
     from music_rllib.sweep.logbook import Logbook
 
     with Display(console, opened.plan, opened.board) as display:
-        logbook = Logbook(tracker, lambda text: display.say(text, "yellow"))
+        logbook = Logbook(tracker, lambda text: display.say(text, "yellow"), opened.store)
         _take_over(opened, display, logbook)
-        stopped_by = _compute(opened, display, logbook)
+        campaign = _open_campaign(opened, display, logbook)
+        stopped_by = _compute(opened, display, logbook, campaign)
     failed = bool(opened.board.having(Status.FAILED, Status.SKIPPED)) or (
         stopped_by is None and not opened.board.complete
     )
+    searches = [] if campaign is None else _close_campaign(opened, campaign, tracker)
     tracker.close("KILLED" if stopped_by else "FAILED" if failed else "FINISHED")
     console.print(
         results_table(opened.plan, opened.board.__getitem__, opened.results(), tracker.run_id)
     )
+    for view in search_views(searches):
+        console.print(view)
     if undelivered := tracker.undelivered_message():
         console.print(Text(undelivered, style="yellow"), soft_wrap=True)
     console.print(Text(f"Open MLflow's pages with: {tracker.ui_command()}"), soft_wrap=True)
@@ -163,19 +175,53 @@ def _take_over(opened: Sweep, display: Display, logbook: Logbook) -> None:
         logbook.reused(node, opened.store)
 
 
-def _compute(opened: Sweep, display: Display, logbook: Logbook) -> int | None:
+def _open_campaign(opened: Sweep, display: Display, logbook: Logbook) -> Campaign | None:
+    """The sweep's searches, if it has any, as far as earlier results lead."""
+    if not opened.plan.searched:
+        return None
+    from music_rllib.sweep.campaign import Campaign
+    from music_rllib.sweep.searches import open_searches
+
+    campaign = Campaign(
+        opened,
+        open_searches(opened),
+        reused=lambda node: logbook.reused(node, opened.store),
+        pruned=logbook.pruned,
+        say=display.say,
+    )
+    campaign.advance()
+    return campaign
+
+
+def _close_campaign(opened: Sweep, campaign: Campaign, tracker: Tracker) -> list[dict[str, Any]]:
+    """Keep what came of the searches, in the sweep's folder and in MLflow."""
+    from music_rllib.sweep.searches import outcome
+
+    campaign.stop()
+    found = outcome(campaign)
+    text = as_json(found)
+    tracker.put_sweep_artefact(names.ARTEFACT_SEARCH, text)
+    keep(opened, SEARCH, text)
+    return found
+
+
+def _compute(
+    opened: Sweep, display: Display, logbook: Logbook, campaign: Campaign | None
+) -> int | None:
     """Compute what is left, if anything; the signal that stopped it."""
-    if opened.board.complete:
+    if opened.board.complete and (campaign is None or campaign.over):
         return None
     from music_rllib.sweep.runner import compute
 
     address = cluster_address()
     display.say("starting a local Ray" if address is None else f"connecting to Ray at {address}")
 
+    listeners: list[Listener] = [logbook, display, *([campaign] if campaign else [])]
+
     def on_stop() -> None:
         display.say("stopping, this takes a few seconds; Ctrl-C again stops at once", "yellow")
 
-    return compute(opened, [logbook, display], on_stop).stopped_by
+    return compute(opened, listeners, on_stop, campaign).stopped_by
 
 
 def _say_how_to_continue(console: Console) -> None:

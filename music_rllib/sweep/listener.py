@@ -41,5 +41,11 @@ class Listener:
     def skipped(self, node: Node, because: Node) -> None:
         """The node won't be computed, because another one failed."""
 
+    def paused(self, node: Node) -> None:
+        """The node is computed as far as its trial is looked at next."""
+
+    def pruned(self, node: Node, reason: str) -> None:
+        """The node isn't computed any further, because its trial was stopped early."""
+
     def tick(self) -> None:
         """Some time has passed; often."""

@@ -9,6 +9,7 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from ray import tune
 from ray.tune.experiment import Trial
@@ -23,6 +24,9 @@ from music_rllib.sweep.stopping import StopSignals
 from music_rllib.sweep.trainable import NodeJob, RunTrainable
 from music_rllib.sweep.tune_events import RESTARTS, TuneEvents
 
+if TYPE_CHECKING:
+    from music_rllib.sweep.campaign import Campaign
+
 __all__ = ["Outcome", "compute"]
 
 
@@ -34,13 +38,19 @@ class Outcome:
     """The signal that stopped it; None if it went to its end."""
 
 
-def compute(sweep: Sweep, listeners: Sequence[Listener], on_stop: Callable[[], None]) -> Outcome:
-    """Compute the waiting nodes.
+def compute(
+    sweep: Sweep,
+    listeners: Sequence[Listener],
+    on_stop: Callable[[], None],
+    campaign: Campaign | None = None,
+) -> Outcome:
+    """Compute the waiting nodes, and those that searches ask for.
 
     Args:
         sweep: Its board says afterwards what became of each node.
         listeners: Are told what happens.
         on_stop: Called, in a signal handler, when the user asks to stop.
+        campaign: The searches; None where there are none.
 
     Raises:
         ClusterError: Ray can't be reached or can't hold a run.
@@ -54,17 +64,21 @@ def compute(sweep: Sweep, listeners: Sequence[Listener], on_stop: Callable[[], N
             node,
             sweep.storage,
             resources.cpus_per_run,
+            until=sweep.board.until(node.key),
             checkpoints=sweep.config.checkpoints,
             sweep=sweep.plan.name,
             stop_key=stopping.flag.key,
         ).to_tune(),
+        **({} if campaign is None else {"advance": campaign.advance}),
+        stopped=lambda: stopping.received is not None,
     )
     with cluster(resources) as slots, _tune_folder(sweep) as place, _quiet_tune(slots), stopping:
         tuner = tune.Tuner(
             RunTrainable,
             tune_config=tune.TuneConfig(
                 search_alg=searcher,
-                num_samples=len(sweep.board.having(Status.WAITING)),
+                # As many as the searcher says; -1 is without an end.
+                num_samples=-1 if campaign else len(sweep.board.having(Status.WAITING)),
                 trial_name_creator=_trial_name,
                 trial_dirname_creator=_trial_name,
             ),
@@ -80,11 +94,13 @@ def compute(sweep: Sweep, listeners: Sequence[Listener], on_stop: Callable[[], N
             ),
         )
         tuner.fit()
-    return Outcome(stopped_by=None if sweep.board.complete else stopping.received)
+    done = sweep.board.complete and (campaign is None or campaign.over)
+    return Outcome(stopped_by=None if done else stopping.received)
 
 
 def _trial_name(trial: Trial) -> str:
-    return NodeJob.from_tune(trial.config).key
+    # A node that a search continues is a second trial of Tune's.
+    return f"{NodeJob.from_tune(trial.config).key}-{trial.trial_id}"
 
 
 @contextlib.contextmanager

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any
 
 from rich.console import Group, RenderableType
 from rich.table import Table
@@ -11,11 +12,12 @@ from rich.text import Text
 from music_rllib.experiment.model import Source, Stage, SweepConfig
 from music_rllib.experiment.plan import Node, Plan, short
 from music_rllib.experiment.result import RunResult
+from music_rllib.experiment.space import Choice, Dimension, SearchSettings
 from music_rllib.sweep.board import Status
 from music_rllib.sweep.words import clock, in_words, percent
 from music_rllib.tracking import names
 
-__all__ = ["plan_view", "results_table"]
+__all__ = ["plan_view", "ranking_table", "results_table", "search_runs", "search_views"]
 
 
 def plan_view(config: SweepConfig, plan: Plan, finished: Collection[str]) -> RenderableType:
@@ -28,7 +30,16 @@ def plan_view(config: SweepConfig, plan: Plan, finished: Collection[str]) -> Ren
     nodes = {node.key: node for node in plan.nodes}
     for stage in config.stages:
         table.add_row(*_stage_row(stage, plan, nodes, finished, len(config.seeds)))
-    return Group(table, Text(_summary(plan, finished)))
+    text = _summary(plan, finished)
+    searched = [(stage, stage.search) for stage in config.stages if stage.search is not None]
+    if searched:
+        runs = sum(search_runs(stage, search, len(config.seeds)) for stage, search in searched)
+        steps = sum(
+            search_runs(stage, search, len(config.seeds)) * _budget(stage, search)
+            for stage, search in searched
+        )
+        text += f" Searches: up to {runs} runs and {steps:,} env steps more."
+    return Group(table, Text(text))
 
 
 def _stage_row(
@@ -38,7 +49,14 @@ def _stage_row(
     finished: Collection[str],
     seeds: int,
 ) -> list[str]:
+    if stage.search is not None:
+        return _search_row(stage, stage.search, plan, seeds)
     runs = [run for run in plan.runs if run.stage == stage.name]
+    if not runs:  # its settings are searched for: it runs as trials want it
+        budget = next(iter(stage.points[0].runs.values())).env_steps
+        tasks = ", ".join(task.name for task in stage.tasks)
+        counts = ["as needed", str(seeds), "-", f"{budget:,}", "-", "-"]
+        return [stage.name, stage.variant, _source(stage.source), tasks, "-", *counts]
     budgets = sorted({nodes[run.key].run.env_steps for run in runs})
     return [
         stage.name,
@@ -53,6 +71,57 @@ def _stage_row(
         f"{sum(nodes[run.key].run.env_steps for run in runs):,}",
         str(sum(run.key in finished for run in runs)),
     ]
+
+
+def _search_row(stage: Stage, search: SearchSettings, plan: Plan, seeds: int) -> list[str]:
+    """What a search takes at most: it may stop trials early, and points may repeat."""
+    studies, budget = len(search.arms()), _budget(stage, search)
+    runs = search_runs(stage, search, seeds)
+    axes = [f"{name}: {_dimension(one)}" for name, one in search.space.items()]
+    axes += [
+        f"{name}: {', '.join(short(value) for value in values)} ({search.mode})"
+        for name, values in search.compare.items()
+    ]
+    fresh = 0 if search.final is None else search.final.seeds
+    return [
+        stage.name,
+        stage.variant,
+        _source(stage.source),
+        ", ".join(task.name for task in stage.tasks),
+        "\n".join(axes),
+        f"{studies} x {search.count}\n{search.sampler}"
+        if studies > 1
+        else f"{search.count}\n{search.sampler}",
+        f"{seeds} + {fresh} fresh" if fresh else str(seeds),
+        f"<= {runs}",
+        f"<= {budget:,}",
+        f"<= {runs * budget:,}",
+        "-",
+    ]
+
+
+def _budget(stage: Stage, search: SearchSettings) -> int:
+    """Environment steps of a run, at most."""
+    ends = search.space.get("env_steps")
+    if ends is not None:
+        return int(max(ends.ends()))
+    return max(run.env_steps for point in stage.points for run in point.runs.values())
+
+
+def search_runs(stage: Stage, search: SearchSettings, seeds: int) -> int:
+    """Runs of a searched stage at most, with those of the final ranking."""
+    trials = search.count * seeds
+    if search.final is not None:
+        trials += min(search.final.trials, search.count) * search.final.seeds
+    return trials * len(search.arms()) * len(stage.tasks)
+
+
+def _dimension(dimension: Dimension) -> str:
+    if isinstance(dimension, Choice):
+        return ", ".join(short(value) for value in dimension.choice)
+    low, high = dimension.bounds
+    step = "" if dimension.step in (None, 1) else f" by {dimension.step:g}"
+    return f"{low:g} to {high:g}{step}{' (log)' if dimension.log else ''}"
 
 
 def _source(source: Source | None) -> str:
@@ -111,6 +180,8 @@ def results_table(
     table.add_column("state", no_wrap=True)
     nodes = {node.key: node for node in plan.nodes}
     for run in plan.runs:
+        if run.part:
+            continue  # one of many: its trial has a row in another table
         state = status(run.key)
         table.add_row(
             run.stage,
@@ -126,9 +197,98 @@ def results_table(
     return table
 
 
+def search_views(searches: Sequence[Mapping[str, Any]]) -> list[RenderableType]:
+    """Tables of what came of searches (`searches.outcome`): trials, importance, the ranking."""
+    views: list[RenderableType] = []
+    for search in searches:
+        for arm in search["arms"]:
+            views.append(_trials_table(search, arm))
+            if arm["importance"]:
+                shares = [f"{name} {percent(share)}" for name, share in arm["importance"].items()]
+                views.append(Text(f"Share of the variance explained (fANOVA): {', '.join(shares)}"))
+        if search["ranking"]:
+            views.append(ranking_table(search))
+    return views
+
+
+def _trials_table(search: Mapping[str, Any], arm: Mapping[str, Any]) -> Table:
+    fixed = ", ".join(f"{name} = {short(value)}" for name, value in arm["values"].items())
+    table = Table(
+        title=f"Trials of {search['stage']}{f' with {fixed}' if fixed else ''}: "
+        f"{arm['judged']} judged, {arm['pruned']} stopped early, {arm['failed']} failed",
+        title_justify="left",
+    )
+    names_of = dict.fromkeys(
+        name for trial in arm["trials"] for name in trial["values"] if name not in arm["values"]
+    )
+    table.add_column("trial", justify="right")
+    for name in names_of:
+        table.add_column(name, justify="right")
+    for objective in search["objectives"]:
+        table.add_column(objective["name"], justify="right")
+    table.add_column("state", no_wrap=True)
+    table.add_column("why")
+    for trial in arm["trials"]:
+        if trial["state"] == "waiting":
+            continue
+        values = trial["objective"] or [None] * len(search["objectives"])
+        intervals = trial.get("interval") or [None] * len(values)
+        table.add_row(
+            str(trial["number"]),
+            *(short(trial["values"][n]) if n in trial["values"] else "-" for n in names_of),
+            *(with_interval(v, i) for v, i in zip(values, intervals, strict=True)),
+            trial["state"],
+            trial["reason"] or "",
+            style={"failed": "red", "pruned": "dim"}.get(trial["state"])
+            or ("bold" if trial["number"] == arm["best"] else None),
+        )
+    return table
+
+
+def ranking_table(search: Mapping[str, Any]) -> Table:
+    """Finalists on fresh seeds."""
+    table = Table(
+        title=f"Ranking of {search['stage']} on fresh seeds. 'in the search' is too good: the "
+        "trials were chosen for it",
+        title_justify="left",
+    )
+    names_of = dict.fromkeys(name for row in search["ranking"] for name in row["values"])
+    for name in ("rank", "trial", *names_of):
+        table.add_column(name, justify="right")
+    for objective in search["objectives"]:
+        table.add_column(f"{objective['name']}\non fresh seeds, 95 %", justify="right")
+        table.add_column("in the\nsearch", justify="right")
+    table.add_column("P(best is\nbetter)", justify="right")
+    for rank, row in enumerate(search["ranking"], 1):
+        values = (short(row["values"][n]) if n in row["values"] else "-" for n in names_of)
+        if "failure" in row:
+            table.add_row("-", str(row["trial"]), *values, row["failure"], style="red")
+            continue
+        numbers = [
+            text
+            for fresh, ends, searched in zip(
+                row["fresh"], row["interval"], row["searched"], strict=True
+            )
+            for text in (with_interval(fresh, ends), f"{searched:.3g}")
+        ]
+        chance = row.get("best_is_better_with")
+        table.add_row(str(rank), str(row["trial"]), *values, *numbers, percent(chance))
+    return table
+
+
+def with_interval(value: float | None, ends: Sequence[float | None] | None) -> str:
+    """`0.45 [0.3, 0.6]`; without the ends where a single run has none."""
+    if value is None:
+        return "-"
+    low, high = ends or (None, None)
+    if low is None or high is None or low != low or high != high:
+        return f"{value:.3g}"
+    return f"{value:.3g} [{low:.3g}, {high:.3g}]"
+
+
 def _grid_columns(plan: Plan) -> list[str]:
     """What tells trials apart, besides q, which has its column."""
-    found = dict.fromkeys(name for run in plan.runs for name in run.values)
+    found = dict.fromkeys(name for run in plan.runs if not run.part for name in run.values)
     return [name for name in found if name != "tac.entropic_index"]
 
 

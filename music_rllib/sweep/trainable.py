@@ -36,10 +36,12 @@ from music_rllib.tracking import names
 if TYPE_CHECKING:
     from music_rllib.experiment.training import TrainingRun
 
-__all__ = ["CAUSE", "NOTES", "REPORTS", "STOPPED", "TRACEBACK", "NodeJob", "RunTrainable"]
+__all__ = ["CAUSE", "NOTES", "PAUSED", "REPORTS", "STOPPED", "TRACEBACK", "NodeJob", "RunTrainable"]
 
 REPORTS, NOTES = "reports", "notes"
 """Keys of a Tune result: reports as JSON lines, and what a person should be told."""
+PAUSED = "paused"
+"""Key of a Tune result: environment steps of a run that is computed as far as it is wanted."""
 STOPPED = "stopped"
 """Key of a Tune result: True from a run that has kept its state, as it was asked to stop."""
 CAUSE, TRACEBACK = "cause", "traceback"
@@ -62,6 +64,9 @@ class NodeJob(BaseModel):
     source_task: Task | None
     storage: str
     cpus: int
+    until: int | None = None
+    """Stop at the first evaluation from so many environment steps on, to be continued; None: go on
+    to the end."""
     checkpoints: Checkpoints = Checkpoints()
     sweep: str = ""
     """Name of the sweep, for messages."""
@@ -75,12 +80,14 @@ class NodeJob(BaseModel):
         storage: str,
         cpus: int,
         *,
+        until: int | None = None,
         checkpoints: Checkpoints | None = None,
         sweep: str = "",
         stop_key: str | None = None,
     ) -> NodeJob:
         """The job that computes `node` in the storage at this URI on so many CPUs."""
         return cls(
+            until=until,
             checkpoints=checkpoints or Checkpoints(),
             sweep=sweep,
             stop_key=stop_key,
@@ -155,9 +162,22 @@ class RunTrainable(Trainable):
                 return self._finished_elsewhere(store)
             self._training = self._begin(store)
             if self._history:
-                return self._result(done=False)
+                return self._so_far()
         done = self._advance(self._training, store)
-        return self._result(done=done)
+        return self._result(done=True) if done else self._so_far()
+
+    def _so_far(self) -> dict[str, Any]:
+        """A result of a run that isn't over, but may be as far as it is wanted for now."""
+        until = self._job.until
+        evaluated = any(
+            names.EVAL_EPISODES in report.metrics
+            for report in self._history
+            if until is not None and report.env_steps >= until
+        )
+        if self._stopped or not evaluated:
+            return self._result(done=False)
+        self._release()
+        return self._result(done=True) | {PAUSED: self._history[-1].env_steps}
 
     def _finished_elsewhere(self, store: NodeStore) -> dict[str, Any]:
         """Another sweep, or a worker that outlived its driver, was faster."""

@@ -22,6 +22,7 @@ from music_rllib.sweep.listener import Failure, Listener
 from music_rllib.sweep.trainable import (
     CAUSE,
     NOTES,
+    PAUSED,
     REPORTS,
     TRACEBACK,
     NodeJob,
@@ -87,6 +88,11 @@ class TuneEvents(Callback):
         node = self._node(trial)
         if (cause := trial.last_result.get(CAUSE)) is not None:
             self._fail(node, cause, trial.last_result[TRACEBACK])
+            return
+        if (reached := trial.last_result.get(PAUSED)) is not None:
+            self._board.pause(node.key, reached)
+            for listener in self._listeners:
+                listener.paused(node)
             return
         try:
             result = self._store.result(node.key)

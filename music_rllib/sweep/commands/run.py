@@ -50,6 +50,12 @@ def add_sweep_options(parser: argparse.ArgumentParser) -> None:
         "Sweeps with the same storage share finished runs.",
     )
     parser.add_argument("--name", help="Name of the sweep; replaces the file's 'name'.")
+    parser.add_argument(
+        "--seeds",
+        metavar="N",
+        help="So many seeds, or a list like 0,1,7; replaces the file's 'seeds'. The report says "
+        "how many would likely decide; those that have run are reused.",
+    )
 
 
 def _execute(arguments: argparse.Namespace) -> int:
@@ -61,4 +67,5 @@ def _execute(arguments: argparse.Namespace) -> int:
         dry_run=arguments.dry_run,
         storage=arguments.storage,
         name=arguments.name,
+        seeds=arguments.seeds,
     )

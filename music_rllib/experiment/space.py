@@ -1,0 +1,408 @@
+"""What a searched stage looks for and how: the `search` section of a sweep's YAML file."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    JsonValue,
+    Tag,
+    model_validator,
+)
+
+__all__ = [
+    "FINAL_SEED",
+    "Choice",
+    "Dimension",
+    "Final",
+    "FloatRange",
+    "IntRange",
+    "Objective",
+    "Pruning",
+    "Rung",
+    "SearchSettings",
+    "WarmStart",
+]
+
+FINAL_SEED = 1_000_000
+"""First of the fresh seeds of the final ranking: no search uses seeds from here on."""
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+When = dict[str, JsonValue]
+
+
+class _Dimension(_Strict):
+    when: When = Field(default_factory=dict)
+    """Only where each of these settings, which stand above this one in the space, has this value,
+    or one of a list of values."""
+
+    def applies(self, chosen: Mapping[str, Any]) -> bool:
+        """Whether this dimension exists beside the values that are chosen already."""
+        return all(
+            name in chosen and chosen[name] in (wanted if isinstance(wanted, list) else [wanted])
+            for name, wanted in self.when.items()
+        )
+
+
+class FloatRange(_Dimension):
+    """A real number."""
+
+    bounds: tuple[float, float] = Field(alias="float")
+    """Lowest and highest value, both possible."""
+    log: bool = False
+    """Whether to search in the logarithm."""
+    step: float | None = Field(None, gt=0)
+    """Only the lowest value and those that are whole steps above it."""
+
+    @model_validator(mode="after")
+    def _is_a_range(self) -> Self:
+        _check_range(self.bounds, log=self.log, step=self.step)
+        return self
+
+    def ends(self) -> tuple[Any, ...]:
+        """Values that must be sound for the whole range to be."""
+        return self.bounds
+
+    @property
+    def reachable(self) -> tuple[float, float]:
+        """The ends, the upper one a whole number of steps above the lower."""
+        values = self.values()
+        return (values[0], values[-1]) if values else self.bounds
+
+    def values(self) -> tuple[Any, ...] | None:
+        """All values, for a grid; None where they can't be listed."""
+        if self.step is None:
+            return None
+        low, high = self.bounds
+        count = int((high - low) / self.step + 1e-9) + 1
+        return tuple(float(f"{low + index * self.step:.12g}") for index in range(count))
+
+
+class IntRange(_Dimension):
+    """A whole number."""
+
+    bounds: tuple[int, int] = Field(alias="int")
+    """Lowest and highest value, both possible."""
+    log: bool = False
+    """Whether to search in the logarithm."""
+    step: int = Field(1, gt=0)
+    """Only the lowest value and those that are whole steps above it."""
+
+    @model_validator(mode="after")
+    def _is_a_range(self) -> Self:
+        _check_range(self.bounds, log=self.log, step=None if self.step == 1 else self.step)
+        return self
+
+    def ends(self) -> tuple[Any, ...]:
+        """Values that must be sound for the whole range to be."""
+        return self.bounds
+
+    @property
+    def reachable(self) -> tuple[int, int]:
+        """The ends, the upper one a whole number of steps above the lower."""
+        low, high = self.bounds
+        return low, low + (high - low) // self.step * self.step
+
+    def values(self) -> tuple[Any, ...] | None:
+        """All values, for a grid."""
+        return tuple(range(self.bounds[0], self.bounds[1] + 1, self.step))
+
+
+class Choice(_Dimension):
+    """One of some values of any kind: numbers, text, schedules."""
+
+    choice: list[JsonValue] = Field(min_length=1)
+    """The values."""
+
+    def ends(self) -> tuple[Any, ...]:
+        """Values that must be sound for all of them to be."""
+        return tuple(self.choice)
+
+    def values(self) -> tuple[Any, ...] | None:
+        """All values, for a grid."""
+        return tuple(self.choice)
+
+
+def _kind(value: Any) -> str | None:
+    if isinstance(value, _Dimension):
+        return {FloatRange: "real", IntRange: "whole", Choice: "options"}[type(value)]
+    kinds = {"float": "real", "int": "whole", "choice": "options"}
+    found = [kinds[key] for key in value if key in kinds] if isinstance(value, dict) else []
+    return found[0] if len(found) == 1 else None
+
+
+Dimension = Annotated[
+    Annotated[FloatRange, Tag("real")]
+    | Annotated[IntRange, Tag("whole")]
+    | Annotated[Choice, Tag("options")],
+    Discriminator(
+        _kind,
+        custom_error_type="dimension",
+        custom_error_message="must have exactly one of float, int and choice",
+    ),
+]
+
+
+def _check_range(ends: tuple[float, float], *, log: bool, step: float | None) -> None:
+    low, high = ends
+    if not low < high:
+        raise ValueError(f"must be [lowest, highest], got [{low:g}, {high:g}]")
+    if log and low <= 0:
+        raise ValueError(
+            f"must be above 0 to be searched in the logarithm, got [{low:g}, {high:g}]"
+        )
+    if log and step is not None:
+        raise ValueError("must not have both log and step")
+    if step is not None and step > high - low:
+        raise ValueError(f"must be wider than its step {step:g}, got [{low:g}, {high:g}]")
+
+
+class Objective(_Strict):
+    """What makes a trial good: one number from its runs."""
+
+    metric: str = "evaluation/success_rate"
+    """A metric as MLflow shows it (docs/algorithms.md); `env_steps` for the budget itself."""
+    read: Literal["last", "best", "mean", "steps_to"] = "last"
+    """A run's number: the metric's last value, its best one, the mean over the run, or the
+    environment steps until it reaches `threshold` (the budget where it never does)."""
+    threshold: float | None = None
+    """Of `steps_to`."""
+    aggregate: Literal["iqm", "mean", "median", "worst_task"] = "iqm"
+    """A trial's number from its runs' (seeds times tasks): interquartile mean, mean or median over
+    all of them, or the mean over seeds of the task where that is worst."""
+    direction: Literal["maximize", "minimize"] | None = None
+    """null: maximize, and minimize with `steps_to`."""
+
+    @model_validator(mode="after")
+    def _threshold_belongs(self) -> Self:
+        if (self.read == "steps_to") != (self.threshold is not None):
+            raise ValueError("threshold must be given with read: steps_to, and only there")
+        return self
+
+    @property
+    def maximised(self) -> bool:
+        """Whether more is better."""
+        return (self.direction or ("minimize" if self.read == "steps_to" else "maximize")) == (
+            "maximize"
+        )
+
+    @property
+    def label(self) -> str:
+        """`iqm of evaluation/success_rate`."""
+        read = {"last": "", "best": "best ", "mean": "mean ", "steps_to": "steps to "}[self.read]
+        until = "" if self.threshold is None else f" >= {self.threshold:g}"
+        return f"{self.aggregate} of {read}{self.metric}{until}"
+
+
+class Rung(_Strict):
+    """A point of a trial at which it may be stopped."""
+
+    seeds: int | None = Field(None, gt=0)
+    """Its first so many seeds have run; null: all."""
+    env_steps: int | None = Field(None, gt=0)
+    """Up to so many environment steps, rounded up to the next evaluation; null: to the end."""
+
+
+class Pruning(_Strict):
+    """Successive halving over budgets and seeds, with an interval as a second opinion."""
+
+    rungs: tuple[Rung, ...] = Field(min_length=1)
+    """In order; each with at least the seeds and steps of the one before."""
+    keep: float = Field(0.5, gt=0, lt=1)
+    """A trial goes on if it is in this best part of those that have reached the rung, ..."""
+    confidence: float = Field(0.9, gt=0, lt=1)
+    """... or if its interval at this confidence reaches the best trial's value there."""
+    warm_up: int = Field(4, gt=0)
+    """The first so many trials always go on."""
+
+
+class Final(_Strict):
+    """The best trials once more, on seeds that had no part in choosing them."""
+
+    trials: int = Field(3, gt=0)
+    """So many of the best; in `compare` mode so many of each value."""
+    seeds: int = Field(5, gt=0)
+    """Fresh seeds for each."""
+
+
+class WarmStart(_Strict):
+    """An earlier study to learn from; its trials are not ranked again."""
+
+    study: str
+    """Its name, as `python -m music_rllib.sweep status` shows it, or the beginning of it."""
+    storage: str | None = None
+    """Its Optuna storage: a database URL or a sqlite file; null: this search's own."""
+
+
+class SearchSettings(_Strict):
+    """How a stage's trials are chosen, and judged."""
+
+    mode: Literal["search", "compare"] = "search"
+    """`search`: find the best point. `compare`: the same search for each value of `compare`, with
+    the same number of trials and the same seeds, and then those values side by side."""
+    space: dict[str, Dimension] = Field(min_length=1)
+    """Dotted setting to where it is searched; `STAGE:setting` for one of the stage that this one
+    starts from."""
+    compare: dict[str, Annotated[list[JsonValue], Field(min_length=2)]] = Field(
+        default_factory=dict
+    )
+    """Of `compare` mode: dotted setting to the values to tell apart."""
+    sampler: Literal["tpe", "random", "grid", "cmaes", "nsga2"] = "tpe"
+    """Optuna's TPE, CMA-ES (numbers only) and NSGA-II (several objectives), random, or all points
+    of a grid in order."""
+    trials: int | None = Field(None, gt=0)
+    """Trials to judge; null with `grid`: all points."""
+    startup_trials: int = Field(5, gt=0)
+    """Random trials before TPE or CMA-ES has something to go by."""
+    population: int = Field(10, gt=1)
+    """Size of a generation of CMA-ES and NSGA-II."""
+    concurrent: int = Field(2, gt=0)
+    """Trial n is chosen when all up to n minus this are judged, and by their results alone: more
+    keeps more CPUs busy, less learns sooner. Part of what makes a study reproducible."""
+    seed: int = Field(0, ge=0, lt=2**31)
+    """Of the choice of points."""
+    objective: Objective | list[Objective] = Objective()
+    """What is optimised; a list of several gives a Pareto front."""
+    points_to_evaluate: list[dict[str, JsonValue]] = Field(default_factory=list)
+    """Points, or parts of points, that are the first trials."""
+    pruning: Pruning | None = None
+    """null: every trial runs to its end on all seeds."""
+    final: Final | None = Final()
+    """The ranking at the end; null: none, and the best value found is too good to be true."""
+    study: str | None = Field(None, min_length=1)
+    """Name under which drivers share a study; null: the sweep's name."""
+    storage: str | None = Field(None, min_length=1)
+    """Optuna's storage: `postgresql://user@host/database` (the password comes from `PGPASSWORD` or
+    a password file), or another SQLAlchemy URL; null: a sqlite file in the sweep's folder."""
+    warm_start: WarmStart | None = None
+    """null: begin with what is known of the space alone."""
+
+    @property
+    def objectives(self) -> tuple[Objective, ...]:
+        """One, or several."""
+        return tuple(self.objective) if isinstance(self.objective, list) else (self.objective,)
+
+    @property
+    def count(self) -> int:
+        """Trials of each study."""
+        grid = self.grid() if self.sampler == "grid" else []
+        return min(self.trials or len(grid), len(grid)) if grid else (self.trials or 0)
+
+    def grid(self) -> list[dict[str, Any]]:
+        """All points, the last dimension varying fastest."""
+        points: list[dict[str, Any]] = [{}]
+        for name, dimension in self.space.items():
+            values = dimension.values() or ()
+            points = [
+                {**point, **extra}
+                for point in points
+                for extra in (
+                    [{name: value} for value in values] if dimension.applies(point) else [{}]
+                )
+            ]
+        return points
+
+    def arms(self) -> list[dict[str, Any]]:
+        """What `compare` tells apart; one empty mapping in `search` mode."""
+        choices = [[(name, value) for value in values] for name, values in self.compare.items()]
+        return [dict(pairs) for pairs in itertools.product(*choices)]
+
+    def corners(self) -> Iterator[dict[str, tuple[tuple[str | int, ...], Any]]]:
+        """Points that show whether the space's ends are sound: each end once, the rest at first.
+
+        Yields:
+            Dotted setting to (place below `search`, value).
+        """
+        middle = {
+            name: (("space", name), dimension.ends()[0]) for name, dimension in self.space.items()
+        }
+        for name, dimension in self.space.items():
+            for value in dimension.ends():
+                yield self._existing(middle | {name: (("space", name), value)}, keep=name)
+
+    def _existing(
+        self, point: dict[str, tuple[tuple[str | int, ...], Any]], keep: str
+    ) -> dict[str, tuple[tuple[str | int, ...], Any]]:
+        """Set what `keep` depends on, and leave out what does not exist then."""
+        point = dict(point)
+        todo = [keep]
+        while todo:
+            for name, wanted in self.space[todo.pop()].when.items():
+                value = wanted[0] if isinstance(wanted, list) else wanted
+                point[name] = (("space", name), value)
+                todo.append(name)
+        found: dict[str, tuple[tuple[str | int, ...], Any]] = {}
+        for name, dimension in self.space.items():
+            if dimension.applies({key: value for key, (_, value) in found.items()}):
+                found[name] = point[name]
+        return found
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> Self:
+        for rule in self._broken_rules():
+            raise ValueError(rule)
+        return self
+
+    def _broken_rules(self) -> Iterator[str]:
+        names = list(self.space)
+        for position, (name, dimension) in enumerate(self.space.items()):
+            for other, wanted in dimension.when.items():
+                if other not in names[:position]:
+                    yield f"space.{name}.when must name settings that stand above it, got {other!r}"
+                    continue
+                above = self.space[other]
+                values = wanted if isinstance(wanted, list) else [wanted]
+                if isinstance(above, Choice) and any(v not in above.choice for v in values):
+                    yield f"space.{name}.when must hold values of {other}, got {json.dumps(wanted)}"
+        for name in self.compare:
+            if name in self.space:
+                yield f"compare.{name} must not be in the space too, got it in both"
+        if (self.mode == "compare") != bool(self.compare):
+            yield "compare must be given with mode: compare, and only there"
+        yield from self._broken_sampler()
+        yield from self._broken_pruning()
+        for point in self.points_to_evaluate:
+            for name in point:
+                if name not in self.space:
+                    yield f"points_to_evaluate must hold settings of the space, got {name!r}"
+            if self.sampler == "grid":
+                yield f"points_to_evaluate must be empty with sampler: grid, got {len(point)}"
+
+    def _broken_sampler(self) -> Iterator[str]:
+        if self.sampler == "grid":
+            for name, dimension in self.space.items():
+                if dimension.values() is None:
+                    yield f"space.{name} must have a step to be part of a grid"
+        elif self.trials is None:
+            yield f"trials must be given with sampler: {self.sampler}"
+        if self.sampler == "cmaes":
+            for name, dimension in self.space.items():
+                if isinstance(dimension, Choice) or dimension.when:
+                    yield f"space.{name} must be a number without 'when' for sampler: cmaes"
+        if self.sampler == "cmaes" and len(self.objectives) > 1:
+            yield "sampler must be tpe, nsga2, random or grid for several objectives, got cmaes"
+        if not self.objectives:
+            yield "objective must be given, got an empty list"
+
+    def _broken_pruning(self) -> Iterator[str]:
+        if self.pruning is None:
+            return
+        if len(self.objectives) > 1:
+            yield "pruning must be null for several objectives"
+        before = (0, 0.0)
+        for rung in self.pruning.rungs:
+            here = (rung.seeds or 10**9, rung.env_steps or float("inf"))
+            if here[0] < before[0] or here[1] < before[1] or here == before:
+                yield "pruning.rungs must grow in seeds or env_steps and never shrink"
+            before = here

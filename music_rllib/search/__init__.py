@@ -1,0 +1,1 @@
+"""Searching for good trials with Optuna: proposals, judgement, studies. Knows no Ray."""

@@ -1,0 +1,160 @@
+"""What a trial is worth: one number from its runs, and whether it may be stopped early.
+
+Shapes: `scores` is `[seeds, tasks]`, one number per run.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from music_rllib.experiment.result import Report
+from music_rllib.experiment.space import Objective, Pruning
+from music_rllib.reports.statistics import Estimate, estimate, interquartile_mean
+from music_rllib.tracking import names
+
+__all__ = ["Verdict", "aggregate", "interval", "prune", "score"]
+
+Array = NDArray[np.float64]
+
+
+def score(objective: Objective, history: Sequence[Report], budget: int) -> float:
+    """A run's number.
+
+    Args:
+        objective: What to read.
+        history: The run's reports, as far as they count.
+        budget: Environment steps of the whole run, for a threshold that is never reached.
+
+    Raises:
+        ValueError: The run never reported the metric, or reported NaN.
+    """
+    values = [
+        (report.env_steps, report.metrics[objective.metric])
+        for report in history
+        if objective.metric in report.metrics
+    ]
+    if objective.metric == names.ENV_STEPS:
+        values = [(report.env_steps, float(report.env_steps)) for report in history]
+    if not values:
+        raise ValueError(f"it never reported {objective.metric}")
+    numbers = [value for _, value in values]
+    if not math.isfinite(sum(numbers)):
+        raise ValueError(f"its {objective.metric} is not a finite number")
+    if objective.read == "last":
+        return numbers[-1]
+    if objective.read == "mean":
+        return float(np.mean(numbers))
+    if objective.read == "best":
+        # The best of a metric, whichever way the objective counts it.
+        return max(numbers) if objective.maximised else min(numbers)
+    assert objective.threshold is not None
+    reached = (steps for steps, value in values if value >= objective.threshold)
+    return float(next(reached, budget))
+
+
+def aggregate(objective: Objective, scores: Array) -> float:
+    """A trial's number from those of its runs, `[seeds, tasks]`."""
+    match objective.aggregate:
+        case "iqm":
+            return float(interquartile_mean(scores.reshape(-1)))
+        case "mean":
+            return float(np.mean(scores))
+        case "median":
+            return float(np.median(scores))
+    by_task = scores.mean(axis=0)
+    return float(by_task.min() if objective.maximised else by_task.max())
+
+
+def interval(objective: Objective, scores: Array, seed: int = 0) -> Estimate:
+    """A trial's number with its 95 % stratified-bootstrap interval; NaN ends for a single run."""
+
+    def statistic(values: Array, axis: int) -> Array:
+        match objective.aggregate:
+            case "iqm":
+                return interquartile_mean(values, axis)
+            case "median":
+                return np.asarray(np.median(values, axis=axis))
+        return np.asarray(np.mean(values, axis=axis))
+
+    rng = np.random.default_rng(seed)
+    if objective.aggregate != "worst_task":
+        return estimate(scores, rng, statistic)
+    worst = scores.mean(axis=0).argmin() if objective.maximised else scores.mean(axis=0).argmax()
+    return estimate(scores[:, [int(worst)]], rng, statistic)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """Whether a trial goes on from a rung."""
+
+    stop: bool
+    reason: str
+    """In words, with the numbers that decided."""
+
+
+def prune(
+    objective: Objective,
+    pruning: Pruning,
+    *,
+    scores: Array,
+    others: Mapping[int, Array],
+    place: str,
+) -> Verdict:
+    """Whether a trial that has reached a rung is stopped there.
+
+    It goes on if it is in the best part of those that have reached the rung, and it goes on too if
+    its interval reaches the best of them: then its place may be bad luck. The interval is that of a
+    mean with the spread between seeds that all trials at this rung have in common, since a few runs
+    of one trial tell little about theirs.
+
+    Args:
+        objective: What counts.
+        pruning: The rules.
+        scores: The trial's runs so far, `[seeds, tasks]`.
+        others: Trial number to the same of each earlier trial that reached this rung.
+        place: The rung in words.
+    """
+    sign = 1.0 if objective.maximised else -1.0
+    mine = sign * aggregate(objective, scores)
+    theirs = {number: sign * aggregate(objective, values) for number, values in others.items()}
+    if not theirs:
+        return Verdict(stop=False, reason=f"{place}: the first to get there")
+    ranked = sorted([*theirs.values(), mine], reverse=True)
+    kept = max(1, math.ceil(pruning.keep * len(ranked)))
+    bar, best = ranked[kept - 1], max(theirs.values())
+    if mine >= bar:
+        return Verdict(stop=False, reason=f"{place}: among the best {kept} of {len(ranked)}")
+    half = _half_width(scores, list(others.values()), pruning.confidence)
+    ends = f"[{sign * mine - half:.4g}, {sign * mine + half:.4g}]"
+    if mine + half >= best:
+        return Verdict(
+            stop=False,
+            reason=f"{place}: its interval {ends} reaches the best trial's {sign * best:.4g}",
+        )
+    number = max(theirs, key=lambda other: theirs[other])
+    return Verdict(
+        stop=True,
+        reason=(
+            f"{place}: {sign * mine:.4g} is not among the best {kept} of {len(ranked)} (from "
+            f"{sign * bar:.4g} on), and its {100 * pruning.confidence:.0f} % interval {ends} does "
+            f"not reach the {sign * best:.4g} of trial {number}"
+        ),
+    )
+
+
+def _half_width(scores: Array, others: Sequence[Array], confidence: float) -> float:
+    """Of the interval around a trial's mean; infinite where no two seeds tell the spread."""
+    squares, freedom = 0.0, 0
+    for values in (scores, *others):
+        squares += float(np.sum((values - values.mean(axis=0)) ** 2))
+        freedom += values.size - values.shape[1]
+    if freedom == 0:
+        return math.inf
+    spread = math.sqrt(squares / freedom)
+    return float(stats.t.ppf((1 + confidence) / 2, freedom)) * spread / math.sqrt(scores.size)

@@ -1,0 +1,406 @@
+"""A study in Optuna's storage: which trials there are, who judges which, what came of them.
+
+Trials are laid out beforehand as waiting ones, and a driver claims the lowest by an atomic change
+of its state: none is lost or judged twice, whatever the number of drivers. A driver says from time
+to time that it is alive; the trials of one that has fallen silent are put back.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import time
+import uuid
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import optuna
+import psutil
+from optuna.exceptions import DuplicatedStudyError, StorageInternalError, UpdateFinishedTrialError
+from optuna.storages import BaseStorage, RDBStorage, get_storage
+from optuna.study import StudyDirection
+from optuna.trial import FrozenTrial, TrialState, create_trial
+from sqlalchemy.engine import make_url
+from sqlalchemy.exc import ArgumentError, SQLAlchemyError
+
+from music_rllib.experiment.files import content_key
+from music_rllib.experiment.sealed import StorageError
+from music_rllib.experiment.space import SearchSettings
+from music_rllib.search.proposals import Proposal, Proposer, as_proposal
+from music_rllib.tracking.redaction import redact
+
+__all__ = ["REASON", "SCORES", "VALUES", "Study", "open_studies", "study_names"]
+
+LEASE_SECONDS = 120.0
+"""After so long without a sign of life a driver on another machine counts as dead."""
+SIGN_SECONDS = 20.0
+
+FINGERPRINT, SETTINGS, POINTS, PRIOR, BASE = (
+    "music_rllib:fingerprint",
+    "music_rllib:settings",
+    "music_rllib:points",
+    "music_rllib:prior",
+    "music_rllib:base",
+)
+OWNER, VALUES, REASON, SCORES = "owner", "values", "reason", "scores"
+DRIVER = "driver:"
+
+
+def open_studies(url: str) -> BaseStorage:
+    """Open Optuna's storage.
+
+    Args:
+        url: SQLAlchemy's URL, or the path of a sqlite file. PostgreSQL's password comes from
+            `PGPASSWORD` or a password file.
+
+    Raises:
+        StorageError: The database can't be reached.
+    """
+    if "://" not in url:
+        url = f"sqlite:///{url}"
+    shown = redact(url)
+    try:
+        parsed = make_url(url)
+        if parsed.password:
+            raise StorageError(
+                f"search.storage must not hold a password, got one in {shown}: put it into the "
+                "environment as PGPASSWORD, or into ~/.pgpass"
+            )
+        local = parsed.get_backend_name() == "sqlite"
+        options: dict[str, Any] = {"connect_args": {"timeout": 60}} if local else {"pool_size": 2}
+        storage = RDBStorage(url, engine_kwargs=options | {"pool_pre_ping": True})
+        return get_storage(storage)  # with a cache of ended trials
+    except StorageError:
+        raise
+    except (
+        ArgumentError,
+        ImportError,
+        StorageInternalError,
+        SQLAlchemyError,
+        RuntimeError,
+    ) as error:
+        cause = str(error.__cause__ or error).strip().splitlines()[0]
+        raise StorageError(
+            f"search.storage must be a database that can be used, got {shown}: {redact(cause)}"
+        ) from error
+
+
+def study_names(storage: BaseStorage) -> list[str]:
+    """All studies, the oldest first."""
+    return [one.study_name for one in _studies(storage)]
+
+
+def _studies(storage: BaseStorage) -> list[Any]:
+    return sorted(storage.get_all_studies(), key=lambda one: int(one._study_id))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Identity:
+    """What makes a study this study."""
+
+    base: str
+    """`sweep/stage`, with the compared values behind it."""
+    fingerprint: str
+    """Hash of all that determines its points and values."""
+
+    @property
+    def name(self) -> str:
+        """In the storage."""
+        return f"{self.base} @{self.fingerprint}"
+
+
+class Study:
+    """One study, opened by one driver."""
+
+    def __init__(
+        self,
+        storage: BaseStorage,
+        base: str,
+        settings: SearchSettings,
+        determined_by: Mapping[str, Any],
+        *,
+        alone: bool,
+    ) -> None:
+        """Open or make the study.
+
+        Args:
+            storage: Where it is.
+            base: Its name without the hash.
+            settings: How it is searched.
+            determined_by: What else determines its values, as plain data.
+            alone: No other driver can be at work: whatever is running was left by a dead one.
+        """
+        self.settings = settings
+        self._storage = storage
+        self.identity = Identity(
+            base=base, fingerprint=content_key([_of_study(settings), determined_by])
+        )
+        self._alone = alone
+        self._me = f"{socket.gethostname()}:{os.getpid()}:{uuid.uuid4().hex[:8]}"
+        self._id, points, prior = self._open()
+        self._proposer = Proposer(settings, points, prior)
+        self._signed = 0.0
+        self.lay_out()
+        self.release_the_dead()
+
+    # -- making it ---------------------------------------------------------------------------
+
+    def _open(self) -> tuple[int, list[dict[str, Any]], list[FrozenTrial]]:
+        name = self.identity.name
+        directions = [
+            StudyDirection.MAXIMIZE if one.maximised else StudyDirection.MINIMIZE
+            for one in self.settings.objectives
+        ]
+        # All but the name must be there before another driver sees the study: prepared first.
+        points = [*self.settings.points_to_evaluate, *self._taken_over()]
+        prior = self._warm_start()
+        try:
+            study = self._storage.create_new_study(directions, study_name=name)
+        except DuplicatedStudyError:
+            study = self._storage.get_study_id_from_name(name)
+            return self._wait_until_made(study)
+        attributes = {
+            FINGERPRINT: self.identity.fingerprint,
+            BASE: self.identity.base,
+            SETTINGS: _of_study(self.settings),
+            PRIOR: [_as_data(trial) for trial in prior],
+            POINTS: points,  # last: it says that all is there
+        }
+        for key, value in attributes.items():
+            self._storage.set_study_user_attr(study, key, value)
+        return study, points, prior
+
+    def _wait_until_made(self, study: int) -> tuple[int, list[dict[str, Any]], list[FrozenTrial]]:
+        for _ in range(100):
+            attributes = self._storage.get_study_user_attrs(study)
+            if POINTS in attributes:
+                prior = [_from_data(data, self.settings) for data in attributes[PRIOR]]
+                return study, attributes[POINTS], prior
+            time.sleep(0.1)
+        # Its maker died in between: nothing has been searched with it yet.
+        points = [*self.settings.points_to_evaluate, *self._taken_over()]
+        self._storage.set_study_user_attr(study, PRIOR, [])
+        self._storage.set_study_user_attr(study, POINTS, points)
+        return study, points, []
+
+    def _taken_over(self) -> list[dict[str, Any]]:
+        """Points of the newest study of the same name that was judged otherwise: they come first.
+
+        Their runs are in the store, so that a study extended by seeds, or by a finer or wider
+        space, pays only for what is new.
+        """
+        if self.settings.sampler == "grid":
+            return []
+        older = [
+            one
+            for one in _studies(self._storage)
+            if one.user_attrs.get(BASE) == self.identity.base
+            and one.study_name != self.identity.name
+        ]
+        if not older:
+            return []
+        given = [json.dumps(point, sort_keys=True) for point in self.settings.points_to_evaluate]
+        points = []
+        for trial in self._storage.get_all_trials(older[-1]._study_id, deepcopy=False):
+            values = trial.user_attrs.get(VALUES)
+            if (
+                trial.state.is_finished()
+                and values
+                and _fits(values, self.settings)
+                and json.dumps(values, sort_keys=True) not in given
+            ):
+                points.append(values)
+        return points
+
+    def _warm_start(self) -> list[FrozenTrial]:
+        """Finished trials of the study to learn from, as far as they fit the space."""
+        warm = self.settings.warm_start
+        if warm is None:
+            return []
+        storage = self._storage if warm.storage is None else open_studies(warm.storage)
+        found = [one for one in _studies(storage) if one.study_name.startswith(warm.study)]
+        found = [one for one in found if one.study_name != self.identity.name]
+        if not found:
+            known = ", ".join(study_names(storage)) or "none"
+            raise StorageError(
+                f"search.warm_start.study must be (the beginning of) one of {known}, "
+                f"got {warm.study!r}"
+            )
+        prior = []
+        for trial in storage.get_all_trials(found[-1]._study_id, deepcopy=False):
+            if trial.state is not TrialState.COMPLETE or trial.values is None:
+                continue
+            values = trial.user_attrs.get(VALUES, dict(trial.params))
+            if len(trial.values) == len(self.settings.objectives) and _fits(values, self.settings):
+                data = {"values": values, "judged": list(trial.values)}
+                prior.append(_from_data(data, self.settings))
+        return prior
+
+    def lay_out(self) -> None:
+        """Make the trials that aren't there yet, waiting."""
+        there = len(self._storage.get_all_trials(self._id, deepcopy=False))
+        for _ in range(there, self.settings.count):
+            self._storage.create_new_trial(self._id, create_trial(state=TrialState.WAITING))
+
+    # -- looking at it -----------------------------------------------------------------------
+
+    @property
+    def name(self) -> str:
+        """In the storage."""
+        return self.identity.name
+
+    def trials(self) -> list[FrozenTrial]:
+        """The study's trials in order of their numbers, those beyond `trials` left out."""
+        found = self._storage.get_all_trials(self._id, deepcopy=False)
+        return sorted(found, key=lambda one: one.number)[: self.settings.count]
+
+    @property
+    def prior(self) -> int:
+        """Trials of an older study that it learns from."""
+        return len(self._storage.get_study_user_attrs(self._id).get(PRIOR, []))
+
+    # -- working on it -----------------------------------------------------------------------
+
+    def claim(self) -> FrozenTrial | None:
+        """The next trial to judge, with its point; None where there is none, or none yet.
+
+        A trial's point depends on those before it, so it is only claimed when they are far enough.
+        """
+        trials = self.trials()
+        for trial in trials:
+            if trial.state is TrialState.WAITING:
+                break
+        else:
+            return None
+        lag = trial.number - self.settings.concurrent
+        judged = trials[: lag + 1] if lag >= 0 else []
+        between = trials[len(judged) : trial.number]
+        if not all(one.state.is_finished() for one in judged):
+            return None
+        if not all(VALUES in one.user_attrs for one in between):
+            return None
+        if not self._storage.set_trial_state_values(trial._trial_id, TrialState.RUNNING):
+            return None  # another driver was faster
+        self._set(trial, OWNER, self._me)
+        if VALUES not in trial.user_attrs:
+            self._keep(trial, self._proposer.propose(trial.number, judged, between))
+        return self._storage.get_trial(trial._trial_id)
+
+    def _keep(self, trial: FrozenTrial, proposal: Proposal) -> None:
+        for name, distribution in proposal.distributions.items():
+            internal = distribution.to_internal_repr(proposal.params[name])
+            self._storage.set_trial_param(trial._trial_id, name, internal, distribution)
+        for key, value in proposal.system_attrs.items():
+            self._storage.set_trial_system_attr(trial._trial_id, key, value)
+        self._set(trial, VALUES, dict(proposal.values))
+
+    def report(self, trial: FrozenTrial, rung: int, value: float | None, scores: Any) -> None:
+        """Keep what a trial was worth at a rung, if one number says it, and its runs' numbers."""
+        kept = dict(self._storage.get_trial(trial._trial_id).user_attrs.get(SCORES, {}))
+        self._set(trial, SCORES, kept | {str(rung): scores})
+        if value is not None:
+            self._storage.set_trial_intermediate_value(trial._trial_id, rung, value)
+
+    def end(
+        self, trial: FrozenTrial, state: TrialState, values: Sequence[float] | None, reason: str
+    ) -> None:
+        """Keep what became of a trial; if somebody has done so already, theirs stays."""
+        try:
+            if reason:
+                self._set(trial, REASON, reason)
+            self._storage.set_trial_state_values(trial._trial_id, state, values)
+        except UpdateFinishedTrialError:
+            pass  # taken over while this driver was silent, and judged: the same, by the same rules
+
+    def _set(self, trial: FrozenTrial, key: str, value: Any) -> None:
+        self._storage.set_trial_user_attr(trial._trial_id, key, value)
+
+    # -- drivers -----------------------------------------------------------------------------
+
+    def sign(self, now: float | None = None) -> None:
+        """Say, from time to time, that this driver is alive, and put back what dead ones hold."""
+        now = time.time() if now is None else now
+        if now - self._signed >= SIGN_SECONDS:
+            self._signed = now
+            self._storage.set_study_user_attr(self._id, f"{DRIVER}{self._me}", now)
+            self.release_the_dead(now)
+
+    def release_the_dead(self, now: float | None = None) -> None:
+        """Put trials of drivers that are no more back among the waiting ones."""
+        now = time.time() if now is None else now
+        signs = self._storage.get_study_user_attrs(self._id)
+        for trial in self.trials():
+            owner = trial.user_attrs.get(OWNER, "")
+            if trial.state is not TrialState.RUNNING or owner == self._me:
+                continue
+            if not owner and not self._alone:
+                # Claimed a moment ago: its owner is about to write its name.
+                started = trial.datetime_start
+                if started is not None and now - started.timestamp() < LEASE_SECONDS:
+                    continue
+            last = float(signs.get(f"{DRIVER}{owner}", 0.0))
+            if self._alone or _is_dead(owner) or now - last > LEASE_SECONDS:
+                self._storage.set_trial_state_values(trial._trial_id, TrialState.WAITING)
+
+    def release(self) -> None:
+        """Put what this driver holds back: it stops."""
+        for trial in self.trials():
+            if trial.state is TrialState.RUNNING and trial.user_attrs.get(OWNER) == self._me:
+                self._storage.set_trial_state_values(trial._trial_id, TrialState.WAITING)
+
+    def as_optuna(self) -> optuna.Study:
+        """For Optuna's own analyses."""
+        return optuna.load_study(study_name=self.name, storage=self._storage)
+
+
+def _is_dead(owner: str) -> bool:
+    """Whether a driver of this very machine is gone."""
+    host, _, rest = owner.partition(":")
+    pid = rest.partition(":")[0]
+    return host == socket.gethostname() and pid.isdigit() and not psutil.pid_exists(int(pid))
+
+
+def _of_study(settings: SearchSettings) -> dict[str, Any]:
+    """Settings that determine points and values: not how many trials, nor where they are kept."""
+    aside = {"trials", "final", "study", "storage", "warm_start", "compare", "mode"}
+    found = settings.model_dump(mode="json", by_alias=True, exclude=aside)
+    if settings.warm_start is not None:
+        found["warm_start"] = settings.warm_start.study
+    return found
+
+
+def _fits(values: Mapping[str, Any], settings: SearchSettings) -> bool:
+    """Whether a point lies in the space."""
+    seen: dict[str, Any] = {}
+    for name, dimension in settings.space.items():
+        if not dimension.applies(seen):
+            if name in values:
+                return False
+            continue
+        if name not in values:
+            return False
+        known, value = dimension.values(), values[name]
+        if known is not None:
+            if value not in known:
+                return False
+        elif not dimension.ends()[0] <= value <= dimension.ends()[1]:
+            return False
+        seen[name] = value
+    return len(seen) == len(values)
+
+
+def _as_data(trial: FrozenTrial) -> dict[str, Any]:
+    return {"values": trial.user_attrs[VALUES], "judged": list(trial.values or [])}
+
+
+def _from_data(data: Mapping[str, Any], settings: SearchSettings) -> FrozenTrial:
+    """A trial of an older study, without what its sampler kept: that may be a pickle."""
+    proposal = as_proposal(settings.space, data["values"])
+    return create_trial(
+        values=list(data["judged"]),
+        params=dict(proposal.params),
+        distributions=dict(proposal.distributions),
+        user_attrs={VALUES: dict(data["values"])},
+    )

@@ -1,0 +1,259 @@
+"""A sweep's searches opened, and what came of them as plain data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import optuna
+from optuna.trial import FrozenTrial, TrialState
+
+from music_rllib.experiment.model import Stage, SweepConfig
+from music_rllib.experiment.plan import node_key, short
+from music_rllib.experiment.space import Rung, SearchSettings
+from music_rllib.reports.statistics import probability_of_improvement
+from music_rllib.search.judge import interval
+from music_rllib.search.studies import REASON, SCORES, VALUES, Study, open_studies
+from music_rllib.sweep.campaign import Arm, Campaign, Finalist, Search, ranked
+from music_rllib.sweep.session import Sweep
+from music_rllib.tracking.redaction import redact
+
+__all__ = ["check_storages", "open_searches", "outcome"]
+
+STUDY_FILE = "study.db"
+"""In the sweep's folder."""
+IMPORTANCE_TRIALS = 4
+"""Judged trials from which on the importance of settings is estimated."""
+
+
+def check_storages(config: SweepConfig) -> None:
+    """Reach the databases that searches name.
+
+    Raises:
+        StorageError: One can't be used.
+    """
+    for stage in config.stages:
+        if stage.search is not None:
+            for url in (stage.search.storage, (stage.search.warm_start or stage.search).storage):
+                if url is not None:
+                    open_studies(url)
+
+
+def open_searches(sweep: Sweep) -> list[Search]:
+    """Open or make the studies of a sweep's searched stages.
+
+    Raises:
+        StorageError: A study's storage can't be used.
+    """
+    return [_open_search(sweep, stage) for stage in sweep.plan.searched]
+
+
+def _open_search(sweep: Sweep, stage: Stage) -> Search:
+    settings = stage.search
+    assert settings is not None
+    sweep.folder.mkdir(parents=True, exist_ok=True)
+    storage = open_studies(settings.storage or str(sweep.folder / STUDY_FILE))
+    arms = [
+        Arm(
+            values=values,
+            position=position,
+            study=Study(
+                storage,
+                "/".join(
+                    (settings.study or sweep.config.name, stage.name, *_names(values)),
+                ),
+                settings,
+                _determined_by(sweep, stage, values),
+                # The sweep's folder is locked by this process, and the file is in it.
+                alone=settings.storage is None,
+            ),
+        )
+        for position, values in enumerate(settings.arms())
+    ]
+    rungs = [] if settings.pruning is None else list(settings.pruning.rungs)
+    seeds = len(sweep.plan.seeds)
+    rungs = [Rung(seeds=min(r.seeds or seeds, seeds), env_steps=r.env_steps) for r in rungs]
+    end = Rung(seeds=seeds)
+    return Search(
+        stage=stage, settings=settings, arms=arms, rungs=(*(r for r in rungs if r != end), end)
+    )
+
+
+def _names(values: Mapping[str, Any]) -> list[str]:
+    return [f"{name}={short(value)}" for name, value in values.items()]
+
+
+def _determined_by(sweep: Sweep, stage: Stage, values: Mapping[str, Any]) -> dict[str, Any]:
+    """What the stage's runs have in common, beside what is searched."""
+    (point,) = stage.points
+    source = stage.source
+    above = next(
+        (one for one in sweep.config.stages if source is not None and one.name == source.stage),
+        None,
+    )
+    return {
+        "arm": dict(values),
+        "seeds": list(sweep.plan.seeds),
+        "runs": {task: node_key(run, None) for task, run in point.runs.items()},
+        "source": {
+            task: node_key(run, None)
+            for task, run in (above.points[0].runs if above else {}).items()
+        },
+        "checkpoint": source.checkpoint.manifest.content_hash
+        if source is not None and source.checkpoint is not None
+        else None,
+    }
+
+
+# --- what came of them -------------------------------------------------------------------------
+
+
+def outcome(campaign: Campaign, *, thorough: bool = True) -> list[dict[str, Any]]:
+    """The searches' state as plain data, for files, tables and MLflow.
+
+    Args:
+        campaign: It.
+        thorough: With intervals and importance, which take a while.
+    """
+    return [_search(search, thorough) for search in campaign.searches]
+
+
+def _search(search: Search, thorough: bool) -> dict[str, Any]:
+    settings = search.settings
+    arms = [_arm(search, arm, thorough) for arm in search.arms]
+    finalists = [one for arm in search.arms for one in arm.finalists or ()]
+    return {
+        "stage": search.stage.name,
+        "mode": settings.mode,
+        "sampler": settings.sampler,
+        "objectives": [
+            {"name": one.label, "direction": "maximize" if one.maximised else "minimize"}
+            for one in settings.objectives
+        ],
+        "storage": None if settings.storage is None else redact(settings.storage),
+        "arms": arms,
+        "ranking": _ranking(settings, finalists) if thorough else [],
+        "complete": all(one.scores is not None or one.failure for one in finalists)
+        and all(arm.finalists is not None for arm in search.arms),
+    }
+
+
+def _arm(search: Search, arm: Arm, thorough: bool) -> dict[str, Any]:
+    trials = arm.study.trials()
+    best = ranked(search.settings, trials)
+    states = [trial.state.name for trial in trials]
+    return {
+        "values": dict(arm.values),
+        "study": arm.study.name,
+        "learnt_from": arm.study.prior,
+        "judged": states.count("COMPLETE"),
+        "pruned": states.count("PRUNED"),
+        "failed": states.count("FAIL"),
+        "running": states.count("RUNNING"),
+        "trials": [_trial(search, arm, trial, thorough) for trial in trials],
+        "best": best[0].number if best else None,
+        "importance": importance(arm.study, search.settings) if thorough else {},
+    }
+
+
+_STATES = {
+    TrialState.COMPLETE: "judged",
+    TrialState.PRUNED: "pruned",
+    TrialState.FAIL: "failed",
+    TrialState.RUNNING: "running",
+    TrialState.WAITING: "waiting",
+}
+
+
+def _trial(search: Search, arm: Arm, trial: FrozenTrial, thorough: bool) -> dict[str, Any]:
+    scores = trial.user_attrs.get(SCORES, {})
+    last = scores[max(scores, key=int)] if scores else None
+    found = {
+        "number": trial.number,
+        "state": _STATES[trial.state],
+        "values": {**arm.values, **trial.user_attrs.get(VALUES, {})},
+        "objective": list(trial.values) if trial.state is TrialState.COMPLETE else None,
+        "scores": last,
+        "reason": trial.user_attrs.get(REASON),
+    }
+    if thorough and trial.state is TrialState.COMPLETE and last:
+        found["interval"] = _interval(search.settings, last)
+    return found
+
+
+def _interval(settings: SearchSettings, scores: Sequence[Any]) -> list[list[float]]:
+    """Ends of each objective's 95 % interval over seeds; NaN where a single run has none."""
+    return [
+        [float(found.lower), float(found.upper)]
+        for found in (
+            interval(objective, np.asarray(of_objective))
+            for objective, of_objective in zip(settings.objectives, scores, strict=True)
+        )
+    ]
+
+
+def importance(study: Study, settings: SearchSettings) -> dict[str, float]:
+    """Share of the objective's variance that each setting accounts for (fANOVA), the largest first.
+
+    Empty where too few trials have been judged, or all are worth the same; for several objectives
+    it is that of the first.
+    """
+    judged = [trial for trial in study.trials() if trial.state is TrialState.COMPLETE]
+    if len(judged) < IMPORTANCE_TRIALS or len({trial.values[0] for trial in judged}) < 2:
+        return {}
+    if all(len({str(t.params.get(name)) for t in judged}) < 2 for name in settings.space):
+        return {}
+    optuna_study = study.as_optuna()
+    evaluator = optuna.importance.FanovaImportanceEvaluator(seed=settings.seed)
+    try:
+        found = optuna.importance.get_param_importances(
+            optuna_study,
+            evaluator=evaluator,
+            target=lambda trial: float(trial.values[0]),
+        )
+    except (ValueError, RuntimeError):  # no setting that all trials have, or no variance
+        return {}
+    return {name: float(share) for name, share in found.items()}
+
+
+def _ranking(settings: SearchSettings, finalists: Sequence[Finalist]) -> list[dict[str, Any]]:
+    """Finalists by their values on fresh seeds, the best first, each compared with the best."""
+    done = [one for one in finalists if one.scores is not None]
+    maximised = settings.objectives[0].maximised
+    rows = []
+    for finalist in done:
+        assert finalist.scores is not None
+        found = [
+            interval(objective, scores)
+            for objective, scores in zip(settings.objectives, finalist.scores, strict=True)
+        ]
+        rows.append(
+            {
+                "trial": finalist.number,
+                "values": dict(finalist.values),
+                "searched": list(finalist.searched),
+                "fresh": [float(one.value) for one in found],
+                "interval": [[float(one.lower), float(one.upper)] for one in found],
+                "selection_bias": [
+                    searched - float(one.value)
+                    for searched, one in zip(finalist.searched, found, strict=True)
+                ],
+                "scores": [scores.tolist() for scores in finalist.scores],
+                "nodes": [run.key for run in finalist.runs],
+            }
+        )
+    rows.sort(key=lambda row: row["fresh"][0], reverse=maximised)  # type: ignore[index]
+    if rows:
+        best = np.asarray(rows[0]["scores"][0])  # type: ignore[index]
+        for row in rows[1:]:
+            mine = np.asarray(row["scores"][0])  # type: ignore[index]
+            better = probability_of_improvement(best, mine, np.random.default_rng(0))
+            chance = float(better.value) if maximised else 1 - float(better.value)
+            row["best_is_better_with"] = chance
+    rows.extend(
+        {"trial": failed.number, "values": dict(failed.values), "failure": failed.failure}
+        for failed in finalists
+        if failed.failure
+    )
+    return rows
