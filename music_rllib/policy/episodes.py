@@ -1,0 +1,117 @@
+"""Episodes of a policy in its task, and what came of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from music_rllib.envs.make import Env, make_env
+from music_rllib.policy.policy import Policy, PolicyError
+
+__all__ = ["EpisodeResult", "Moment", "open_task", "play"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeResult:
+    """One episode; None where the task doesn't say."""
+
+    seed: int
+    """Of the environment's reset."""
+    success: bool | None
+    """At the last step: what success rates mean here."""
+    success_any_step: bool | None
+    episode_return: float
+    """Undiscounted sum of the task's rewards."""
+    env_steps: int
+    object_displacement: float | None
+    """Distance between the surroundings' first and last state (metres in the Fetch tasks)."""
+
+
+class Moment(NamedTuple):
+    """What an onlooker sees after the reset and after each step."""
+
+    env: Env
+    step: int
+    success: bool | None
+    """None before the first step, and where the task doesn't say."""
+    distance: float | None
+    """Between achieved and desired goal."""
+
+
+def open_task(policy: Policy, **options: Any) -> Env:
+    """The policy's environment; `options` go to `gymnasium.make` over those of the task.
+
+    Raises:
+        PolicyError: it can't be made.
+    """
+    task = policy.task
+    try:
+        return make_env(task.env_id, **{**task.env_kwargs, **options})
+    except (gym.error.Error, ImportError, TypeError) as error:
+        raise PolicyError(f"the environment {task.env_id} must be there: {error}") from error
+
+
+def play(
+    policy: Policy, env: Env, episodes: int, seed: int, see: Callable[[Moment], None] | None = None
+) -> Iterator[EpisodeResult]:
+    """Play `episodes` deterministic episodes; equal seeds give equal starts and goals.
+
+    Args:
+        policy: acts.
+        env: from `open_task`.
+        episodes: how many.
+        seed: determines all of their resets.
+        see: is shown each moment of each episode.
+    """
+    for number in range(episodes):
+        reset = int(np.random.SeedSequence((seed, number)).generate_state(1)[0])
+        yield _episode(policy, env, reset, see)
+
+
+def _episode(
+    policy: Policy, env: Env, seed: int, see: Callable[[Moment], None] | None
+) -> EpisodeResult:
+    observation, _ = env.reset(seed=seed)
+    first, total, successes = _surroundings(policy, observation), 0.0, []
+    if see:
+        see(Moment(env, 0, None, _distance(observation)))
+    steps = 0
+    for steps in range(1, policy.max_episode_steps + 1):
+        action = policy.act(observation).astype(env.action_space.dtype)
+        observation, reward, terminated, truncated, info = env.step(action)
+        total += float(reward)
+        said = info.get(policy.task.success_key) if policy.task.success_key else None
+        if said is not None:
+            successes.append(bool(said))
+        if see:
+            see(Moment(env, steps, None if said is None else bool(said), _distance(observation)))
+        if terminated or truncated:
+            break
+    last = _surroundings(policy, observation)
+    return EpisodeResult(
+        seed=seed,
+        success=successes[-1] if successes else None,
+        success_any_step=any(successes) if successes else None,
+        episode_return=total,
+        env_steps=steps,
+        object_displacement=None if last is None else float(np.linalg.norm(last - first)),
+    )
+
+
+def _surroundings(policy: Policy, observation: Any) -> NDArray[Any] | None:
+    indices = list(policy.task.surrounding_indices)
+    if not indices:
+        return None
+    flat = observation["observation"] if policy.goal_size else observation
+    return np.asarray(flat)[indices]
+
+
+def _distance(observation: Any) -> float | None:
+    if not isinstance(observation, dict):
+        return None
+    return float(np.linalg.norm(observation["achieved_goal"] - observation["desired_goal"]))

@@ -1,0 +1,241 @@
+"""Pictures of a policy at work: rendered without a screen, as MP4 or GIF.
+
+MuJoCo draws off-screen through EGL or OSMesa. Which of them works depends on the machine's
+drivers, and a wrong choice can end the process: each is tried out in a process of its own.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from music_rllib.envs.make import Env
+from music_rllib.policy.episodes import EpisodeResult, Moment, open_task, play
+from music_rllib.policy.policy import Policy
+
+__all__ = ["FORMATS", "VideoError", "film", "find_renderer", "write_video"]
+
+FORMATS = (".mp4", ".gif")
+FRAMES_PER_SECOND = 20
+SIZE = 320
+"""Width and height of the picture in pixels; a line of text is above and below."""
+LINE = 26
+HOLD = 12
+"""Frames for which an episode's last picture stays."""
+
+SUCCESS, NOT_YET, UNKNOWN = "#009E73", "#D55E00", "#666666"
+"""Okabe and Ito's green and vermilion; words say the same."""
+DARK, LIGHT = "#1b1b1b", "#ffffff"
+
+Frame = NDArray[np.uint8]
+
+
+class VideoError(RuntimeError):
+    """No video can be made here; says why and what to do."""
+
+
+def film(
+    policy: Policy, episodes: int, seed: int, title: str
+) -> tuple[list[Frame], list[EpisodeResult]]:
+    """Play and draw episodes: the scene, its goal, the step, and whether it is a success.
+
+    Args:
+        policy: acts.
+        episodes: how many, one after the other.
+        seed: as for `episodes.play`: the same episodes.
+        title: is written above.
+
+    Returns:
+        Pictures [height, width, 3], and what came of the episodes.
+
+    Raises:
+        VideoError: this machine or this environment can't draw.
+        PolicyError: the environment can't be made.
+    """
+    frames: list[Frame] = []
+    results: list[EpisodeResult] = []
+    why_not = use_renderer()
+    env = open_task(policy, render_mode="rgb_array", **_size(policy))
+    try:
+        if "rgb_array" not in (env.metadata.get("render_modes") or []):
+            raise VideoError(f"{policy.task.env_id} can't be drawn: it has no rgb_array rendering")
+        if why_not is not None and hasattr(env.unwrapped, "mujoco_renderer"):
+            raise VideoError(why_not)
+
+        def see(moment: Moment) -> None:
+            about = title if episodes == 1 else f"{title}  ·  episode {len(results) + 1}"
+            limit = policy.max_episode_steps
+            frames.append(_draw(_picture(moment.env), about, moment, limit))
+
+        for result in play(policy, env, episodes, seed, see):
+            results.append(result)
+            frames.extend([frames[-1]] * HOLD)
+    finally:
+        env.close()
+    return frames, results
+
+
+def _size(policy: Policy) -> dict[str, int]:
+    """Options of MuJoCo's environments; others choose their own size."""
+    name = policy.task.env_id
+    mujoco = any(word in name for word in ("Fetch", "Hand", "Cheetah", "Hopper", "Walker", "Ant"))
+    return {"width": SIZE, "height": SIZE} if mujoco else {}
+
+
+def _picture(env: Env) -> Image.Image:
+    try:
+        picture: Any = env.render()
+    # Whatever a driver raises: without a screen that is what happens.
+    except Exception as error:
+        raise VideoError(f"the scene can't be drawn: {error}") from error
+    if picture is None:
+        raise VideoError("the scene can't be drawn: the environment gives no picture")
+    return Image.fromarray(np.asarray(picture, np.uint8)).convert("RGB")
+
+
+def _draw(picture: Image.Image, title: str, moment: Moment, limit: int) -> Frame:
+    # Even sizes: MP4 stores colours for two by two pixels.
+    width = (max(picture.width, SIZE) + 1) // 2 * 2
+    height = (picture.height + 1) // 2 * 2
+    sheet = Image.new("RGB", (width, height + 2 * LINE), DARK)
+    sheet.paste(picture, ((width - picture.width) // 2, LINE))
+    pen, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=13)
+    pen.text((8, 5), title, fill=LIGHT, font=font)
+    words, colour = {
+        True: ("goal reached", SUCCESS),
+        False: ("goal not reached", NOT_YET),
+        None: ("", UNKNOWN),
+    }[moment.success]
+    if moment.step == 0 and moment.distance is not None:
+        words = "start"
+    pen.rectangle((0, LINE + height, width, height + 2 * LINE), fill=colour)
+    left = f"step {moment.step} of {limit}"
+    if moment.distance is not None:
+        left += f"  ·  goal {moment.distance:.2f} away"
+    pen.text((8, LINE + height + 5), left, fill=LIGHT, font=font)
+    room = width - 8 - pen.textlength(words, font=font)
+    pen.text((room, LINE + height + 5), words, fill=LIGHT, font=font)
+    return np.asarray(sheet, np.uint8)
+
+
+def use_renderer() -> str | None:
+    """Let MuJoCo draw by the first way that works; why not, where none does."""
+    name, why_not = find_renderer(os.environ.get("MUJOCO_GL"))
+    if name is not None:
+        os.environ["MUJOCO_GL"] = name
+    return why_not
+
+
+@functools.cache
+def find_renderer(chosen: str | None = None) -> tuple[str | None, str | None]:
+    """The way to draw without a screen: `egl` or `osmesa`, or the user's own `MUJOCO_GL`.
+
+    Returns:
+        Its name, or None and what is the matter with each.
+    """
+    reasons = []
+    for name in [chosen] if chosen else ["egl", "osmesa"]:
+        environment = os.environ | {"MUJOCO_GL": name, "PYOPENGL_PLATFORM": name}
+        try:
+            done = subprocess.run(  # noqa: S603
+                [sys.executable, "-c", _TRY],
+                env=environment,
+                capture_output=True,
+                text=True,
+                timeout=120,
+                check=False,
+            )
+        except subprocess.TimeoutExpired:
+            reasons.append(f"{name}: no answer")
+            continue
+        if done.returncode == 0:
+            return name, None
+        lines = done.stderr.strip().splitlines() or [f"ended with {done.returncode}"]
+        reasons.append(f"{name}: {lines[-1]}")
+    return None, (
+        f"no way to draw without a screen works here ({'; '.join(reasons)}). Install EGL "
+        "(Debian: apt-get install libegl1 libgl1-mesa-dri) or OSMesa (libosmesa6), or set MUJOCO_GL"
+    )
+
+
+_TRY = """
+import mujoco
+context = mujoco.GLContext(16, 16)
+context.make_current()
+model = mujoco.MjModel.from_xml_string("<mujoco/>")
+mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value).free()
+context.free()
+"""
+
+
+def write_video(path: Path, frames: Sequence[Frame]) -> None:
+    """Write `frames` as the format that the path's ending names.
+
+    Raises:
+        VideoError: the ending is none of `FORMATS`, there is no encoder, or it fails.
+        OSError: the file can't be written.
+    """
+    if path.suffix.lower() == ".gif":
+        _write_gif(path, frames)
+    elif path.suffix.lower() == ".mp4":
+        _write_mp4(path, frames)
+    else:
+        raise VideoError(f"a video must end in {' or '.join(FORMATS)}, got {path.name!r}")
+
+
+def _write_gif(path: Path, frames: Sequence[Frame]) -> None:
+    # One palette for all, so that nothing flickers and unchanged pixels cost nothing; made of more
+    # than one picture, so that the colours of success and failure are in it.
+    samples = [frames[i] for i in np.linspace(0, len(frames) - 1, 6).astype(int)]
+    palette = Image.fromarray(np.concatenate(samples)).quantize(160)
+    pictures = [
+        Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE)
+        for frame in frames
+    ]
+    pictures[0].save(
+        path,
+        format="GIF",
+        save_all=True,
+        append_images=pictures[1:],
+        duration=1000 // FRAMES_PER_SECOND,
+        loop=0,
+    )
+
+
+def _write_mp4(path: Path, frames: Sequence[Frame]) -> None:
+    height, width, _ = frames[0].shape
+    command = [_encoder(), "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"]
+    command += ["-s", f"{width}x{height}", "-r", str(FRAMES_PER_SECOND), "-i", "-", "-an"]
+    command += ["-vcodec", "libx264", "-pix_fmt", "yuv420p", "-crf", "26"]
+    command += ["-threads", "1", "-movflags", "+faststart", str(path)]
+    data = b"".join(frame.tobytes() for frame in frames)
+    done = subprocess.run(  # noqa: S603
+        command, input=data, capture_output=True, check=False
+    )
+    if done.returncode:
+        reason = done.stderr.decode(errors="replace").strip().splitlines()[-1:]
+        raise VideoError(f"{path} could not be encoded: {' '.join(reason)}")
+
+
+def _encoder() -> str:
+    found = shutil.which("ffmpeg")
+    if found:
+        return found
+    try:
+        import imageio_ffmpeg
+
+        return str(imageio_ffmpeg.get_ffmpeg_exe())
+    except (ImportError, RuntimeError):
+        raise VideoError(
+            "an .mp4 needs ffmpeg: install it, or pip install 'music_rllib[video]', or name a .gif"
+        ) from None
