@@ -10,7 +10,7 @@ PYTEST_ARGS ?=
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help venv sweep test test-unit lint type bench clean
+.PHONY: help venv sweep test test-unit test-faults lint type bench clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -47,6 +47,9 @@ test: venv  ## run the whole suite (CI=true: a missing service is a failure, not
 
 test-unit: venv  ## run the quick tests (under a minute)
 	@$(BIN)/python -m pytest tests/unit $(PYTEST_ARGS)
+
+test-faults: venv  ## kill, fill, cut and corrupt, and compare with unbroken runs (half an hour)
+	@$(BIN)/python -m pytest -m faults $(PYTEST_ARGS)
 
 lint: venv  ## ruff: rules and formatting
 	@$(BIN)/ruff check .

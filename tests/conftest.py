@@ -38,7 +38,13 @@ _IN_CI = os.environ.get("CI", "").lower() in ("1", "true")
 hypothesis.settings.load_profile("ci" if _IN_CI else "here")
 
 _TESTS = Path(__file__).parent
-_TIERS = {"unit": "unit", "contract": "unit", "integration": "integration", "e2e": "e2e"}
+_TIERS = {
+    "unit": "unit",
+    "contract": "unit",
+    "integration": "integration",
+    "e2e": "e2e",
+    "faults": "faults",
+}
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -15,7 +15,9 @@ from music_rllib.experiment.config import load_sweep
 from music_rllib.experiment.model import SweepConfig
 from music_rllib.experiment.plan import make_plan
 from music_rllib.sweep.board import Status
-from music_rllib.sweep.frame import FAILED
+from music_rllib.sweep.changes import changes_since, keep_settings
+from music_rllib.sweep.driving import driving
+from music_rllib.sweep.frame import FAILED, BadInputError
 from music_rllib.sweep.listener import Listener
 from music_rllib.sweep.local import (
     check_cpus,
@@ -55,6 +57,7 @@ def run_sweep(
     storage: str | None = None,
     name: str | None = None,
     seeds: str | None = None,
+    accept_changes: bool = False,
 ) -> int:
     """Train every run of a sweep, compare them, and log them to MLflow.
 
@@ -65,6 +68,7 @@ def run_sweep(
         storage: Replaces the file's `storage`.
         name: Replaces the file's `name`.
         seeds: Replaces the file's `seeds`: how many, or a list with commas.
+        accept_changes: Train runs anew whose settings are others than the last time.
 
     Returns:
         The exit code.
@@ -75,13 +79,13 @@ def run_sweep(
     try:
         path = config or DEFAULT_CONFIG
         loaded = load_sweep(path, name=name, storage=storage, seeds=seeds)
-        return _sweep(console, loaded, dry_run=dry_run)
+        return _sweep(console, loaded, dry_run=dry_run, accept_changes=accept_changes)
     except KeyboardInterrupt:
         _say_how_to_continue(console)
         return 128 + signal.SIGINT
 
 
-def _sweep(console: Console, config: SweepConfig, *, dry_run: bool) -> int:
+def _sweep(console: Console, config: SweepConfig, *, dry_run: bool, accept_changes: bool) -> int:
     """Run the whole program.
 
     Returns:
@@ -91,10 +95,22 @@ def _sweep(console: Console, config: SweepConfig, *, dry_run: bool) -> int:
         BadInputError: Nothing was started.
     """
     opened = _open(console, config)
+    changes = changes_since(opened)
     if dry_run:
+        if changes is not None:
+            console.print(Text(str(changes), style="yellow"), soft_wrap=True)
         console.print("Dry run: the configuration is sound, nothing was started.")
         return 0
+    if changes is not None and not accept_changes:
+        raise BadInputError(str(changes))
+    with driving(opened):
+        return _drive(console, opened)
+
+
+def _drive(console: Console, opened: Sweep) -> int:
+    """Run a sweep that nobody else drives."""
     keep_record(opened)
+    keep_settings(opened)
     import_checkpoints(opened.plan, opened.store)
     verify_inputs(opened.board, opened.store)
     if not opened.board.complete and (address := cluster_address()) is not None:
@@ -102,7 +118,7 @@ def _sweep(console: Console, config: SweepConfig, *, dry_run: bool) -> int:
     if opened.plan.searched:
         from music_rllib.sweep.searches import check_storages
 
-        check_storages(config)
+        check_storages(opened.config)
     tracker = _open_tracker(opened)
     with tracker:
         return _compute_and_report(console, opened, tracker)

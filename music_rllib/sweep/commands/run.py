@@ -30,6 +30,12 @@ def register(commands: Commands) -> None:
     parser.add_argument(
         "--dry-run", action="store_true", help="Check everything and show the plan; run nothing."
     )
+    parser.add_argument(
+        "--accept-changes",
+        action="store_true",
+        help="Where settings are others than the last time under this name: train anew what they "
+        "touch. Without it the command says what would be lost, and starts nothing.",
+    )
     add_json(parser)
     parser.set_defaults(execute=_execute)
 
@@ -68,4 +74,5 @@ def _execute(arguments: argparse.Namespace) -> int:
         storage=arguments.storage,
         name=arguments.name,
         seeds=arguments.seeds,
+        accept_changes=arguments.accept_changes,
     )

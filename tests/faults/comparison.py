@@ -1,0 +1,73 @@
+"""What two sweeps have in common where nothing was lost: every number, in store and MLflow."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from mlflow import MlflowClient
+
+from music_rllib.experiment.store import NodeStore
+from music_rllib.tracking import names
+
+Numbers = dict[str, list[tuple[int, dict[str, float]]]]
+
+
+def nodes(storage: Path) -> Numbers:
+    """Node key to its reports: environment steps and metrics, but for those about the machine."""
+    store = NodeStore(str(storage))
+    return {
+        folder.name: [
+            (report.env_steps, without_machine(report.metrics))
+            for report in store.history(folder.name)
+        ]
+        for folder in sorted((storage / "nodes").iterdir())
+        if not folder.name.startswith(".")
+    }
+
+
+def weights(storage: Path) -> dict[str, bytes]:
+    """Every file of weights that was handed over or could be."""
+    return {
+        str(path.relative_to(storage)): path.read_bytes()
+        for path in sorted((storage / "nodes").rglob("*.safetensors"))
+    }
+
+
+def without_machine(metrics: dict[str, float]) -> dict[str, float]:
+    return {name: value for name, value in metrics.items() if not name.startswith("system/")}
+
+
+def logged(tracking_uri: str, experiment: str = "points") -> Numbers:
+    """Run name to its metrics in MLflow, by step; fails where a step is there twice."""
+    client = MlflowClient(tracking_uri)
+    found = client.get_experiment_by_name(experiment)
+    assert found is not None
+    runs = client.search_runs([found.experiment_id])
+    assert len({run.info.run_name for run in runs}) == len(runs), "a run is there twice"
+    return {run.info.run_name: _steps(client, run) for run in runs if _is_of_a_node(run)}
+
+
+def _is_of_a_node(run: Any) -> bool:
+    return bool(run.data.tags.get(names.TAG_KIND) == names.KIND_RUN)
+
+
+def _steps(client: MlflowClient, run: Any) -> list[tuple[int, dict[str, float]]]:
+    steps: dict[int, dict[str, float]] = {}
+    for name in without_machine(run.data.metrics):
+        history = client.get_metric_history(run.info.run_id, name)
+        twice = [step for step, n in Counter(point.step for point in history).items() if n > 1]
+        assert not twice, f"{run.info.run_name}: {name} is there twice at {twice}"
+        for point in history:
+            steps.setdefault(point.step, {})[name] = point.value
+    return sorted(steps.items())
+
+
+def same(one: Path, other: Path, *, uri: str = "sqlite:///{}/mlflow.db") -> None:
+    """Both storages hold the same numbers, bit for bit."""
+    assert nodes(one) == nodes(other)
+    assert weights(one) == weights(other)
+    assert logged(uri.format(one)) == logged(uri.format(other))
+    assert not list((other / "work").iterdir()), "nothing is left of finished runs"
+    assert not list((other / "nodes").glob(".*")), "nothing is left of killed attempts"

@@ -1,0 +1,26 @@
+"""The fault-injection suite: `make test-faults` runs all of it, a plain `pytest` its quick half."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.integration.conftest import mlflow_runs, sweep_document, sweep_program
+
+__all__ = ["mlflow_runs", "sweep_document", "sweep_program"]
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out what takes many minutes, unless `-m` asks for faults."""
+    if "faults" in (config.option.markexpr or ""):
+        return
+    here = Path(__file__).parent
+    thorough = [
+        item
+        for item in items
+        if item.path.is_relative_to(here) and item.get_closest_marker("thorough")
+    ]
+    if thorough:
+        config.hook.pytest_deselected(items=thorough)
+        items[:] = [item for item in items if item not in thorough]

@@ -1,0 +1,140 @@
+"""A sweep whose configuration has changed since it was last run."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import pyarrow.fs as pafs
+import pytest
+import yaml
+
+from music_rllib.experiment.config import load_sweep
+from music_rllib.experiment.lease import Lease, LeaseFile
+from music_rllib.experiment.model import SweepConfig
+from music_rllib.experiment.plan import make_plan
+from music_rllib.experiment.result import RunResult
+from music_rllib.experiment.sealed import StorageError
+from music_rllib.sweep import changes as changes_module
+from music_rllib.sweep.changes import changes_since, keep_settings
+from music_rllib.sweep.driving import driving
+from music_rllib.sweep.session import Sweep, open_sweep
+
+RESULT = RunResult(label="l", env_steps=1200, seconds=1.0, metrics={})
+
+
+def opened(folder: Path, document: dict[str, Any]) -> Sweep:
+    path = folder / "sweep.yaml"
+    path.write_text(yaml.safe_dump(document, sort_keys=False))
+    config: SweepConfig = load_sweep(path)
+    storage = folder / "results"
+    return open_sweep(config, make_plan(config), str(storage), storage / config.name)
+
+
+def finish(sweep: Sweep, folder: Path, *labels: str) -> None:
+    (folder / "made").mkdir(exist_ok=True)
+    for node in sweep.plan.nodes:
+        if node.label in labels:
+            sweep.store.publish(node.key, folder / "made", RESULT)
+
+
+def test_what_changed_and_what_it_leaves_behind(
+    tmp_path: Path, sweep_document: dict[str, Any]
+) -> None:
+    first = opened(tmp_path, sweep_document)
+    assert changes_since(first) is None, "the first time"
+    keep_settings(first)
+    finish(first, tmp_path, "pretrain/Point/seed0")
+    begun = next(node for node in first.plan.nodes if node.label.startswith("finetune"))
+    with first.store.work_folder(begun.key).new_checkpoint(800):
+        pass
+    assert changes_since(opened(tmp_path, sweep_document)) is None, "nothing has changed"
+
+    sweep_document["stages"][1]["grid"]["tac.entropic_index"] = [1.0, 1.5, 2.0]
+    sweep_document["seeds"] = [0, 1]
+    assert changes_since(opened(tmp_path, sweep_document)) is None, "what is new costs nothing"
+
+    sweep_document["defaults"]["tac"]["lr"] = 0.01
+    changes = changes_since(opened(tmp_path, sweep_document))
+    assert changes is not None
+    assert changes.what == ("tac.lr: 0.001 -> 0.01 (3 runs)",)
+    assert set(changes.lost) == {
+        "pretrain/Point/seed0: is finished",
+        f"{begun.label}: is at 800 env steps",
+    }
+    text = str(changes)
+    assert text.startswith("the configuration of sweep 'points' has changed")
+    assert "--accept-changes" in text
+    assert "--name NEW" in text
+
+
+def test_a_new_version_of_the_algorithm_is_named(
+    tmp_path: Path, sweep_document: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = opened(tmp_path, sweep_document)
+    keep_settings(first)
+    finish(first, tmp_path, "pretrain/Point/seed0")
+    monkeypatch.setattr("music_rllib.experiment.plan.ALGORITHM_VERSION", "next")
+    monkeypatch.setattr(changes_module, "ALGORITHM_VERSION", "next")
+    changes = changes_since(opened(tmp_path, sweep_document))
+    assert changes is not None
+    (line,) = changes.what
+    assert line.startswith("version of the algorithm: ")
+    assert line.endswith(" -> next")
+
+
+def test_the_program_starts_nothing_until_changes_are_accepted(
+    sweep_program: Any, sweep_document: dict[str, Any]
+) -> None:
+    sweep_document["stages"] = sweep_document["stages"][:1]
+    first = opened(sweep_program.folder, sweep_document)
+    keep_settings(first)
+    finish(first, sweep_program.folder, "pretrain/Point/seed0")
+    sweep_document["defaults"]["tac"]["lr"] = 0.01
+    sweep_program.write(sweep_document)
+    code, output, errors = sweep_program.run()
+    assert code == 2
+    assert "tac.lr: 0.001 -> 0.01 (1 run)" in errors
+    assert "starting a local Ray" not in output
+    code, output, errors = sweep_program.run("--dry-run")
+    assert code == 0
+    assert "tac.lr: 0.001 -> 0.01 (1 run)" in output
+
+
+@pytest.mark.thorough
+def test_accepted_changes_are_trained(sweep_program: Any, sweep_document: dict[str, Any]) -> None:
+    sweep_document["stages"] = sweep_document["stages"][:1]
+    first = opened(sweep_program.folder, sweep_document)
+    keep_settings(first)
+    finish(first, sweep_program.folder, "pretrain/Point/seed0")
+    sweep_document["defaults"]["tac"]["lr"] = 0.01
+    sweep_program.write(sweep_document)
+    code, output, errors = sweep_program.run("--accept-changes")
+    assert (code, errors) == (0, ""), output
+    assert "pretrain/Point/seed0: finished" in output
+    assert len(list((sweep_program.folder / "results" / "nodes").iterdir())) == 2
+
+
+def test_a_second_driver_is_refused_and_a_dead_one_does_not_count(
+    tmp_path: Path, sweep_document: dict[str, Any]
+) -> None:
+    sweep = opened(tmp_path, sweep_document)
+    file = LeaseFile(pafs.LocalFileSystem(), str(sweep.folder / "driver.json"))
+    theirs = Lease.of_this_process("sweep 'points'")
+    assert file.acquire(theirs) is None
+    match = rf"points must be used by one process at a time.*\(process {os.getpid()} on "
+    with pytest.raises(StorageError, match=match), driving(sweep):
+        pass
+    file.release(theirs.owner)
+
+    child = os.fork()
+    if child == 0:
+        file.acquire(Lease.of_this_process("sweep 'points'"))
+        os.kill(os.getpid(), signal.SIGKILL)
+    os.waitpid(child, 0)
+    assert file.read() is not None
+    with driving(sweep):
+        assert file.is_owned_by(str(getattr(file.read(), "owner", None)))
+    assert file.read() is None

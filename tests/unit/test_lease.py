@@ -1,0 +1,131 @@
+"""Leases: one owner at a time, and none for ever."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pyarrow.fs as pafs
+import pytest
+from fsspec.implementations.memory import MemoryFileSystem
+
+from music_rllib.experiment import lease as lease_module
+from music_rllib.experiment.lease import HeldLease, Lease, LeaseFile, LeaseLostError
+from music_rllib.experiment.sealed import StorageError
+
+pytestmark = pytest.mark.faults
+
+
+@pytest.fixture(params=["disk", "object store"])
+def place(
+    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> LeaseFile:
+    if request.param == "disk":
+        return LeaseFile(pafs.LocalFileSystem(), str(tmp_path / "work" / "lease.json"))
+    monkeypatch.setattr(lease_module, "SETTLE_SECONDS", 0.05)
+    memory = MemoryFileSystem()
+    memory.store.clear()
+    memory.pseudo_dirs[:] = [""]
+    filesystem = pafs.PyFileSystem(pafs.FSSpecHandler(memory))
+    return LeaseFile(filesystem, "bucket/work/lease.json")
+
+
+def elsewhere(what: str = "another sweep", seconds: float = 60.0) -> Lease:
+    lease = Lease.of_this_process(what, seconds)
+    return lease.model_copy(update={"machine": "another one", "host": "far-away", "pid": 1})
+
+
+def test_a_held_lease_is_refused_and_its_holder_named(place: LeaseFile) -> None:
+    theirs = elsewhere()
+    assert place.acquire(theirs) is None
+    holder = place.acquire(Lease.of_this_process("mine"))
+    assert holder == theirs
+    assert str(holder).startswith("another sweep (process 1 on far-away, since ")
+    place.release(theirs.owner)
+    assert place.acquire(Lease.of_this_process("mine")) is None
+
+
+def test_an_expired_lease_is_taken_over_and_its_old_owner_writes_no_more(place: LeaseFile) -> None:
+    theirs, mine = elsewhere(seconds=-1.0), Lease.of_this_process("mine")
+    assert place.acquire(theirs) is None
+    held = HeldLease(place, theirs)
+    assert place.acquire(mine) is None
+    with pytest.raises(
+        LeaseLostError, match=r"lease\.json must name this process .* it names mine"
+    ):
+        held.check()
+    assert not place.renew(theirs)
+    held.release()
+    assert place.is_owned_by(mine.owner), "who lost it removes nothing"
+
+
+def test_a_lease_is_renewed_while_it_is_held(place: LeaseFile) -> None:
+    mine = Lease.of_this_process("mine", seconds=2.0)
+    place.acquire(mine)
+    held = HeldLease(place, mine)
+    deadline = time.monotonic() + 60
+    while (now := place.read()) is None or now.expires <= mine.expires + 2.0:
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    held.check()
+    held.release()
+    assert place.read() is None
+
+
+def test_the_lease_of_a_process_that_was_killed_here_needs_no_waiting(tmp_path: Path) -> None:
+    code = (
+        "import sys, time, pyarrow.fs as pafs\n"
+        "from music_rllib.experiment.lease import Lease, LeaseFile\n"
+        "LeaseFile(pafs.LocalFileSystem(), sys.argv[1]).acquire(Lease.of_this_process('theirs'))\n"
+        "print('held', flush=True)\n"
+        "time.sleep(600)\n"
+    )
+    path = tmp_path / "lease.json"
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE, text=True
+    )
+    with process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "held\n"
+        file, mine = LeaseFile(pafs.LocalFileSystem(), str(path)), Lease.of_this_process("mine")
+        assert file.acquire(mine) is not None
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+    assert file.acquire(mine) is None
+
+
+def test_of_many_at_once_one_gets_it(tmp_path: Path) -> None:
+    path = str(tmp_path / "lease.json")
+    won: list[str] = []
+
+    def contend() -> None:
+        file, lease = LeaseFile(pafs.LocalFileSystem(), path), Lease.of_this_process("one of many")
+        if file.acquire(lease) is None:
+            won.append(lease.owner)
+
+    threads = [threading.Thread(target=contend) for _ in range(12)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(won) == 1
+
+
+def test_half_a_lease_is_none(tmp_path: Path) -> None:
+    path = tmp_path / "lease.json"
+    path.write_text('{"owner": "x", "pi')
+    file = LeaseFile(pafs.LocalFileSystem(), str(path))
+    assert file.read() is None
+    assert file.acquire(Lease.of_this_process("mine")) is None
+
+
+def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "work").write_text("a file where the folder should be")
+    file = LeaseFile(pafs.LocalFileSystem(), str(tmp_path / "work" / "lease.json"))
+    with pytest.raises(StorageError, match=r"work.* must be writable"):
+        file.acquire(Lease.of_this_process("mine"))
