@@ -41,6 +41,8 @@ class ServeSettings(BaseModel):
     """Processes that compute actions."""
     cpus_per_replica: float = Field(1.0, gt=0)
     """CPUs reserved for each."""
+    token_required: bool = False
+    """Refuse to start without a token in the environment; for services beyond loopback."""
 
 
 def app(settings: ServeSettings) -> Application:
@@ -48,9 +50,12 @@ def app(settings: ServeSettings) -> Application:
 
     Raises:
         PolicyError: There is no such policy.
+        ValueError: A token is required and there is none.
     """
-    policy = load_policy(find_policy(settings.policy, settings.storage))
     token = os.environ.get(TOKEN_VARIABLE)
+    if settings.token_required and not token:
+        raise ValueError(f"{TOKEN_VARIABLE} must be set in the environment for token_required")
+    policy = load_policy(find_policy(settings.policy, settings.storage))
     deployment: Any = PolicyServer
     # The token's hash: a deployment's arguments are kept by Ray and may be shown.
     return deployment.options(

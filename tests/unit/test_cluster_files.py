@@ -1,0 +1,279 @@
+"""The files of `cluster/`: sound by their real schemas, which notice planted mistakes."""
+
+from __future__ import annotations
+
+import copy
+import os
+import re
+import shutil
+import stat
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+import music_rllib
+from cluster.check import ALL, KINDS, check_document, check_file
+from music_rllib.experiment.config import load_sweep
+
+ROOT = Path(__file__).parents[2]
+CLUSTER = ROOT / "cluster"
+JOB, RAY = "kuberay/rayjob/rayjob.yaml", "kuberay/raycluster/raycluster.yaml"
+
+
+@pytest.fixture(autouse=True)
+def token(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What `ray get-auth-token --generate` leaves."""
+    (tmp_path / "home" / ".ray").mkdir(parents=True)
+    (tmp_path / "home" / ".ray" / "auth_token").write_text("t")
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+
+
+def load(name: str) -> Any:
+    return yaml.safe_load((CLUSTER / name).read_text())
+
+
+@pytest.mark.parametrize("name", [name for name in ALL if name != "onprem.yaml"])
+def test_file_is_sound(name: str) -> None:
+    assert check_file(CLUSTER / name) == []
+
+
+def test_addresses_of_your_own_machines_must_be_put_in() -> None:
+    problems = check_file(CLUSTER / "onprem.yaml")
+    assert [problem.partition(":")[0] for problem in problems] == [
+        "provider.head_ip",
+        "provider.worker_ips.0",
+        "provider.worker_ips.1",
+    ]
+    document = load("onprem.yaml")
+    document["provider"] |= {"head_ip": "10.0.0.1", "worker_ips": ["10.0.0.2", "10.0.0.3"]}
+    assert check_document(document, CLUSTER / "onprem.yaml") == []
+
+
+def test_a_missing_token_is_noticed(tmp_path: Path) -> None:
+    (tmp_path / "home" / ".ray" / "auth_token").unlink()
+    (problem,) = check_file(CLUSTER / "aws.yaml")
+    assert "run 'ray get-auth-token --generate'" in problem
+
+
+Change = Callable[[Any], None]
+
+
+def put(place: str, value: Any) -> Change:
+    def change(document: Any) -> None:
+        *above, last = place.split("/")
+        for part in above:
+            document = document[int(part) if part.isdigit() else part]
+        if isinstance(document, list):
+            document[int(last)] = value
+        else:
+            document[last] = value
+
+    return change
+
+
+HEAD = "spec/headGroupSpec/template/spec/containers/0"
+JOB_HEAD = f"spec/rayClusterSpec/{HEAD.removeprefix('spec/')}"
+NODE = "available_node_types/cpu/node_config"
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "expected"),
+    [
+        ("aws.yaml", put("max_worker", 3), "max_worker"),
+        ("aws.yaml", put("head_node_type", "other"), "head_node_type"),
+        ("aws.yaml", put("upscaling_speed", "fast"), "fast"),
+        ("aws.yaml", put("available_node_types/cpu/min_worker", 1), "min_worker"),
+        ("aws.yaml", put("file_mounts/~x", "no/such/file"), "no/such/file must exist"),
+        ("aws.yaml", put("head_start_ray_commands", ["ray start --head"]), "RAY_AUTH_MODE=token"),
+        ("aws.yaml", put(f"{NODE}/InstanceTyp", "c7i.large"), "InstanceTyp"),
+        ("aws.yaml", put(f"{NODE}/MetadataOptions", {"HttpTokens": 3}), "HttpTokens"),
+        ("onprem.yaml", put("auth/ssh_users", "me"), "ssh_users"),
+        ("compose.yaml", put("services/head/imagee", "x"), "imagee"),
+        ("compose.yaml", put("services/head/ports", ["8265:8265"]), "127.0.0.1 only"),
+        ("compose.yaml", put("services/head/healthcheck/retry", 3), "retry"),
+        ("compose.yaml", put("services/worker/depends_on", ["haed"]), "must be a service"),
+        ("compose.yaml", put("services/mlflow/volumes", ["artefacts:/a"]), "under volumes"),
+        (RAY, put("spec/headGroupSpecs", {}), "headGroupSpecs"),
+        (RAY, put("spec/authOptions/mode", "tokens"), "tokens"),
+        (RAY, put("spec/workerGroupSpecs/0/replicas", "many"), "many"),
+        (RAY, put(f"{HEAD}/resource", {}), "resource"),
+        (RAY, put(f"{HEAD}/env", [{"name": "A", "valeu": "b"}]), "valeu"),
+        (RAY, put(f"{HEAD}/ports", [{"containerPort": "8265"}]), "8265"),
+        (JOB, put("spec/backOffLimit", 3), "backOffLimit"),
+        (JOB, put("spec/submissionMode", "Http"), "Http"),
+        (JOB, put(f"{JOB_HEAD}/volumeMounts/0/mountpath", "/x"), "mountpath"),
+        (JOB, put("metadata/name", "Sweep_1"), "Sweep_1"),
+        ("kuberay/storage/storage.yaml", put("spec/accessMode", []), "accessMode"),
+        ("serve.yaml", put("http_options/hots", "0.0.0.0"), "hots"),
+        ("serve.yaml", put("applications/0/args/replica", 2), "replica"),
+        ("serve.yaml", put("applications/0/args/token_required", False), "token_required"),
+    ],
+)
+def test_planted_mistake_is_found(name: str, change: Change, expected: str) -> None:
+    document = load(name)
+    change(document)
+    problems = check_document(document, CLUSTER / name)
+    assert any(expected in problem for problem in problems), problems
+
+
+def test_the_command_says_what_is_wrong(tmp_path: Path) -> None:
+    (tmp_path / "a.yaml").write_text("services: {head: {image: 3}}")
+    (tmp_path / "b.yaml").write_text("x: [")
+    done = subprocess.run(
+        [sys.executable, CLUSTER / "check.py", tmp_path / "a.yaml", tmp_path / "b.yaml"],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (2, "")
+    assert "services.head.image" in done.stdout
+    assert "while parsing" in done.stdout
+
+
+def test_every_file_with_a_schema_is_checked() -> None:
+    """A new file must not stay unchecked."""
+    others = {"sweep.yaml", "prometheus.yml"}
+    for path in CLUSTER.rglob("*.y*ml"):
+        name = path.relative_to(CLUSTER).as_posix()
+        assert name in ALL or name in others or path.name == "kustomization.yaml", name
+    assert len(KINDS) == 4
+
+
+# -- what must agree with the rest of the project ---------------------------------------------
+
+
+def exact(package: str) -> str:
+    found = re.search(rf"^{package}==(\S+)$", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
+    assert found
+    return found[1]
+
+
+def test_versions_agree() -> None:
+    assert load(RAY)["spec"]["rayVersion"] == exact("ray")
+    assert load(JOB)["spec"]["rayClusterSpec"]["rayVersion"] == exact("ray")
+    tags = set()
+    for path in [CLUSTER / "compose.yaml", CLUSTER / RAY, CLUSTER / JOB, CLUSTER / "Dockerfile"]:
+        tags |= set(re.findall(r"music-rllib(?:-mlflow)?:(\S+)", path.read_text()))
+    assert tags == {music_rllib.__version__}
+
+
+def test_sweeps_that_the_files_name_are_there() -> None:
+    entrypoint = load(JOB)["spec"]["entrypoint"]
+    (inside,) = re.findall(r"/opt/music_rllib/(\S+\.yaml)", entrypoint)
+    assert load_sweep(ROOT / inside).stages
+    sweep = load_sweep(CLUSTER / "sweep.yaml")
+    assert sweep.storage == "/results"
+    assert sweep.mlflow.tracking_uri == "http://mlflow:5000"
+
+
+def test_image_has_what_it_copies_and_runs_as_nobody_special() -> None:
+    text = (CLUSTER / "Dockerfile").read_text()
+    allowed = [
+        line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line[:1] == "!"
+    ]
+    for line in re.findall(r"^COPY (.*) \S+$", text, re.MULTILINE):
+        for source in line.split():
+            assert (ROOT / source).exists(), source
+            assert source in allowed, f".dockerignore keeps {source} out"
+    for stage in text.split("\nFROM ")[2:]:
+        assert re.search(r"^USER 1000$", stage, re.MULTILINE), stage[:40]
+    assert not re.search(r"(?im)^(ENV|ARG|RUN).*(password|secret|token|_key)", text)
+    (base,) = re.findall(r"^FROM (\S+:\S+)", text, re.MULTILINE)
+    assert re.search(r"\d", base.partition(":")[2]), "a moving tag"
+
+
+def test_kustomize_puts_the_objects_together() -> None:
+    kubectl = shutil.which("kubectl")
+    for name in ("raycluster", "rayjob"):
+        folder = CLUSTER / "kuberay" / name
+        document = yaml.safe_load((folder / "kustomization.yaml").read_text())
+        assert all((folder / resource).exists() for resource in document["resources"])
+        if kubectl is None:
+            continue
+        done = subprocess.run(
+            [kubectl, "kustomize", folder], capture_output=True, text=True, timeout=60, check=True
+        )
+        kinds = {entry["kind"] for entry in yaml.safe_load_all(done.stdout)}
+        assert kinds == {"PersistentVolumeClaim", {"raycluster": "RayCluster"}.get(name, "RayJob")}
+
+
+# -- secrets ----------------------------------------------------------------------------------
+
+
+def test_compose_takes_every_secret_from_the_environment(tmp_path: Path) -> None:
+    env = tmp_path / "env"
+    subprocess.run(["sh", CLUSTER / "make_env.sh", env], check=True, capture_output=True)
+    assert stat.S_IMODE(env.stat().st_mode) == 0o600
+    written = dict(line.split("=", 1) for line in env.read_text().splitlines())
+    text = (CLUSTER / "compose.yaml").read_text()
+    # With ":?" compose stops where it is missing; ":-" gives a default, which no secret may have.
+    required = set(re.findall(r"\$\{(\w+):\?", text))
+    assert required == set(written)
+    for name in re.findall(r"\$\{(\w+):-", text):
+        assert not re.search("PASSWORD|TOKEN|KEY", name)
+    assert not re.findall(r"\$\{\w+\}|\$[A-Z]\w+", text), "a variable that may silently be empty"
+    for line in re.findall(r"^.*(?:PASSWORD|TOKEN|SECRET_KEY)\w*: .*$", text, re.MULTILINE):
+        assert ":?" in line, line
+    secrets = [value for name, value in written.items() if "USERNAME" not in name]
+    assert len(set(secrets)) == len(secrets)
+    assert all(len(value) == 48 for value in secrets)
+    again = subprocess.run(["sh", CLUSTER / "make_env.sh", env], capture_output=True, check=False)
+    assert again.returncode == 1
+    assert dict(line.split("=", 1) for line in env.read_text().splitlines()) == written
+
+
+def test_secrets_file_is_ignored_by_git_and_by_images() -> None:
+    assert "cluster/.env" in (ROOT / ".gitignore").read_text().splitlines()
+    assert (ROOT / ".dockerignore").read_text().splitlines()[1] == "*"
+
+
+def test_token_authentication_is_on_everywhere() -> None:
+    services = load("compose.yaml")["services"]
+    for name in ("head", "worker"):
+        assert services[name]["environment"]["RAY_AUTH_MODE"] == "token"
+    assert load(RAY)["spec"]["authOptions"] == {"mode": "token"}
+    assert load(JOB)["spec"]["rayClusterSpec"]["authOptions"] == {"mode": "token"}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"MLFLOW_ADMIN_PASSWORD": ""}, "MLFLOW_ADMIN_PASSWORD must be set"),
+        ({"MLFLOW_ADMIN_PASSWORD": "short"}, "at least 12 characters"),
+        ({"MLFLOW_ADMIN_PASSWORD": "with%percent-in-it"}, "must have no %"),
+        ({"MLFLOW_FLASK_SERVER_SECRET_KEY": ""}, "must be set"),
+    ],
+)
+def test_mlflow_does_not_start_without_its_secrets(change: dict[str, str], message: str) -> None:
+    environment = {
+        "PATH": os.environ["PATH"],
+        "MLFLOW_BACKEND_STORE_URI": "sqlite:///x.db",
+        "MLFLOW_AUTH_DATABASE_URI": "sqlite:///y.db",
+        "MLFLOW_ADMIN_USERNAME": "music",
+        "MLFLOW_ADMIN_PASSWORD": "correct-horse-battery",
+        "MLFLOW_FLASK_SERVER_SECRET_KEY": "key",
+    }
+    done = subprocess.run(
+        ["sh", CLUSTER / "mlflow-server.sh"],
+        env=environment | change,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert message in done.stderr
+
+
+def test_copies_are_independent() -> None:
+    """The check must not change what it is given; `ray up` is given it afterwards."""
+    document = load("aws.yaml")
+    before = copy.deepcopy(document)
+    list(KINDS["provider"](document, CLUSTER / "aws.yaml"))
+    assert document == before
