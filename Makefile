@@ -10,7 +10,7 @@ PYTEST_ARGS ?=
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help venv sweep test test-unit test-faults lint type bench clean
+.PHONY: help venv sweep test test-unit test-faults lint type bench profile clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -58,8 +58,12 @@ lint: venv  ## ruff: rules and formatting
 type: venv  ## mypy --strict
 	@$(BIN)/mypy
 
-bench: venv  ## the learner's cost against a raw torch loop, both measured in this run
-	@$(BIN)/python -m benchmarks.learner
+bench: venv  ## what everything costs, as ratios in one run (BENCH='step environment': some of it)
+	@$(BIN)/python -m pip install -qq -c constraints.txt -e '.[bench]'
+	@$(BIN)/python -m benchmarks $(BENCH)
+
+profile: venv  ## write a flame graph of a training run to results/profile.svg
+	@$(BIN)/python -m benchmarks.profile
 
 clean:  ## remove caches and build output (keeps .venv and results)
 	@rm -rf build dist *.egg-info .pytest_cache .hypothesis .mypy_cache .ruff_cache

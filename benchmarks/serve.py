@@ -86,7 +86,7 @@ def service(policy: str, replicas: int) -> Iterator[str]:
     with socket.create_server(("127.0.0.1", 0)) as probe:
         port = probe.getsockname()[1]
     arguments = ["--port", str(port), "--replicas", str(replicas)]
-    process = subprocess.Popen(  # noqa: S603 - this project's own program
+    process = subprocess.Popen(
         [sys.executable, "-m", "music_rllib.serve", policy, *arguments],
         stdout=subprocess.PIPE,
         text=True,

@@ -1,0 +1,155 @@
+"""`make bench`: every cost that a sweep consists of, as ratios measured in one run."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import os
+import platform
+import sys
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from music_rllib._quiet import prepare_environment, quiet_third_parties
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from benchmarks.measure import Row
+
+GROUPS = {
+    "step": "training_step",
+    "environment": "environment",
+    "replay": "sampling",
+    "training": "whole_training",
+    "checkpoint": "checkpoint",
+    "memory": "memory",
+    "sweep": "sweep",
+}
+EXAMPLES = """\
+examples:
+  python -m benchmarks                       the whole table, about 30 minutes on an idle machine
+  python -m benchmarks step environment      two groups of it
+  python -m benchmarks --repeats 9 step      more turns
+
+Stable-Baselines3 is compared with where it is installed: pip install -e '.[bench]'.
+"""
+
+
+def main() -> int:
+    """Measures, prints and writes the table."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks",
+        description=__doc__,
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("groups", nargs="*", metavar="GROUP", help=f"of {', '.join(GROUPS)}")
+    parser.add_argument("--repeats", type=int, default=5, help="turns of each (default 5)")
+    parser.add_argument(
+        "--output", type=Path, default=Path("results/bench"), help="folder for bench.json and .md"
+    )
+    arguments = parser.parse_args()
+    if unknown := set(arguments.groups) - GROUPS.keys():
+        parser.error(f"GROUP must be one of {', '.join(GROUPS)}, got {', '.join(sorted(unknown))}")
+    if arguments.repeats < 1:
+        parser.error(f"--repeats must be >= 1, got {arguments.repeats}")
+    prepare_environment()
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    rows: list[Row] = []
+    before = os.getloadavg()[0]
+    for name in arguments.groups or GROUPS:
+        print(f"measuring: {name}", file=sys.stderr, flush=True)
+        rows += measure(name, arguments.repeats)
+        report(rows, before, arguments.output)
+    return 0
+
+
+def measure(name: str, repeats: int) -> Iterator[Row]:
+    """All rows of a group, with Ray and torch as in a trial: one thread."""
+    import ray
+    import torch
+
+    from music_rllib._allocator import keep_freed_memory
+
+    quiet_third_parties()
+    torch.set_num_threads(1)
+    keep_freed_memory()  # what is compared with gets it too
+    if not ray.is_initialized():
+        ray.init(num_cpus=2, include_dashboard=False, logging_level="error", log_to_driver=False)
+    module: Any = importlib.import_module(f"benchmarks.{GROUPS[name]}")
+    yield from module.rows(repeats)
+
+
+def report(rows: list[Row], load_before: float, folder: Path) -> None:
+    """Prints the table so far and writes it as JSON and Markdown."""
+    from rich.console import Console
+
+    machine = {
+        "cpu": _cpu(),
+        "cores": os.cpu_count(),
+        "python": platform.python_version(),
+        "load_average_before": round(load_before, 2),
+        "load_average_after": round(os.getloadavg()[0], 2),
+    }
+    described = ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in machine.items())
+    console = Console(width=max(110, Console().width))
+    console.print(as_table(rows))
+    console.print(described)
+    folder.mkdir(parents=True, exist_ok=True)
+    document = {"machine": machine, "rows": [asdict(row) for row in rows]}
+    (folder / "bench.json").write_text(json.dumps(document, indent=1) + "\n")
+    (folder / "bench.md").write_text(as_markdown(rows) + f"\n{described}\n")
+
+
+COLUMNS = ("group", "what", "value", "against", "ratio", "range", "target", "met")
+
+
+def cells(row: Row) -> tuple[str, ...]:
+    """A row as text, in the order of `COLUMNS`."""
+    spread = "" if row.low is None or row.high is None else f"{row.low:.2f} - {row.high:.2f}"
+    return (
+        row.group,
+        row.what,
+        f"{row.value:,.4g} {row.unit}",
+        row.against,
+        "" if row.ratio is None else f"{row.ratio:.2f}",
+        spread,
+        row.target,
+        {True: "yes", False: "NO", None: ""}[row.met],
+    )
+
+
+def as_table(rows: list[Row]) -> Table:
+    """For the screen."""
+    from rich.table import Table
+
+    table = Table(title="medians over interleaved turns, one thread each")
+    for column in COLUMNS:
+        right = column in ("value", "ratio", "range", "target")
+        table.add_column(column, justify="right" if right else "left", overflow="fold")
+    for row in rows:
+        table.add_row(*cells(row))
+    return table
+
+
+def as_markdown(rows: list[Row]) -> str:
+    """For the documentation."""
+    lines = ["| " + " | ".join(COLUMNS) + " |", "|" + "---|" * len(COLUMNS)]
+    lines += ["| " + " | ".join(cells(row)) + " |" for row in rows]
+    return "\n".join(lines) + "\n"
+
+
+def _cpu() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    return next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), "")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,62 @@
+"""Peak memory of one trial with a million transitions, in a process of its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import subprocess
+import sys
+from collections.abc import Iterator
+
+from benchmarks.measure import Row
+
+__all__ = ["rows"]
+
+TRANSITIONS = 1_000_000
+LIMIT = 1.2
+
+
+def rows(repeats: int) -> Iterator[Row]:
+    """Resident memory at its highest: Ray's client, torch, networks, replay, a checkpoint."""
+    del repeats  # it does not vary
+    finished = subprocess.run(
+        [sys.executable, "-m", "benchmarks.memory"],
+        stdout=subprocess.PIPE,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        check=True,
+    )
+    peak = json.loads(finished.stdout.splitlines()[-1])["peak_gb"]
+    yield Row(
+        "memory", f"one trial, {TRANSITIONS:,} transitions", peak, "GB",
+        target=f"<= {LIMIT:g}", met=peak <= LIMIT,
+    )  # fmt: skip
+
+
+def main() -> None:
+    """Trains with a full replay for a while, saves, and prints the highest resident memory."""
+    from tempfile import TemporaryDirectory
+
+    import ray
+
+    from benchmarks.checkpoint import save
+    from benchmarks.runs import fill, settings
+    from music_rllib._quiet import quiet_third_parties
+    from music_rllib.experiment.store import NodeStore
+    from music_rllib.experiment.training import TrainingRun
+
+    quiet_third_parties()
+    ray.init(num_cpus=1, include_dashboard=False, logging_level="error", log_to_driver=False)
+    training = TrainingRun(settings())
+    fill(training, TRANSITIONS)
+    training.advance()
+    with TemporaryDirectory() as folder:
+        from pathlib import Path
+
+        save(training, NodeStore(folder).work_folder("0" * 20), Path(folder), 1)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
+    print(json.dumps({"peak_gb": peak}))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,151 @@
+"""One training program in a process of its own: `python -m benchmarks.peer NAME`.
+
+Reads seconds from its input, a line each; trains for at least so long, and answers with a line of
+JSON: the environment steps and the seconds they took.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+from music_rllib._quiet import prepare_environment, quiet_third_parties
+
+__all__ = ["PEERS"]
+
+ENV_ID = "FetchPush-v4"
+WARM_UP = 1_000
+HIDDEN = [256, 256, 256]
+BATCH = 256
+
+
+def ours(replay_ratio: float, precision: str = "float32") -> Callable[[], int]:
+    """TAC with HER at q = 1 (SAC), four sub-environments."""
+    from music_rllib import TACConfig
+
+    config = TACConfig().environment(ENV_ID).env_runners(num_envs_per_env_runner=4)
+    config.training(
+        random_steps=WARM_UP, hidden_sizes=HIDDEN, batch_size=BATCH, replay_ratio=replay_ratio,
+        precision=precision,
+    )  # fmt: skip
+    config.replay(hindsight_k=4.0).reporting(min_sample_timesteps_per_iteration=1)
+    config.debugging(seed=0)
+    algo = config.build_algo()
+
+    def some_more() -> int:
+        algo.train()
+        return int(algo.env_steps)
+
+    return some_more
+
+
+def rllib_sac(*, plain: bool) -> Callable[[], int]:
+    """RLlib's SAC at one update an environment step, without hindsight (it has none)."""
+    import gymnasium as gym
+    from ray.rllib.algorithms.sac import SACConfig
+    from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
+    from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, NUM_ENV_STEPS_SAMPLED_LIFETIME
+    from ray.tune.registry import register_env
+
+    from music_rllib.envs.make import make_env
+
+    def flat(_: Any) -> gym.Env[Any, Any]:
+        make_env(ENV_ID).close()  # registers the robotics tasks
+        env = gym.make(ENV_ID)
+        kept: Any = gym.wrappers.FilterObservation(env, ["observation", "desired_goal"])
+        return gym.wrappers.FlattenObservation(kept)
+
+    register_env("flat-push", flat)
+    config = SACConfig().environment("flat-push").env_runners(num_env_runners=0)
+    config.training(
+        train_batch_size_per_learner=BATCH,
+        training_intensity=BATCH,
+        num_steps_sampled_before_learning_starts=WARM_UP,
+        initial_alpha=0.05,
+    )
+    if plain:
+        model = DefaultModelConfig(
+            fcnet_hiddens=HIDDEN, fcnet_activation="relu", head_fcnet_hiddens=[]
+        )
+        config.rl_module(model_config=model)
+    config.reporting(min_sample_timesteps_per_iteration=20, min_time_s_per_iteration=0)
+    config.debugging(seed=0)
+    algo = config.build_algo()
+
+    def some_more() -> int:
+        result = algo.train()
+        return int(result[ENV_RUNNER_RESULTS][NUM_ENV_STEPS_SAMPLED_LIFETIME])
+
+    return some_more
+
+
+def sb3_sac(train_freq: int, gradient_steps: int) -> Callable[[], int]:
+    """Stable-Baselines3's SAC with its HerReplayBuffer."""
+    import gymnasium as gym
+    from stable_baselines3 import SAC, HerReplayBuffer
+
+    from music_rllib.envs.make import make_env
+
+    make_env(ENV_ID).close()  # registers the robotics tasks
+    model = SAC(
+        "MultiInputPolicy",
+        gym.make(ENV_ID),
+        replay_buffer_class=HerReplayBuffer,
+        replay_buffer_kwargs={"n_sampled_goal": 4, "goal_selection_strategy": "future"},
+        batch_size=BATCH,
+        learning_starts=WARM_UP,
+        train_freq=train_freq,
+        gradient_steps=gradient_steps,
+        ent_coef=0.05,
+        policy_kwargs={"net_arch": HIDDEN},
+        seed=0,
+        device="cpu",
+    )
+
+    def some_more() -> int:
+        model.learn(50, reset_num_timesteps=False)
+        return int(model.num_timesteps)
+
+    return some_more
+
+
+PEERS: dict[str, Callable[[], Callable[[], int]]] = {
+    "ours": lambda: ours(1.0),
+    "ours, ratio 0.4": lambda: ours(0.4),
+    "ours, bf16": lambda: ours(1.0, "bf16"),
+    "RLlib SAC": lambda: rllib_sac(plain=False),
+    "RLlib SAC, same networks": lambda: rllib_sac(plain=True),
+    "SB3 SAC+HER": lambda: sb3_sac(1, 1),
+    "SB3 SAC+HER, ratio 0.4": lambda: sb3_sac(5, 2),
+}
+
+
+def main() -> None:
+    """Warms up until learning has begun, and then serves turns."""
+    prepare_environment()
+    answers, sys.stdout = sys.stdout, sys.stderr
+    import torch
+
+    torch.set_num_threads(1)
+    if not sys.argv[1].startswith("SB3"):
+        import ray
+
+        ray.init(num_cpus=1, include_dashboard=False, logging_level="error", log_to_driver=False)
+    quiet_third_parties()
+    train = PEERS[sys.argv[1]]()
+    while (steps := train()) < WARM_UP + 50:
+        pass
+    print(json.dumps({"ready": steps}), file=answers, flush=True)
+    for line in sys.stdin:
+        first, begin = steps, time.perf_counter()
+        while time.perf_counter() - begin < float(line):
+            steps = train()
+        taken = time.perf_counter() - begin
+        print(json.dumps({"steps": steps - first, "seconds": taken}), file=answers, flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,36 @@
+"""Runs on FetchPush whose replay is filled with random trajectories, to weigh and to save."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from benchmarks.sampling import LAYOUT, random_trajectory
+from music_rllib.envs.registry import BUILT_IN_TASKS
+from music_rllib.experiment.settings import RunSettings
+from music_rllib.experiment.training import TrainingRun
+
+__all__ = ["fill", "settings"]
+
+
+def settings(env_steps: int = 10**6, seed: int = 0) -> RunSettings:
+    """TAC with HER as in the `small` preset's measure: 3 x 256 networks, 0.4 updates a step."""
+    return RunSettings.model_validate(
+        {
+            "task": BUILT_IN_TASKS["FetchPush"],
+            "variant": "tac",
+            "seed": seed,
+            "env_steps": env_steps,
+            "evaluation": {"interval": max(env_steps // 2, 1), "episodes": 4},
+            "tac": {"replay_ratio": 0.4, "random_steps": 400},
+            "replay": {"capacity": 10**6, "hindsight_k": 4.0},
+        }
+    )
+
+
+def fill(training: TrainingRun, transitions: int) -> None:
+    """Adds random trajectories until the replay holds so many transitions."""
+    rng = np.random.default_rng(0)
+    some = [random_trajectory(rng) for _ in range(100)]
+    while len(training.algorithm.replay) < transitions:
+        training.algorithm.replay.extend(some)
+    assert training.algorithm.replay.layout == LAYOUT

@@ -1,0 +1,81 @@
+"""Minibatches of 256 from replays of 1,000 to 20,000 trajectories."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.measure import Row, interleaved, ratio_row
+from music_rllib.replay.buffer import ReplayLayout, Trajectory, TrajectoryReplay
+
+__all__ = ["filled_replay", "random_trajectory", "rows"]
+
+GROUP = "replay"
+LAYOUT = ReplayLayout(observation=25, action=4, goal=3, horizon=50)
+BATCH, CALLS, PER_CALL = 256, 4, 50
+Floats = NDArray[np.float32]
+KINDS = ("uniform", "HER", "MUSIC-p")
+
+
+def random_trajectory(rng: np.random.Generator) -> Trajectory:
+    """An episode with the shapes of FetchPush's."""
+    frames = rng.standard_normal((LAYOUT.horizon + 1, LAYOUT.frame), dtype=np.float32)
+    actions = rng.uniform(-1, 1, (LAYOUT.horizon, LAYOUT.action)).astype(np.float32)
+    return Trajectory(frames, actions, np.full(LAYOUT.horizon, -1.0, np.float32), False)
+
+
+def filled_replay(trajectories: int, kind: str = "uniform") -> TrajectoryReplay:
+    """A replay that is full with so many trajectories."""
+
+    def reward(achieved: Floats, desired: Floats) -> Floats:
+        far = np.linalg.norm(achieved - desired, axis=-1) > 0.05
+        return -np.asarray(far, np.float32)
+
+    rng = np.random.default_rng(0)
+    replay = TrajectoryReplay(
+        LAYOUT,
+        trajectories * LAYOUT.horizon,
+        rng,
+        goal_reward=reward if kind == "HER" else None,
+        hindsight_k=4.0 if kind == "HER" else 0.0,
+    )
+    some = [random_trajectory(rng) for _ in range(100)]
+    for _ in range(trajectories // 100):
+        replay.extend(some, rng.uniform(0, 1e-2, 100) if kind == "MUSIC-p" else None)
+    return replay
+
+
+def minibatches(replay: TrajectoryReplay) -> Callable[[], None]:
+    """A turn of minibatches, drawn as in training: `PER_CALL` of them behind each other."""
+
+    def turn() -> None:
+        for _ in range(CALLS):
+            replay.sample_transitions(PER_CALL * BATCH)
+
+    return turn
+
+
+def rows(repeats: int) -> Iterator[Row]:
+    """Milliseconds a minibatch: flat in the replay's size, and -p near to uniform."""
+    sizes = (1_000, 10_000, 20_000)
+    turns = {(kind, n): minibatches(filled_replay(n, kind)) for kind in KINDS for n in sizes}
+    taken = interleaved({f"{kind} {n}": turn for (kind, n), turn in turns.items()}, repeats)
+    for kind, n in turns:
+        times = taken[f"{kind} {n}"]
+        value = statistics.median(times) / (CALLS * PER_CALL) * 1e3
+        what = f"{kind}, {n:,} trajectories"
+        if kind == "MUSIC-p":
+            against, peer, limit = "uniform", taken[f"uniform {n}"], 2.0
+        else:
+            against, peer, limit = "1,000 trajectories", taken[f"{kind} 1000"], None
+        ratios = [a / b for a, b in zip(times, peer, strict=True)]
+        if kind == "HER" and n == max(sizes):
+            yield Row(GROUP, f"{what}: a minibatch", value, "ms", target="<= 0.25",
+                      met=value <= 0.25)  # fmt: skip
+        yield ratio_row(
+            GROUP, what, value, "ms/minibatch", against=f"{against} (time)", ratios=ratios,
+            at_most=limit,
+        )  # fmt: skip

@@ -1,0 +1,117 @@
+"""A sweep of eight runs against the same runs without one, two at a time; a run's start-up."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import ray
+import yaml
+
+from benchmarks.measure import Row, ratio_row
+from benchmarks.runs import settings
+
+__all__ = ["rows"]
+
+GROUP = "sweep"
+RUNS, ENV_STEPS, AT_A_TIME = 8, 12_000, 2
+ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+
+
+def rows(repeats: int) -> Iterator[Row]:
+    """One round for the eight runs, which take minutes; the start-up in several."""
+    yield from start_up(repeats)
+    ray.shutdown()  # the sweep brings its own
+    bare = bare_runs()
+    whole = sweep()
+    yield ratio_row(
+        GROUP, f"{RUNS} runs of {ENV_STEPS:,} steps", whole, "s",
+        against=f"the same runs bare, {AT_A_TIME} at a time (time)", ratios=[whole / bare],
+        at_most=1.05,
+    )  # fmt: skip
+
+
+def sweep() -> float:
+    """Wall time of the whole program, its Ray and its MLflow store included."""
+    run = settings(ENV_STEPS)
+    document = {
+        "name": "bench",
+        "tasks": ["FetchPush"],
+        "seeds": list(range(RUNS)),
+        "resources": {"num_cpus": AT_A_TIME, "cpus_per_run": 1},
+        "defaults": {
+            "env_steps": run.env_steps,
+            "evaluation": run.evaluation.model_dump(mode="json"),
+            "tac": {"replay_ratio": run.tac.replay_ratio, "random_steps": run.tac.random_steps},
+            "replay": {"capacity": run.replay.capacity, "hindsight_k": run.replay.hindsight_k},
+        },
+        "stages": [{"name": "train", "variant": "tac"}],
+    }
+    with TemporaryDirectory() as folder:
+        file = Path(folder, "bench.yaml")
+        file.write_text(yaml.safe_dump(document | {"storage": f"{folder}/results"}))
+        return _wall_time("-m", "music_rllib.sweep", str(file))
+
+
+def bare_runs() -> float:
+    """Wall time of as many plain processes, each of which trains one run and nothing else."""
+    begin = time.perf_counter()
+    with ThreadPoolExecutor(AT_A_TIME) as pool:
+        list(pool.map(lambda seed: _wall_time("-m", "benchmarks.sweep", str(seed)), range(RUNS)))
+    return time.perf_counter() - begin
+
+
+def _wall_time(*arguments: str) -> float:
+    begin = time.perf_counter()
+    subprocess.run(
+        [sys.executable, *arguments], env=ENVIRONMENT, stdout=subprocess.DEVNULL, check=True
+    )
+    return time.perf_counter() - begin
+
+
+class Starter:
+    """What a trial's process does until its first episode has been played."""
+
+    def first_step(self) -> int:
+        from music_rllib.experiment.training import TrainingRun
+
+        training = TrainingRun(settings())
+        training.algorithm.env_runner.sample(num_episodes=1)
+        return os.getpid()
+
+
+def start_up(repeats: int) -> Iterator[Row]:
+    """From asking Ray for a process to the first environment steps."""
+    actor = ray.remote(num_cpus=1)(Starter)
+    taken = []
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        starter = actor.remote()
+        ray.get(starter.first_step.remote())
+        taken.append(time.perf_counter() - begin)
+        ray.kill(starter)
+    middle = sorted(taken)[len(taken) // 2]
+    yield Row(GROUP, "start of a run to its first steps", middle, "s", target="<= 6",
+              met=middle <= 6)  # fmt: skip
+
+
+def train(seed: int) -> None:
+    """One run without a sweep around it."""
+    from music_rllib._quiet import quiet_third_parties
+    from music_rllib.experiment.training import TrainingRun
+
+    quiet_third_parties()
+    ray.init(num_cpus=1, include_dashboard=False, logging_level="error", log_to_driver=False)
+    training = TrainingRun(settings(ENV_STEPS, seed))
+    while not training.finished:
+        training.advance()
+
+
+if __name__ == "__main__":
+    train(int(sys.argv[1]))

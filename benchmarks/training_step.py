@@ -1,0 +1,151 @@
+"""One training step (sampling, relabelling, update) against bare torch and the matrix products."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
+from typing import Any
+
+import torch
+
+from benchmarks.measure import Row, interleaved, ratio_row
+from benchmarks.raw_torch import HIDDEN, RawUpdate
+from music_rllib import TACConfig
+from music_rllib.tac.algorithm import TAC
+from music_rllib.tac.precision import has_bf16
+
+__all__ = ["rows"]
+
+GROUP = "training step"
+UPDATES = 50
+BATCH, INPUTS, ACTIONS = 256, 28, 4
+VARIANTS: dict[str, dict[str, Any]] = {
+    "TAC": {},
+    "TAC, HER": {"hindsight_k": 4.0},
+    "TAC, HER, frozen estimator": {"hindsight_k": 4.0, "estimator": "frozen"},
+    "TAC, HER, trained estimator": {"hindsight_k": 4.0, "estimator": "trained"},
+}
+
+
+def algorithm(hindsight_k: float = 0.0, estimator: str = "none", **training: Any) -> TAC:
+    """TAC on FetchPush, 10,000 random transitions in its replay."""
+    config = TACConfig().environment("FetchPush-v4").env_runners(num_envs_per_env_runner=4)
+    config.training(entropic_index=1.5, alpha=0.05, random_steps=10_000, **training)
+    config.replay(capacity=10_000, hindsight_k=hindsight_k).debugging(seed=0)
+    weight = 0.0 if estimator == "none" else 1.0
+    config.music(
+        agent_indices=range(3),
+        surrounding_indices=range(3, 6),
+        estimator=estimator,
+        mi_reward_weight=weight,
+    )
+    algo: TAC = config.build_algo()
+    while len(algo.replay) < 10_000:
+        algo.training_step()
+    return algo
+
+
+def updates(algo: TAC) -> Callable[[], None]:
+    """A turn of `UPDATES` updates: sampling and relabelling, and the Learner's call."""
+
+    def turn() -> None:
+        algo.learner_group.update(batch=algo.sample_batch(UPDATES), timesteps={})
+
+    return turn
+
+
+def raw_updates(*, bf16: bool = False) -> Callable[[], None]:
+    """A turn of `UPDATES` updates in bare torch."""
+    raw = RawUpdate(INPUTS, ACTIONS, BATCH, q=1.5, alpha=0.05, bf16=bf16)
+
+    def turn() -> None:
+        for _ in range(UPDATES):
+            raw.step()
+
+    return turn
+
+
+def products() -> Callable[[], None]:
+    """A turn of matrix products with the FLOPs of `UPDATES` updates, at the networks' size."""
+    width = HIDDEN[0]
+    left, right = torch.randn(BATCH, width), torch.randn(width, width)
+    count = round(UPDATES * flops(INPUTS, ACTIONS, HIDDEN, BATCH) / (2 * BATCH * width * width))
+
+    def turn() -> None:
+        for _ in range(count):
+            left @ right
+
+    return turn
+
+
+def flops(inputs: int, actions: int, hidden: Sequence[int], batch: int) -> int:
+    """Multiplications and additions of all matrix products in one update."""
+
+    def layers(first: int, last: int) -> list[int]:
+        return [a * b for a, b in pairwise([first, *hidden, last])]
+
+    def cost(sizes: list[int], passes: str) -> int:
+        whole, upper = sum(sizes), sum(sizes[1:])
+        return sum({"forward": whole, "weights": whole, "inputs": whole, "hidden": upper}[p]
+                   for p in passes.split())  # fmt: skip
+
+    trained = "forward weights hidden"
+    policy = cost(layers(inputs, 2 * actions), trained)
+    value = cost(layers(inputs, 1), trained) + cost(layers(inputs, 1), "forward")
+    critic = layers(inputs + actions, 1)
+    critics = 2 * cost(critic, trained) + 2 * cost(critic, "forward inputs")
+    return 2 * batch * (policy + value + critics)
+
+
+def rows(repeats: int) -> Iterator[Row]:
+    """Against bare torch in the same run, and bare torch against the matrix products."""
+    ours = {name: updates(algorithm(**settings)) for name, settings in VARIANTS.items()}
+    turns = {"raw": raw_updates(), "products": products(), **ours}
+    if has_bf16():
+        turns["raw, bf16"] = raw_updates(bf16=True)
+        turns["TAC, HER, bf16"] = updates(algorithm(hindsight_k=4.0, precision="bf16"))
+    taken = interleaved(turns, repeats)
+    floor = taken["products"]
+    for name, times in taken.items():
+        if name == "products":
+            continue
+        rate = UPDATES / statistics.median(times)
+        against, peer, limit = "raw torch", taken["raw"], 1.12
+        if name == "raw":
+            against, peer, limit = "its matrix products", floor, 1.5
+        elif name == "TAC, HER, trained estimator":
+            against, peer, limit = "TAC, HER", taken["TAC, HER"], 1.35
+        elif "bf16" in name:
+            name = name.replace(", bf16", "") + ", bf16"
+            without = name.removesuffix(", bf16")
+            ratios = [a / b for a, b in zip(taken[without], times, strict=True)]
+            yield ratio_row(
+                GROUP, name, rate, "updates/s", against="float32 (speed)", ratios=ratios,
+                at_least=1.5,
+            )  # fmt: skip
+            continue
+        ratios = [a / b for a, b in zip(times, peer, strict=True)]
+        yield ratio_row(
+            GROUP, name, rate, "updates/s", against=f"{against} (time)", ratios=ratios,
+            at_most=limit,
+        )  # fmt: skip
+    if torch.cuda.is_available():
+        yield from on_gpu(repeats)
+
+
+def on_gpu(repeats: int) -> Iterator[Row]:
+    """Updates a second with the Learner on the GPU, at two batch sizes."""
+    for batch in (256, 4096):
+        algo = algorithm(hindsight_k=4.0, batch_size=batch)
+        turn = updates(algo)
+        turn()
+        times = []
+        for _ in range(repeats):
+            begin = time.perf_counter()
+            turn()
+            torch.cuda.synchronize()
+            times.append(time.perf_counter() - begin)
+        rate = UPDATES / statistics.median(times)
+        yield Row(GROUP, f"TAC, HER, GPU, batch {batch}", rate, "updates/s")
