@@ -74,6 +74,8 @@ class Logbook(Listener):
         self._store = store
         self._open: set[str] = set()
         """Nodes whose run the tracker has begun."""
+        self._waiting: dict[str, list[Report]] = {}
+        """Reports that the tracker could not keep yet, by node."""
         self._complained = False
 
     def reused(self, node: Node, store: NodeStore) -> None:
@@ -96,24 +98,35 @@ class Logbook(Listener):
 
     def started(self, node: Node) -> None:
         """Open the node's MLflow run, or go on with the one it has."""
+        self._begin(node)
+
+    def _begin(self, node: Node) -> bool:
         if self._try(lambda: self._tracker.start(run_info(node))):
             self._open.add(node.key)
+        return node.key in self._open
 
     def reported(self, node: Node, reports: list[Report]) -> None:
         """Log metrics with their original time, so that repeats are the same."""
+        self._waiting.setdefault(node.key, []).extend(reports)
+        self._catch_up(node)
+
+    def _catch_up(self, node: Node) -> bool:
+        """Log what waits, in order: a later step must not come before an earlier one."""
+        waiting = self._waiting.get(node.key, [])
 
         def log() -> None:
-            for report in reports:
+            while waiting:
+                report = waiting[0]
                 self._tracker.log(
                     node.key, report.metrics, report.env_steps, report.timestamp_ms / 1000
                 )
+                del waiting[0]
 
-        if node.key in self._open:
-            self._try(log)
+        return (node.key in self._open or self._begin(node)) and self._try(log)
 
     def finished(self, node: Node, result: RunResult) -> None:
-        """Close the run, with its policy."""
-        if node.key not in self._open:
+        """Close the run, with its policy; where that can't be, the next sweep does it."""
+        if not self._catch_up(node):
             return
         with self._policy(node) as artefacts:
             self._try(lambda: self._tracker.finish(node.key, "FINISHED", artefacts=artefacts))
@@ -134,9 +147,7 @@ class Logbook(Listener):
 
     def failed(self, node: Node, failure: Failure) -> None:
         """Close the run with its cause."""
-        if node.key not in self._open:  # its worker didn't even come up
-            self.started(node)
-        if node.key in self._open:
+        if self._catch_up(node):
             self._try(lambda: self._tracker.finish(node.key, "FAILED", failure=failure.cause))
 
     def pruned(self, node: Node, reason: str) -> None:
@@ -155,7 +166,10 @@ class Logbook(Listener):
             log()
         except TrackingError as error:
             if not self._complained:
-                self._complain(f"MLflow gets nothing from here on, training goes on: {error}")
+                self._complain(f"MLflow gets nothing for now, training goes on: {error}")
             self._complained = True
             return False
+        if self._complained:
+            self._complained = False
+            self._complain("what MLflow is to get can be kept again")
         return True

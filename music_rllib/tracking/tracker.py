@@ -19,6 +19,7 @@ from typing import Self
 import yaml
 
 from music_rllib.tracking import names
+from music_rllib.tracking.errors import TrackingError
 from music_rllib.tracking.provenance import provenance_tags
 from music_rllib.tracking.redaction import flat_params, redact, without_secrets
 from music_rllib.tracking.sender import Backlog
@@ -118,6 +119,8 @@ class Tracker:
         self._open: dict[str, Spool] = {}
         self._checked_names: set[str] = set()
         self._left: Backlog | None = None
+        self._unwritten: str | None = None
+        """Why something could not even be kept on disk."""
         try:
             self._begin(sweep_name, config, tags or {})
         except BaseException:
@@ -262,15 +265,23 @@ class Tracker:
         The second call only repeats the first one's answer.
         """
         if self._left is None:
-            for node_key in list(self._open):
-                self.finish(node_key, "KILLED")
-            self._session.parent.spool.append([_finish(status, time.time(), None)])
+            try:
+                for node_key in list(self._open):
+                    self.finish(node_key, "KILLED")
+                self._session.parent.spool.append([_finish(status, time.time(), None)])
+            except TrackingError as error:  # results are in the store: this must not hide them
+                self._unwritten = str(error)
             self._left = self._session.close(timeout)
         return self._left
 
     def undelivered_message(self) -> str | None:
         """What did not arrive, where it is kept and how to send it; None where all arrived."""
         left = self.backlog()
+        if self._unwritten is not None:
+            return (
+                f"MLflow doesn't have everything: {self._unwritten}. Repeat the command when that "
+                "is mended: what is finished is logged from the storage"
+            )
         if not left:
             return None
         command = shlex.join(["python", "-m", "music_rllib.tracking", "deliver"])
