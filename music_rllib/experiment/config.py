@@ -144,7 +144,7 @@ def _resolve(file: YamlFile, document: dict[str, Any], findings: Findings) -> Sw
     if header and any(stage and stage.search for stage in stages.values()):
         for position, one in enumerate(header.seeds):
             if one >= FINAL_SEED:
-                rule = f"must be < {FINAL_SEED} in a search, whose fresh seeds begin there, got {one}"
+                rule = f"must be < {FINAL_SEED}, where a search's fresh seeds begin, got {one}"
                 findings.add(("seeds", position), rule)
     if findings.problems or header is None:
         return None

@@ -26,7 +26,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from music_rllib.experiment.sealed import StorageError
 
-__all__ = ["HeldLease", "Lease", "LeaseFile", "LeaseLostError"]
+__all__ = ["HeldLease", "Lease", "LeaseFile", "LeaseLostError", "runs_here", "this_machine"]
 
 EXPIRES_SECONDS = 60.0
 """How long a lease holds that isn't renewed; clocks of machines should agree better than that."""
@@ -83,7 +83,7 @@ class Lease(BaseModel):
         """Whether its owner may still be at work."""
         if time.time() >= self.expires:
             return False
-        return self.machine != this_machine() or _runs(self.pid, self.process_started)
+        return self.machine != this_machine() or runs_here(self.pid, self.process_started)
 
     def __str__(self) -> str:
         since = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(self.since))
@@ -99,7 +99,8 @@ def this_machine() -> str:
         return f"{socket.gethostname()} {uuid.getnode()}"
 
 
-def _runs(pid: int, started: float) -> bool:
+def runs_here(pid: int, started: float) -> bool:
+    """Whether this machine has that process, and it is the one that began then."""
     try:
         process = psutil.Process(pid)
         return abs(process.create_time() - started) < 10 and process.status() != "zombie"

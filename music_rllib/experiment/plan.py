@@ -80,6 +80,8 @@ class Plan:
         self.name = name
         self.seeds = tuple(seeds)
         self.runs: list[Run] = []
+        self.trials: list[dict[str, Any]] = []
+        """What `add_trial` was called with, as plain data."""
         self._known: set[tuple[str, str]] = set()
         self._nodes: dict[str, Node] = {}
         self._by_cell: dict[tuple[str, int, str, int], Run] = {}
@@ -160,6 +162,15 @@ class Plan:
                 )
                 self._add(run, settings, node_input)
                 runs.append(run)
+        self.trials.append(
+            {
+                "stage": stage,
+                "trial": trial,
+                "values": dict(values),
+                "seeds": list(seeds),
+                "part": part,
+            }
+        )
         return runs
 
     def _trial_input(

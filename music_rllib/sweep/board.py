@@ -110,6 +110,13 @@ class Board:
             self._status[key] = Status.WAITING
             self.changes += 1
 
+    def recall(self, node: Node, *, finished: bool) -> None:
+        """A node of a trial that ended earlier: nothing is to be computed."""
+        if node.key not in self._nodes:
+            self._nodes[node.key] = node
+            self._status[node.key] = Status.REUSED if finished else Status.PRUNED
+            self.changes += 1
+
     def _is_lost(self, key: str) -> bool:
         return self._status.get(key) in (Status.FAILED, Status.SKIPPED)
 

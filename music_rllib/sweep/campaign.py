@@ -129,6 +129,42 @@ class Campaign(Listener):
 
     # -- going on ----------------------------------------------------------------------------
 
+    def recall(self) -> None:
+        """Put the runs of trials that have ended before this driver began into the plan."""
+        for search in self.searches:
+            for arm in search.arms:
+                for trial in arm.study.trials():
+                    if trial.state.is_finished() and VALUES in trial.user_attrs:
+                        self._recall(search, arm, trial)
+
+    def _recall(self, search: Search, arm: Arm, trial: FrozenTrial) -> None:
+        reached = [int(rung) for rung in trial.user_attrs.get(SCORES, {})]
+        rung = search.rungs[min(max(reached, default=0), len(search.rungs) - 1)]
+        try:
+            runs = self._plan.add_trial(
+                search.stage.name,
+                trial.number * len(search.arms) + arm.position,
+                {**arm.values, **trial.user_attrs[VALUES]},
+                self._plan.seeds[: rung.seeds],
+                f"trial{trial.number}",
+            )
+        except ConfigError:
+            return  # that is why it failed
+        for run in runs:
+            node = self._plan.node(run.key)
+            for one in (self._source_of(node), node):
+                if one is None or self._board.knows(one.key):
+                    continue
+                finished = self._store.is_finished(one.key)
+                self._board.recall(one, finished=finished)
+                if finished:
+                    self._reused(one)
+
+    def _source_of(self, node: Node) -> Node | None:
+        if node.input is None or node.input.checkpoint is not None:
+            return None
+        return self._plan.node(node.input.key)
+
     def advance(self) -> bool:
         """Judge what can be judged and put what is wanted next on the board.
 
@@ -210,8 +246,8 @@ class Campaign(Listener):
 
     def _want(self, run: Run, until: int | None) -> None:
         node = self._plan.node(run.key)
-        if node.input is not None and node.input.checkpoint is None:
-            self._want_node(self._plan.node(node.input.key), None)
+        if (source := self._source_of(node)) is not None:
+            self._want_node(source, None)
         self._want_node(node, until if until is None or until < node.run.env_steps else None)
 
     def _want_node(self, node: Node, until: int | None) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import signal
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,9 +14,11 @@ from rich.text import Text
 
 from music_rllib.experiment.config import load_sweep
 from music_rllib.experiment.model import SweepConfig
-from music_rllib.experiment.plan import make_plan
+from music_rllib.experiment.plan import Node, make_plan
+from music_rllib.sweep import records
+from music_rllib.sweep.beacon import Beacon
 from music_rllib.sweep.board import Status
-from music_rllib.sweep.changes import changes_since, keep_settings
+from music_rllib.sweep.changes import Changes, changes_since, keep_settings
 from music_rllib.sweep.driving import driving
 from music_rllib.sweep.frame import FAILED, BadInputError
 from music_rllib.sweep.listener import Listener
@@ -31,18 +34,19 @@ from music_rllib.sweep.preflight import (
     verify_inputs,
 )
 from music_rllib.sweep.records import SEARCH, as_json, keep
-from music_rllib.sweep.session import Sweep, keep_record, open_sweep
-from music_rllib.sweep.tables import plan_view, results_table, search_views
+from music_rllib.sweep.session import Sweep, keep_record, open_sweep, plan_document
+from music_rllib.sweep.tables import plan_view, results_table, search_runs, search_views
 from music_rllib.tracking import names
 from music_rllib.tracking.redaction import redact
 
 if TYPE_CHECKING:
     from music_rllib.sweep.campaign import Campaign
     from music_rllib.sweep.display import Display
+    from music_rllib.sweep.find import Found
     from music_rllib.sweep.logbook import Logbook
     from music_rllib.tracking.tracker import Tracker
 
-__all__ = ["DEFAULT_CONFIG", "run_sweep"]
+__all__ = ["DEFAULT_CONFIG", "resume_sweep", "run_sweep"]
 
 DEFAULT_CONFIG = Path(__file__).with_name("default.yaml")
 NAMED = 10
@@ -58,6 +62,7 @@ def run_sweep(
     name: str | None = None,
     seeds: str | None = None,
     accept_changes: bool = False,
+    answer: Callable[[dict[str, Any]], None] = lambda document: None,
 ) -> int:
     """Train every run of a sweep, compare them, and log them to MLflow.
 
@@ -69,6 +74,7 @@ def run_sweep(
         name: Replaces the file's `name`.
         seeds: Replaces the file's `seeds`: how many, or a list with commas.
         accept_changes: Train runs anew whose settings are others than the last time.
+        answer: Takes the plan of a dry run, or the sweep's last `state.json`, as plain data.
 
     Returns:
         The exit code.
@@ -79,13 +85,40 @@ def run_sweep(
     try:
         path = config or DEFAULT_CONFIG
         loaded = load_sweep(path, name=name, storage=storage, seeds=seeds)
-        return _sweep(console, loaded, dry_run=dry_run, accept_changes=accept_changes)
+        return _sweep(console, loaded, answer, dry_run=dry_run, accept_changes=accept_changes)
     except KeyboardInterrupt:
         _say_how_to_continue(console)
         return 128 + signal.SIGINT
 
 
-def _sweep(console: Console, config: SweepConfig, *, dry_run: bool, accept_changes: bool) -> int:
+def resume_sweep(
+    console: Console,
+    found: Found,
+    *,
+    seeds: str | None = None,
+    answer: Callable[[dict[str, Any]], None] = lambda document: None,
+) -> int:
+    """Go on with a sweep by the configuration in its storage; the exit code.
+
+    Raises:
+        BadInputError: Nothing was started; as other errors that say what to change.
+    """
+    try:
+        loaded = found.config(seeds)
+        return _sweep(console, loaded, answer, dry_run=False, accept_changes=False)
+    except KeyboardInterrupt:
+        _say_how_to_continue(console)
+        return 128 + signal.SIGINT
+
+
+def _sweep(
+    console: Console,
+    config: SweepConfig,
+    answer: Callable[[dict[str, Any]], None],
+    *,
+    dry_run: bool,
+    accept_changes: bool,
+) -> int:
     """Run the whole program.
 
     Returns:
@@ -100,11 +133,47 @@ def _sweep(console: Console, config: SweepConfig, *, dry_run: bool, accept_chang
         if changes is not None:
             console.print(Text(str(changes), style="yellow"), soft_wrap=True)
         console.print("Dry run: the configuration is sound, nothing was started.")
+        answer(plan_answer(opened, changes))
         return 0
     if changes is not None and not accept_changes:
         raise BadInputError(str(changes))
     with driving(opened):
-        return _drive(console, opened)
+        code = _drive(console, opened)
+    answer(records.read(opened.storage, f"{config.name}/{records.STATE}") or {})
+    return code
+
+
+def plan_answer(opened: Sweep, changes: Changes | None = None) -> dict[str, Any]:
+    """The plan as plain data."""
+    config = opened.config
+    searches = [
+        {
+            "stage": stage.name,
+            "mode": stage.search.mode,
+            "sampler": stage.search.sampler,
+            "studies": len(stage.search.arms()),
+            "trials": stage.search.count,
+            "runs_at_most": search_runs(stage, stage.search, len(config.seeds)),
+            "space": stage.search.model_dump(mode="json", by_alias=True)["space"],
+        }
+        for stage in config.stages
+        if stage.search is not None
+    ]
+    nodes = [
+        node | {"finished": node["key"] in opened.finished}
+        for node in plan_document(opened)["nodes"]
+    ]
+    return {
+        "sweep": config.name,
+        "storage": redact(opened.storage),
+        "seeds": list(config.seeds),
+        "runs": len(opened.plan.runs),
+        "env_steps": opened.plan.env_steps,
+        "env_steps_left": sum(node["env_steps"] for node in nodes if not node["finished"]),
+        "nodes": nodes,
+        "searches": searches,
+        "changes": None if changes is None else str(changes),
+    }
 
 
 def _drive(console: Console, opened: Sweep) -> int:
@@ -156,15 +225,16 @@ def _compute_and_report(console: Console, opened: Sweep, tracker: Tracker) -> in
     from music_rllib.sweep.display import Display
     from music_rllib.sweep.logbook import Logbook
 
-    with Display(console, opened.plan, opened.board) as display:
+    with Display(console, opened.plan, opened.board) as display, Beacon(opened) as beacon:
         logbook = Logbook(tracker, lambda text: display.say(text, "yellow"), opened.store)
         _take_over(opened, display, logbook)
-        campaign = _open_campaign(opened, display, logbook)
-        stopped_by = _compute(opened, display, logbook, campaign)
-    failed = bool(opened.board.having(Status.FAILED, Status.SKIPPED)) or (
-        stopped_by is None and not opened.board.complete
-    )
-    searches = [] if campaign is None else _close_campaign(opened, campaign, tracker)
+        campaign = _open_campaign(opened, display, logbook, beacon)
+        stopped_by = _compute(opened, display, logbook, beacon, campaign)
+        failed = bool(opened.board.having(Status.FAILED, Status.SKIPPED)) or (
+            stopped_by is None and not opened.board.complete
+        )
+        searches = [] if campaign is None else _close_campaign(opened, campaign, tracker)
+        beacon.end("stopped" if stopped_by else "failed" if failed else "finished")
     tracker.close("KILLED" if stopped_by else "FAILED" if failed else "FINISHED")
     console.print(
         results_table(opened.plan, opened.board.__getitem__, opened.results(), tracker.run_id)
@@ -191,20 +261,28 @@ def _take_over(opened: Sweep, display: Display, logbook: Logbook) -> None:
         logbook.reused(node, opened.store)
 
 
-def _open_campaign(opened: Sweep, display: Display, logbook: Logbook) -> Campaign | None:
+def _open_campaign(
+    opened: Sweep, display: Display, logbook: Logbook, beacon: Beacon
+) -> Campaign | None:
     """The sweep's searches, if it has any, as far as earlier results lead."""
     if not opened.plan.searched:
         return None
     from music_rllib.sweep.campaign import Campaign
-    from music_rllib.sweep.searches import open_searches
+    from music_rllib.sweep.searches import open_searches, outcome
+
+    def reused(node: Node) -> None:
+        logbook.reused(node, opened.store)
+        beacon.reused(node)
 
     campaign = Campaign(
         opened,
         open_searches(opened),
-        reused=lambda node: logbook.reused(node, opened.store),
+        reused=reused,
         pruned=logbook.pruned,
         say=display.say,
     )
+    beacon.searches = lambda: outcome(campaign, thorough=False)
+    campaign.recall()
     campaign.advance()
     return campaign
 
@@ -222,7 +300,11 @@ def _close_campaign(opened: Sweep, campaign: Campaign, tracker: Tracker) -> list
 
 
 def _compute(
-    opened: Sweep, display: Display, logbook: Logbook, campaign: Campaign | None
+    opened: Sweep,
+    display: Display,
+    logbook: Logbook,
+    beacon: Beacon,
+    campaign: Campaign | None,
 ) -> int | None:
     """Compute what is left, if anything; the signal that stopped it."""
     if opened.board.complete and (campaign is None or campaign.over):
@@ -232,7 +314,9 @@ def _compute(
     address = cluster_address()
     display.say("starting a local Ray" if address is None else f"connecting to Ray at {address}")
 
-    listeners: list[Listener] = [logbook, display, *([campaign] if campaign else [])]
+    listeners: list[Listener] = [logbook, display, beacon]
+    if campaign is not None:
+        listeners.append(campaign)
 
     def on_stop() -> None:
         display.say("stopping, this takes a few seconds; Ctrl-C again stops at once", "yellow")

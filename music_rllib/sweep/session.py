@@ -5,17 +5,17 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from music_rllib.experiment.files import write_atomically
 from music_rllib.experiment.model import SweepConfig
 from music_rllib.experiment.plan import Plan
 from music_rllib.experiment.result import RunResult
-from music_rllib.experiment.sealed import StorageError
 from music_rllib.experiment.store import NodeStore
 from music_rllib.sweep.board import Board, Status
-from music_rllib.tracking.redaction import redact
+from music_rllib.sweep.records import CONFIG, PLAN, as_json, keep
+from music_rllib.tracking.redaction import redact, without_secrets
 
-__all__ = ["Sweep", "keep_record", "open_sweep"]
+__all__ = ["Sweep", "keep_record", "open_sweep", "plan_document"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,12 +62,8 @@ def open_sweep(config: SweepConfig, plan: Plan, storage: str, folder: Path) -> S
     )
 
 
-def keep_record(sweep: Sweep) -> None:
-    """Write the configuration and the plan into the sweep's folder.
-
-    Raises:
-        StorageError: The folder can't be written.
-    """
+def plan_document(sweep: Sweep) -> dict[str, Any]:
+    """The runs, those of searches as far as they are chosen."""
     nodes = [
         {
             "key": node.key,
@@ -77,13 +73,25 @@ def keep_record(sweep: Sweep) -> None:
         }
         for node in sweep.plan.nodes
     ]
-    try:
-        sweep.folder.mkdir(parents=True, exist_ok=True)
-        write_atomically(sweep.folder / "sweep.yaml", sweep.config.text.encode())
-        write_atomically(
-            sweep.folder / "plan.json",
-            json.dumps({"storage": redact(sweep.storage), "nodes": nodes}, indent=1).encode(),
-        )
-    except OSError as error:
-        place = error.filename or sweep.folder
-        raise StorageError(f"{place} must be writable: {error.strerror}") from error
+    return {"storage": redact(sweep.storage), "nodes": nodes, "trials": sweep.plan.trials}
+
+
+def keep_record(sweep: Sweep) -> None:
+    """Write the configuration and the plan into the sweep's folder.
+
+    Raises:
+        StorageError: The folder can't be written.
+    """
+    keep(sweep, "sweep.yaml", sweep.config.text)
+    keep(sweep, CONFIG, as_json(_configuration(sweep.config)))
+    keep(sweep, PLAN, as_json(plan_document(sweep)))
+
+
+def _configuration(config: SweepConfig) -> dict[str, Any]:
+    """All of it, without secrets, and with paths that mean the same from anywhere."""
+    document: dict[str, Any] = json.loads(as_json(without_secrets(config.document)))
+    for stage in document["stages"]:
+        source = stage.get("init_from")
+        if isinstance(source, dict) and source.get("checkpoint"):
+            source["checkpoint"] = str(Path(source["checkpoint"]).expanduser().absolute())
+    return document

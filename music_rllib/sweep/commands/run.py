@@ -66,6 +66,7 @@ def add_sweep_options(parser: argparse.ArgumentParser) -> None:
 
 def _execute(arguments: argparse.Namespace) -> int:
     from music_rllib.sweep.driver import run_sweep
+    from music_rllib.sweep.frame import print_json
 
     return run_sweep(
         console_for(arguments),
@@ -74,5 +75,6 @@ def _execute(arguments: argparse.Namespace) -> int:
         storage=arguments.storage,
         name=arguments.name,
         seeds=arguments.seeds,
+        answer=print_json if arguments.json else lambda document: None,
         accept_changes=arguments.accept_changes,
     )

@@ -1,0 +1,90 @@
+"""`status`: how far a sweep is."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from typing import TYPE_CHECKING, Any
+
+from music_rllib.sweep.frame import (
+    BadInputError,
+    Commands,
+    add_json,
+    add_place,
+    console_for,
+    print_json,
+)
+
+if TYPE_CHECKING:
+    from music_rllib.sweep.find import Found
+
+__all__ = ["register", "state_of"]
+
+EPILOG = """\
+examples:
+  python -m music_rllib.sweep status results/smoke
+  python -m music_rllib.sweep status results/smoke --watch
+      again and again, until the sweep ends
+  python -m music_rllib.sweep status s3://bucket/sweeps/smoke --json
+"""
+
+
+def register(commands: Commands) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        "status",
+        help="how far a sweep is: stages, trials, runs, budget, best so far",
+        description="How far a sweep is: stages, trials, runs, budget spent and left, best so far.",
+        epilog=EPILOG,
+    )
+    add_place(parser)
+    parser.add_argument(
+        "--watch", action="store_true", help="Show it again every few seconds until it ends."
+    )
+    parser.add_argument(
+        "--interval", type=float, default=3.0, metavar="SECONDS", help="Of --watch (default 3)."
+    )
+    add_json(parser)
+    parser.set_defaults(execute=_execute)
+
+
+def _execute(arguments: argparse.Namespace) -> int:
+    from music_rllib.sweep.find import find_sweep
+    from music_rllib.sweep.status_view import status_view
+
+    found = find_sweep(arguments.sweep, arguments.storage)
+    if arguments.json and arguments.watch:
+        raise BadInputError("--json must be given without --watch, got both")
+    console = console_for(arguments)
+    state = state_of(found)
+    if arguments.json:
+        print_json(state)
+        return 0
+    if not arguments.watch:
+        console.print(status_view(state))
+        return 0
+    from rich.live import Live
+
+    with Live(console=console, auto_refresh=False) as live:
+        while True:
+            live.update(status_view(state), refresh=True)
+            if state["state"] != "running":
+                return 0
+            time.sleep(max(arguments.interval, 0.2))
+            state = state_of(found)
+
+
+def state_of(found: Found) -> dict[str, Any]:
+    """`state.json`, with what became of its driver."""
+    from music_rllib.sweep import records
+    from music_rllib.sweep.beacon import is_alive
+
+    state = found.read(records.STATE)
+    if state is None:
+        return {"sweep": found.name, "place": found.place, "state": "not started"}
+    alive = is_alive(state)
+    outcome = state["driver"]["outcome"]
+    if outcome == "running" and not alive:
+        outcome = "interrupted"
+        state["running"] = []
+    return {"place": found.place, "state": outcome, **state}

@@ -1,0 +1,54 @@
+"""`compare` as a table."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from music_rllib.experiment.plan import short
+from music_rllib.sweep.tables import with_interval
+from music_rllib.sweep.words import percent
+
+__all__ = ["compare_view"]
+
+
+def compare_view(document: Mapping[str, Any]) -> RenderableType:
+    """One table for each group of conditions that may be compared."""
+    if not document["groups"]:
+        return Text(f"Stage {document['stage']} of {document['sweep']} has no finished run yet.")
+    parts: list[RenderableType] = []
+    for group in document["groups"]:
+        parts += [_table(document, group), Text(group["verdict"])]
+    return Group(*parts)
+
+
+def _table(document: Mapping[str, Any], group: Mapping[str, Any]) -> Table:
+    rows = group["conditions"]
+    title = f"{document['metric']} of {document['stage']} {group['part']}".strip()
+    table = Table(title=title, title_justify="left")
+    settings = dict.fromkeys(name for row in rows for name in row["values"])
+    tasks = dict.fromkeys(task for row in rows for task in row["tasks"])
+    for name in settings:
+        table.add_column(name, justify="right")
+    table.add_column("IQM, 95 %", justify="right")
+    for task in tasks if len(tasks) > 1 else ():
+        table.add_column(task, justify="right")
+    for name in ("runs", "P(first is better)", ""):
+        table.add_column(name, justify="right")
+    for row in rows:
+        table.add_row(
+            *(short(row["values"][name]) if name in row["values"] else "-" for name in settings),
+            with_interval(row["value"], row["interval"]),
+            *(
+                f"{row['tasks'][task]:.3g}" if task in row["tasks"] else "-"
+                for task in (tasks if len(tasks) > 1 else ())
+            ),
+            f"{row['runs']} of {row['planned']}",
+            percent(row["best_is_better_with"]),
+            "overlaps" if row["overlaps_best"] else "",
+        )
+    return table
