@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import shutil
 import tempfile
+import time
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from ray.rllib.algorithms.algorithm import Algorithm
-from ray.rllib.core import COMPONENT_EVAL_ENV_RUNNER, DEFAULT_MODULE_ID
+from ray.rllib.core import (
+    COMPONENT_EVAL_ENV_RUNNER,
+    COMPONENT_RL_MODULE,
+    DEFAULT_MODULE_ID,
+)
 from ray.rllib.core.columns import Columns
+from ray.rllib.env.env_runner_group import EnvRunnerGroup
 from ray.rllib.policy.sample_batch import MultiAgentBatch, SampleBatch
 from ray.rllib.utils.checkpoints import Checkpointable
 from ray.rllib.utils.metrics import (
@@ -36,6 +42,8 @@ from music_rllib.tac.module import ESTIMATOR_MODULE
 
 __all__ = ["TAC"]
 
+REVIVE_SECONDS = 300.0
+"""How long a remote environment runner that died may take to come back."""
 UPDATES_PER_CALL = 100
 """Updates whose minibatches are sampled and sent together: few enough to stay in the cache."""
 
@@ -60,6 +68,10 @@ class TAC(Algorithm):
         self.grad_updates = 0
         """Gradient updates done so far."""
         self.replay = self._make_replay()
+        self._runner_states: dict[int, StateDict] = {}
+        """Remote runners' random streams after their last episodes, by worker index."""
+        for index, state in self._ask_runners(_stream_of):
+            self._runner_states[index] = state
 
     def _make_replay(self) -> TrajectoryReplay:
         settings = self._replay_settings
@@ -124,18 +136,64 @@ class TAC(Algorithm):
 
     def _collect(self, *, random_actions: bool) -> list[Episode]:
         """One episode in every sub-environment."""
-        group = self.env_runner_group
-        remote = group.num_healthy_remote_workers() > 0
-        samples = group.foreach_env_runner(
-            lambda runner: (runner.sample(random_actions=random_actions), runner.get_metrics()),
-            local_env_runner=not remote,
-        )
-        if not samples:
-            raise RuntimeError("no environment runner is alive to collect episodes")
+
+        def play(runner: TrajectoryEnvRunner) -> tuple[list[Episode], Any]:
+            return runner.sample(random_actions=random_actions), runner.get_metrics()
+
+        remote = bool(self._runner_states)
+        samples = self._collect_from_afar(play) if remote else [play(self.env_runner)]
         self.metrics.aggregate([metrics for _, metrics in samples], key=ENV_RUNNER_RESULTS)
         episodes = [episode for sampled, _ in samples for episode in sampled]
         self.env_steps += sum(len(episode) for episode in episodes)
         return episodes
+
+    # -- remote environment runners, which may die ----------------------------------------
+
+    def _ask_runners(self, question: Callable[[Any], Any], among: Iterable[int] = ()) -> list[Any]:
+        """Answers of the remote runners that are alive, of all or of those named."""
+        answers: list[Any] = self.env_runner_group.foreach_env_runner(
+            question, local_env_runner=False, remote_worker_ids=sorted(among) or None
+        )
+        return answers
+
+    def _collect_from_afar(self, play: Callable[[Any], Any]) -> list[tuple[list[Episode], Any]]:
+        """One round of every remote runner, in their order; a dead one plays it again.
+
+        Raises:
+            RuntimeError: one did not come back.
+        """
+
+        def play_and_tell(runner: TrajectoryEnvRunner) -> tuple[Any, tuple[int, StateDict]]:
+            return play(runner), _stream_of(runner)
+
+        samples: dict[int, tuple[list[Episode], Any]] = {}
+        give_up = time.monotonic() + REVIVE_SECONDS
+        while missing := self._runner_states.keys() - samples.keys():
+            for sample, (index, state) in self._ask_runners(play_and_tell, missing):
+                samples[index], self._runner_states[index] = sample, state
+            if self._runner_states.keys() - samples.keys():
+                if time.monotonic() > give_up:
+                    raise RuntimeError(
+                        f"environment runners {sorted(missing)} died and did not come back within "
+                        f"{REVIVE_SECONDS:.0f} s"
+                    )
+                if not self.restore_env_runners(self.env_runner_group):
+                    time.sleep(0.5)
+        return [samples[index] for index in sorted(samples)]
+
+    def restore_env_runners(self, env_runner_group: EnvRunnerGroup) -> list[int]:
+        """Brings dead runners back, with the random streams that they would have gone on with."""
+        restored: list[int] = super().restore_env_runners(env_runner_group)
+        if restored and env_runner_group is self.env_runner_group:
+            self._put_back_streams(restored)
+            env_runner_group.sync_weights(
+                from_worker_or_learner_group=self.learner_group, inference_only=True
+            )
+        return restored
+
+    def _put_back_streams(self, indices: Iterable[int]) -> None:
+        states = {index: self._runner_states[index] for index in indices}
+        self._ask_runners(lambda runner: runner.set_state(states[runner.worker_index]), states)
 
     def _observe_inputs(self, episodes: list[Episode]) -> None:
         """Shows the new states to the normaliser, also with the goals that hindsight will use."""
@@ -260,6 +318,7 @@ class TAC(Algorithm):
         if self._check_component(self.REPLAY, components, not_components):
             state[self.REPLAY] = _ReplayComponent(self.replay).get_state()
         state[_COUNTERS] = {"env_steps": self.env_steps, "grad_updates": self.grad_updates}
+        state[_RUNNERS] = dict(self._runner_states)
         return state
 
     def set_state(self, state: StateDict) -> None:
@@ -272,11 +331,22 @@ class TAC(Algorithm):
         if _COUNTERS in state:
             self.env_steps = state[_COUNTERS]["env_steps"]
             self.grad_updates = state[_COUNTERS]["grad_updates"]
+        if (
+            self._runner_states.keys()
+            and self._runner_states.keys() == state.get(_RUNNERS, {}).keys()
+        ):
+            self._runner_states = dict(state[_RUNNERS])
+            self._put_back_streams(self._runner_states)
 
 
-_COUNTERS = "tac_counters"
+_COUNTERS, _RUNNERS = "tac_counters", "tac_runners"
 _REPLAY_STREAM = 101
 """Keeps the replay's random stream apart from the environment runners'."""
+
+
+def _stream_of(runner: TrajectoryEnvRunner) -> tuple[int, StateDict]:
+    """Worker index, and what its next episodes depend on beside the weights."""
+    return runner.worker_index, runner.get_state(not_components=COMPONENT_RL_MODULE)
 
 
 class _ReplayComponent(Checkpointable):

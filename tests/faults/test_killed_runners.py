@@ -1,0 +1,43 @@
+"""`kill -9` of remote environment runners, whose episodes go on where they were."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+import pytest
+
+from music_rllib.tac.algorithm import TAC
+from tests.integration.test_tac_algorithm import build, fingerprint
+
+pytestmark = pytest.mark.usefixtures("local_ray")
+
+
+def remote_runner() -> TAC:
+    return build(where={"num_env_runners": 1})
+
+
+def kill_runner(algo: TAC) -> None:
+    (pid,) = algo._ask_runners(lambda runner: os.getpid())
+    assert pid != os.getpid()
+    os.kill(pid, signal.SIGKILL)
+
+
+@pytest.mark.filterwarnings("ignore")  # Ray says what happened
+def test_a_killed_runner_changes_no_number(tmp_path: Path) -> None:
+    unbroken = remote_runner()
+    expected = [fingerprint(unbroken, 1) for _ in range(4)]
+    unbroken.stop()
+    algo = remote_runner()
+    kill_runner(algo)
+    assert fingerprint(algo, 1) == expected[0]
+    assert fingerprint(algo, 1) == expected[1]
+    kill_runner(algo)
+    assert fingerprint(algo, 1) == expected[2]
+    algo.save_to_path(tmp_path / "checkpoint")
+    algo.stop()
+    resumed = remote_runner()
+    resumed.restore_from_path(tmp_path / "checkpoint")
+    assert fingerprint(resumed, 1) == expected[3]
+    resumed.stop()
