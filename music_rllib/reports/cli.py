@@ -34,6 +34,9 @@ EPILOG = """
     python -m music_rllib.report results/smoke --export published/smoke --format csv
         its runs and metrics as plain tables; `report published/smoke` reads them again
 
+    python -m music_rllib.report results/smoke --export published/smoke --add
+        the same, and what another machine has exported there stays
+
 **Exit codes**: 0 the report is written, whatever state the sweep is in; 2 there is no such sweep.
 """
 
@@ -83,11 +86,17 @@ def report(
     format_: Annotated[
         TableFormat, typer.Option("--format", help="Of the exported tables.")
     ] = TableFormat.parquet,
+    add: Annotated[
+        bool,
+        typer.Option(
+            "--add", help="With --export: keep the runs that an earlier export has there."
+        ),
+    ] = False,
 ) -> None:
     """One self-contained page about a sweep, with its figures (PNG, SVG) and numbers (CSV)."""
     try:
         if export is not None:
-            _export(sweep, storage, tracking_uri, export, format_)
+            _export(sweep, storage, tracking_uri, export, format_, add=add)
         else:
             _report(sweep, storage, tracking_uri, output, difference, seed, attach=attach)
     except (ReportError, TrackingError) as error:
@@ -96,15 +105,30 @@ def report(
 
 
 def _export(
-    place: str, storage: str, tracking_uri: str | None, folder: Path, table_format: TableFormat
+    place: str,
+    storage: str,
+    tracking_uri: str | None,
+    folder: Path,
+    table_format: TableFormat,
+    *,
+    add: bool,
 ) -> None:
-    from music_rllib.reports.archive import write_archive
+    from music_rllib.reports.archive import is_archive, read_archive, write_archive
     from music_rllib.reports.locate import find_sweep
+    from music_rllib.reports.merge import merged
 
-    found = find_sweep(place, storage=storage, tracking_uri=tracking_uri)
-    write_archive(found.sweep, folder, table_format.value)
-    values = sum(len(column.run) for column in found.sweep.history.values())
-    typer.echo(f"{len(found.sweep.runs)} runs, {values} values: {folder}")
+    sweep = find_sweep(place, storage=storage, tracking_uri=tracking_uri).sweep
+    if add and is_archive(folder):
+        earlier = read_archive(folder)
+        if earlier.name != sweep.name:
+            raise ReportError(
+                f"--add needs an export of the same sweep, got {earlier.name!r} in {folder} and "
+                f"{sweep.name!r}"
+            )
+        sweep = merged(earlier, sweep)
+    write_archive(sweep, folder, table_format.value)
+    values = sum(len(column.run) for column in sweep.history.values())
+    typer.echo(f"{len(sweep.runs)} runs, {values} values: {folder}")
 
 
 def _report(
