@@ -82,7 +82,7 @@ def keep_record(sweep: Sweep) -> None:
     Raises:
         StorageError: The folder can't be written.
     """
-    keep(sweep, "sweep.yaml", sweep.config.text)
+    keep(sweep, "sweep.yaml", redact(sweep.config.text))
     keep(sweep, CONFIG, as_json(_configuration(sweep.config)))
     keep(sweep, PLAN, as_json(plan_document(sweep)))
 

@@ -1,0 +1,152 @@
+"""Planted secrets: an MLflow server with a password, and a look into all that is written."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import stat
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import requests
+
+from music_rllib.tracking.redaction import redact
+
+ROOT = Path(__file__).parents[2]
+USER, PASSWORD = "music", "planted-mlflow-password"
+PLANTED = {
+    "MLFLOW_TRACKING_USERNAME": USER,
+    "MLFLOW_TRACKING_PASSWORD": PASSWORD,
+    "AWS_SECRET_ACCESS_KEY": "planted-aws-key",
+    "MUSIC_RLLIB_SERVE_TOKEN": "planted-serve-token",
+    "RAY_AUTH_TOKEN": "planted-ray-token-" + "0" * 32,
+    "RAY_AUTH_MODE": "token",
+}
+SECRETS = [value for name, value in PLANTED.items() if "planted" in value]
+
+
+@pytest.fixture
+def mlflow_server(tmp_path: Path) -> Iterator[str]:
+    """`cluster/mlflow-server.sh` on loopback, with sqlite; its URI."""
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
+    folder = tmp_path / "server"
+    folder.mkdir()
+    environment = os.environ | {
+        "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
+        "TMPDIR": str(folder),
+        "MLFLOW_BACKEND_STORE_URI": f"sqlite:///{folder}/runs.db",
+        "MLFLOW_AUTH_DATABASE_URI": f"sqlite:///{folder}/users.db",
+        "MLFLOW_ADMIN_USERNAME": USER,
+        "MLFLOW_ADMIN_PASSWORD": PASSWORD,
+        "MLFLOW_FLASK_SERVER_SECRET_KEY": "planted-flask-key",
+        "MLFLOW_ARTIFACTS": str(folder / "artefacts"),
+        "MLFLOW_PORT": str(port),
+        "MLFLOW_WORKERS": "1",
+    }
+    with (folder / "log").open("w") as log:
+        process = subprocess.Popen(
+            ["sh", ROOT / "cluster" / "mlflow-server.sh"],
+            cwd=folder,
+            env=environment,
+            stdout=log,
+            stderr=log,
+            start_new_session=True,
+        )
+    try:
+        uri = f"http://127.0.0.1:{port}"
+        wait_for(uri, process, folder / "log")
+        yield uri
+    finally:
+        process.terminate()
+        try:
+            process.wait(timeout=60)
+        finally:
+            # Whatever a hard end left; the group is ours.
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+    assert not list(folder.rglob("basic_auth.ini")), "the server must delete its password's file"
+
+
+def wait_for(uri: str, process: subprocess.Popen[Any], log: Path) -> None:
+    for _ in range(600):
+        assert process.poll() is None, log.read_text()
+        try:
+            if requests.get(f"{uri}/health", timeout=5).ok:
+                return
+        except requests.ConnectionError:
+            time.sleep(0.2)
+    pytest.fail(log.read_text())
+
+
+def holders(folder: Path, secrets: list[str]) -> list[tuple[str, str]]:
+    """Files below `folder` with one of the secrets in them."""
+    return [
+        (path.relative_to(folder).as_posix(), secret)
+        for path in folder.rglob("*")
+        if path.is_file()
+        for secret in secrets
+        if secret.encode() in path.read_bytes()
+    ]
+
+
+def test_secrets_are_used_and_written_nowhere(
+    sweep_program: Any, sweep_document: dict[str, Any], mlflow_server: str, tmp_path: Path
+) -> None:
+    document = sweep_document
+    document["stages"] = document["stages"][:1]
+    document["defaults"]["env_steps"] = 600
+    document["mlflow"] = {"tracking_uri": mlflow_server}
+    sweep_program.write(document)
+
+    code, _, errors = sweep_program.run()
+    assert code == 2, "without a password nothing must start"
+    assert "401" in errors
+
+    sweep_program.environment |= PLANTED
+    code, output, errors = sweep_program.run()
+    assert (code, errors) == (0, ""), output
+    auth = (USER, PASSWORD)
+    found = requests.post(
+        f"{mlflow_server}/api/2.0/mlflow/runs/search",
+        json={"experiment_ids": ["1"], "max_results": 50},
+        auth=auth,
+        timeout=60,
+    ).json()
+    assert len(found["runs"]) == 2, "the sweep's run and the node's"
+    assert not [secret for secret in SECRETS if secret in output]
+    # The storage, the server's database, artefacts and log, and what a second reader is shown.
+    (settings,) = tmp_path.rglob("basic_auth.ini")  # the one place where MLflow takes it from
+    assert stat.S_IMODE(settings.stat().st_mode) == 0o600
+    found_in = holders(tmp_path, [*SECRETS, "planted-flask-key"])
+    assert found_in == [(settings.relative_to(tmp_path).as_posix(), PASSWORD)]
+    assert not [secret for secret in SECRETS if secret in str(found)]
+
+
+def test_a_password_in_the_tracking_uri_is_not_kept(
+    sweep_program: Any, sweep_document: dict[str, Any], tmp_path: Path
+) -> None:
+    """It should be in the environment; where it is not, the copy of the file leaves it out."""
+    from music_rllib.experiment.config import load_sweep
+    from music_rllib.experiment.plan import make_plan
+    from music_rllib.sweep.session import keep_record, open_sweep
+
+    document = sweep_document
+    document["mlflow"] = {"tracking_uri": "http://music:planted-in-a-uri@localhost:1"}
+    del document["environments"], document["resources"]
+    document["tasks"] = ["FetchPush"]
+    sweep_program.write(document)
+    config = load_sweep(tmp_path / "sweep.yaml")
+    storage = tmp_path / "kept"
+    opened = open_sweep(config, make_plan(config), str(storage), storage / config.name)
+    keep_record(opened)
+    assert holders(storage, ["planted-in-a-uri"]) == []
+    kept = (storage / config.name / "sweep.yaml").read_text()
+    assert kept == redact((tmp_path / "sweep.yaml").read_text())
+    assert "http://localhost:1" in kept
