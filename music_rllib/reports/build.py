@@ -9,10 +9,11 @@ import numpy as np
 
 from music_rllib.reports.analysis import analyse
 from music_rllib.reports.data import ReportError, Sweep
-from music_rllib.reports.figures import METRICS, files
+from music_rllib.reports.figures import METRICS
 from music_rllib.reports.gallery import Drawing, stage_drawings
 from music_rllib.reports.missing import missing
 from music_rllib.reports.page import Report, render
+from music_rllib.reports.pictures import draw_all
 from music_rllib.reports.tables import (
     Table,
     improvement_table,
@@ -50,10 +51,12 @@ def build_report(
         command: that makes this report.
     """
     analyses = analyse(sweep, rng)
+    drawings = [d for analysis in analyses for d in stage_drawings(sweep, analysis, rng)]
     return Report(
         sweep=sweep,
         analyses=analyses,
-        drawings=[d for analysis in analyses for d in stage_drawings(sweep, analysis, rng)],
+        drawings=drawings,
+        pictures=draw_all(drawings),
         missing=missing(sweep, analyses, undelivered),
         difference=difference,
         command=command,
@@ -77,7 +80,7 @@ def write_report(report: Report, folder: Path) -> Path:
             part.mkdir(parents=True, exist_ok=True)
         _remove_others(figures, {drawing.name for drawing in report.drawings})
         for drawing in report.drawings:
-            for kind, content in files(drawing.panels, drawing.legend).items():
+            for kind, content in report.pictures[drawing.name].files.items():
                 (figures / f"{drawing.name}.{kind}").write_bytes(content)
         for table in _tables(report):
             (tables / f"{table.name}.csv").write_text(table.to_csv(), encoding="utf-8")

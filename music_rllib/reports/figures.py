@@ -171,7 +171,7 @@ def finals_panel(scope: Scope, siblings: tuple[Condition, ...]) -> Panel:
 def svg_inline(panel: Panel, name: str, description: str) -> str:
     """A panel as an SVG element for the page; ids begin with `name`, to be the page's only ones."""
     with mpl.rc_context(_settings(_INK, _GRID)):
-        drawn = _drawn([panel], [])
+        drawn = _drawn([panel], [], opaque=False)
         buffer = io.StringIO()
         drawn.savefig(buffer, format="svg", metadata={"Date": None})
     text = buffer.getvalue()
@@ -185,10 +185,13 @@ def svg_inline(panel: Panel, name: str, description: str) -> str:
 
 
 def files(panels: Sequence[Panel], legend: Legend) -> dict[str, bytes]:
-    """All panels side by side on white paper, with a legend, as ``svg`` and ``png`` (150 dpi)."""
+    """All panels side by side on white paper, with a legend, as ``svg`` and ``png`` (150 dpi).
+
+    Drawn once for both.
+    """
     made = {}
     with mpl.rc_context(_settings(_PAPER_INK, _PAPER_GRID)):
-        drawn = _drawn(panels, legend)
+        drawn = _drawn(panels, legend, opaque=True)
         for kind, metadata in (("svg", {"Date": None}), ("png", {})):
             buffer = io.BytesIO()
             drawn.savefig(buffer, format=kind, dpi=150, metadata=metadata)
@@ -216,14 +219,14 @@ def _settings(ink: str, grid: str) -> Any:
     }
 
 
-def _drawn(panels: Sequence[Panel], legend: Legend) -> Figure:
+def _drawn(panels: Sequence[Panel], legend: Legend, *, opaque: bool) -> Figure:
     """Margins are fixed: matplotlib's own layout takes longer than everything else together."""
     columns = max(1, 2 * len(panels))
     below = 0.28 * math.ceil(len(legend) / columns)
     width, height = PANEL[0] * len(panels), PANEL[1] + below
     figure = Figure(figsize=(width, height))
     FigureCanvasAgg(figure)
-    figure.patch.set_alpha(1.0 if legend else 0.0)
+    figure.patch.set_alpha(1.0 if opaque else 0.0)
     for number, panel in enumerate(panels):
         left = number * PANEL[0]
         axes = figure.add_axes(

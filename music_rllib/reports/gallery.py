@@ -20,11 +20,19 @@ from music_rllib.reports.figures import (
     finals_panel,
     profile_panel,
 )
-from music_rllib.reports.palette import style_of
+from music_rllib.reports.influence import (
+    CHANCE,
+    importance_panel,
+    importances,
+    parallel_panel,
+    sensitivity_panels,
+)
+from music_rllib.reports.palette import BARS, Style, style_of
 
-__all__ = ["CURVES", "FINALS", "PROFILES", "Drawing", "slug", "stage_drawings"]
+__all__ = ["CURVES", "FINALS", "INFLUENCE", "PROFILES", "Drawing", "slug", "stage_drawings"]
 
 FINALS, PROFILES = "Final success rate", "Performance profile"
+INFLUENCE = ("Sensitivity", "Importance of settings", "Parallel coordinates")
 CURVES = tuple(metric.title for metric in METRICS)
 
 
@@ -79,6 +87,7 @@ def stage_drawings(
         panels=tuple(profile_panel(scope, stage.conditions, rng) for scope in scopes),
         legend=legend,
     )
+    yield from _influence(sweep, analysis)
 
 
 def _curves(sweep: Sweep, stage: Stage, metric: Metric, rng: np.random.Generator) -> Drawing | None:
@@ -123,3 +132,42 @@ def _caption(stage: Stage, metric: Metric) -> str:
 
 def _legend(stage: Stage) -> Legend:
     return [(c.label, style_of(c, stage.conditions)) for c in stage.conditions]
+
+
+def _influence(sweep: Sweep, analysis: StageAnalysis) -> Iterator[Drawing]:
+    """What the settings do, where more than q varies."""
+    stage = analysis.stage
+    by_q = {c.entropic_index: style_of(c, stage.conditions) for c in stage.conditions}
+    found = importances(sweep, analysis)
+    per_task = [(t, [one for one in found if one.task == t]) for t in stage.tasks]
+    parallel = [parallel_panel(scope, stage.conditions) for scope in analysis.scopes]
+    lines = [(f"q = {q}", style._replace(line="solid")) for q, style in by_q.items()]
+    bars = [(n, Style(BARS[n == CHANCE], "s", "solid")) for n in ("setting", CHANCE)]
+    drawings = (
+        (sensitivity_panels(analysis), _SENSITIVITY, lines),
+        ([importance_panel(task, some) for task, some in per_task if some], _IMPORTANCE, bars),
+        ([panel for panel in parallel if panel is not None], _PARALLEL, lines),
+    )
+    for title, (panels, caption, legend) in zip(INFLUENCE, drawings, strict=True):
+        if panels:
+            yield Drawing(
+                stage=stage.name,
+                title=title,
+                caption=caption,
+                panels=tuple(panels),
+                legend=legend,
+            )
+
+
+_SENSITIVITY = (
+    "Interquartile mean of the final success rate over the entropy coefficient α and the weight of "
+    "the MI reward, linear between the settings that were tried (marks); nothing outside of them "
+    "is known."
+)
+_IMPORTANCE = (
+    "Functional ANOVA (Hutter et al. 2014, as in Optuna) over the finished runs. A setting matters "
+    "only as far as it explains more than the seed does."
+)
+_PARALLEL = (
+    "A line per condition through its settings to its final success rate; the fainter, the lower."
+)

@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 import statistics
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
 from music_rllib.reports.analysis import SIGNIFICANCE, StageAnalysis, Wait
 from music_rllib.reports.data import Sweep
-from music_rllib.reports.figures import svg_inline
-from music_rllib.reports.gallery import CURVES, FINALS, PROFILES, Drawing, slug
+from music_rllib.reports.gallery import CURVES, FINALS, INFLUENCE, PROFILES, Drawing, slug
 from music_rllib.reports.html import (
     Cell,
     bullets,
@@ -24,6 +23,8 @@ from music_rllib.reports.html import (
     table,
     text,
 )
+from music_rllib.reports.influence import FEWEST_RUNS, varied
+from music_rllib.reports.pictures import Pictures
 from music_rllib.reports.tables import last_success
 from music_rllib.reports.verdict import interval_text, p_text, verdict
 from music_rllib.tracking import names
@@ -41,6 +42,8 @@ class Report:
     sweep: Sweep
     analyses: Sequence[StageAnalysis]
     drawings: Sequence[Drawing]
+    pictures: Mapping[str, Pictures]
+    """By the drawings' names."""
     missing: Sequence[str]
     difference: float
     """In success rate, which the reader would want to be able to see."""
@@ -106,26 +109,36 @@ def _stage(report: Report, analysis: StageAnalysis) -> str:
         said = "".join(paragraph(line) for line in verdict(scope, report.difference))
         parts.append(f'<div class="verdict">{said}</div>')
     drawn = {drawing.title: drawing for drawing in report.drawings if drawing.stage == stage.name}
-    parts += [_figure(drawn, title) for title in (CURVES[0], FINALS)]
+    parts += [_figure(report, drawn, title) for title in (CURVES[0], FINALS)]
     parts += [_final_table(analysis), _waits_table(analysis), _improvement_table(analysis)]
-    parts += [_figure(drawn, title) for title in (PROFILES, *CURVES[1:])]
+    parts += [_figure(report, drawn, title) for title in (PROFILES, *INFLUENCE, *CURVES[1:])]
+    parts.append(_why_no_influence(report, analysis, drawn))
     return "".join([*parts, "</section>"])
 
 
-def _figure(drawn: dict[str, Drawing], title: str) -> str:
+def _figure(report: Report, drawn: dict[str, Drawing], title: str) -> str:
     drawing = drawn.get(title)
     if drawing is None:
         return ""
-    panels = "".join(
-        "<div>"
-        + svg_inline(panel, f"{drawing.name}-{number}", f"{title}, {panel.title}")
-        + "</div>"
-        for number, panel in enumerate(drawing.panels)
-    )
+    panels = "".join(f"<div>{svg}</div>" for svg in report.pictures[drawing.name].inline)
     return (
         f'<figure id="{drawing.name}"><h3>{text(title)}</h3>{legend(drawing.legend)}'
         f'<div class="panels">{panels}</div>'
         f"<figcaption>{text(drawing.caption)}</figcaption></figure>"
+    )
+
+
+def _why_no_influence(report: Report, analysis: StageAnalysis, drawn: Mapping[str, Drawing]) -> str:
+    """What would have to vary for the figures that are not there."""
+    absent = [title for title in INFLUENCE if title not in drawn]
+    if not absent or len(analysis.stage.conditions) == 1:
+        return ""
+    settings = ", ".join(varied(analysis.stage.conditions)) or "nothing"
+    return paragraph(
+        f"Not drawn: {', '.join(title.lower() for title in absent)}. This stage varies {settings}; "
+        "sensitivity needs α or the MI weight, the other two need a second setting beside q and "
+        f"finished runs (importance: {FEWEST_RUNS} on a task).",
+        "soft",
     )
 
 

@@ -7,13 +7,14 @@ Between them the colour is mixed, so any q has one, by a function of q alone.
 
 from __future__ import annotations
 
+import functools
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
 from music_rllib.reports.conditions import Condition
 
-__all__ = ["DARK", "LIGHT", "Style", "colour_of", "marker_of", "style_of"]
+__all__ = ["BARS", "DARK", "LIGHT", "Style", "colour_of", "marker_of", "style_of"]
 
 LIGHT, DARK = "#ffffff", "#14171c"
 """The two papers."""
@@ -26,6 +27,8 @@ _ANCHORS = (
     (3.0, "#a0522d"),
 )
 _UNKNOWN = "#808080"
+BARS = ("#1f7fc4", "#808080")
+"""Of settings, and of what is only chance."""
 _MARKERS = "osD^vPX"
 
 Line = Literal["solid", "dashed", "dashdot", "dotted"]
@@ -40,6 +43,7 @@ class Style(NamedTuple):
     line: Line
 
 
+@functools.cache
 def colour_of(entropic_index: str) -> str:
     """Colour of a q in words; a schedule has that of its last value."""
     q = _number(entropic_index)

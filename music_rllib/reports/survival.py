@@ -72,10 +72,20 @@ def median_wait_interval(
     runs = len(waits.steps)
     if runs < 2:
         return np.nan, np.nan
-    drawn = [
-        median_wait(Waits(steps=waits.steps[chosen], reached=waits.reached[chosen]))
-        for chosen in rng.integers(runs, size=(resamples, runs))
-    ]
+    drawn = _medians(waits, rng.integers(runs, size=(resamples, runs)))
     tail = (1 - CONFIDENCE) / 2
     lower, upper = np.quantile(drawn, [tail, 1 - tail], method="inverted_cdf")
     return float(lower), float(upper)
+
+
+def _medians(waits: Waits, chosen: NDArray[np.int64]) -> Array:
+    """`[S]` the median wait of each sample: `[S, R]` runs, drawn with replacement."""
+    steps, position = np.unique(waits.steps, return_inverse=True)
+    there, samples = np.zeros((len(chosen), len(steps))), np.arange(len(chosen))[:, np.newaxis]
+    everyone = there.copy()
+    np.add.at(everyone, (samples, position[chosen]), 1)
+    np.add.at(there, (samples, position[chosen]), waits.reached[chosen])
+    waiting = everyone[:, ::-1].cumsum(1)[:, ::-1]
+    below = np.cumprod(1 - there / np.maximum(waiting, 1), axis=1)
+    passed = (below <= 0.5 + 1e-12) & (there > 0)
+    return np.where(passed.any(1), steps[passed.argmax(1)], np.inf)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from html.parser import HTMLParser
-from itertools import combinations
+from itertools import combinations, product
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +15,12 @@ from music_rllib.reports.analysis import THRESHOLDS, Scope, analyse
 from music_rllib.reports.build import build_report, write_report
 from music_rllib.reports.conditions import find_stages
 from music_rllib.reports.data import Points, RunRecord, Sweep, columns
+from music_rllib.reports.gallery import INFLUENCE
+from music_rllib.reports.influence import CHANCE, importances
 from music_rllib.reports.missing import planned_runs
 from music_rllib.reports.page import Report, render
 from music_rllib.reports.palette import DARK, LIGHT, colour_of, marker_of
+from music_rllib.reports.pictures import draw_all
 from music_rllib.reports.verdict import verdict
 from music_rllib.tracking import names
 
@@ -362,6 +365,64 @@ def test_planned_runs_of_a_configuration() -> None:
     assert planned is not None
     assert len(planned) == 2
     assert planned_runs("name: [") is None
+
+
+# Influence of settings --------------------------------------------------------------------------
+
+
+def grid_of_settings() -> Sweep:
+    """q decides, α helps a little, the weight does nothing; three seeds each."""
+    runs = []
+    for q, alpha, weight in product(("1", "2"), ("0.01", "0.1"), ("0.5", "1")):
+        for seed in range(3):
+            final = 0.3 + 0.5 * (q == "2") + 0.05 * (alpha == "0.1") + 0.01 * seed
+            params = {"tac.alpha": alpha, "music.mi_reward_weight": weight}
+            tags = {names.TAG_ALPHA: alpha, names.TAG_MI_REWARD_WEIGHT: weight}
+            runs.append((one_run(q, seed, params=params, **tags), climbing(final)))
+    return sweep_of(runs)
+
+
+def test_what_matters_is_found_and_drawn() -> None:
+    report = report_on(grid_of_settings())
+    (analysis,) = report.analyses
+    shares = {one.setting: one.share for one in importances(report.sweep, analysis)}
+    assert set(shares) == {"q", "α", "MI weight", CHANCE}
+    assert shares["q"] > 0.8
+    assert shares["MI weight"] < 0.05
+    assert sum(shares.values()) == pytest.approx(1.0)
+    panels = {drawing.title: [p.title for p in drawing.panels] for drawing in report.drawings}
+    assert panels["Sensitivity"] == ["FetchPush, q = 1", "FetchPush, q = 2"]
+    assert panels["Importance of settings"] == panels["Parallel coordinates"] == ["FetchPush"]
+    page = render(report)
+    for title in INFLUENCE:
+        assert f"<h3>{title}</h3>" in page
+    assert "Not drawn" not in page
+
+
+def test_one_varied_setting_gives_a_line_and_the_page_says_what_is_not_drawn() -> None:
+    tags = [{names.TAG_ALPHA: alpha} for alpha in ("0.01", "0.1")]
+    lines = sweep_of(
+        [
+            (one_run("1", s, params={"tac.alpha": t[names.TAG_ALPHA]}, **t), climbing(0.5 + s / 10))
+            for s in range(2)
+            for t in tags
+        ]
+    )
+    drawn = {drawing.title for drawing in report_on(lines).drawings}
+    assert "Sensitivity" in drawn
+    assert not drawn & set(INFLUENCE[1:])
+    only_q = Page(render(report_on(compared({"1": [0.5, 0.6], "2": [0.6, 0.7]})))).text
+    assert "Not drawn: sensitivity, importance of settings, parallel coordinates" in only_q
+    assert "This stage varies q;" in only_q
+
+
+def test_many_figures_are_the_same_drawn_one_by_one_and_in_processes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    drawings = report_on(grid_of_settings()).drawings
+    together = draw_all(drawings)
+    monkeypatch.setattr("music_rllib.reports.pictures.FEW", len(drawings))
+    assert draw_all(drawings) == together
 
 
 # Colours ----------------------------------------------------------------------------------------
