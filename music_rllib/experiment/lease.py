@@ -103,7 +103,7 @@ def runs_here(pid: int, started: float) -> bool:
     """Whether this machine has that process, and it is the one that began then."""
     try:
         process = psutil.Process(pid)
-        return abs(process.create_time() - started) < 10 and process.status() != "zombie"
+        return bool(abs(process.create_time() - started) < 10 and process.status() != "zombie")
     except psutil.NoSuchProcess:
         return False
     except psutil.Error:

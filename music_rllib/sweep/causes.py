@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 
+import psutil
 from ray.exceptions import RayActorError, RayError, RayTaskError
 
 __all__ = ["cause_of"]
@@ -28,10 +29,22 @@ def cause_of(error: BaseException | None, text: str, limit: int = 300) -> str:
         lines = _death(str(error))
     elif isinstance(error, RayError):
         lines = _non_empty(str(error))[:2]
+    elif isinstance(error, MemoryError):
+        lines = [f"{type(error).__name__}: {str(error) or 'no memory was left'}", _memory()]
     else:
         first, *rest = _non_empty(str(error)) or ["(no message)"]
         lines = [f"{type(error).__name__}: {first}", *rest[:1]]
     return "\n".join(line if len(line) <= limit else line[: limit - 3] + "..." for line in lines)
+
+
+def _memory() -> str:
+    """What there is where this is asked, which is in the worker."""
+    memory, own = psutil.virtual_memory(), psutil.Process().memory_info().rss
+    return (
+        f"The process had {own / 2**30:.1f} GiB, {memory.available / 2**30:.1f} of the machine's "
+        f"{memory.total / 2**30:.1f} GiB are free. Fewer runs at once or a smaller replay.capacity "
+        "need less."
+    )
 
 
 def _non_empty(text: str) -> list[str]:

@@ -9,13 +9,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from music_rllib.experiment.files import write_atomically
+from music_rllib.experiment.model import SweepConfig
 from music_rllib.experiment.plan import Node
 from music_rllib.experiment.sealed import StorageError
 from music_rllib.experiment.store import NodeStore
+from music_rllib.sweep.places import resolve_storage, sweep_folder
 from music_rllib.sweep.session import Sweep
 from music_rllib.tac.version import ALGORITHM_VERSION
 
-__all__ = ["Changes", "changes_since", "keep_settings"]
+__all__ = ["Changes", "changes_since", "check_begun", "keep_settings"]
 
 FILE = "settings.json"
 SHOWN = 10
@@ -66,6 +68,19 @@ def keep_settings(sweep: Sweep) -> None:
     except OSError as error:
         place = error.filename or path
         raise StorageError(f"{place} must be writable: {error.strerror}") from error
+
+
+def check_begun(config: SweepConfig) -> None:
+    """Whether there is a sweep to go on with.
+
+    Raises:
+        StorageError: There is none of this name.
+    """
+    folder = sweep_folder(resolve_storage(config.storage)[0], config.name)
+    if not (folder / FILE).is_file():
+        raise StorageError(
+            f"--resume must find an earlier run of sweep {config.name!r}, there is none in {folder}"
+        )
 
 
 def _settings(node: Node) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from music_rllib.experiment.plan import Node, make_plan
 from music_rllib.sweep import records
 from music_rllib.sweep.beacon import Beacon
 from music_rllib.sweep.board import Status
-from music_rllib.sweep.changes import Changes, changes_since, keep_settings
+from music_rllib.sweep.changes import Changes, changes_since, check_begun, keep_settings
 from music_rllib.sweep.driving import driving
 from music_rllib.sweep.frame import FAILED, BadInputError
 from music_rllib.sweep.listener import Listener
@@ -62,6 +62,7 @@ def run_sweep(
     name: str | None = None,
     seeds: str | None = None,
     accept_changes: bool = False,
+    must_exist: bool = False,
     answer: Callable[[dict[str, Any]], None] = lambda document: None,
 ) -> int:
     """Train every run of a sweep, compare them, and log them to MLflow.
@@ -74,6 +75,7 @@ def run_sweep(
         name: Replaces the file's `name`.
         seeds: Replaces the file's `seeds`: how many, or a list with commas.
         accept_changes: Train runs anew whose settings are others than the last time.
+        must_exist: Refuse to begin a sweep; only go on with one.
         answer: Takes the plan of a dry run, or the sweep's last `state.json`, as plain data.
 
     Returns:
@@ -85,6 +87,8 @@ def run_sweep(
     try:
         path = config or DEFAULT_CONFIG
         loaded = load_sweep(path, name=name, storage=storage, seeds=seeds)
+        if must_exist:
+            check_begun(loaded)
         return _sweep(console, loaded, answer, dry_run=dry_run, accept_changes=accept_changes)
     except KeyboardInterrupt:
         _say_how_to_continue(console)
@@ -96,6 +100,7 @@ def resume_sweep(
     found: Found,
     *,
     seeds: str | None = None,
+    accept_changes: bool = False,
     answer: Callable[[dict[str, Any]], None] = lambda document: None,
 ) -> int:
     """Go on with a sweep by the configuration in its storage; the exit code.
@@ -105,7 +110,7 @@ def resume_sweep(
     """
     try:
         loaded = found.config(seeds)
-        return _sweep(console, loaded, answer, dry_run=False, accept_changes=False)
+        return _sweep(console, loaded, answer, dry_run=False, accept_changes=accept_changes)
     except KeyboardInterrupt:
         _say_how_to_continue(console)
         return 128 + signal.SIGINT

@@ -87,7 +87,7 @@ class TAC(Algorithm):
 
     @property
     def _by_td_error(self) -> bool:
-        return self._replay_settings.priority == "td_error"
+        return bool(self._replay_settings.priority == "td_error")
 
     def _a_runner_with_environments(self) -> TrajectoryEnvRunner:
         """The local runner; with remote ones it has no environments yet, and needs one now."""

@@ -6,9 +6,27 @@ from pathlib import Path
 
 import pytest
 
-from tests.integration.conftest import mlflow_runs, sweep_document, sweep_program
+from tests.faults import sweeps
+from tests.integration.conftest import Program, mlflow_runs, sweep_document, sweep_program
 
 __all__ = ["mlflow_runs", "sweep_document", "sweep_program"]
+
+
+@pytest.fixture(scope="session")
+def unbroken(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The storage of `sweeps.document()`, run in one go."""
+    program = sweeps.program(tmp_path_factory.mktemp("unbroken"))
+    program.write(sweeps.document())
+    sweeps.finish(program)
+    return program.folder / "results"
+
+
+@pytest.fixture
+def program(tmp_path: Path) -> Program:
+    """The program in a folder of its own, with `sweeps.document()` to run."""
+    own = sweeps.program(tmp_path)
+    own.write(sweeps.document())
+    return own
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -1,94 +1,113 @@
-"""`kill -9` of the driver: whatever it was doing, the sweep ends with the same numbers."""
+"""Drivers and workers that are killed or told to stop: the sweep ends with the same numbers."""
 
 from __future__ import annotations
 
 import os
 import random
+import re
 import signal
-import subprocess
 import time
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from tests.faults import comparison
-
-FIRST_SIGN = 120.0
-"""Seconds that a start may take on a busy machine."""
-
-
-def lines_of(document: dict[str, Any]) -> dict[str, Any]:
-    """Long enough to be killed often, with a checkpoint every few rounds."""
-    document["defaults"]["env_steps"] = 4000
-    document["defaults"]["evaluation"] = {"interval": 400, "episodes": 2}
-    document["checkpoints"] = {"minutes": 0.0001}
-    return document
+from music_rllib.sweep.tune_events import RESTARTS
+from tests.faults import comparison, sweeps
+from tests.integration.conftest import Program
 
 
-def kill(process: subprocess.Popen[str]) -> str:
-    """`kill -9` the driver alone; Ray's processes must notice by themselves."""
-    os.kill(process.pid, signal.SIGKILL)
-    output, _ = process.communicate(timeout=60)
-    return output
+def test_a_killed_worker_then_sigterm_then_a_killed_driver(
+    program: Program, unbroken: Path
+) -> None:
+    """In pretraining, after the handoff, and after the resume."""
+    process = sweeps.start_until(program, "pretrain/Point/seed0: started")
+    sweeps.kill_a_worker(process)
+    output = sweeps.read_until(process, ": FAILED", "finetune/Point/tac.entropic_index=1/seed0: s")
+    assert "The worker process died" in output
+    assert f"Another worker goes on from the last checkpoint (1 of {RESTARTS} times)." in output
+    process.send_signal(signal.SIGTERM)
+    output, errors = process.communicate(timeout=180)
+    assert (process.returncode, errors) == (128 + signal.SIGTERM, ""), output
+    assert "continue with: python -m music_rllib.sweep" in output
 
-
-def unbroken(program: Any, document: dict[str, Any]) -> Path:
-    """The storage of the same sweep, run in one go."""
-    program.write(document | {"storage": "unbroken"})
-    code, output, errors = program.run()
-    assert (code, errors) == (0, ""), output
-    return Path(program.folder, "unbroken")
-
-
-def start_until_a_sign(program: Any, signs: tuple[str, ...]) -> subprocess.Popen[str]:
-    """Start and read until a line has one of `signs`, or the end."""
-    process: subprocess.Popen[str] = program.start()
-    assert process.stdout is not None
-    deadline = time.monotonic() + FIRST_SIGN
-    for line in process.stdout:
-        if any(sign in line for sign in signs) or time.monotonic() > deadline:
-            break
-    return process
-
-
-@pytest.mark.parametrize("sign", ["pretrain/Point/seed0: 1,", "finetune/Point"])
-def test_killed_once(sweep_program: Any, sweep_document: dict[str, Any], sign: str) -> None:
-    """In pretraining, and right after the handoff."""
-    document = lines_of(sweep_document)
-    document["stages"][1]["grid"]["tac.entropic_index"] = [1.5]
-    expected = unbroken(sweep_program, document)
-    sweep_program.write(document)
-    kill(start_until_a_sign(sweep_program, (sign,)))
-    code, output, errors = sweep_program.run()
-    assert (code, errors) == (0, ""), output
-    comparison.same(expected, sweep_program.folder / "results")
+    process = sweeps.start_until(program, "finetune", "Results of")
+    sweeps.kill(process)
+    output = sweeps.finish(program)
+    assert "pretrain/Point/seed0: finished earlier, reused" in output
+    comparison.same(unbroken, program.folder / "results")
 
 
 @pytest.mark.thorough
-@pytest.mark.timeout(3600)
-def test_killed_twenty_times_at_random_moments(
-    sweep_program: Any, sweep_document: dict[str, Any]
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("sign", ["starting a local Ray", "pretrain/Point/seed0: ", "finetune/"])
+def test_told_to_stop_in_each_stage(
+    number: signal.Signals, sign: str, program: Program, unbroken: Path
 ) -> None:
+    process = sweeps.start_until(program, sign)
+    time.sleep(1.0)
+    process.send_signal(number)
+    output, errors = process.communicate(timeout=180)
+    if sign == "starting a local Ray":  # nothing to save yet
+        assert process.returncode in {128 + number, -number}, output + errors
+    else:
+        assert (process.returncode, errors) == (128 + number, ""), output
+    # What was saved on the signal is where it goes on: not a step is computed again.
+    saved = dict(re.findall(r"\] (\S+): saved at ([\d,]+) env steps", output))
+    output = sweeps.finish(program)
+    continued = dict(re.findall(r"\] (\S+): continues at ([\d,]+) env steps", output))
+    assert saved.items() <= continued.items()
+    comparison.same(unbroken, program.folder / "results")
+
+
+@pytest.mark.thorough
+def test_a_second_signal_ends_it_at_once(program: Program, unbroken: Path) -> None:
+    process = sweeps.start_until(program, "pretrain/Point/seed0: started")
+    process.send_signal(signal.SIGINT)
+    sweeps.read_until(process, "stopping, this takes a few seconds")
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=30)
+    assert process.returncode == 128 + signal.SIGINT
+    sweeps.finish(program)
+    comparison.same(unbroken, program.folder / "results")
+
+
+@pytest.mark.thorough
+def test_a_run_whose_worker_dies_again_and_again_fails_with_the_cause(
+    program: Program, unbroken: Path
+) -> None:
+    document = sweeps.document()
+    document["defaults"]["env_steps"] = 200_000
+    document["stages"] = document["stages"][:1]
+    program.write(document)
+    process = sweeps.start_until(program, "pretrain/Point/seed0: started")
+    for attempt in range(RESTARTS + 1):
+        sweeps.kill_a_worker(process)
+        sign = ": FAILED: " if attempt == RESTARTS else "pretrain/Point/seed0: started"
+        sweeps.read_until(process, sign)
+    output, errors = process.communicate(timeout=180)
+    assert (process.returncode, errors) == (1, ""), output
+    assert "The same command again continues from the last checkpoint" in output
+
+
+@pytest.mark.thorough
+@pytest.mark.timeout(5400)
+def test_killed_twenty_times_at_random_moments(program: Program, unbroken: Path) -> None:
     """In the plan, while Ray starts, in each stage, in checkpoints and while MLflow is fed."""
-    document = lines_of(sweep_document)
-    expected = unbroken(sweep_program, document)
-    sweep_program.write(document)
-    seed = random.randrange(10**6)
-    print(f"seed {seed}")
-    rng, kills = random.Random(seed), 0
+    seed = int(os.environ.get("FAULT_SEED", random.randrange(10**6)))
+    print(f"FAULT_SEED={seed}")
+    rng, kills, results = random.Random(seed), 0, program.folder / "results"
     while kills < 20:
         # Before Ray is up there is little to break: mostly a moment in training.
         signs = rng.choice([("starting a local Ray",), *[(": started", ": continues")] * 4])
-        process = start_until_a_sign(sweep_program, signs)
-        time.sleep(rng.uniform(0.0, 6.0))
-        if process.poll() is not None:  # it had finished: once more, from nothing
-            assert process.returncode == 0, process.communicate()
-            comparison.same(expected, sweep_program.folder / "results")
-            (sweep_program.folder / "results").rename(sweep_program.folder / f"done-{kills}")
+        process = sweeps.start_until(program, *signs, "Results of")
+        time.sleep(rng.uniform(0.0, 10.0))
+        if process.poll() is None:
+            sweeps.kill(process)
+            kills += 1
             continue
-        kill(process)
-        kills += 1
-    code, output, errors = sweep_program.run(timeout=600)
-    assert (code, errors) == (0, ""), output
-    comparison.same(expected, sweep_program.folder / "results")
+        output, errors = process.communicate()
+        assert (process.returncode, errors) == (0, ""), output
+        comparison.same(unbroken, results)
+        results.rename(program.folder / f"done-{kills}")  # once more, from nothing
+    sweeps.finish(program)
+    comparison.same(unbroken, results)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pyarrow.fs as pafs
 import pytest
-from fsspec.implementations.memory import MemoryFileSystem
+from fsspec.implementations.memory import MemoryFileSystem  # type: ignore[import-untyped]
 
 from music_rllib.experiment import lease as lease_module
 from music_rllib.experiment.lease import HeldLease, Lease, LeaseFile, LeaseLostError

@@ -1,5 +1,7 @@
 """Why a run failed: the one line that a person needs."""
 
+import re
+
 import pytest
 from ray.exceptions import ActorDiedError, OutOfMemoryError, RayActorError, RayTaskError
 
@@ -25,12 +27,11 @@ def in_a_task(cause: Exception) -> RayTaskError:
     [
         (in_a_task(ValueError("must be > 0")), "ValueError: must be > 0"),
         (in_a_task(RuntimeError("one\n\ntwo\nthree")), "RuntimeError: one\ntwo"),
-        (in_a_task(MemoryError()), "MemoryError: (no message)"),
         (OutOfMemoryError("low on memory\nby 3 GB\nand more"), "low on memory\nby 3 GB"),
         (ActorDiedError(in_a_task(ImportError("no module"))), "ImportError('no module')"),
         (None, "KeyError: 'the last line'"),
     ],
-    ids=["one line", "many lines", "no message", "memory", "never came up", "not readable"],
+    ids=["one line", "many lines", "memory", "never came up", "not readable"],
 )
 def test_the_cause_is_what_was_raised(error: BaseException | None, expected: str) -> None:
     assert cause_of(error, "Traceback:\n  File\nKeyError: 'the last line'\n\n") == expected
@@ -44,6 +45,13 @@ def test_a_worker_that_died_says_where_and_what_to_do() -> None:
     )
     assert "lack of memory" in second
     assert "continues from the last checkpoint" in second
+
+
+def test_a_lack_of_memory_names_the_limits() -> None:
+    first, second = cause_of(in_a_task(MemoryError()), "").splitlines()
+    assert first == "MemoryError: no memory was left"
+    assert re.match(r"The process had \d+\.\d GiB, \d+\.\d of the machine's \d+\.\d GiB", second)
+    assert "replay.capacity" in second
 
 
 def test_long_lines_are_cut() -> None:

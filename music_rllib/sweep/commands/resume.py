@@ -29,6 +29,7 @@ def register(commands: Commands) -> None:
     )
     add_place(parser)
     parser.add_argument("--seeds", metavar="N", help="As of 'run'.")
+    parser.add_argument("--accept-changes", action="store_true", help="As of 'run'.")
     add_json(parser)
     parser.set_defaults(execute=_execute)
 
@@ -41,5 +42,6 @@ def _execute(arguments: argparse.Namespace) -> int:
         console_for(arguments),
         find_sweep(arguments.sweep, arguments.storage),
         seeds=arguments.seeds,
+        accept_changes=arguments.accept_changes,
         answer=print_json if arguments.json else lambda document: None,
     )

@@ -36,6 +36,12 @@ def register(commands: Commands) -> None:
         help="Where settings are others than the last time under this name: train anew what they "
         "touch. Without it the command says what would be lost, and starts nothing.",
     )
+    parser.add_argument(
+        "--resume",
+        action="store_true",
+        help="Start only where there is an earlier run of this sweep to go on with. Without it a "
+        "repeated command goes on just the same.",
+    )
     add_json(parser)
     parser.set_defaults(execute=_execute)
 
@@ -77,4 +83,5 @@ def _execute(arguments: argparse.Namespace) -> int:
         seeds=arguments.seeds,
         answer=print_json if arguments.json else lambda document: None,
         accept_changes=arguments.accept_changes,
+        must_exist=arguments.resume,
     )

@@ -1,0 +1,85 @@
+"""The small sweep that faults are injected into, as a program of its own."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import psutil
+import yaml
+
+from tests.integration.conftest import ENVIRONMENTS, REPOSITORY, SWEEP, Program
+
+FIRST_SIGN = 180.0
+"""Seconds that a start may take on a busy machine."""
+
+
+def document(**changes: Any) -> dict[str, Any]:
+    """A sweep of three runs with a checkpoint at every report; some seconds of training each."""
+    whole: dict[str, Any] = yaml.safe_load(yaml.safe_dump(SWEEP))
+    whole["defaults"]["env_steps"] = 4000
+    whole["checkpoints"] = {"minutes": 0.0001}
+    return whole | changes
+
+
+def program(folder: Path) -> Program:
+    """What runs it in `folder`."""
+    paths = os.pathsep.join(map(str, (REPOSITORY, ENVIRONMENTS)))
+    return Program(folder, os.environ | {"PYTHONPATH": paths})
+
+
+def start_until(program: Program, *signs: str) -> subprocess.Popen[str]:
+    """Start and read until a line has one of `signs`, or the end."""
+    process = program.start()
+    read_until(process, *signs)
+    return process
+
+
+def read_until(process: subprocess.Popen[str], *signs: str) -> str:
+    """Read on until a line has one of `signs`; what was read."""
+    assert process.stdout is not None
+    deadline, seen = time.monotonic() + FIRST_SIGN, []
+    for line in process.stdout:
+        seen.append(line)
+        if any(sign in line for sign in signs) or time.monotonic() > deadline:
+            break
+    return "".join(seen)
+
+
+def kill(process: subprocess.Popen[str]) -> None:
+    """`kill -9` the driver alone; Ray's processes must notice by themselves."""
+    os.kill(process.pid, signal.SIGKILL)
+    process.communicate(timeout=120)
+
+
+def workers(process: subprocess.Popen[str]) -> Iterator[psutil.Process]:
+    """Processes that train for a driver with a local Ray."""
+    for child in psutil.Process(process.pid).children(recursive=True):
+        try:
+            if child.cmdline()[0].startswith("ray::RunTrainable"):
+                yield child
+        except (psutil.Error, IndexError):
+            continue
+
+
+def kill_a_worker(process: subprocess.Popen[str]) -> None:
+    """`kill -9` one that trains, as soon as there is one."""
+    deadline = time.monotonic() + FIRST_SIGN
+    while time.monotonic() < deadline:
+        for worker in workers(process):
+            os.kill(worker.pid, signal.SIGKILL)
+            return
+        time.sleep(0.1)
+    raise AssertionError("no worker came up")
+
+
+def finish(program: Program, timeout: float = 600) -> str:
+    """Run to the end, which is good; what was said."""
+    code, output, errors = program.run(timeout=timeout)
+    assert (code, errors) == (0, ""), output + errors
+    return output
