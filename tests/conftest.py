@@ -16,6 +16,8 @@ os.environ.update(
         # More threads change the sums' order and are slower on busy machines.
         "OMP_NUM_THREADS": "1",
         "NO_COLOR": "1",
+        # Seconds for each sweep; the test of it asks for it.
+        "MUSIC_RLLIB_REPORT": "off",
     }
 )
 for _name in ("FORCE_COLOR", "RAY_ADDRESS", "MLFLOW_TRACKING_URI", "MLFLOW_RUN_ID"):

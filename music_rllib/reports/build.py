@@ -10,6 +10,7 @@ import numpy as np
 from music_rllib.reports.analysis import analyse
 from music_rllib.reports.data import ReportError, Sweep
 from music_rllib.reports.figures import METRICS
+from music_rllib.reports.films import make_films
 from music_rllib.reports.gallery import Drawing, stage_drawings
 from music_rllib.reports.missing import missing
 from music_rllib.reports.page import Report, render
@@ -22,6 +23,7 @@ from music_rllib.reports.tables import (
     waits_table,
 )
 from music_rllib.tracking import names
+from music_rllib.tracking.store import TrackingStore
 
 __all__ = ["PAGE", "WANTED", "build_report", "write_report"]
 
@@ -40,6 +42,8 @@ def build_report(
     difference: float,
     undelivered: int = 0,
     command: str = "",
+    store: TrackingStore | None = None,
+    video_seed: int | None = None,
 ) -> Report:
     """Compute and arrange everything.
 
@@ -49,6 +53,8 @@ def build_report(
         difference: in success rate, which the reader would want to be able to see.
         undelivered: runs of which MLflow does not have everything yet.
         command: that makes this report.
+        store: where the sweep is logged, with its policies.
+        video_seed: of the filmed episodes; None: no videos.
     """
     analyses = analyse(sweep, rng)
     drawings = [d for analysis in analyses for d in stage_drawings(sweep, analysis, rng)]
@@ -60,11 +66,12 @@ def build_report(
         missing=missing(sweep, analyses, undelivered),
         difference=difference,
         command=command,
+        films=None if video_seed is None else make_films(sweep, analyses, store, video_seed),
     )
 
 
 def write_report(report: Report, folder: Path) -> Path:
-    """Write the page, `figures/*.png`, `figures/*.svg` and `tables/*.csv` into `folder`.
+    """Write the page, `figures/*` (PNG, SVG), `videos/*` and `tables/*.csv` into `folder`.
 
     Figures of an earlier report that this one does not have are removed.
 
@@ -82,6 +89,10 @@ def write_report(report: Report, folder: Path) -> Path:
         for drawing in report.drawings:
             for kind, content in report.pictures[drawing.name].files.items():
                 (figures / f"{drawing.name}.{kind}").write_bytes(content)
+        if report.films is not None and report.films.films:
+            (folder / "videos").mkdir(exist_ok=True)
+            for film in report.films.films:
+                (folder / "videos" / film.name).write_bytes(film.data)
         for table in _tables(report):
             (tables / f"{table.name}.csv").write_text(table.to_csv(), encoding="utf-8")
         page = folder / PAGE

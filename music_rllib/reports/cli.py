@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from music_rllib.reports.data import ReportError
+from music_rllib.tracking import names
 from music_rllib.tracking.errors import TrackingError
 from music_rllib.tracking.redaction import redact
 
@@ -64,7 +65,13 @@ def report(
         str, typer.Option(help="Where a sweep's name is looked for, as in the sweep's YAML file.")
     ] = "results",
     tracking_uri: Annotated[
-        str | None, typer.Option(help="Read from this MLflow instead of the sweep's own.")
+        str | None,
+        typer.Option(
+            help="Read from this MLflow instead of the sweep's own.",
+            # A password on a command line could be read by everyone on the machine.
+            envvar=names.VARIABLE_TRACKING_URI,
+            show_envvar=False,
+        ),
     ] = None,
     difference: Annotated[
         float,
@@ -76,6 +83,9 @@ def report(
         ),
     ] = 0.1,
     seed: Annotated[int, typer.Option(min=0, help="Of the bootstrap and the permutations.")] = 0,
+    videos: Annotated[
+        bool, typer.Option(help="Film an episode for each q, where this machine can draw.")
+    ] = True,
     attach: Annotated[
         bool, typer.Option("--attach", help="Also keep the report with the sweep's run in MLflow.")
     ] = False,
@@ -88,9 +98,7 @@ def report(
     ] = TableFormat.parquet,
     add: Annotated[
         bool,
-        typer.Option(
-            "--add", help="With --export: keep the runs that an earlier export has there."
-        ),
+        typer.Option("--add", help="With --export: keep the runs of an earlier export there."),
     ] = False,
 ) -> None:
     """One self-contained page about a sweep, with its figures (PNG, SVG) and numbers (CSV)."""
@@ -98,7 +106,16 @@ def report(
         if export is not None:
             _export(sweep, storage, tracking_uri, export, format_, add=add)
         else:
-            _report(sweep, storage, tracking_uri, output, difference, seed, attach=attach)
+            _report(
+                sweep,
+                storage,
+                tracking_uri,
+                output,
+                difference,
+                seed,
+                videos=videos,
+                attach=attach,
+            )
     except (ReportError, TrackingError) as error:
         typer.echo(f"error: {redact(str(error))}", err=True)
         raise typer.Exit(BAD_INPUT) from error
@@ -139,6 +156,7 @@ def _report(
     difference: float,
     seed: int,
     *,
+    videos: bool,
     attach: bool,
 ) -> None:
     import numpy as np
@@ -153,6 +171,8 @@ def _report(
         np.random.default_rng(seed),
         difference=difference,
         undelivered=found.undelivered,
+        store=found.store,
+        video_seed=seed if videos else None,
         command=redact(shlex.join(["python", "-m", "music_rllib.report", *sys.argv[1:]])),
     )
     page = write_report(made, output or found.folder / "report")

@@ -12,7 +12,7 @@ from music_rllib.reports.palette import Style
 __all__ = ["Cell", "bullets", "document", "facts", "legend", "link", "paragraph", "table", "text"]
 
 # Nothing may be fetched, whatever finds its way into a page.
-_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
+_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; media-src data:"
 _DASHES = {"solid": "", "dashed": "6 3", "dashdot": "6 2 1.5 2", "dotted": "1.5 2.5"}
 
 _MARKS = {"o": "●", "s": "■", "D": "◆", "^": "▲", "v": "▼", "P": "✚", "X": "✖", "*": "★"}

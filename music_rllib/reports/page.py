@@ -11,6 +11,7 @@ from datetime import UTC, datetime
 
 from music_rllib.reports.analysis import SIGNIFICANCE, StageAnalysis, Wait
 from music_rllib.reports.data import Sweep
+from music_rllib.reports.films import Film, Films
 from music_rllib.reports.gallery import CURVES, FINALS, INFLUENCE, PROFILES, Drawing, slug
 from music_rllib.reports.html import (
     Cell,
@@ -49,6 +50,8 @@ class Report:
     """In success rate, which the reader would want to be able to see."""
     command: str
     """That made this report."""
+    films: Films | None = None
+    """None where nobody asked for videos."""
 
 
 def render(report: Report) -> str:
@@ -57,6 +60,7 @@ def render(report: Report) -> str:
         _head(report),
         # What comes of a sweep is in its last stage.
         *(_stage(report, analysis) for analysis in reversed(report.analyses)),
+        _films(report.films),
         _budget(report.sweep, report.analyses),
         _failures(report.sweep),
         _all_runs(report.sweep),
@@ -209,6 +213,46 @@ def _improvement_table(analysis: StageAnalysis) -> str:
         "Probability that a run of the first ends higher than a run of the second (ties half). "
         f"Decided: the intervals of the final rates are apart and p < {SIGNIFICANCE:g} after "
         "Holm's correction.",
+    )
+
+
+def _films(films: Films | None) -> str:
+    if films is None or not (films.films or films.why_not):
+        return ""
+    shown = "".join(
+        f"<figure>{_player(film)}<figcaption>q = {text(film.entropic_index)} on {text(film.task)}: "
+        f"{_OUTCOMES[film.success]}. {text(film.run)}</figcaption></figure>"
+        for film in films.films
+    )
+    parts = ["<h2>Videos</h2>"]
+    if shown:
+        parts.append(
+            paragraph(
+                "One episode each, with the same start and goal for every q: an example, and no "
+                "evidence. The policy is that of the middle run by final success.",
+                "soft",
+            )
+            + f'<div class="panels videos">{shown}</div>'
+        )
+    if films.why_not:
+        parts.append(
+            paragraph(
+                f"No video of {films.why_not}" if shown else f"No videos: {films.why_not}", "soft"
+            )
+        )
+    return "".join(parts)
+
+
+_OUTCOMES = {True: "goal reached", False: "goal not reached", None: "the task names no success"}
+
+
+def _player(film: Film) -> str:
+    label = f"An episode with q = {film.entropic_index} on {film.task}"
+    if film.ending == "gif":
+        return f'<img src="{film.uri}" alt="{text(label)}">'
+    return (
+        f'<video src="{film.uri}" aria-label="{text(label)}" controls loop muted playsinline>'
+        "</video>"
     )
 
 

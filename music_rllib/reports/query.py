@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from mlflow import MlflowClient
     from mlflow.entities import Metric, Run
 
-__all__ = ["attach", "read_mlflow"]
+__all__ = ["attach", "download_policy", "read_mlflow"]
 
 RUNS_PER_PAGE = 1000
 REQUESTS_AT_ONCE = 8
@@ -97,6 +97,26 @@ def attach(store: TrackingStore, run_id: str, folder: Path, name: str) -> None:
         raise ReportError(
             f"MLflow at {store.public_uri} must take the report, it answered: {_first_line(error)}"
         ) from error
+
+
+def download_policy(
+    store: TrackingStore, experiment_id: str, run_id: str, folder: Path
+) -> Path | None:
+    """The file of the policy that is logged as a run's model, in `folder`; None without one."""
+    client = _open(store)
+    import mlflow
+
+    found = client.search_logged_models(
+        [experiment_id], f"tags.`{names.TAG_SOURCE_RUN}` = '{run_id}'", max_results=1
+    )
+    if not found or found[0].status != "READY":
+        return None
+    place = f"{found[0].artifact_location}/artifacts/{names.ARTEFACT_POLICY}"
+    return Path(
+        mlflow.artifacts.download_artifacts(
+            artifact_uri=place, dst_path=str(folder), tracking_uri=store.uri
+        )
+    )
 
 
 def _open(store: TrackingStore) -> MlflowClient:

@@ -34,6 +34,7 @@ from music_rllib.sweep.preflight import (
     verify_inputs,
 )
 from music_rllib.sweep.records import SEARCH, as_json, keep
+from music_rllib.sweep.reporting import report_at_end
 from music_rllib.sweep.session import Sweep, keep_record, open_sweep, plan_document
 from music_rllib.sweep.tables import plan_view, results_table, search_runs, search_views
 from music_rllib.tracking import names
@@ -90,9 +91,20 @@ def run_sweep(
         if must_exist:
             check_begun(loaded)
         return _sweep(console, loaded, answer, dry_run=dry_run, accept_changes=accept_changes)
-    except KeyboardInterrupt:
-        _say_how_to_continue(console)
-        return 128 + signal.SIGINT
+    except (KeyboardInterrupt, SystemExit) as stopped:
+        return _code_of(console, stopped)
+
+
+def _code_of(console: Console, stopped: KeyboardInterrupt | SystemExit) -> int:
+    """The exit code after a signal that came while nothing was trained."""
+    if isinstance(stopped, KeyboardInterrupt):
+        number = signal.SIGINT
+    elif stopped.code == signal.SIGTERM:  # how Ray's handler, which `ray.init` sets, ends it
+        number = signal.SIGTERM
+    else:
+        raise stopped
+    _say_how_to_continue(console)
+    return 128 + number
 
 
 def resume_sweep(
@@ -111,9 +123,8 @@ def resume_sweep(
     try:
         loaded = found.config(seeds)
         return _sweep(console, loaded, answer, dry_run=False, accept_changes=accept_changes)
-    except KeyboardInterrupt:
-        _say_how_to_continue(console)
-        return 128 + signal.SIGINT
+    except (KeyboardInterrupt, SystemExit) as stopped:
+        return _code_of(console, stopped)
 
 
 def _sweep(
@@ -248,6 +259,10 @@ def _compute_and_report(console: Console, opened: Sweep, tracker: Tracker) -> in
         console.print(view)
     if undelivered := tracker.undelivered_message():
         console.print(Text(undelivered, style="yellow"), soft_wrap=True)
+    if stopped_by is None:
+        report = report_at_end(opened.folder, opened.config.mlflow.tracking_uri)
+        if report is not None:
+            console.print(Text(report), soft_wrap=True)
     console.print(Text(f"Open MLflow's pages with: {tracker.ui_command()}"), soft_wrap=True)
     if stopped_by is not None:
         _say_how_to_continue(console)

@@ -171,3 +171,9 @@ ARTEFACT_RUN_CONFIG = "config/run.yaml"
 ARTEFACT_LEARNING_CURVE = "learning_curve.png"
 ARTEFACT_POLICY = "policy.safetensors"
 """The final policy on its way to MLflow, where it becomes the run's logged model."""
+
+# Environment variables --------------------------------------------------------------------------
+VARIABLE_TRACKING_URI = "MUSIC_RLLIB_TRACKING_URI"
+"""Tells the report of a sweep's end where to read, password included."""
+VARIABLE_REPORT = "MUSIC_RLLIB_REPORT"
+"""`off`: no report at a sweep's end."""
