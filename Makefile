@@ -10,7 +10,7 @@ PYTEST_ARGS ?=
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help venv sweep test test-unit test-faults lint type bench profile clean
+.PHONY: help venv sweep test test-unit test-faults lint type bench profile results clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -64,6 +64,9 @@ bench: venv  ## what everything costs, as ratios in one run (BENCH='step environ
 
 profile: venv  ## write a flame graph of a training run to results/profile.svg
 	@$(BIN)/python -m benchmarks.profile
+
+results: venv  ## rebuild docs/results.md and its figures from docs/results/data
+	@$(BIN)/python docs/generate_results.py
 
 clean:  ## remove caches and build output (keeps .venv and results)
 	@rm -rf build dist *.egg-info .pytest_cache .hypothesis .mypy_cache .ruff_cache

@@ -23,8 +23,9 @@ def blocks(text: str, language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
 
 
-def test_configuration_page_is_up_to_date() -> None:
-    script = DOCS / "generate_configuration.py"
+@pytest.mark.parametrize("page", ["configuration", "results"])
+def test_generated_pages_are_up_to_date(page: str) -> None:
+    script = DOCS / f"generate_{page}.py"
     done = subprocess.run(
         [sys.executable, str(script), "--check"],
         cwd=ROOT,

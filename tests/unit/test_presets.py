@@ -70,3 +70,11 @@ def test_mistakes_are_named_where_they_are(
 ) -> None:
     with pytest.raises(ConfigError, match=message):
         load_sweep(sweep(tmp_path, preset, content))
+
+
+SWEEPS = sorted(path for path in SHIPPED.parent.rglob("*.yaml") if path.parent != SHIPPED)
+
+
+@pytest.mark.parametrize("path", SWEEPS, ids=lambda path: path.stem)
+def test_every_shipped_sweep_is_sound(path: Path) -> None:
+    assert load_sweep(path).stages
