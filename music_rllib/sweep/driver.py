@@ -30,6 +30,7 @@ from music_rllib.sweep.local import (
 from music_rllib.sweep.places import resolve_storage, sweep_folder
 from music_rllib.sweep.preflight import (
     check_environments,
+    check_hardware,
     import_checkpoints,
     verify_inputs,
 )
@@ -215,6 +216,8 @@ def _open(console: Console, config: SweepConfig) -> Sweep:
         console.print(f"No CONFIG given: running the packaged sweep {DEFAULT_CONFIG}.")
     plan = make_plan(config)
     check_environments(plan)
+    if cluster_address() is None:
+        check_hardware(plan)
     check_cpus(config.resources)
     storage, remark = resolve_storage(config.storage)
     opened = open_sweep(config, plan, storage, sweep_folder(storage, config.name))
@@ -329,12 +332,14 @@ def _compute(
     """Compute what is left, if anything; the signal that stopped it."""
     if opened.board.complete and (campaign is None or campaign.over):
         return None
+    from music_rllib.sweep.gauges import Gauges
     from music_rllib.sweep.runner import compute
 
     address = cluster_address()
     display.say("starting a local Ray" if address is None else f"connecting to Ray at {address}")
 
-    listeners: list[Listener] = [logbook, display, beacon]
+    gauges = Gauges(opened.config.name, opened.board, logbook.backlog, opened.folder)
+    listeners: list[Listener] = [logbook, display, beacon, gauges]
     if campaign is not None:
         listeners.append(campaign)
 

@@ -22,6 +22,7 @@ from music_rllib.sweep.words import in_words
 from music_rllib.tac.settings import LearnedAlpha
 from music_rllib.tracking import names
 from music_rllib.tracking.errors import TrackingError
+from music_rllib.tracking.sender import Backlog
 from music_rllib.tracking.tracker import Point, RunInfo, Tracker
 
 __all__ = ["Logbook", "run_info"]
@@ -159,6 +160,10 @@ class Logbook(Listener):
         self._try(lambda: self._tracker.start(told))
         self._try(lambda: self._tracker.finish(node.key, "KILLED"))
         self._open.discard(node.key)
+
+    def backlog(self) -> Backlog:
+        """What MLflow does not have yet."""
+        return self._tracker.backlog()
 
     def _try(self, log: Callable[[], object]) -> bool:
         """Log; False, with a complaint the first time, where the tracker can't."""
