@@ -107,7 +107,7 @@ def _bad_input() -> tuple[type[Exception], ...]:
     from music_rllib.experiment.handoff import HandoffError
     from music_rllib.experiment.sealed import StorageError
     from music_rllib.sweep.local import ClusterError
-    from music_rllib.sweep.preflight import TaskError
+    from music_rllib.sweep.preflight import HardwareError, TaskError
     from music_rllib.tracking.errors import TrackingError
 
     return (
@@ -115,6 +115,7 @@ def _bad_input() -> tuple[type[Exception], ...]:
         ClusterError,
         ConfigError,
         HandoffError,
+        HardwareError,
         StorageError,
         TaskError,
         TrackingError,

@@ -17,7 +17,14 @@ from music_rllib.sweep.board import Board, Status
 if TYPE_CHECKING:  # the environments are heavy, and most sweeps have none of their own
     from music_rllib.envs.make import Env
 
-__all__ = ["TaskError", "check_environments", "import_checkpoints", "verify_inputs"]
+__all__ = [
+    "HardwareError",
+    "TaskError",
+    "check_environments",
+    "check_hardware",
+    "import_checkpoints",
+    "verify_inputs",
+]
 
 
 class TaskError(ValueError):
@@ -41,6 +48,26 @@ def check_environments(plan: Plan) -> None:
         problems += [f"environments.{name}: {line}" for line in misfits]
     if problems:
         raise TaskError("\n".join(problems))
+
+
+class HardwareError(ValueError):
+    """A setting that this machine's hardware does not allow."""
+
+
+def check_hardware(plan: Plan) -> None:
+    """Look whether this machine can compute as the runs want it, where they are to run on it.
+
+    Raises:
+        HardwareError: It can't.
+    """
+    if all(node.run.tac.precision == "float32" for node in plan.nodes):
+        return
+    from music_rllib.tac.precision import PrecisionError, check_precision
+
+    try:
+        check_precision("bf16")
+    except PrecisionError as error:
+        raise HardwareError(str(error)) from error
 
 
 def _misfits(task: Task, *, hindsight: bool) -> list[str]:

@@ -1,9 +1,14 @@
 """bfloat16 products: close to float32, in float32 outside, and refused where there are none."""
 
+from pathlib import Path
+
 import pytest
 import torch
 from torch import Tensor
 
+from music_rllib.experiment.config import load_sweep
+from music_rllib.experiment.plan import make_plan
+from music_rllib.sweep.preflight import HardwareError, check_hardware
 from music_rllib.tac import precision
 from music_rllib.tac.networks import Critics, Perceptron
 from music_rllib.tac.precision import PrecisionError, check_precision
@@ -49,3 +54,16 @@ def test_bf16_is_refused_without_hardware_for_it(monkeypatch: pytest.MonkeyPatch
     check_precision("float32")
     monkeypatch.setattr(precision, "cpu_flags", lambda: frozenset({"avx512_bf16"}))
     check_precision("bf16")
+
+
+def test_a_local_sweep_in_bf16_is_refused_before_it_starts(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(precision, "cpu_flags", lambda: frozenset({"avx2"}))
+    file = tmp_path / "sweep.yaml"
+    file.write_text(
+        "name: fast\ntasks: [FetchReach]\ndefaults: {tac: {precision: bf16}}\n"
+        "stages: [{name: train, variant: tac}]\n"
+    )
+    with pytest.raises(HardwareError, match="this CPU has none of amx_bf16, avx512_bf16, bf16"):
+        check_hardware(make_plan(load_sweep(file)))
