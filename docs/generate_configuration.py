@@ -94,8 +94,7 @@ SEARCH_TEXT = """\
 ### Search
 
 A stage with `search` in place of `grid` finds its trials itself; [search.md](search.md) says which
-way
-answers which question.
+way answers which question.
 """
 
 VARIANTS_TEXT = """\

@@ -163,7 +163,7 @@ def _check_range(ends: tuple[float, float], *, log: bool, step: float | None) ->
             f"must be above 0 to be searched in the logarithm, got [{low:g}, {high:g}]"
         )
     if log and step is not None:
-        raise ValueError("must not have both log and step")
+        raise ValueError(f"step must be left out with log: true, got {step:g}")
     if step is not None and step > high - low:
         raise ValueError(f"must be wider than its step {step:g}, got [{low:g}, {high:g}]")
 
@@ -187,7 +187,10 @@ class Objective(_Strict):
     @model_validator(mode="after")
     def _threshold_belongs(self) -> Self:
         if (self.read == "steps_to") != (self.threshold is not None):
-            raise ValueError("threshold must be given with read: steps_to, and only there")
+            raise ValueError(
+                "threshold must be given with read: steps_to, and only there, "
+                f"got read: {self.read}"
+            )
         return self
 
     @property
@@ -369,7 +372,7 @@ class SearchSettings(_Strict):
             if name in self.space:
                 yield f"compare.{name} must not be in the space too, got it in both"
         if (self.mode == "compare") != bool(self.compare):
-            yield "compare must be given with mode: compare, and only there"
+            yield f"compare must be given with mode: compare, and only there, got mode: {self.mode}"
         yield from self._broken_sampler()
         yield from self._broken_pruning()
         for point in self.points_to_evaluate:
@@ -383,13 +386,16 @@ class SearchSettings(_Strict):
         if self.sampler == "grid":
             for name, dimension in self.space.items():
                 if dimension.values() is None:
-                    yield f"space.{name} must have a step to be part of a grid"
+                    yield f"space.{name} must have a step to be part of a grid, got none"
         elif self.trials is None:
-            yield f"trials must be given with sampler: {self.sampler}"
+            yield f"trials must be given with sampler: {self.sampler}, got null"
         if self.sampler == "cmaes":
             for name, dimension in self.space.items():
                 if isinstance(dimension, Choice) or dimension.when:
-                    yield f"space.{name} must be a number without 'when' for sampler: cmaes"
+                    yield (
+                        f"space.{name} must be a number without 'when' for sampler: cmaes, "
+                        "got another"
+                    )
         if self.sampler == "cmaes" and len(self.objectives) > 1:
             yield "sampler must be tpe, nsga2, random or grid for several objectives, got cmaes"
         if not self.objectives:
@@ -399,10 +405,13 @@ class SearchSettings(_Strict):
         if self.pruning is None:
             return
         if len(self.objectives) > 1:
-            yield "pruning must be null for several objectives"
+            yield "pruning must be null for several objectives, got rungs"
         before = (0, 0.0)
         for rung in self.pruning.rungs:
             here = (rung.seeds or 10**9, rung.env_steps or float("inf"))
             if here[0] < before[0] or here[1] < before[1] or here == before:
-                yield "pruning.rungs must grow in seeds or env_steps and never shrink"
+                yield (
+                    "pruning.rungs must grow in seeds or env_steps and never shrink, got "
+                    f"{rung.model_dump_json(exclude_none=True)} behind a larger one"
+                )
             before = here

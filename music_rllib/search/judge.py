@@ -104,20 +104,22 @@ def prune(
     *,
     scores: Array,
     others: Mapping[int, Array],
+    whole: Sequence[Array] = (),
     place: str,
 ) -> Verdict:
     """Whether a trial that has reached a rung is stopped there.
 
     It goes on if it is in the best part of those that have reached the rung, and it goes on too if
     its interval reaches the best of them: then its place may be bad luck. The interval is that of a
-    mean with the spread between seeds that all trials at this rung have in common, since a few runs
-    of one trial tell little about theirs.
+    mean, with the spread between seeds that earlier trials have in common: a few runs of one trial
+    tell little about theirs.
 
     Args:
         objective: What counts.
         pruning: The rules.
         scores: The trial's runs so far, `[seeds, tasks]`.
         others: Trial number to the same of each earlier trial that reached this rung.
+        whole: All runs of earlier trials that went to their end, `[seeds, tasks]` each.
         place: The rung in words.
     """
     sign = 1.0 if objective.maximised else -1.0
@@ -130,7 +132,7 @@ def prune(
     bar, best = ranked[kept - 1], max(theirs.values())
     if mine >= bar:
         return Verdict(stop=False, reason=f"{place}: among the best {kept} of {len(ranked)}")
-    half = _half_width(scores, list(others.values()), pruning.confidence)
+    half = _half_width(scores, [*others.values(), *whole], pruning.confidence)
     ends = f"[{sign * mine - half:.4g}, {sign * mine + half:.4g}]"
     if mine + half >= best:
         return Verdict(

@@ -68,9 +68,14 @@ def open_studies(url: str) -> BaseStorage:
                 f"search.storage must not hold a password, got one in {shown}: put it into the "
                 "environment as PGPASSWORD, or into ~/.pgpass"
             )
+        if parsed.drivername == "postgresql":
+            parsed = parsed.set(drivername="postgresql+psycopg2")
         local = parsed.get_backend_name() == "sqlite"
         options: dict[str, Any] = {"connect_args": {"timeout": 60}} if local else {"pool_size": 2}
-        storage = RDBStorage(url, engine_kwargs=options | {"pool_pre_ping": True})
+        storage = RDBStorage(
+            parsed.render_as_string(hide_password=False),
+            engine_kwargs=options | {"pool_pre_ping": True},
+        )
         return get_storage(storage)  # with a cache of ended trials
     except StorageError:
         raise
@@ -142,6 +147,7 @@ class Study:
         self._id, points, prior = self._open()
         self._proposer = Proposer(settings, points, prior)
         self._signed = 0.0
+        self._known: list[FrozenTrial] | None = None
         self.lay_out()
         self.release_the_dead()
 
@@ -252,9 +258,18 @@ class Study:
         return self.identity.name
 
     def trials(self) -> list[FrozenTrial]:
-        """The study's trials in order of their numbers, those beyond `trials` left out."""
-        found = self._storage.get_all_trials(self._id, deepcopy=False)
-        return sorted(found, key=lambda one: one.number)[: self.settings.count]
+        """The study's trials in order of their numbers, those beyond `trials` left out.
+
+        As they were at the last `refresh`, or at this driver's last change.
+        """
+        if self._known is None:
+            found = self._storage.get_all_trials(self._id, deepcopy=False)
+            self._known = sorted(found, key=lambda one: one.number)[: self.settings.count]
+        return self._known
+
+    def refresh(self) -> None:
+        """Look again at what other drivers have done."""
+        self._known = None
 
     @property
     def prior(self) -> int:
@@ -281,6 +296,7 @@ class Study:
             return None
         if not all(VALUES in one.user_attrs for one in between):
             return None
+        self.refresh()
         if not self._storage.set_trial_state_values(trial._trial_id, TrialState.RUNNING):
             return None  # another driver was faster
         self._set(trial, OWNER, self._me)
@@ -310,11 +326,13 @@ class Study:
         try:
             if reason:
                 self._set(trial, REASON, reason)
+            self.refresh()
             self._storage.set_trial_state_values(trial._trial_id, state, values)
         except UpdateFinishedTrialError:
             pass  # taken over while this driver was silent, and judged: the same, by the same rules
 
     def _set(self, trial: FrozenTrial, key: str, value: Any) -> None:
+        self.refresh()
         self._storage.set_trial_user_attr(trial._trial_id, key, value)
 
     # -- drivers -----------------------------------------------------------------------------
@@ -325,11 +343,13 @@ class Study:
         if now - self._signed >= SIGN_SECONDS:
             self._signed = now
             self._storage.set_study_user_attr(self._id, f"{DRIVER}{self._me}", now)
-            self.release_the_dead(now)
+            if not self._alone:
+                self.release_the_dead(now)
 
     def release_the_dead(self, now: float | None = None) -> None:
         """Put trials of drivers that are no more back among the waiting ones."""
         now = time.time() if now is None else now
+        self.refresh()
         signs = self._storage.get_study_user_attrs(self._id)
         for trial in self.trials():
             owner = trial.user_attrs.get(OWNER, "")
@@ -343,12 +363,14 @@ class Study:
             last = float(signs.get(f"{DRIVER}{owner}", 0.0))
             if self._alone or _is_dead(owner) or now - last > LEASE_SECONDS:
                 self._storage.set_trial_state_values(trial._trial_id, TrialState.WAITING)
+        self.refresh()
 
     def release(self) -> None:
         """Put what this driver holds back: it stops."""
         for trial in self.trials():
             if trial.state is TrialState.RUNNING and trial.user_attrs.get(OWNER) == self._me:
                 self._storage.set_trial_state_values(trial._trial_id, TrialState.WAITING)
+        self.refresh()
 
     def as_optuna(self) -> optuna.Study:
         """For Optuna's own analyses."""

@@ -175,6 +175,9 @@ class Campaign(Listener):
         if self._seen == self._board.changes and now - self._polled < POLL_SECONDS:
             return self._more
         self._polled = now
+        for search in self.searches:
+            for arm in search.arms:
+                arm.study.refresh()
         while True:
             before = self._board.changes
             moved = [self._advance(search) for search in self.searches]
@@ -206,7 +209,11 @@ class Campaign(Listener):
             arm.study.sign()
             for active in list(arm.active.values()):
                 moved |= self._judge(search, arm, active)
-            while (trial := arm.study.claim()) is not None:
+            # Only what this driver has room for: the rest is for others.
+            while self._board.next_ready() is None:
+                trial = arm.study.claim()
+                if trial is None:
+                    break
                 moved = True
                 self._begin(search, arm, trial)
         if all(arm.finalists is None and arm.over for arm in search.arms):
@@ -315,7 +322,7 @@ class Campaign(Listener):
             return self._store.history(key)
         return [report for _, report in sorted(self._heard.get(key, {}).items())]
 
-    def _stops(self, search: Search, arm: Arm, active: Active, scores: Array) -> str | None:
+    def _stops(self, search: Search, arm: Arm, active: Active, mine: Array) -> str | None:
         """Why the trial is stopped at its rung; None: it goes on.
 
         It is compared with the trials that had all ended when it was chosen, so that the answer
@@ -326,19 +333,20 @@ class Campaign(Listener):
         number = active.trial.number
         if number < pruning.warm_up:
             return None
-        others = {
-            other.number: np.asarray(other.user_attrs[SCORES][str(active.rung)][0])
-            for other in arm.study.trials()[: max(0, number - search.settings.concurrent + 1)]
-            if str(active.rung) in other.user_attrs.get(SCORES, {})
-        }
+        earlier = arm.study.trials()[: max(0, number - search.settings.concurrent + 1)]
+        at, end = str(active.rung), str(len(search.rungs) - 1)
+        kept = {other.number: other.user_attrs.get(SCORES, {}) for other in earlier}
+        others = {n: np.asarray(scores[at][0]) for n, scores in kept.items() if at in scores}
+        whole = [np.asarray(scores[end][0]) for scores in kept.values() if end in scores]
         rung = search.rungs[active.rung]
         steps = "" if rung.env_steps is None else f" after {rung.env_steps:,} env steps"
         verdict = prune(
             search.settings.objectives[0],
             pruning,
-            scores=scores,
+            scores=mine,
             others=others,
-            place=f"with {scores.shape[0]} of {len(self._plan.seeds)} seeds{steps}",
+            whole=whole,
+            place=f"with {mine.shape[0]} of {len(self._plan.seeds)} seeds{steps}",
         )
         return verdict.reason if verdict.stop else None
 

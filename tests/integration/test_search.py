@@ -1,0 +1,221 @@
+"""A search with a real Ray, stopped and resumed, and two drivers on PostgreSQL."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import textwrap
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from music_rllib.policy import load_policy
+from music_rllib.tracking import names
+
+pytestmark = pytest.mark.integration
+
+Document = dict[str, Any]
+ROOT = Path(__file__).parents[2]
+
+
+def searched(sweep_document: Document) -> Document:
+    """A search over very short runs."""
+    sweep_document["seeds"] = [0, 1]
+    sweep_document["defaults"] |= {
+        "env_steps": 400,
+        "evaluation": {"interval": 200, "episodes": 2},
+    }
+    sweep_document["defaults"]["tac"]["random_steps"] = 100
+    sweep_document["stages"] = [
+        {
+            "name": "train",
+            "variant": "tac",
+            "search": {
+                "space": {
+                    "tac.entropic_index": {"float": [1.0, 2.0], "step": 0.5},
+                    "tac.alpha": {"float": [0.01, 0.5], "log": True},
+                },
+                "trials": 3,
+                "startup_trials": 2,
+                "objective": {"metric": names.EVAL_RETURN, "aggregate": "mean"},
+                "pruning": {"rungs": [{"seeds": 1, "env_steps": 200}], "warm_up": 1},
+                "final": {"trials": 1, "seeds": 2},
+            },
+        }
+    ]
+    return sweep_document
+
+
+def command(program: Any, *arguments: str) -> tuple[int, str, str]:
+    done = subprocess.run(
+        [sys.executable, "-m", "music_rllib.sweep", *arguments],
+        cwd=program.folder,
+        env=program.environment,
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
+    return done.returncode, done.stdout, done.stderr
+
+
+def test_a_search_stopped_and_resumed_and_what_its_commands_say(
+    sweep_program: Any, sweep_document: Document, mlflow_runs: Callable[[], Any], tmp_path: Path
+) -> None:
+    sweep_program.write(searched(sweep_document))
+    process = sweep_program.start_until("trial0/")
+    code, output, errors = command(sweep_program, "stop", "results/points", "--json")
+    assert (code, json.loads(output)["state"]) == (0, "stopped"), errors
+    process.communicate(timeout=60)
+    assert process.returncode == 128 + signal.SIGINT
+    code, output, _ = command(sweep_program, "status", "results/points")
+    assert (code, "Sweep points: stopped" in output) == (0, True), output
+
+    code, output, errors = command(sweep_program, "resume", "points", "--json")
+    assert code == 0, errors
+    state = json.loads(output)
+    assert state["driver"]["outcome"] == "finished"
+    check_search(sweep_program.folder / "results")
+    check_commands(sweep_program)
+    runs = mlflow_runs()
+    parts = {run.data.tags[names.TAG_PART] for run in runs.values() if "part" in run.data.tags}
+    assert {"trial0", "trial1", "trial2"} <= parts
+    assert any(part.startswith("final") for part in parts)
+
+
+def check_search(storage: Path) -> None:
+    """Every objective is the mean of what its runs have in the store."""
+    (found,) = json.loads((storage / "points/search.json").read_text())
+    plan = json.loads((storage / "points/plan.json").read_text())
+    labels = {node["label"]: node["key"] for node in plan["nodes"]}
+    assert found["complete"]
+    for trial in found["arms"][0]["trials"]:
+        assert trial["state"] in {"judged", "pruned"}
+        if trial["state"] == "pruned":
+            assert trial["reason"]
+            continue
+        values = []
+        for label, key in labels.items():
+            if f"/trial{trial['number']}/" in label:
+                manifest = json.loads((storage / "nodes" / key / "manifest.json").read_text())
+                values.append(manifest["meta"]["result"]["metrics"][names.EVAL_RETURN])
+        assert len(values) == 2
+        assert trial["objective"] == [pytest.approx(sum(values) / 2)]
+    (first,) = found["ranking"]
+    assert len(first["scores"][0]) == 2
+
+
+def check_commands(program: Any) -> None:
+    code, output, _ = command(program, "compare", "results/points", "--json")
+    groups = json.loads(output)["groups"]
+    assert (code, [group["part"] for group in groups]) == (0, ["on fresh seeds", "in the search"])
+    code, output, errors = command(program, "best", "results/points", "--output", "out", "--json")
+    assert code == 0, errors
+    chosen = json.loads(output)
+    assert chosen["on_fresh_seeds"]
+    policy = load_policy(program.folder / "out")
+    assert policy.task.name == "Point"
+    assert (program.folder / "out/run.yaml").is_file()
+    code, output, _ = command(program, "clean", "results/points", "--all", "--yes", "--json")
+    assert (code, json.loads(output)["deleted"]) == (0, True)
+    assert not list((program.folder / "results/nodes").iterdir())
+    assert not (program.folder / "results/points").exists()
+
+
+# --- PostgreSQL --------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def postgresql(require_service: Callable[[str], Path], tmp_path: Path) -> Iterator[str]:
+    """A server of its own, on a free port of loopback; its URL."""
+    programs = require_service("postgresql").resolve().parent
+    programs = programs if (programs / "initdb").exists() else postgresql_programs()
+    folder = tmp_path / "postgresql"
+    folder.mkdir()
+    # The server refuses to run as root.
+    user: list[str] = []
+    if os.getuid() == 0:
+        shutil.chown(folder, "nobody")
+        for above in (folder, *folder.parents):
+            if above.stat().st_uid == 0 and above != Path("/tmp") and above != Path("/"):
+                above.chmod(above.stat().st_mode | 0o011)
+        user = ["setpriv", "--reuid=nobody", "--clear-groups"]
+    run = {"check": True, "capture_output": True, "timeout": 120, "cwd": folder}
+    data = folder / "data"
+    initdb = [*user, str(programs / "initdb"), "-D", str(data), "-U", "driver", "--no-sync"]
+    subprocess.run(initdb, **run)  # type: ignore[call-overload]
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    options = f"-p {port} -k {folder} -c listen_addresses=127.0.0.1 -c fsync=off"
+    control = [*user, str(programs / "pg_ctl"), "-D", str(data), "-w", "-l", str(folder / "log")]
+    subprocess.run([*control, "-o", options, "start"], **run)  # type: ignore[call-overload]
+    try:
+        yield f"postgresql://driver@127.0.0.1:{port}/postgres"
+    finally:
+        with contextlib.suppress(subprocess.CalledProcessError):
+            stop = [*control, "-m", "immediate", "stop"]
+            subprocess.run(stop, **run)  # type: ignore[call-overload]
+
+
+def postgresql_programs() -> Path:
+    found = sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb"))
+    assert found, "initdb must be beside postgres"
+    return found[-1].parent
+
+
+DRIVER = """
+    import sys, time
+    from pathlib import Path
+    sys.path.insert(0, sys.argv[1])
+    from test_search import Driver, document
+
+    folder = Path(sys.argv[2])
+    search = {"storage": sys.argv[3], "study": "together", "trials": 24, "concurrent": 6}
+    driver = Driver(folder, document(search), seed=int(sys.argv[4]))
+    while not driver.campaign.over:
+        try:
+            driver.play(slots=2)
+        except AssertionError as error:
+            assert "wait for ever" in str(error), error
+            time.sleep(0.02)  # for what the other one judges
+    import json
+    mine = sorted({run.part for run in driver.sweep.plan.runs if run.part})
+    print(json.dumps([mine, driver.trials()]))
+"""
+
+
+def test_two_drivers_on_postgresql_lose_and_double_no_trial(
+    postgresql: str, tmp_path: Path
+) -> None:
+    drivers = []
+    for seed, name in enumerate(("one", "other")):
+        (tmp_path / name).mkdir()
+        code = textwrap.dedent(DRIVER)
+        arguments = [str(ROOT / "tests/unit"), str(tmp_path / name), postgresql, str(seed)]
+        drivers.append(
+            subprocess.Popen(
+                [sys.executable, "-c", code, *arguments],
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+                env=os.environ | {"PYTHONPATH": str(ROOT)},
+            )
+        )
+    ended = [driver.communicate(timeout=240) for driver in drivers]
+    assert [driver.returncode for driver in drivers] == [0, 0], ended
+    found = [json.loads(output.splitlines()[-1]) for output, _ in ended]
+    (mine, trials), (theirs, the_same) = found
+    assert trials == the_same
+    assert [trial["state"] for trial in trials] == ["judged"] * 24
+    assert sorted([*mine, *theirs]) == sorted(f"trial{number}" for number in range(24)), "once each"
+    assert mine
+    assert theirs

@@ -1,0 +1,697 @@
+"""Searches: what a trial is worth, which point comes next, what is stopped, and what is resumed.
+
+Runs are played here by a formula in place of training: everything else is real, the studies'
+database and the node store among it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import random
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+import yaml
+from ray.tune.search import Searcher
+
+from music_rllib.experiment.config import load_sweep
+from music_rllib.experiment.plan import Node, make_plan
+from music_rllib.experiment.problems import ConfigError
+from music_rllib.experiment.result import HISTORY, Report, RunResult, last_values, to_json_lines
+from music_rllib.experiment.settings import RunSettings
+from music_rllib.experiment.space import FINAL_SEED, Objective, Pruning, Rung
+from music_rllib.search.judge import aggregate, prune, score
+from music_rllib.sweep.board import Status
+from music_rllib.sweep.campaign import Campaign
+from music_rllib.sweep.dag_searcher import DagSearcher
+from music_rllib.sweep.places import sweep_folder
+from music_rllib.sweep.searches import open_searches, outcome
+from music_rllib.sweep.session import Sweep, open_sweep
+from music_rllib.tracking import names
+
+Document = dict[str, Any]
+Formula = Callable[[RunSettings, float], float]
+"""Success rate of a run after a fraction of its budget."""
+
+
+@pytest.fixture
+def tmp_path(tmp_path: Path) -> Iterator[Path]:
+    """In memory where that can be: a study is written in hundreds of small transactions."""
+    memory = Path("/dev/shm")
+    if not memory.is_dir():
+        yield tmp_path
+        return
+    with tempfile.TemporaryDirectory(dir=memory) as folder:
+        yield Path(folder)
+
+
+SPACE: Document = {
+    "tac.entropic_index": {"float": [1.0, 2.5], "step": 0.25},
+    "tac.alpha": {"float": [0.005, 0.5], "log": True},
+}
+SEARCH: Document = {"space": SPACE, "trials": 6, "startup_trials": 2, "final": None}
+
+
+def document(search: Document, **changes: Any) -> Document:
+    base: Document = {
+        "name": "s",
+        "tasks": ["FetchPush"],
+        "seeds": [0, 1, 2],
+        "defaults": {"env_steps": 4000, "evaluation": {"interval": 1000, "episodes": 2}},
+        "stages": [
+            {"name": "pretrain", "variant": "music-u"},
+            {
+                "name": "finetune",
+                "variant": "music-r",
+                "init_from": "pretrain",
+                "search": SEARCH | search,
+            },
+        ],
+    }
+    return base | changes
+
+
+def success(run: RunSettings, share: float) -> float:
+    """Best at q = 1.5 and alpha = 0.05, with a spread between seeds."""
+    q, alpha = float(run.tac.entropic_index), float(run.tac.alpha)  # type: ignore[arg-type]
+    height = 0.9 - 0.5 * abs(q - 1.5) - 0.15 * abs(math.log10(alpha / 0.05))
+    return round(share * height + 0.02 * ((7 * run.seed) % 3 - 1), 6)
+
+
+class Driver:
+    """One driver of a sweep; plays Tune with runs that end in random order."""
+
+    def __init__(
+        self, folder: Path, content: Document, formula: Formula = success, seed: int = 0
+    ) -> None:
+        path = folder / "sweep.yaml"
+        path.write_text(yaml.safe_dump(content, sort_keys=False))
+        config = load_sweep(path, storage=str(folder / "results"))
+        plan = make_plan(config)
+        self.sweep: Sweep = open_sweep(
+            config, plan, config.storage, sweep_folder(config.storage, config.name)
+        )
+        self._time = 0.0
+        self.computed: list[str] = []
+        self.pruned: dict[str, str] = {}
+        self.campaign = Campaign(
+            self.sweep,
+            open_searches(self.sweep),
+            pruned=lambda node, reason: self.pruned.__setitem__(node.label, reason),
+            now=self._clock,
+        )
+        self.campaign.recall()
+        self._formula = formula
+        self._rng = random.Random(seed)
+        self._running: list[tuple[Node, int | None]] = []
+
+    def _clock(self) -> float:
+        self._time += 10.0  # other drivers are looked at each time
+        return self._time
+
+    def play(self, stop_after: int | None = None, slots: int = 2) -> None:
+        """Go on to the end, or until so many pieces of runs have been computed."""
+        board = self.sweep.board
+        searcher = DagSearcher(board, lambda node: {"key": node.key}, self.campaign.advance)
+        running = self._running
+        while stop_after is None or len(self.computed) < stop_after:
+            suggestion = None
+            if len(running) < slots:
+                suggestion = searcher.suggest("t")
+            if suggestion == Searcher.FINISHED and not running:
+                return
+            if isinstance(suggestion, dict):
+                node = board.node(suggestion["key"])
+                running.append((node, board.until(node.key)))
+            elif running:
+                self._compute(*running.pop(self._rng.randrange(len(running))))
+            else:
+                raise AssertionError("Tune would wait for ever")
+
+    def _compute(self, node: Node, until: int | None) -> None:
+        self.computed.append(f"{node.key}/{until}")
+        budget = node.run.env_steps
+        reports = [
+            Report(
+                env_steps=steps,
+                seconds=1.0,
+                timestamp_ms=1,
+                metrics={
+                    names.EVAL_EPISODES: 2.0,
+                    names.EVAL_SUCCESS: self._formula(node.run, steps / budget),
+                },
+            )
+            for steps in range(1000, (until or budget) + 1, 1000)
+        ]
+        self.campaign.reported(node, reports)
+        if until is not None:
+            self.sweep.board.pause(node.key, until)
+            return
+        publish(self.sweep, node, reports)
+        self.sweep.board.finish(node.key)
+
+    def trials(self, arm: int = 0) -> list[dict[str, Any]]:
+        """As plain data, with plain numbers."""
+        (found,) = outcome(self.campaign)
+        trials: list[dict[str, Any]] = json.loads(json.dumps(found["arms"][arm]["trials"]))
+        return trials
+
+    def outcome(self) -> dict[str, Any]:
+        (found,) = outcome(self.campaign)
+        return found
+
+
+def publish(sweep: Sweep, node: Node, reports: list[Report]) -> None:
+    folder = sweep.folder / "made"
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / HISTORY).write_bytes(to_json_lines(reports))
+    result = RunResult(
+        label=node.label,
+        env_steps=reports[-1].env_steps,
+        seconds=1.0,
+        metrics=last_values(reports),
+    )
+    sweep.store.publish(node.key, folder, result)
+
+
+def searched(folder: Path, search: Document | None = None, **changes: Any) -> Driver:
+    driver = Driver(folder, document(search or {}, **changes))
+    driver.play()
+    return driver
+
+
+def points(trials: list[dict[str, Any]]) -> list[Mapping[str, Any]]:
+    return [trial["values"] for trial in trials]
+
+
+# --- judging -----------------------------------------------------------------------------------
+
+
+def test_the_objective_is_the_aggregate_of_a_trials_runs_recomputed(tmp_path: Path) -> None:
+    driver = searched(tmp_path)
+    trials = driver.trials()
+    assert [trial["state"] for trial in trials] == ["judged"] * 6
+    runs = [run for run in driver.sweep.plan.runs if run.part]
+    assert len(runs) == 18
+    for trial in trials:
+        mine = [run for run in runs if run.part == f"trial{trial['number']}"]
+        assert {run.seed for run in mine} == {0, 1, 2}
+        results = [driver.sweep.store.result(run.key) for run in mine]
+        values = sorted(result.metrics[names.EVAL_SUCCESS] for result in results if result)
+        # Three values: a quarter of them is less than one, so none is cut off.
+        assert trial["objective"] == [pytest.approx(sum(values) / 3, abs=1e-12)]
+        assert driver.sweep.plan.node(mine[0].key).run.tac.alpha == trial["values"]["tac.alpha"]
+    best = max(trials, key=lambda trial: float(trial["objective"][0]))
+    assert driver.outcome()["arms"][0]["best"] == best["number"]
+
+
+@pytest.mark.parametrize(
+    ("how", "expected"),
+    [("iqm", 4.0), ("mean", 14.0), ("median", 4.0), ("worst_task", 2.5)],
+)
+def test_aggregates(how: str, expected: float) -> None:
+    # Two tasks in columns, four seeds: 1..4 and 4, 5, 6, 87; the middle half is 3, 4, 4, 5.
+    scores = np.array([[1.0, 4.0], [2.0, 5.0], [3.0, 6.0], [4.0, 87.0]])
+    assert aggregate(Objective(aggregate=how), scores) == pytest.approx(expected)  # type: ignore[arg-type]
+
+
+def test_the_worst_task_of_something_minimised_is_the_highest() -> None:
+    objective = Objective(aggregate="worst_task", direction="minimize")
+    assert aggregate(objective, np.array([[1.0, 9.0], [3.0, 11.0]])) == 10.0
+
+
+@pytest.mark.parametrize(
+    ("objective", "expected"),
+    [
+        ({}, 0.5),
+        ({"read": "best"}, 0.8),
+        ({"read": "mean"}, 0.5),
+        ({"read": "steps_to", "threshold": 0.6}, 2000.0),
+        ({"read": "steps_to", "threshold": 0.9}, 5000.0),
+        ({"metric": "env_steps"}, 3000.0),
+    ],
+)
+def test_a_runs_number(objective: Document, expected: float) -> None:
+    history = [
+        Report(env_steps=1000 * at, seconds=0, timestamp_ms=0, metrics={names.EVAL_SUCCESS: value})
+        for at, value in ((1, 0.2), (2, 0.8), (3, 0.5))
+    ]
+    assert score(Objective(**objective), history, 5000) == pytest.approx(expected)
+
+
+def test_a_run_without_the_metric_fails_its_trial_and_nothing_else(tmp_path: Path) -> None:
+    def formula(run: RunSettings, share: float) -> float:
+        return math.nan if run.tac.entropic_index == 2.5 else success(run, share)
+
+    space = {"tac.entropic_index": {"choice": [1.0, 2.5]}}
+    driver = Driver(tmp_path, document({"space": space, "sampler": "grid"}), formula)
+    driver.play()
+    good, bad = driver.trials()
+    assert good["state"] == "judged"
+    assert bad["state"] == "failed"
+    assert "evaluation/success_rate is not a finite number" in bad["reason"]
+
+
+# --- choosing ----------------------------------------------------------------------------------
+
+KINDS: list[Document] = [
+    {"sampler": "tpe", "trials": 10},
+    {"sampler": "random"},
+    {"sampler": "cmaes", "trials": 12, "population": 4},
+    {
+        "sampler": "nsga2",
+        "population": 4,
+        "trials": 10,
+        "objective": [{}, {"read": "steps_to", "threshold": 0.5}],
+    },
+    {"sampler": "tpe", "concurrent": 1},
+    {
+        "pruning": {"rungs": [{"seeds": 1, "env_steps": 2000}, {"seeds": 2}], "warm_up": 2},
+        "trials": 10,
+        "concurrent": 3,
+    },
+]
+
+
+@pytest.mark.parametrize("search", KINDS, ids=lambda search: json.dumps(search)[:40])
+def test_a_resumed_study_equals_the_unbroken_one(search: Document, tmp_path: Path) -> None:
+    for folder in ("whole", "broken"):
+        (tmp_path / folder).mkdir()
+    whole = searched(tmp_path / "whole", search)
+    for attempt in range(40):
+        # A driver that is killed: it says nothing, and its trials are left as they are.
+        driver = Driver(tmp_path / "broken", document(search), seed=attempt + 1)
+        driver.play(stop_after=9)
+        if driver.campaign.over:
+            break
+    assert driver.campaign.over
+    assert attempt > 1
+    assert driver.trials() == whole.trials()
+
+
+def test_points_do_not_depend_on_the_order_in_which_runs_end(tmp_path: Path) -> None:
+    found = []
+    for seed in range(3):
+        folder = tmp_path / str(seed)
+        folder.mkdir()
+        driver = Driver(folder, document({"trials": 6, "concurrent": 3}), seed=seed)
+        driver.play(slots=1 + 2 * seed)
+        found.append(driver.trials())
+    assert found[0] == found[1] == found[2]
+
+
+def test_another_seed_of_the_search_chooses_other_points(tmp_path: Path) -> None:
+    found = []
+    for seed in (0, 1):
+        folder = tmp_path / str(seed)
+        folder.mkdir()
+        found.append(points(searched(folder, {"seed": seed}).trials()))
+    assert found[0] != found[1]
+
+
+def test_tpe_learns(tmp_path: Path) -> None:
+    trials = searched(tmp_path, {"trials": 20, "startup_trials": 6}).trials()
+    values = [trial["objective"][0] for trial in trials]
+    assert np.mean(values[12:]) > np.mean(values[:6]) + 0.05
+
+
+def test_given_points_come_first(tmp_path: Path) -> None:
+    given = [{"tac.entropic_index": 1.25, "tac.alpha": 0.1}, {"tac.entropic_index": 2.0}]
+    trials = searched(tmp_path, {"points_to_evaluate": given}).trials()
+    assert trials[0]["values"] == given[0]
+    assert trials[1]["values"]["tac.entropic_index"] == 2.0
+
+
+def test_a_grid_tries_every_point_that_exists(tmp_path: Path) -> None:
+    space = {
+        "tac.bootstrap": {"choice": ["value", "critics"]},
+        "tac.policy_critic": {"choice": ["first", "min"], "when": {"tac.bootstrap": "critics"}},
+        "tac.batch_size": {"int": [64, 128], "step": 64},
+    }
+    driver = searched(tmp_path, {"space": space, "sampler": "grid", "trials": None})
+    found = points(driver.trials())
+    assert len(found) == 2 * (1 + 2)
+    assert found[0] == {"tac.bootstrap": "value", "tac.batch_size": 64}
+    assert all(("tac.policy_critic" in p) == (p["tac.bootstrap"] == "critics") for p in found)
+
+
+def test_conditional_settings_and_choices_of_any_kind(tmp_path: Path) -> None:
+    space = {
+        "tac.alpha": {"choice": [0.1, {"learned": True, "initial": 0.3}]},
+        "tac.bootstrap": {"choice": ["value", "critics"]},
+        "tac.policy_critic": {"choice": ["first", "min"], "when": {"tac.bootstrap": ["critics"]}},
+    }
+
+    def formula(run: RunSettings, share: float) -> float:
+        return share * (0.5 if run.tac.bootstrap == "critics" else 0.4)
+
+    driver = Driver(tmp_path, document({"space": space, "trials": 12}), formula)
+    driver.play()
+    found = points(driver.trials())
+    assert {type(point["tac.alpha"]) for point in found} == {float, dict}
+    assert any("tac.policy_critic" in point for point in found)
+    assert all(("tac.policy_critic" in p) == (p["tac.bootstrap"] == "critics") for p in found)
+
+
+# --- stopping early ----------------------------------------------------------------------------
+
+
+def test_what_is_stopped_early_is_so_for_a_reason_and_costs_less(tmp_path: Path) -> None:
+    pruning = {"rungs": [{"seeds": 1, "env_steps": 2000}, {"seeds": 2}], "warm_up": 3, "keep": 0.3}
+    driver = searched(tmp_path, {"pruning": pruning, "trials": 14})
+    trials = driver.trials()
+    stopped = [trial for trial in trials if trial["state"] == "pruned"]
+    assert stopped
+    assert not any(trial["number"] < 3 for trial in stopped)
+    for trial in stopped:
+        assert "is not among the best" in trial["reason"]
+        assert "interval" in trial["reason"]
+        runs = [run for run in driver.sweep.plan.runs if run.part == f"trial{trial['number']}"]
+        assert len(runs) < 3
+    assert driver.pruned
+    assert set(driver.pruned.values()) <= {trial["reason"] for trial in stopped}
+    best = max((t for t in trials if t["objective"]), key=lambda trial: trial["objective"])
+    assert best["number"] == driver.outcome()["arms"][0]["best"]
+
+
+def test_a_trial_is_stopped_only_if_its_interval_says_so() -> None:
+    pruning = Pruning(rungs=(Rung(seeds=2),), keep=0.3, confidence=0.9)
+    others = {n: np.array([[0.7 + 0.01 * n], [0.72 + 0.01 * n]]) for n in range(6)}
+
+    def verdict(values: list[float]) -> Any:
+        scores = np.array(values)[:, None]
+        return prune(Objective(), pruning, scores=scores, others=others, place="here")
+
+    assert verdict([0.2, 0.22]).stop
+    assert "[0.1" in verdict([0.2, 0.22]).reason
+    assert not verdict([0.9, 0.9]).stop
+    wide = verdict([0.2, 0.9])
+    assert not wide.stop
+    assert "its interval" in wide.reason
+    lower = Objective(direction="minimize")
+    worse = prune(lower, pruning, scores=np.array([[2.0], [2.1]]), others=others, place="here")
+    assert worse.stop
+
+
+# --- the final ranking -------------------------------------------------------------------------
+
+
+def test_the_ranking_is_of_fresh_seeds(tmp_path: Path) -> None:
+    def lucky(run: RunSettings, share: float) -> float:
+        """Good where it was searched and nowhere else."""
+        q = float(run.tac.entropic_index)  # type: ignore[arg-type]
+        if q == 2.5 and run.seed < FINAL_SEED:
+            return 0.99 * share
+        return share * (0.6 - 0.1 * abs(q - 1.5)) + 0.01 * (run.seed % 3)
+
+    space = {"tac.entropic_index": {"float": [1.0, 2.5], "step": 0.5}}
+    final = {"trials": 2, "seeds": 4}
+    driver = Driver(tmp_path, document({"space": space, "sampler": "grid", "final": final}), lucky)
+    driver.play()
+    found = driver.outcome()
+    assert found["complete"]
+    assert found["arms"][0]["best"] == 3, "the lucky one was the best in the search"
+    first, second = found["ranking"]
+    assert (first["values"]["tac.entropic_index"], second["values"]["tac.entropic_index"]) == (
+        1.5,
+        2.5,
+    )
+    assert second["selection_bias"][0] > 0.4
+    assert abs(first["selection_bias"][0]) < 0.02
+    assert first["interval"][0][0] <= first["fresh"][0] <= first["interval"][0][1]
+    assert second["best_is_better_with"] == 1.0
+    runs = [run for run in driver.sweep.plan.runs if run.part.startswith("final")]
+    assert {run.seed for run in runs} == {FINAL_SEED + n for n in range(4)}
+    pretrained = {run.seed for run in driver.sweep.plan.runs if run.stage == "pretrain"}
+    assert pretrained == {0, 1, 2} | {run.seed for run in runs}, "one for each seed, shared"
+
+
+def test_importance_names_what_matters(tmp_path: Path) -> None:
+    def formula(run: RunSettings, share: float) -> float:
+        return share * float(run.tac.entropic_index) / 3  # type: ignore[arg-type]
+
+    driver = Driver(tmp_path, document({"trials": 12, "sampler": "random"}), formula)
+    driver.play()
+    (arm,) = driver.outcome()["arms"]
+    assert next(iter(arm["importance"])) == "tac.entropic_index"
+    assert sum(arm["importance"].values()) == pytest.approx(1.0)
+
+
+# --- comparing, extending, learning from others ------------------------------------------------
+
+
+def test_compare_gives_every_value_the_same_budget_and_seeds(tmp_path: Path) -> None:
+    search = {
+        "mode": "compare",
+        "compare": {"tac.entropic_index": [1.0, 1.5, 2.0]},
+        "space": {"tac.alpha": {"float": [0.005, 0.5], "log": True}},
+        "trials": 4,
+        "final": {"trials": 1, "seeds": 3},
+    }
+    driver = searched(tmp_path, search)
+    found = driver.outcome()
+    assert [arm["values"] for arm in found["arms"]] == [
+        {"tac.entropic_index": q} for q in (1.0, 1.5, 2.0)
+    ]
+    for arm in found["arms"]:
+        assert [trial["state"] for trial in arm["trials"]] == ["judged"] * 4
+    # The same sampler's seed: all begin with the same point.
+    first = {arm["trials"][0]["values"]["tac.alpha"] for arm in found["arms"]}
+    assert len(first) == 1
+    by_q: dict[float, set[int]] = {}
+    for run in driver.sweep.plan.runs:
+        if run.part.startswith("trial"):
+            by_q.setdefault(run.values["tac.entropic_index"], set()).add(run.seed)
+    assert by_q == {1.0: {0, 1, 2}, 1.5: {0, 1, 2}, 2.0: {0, 1, 2}}
+    assert found["ranking"][0]["values"]["tac.entropic_index"] == 1.5
+    assert len(found["ranking"]) == 3
+
+
+def test_more_trials_go_on_where_the_study_ended(tmp_path: Path) -> None:
+    before = searched(tmp_path, {"trials": 5})
+    after = searched(tmp_path, {"trials": 8})
+    assert after.trials()[:5] == before.trials()
+    assert len(after.computed) == 3 * 3
+
+
+def test_more_seeds_pay_only_for_the_new_ones(tmp_path: Path) -> None:
+    before = searched(tmp_path)
+    after = searched(tmp_path, seeds=[0, 1, 2, 3, 4])
+    assert points(after.trials()) == points(before.trials())
+    assert len(after.computed) == 6 * 2 + 2, "of each trial two runs, and what they start from"
+    assert all(len(trial["scores"][0]) == 5 for trial in after.trials())
+
+
+def test_a_finer_grid_pays_only_for_what_is_new(tmp_path: Path) -> None:
+    def grid(step: float) -> Document:
+        space = {"tac.entropic_index": {"float": [1.0, 2.0], "step": step}}
+        return {"space": space, "sampler": "grid", "trials": None}
+
+    searched(tmp_path, grid(0.5))
+    after = searched(tmp_path, grid(0.25))
+    assert len(after.trials()) == 5
+    assert len(after.computed) == 2 * 3
+
+
+def test_a_study_of_another_space_takes_its_points_over(tmp_path: Path) -> None:
+    before = searched(tmp_path, {"trials": 4})
+    wider = SPACE | {"tac.alpha": {"float": [0.001, 0.9], "log": True}}
+    after = searched(tmp_path, {"trials": 6, "space": wider})
+    assert points(after.trials())[:4] == points(before.trials())
+    assert len(after.computed) == 2 * 3
+
+
+def test_a_warm_start_learns_from_an_older_study_and_does_not_rank_it(tmp_path: Path) -> None:
+    searched(tmp_path, {"trials": 12})
+    warm = {"study": "s/finetune", "storage": str(tmp_path / "results/s/study.db")}
+    cold = searched(tmp_path, {"trials": 4}, name="cold").trials()
+    driver = searched(tmp_path, {"trials": 4, "warm_start": warm}, name="warm")
+    assert driver.outcome()["arms"][0]["learnt_from"] == 12
+    assert len(driver.trials()) == 4
+    values = [trial["objective"][0] for trial in driver.trials()]
+    assert np.mean(values) > np.mean([trial["objective"][0] for trial in cold])
+
+
+def test_settings_of_the_pretraining_can_be_searched_and_are_shared(tmp_path: Path) -> None:
+    space = {
+        "pretrain:music.lr": {"choice": [0.001, 0.01]},
+        "tac.alpha": {"choice": [0.05, 0.1, 0.2]},
+    }
+    driver = searched(tmp_path, {"space": space, "sampler": "grid", "trials": None})
+    nodes = [node for node in driver.sweep.plan.nodes if node.stage == "pretrain"]
+    assert len(nodes) == 2 * 3, "one for each of its settings and seed"
+    assert {node.run.music.lr for node in nodes} == {0.001, 0.01}
+    assert len([run for run in driver.sweep.plan.runs if run.part]) == 6 * 3
+
+
+def test_two_drivers_share_a_study(tmp_path: Path) -> None:
+    database = f"sqlite:///{tmp_path}/shared.db"
+    search = {"storage": database, "study": "together", "trials": 10, "concurrent": 3}
+    for folder in ("one", "other", "alone"):
+        (tmp_path / folder).mkdir()
+    one = Driver(tmp_path / "one", document(search))
+    other = Driver(tmp_path / "other", document(search), seed=1)
+    for _ in range(200):
+        for driver in (one, other):
+            try:
+                driver.play(stop_after=len(driver.computed) + 2)
+            except AssertionError:
+                continue  # it waits for what the other one judges
+        if one.campaign.over and other.campaign.over:
+            break
+    assert one.trials() == other.trials()
+    assert [trial["state"] for trial in one.trials()] == ["judged"] * 10
+    by_trial = [{run.part for run in d.sweep.plan.runs if run.part} for d in (one, other)]
+    assert by_trial[0] | by_trial[1] == {f"trial{number}" for number in range(10)}
+    assert not by_trial[0] & by_trial[1]
+    assert all(by_trial)
+    alone = searched(tmp_path / "alone", search | {"storage": None})
+    assert alone.trials() == one.trials()
+
+
+def test_a_dead_drivers_trials_are_taken_over(tmp_path: Path) -> None:
+    search = {"storage": f"sqlite:///{tmp_path}/shared.db", "study": "together"}
+    dead = Driver(tmp_path, document(search))
+    dead.play(stop_after=4)
+    study = dead.campaign.searches[0].arms[0].study
+    held = [trial.number for trial in study.trials() if trial.state.name == "RUNNING"]
+    assert held
+    driver = Driver(tmp_path, document(search))
+    mine = driver.campaign.searches[0].arms[0].study
+    mine.release_the_dead()
+    assert [t.number for t in mine.trials() if t.state.name == "RUNNING"] == held, "it is alive"
+    later = 10_000_000_000.0
+    mine.release_the_dead(later)
+    driver.play()
+    assert [trial["state"] for trial in driver.trials()] == ["judged"] * 6
+
+
+def test_what_a_failed_run_takes_with_it(tmp_path: Path) -> None:
+    driver = Driver(tmp_path, document({}))
+    driver.play(stop_after=3)
+    node = next(n for n in driver.sweep.board.having(Status.WAITING) if n.part)
+    driver.sweep.board.start(node.key)
+    driver.sweep.board.fail(node.key)
+    driver.play()
+    states = [trial["state"] for trial in driver.trials()]
+    assert states.count("failed") == 1
+    assert states.count("judged") == 5
+    (failed,) = [trial for trial in driver.trials() if trial["state"] == "failed"]
+    assert "failed" in failed["reason"]
+
+
+def test_two_hundred_trials_cost_the_driver_no_more_each_than_one_hundred(tmp_path: Path) -> None:
+    driver = Driver(tmp_path, document({"trials": 200, "sampler": "random"}, seeds=[0]))
+    process = psutil.Process()
+    seconds, memory = [], []
+    for until in (51, 101, 151, 201):  # one is the pretraining
+        before = time.process_time()
+        driver.play(stop_after=until)
+        seconds.append(time.process_time() - before)
+        memory.append(process.memory_info().rss)
+    driver.play()
+    assert [trial["state"] for trial in driver.trials()] == ["judged"] * 200
+    assert seconds[3] < 3 * seconds[0], seconds
+    assert memory[3] - memory[0] < 30 * 2**20, memory
+
+
+# --- the same everywhere -----------------------------------------------------------------------
+
+
+def test_the_same_file_gives_the_same_points_on_another_machine(tmp_path: Path) -> None:
+    """Six digits of each: the last bits of a machine's logarithm play no part."""
+    driver = Driver(tmp_path, document({}))
+    driver.play(stop_after=2)
+    assert points(driver.trials())[:2] == FIRST_POINTS
+
+
+FIRST_POINTS: list[Mapping[str, Any]] = [
+    {"tac.entropic_index": 2.5, "tac.alpha": 0.135116},
+    {"tac.entropic_index": 1.5, "tac.alpha": 0.146438},
+]
+
+
+# --- mistakes ----------------------------------------------------------------------------------
+
+MISTAKES: list[tuple[Document, str]] = [
+    ({"trials": None}, "search.trials must be given with sampler: tpe, got null"),
+    (
+        {"space": {"tac.alpha": {"float": [0.5, 0.1]}}},
+        "search.space.tac.alpha must be [lowest, highest], got [0.5, 0.1]",
+    ),
+    (
+        {"space": {"tac.alpha": {"float": [0.0, 0.1], "log": True}}},
+        "search.space.tac.alpha must be above 0 to be searched in the logarithm",
+    ),
+    (
+        {"space": {"tac.alpha": {"flaot": [0.0, 0.1]}}},
+        "search.space.tac.alpha must have exactly one of float, int and choice",
+    ),
+    (
+        {"space": {"tac.entropic_index": {"float": [0, 2]}}},
+        "search.space.tac.entropic_index must be > 0, got 0",
+    ),
+    (
+        {"space": {"tac.entropic_indx": {"float": [1, 2]}}},
+        "is not a known setting (did you mean 'entropic_index'?)",
+    ),
+    (
+        {"space": {"seed": {"int": [1, 2]}}},
+        "seed is never a grid dimension",
+    ),
+    (
+        {"space": {"tac.lr": {"float": [0.1, 1], "when": {"tac.tau": 1}}}},
+        "space.tac.lr.when must name settings that stand above it, got 'tac.tau'",
+    ),
+    ({"sampler": "grid"}, "space.tac.alpha must have a step to be part of a grid"),
+    (
+        {"sampler": "cmaes", "space": {"tac.policy_critic": {"choice": ["min", "first"]}}},
+        "space.tac.policy_critic must be a number without 'when' for sampler: cmaes",
+    ),
+    ({"mode": "compare"}, "compare must be given with mode: compare, and only there"),
+    (
+        {"objective": {"metric": "evaluation/succes_rate"}},
+        "must be a metric that runs report",
+    ),
+    ({"objective": {"read": "steps_to"}}, "threshold must be given with read: steps_to"),
+    (
+        {"points_to_evaluate": [{"tac.alpha": 3}]},
+        "points_to_evaluate[0].tac.alpha must be in [0.005, 0.5], got 3",
+    ),
+    (
+        {"pruning": {"rungs": [{"seeds": 2}, {"seeds": 1}]}},
+        "pruning.rungs must grow in seeds or env_steps and never shrink",
+    ),
+    (
+        {"space": {"warmup:tac.lr": {"float": [0.1, 1]}}},
+        "must name settings of this stage or of the one it starts from, which is 'pretrain'",
+    ),
+]
+
+
+@pytest.mark.parametrize(("search", "message"), MISTAKES, ids=[text[:45] for _, text in MISTAKES])
+def test_mistakes_in_a_search_are_named(search: Document, message: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError) as error:
+        Driver(tmp_path, document(search))
+    assert message in str(error.value)
+    assert "sweep.yaml:" in str(error.value)
+
+
+def test_a_password_belongs_into_the_environment(tmp_path: Path) -> None:
+    search = {"storage": "postgresql://me:hidden@127.0.0.1:9/studies"}
+    with pytest.raises(RuntimeError, match="must not hold a password") as error:
+        Driver(tmp_path, document(search))
+    assert "hidden" not in str(error.value)
+
+
+def test_a_database_that_is_not_there(tmp_path: Path) -> None:
+    search = {"storage": "postgresql://me@127.0.0.1:9/studies"}
+    with pytest.raises(RuntimeError, match=r"search.storage must be a database that can be used"):
+        Driver(tmp_path, document(search))
