@@ -51,6 +51,21 @@ class Resources(_Strict):
     """CPUs of the local Ray that is started where no cluster is given; null: all there are."""
     cpus_per_run: int = Field(1, gt=0)
     """CPUs reserved for a run; a run itself uses one."""
+    gpus_per_run: float = Field(0.0, ge=0)
+    """GPUs reserved for a run, whose networks then train on one; 0.25 shares one between four."""
+    memory_per_run: float | None = Field(None, gt=0)
+    """GiB of memory reserved for a run, so that fewer run side by side; null: memory is not
+    counted."""
+
+    @property
+    def bundle(self) -> dict[str, float]:
+        """What is reserved for a run, by Ray's names; memory in bytes."""
+        wanted: dict[str, float] = {"CPU": self.cpus_per_run}
+        if self.gpus_per_run:
+            wanted["GPU"] = self.gpus_per_run
+        if self.memory_per_run is not None:
+            wanted["memory"] = round(self.memory_per_run * 2**30)
+        return wanted
 
     @model_validator(mode="after")
     def _one_fits(self) -> Self:

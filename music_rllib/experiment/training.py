@@ -81,6 +81,7 @@ class TrainingRun:
     Args:
         run: the settings.
         handoff: weights to start from, by module name (`TAC.set_parts`).
+        gpus: more than 0: the networks train on a GPU.
 
     Raises:
         ValueError: settings or weights that do not fit the environment.
@@ -90,9 +91,13 @@ class TrainingRun:
         self,
         run: RunSettings,
         handoff: Mapping[str, Mapping[str, NDArray[Any]]] | None = None,
+        gpus: float = 0.0,
     ) -> None:
         self.run = run
-        self.algorithm: TAC = algorithm_config(run).build_algo()
+        config = algorithm_config(run)
+        if gpus:
+            config.learners(num_gpus_per_learner=gpus)
+        self.algorithm: TAC = config.build_algo()
         if handoff:
             self.algorithm.set_parts(handoff)
         self._rounds: defaultdict[str, list[float]] = defaultdict(list)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import ray
@@ -13,7 +14,7 @@ from music_rllib._quiet import quiet_third_parties
 from music_rllib.experiment.model import Resources
 from music_rllib.sweep.local import ClusterError, check_cpus, cluster_address
 
-__all__ = ["cluster"]
+__all__ = ["cluster", "slots"]
 
 OBJECT_STORE_BYTES = 128 * 2**20
 """Enough, as reports are all that workers send; Ray's default takes a third of the memory."""
@@ -55,11 +56,46 @@ def cluster(resources: Resources) -> Iterator[int]:
 
 
 def _slots(resources: Resources) -> int:
-    nodes = [node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"]]
-    slots = sum(int(cpus // resources.cpus_per_run) for cpus in nodes)
-    if slots == 0:
-        raise ClusterError(
-            f"resources.cpus_per_run must fit into one node of the cluster, whose largest has "
-            f"{max(nodes, default=0):g} CPUs, got {resources.cpus_per_run}"
-        )
-    return slots
+    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    return slots(resources, nodes, local=cluster_address() is None)
+
+
+def slots(resources: Resources, nodes: Sequence[Mapping[str, float]], *, local: bool) -> int:
+    """How many runs fit at once into nodes with these resources.
+
+    Args:
+        resources: What is reserved for a run.
+        nodes: Ray's resources of each node.
+        local: Whether this is the Ray of one sweep; for the message.
+
+    Raises:
+        ClusterError: Not even one fits, and none ever will.
+    """
+    bundle = resources.bundle
+    count = sum(
+        min(int(node.get(name, 0) / amount + 1e-9) for name, amount in bundle.items())
+        for node in nodes
+    )
+    if count:
+        return count
+    where = "this machine, which" if local else "one node of the cluster, whose largest"
+    for name, (setting, unit, scale) in _SETTINGS.items():
+        largest = max((node.get(name, 0) for node in nodes), default=0)
+        if bundle.get(name, 0) > largest:
+            raise ClusterError(
+                f"resources.{setting} must fit into {where} has "
+                f"{math.floor(largest / scale * 10) / 10:g} {unit}, got "
+                f"{getattr(resources, setting):g}"
+            )
+    raise ClusterError(
+        "resources must fit into one node; each of them is on some node, but all together "
+        f"({', '.join(f'{name} {amount:g}' for name, amount in bundle.items())}) on none"
+    )
+
+
+_SETTINGS = {
+    "CPU": ("cpus_per_run", "CPUs", 1),
+    "GPU": ("gpus_per_run", "GPUs", 1),
+    "memory": ("memory_per_run", "GiB of memory for Ray", 2**30),
+}
+"""Ray's name to the setting, the unit in messages, and what a unit is."""

@@ -64,6 +64,8 @@ def compute(
             node,
             sweep.storage,
             resources.cpus_per_run,
+            gpus=resources.gpus_per_run,
+            memory=int(resources.bundle.get("memory", 0)),
             until=sweep.board.until(node.key),
             checkpoints=sweep.config.checkpoints,
             sweep=sweep.plan.name,

@@ -64,6 +64,9 @@ class NodeJob(BaseModel):
     source_task: Task | None
     storage: str
     cpus: int
+    gpus: float = 0.0
+    memory: int = 0
+    """Bytes that are reserved; 0: memory is not counted."""
     until: int | None = None
     """Stop at the first evaluation from so many environment steps on, to be continued; None: go on
     to the end."""
@@ -80,6 +83,8 @@ class NodeJob(BaseModel):
         storage: str,
         cpus: int,
         *,
+        gpus: float = 0.0,
+        memory: int = 0,
         until: int | None = None,
         checkpoints: Checkpoints | None = None,
         sweep: str = "",
@@ -87,6 +92,8 @@ class NodeJob(BaseModel):
     ) -> NodeJob:
         """The job that computes `node` in the storage at this URI on so many CPUs."""
         return cls(
+            gpus=gpus,
+            memory=memory,
             until=until,
             checkpoints=checkpoints or Checkpoints(),
             sweep=sweep,
@@ -120,8 +127,10 @@ class RunTrainable(Trainable):
 
     @classmethod
     def default_resource_request(cls, config: dict[str, Any]) -> PlacementGroupFactory:
-        """One bundle with the CPUs of a run."""
-        return PlacementGroupFactory([{"CPU": NodeJob.from_tune(config).cpus}])
+        """One bundle with what a run uses."""
+        job = NodeJob.from_tune(config)
+        bundle: dict[str, float] = {"CPU": job.cpus, "GPU": job.gpus, "memory": job.memory}
+        return PlacementGroupFactory([{name: amount for name, amount in bundle.items() if amount}])
 
     def setup(self, config: dict[str, Any]) -> None:
         """Only what can't fail: errors in a step are reported with their cause."""
@@ -213,7 +222,7 @@ class RunTrainable(Trainable):
     def _begin(self, store: NodeStore) -> TrainingRun:
         from music_rllib.experiment.training import TrainingRun
 
-        training = TrainingRun(self._job.run, self._weights(store))
+        training = TrainingRun(self._job.run, self._weights(store), self._job.gpus)
         with self._work(store).newest(self._notes.append) as saved:
             if saved is not None:
                 training.restore(saved)
