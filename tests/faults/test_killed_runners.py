@@ -24,6 +24,7 @@ def kill_runner(algo: TAC) -> None:
     os.kill(pid, signal.SIGKILL)
 
 
+@pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore")  # Ray says what happened
 def test_a_killed_runner_changes_no_number(tmp_path: Path) -> None:
     unbroken = remote_runner()
