@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 import os
 import re
 import shutil
@@ -138,7 +139,7 @@ def test_the_command_says_what_is_wrong(tmp_path: Path) -> None:
 
 def test_every_file_with_a_schema_is_checked() -> None:
     """A new file must not stay unchecked."""
-    others = {"sweep.yaml", "prometheus.yml"}
+    others = {"grafana-datasource.yml", "prometheus.yml", "sweep.yaml"}
     for path in CLUSTER.rglob("*.y*ml"):
         name = path.relative_to(CLUSTER).as_posix()
         assert name in ALL or name in others or path.name == "kustomization.yaml", name
@@ -201,6 +202,45 @@ def test_kustomize_puts_the_objects_together() -> None:
         )
         kinds = {entry["kind"] for entry in yaml.safe_load_all(done.stdout)}
         assert kinds == {"PersistentVolumeClaim", {"raycluster": "RayCluster"}.get(name, "RayJob")}
+
+
+def test_grafana_finds_its_dashboards_and_prometheus() -> None:
+    """Where the files of `dashboards/` say, by the names that compose gives."""
+    services = load("compose.yaml")["services"]
+    mounted = dict(volume.split(":")[:2][::-1] for volume in services["grafana"]["volumes"])
+    inside = "/etc/grafana/provisioning"
+    (provider,) = load_from(mounted[f"{inside}/dashboards"], "music_rllib.yml")["providers"]
+    variable = provider["options"]["path"].strip("${}")
+    folder = CLUSTER / mounted[services["grafana"]["environment"][variable]]
+    boards = [json.loads(path.read_text()) for path in folder.glob("*.json")]
+    assert boards
+    (source,) = load("grafana-datasource.yml")["datasources"]
+    assert source["url"] == "http://prometheus:9090"
+    (local,) = load_from("../dashboards/grafana/provisioning/datasources", "prometheus.yml")[
+        "datasources"
+    ]
+    assert source == local | {"url": source["url"]}
+    (scraped,) = load("prometheus.yml")["scrape_configs"]
+    (discovery,) = scraped["dns_sd_configs"]
+    assert set(discovery["names"]) <= set(services)
+    for name in discovery["names"]:
+        assert f"--metrics-export-port={discovery['port']}" in services[name]["command"]
+
+
+def test_prometheus_takes_its_configuration(require_service: Callable[[str], Path]) -> None:
+    program = require_service("prometheus").with_name("promtool")
+    done = subprocess.run(
+        [program, "check", "config", CLUSTER / "prometheus.yml"],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def load_from(folder: str, name: str) -> Any:
+    return yaml.safe_load((CLUSTER / folder / name).read_text())
 
 
 # -- secrets ----------------------------------------------------------------------------------
