@@ -37,6 +37,7 @@ from music_rllib.sweep.preflight import (
 from music_rllib.sweep.records import SEARCH, as_json, keep
 from music_rllib.sweep.reporting import report_at_end
 from music_rllib.sweep.session import Sweep, keep_record, open_sweep, plan_document
+from music_rllib.sweep.signals import early
 from music_rllib.sweep.tables import plan_view, results_table, search_runs, search_views
 from music_rllib.tracking import names
 from music_rllib.tracking.redaction import redact
@@ -99,7 +100,7 @@ def run_sweep(
 def _code_of(console: Console, stopped: KeyboardInterrupt | SystemExit) -> int:
     """The exit code after a signal that came while nothing was trained."""
     if isinstance(stopped, KeyboardInterrupt):
-        number = signal.SIGINT
+        number = early.received or signal.SIGINT
     elif stopped.code == signal.SIGTERM:  # how Ray's handler, which `ray.init` sets, ends it
         number = signal.SIGTERM
     else:
@@ -154,7 +155,7 @@ def _sweep(
         return 0
     if changes is not None and not accept_changes:
         raise BadInputError(str(changes))
-    with driving(opened):
+    with driving(opened), early:
         code = _drive(console, opened)
     answer(records.read(opened.storage, f"{config.name}/{records.STATE}") or {})
     return code
@@ -246,6 +247,7 @@ def _compute_and_report(console: Console, opened: Sweep, tracker: Tracker) -> in
 
     with Display(console, opened.plan, opened.board) as display, Beacon(opened) as beacon:
         logbook = Logbook(tracker, lambda text: display.say(text, "yellow"), opened.store)
+        display.headline = beacon.headline
         _take_over(opened, display, logbook)
         campaign = _open_campaign(opened, display, logbook, beacon)
         stopped_by = _compute(opened, display, logbook, beacon, campaign)
@@ -346,7 +348,10 @@ def _compute(
     def on_stop() -> None:
         display.say("stopping, this takes a few seconds; Ctrl-C again stops at once", "yellow")
 
-    return compute(opened, listeners, on_stop, campaign).stopped_by
+    try:
+        return compute(opened, listeners, on_stop, campaign).stopped_by
+    finally:
+        gauges.close()
 
 
 def _say_how_to_continue(console: Console) -> None:

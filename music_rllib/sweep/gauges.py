@@ -25,8 +25,9 @@ from music_rllib.tracking.sender import Backlog
 
 __all__ = ["GAUGES", "TARGETS", "Gauges"]
 
-TARGETS = "metrics_targets.json"
-"""In the sweep's folder: where this Ray's metrics are, as Prometheus' file_sd reads it."""
+TARGETS = ".prometheus"
+"""Folder beside the sweeps' own: NAME.json says where this Ray's metrics are. Prometheus' file_sd
+reads it, and wants all of them in one folder."""
 SET_SECONDS = 2.0
 RUN_TAGS = ("sweep", "stage", "variant", "task", "q", "seed", "run")
 SWEEP_TAGS = ("sweep",)
@@ -68,11 +69,11 @@ class Gauges(Listener):
         folder: Path,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Say in `folder` where Prometheus finds them; `now` is a clock in seconds."""
+        """Say beside the sweep's `folder` where Prometheus finds them; `now` is in seconds."""
         self._sweep = sweep
         self._board = board
         self._backlog = backlog
-        self._targets = folder / TARGETS
+        self._targets = folder.parent / TARGETS / f"{folder.name}.json"
         self._now = now
         self._next = 0.0
         self._gauges: dict[str, Any] = {}
@@ -111,6 +112,11 @@ class Gauges(Listener):
         # Whatever Ray's metrics say: training goes on.
         with contextlib.suppress(Exception):
             self._set_all()
+
+    def close(self) -> None:
+        """Ray ends, and with it what could be scraped."""
+        with contextlib.suppress(OSError):
+            self._targets.unlink(missing_ok=True)
 
     def _over(self, node: Node) -> None:
         _, values = self._values.setdefault(node.key, (self._tags(node), {}))
@@ -151,6 +157,7 @@ class Gauges(Listener):
         nodes = [node for node in ray.nodes() if node["Alive"] and node["MetricsExportPort"]]
         found = [f"{node['NodeManagerAddress']}:{node['MetricsExportPort']}" for node in nodes]
         entry = {"labels": {"job": "music_rllib", "sweep_name": self._sweep}, "targets": found}
+        self._targets.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(self._targets, json.dumps([entry], indent=1).encode())
 
 

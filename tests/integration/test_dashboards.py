@@ -1,0 +1,154 @@
+"""The dashboards against what they show: a real sweep, scraped by a real Prometheus."""
+
+from __future__ import annotations
+
+import json
+import re
+import socket
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from urllib.error import URLError
+from urllib.parse import urlencode
+from urllib.request import urlopen
+
+import pytest
+import yaml
+
+from music_rllib.sweep.gauges import GAUGES, TARGETS
+
+DASHBOARDS = Path(__file__).parents[2] / "dashboards"
+PATIENCE = 240.0
+
+
+def dashboard() -> dict[str, Any]:
+    path = DASHBOARDS / "grafana" / "dashboards" / "sweeps.json"
+    return json.loads(path.read_text())  # type: ignore[no-any-return]
+
+
+def queries() -> dict[str, str]:
+    """Every panel's query, with Grafana's variables as they are when all is chosen."""
+    return {
+        f"{panel['title']} {target['refId']}": re.sub(r"\$\w+", ".*", target["expr"])
+        for panel in dashboard()["panels"]
+        for target in panel["targets"]
+    }
+
+
+def variables() -> list[tuple[str, str]]:
+    """(metric, label) of each variable's list of values."""
+    found = [
+        re.fullmatch(r"label_values\((\w+), (\w+)\)", variable["query"]["query"])
+        for variable in dashboard()["templating"]["list"]
+    ]
+    return [(match[1], match[2]) for match in found if match is not None]
+
+
+def test_the_dashboard_shows_every_gauge_and_no_other() -> None:
+    shown = {name for query in queries().values() for name in re.findall(r"ray_(\w+)", query)}
+    # The updates that a run has done are for other dashboards.
+    assert shown | {"music_grad_updates"} == set(GAUGES)
+    assert len(variables()) == 3
+
+
+def test_the_provisioning_belongs_together() -> None:
+    grafana = DASHBOARDS / "grafana"
+    sources = yaml.safe_load((grafana / "provisioning/datasources/prometheus.yml").read_text())
+    (source,) = sources["datasources"]
+    panels = dashboard()["panels"]
+    assert {panel["datasource"]["uid"] for panel in panels} == {source["uid"]}
+    assert len({panel["id"] for panel in panels}) == len(panels)
+    places = [panel["gridPos"] for panel in panels]
+    for place in places:
+        assert place["x"] + place["w"] <= 24
+    (provider,) = yaml.safe_load((grafana / "provisioning/dashboards/music_rllib.yml").read_text())[
+        "providers"
+    ]
+    assert provider["type"] == "file"
+
+
+class Prometheus:
+    """A server on the sweep's targets, with the repository's own configuration."""
+
+    def __init__(self, program: Path, folder: Path) -> None:
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            port = probe.getsockname()[1]
+        self.address = f"127.0.0.1:{port}"
+        text = (DASHBOARDS / "prometheus.yml").read_text()
+        config = yaml.safe_load(text)
+        (job,) = config["scrape_configs"]
+        (discovery,) = job["file_sd_configs"]
+        assert f"../results/{TARGETS}/*.json" in discovery["files"]
+        discovery["files"] = [str(folder / "results" / TARGETS / "*.json")]
+        config["global"]["scrape_interval"] = discovery["refresh_interval"] = "1s"
+        (folder / "prometheus.yml").write_text(yaml.safe_dump(config))
+        self.log = folder / "prometheus.log"
+        with self.log.open("wb") as log:
+            self.process = subprocess.Popen(
+                [
+                    str(program),
+                    f"--config.file={folder / 'prometheus.yml'}",
+                    f"--storage.tsdb.path={folder / 'tsdb'}",
+                    f"--web.listen-address={self.address}",
+                ],
+                stdout=log,
+                stderr=log,
+            )
+
+    def ask(self, query: str) -> list[dict[str, Any]]:
+        """An instant query's series; none while it starts."""
+        assert self.process.poll() is None, self.log.read_text()
+        url = f"http://{self.address}/api/v1/query?{urlencode({'query': query})}"
+        try:
+            with urlopen(url, timeout=10) as answer:
+                return json.load(answer)["data"]["result"]  # type: ignore[no-any-return]
+        except (URLError, OSError):
+            return []
+
+
+@pytest.fixture
+def prometheus(require_service: Callable[[str], Path], tmp_path: Path) -> Iterator[Prometheus]:
+    server = Prometheus(require_service("prometheus"), tmp_path)
+    yield server
+    server.process.terminate()
+    server.process.wait(30)
+
+
+def test_every_query_returns_data_of_a_running_sweep(
+    prometheus: Prometheus, sweep_program: Any, sweep_document: dict[str, Any]
+) -> None:
+    sweep_document["name"] = "watched"
+    # Long enough to be looked at; it is stopped when everything has been seen.
+    sweep_document["stages"] = sweep_document["stages"][:1]
+    sweep_document["defaults"]["env_steps"] = 2_000_000
+    sweep_program.write(sweep_document)
+    process = sweep_program.start()
+    waiting = queries()
+    seen: dict[str, list[dict[str, Any]]] = {}
+    deadline = time.monotonic() + PATIENCE
+    try:
+        while waiting and time.monotonic() < deadline and process.poll() is None:
+            for name, query in list(waiting.items()):
+                if found := prometheus.ask(query):
+                    seen[name] = found
+                    del waiting[name]
+            time.sleep(0.5)
+        ended = process.poll()
+        labels = {label for metric, label in variables() if prometheus.ask(f"{metric}")}
+    finally:
+        process.terminate()
+        output, errors = process.communicate(timeout=120)
+    assert ended is None, f"the sweep must not end before it is seen:\n{output}{errors}"
+    assert not waiting, f"no data for {list(waiting)}"
+    assert labels == {"sweep", "task", "q"}
+    (success,) = seen["Success rate by q and task A"]
+    assert success["metric"] == {"q": "1", "task": "Point"}
+    assert 0 <= float(success["value"][1]) <= 1
+    targets = sweep_program.folder / "results" / TARGETS
+    assert not list(targets.iterdir()), "what has ended is not scraped"
+    states = {one["metric"]["state"]: one["value"][1] for one in seen["Runs by state A"]}
+    assert states["started"] == "1"
+    assert seen["Failed runs A"][0]["value"][1] == "0"
