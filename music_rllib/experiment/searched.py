@@ -22,6 +22,7 @@ _METRICS = frozenset(
     for key, value in vars(names).items()
     if key.isupper()
     and isinstance(value, str)
+    and not value.isupper()  # a variable of the environment
     and not key.startswith(("TAG_", "KIND_", "ARTEFACT_", "SETTING_"))
 )
 

@@ -20,7 +20,7 @@ from typing import Any, Self
 import psutil
 
 from music_rllib.experiment.lease import runs_here, this_machine
-from music_rllib.experiment.plan import Node
+from music_rllib.experiment.plan import Node, short
 from music_rllib.experiment.result import Report, RunResult, last_values
 from music_rllib.experiment.sealed import StorageError
 from music_rllib.sweep import records
@@ -28,6 +28,7 @@ from music_rllib.sweep.board import Status
 from music_rllib.sweep.conditions import best_of, conditions
 from music_rllib.sweep.listener import Failure, Listener
 from music_rllib.sweep.session import Sweep, plan_document
+from music_rllib.sweep.tables import with_interval
 from music_rllib.tracking import names
 
 __all__ = ["Beacon", "is_alive"]
@@ -140,6 +141,30 @@ class Beacon(Listener):
             self.update()
             # A large sweep takes longer to describe: never more than a few per cent of the time.
             self._due = self._now() + max(self._interval, 30 * (self._now() - began))
+
+    def headline(self) -> tuple[list[str], str | None]:
+        """Where each stage and search stands, and the best so far, in words."""
+        state = self._state
+        lines = [
+            f"{stage['name']}: "
+            + ", ".join(f"{count} {status}" for status, count in stage["runs"].items())
+            for stage in state["stages"]
+            if stage["runs"]
+        ]
+        lines += [
+            f"search of {search['stage']}: {arm['judged']} of {len(arm['trials'])} trials judged, "
+            f"{arm['pruned']} stopped early"
+            for search in state["searches"]
+            for arm in search["arms"]
+        ]
+        best = state["best"]
+        if best is None:
+            return lines, None
+        values = ", ".join(f"{name} = {short(value)}" for name, value in best["values"].items())
+        return lines, (
+            f"best so far: {best['stage']} {values}".rstrip()
+            + f", success {with_interval(best['value'], best['interval'])} ({best['runs']} runs)"
+        )
 
     # -- speaking ----------------------------------------------------------------------------
 

@@ -44,9 +44,12 @@ class Display(Listener):
         self._board = board
         self._now = now
         self._began = now()
+        self.headline: Callable[[], tuple[list[str], str | None]] = lambda: ([], None)
+        """Gives where each stage stands, and the best so far, in words."""
+        self._best: str | None = None
         self._running: dict[str, tuple[Node, Pace]] = {}
         self._said: dict[str, float] = {}
-        self._refreshed = self._began
+        self._refreshed = self._headed = self._began
         self._live = (
             Live(console=console, auto_refresh=False, transient=True)
             if console.is_terminal
@@ -119,6 +122,13 @@ class Display(Listener):
         self._running.pop(node.key, None)
 
     def tick(self) -> None:
+        now = self._now()
+        if self._live is None and now - self._headed >= QUIET_SECONDS:
+            self._headed = now
+            _, best = self.headline()
+            if best is not None and best != self._best:
+                self._best = best
+                self.say(best)
         if self._live and self._now() - self._refreshed >= REFRESH_SECONDS:
             self._refreshed = self._now()
             self._live.update(self._view(), refresh=True)
@@ -139,7 +149,9 @@ class Display(Listener):
                 clock(pace.seconds_left(self._now())),
                 percent(pace.metrics.get(names.EVAL_SUCCESS)),
             )
-        return Group(table, Text(self._summary(), style="dim"))
+        lines, best = self.headline()
+        texts = [Text(line, style="dim") for line in [*lines, self._summary()]]
+        return Group(table, *texts, *([Text(best)] if best else []))
 
     def _summary(self) -> str:
         """`1 of 4 runs done, 8,000 of 24,000 env steps, 1:02 passed, about 2:10 left`."""

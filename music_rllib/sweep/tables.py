@@ -17,7 +17,14 @@ from music_rllib.sweep.board import Status
 from music_rllib.sweep.words import clock, in_words, percent
 from music_rllib.tracking import names
 
-__all__ = ["plan_view", "ranking_table", "results_table", "search_runs", "search_views"]
+__all__ = [
+    "plan_view",
+    "ranking_table",
+    "results_table",
+    "search_runs",
+    "search_views",
+    "with_interval",
+]
 
 
 def plan_view(config: SweepConfig, plan: Plan, finished: Collection[str]) -> RenderableType:
@@ -38,7 +45,9 @@ def plan_view(config: SweepConfig, plan: Plan, finished: Collection[str]) -> Ren
             search_runs(stage, search, len(config.seeds)) * _budget(stage, search)
             for stage, search in searched
         )
-        text += f" Searches: up to {runs} runs and {steps:,} env steps more."
+        text += f" Searches: up to {runs} runs and {steps:,} env steps more"
+        fresh = any(search.final and stage.source for stage, search in searched)
+        text += ", and what runs on fresh seeds start from." if fresh else "."
     return Group(table, Text(text))
 
 

@@ -28,7 +28,7 @@ ROOT = Path(__file__).parents[2]
 
 def searched(sweep_document: Document) -> Document:
     """A search over very short runs."""
-    sweep_document["seeds"] = [0, 1]
+    sweep_document["seeds"] = [0, 1, 2]
     sweep_document["defaults"] |= {
         "env_steps": 400,
         "evaluation": {"interval": 200, "episodes": 2},
@@ -43,15 +43,19 @@ def searched(sweep_document: Document) -> Document:
                     "tac.entropic_index": {"float": [1.0, 2.0], "step": 0.5},
                     "tac.alpha": {"float": [0.01, 0.5], "log": True},
                 },
-                "trials": 3,
-                "startup_trials": 2,
+                "trials": 6,
+                "startup_trials": 3,
                 "objective": {"metric": names.EVAL_RETURN, "aggregate": "mean"},
-                "pruning": {"rungs": [{"seeds": 1, "env_steps": 200}], "warm_up": 1},
+                "pruning": {"rungs": [{"seeds": 2}], "warm_up": 3},
                 "final": {"trials": 1, "seeds": 2},
             },
         }
     ]
     return sweep_document
+
+
+PATIENCE = 1500
+"""Seconds that a command may take on a busy machine."""
 
 
 def command(program: Any, *arguments: str) -> tuple[int, str, str]:
@@ -61,20 +65,21 @@ def command(program: Any, *arguments: str) -> tuple[int, str, str]:
         env=program.environment,
         capture_output=True,
         text=True,
-        timeout=240,
+        timeout=PATIENCE,
         check=False,
     )
     return done.returncode, done.stdout, done.stderr
 
 
+@pytest.mark.timeout(2 * PATIENCE)
 def test_a_search_stopped_and_resumed_and_what_its_commands_say(
     sweep_program: Any, sweep_document: Document, mlflow_runs: Callable[[], Any], tmp_path: Path
 ) -> None:
     sweep_program.write(searched(sweep_document))
-    process = sweep_program.start_until("trial0/")
+    process = sweep_program.start_until("trial0/", timeout=PATIENCE)
     code, output, errors = command(sweep_program, "stop", "results/points", "--json")
     assert (code, json.loads(output)["state"]) == (0, "stopped"), errors
-    process.communicate(timeout=60)
+    process.communicate(timeout=PATIENCE)
     assert process.returncode == 128 + signal.SIGINT
     code, output, _ = command(sweep_program, "status", "results/points")
     assert (code, "Sweep points: stopped" in output) == (0, True), output
@@ -84,10 +89,19 @@ def test_a_search_stopped_and_resumed_and_what_its_commands_say(
     state = json.loads(output)
     assert state["driver"]["outcome"] == "finished"
     check_search(sweep_program.folder / "results")
+    # Never interrupted, and judged by the runs that are there: the same study.
+    code, _, errors = command(sweep_program, "sweep.yaml", "--name", "whole")
+    assert code == 0, errors
+    resumed, whole = (
+        json.loads((sweep_program.folder / f"results/{name}/search.json").read_text())[0]
+        for name in ("points", "whole")
+    )
+    assert resumed["arms"][0]["trials"] == whole["arms"][0]["trials"]
+    assert resumed["ranking"] == whole["ranking"]
     check_commands(sweep_program)
     runs = mlflow_runs()
     parts = {run.data.tags[names.TAG_PART] for run in runs.values() if "part" in run.data.tags}
-    assert {"trial0", "trial1", "trial2"} <= parts
+    assert {f"trial{number}" for number in range(6)} <= parts
     assert any(part.startswith("final") for part in parts)
 
 
@@ -107,7 +121,7 @@ def check_search(storage: Path) -> None:
             if f"/trial{trial['number']}/" in label:
                 manifest = json.loads((storage / "nodes" / key / "manifest.json").read_text())
                 values.append(manifest["meta"]["result"]["metrics"][names.EVAL_RETURN])
-        assert len(values) == 2
+        assert len(values) == 3
         assert trial["objective"] == [pytest.approx(sum(values) / 2)]
     (first,) = found["ranking"]
     assert len(first["scores"][0]) == 2
@@ -124,10 +138,11 @@ def check_commands(program: Any) -> None:
     policy = load_policy(program.folder / "out")
     assert policy.task.name == "Point"
     assert (program.folder / "out/run.yaml").is_file()
-    code, output, _ = command(program, "clean", "results/points", "--all", "--yes", "--json")
-    assert (code, json.loads(output)["deleted"]) == (0, True)
+    for name in ("whole", "points"):
+        code, output, _ = command(program, "clean", f"results/{name}", "--all", "--yes", "--json")
+        assert (code, json.loads(output)["deleted"]) == (0, True)
+        assert not (program.folder / "results" / name).exists()
     assert not list((program.folder / "results/nodes").iterdir())
-    assert not (program.folder / "results/points").exists()
 
 
 # --- PostgreSQL --------------------------------------------------------------------------------

@@ -219,7 +219,7 @@ def test_the_objective_is_the_aggregate_of_a_trials_runs_recomputed(tmp_path: Pa
 def test_aggregates(how: str, expected: float) -> None:
     # Two tasks in columns, four seeds: 1..4 and 4, 5, 6, 87; the middle half is 3, 4, 4, 5.
     scores = np.array([[1.0, 4.0], [2.0, 5.0], [3.0, 6.0], [4.0, 87.0]])
-    assert aggregate(Objective(aggregate=how), scores) == pytest.approx(expected)  # type: ignore[arg-type]
+    assert aggregate(Objective(aggregate=how), scores) == pytest.approx(expected)
 
 
 def test_the_worst_task_of_something_minimised_is_the_highest() -> None:

@@ -1,0 +1,242 @@
+"""Sub-commands on a sweep's storage: a folder, and a bucket that another machine reaches."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pyarrow.fs as pafs
+import pytest
+import yaml
+from fsspec.implementations.memory import MemoryFileSystem  # type: ignore[import-untyped]
+
+from music_rllib.experiment import sealed, store
+from music_rllib.experiment.config import load_sweep
+from music_rllib.experiment.plan import Node, make_plan
+from music_rllib.experiment.result import HISTORY, Report, RunResult, to_json_lines
+from music_rllib.sweep import cleaning, cli, records
+from music_rllib.sweep.beacon import Beacon, is_alive
+from music_rllib.sweep.places import sweep_folder
+from music_rllib.sweep.session import Sweep, keep_record, open_sweep
+from music_rllib.tracking import names
+
+SWEEP: dict[str, Any] = {
+    "name": "mine",
+    "tasks": ["FetchPush"],
+    "seeds": [0, 1, 2],
+    "defaults": {"env_steps": 4000},
+    "stages": [
+        {"name": "train", "variant": "tac", "grid": {"tac.entropic_index": [1.0, 1.5, 2.0]}}
+    ],
+}
+
+
+class Said:
+    """What the program answered."""
+
+    def __init__(self, code: int, output: str, errors: str) -> None:
+        self.code, self.output, self.errors = code, output, errors
+
+    @property
+    def document(self) -> Any:
+        """Its one JSON document."""
+        assert self.code == 0, self.errors
+        return json.loads(self.output)
+
+
+Program = Callable[..., Said]
+
+
+@pytest.fixture(params=["folder", "bucket"])
+def storage(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Where the sweep is; the bucket is a file system without renames or folders of its own."""
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.chdir(tmp_path)
+    if request.param == "folder":
+        return str(tmp_path / "results")
+    memory = MemoryFileSystem()
+    memory.store.clear()
+    memory.pseudo_dirs[:] = [""]
+    bucket = (pafs.PyFileSystem(pafs.FSSpecHandler(memory)), "bucket/path")
+    # All are loaded by now: one that was loaded later would keep this for good.
+    for module in (sealed, store, records, cleaning):
+        monkeypatch.setattr(module, "open_storage", lambda _: bucket)
+    return "s3://bucket/path"
+
+
+@pytest.fixture
+def program(capsys: pytest.CaptureFixture[str]) -> Program:
+    def run(*arguments: str) -> Said:
+        capsys.readouterr()
+        code = cli.main(arguments)
+        return Said(code, *capsys.readouterr())
+
+    return run
+
+
+def opened(storage: str, tmp_path: Path, **changes: Any) -> Sweep:
+    path = tmp_path / "sweep.yaml"
+    path.write_text(yaml.safe_dump(SWEEP | changes))
+    config = load_sweep(path, storage=storage)
+    folder = sweep_folder(storage, config.name)
+    sweep = open_sweep(config, make_plan(config), storage, folder)
+    keep_record(sweep)
+    return sweep
+
+
+def finish(sweep: Sweep, beacon: Beacon, node: Node, success: float, folder: Path) -> None:
+    """As if the run had been trained."""
+    metrics = {names.EVAL_SUCCESS: success}
+    report = Report(env_steps=4000, seconds=1.0, timestamp_ms=1, metrics=metrics)
+    folder.mkdir(exist_ok=True)
+    (folder / HISTORY).write_bytes(to_json_lines([report]))
+    (folder / "handoff").mkdir(exist_ok=True)
+    (folder / "handoff/handoff.json").write_text("{}")
+    result = RunResult(label=node.label, env_steps=4000, seconds=1.0, metrics=metrics)
+    sweep.store.publish(node.key, folder, result)
+    sweep.board.start(node.key)
+    beacon.reported(node, [report])
+    sweep.board.finish(node.key)
+    beacon.finished(node, result)
+
+
+HEIGHTS = {1.0: 0.2, 1.5: 0.8, 2.0: 0.3}
+
+
+def played(storage: str, tmp_path: Path, runs: int = 9) -> Sweep:
+    sweep = opened(storage, tmp_path)
+    with Beacon(sweep) as beacon:
+        for node in list(sweep.plan.nodes)[:runs]:
+            height = HEIGHTS[float(node.run.tac.entropic_index)]  # type: ignore[arg-type]
+            finish(sweep, beacon, node, height + 0.02 * node.run.seed, tmp_path / "made")
+        beacon.end("finished" if runs == 9 else "stopped")
+    return sweep
+
+
+def test_status_and_compare(storage: str, tmp_path: Path, program: Program) -> None:
+    played(storage, tmp_path)
+    place = f"{storage}/mine"
+    state = program("status", place, "--json").document
+    assert state["state"] == "finished"
+    assert state["stages"][0]["runs"] == {"finished": 9}
+    assert state["env_steps"] == {"done": 36_000, "left": 0}
+    assert state["best"]["values"] == {"tac.entropic_index": 1.5}
+    shown = program("status", "mine", "--storage", storage).output
+    assert "Sweep mine: finished" in shown
+    assert "Best so far: train tac.entropic_index = 1.5: success 0.82 [" in shown
+    (group,) = program("compare", place, "--json").document["groups"]
+    first, *others = group["conditions"]
+    assert first["values"] == {"tac.entropic_index": 1.5}
+    assert first["value"] == pytest.approx(0.82)
+    assert [row["best_is_better_with"] for row in others] == [1.0, 1.0]
+    assert group["verdict"].startswith("tac.entropic_index = 1.5 is ahead")
+    bad = program("compare", place, "--metric", "nonsense")
+    assert (bad.code, "--metric must be one of" in bad.errors) == (2, True)
+
+
+def test_compare_names_no_winner_without_evidence(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    played(storage, tmp_path, runs=4)
+    (group,) = program("compare", f"{storage}/mine", "--json").document["groups"]
+    assert "single run" in group["verdict"]
+    assert sorted(row["runs"] for row in group["conditions"]) == [1, 3]
+    text = program("compare", f"{storage}/mine").output
+    assert "3 of 3" in text
+    assert "1 of 3" in text
+
+
+def test_best_takes_the_middle_run_of_the_best_condition(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    sweep = played(storage, tmp_path)
+    chosen = program("best", f"{storage}/mine", "--output", "out", "--json").document
+    assert chosen["values"] == {"tac.entropic_index": 1.5}
+    (policy,) = chosen["policies"]
+    assert policy["seed"] == 1
+    folder = Path(policy["folder"])
+    assert (folder / "handoff/handoff.json").is_file()
+    settings = yaml.safe_load((folder / "run.yaml").read_text())
+    assert settings["tac"]["entropic_index"] == 1.5
+    assert json.loads((folder / "chosen.json").read_text())["node"] == policy["node"]
+    assert policy["node"] in sweep.finished
+    again = program("best", f"{storage}/mine", "--output", "out")
+    assert (again.code, "first by success rate" in again.output) == (0, True)
+
+
+def test_clean_lists_and_deletes_what_no_other_sweep_has(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    sweep = played(storage, tmp_path)
+    other = opened(storage, tmp_path, name="other", seeds=[0])
+    going = program("clean", f"{storage}/mine", "--all", "--json").document
+    assert not going["deleted"]
+    assert len(going["items"]) == 9 - 3 + 1
+    done = program("clean", f"{storage}/mine", "--all", "--yes")
+    assert (done.code, "7 deleted." in done.output) == (0, True)
+    kept = {node.key for node in sweep.plan.nodes if sweep.store.is_finished(node.key)}
+    assert kept == {node.key for node in other.plan.nodes}
+    gone = program("status", f"{storage}/mine")
+    assert (gone.code, "sweeps there: other" in gone.errors) == (2, True)
+
+
+def test_stop_reaches_the_driver(
+    storage: str, tmp_path: Path, program: Program, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    received = threading.Event()
+    monkeypatch.setattr("music_rllib.sweep.beacon.REMOTE_SECONDS", 1.0)
+    before = signal.signal(signal.SIGINT, lambda *_: received.set())
+    try:
+        sweep = opened(storage, tmp_path)
+        with Beacon(sweep) as beacon:
+            assert is_alive(records.read(storage, "mine/state.json"))
+            refused = program("clean", f"{storage}/mine")
+            assert (refused.code, "must not be running" in refused.errors) == (2, True)
+            asked = program("stop", f"{storage}/mine", "--wait", "0")
+            assert (asked.code, "was told to stop" in asked.output) == (0, True)
+            assert received.wait(60)
+            beacon.end("stopped")
+    finally:
+        signal.signal(signal.SIGINT, before)
+    again = program("stop", f"{storage}/mine", "--json").document
+    assert again == {"sweep": "mine", "was_running": False, "state": "stopped"}
+
+
+def test_a_driver_that_was_killed_is_interrupted(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    sweep = opened(storage, tmp_path)
+    with Beacon(sweep) as beacon:
+        pass
+    state = records.read(storage, "mine/state.json")
+    state["driver"] |= {"ended": None, "outcome": "running", "pid": 2**22 + 1}
+    records.keep(sweep, records.STATE, records.as_json(state))
+    assert beacon is not None
+    assert program("status", f"{storage}/mine", "--json").document["state"] == "interrupted"
+
+
+def test_the_recorded_configuration_is_the_sweeps(storage: str, tmp_path: Path) -> None:
+    from music_rllib.sweep.find import find_sweep
+
+    sweep = opened(storage, tmp_path)
+    found = find_sweep(f"{storage}/mine", None).open()
+    assert [node.key for node in found.plan.nodes] == [node.key for node in sweep.plan.nodes]
+    assert found.storage == storage
+
+
+def test_plan_as_json_with_more_seeds(tmp_path: Path, program: Program) -> None:
+    os.chdir(tmp_path)
+    Path("sweep.yaml").write_text(yaml.safe_dump(SWEEP | {"resources": {"num_cpus": 1}}))
+    plan = program("plan", "sweep.yaml", "--seeds", "5", "--json").document
+    assert plan["seeds"] == [0, 1, 2, 3, 4]
+    assert len(plan["nodes"]) == 15
+    assert plan["env_steps_left"] == 15 * 4000
+    listed = program("plan", "sweep.yaml", "--seeds", "4,9", "--json").document
+    assert listed["seeds"] == [4, 9]
+    bad = program("plan", "sweep.yaml", "--seeds", "many")
+    assert (bad.code, "--seeds must be a number of seeds" in bad.errors) == (2, True)
