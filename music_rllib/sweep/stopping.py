@@ -16,13 +16,11 @@ from typing import Any
 from ray import tune
 from ray.tune.experiment import Trial
 
+from music_rllib.sweep.signals import SIGNALS, early
 from music_rllib.sweep.stop_flag import StopFlag
 from music_rllib.sweep.trainable import STOPPED
 
 __all__ = ["StopSignals"]
-
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
 
 class StopSignals(tune.Callback):
     """Ctrl-C and SIGTERM end Tune's loop in good order: when every run has saved its state.
@@ -55,6 +53,8 @@ class StopSignals(tune.Callback):
     def __enter__(self) -> StopSignals:
         if threading.current_thread() is threading.main_thread():
             # After `ray.init`, which sets handlers of its own.
+            early.install()
+            early.check()
             self._before = {number: signal.getsignal(number) for number in SIGNALS}
         return self
 
@@ -82,6 +82,8 @@ class StopSignals(tune.Callback):
         self._end_loop = end_loop
         for number in SIGNALS:
             signal.signal(number, self._stop)
+        if early.received is not None:
+            self._stop(early.received, None)
 
     def on_trial_start(
         self, iteration: int, trials: list[Trial], trial: Trial, **info: Any

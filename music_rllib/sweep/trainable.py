@@ -191,7 +191,8 @@ class RunTrainable(Trainable):
     def _finished_elsewhere(self, store: NodeStore) -> dict[str, Any]:
         """Another sweep, or a worker that outlived its driver, was faster."""
         self._history = store.history(self._job.key)
-        self._release()
+        if self._held is not None:
+            self._clear(store)
         return self._result(done=True)
 
     def _work(self, store: NodeStore) -> WorkFolder:
@@ -312,6 +313,11 @@ class RunTrainable(Trainable):
                 metrics=last_values(self._history),
             )
             store.publish(self._job.key, folder, result)
+        self._clear(store)
+
+    def _clear(self, store: NodeStore) -> None:
+        """Delete checkpoints and lease of a run that is finished. Only for the lease's holder."""
+        assert self._held is not None
         self._held.end()  # a renewal would make the folder again
         self._held = None
         self._work(store).clear()

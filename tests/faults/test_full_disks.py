@@ -45,13 +45,22 @@ def small_disk(tmp_path: Path) -> Iterator[MakeDisk]:
 def fill(disk: Path) -> Path:
     """Take all that is free there with one file."""
     ballast = disk / "ballast"
-    with ballast.open("wb") as file:
+    deadline = time.monotonic() + 30
+    while True:
         try:
-            while True:
-                file.write(b"0" * 4096)
-                file.flush()
-        except OSError:
-            return ballast
+            handle = os.open(ballast, os.O_CREAT | os.O_WRONLY)
+            break
+        except OSError:  # what was deleted just now may not be free yet
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+    try:
+        while os.write(handle, b"0" * 4096):
+            pass
+    except OSError:
+        return ballast
+    finally:
+        os.close(handle)
+    raise AssertionError("the disk has no end")
 
 
 def save(disk: Path, steps: int, size: int = 1000) -> None:

@@ -218,12 +218,19 @@ def test_checkpoints_are_kept_newest_first_and_pruned(store: NodeStore) -> None:
     work = store.work_folder(KEY)
     with work.newest() as newest:
         assert newest is None
+    parts: list[str] = []
     for env_steps in (1000, 2000, 10_000):
         with work.new_checkpoint(env_steps) as draft:
             (draft.folder / "state").write_text(str(env_steps))
+            with draft.new_part("part") as (name, folder):
+                (folder / "data").write_text(str(env_steps))
+            parts.append(name)
+            draft.needs = parts[-2:]
     with work.newest() as newest:
         assert newest is not None
         assert (newest.folder / "state").read_text() == "10000"
+        read = [(newest.parts[name] / "data").read_text() for name in newest.parts]
+        assert read == ["2000", "10000"]
     assert [int(name.split("-")[0]) for name in work.names()] == [2000, 10_000]
     work.clear()
     with work.newest() as newest:
