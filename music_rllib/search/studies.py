@@ -7,6 +7,7 @@ to time that it is alive; the trials of one that has fallen silent are put back.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import socket
@@ -31,7 +32,10 @@ from music_rllib.experiment.space import SearchSettings
 from music_rllib.search.proposals import Proposal, Proposer, as_proposal
 from music_rllib.tracking.redaction import redact
 
-__all__ = ["REASON", "SCORES", "VALUES", "Study", "open_studies", "study_names"]
+__all__ = ["DATABASE_ERRORS", "REASON", "SCORES", "VALUES", "Study", "open_studies", "study_names"]
+
+DATABASE_ERRORS = (StorageInternalError, SQLAlchemyError)
+"""A database that doesn't answer, or not now."""
 
 LEASE_SECONDS = 120.0
 """After so long without a sign of life a driver on another machine counts as dead."""
@@ -148,6 +152,8 @@ class Study:
         self._proposer = Proposer(settings, points, prior)
         self._signed = 0.0
         self._known: list[FrozenTrial] | None = None
+        self._given: set[int] = set()
+        """Numbers of the trials that `claim` has given out."""
         self.lay_out()
         self.release_the_dead()
 
@@ -284,10 +290,8 @@ class Study:
         A trial's point depends on those before it, so it is only claimed when they are far enough.
         """
         trials = self.trials()
-        for trial in trials:
-            if trial.state is TrialState.WAITING:
-                break
-        else:
+        trial = next((one for one in trials if self._is_free(one)), None)
+        if trial is None:
             return None
         lag = trial.number - self.settings.concurrent
         judged = trials[: lag + 1] if lag >= 0 else []
@@ -297,12 +301,22 @@ class Study:
         if not all(VALUES in one.user_attrs for one in between):
             return None
         self.refresh()
-        if not self._storage.set_trial_state_values(trial._trial_id, TrialState.RUNNING):
-            return None  # another driver was faster
-        self._set(trial, OWNER, self._me)
+        if trial.state is TrialState.WAITING:
+            if not self._storage.set_trial_state_values(trial._trial_id, TrialState.RUNNING):
+                return None  # another driver was faster
+            self._set(trial, OWNER, self._me)
         if VALUES not in trial.user_attrs:
             self._keep(trial, self._proposer.propose(trial.number, judged, between))
-        return self._storage.get_trial(trial._trial_id)
+        found = self._storage.get_trial(trial._trial_id)
+        self._given.add(trial.number)
+        return found
+
+    def _is_free(self, trial: FrozenTrial) -> bool:
+        """Whether nobody has it, or this driver claimed it as the database went away."""
+        if trial.state is TrialState.RUNNING:
+            mine = trial.user_attrs.get(OWNER) == self._me
+            return mine and trial.number not in self._given
+        return trial.state is TrialState.WAITING
 
     def _keep(self, trial: FrozenTrial, proposal: Proposal) -> None:
         for name, distribution in proposal.distributions.items():
@@ -315,21 +329,21 @@ class Study:
     def report(self, trial: FrozenTrial, rung: int, value: float | None, scores: Any) -> None:
         """Keep what a trial was worth at a rung, if one number says it, and its runs' numbers."""
         kept = dict(self._storage.get_trial(trial._trial_id).user_attrs.get(SCORES, {}))
-        self._set(trial, SCORES, kept | {str(rung): scores})
-        if value is not None:
-            self._storage.set_trial_intermediate_value(trial._trial_id, rung, value)
+        with contextlib.suppress(UpdateFinishedTrialError):  # as in `end`
+            self._set(trial, SCORES, kept | {str(rung): scores})
+            if value is not None:
+                self._storage.set_trial_intermediate_value(trial._trial_id, rung, value)
 
     def end(
         self, trial: FrozenTrial, state: TrialState, values: Sequence[float] | None, reason: str
     ) -> None:
         """Keep what became of a trial; if somebody has done so already, theirs stays."""
-        try:
+        # Taken over while this driver was silent, and judged already: by the same rules, the same.
+        with contextlib.suppress(UpdateFinishedTrialError):
             if reason:
                 self._set(trial, REASON, reason)
             self.refresh()
             self._storage.set_trial_state_values(trial._trial_id, state, values)
-        except UpdateFinishedTrialError:
-            pass  # taken over while this driver was silent, and judged: the same, by the same rules
 
     def _set(self, trial: FrozenTrial, key: str, value: Any) -> None:
         self.refresh()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -18,11 +19,12 @@ from music_rllib.experiment.result import Report
 from music_rllib.experiment.sealed import DamagedError
 from music_rllib.experiment.space import FINAL_SEED, Rung, SearchSettings
 from music_rllib.search.judge import aggregate, prune, score
-from music_rllib.search.studies import SCORES, VALUES, Study
+from music_rllib.search.studies import DATABASE_ERRORS, SCORES, VALUES, Study
 from music_rllib.sweep.board import Status
 from music_rllib.sweep.listener import Failure, Listener
 from music_rllib.sweep.session import Sweep
 from music_rllib.tracking import names
+from music_rllib.tracking.redaction import redact
 
 __all__ = ["Arm", "Campaign", "Finalist", "Search", "ranked"]
 
@@ -117,6 +119,8 @@ class Campaign(Listener):
         self._seen = -1
         self._polled = -POLL_SECONDS
         self._more = True
+        self._lost = False
+        """Whether the last look at the database failed."""
 
     # -- listening ---------------------------------------------------------------------------
 
@@ -175,6 +179,21 @@ class Campaign(Listener):
         if self._seen == self._board.changes and now - self._polled < POLL_SECONDS:
             return self._more
         self._polled = now
+        try:
+            self._go_on()
+        except DATABASE_ERRORS as error:
+            # What was begun is begun again next time; runs go on meanwhile.
+            if not self._lost:
+                cause = str(error.__cause__ or error).strip().splitlines()[0]
+                self._say(f"the study's database does not answer, trying again: {redact(cause)}")
+            self._lost = True
+            return True
+        self._lost = False
+        self._seen = self._board.changes
+        self._more = not self.over
+        return self._more
+
+    def _go_on(self) -> None:
         for search in self.searches:
             for arm in search.arms:
                 arm.study.refresh()
@@ -183,9 +202,6 @@ class Campaign(Listener):
             moved = [self._advance(search) for search in self.searches]
             if not any(moved) and before == self._board.changes:
                 break
-        self._seen = self._board.changes
-        self._more = not self.over
-        return self._more
 
     @property
     def over(self) -> bool:
@@ -201,7 +217,8 @@ class Campaign(Listener):
         """This driver ends: let others, or a later one, have its trials."""
         for search in self.searches:
             for arm in search.arms:
-                arm.study.release()
+                with contextlib.suppress(*DATABASE_ERRORS):  # they are taken over in any case
+                    arm.study.release()
 
     def _advance(self, search: Search) -> bool:
         moved = False

@@ -318,6 +318,8 @@ def _close_campaign(opened: Sweep, campaign: Campaign, tracker: Tracker) -> list
 
     campaign.stop()
     found = outcome(campaign)
+    if not found:
+        return found
     text = as_json(found)
     tracker.put_sweep_artefact(names.ARTEFACT_SEARCH, text)
     keep(opened, SEARCH, text)

@@ -14,7 +14,7 @@ from music_rllib.experiment.plan import node_key, short
 from music_rllib.experiment.space import Rung, SearchSettings
 from music_rllib.reports.statistics import probability_of_improvement
 from music_rllib.search.judge import interval
-from music_rllib.search.studies import REASON, SCORES, VALUES, Study, open_studies
+from music_rllib.search.studies import DATABASE_ERRORS, REASON, SCORES, VALUES, Study, open_studies
 from music_rllib.sweep.campaign import Arm, Campaign, Finalist, Search, ranked
 from music_rllib.sweep.session import Sweep
 from music_rllib.tracking.redaction import redact
@@ -115,8 +115,14 @@ def outcome(campaign: Campaign, *, thorough: bool = True) -> list[dict[str, Any]
     Args:
         campaign: It.
         thorough: With intervals and importance, which take a while.
+
+    Returns:
+        Nothing where the database does not answer: what counts is in the node store.
     """
-    return [_search(search, thorough) for search in campaign.searches]
+    try:
+        return [_search(search, thorough) for search in campaign.searches]
+    except DATABASE_ERRORS:
+        return []
 
 
 def _search(search: Search, thorough: bool) -> dict[str, Any]:

@@ -19,6 +19,7 @@ import numpy as np
 import psutil
 import pytest
 import yaml
+from optuna.exceptions import StorageInternalError
 from ray.tune.search import Searcher
 
 from music_rllib.experiment.config import load_sweep
@@ -571,6 +572,52 @@ def test_a_dead_drivers_trials_are_taken_over(tmp_path: Path) -> None:
     mine.release_the_dead(later)
     driver.play()
     assert [trial["state"] for trial in driver.trials()] == ["judged"] * 6
+
+
+def test_a_driver_that_was_taken_for_dead_changes_nothing_any_more(tmp_path: Path) -> None:
+    search = {"storage": f"sqlite:///{tmp_path}/shared.db", "study": "together"}
+    for folder in ("silent", "other"):
+        (tmp_path / folder).mkdir()
+    silent = Driver(tmp_path / "silent", document(search))
+    silent.play(stop_after=5)
+    other = Driver(tmp_path / "other", document(search))
+    other.campaign.searches[0].arms[0].study.release_the_dead(10_000_000_000.0)
+    other.play()
+    before = other.trials()
+    silent.play()
+    assert silent.trials() == before == other.trials()
+
+
+class Flaky:
+    """A database that is gone now and then."""
+
+    def __init__(self, storage: Any, seed: int) -> None:
+        self._storage, self._rng = storage, random.Random(seed)
+        self.down = 0
+
+    def __getattr__(self, name: str) -> Any:
+        if self._rng.random() < 0.1:
+            self.down += 1
+            raise StorageInternalError("the server closed the connection")
+        return getattr(self._storage, name)
+
+
+def test_a_database_that_comes_and_goes_costs_nothing(tmp_path: Path) -> None:
+    for folder in ("whole", "flaky"):
+        (tmp_path / folder).mkdir()
+    whole = searched(tmp_path / "whole")
+    driver = Driver(tmp_path / "flaky", document({}))
+    study = driver.campaign.searches[0].arms[0].study
+    sound, flaky = study._storage, Flaky(study._storage, 1)
+    study._storage = flaky  # type: ignore[assignment]
+    while not driver.campaign.over:
+        try:
+            driver.play(stop_after=len(driver.computed) + 1)
+        except (AssertionError, StorageInternalError):
+            continue  # nothing to do but wait
+    assert flaky.down > 10
+    study._storage = sound
+    assert driver.trials() == whole.trials()
 
 
 def test_what_a_failed_run_takes_with_it(tmp_path: Path) -> None:
