@@ -73,6 +73,9 @@ def find_stages(sweep: Sweep) -> list[Stage]:
         """What varies in the run's own stage and, named after it, in its source's."""
         record = sweep.runs[run]
         own = tuple((n, settings[run][n]) for n in varying[record.stage] if n in settings[run])
+        if part := record.tags.get(names.TAG_PART):
+            # Trials of a search were chosen by some runs: those on fresh seeds are told apart.
+            own += (("seeds", "fresh" if part.startswith("final") else "search"),)
         source = by_key.get(record.tags.get(names.TAG_SOURCE_NODE, ""))
         if source is None or source == run:
             return own

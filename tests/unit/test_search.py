@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import random
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -657,6 +660,36 @@ def test_the_same_file_gives_the_same_points_on_another_machine(tmp_path: Path) 
     driver = Driver(tmp_path, document({}))
     driver.play(stop_after=2)
     assert points(driver.trials())[:2] == FIRST_POINTS
+
+
+def test_node_keys_are_the_same_in_another_process(tmp_path: Path) -> None:
+    driver = Driver(tmp_path, document({"trials": 2}))
+    driver.play()
+    code = (
+        "import json, sys; from pathlib import Path; sys.path.insert(0, sys.argv[1])\n"
+        "from test_search import Driver, document\n"
+        "driver = Driver(Path(sys.argv[2]), document({'trials': 2})); driver.play()\n"
+        "print(json.dumps([[run.label, run.key] for run in driver.sweep.plan.runs]))"
+    )
+    (tmp_path / "there").mkdir()
+    found = subprocess.run(
+        [sys.executable, "-c", code, str(Path(__file__).parent), str(tmp_path / "there")],
+        env=os.environ | {"PYTHONHASHSEED": "12345", "LC_ALL": "C", "TZ": "Asia/Tokyo"},
+        cwd=Path(__file__).parents[2],
+        capture_output=True,
+        check=True,
+        text=True,
+    )
+    here = {run.label: run.key for run in driver.sweep.plan.runs}
+    assert dict(json.loads(found.stdout.splitlines()[-1])) == here
+
+
+@pytest.mark.parametrize("name", ["search", "compare"])
+def test_the_shipped_examples_are_sound(name: str) -> None:
+    config = load_sweep(Path(__file__).parents[2] / f"tune_configs/{name}.yaml")
+    settings = config.stages[-1].search
+    assert settings is not None
+    assert settings.mode == name
 
 
 FIRST_POINTS: list[Mapping[str, Any]] = [
