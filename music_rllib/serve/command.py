@@ -142,6 +142,11 @@ def _serve(arguments: argparse.Namespace) -> int:
     stop = _stop_signal()
     _connect(settings)
     try:
+        _listen(arguments, serve)
+    except BaseException:
+        _disconnect()
+        raise
+    try:
         _run(application, arguments, serve)
         stop.wait()
     finally:
@@ -198,26 +203,52 @@ def _check_room(settings: ServeSettings, cpus_of_nodes: Sequence[float]) -> None
         )
 
 
-def _run(application: Any, arguments: argparse.Namespace, serve: Any) -> None:
-    host, port = arguments.host, arguments.port
-    quiet = {"enable_access_log": False, "log_level": "WARNING"}
-    logging.getLogger("ray.serve").setLevel(logging.WARNING)
+QUIET = {"enable_access_log": False, "log_level": "WARNING"}
+APPLICATION = "policy"
+
+
+def _listen(arguments: argparse.Namespace, serve: Any) -> None:
+    """Start Serve's proxy; on a cluster where Serve runs already, see that we would not disturb."""
+    from ray.serve.context import _get_global_client
+
+    logging.getLogger("ray.serve").setLevel(logging.ERROR)
+    wanted = (arguments.host, arguments.port)
     serve.start(
         proxy_location="HeadOnly",
-        http_options={"host": host, "port": port},
-        logging_config=quiet,
+        http_options=dict(zip(("host", "port"), wanted, strict=True)),
+        logging_config=QUIET,
     )
-    serve.run(application, name="policy", route_prefix="/", logging_config=quiet)
+    # Serve ignores new options where it runs already.
+    options = _get_global_client().http_config
+    if (options.host, options.port) != wanted:
+        raise _BadInputError(
+            "--host and --port must be those on which Ray Serve listens on this cluster already, "
+            f"{options.host}:{options.port}, got {arguments.host}:{arguments.port}"
+        )
+    if APPLICATION in serve.status().applications:
+        raise _BadInputError(
+            "RAY_ADDRESS must be a cluster that serves no policy yet, this one does; stop that "
+            "service first"
+        )
+
+
+def _run(application: Any, arguments: argparse.Namespace, serve: Any) -> None:
+    host, port = arguments.host, arguments.port
+    serve.run(application, name=APPLICATION, route_prefix="/", logging_config=QUIET)
     shown = f"[{host}]" if ":" in host else host
     print(f"Serving {arguments.policy} at http://{shown}:{port}", flush=True)
     print(f"POST /act, GET /health, GET /policy; try it at http://{shown}:{port}/docs", flush=True)
 
 
 def _shut_down(serve: Any) -> None:
-    import ray
-
     # Others may serve on a cluster too; a local Ray ends with all that runs on it.
     if os.environ.get("RAY_ADDRESS"):
-        serve.delete("policy")
-    ray.shutdown()
+        serve.delete(APPLICATION)
+    _disconnect()
     print("Stopped.", flush=True)
+
+
+def _disconnect() -> None:
+    import ray
+
+    ray.shutdown()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -63,4 +65,44 @@ class Point(gym.Env[dict[str, Array], Array]):
         }
 
 
+class Meeting(Point):
+    """Leaves the node's name in `folder` and waits for that of another node.
+
+    Args:
+        folder: where the runs meet.
+    """
+
+    def __init__(self, folder: str) -> None:
+        import ray
+
+        super().__init__()
+        if not ray.is_initialized():
+            return  # the driver only looks at it
+        Path(folder, ray.get_runtime_context().get_node_id()).touch()
+        for _ in range(1500):
+            if len(list(Path(folder).iterdir())) > 1:
+                return
+            time.sleep(0.1)
+        raise RuntimeError("no run on another node has come")
+
+
+class Paced(Point):
+    """Takes its time as long as there is no file at `fast`, so that it can be interrupted.
+
+    Args:
+        fast: the file.
+    """
+
+    def __init__(self, fast: str) -> None:
+        super().__init__()
+        self._fast = Path(fast)
+
+    def step(self, action: Array) -> tuple[dict[str, Array], float, bool, bool, dict[str, Any]]:
+        if not self._fast.exists():
+            time.sleep(0.01)
+        return super().step(action)
+
+
 gym.register("Point-v0", "point_env:Point", max_episode_steps=20)
+gym.register("Meeting-v0", entry_point="point_env:Meeting", max_episode_steps=20)
+gym.register("Paced-v0", entry_point="point_env:Paced", max_episode_steps=20)

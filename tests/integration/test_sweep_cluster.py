@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 import os
 import shutil
 import socket
@@ -9,11 +11,13 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import psutil
 import pytest
+import requests
 import yaml
 
 pytestmark = pytest.mark.integration
@@ -23,13 +27,19 @@ ENVIRONMENTS = Path(__file__).parents[1] / "environments"
 BIN = Path(sys.executable).parent
 
 
+TOKEN = "planted-" + "0123456789abcdef" * 3
+STOP = {"RAY_JOB_STOP_SIGNAL": "SIGINT", "RAY_JOB_STOP_WAIT_TIME_S": "60"}
+"""What the guide tells to put into the runtime environment of jobs."""
+
+
 class Head(NamedTuple):
-    """A running head node."""
+    """A running head node, alone or with a second node."""
 
     address: str
     dashboard: str
-    home: Path
+    folder: Path
     environment: dict[str, str]
+    process: subprocess.Popen[Any]
 
 
 def free_ports(count: int) -> list[int]:
@@ -40,138 +50,274 @@ def free_ports(count: int) -> list[int]:
     return ports
 
 
-@pytest.fixture(scope="module")
-def head() -> Iterator[Head]:
-    """`ray start --head --num-cpus=2`, with a home folder of its own; ended by its process id."""
-    port, dashboard, agent = free_ports(3)
-    # Not pytest's folder: Ray's sockets need a short path.
-    folder = Path(tempfile.mkdtemp(prefix="ray"))
-    home = folder / "home"
-    home.mkdir()
-    environment = os.environ | {
-        "PATH": f"{BIN}{os.pathsep}{os.environ['PATH']}",
-        "HOME": str(home),
-        "PYTHONPATH": str(ENVIRONMENTS),
-        "RAY_AUTH_MODE": "disabled",
-    }
-    command = [str(BIN / "ray"), "start", "--head", "--block", "--num-cpus=2"]
-    options = [
+def ray_start(
+    folder: Path, environment: dict[str, str], cpus: int, *options: str
+) -> subprocess.Popen[Any]:
+    """A node; ends with its process, which is `--block`."""
+    (agent,) = free_ports(1)
+    command = [str(BIN / "ray"), "start", "--block", f"--num-cpus={cpus}"]
+    common = [
         "--disable-usage-stats",
         "--node-ip-address=127.0.0.1",
-        f"--port={port}",
-        f"--dashboard-port={dashboard}",
         # Takes the jobs; its default port may belong to another Ray on this machine.
         f"--dashboard-agent-listen-port={agent}",
-        f"--temp-dir={folder / 'ray'}",
     ]
-    with (folder / "log").open("w") as log:
-        process = subprocess.Popen(
-            [*command, *options],
+    with (folder / "log").open("a") as log:
+        return subprocess.Popen(
+            [*command, *common, *options],
             env=environment,
             stdout=log,
             stderr=log,
             start_new_session=True,
         )
+
+
+@contextlib.contextmanager
+def head_node(home: Path, cpus: int, workers: Sequence[int] = ()) -> Iterator[Head]:
+    """A head that asks for a token, and further nodes, all with this home folder."""
+    port, dashboard = free_ports(2)
+    # Not pytest's folder: Ray's sockets need a short path.
+    folder = Path(tempfile.mkdtemp(prefix="ray"))
+    environment = os.environ | {
+        "PATH": f"{BIN}{os.pathsep}{os.environ['PATH']}",
+        "HOME": str(home),
+        "PYTHONPATH": str(ENVIRONMENTS),
+        "RAY_AUTH_MODE": "token",
+        "RAY_AUTH_TOKEN": TOKEN,
+        "MLFLOW_TRACKING_PASSWORD": "planted-mlflow-password",
+    }
+    address, temporary = f"127.0.0.1:{port}", f"--temp-dir={folder / 'ray'}"
+    options = ["--head", f"--port={port}", f"--dashboard-port={dashboard}", temporary]
+    nodes = [ray_start(folder, environment, cpus, *options)]
+    url = f"http://127.0.0.1:{dashboard}"
+    head = Head(address, url, folder, environment, nodes[0])
     try:
-        wait_for_jobs(dashboard, process, folder / "log")
-        yield Head(f"127.0.0.1:{port}", f"http://127.0.0.1:{dashboard}", home, environment)
+        wait_for_jobs(head)
+        nodes += [ray_start(folder, environment, n, f"--address={address}") for n in workers]
+        wait_for_nodes(head, len(nodes))
+        yield head
     finally:
-        process.terminate()  # `--block` ends its node's processes
-        process.wait(timeout=60)
+        for process in nodes:
+            process.terminate()  # `--block` ends its node's processes
+        for process in nodes:
+            process.wait(timeout=60)
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def wait_for_jobs(port: int, process: subprocess.Popen[Any], log: Path) -> None:
-    """Until the dashboard and the agent behind it take jobs."""
-    from ray.job_submission import JobSubmissionClient
+@pytest.fixture(scope="module")
+def head(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Head]:
+    """Two nodes with one CPU each, so that two runs at a time need both."""
+    with head_node(tmp_path_factory.mktemp("home"), 1, workers=[1]) as head:
+        yield head
 
-    for _ in range(120):
+
+def request(head: Head, path: str, body: Any = None) -> Any:
+    """The dashboard's answer."""
+    headers = {"Authorization": f"Bearer {TOKEN}"}
+    method = "GET" if body is None else "POST"
+    answer = requests.request(
+        method, f"{head.dashboard}{path}", json=body, headers=headers, timeout=30
+    )
+    answer.raise_for_status()
+    return answer.json()
+
+
+def wait_for_jobs(head: Head) -> None:
+    """Until the dashboard and the agent behind it take jobs."""
+    for _ in range(240):
         try:
-            JobSubmissionClient(f"http://127.0.0.1:{port}").submit_job(entrypoint="true")
-        except Exception:
-            assert process.poll() is None, log.read_text()
-            time.sleep(1)
+            request(head, "/api/jobs/", {"entrypoint": "true"})
+        except requests.RequestException:
+            assert head.process.poll() is None, (head.folder / "log").read_text()
+            time.sleep(0.5)
         else:
             return
-    pytest.fail(log.read_text())
+    pytest.fail((head.folder / "log").read_text())
 
 
-def small(document: dict[str, Any]) -> str:
+def wait_for_nodes(head: Head, count: int) -> None:
+    """Until so many nodes are alive."""
+    for _ in range(240):
+        alive = request(head, "/nodes?view=summary")["data"]["summary"]
+        if sum(node["raylet"].get("state") == "ALIVE" for node in alive) == count:
+            return
+        time.sleep(0.5)
+    pytest.fail((head.folder / "log").read_text())
+
+
+def small(document: dict[str, Any]) -> dict[str, Any]:
     document["stages"] = document["stages"][:1]
     document["defaults"]["env_steps"] = 600
     del document["resources"]
-    return yaml.safe_dump(document, sort_keys=False)
+    return document
 
 
-def test_ray_address(head: Head, sweep_document: dict[str, Any], tmp_path: Path) -> None:
-    (tmp_path / "sweep.yaml").write_text(small(sweep_document))
+def run_sweep(
+    head: Head, document: dict[str, Any], folder: Path
+) -> subprocess.CompletedProcess[str]:
+    """With `RAY_ADDRESS`, from a folder of the user's."""
+    (folder / "sweep.yaml").write_text(yaml.safe_dump(document, sort_keys=False))
     path = os.pathsep.join((str(REPOSITORY), str(ENVIRONMENTS)))
-    done = subprocess.run(
+    return subprocess.run(
         [sys.executable, "-m", "music_rllib.sweep", "sweep.yaml"],
-        cwd=tmp_path,
+        cwd=folder,
         env=head.environment | {"RAY_ADDRESS": head.address, "PYTHONPATH": path},
         capture_output=True,
         text=True,
-        timeout=200,
+        timeout=280,
         check=False,
     )
+
+
+def test_two_runs_at_a_time_on_two_nodes(
+    head: Head, sweep_document: dict[str, Any], tmp_path: Path
+) -> None:
+    """Each run waits for the other one, and neither node has room for more than one."""
+    document = small(sweep_document)
+    document["seeds"] = [0, 1]
+    folder = tmp_path / "meeting"
+    folder.mkdir()
+    document["environments"]["Point"] |= {
+        "env_id": "point_env:Meeting-v0",
+        "env_kwargs": {"folder": str(folder)},
+    }
+    done = run_sweep(head, document, tmp_path)
     assert (done.returncode, done.stderr) == (0, ""), done.stdout
-    assert "pretrain/Point/seed0: finished" in done.stdout
-    assert len(list((tmp_path / "results" / "nodes").iterdir())) == 1
+    assert len(list(folder.iterdir())) == 2
+    assert len(list((tmp_path / "results" / "nodes").iterdir())) == 2
 
 
 def test_more_cpus_than_any_node_has(
     head: Head, sweep_document: dict[str, Any], tmp_path: Path
 ) -> None:
-    sweep_document["resources"] = {"cpus_per_run": 64}
-    (tmp_path / "sweep.yaml").write_text(yaml.safe_dump(sweep_document))
-    path = os.pathsep.join((str(REPOSITORY), str(ENVIRONMENTS)))
-    done = subprocess.run(
-        [sys.executable, "-m", "music_rllib.sweep", "sweep.yaml"],
-        cwd=tmp_path,
-        env=head.environment | {"RAY_ADDRESS": head.address, "PYTHONPATH": path},
-        capture_output=True,
-        text=True,
-        timeout=200,
-        check=False,
-    )
+    """Together the nodes have two, but a run is on one of them."""
+    sweep_document["resources"] = {"cpus_per_run": 2}
+    done = run_sweep(head, sweep_document, tmp_path)
     assert done.returncode == 2, done.stderr
     assert "resources.cpus_per_run must fit into one node of the cluster, whose largest" in (
         done.stderr
     )
 
 
-def test_submitted_as_a_job(head: Head, sweep_document: dict[str, Any], tmp_path: Path) -> None:
-    """From a folder with the package in it, as on a machine where it isn't installed."""
-    working_dir = tmp_path / "checkout"
-    shutil.copytree(
-        REPOSITORY / "music_rllib",
-        working_dir / "music_rllib",
-        ignore=shutil.ignore_patterns("__pycache__"),
-    )
-    shutil.copy(ENVIRONMENTS / "point_env.py", working_dir)
-    (working_dir / "sweep.yaml").write_text(small(sweep_document))
-    command = ["job", "submit", "--address", head.dashboard, "--working-dir", str(working_dir)]
-    program = ["python", "-m", "music_rllib.sweep", "sweep.yaml"]
+class Jobs:
+    """`ray job` as a user calls it, from a folder with the package in it and no installation."""
 
-    def submit(*options: str) -> subprocess.CompletedProcess[str]:
+    def __init__(self, folder: Path, sweep: dict[str, Any]) -> None:
+        self.folder = folder
+        shutil.copytree(
+            REPOSITORY / "music_rllib",
+            folder / "music_rllib",
+            ignore=shutil.ignore_patterns("__pycache__"),
+        )
+        shutil.copy(ENVIRONMENTS / "point_env.py", folder)
+        (folder / "sweep.yaml").write_text(yaml.safe_dump(sweep, sort_keys=False))
+
+    def call(
+        self, head: Head, *arguments: str, token: str = TOKEN
+    ) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
-            [BIN / "ray", *command, "--", *program, *options],
-            env=head.environment,
+            [str(BIN / "ray"), "job", *arguments],
+            env=head.environment | {"RAY_ADDRESS": head.dashboard, "RAY_AUTH_TOKEN": token},
             capture_output=True,
             text=True,
             timeout=280,
             check=False,
         )
 
-    done = submit()
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "pretrain/Point/seed0: finished" in done.stdout
-    storage = head.home / "results"
-    assert f"using {storage}. Give an absolute path" in done.stdout
-    assert len(list((storage / "nodes").iterdir())) == 1
-    assert (storage / "mlflow.db").exists()
+    def submit(
+        self, head: Head, job: str, *options: str, wait: bool = True, token: str = TOKEN
+    ) -> subprocess.CompletedProcess[str]:
+        arguments = ["--working-dir", str(self.folder), "--submission-id", job]
+        arguments += ["--runtime-env-json", json.dumps({"env_vars": STOP})]
+        arguments += [] if wait else ["--no-wait"]
+        program = ["python", "-m", "music_rllib.sweep", "sweep.yaml", *options]
+        return self.call(head, "submit", *arguments, "--", *program, token=token)
 
-    again = submit("--dry-run")
-    assert again.returncode == 0
-    assert "1 finished earlier and reused" in again.stdout
+    def wait_for_log(self, head: Head, job: str, wanted: str) -> str:
+        """The job's log when `wanted` is in it."""
+        text = ""
+        for _ in range(400):
+            text = str(request(head, f"/api/jobs/{job}/logs")["logs"])
+            if wanted in text:
+                return text
+            state = request(head, f"/api/jobs/{job}")
+            assert state["status"] in ("PENDING", "RUNNING"), (state, text)
+            time.sleep(0.3)
+        pytest.fail(text)
+
+
+@pytest.mark.timeout(900)  # three programs and two clusters start, one after the other
+def test_job_is_stopped_then_outlives_its_cluster(
+    sweep_document: dict[str, Any], tmp_path: Path
+) -> None:
+    """Stopped in good order; resumed, and its head killed; resumed on a new cluster to its end."""
+    document = small(sweep_document)
+    document["defaults"] |= {"env_steps": 10_000, "evaluation": {"interval": 400, "episodes": 1}}
+    fast = tmp_path / "fast"
+    document["environments"]["Point"] |= {
+        "env_id": "point_env:Paced-v0",
+        "env_kwargs": {"fast": str(fast)},
+    }
+    jobs = Jobs(tmp_path / "checkout", document)
+    home = tmp_path / "home"
+    home.mkdir()
+    storage = home / "results"
+    work = storage / "work"
+    with head_node(home, 1) as head:
+        stranger = jobs.submit(head, "stranger", token="another-token-of-some-length-0123456789")
+        assert stranger.returncode == 1
+        assert "authentication is enabled" in stranger.stderr
+
+        assert jobs.submit(head, "one", wait=False).returncode == 0
+        wait_for_newer(work, "")
+        assert jobs.call(head, "stop", "one").returncode == 0
+        assert request(head, "/api/jobs/one")["status"] == "STOPPED"
+        log = jobs.call(head, "logs", "one").stdout
+        assert "stopping, this takes a few seconds" in log
+        assert "Stopped. Finished runs and the last checkpoints are kept" in log
+
+        assert jobs.submit(head, "two", wait=False).returncode == 0
+        log += jobs.wait_for_log(head, "two", "continues at")
+        wait_for_newer(work, newest_checkpoint(work))
+        kill_tree(head.process)
+    assert not list((storage / "nodes").glob("*")), "it was to be interrupted before its end"
+
+    fast.touch()
+    with head_node(home, 1) as head:
+        done = jobs.submit(head, "three")
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert "continues at" in done.stdout
+        assert "pretrain/Point/seed0: finished" in done.stdout
+        assert f"using {storage}. Give an absolute path" in done.stdout
+        assert request(head, "/api/jobs/three")["driver_exit_code"] == 0
+
+        wrong = jobs.submit(head, "four", "--storage", "ftp://nowhere")
+        assert wrong.returncode == 1, "the client knows no other codes than 0 and 1"
+        assert request(head, "/api/jobs/four")["driver_exit_code"] == 2
+    assert len(list((storage / "nodes").iterdir())) == 1
+    for path in [path for path in storage.rglob("*") if path.is_file()]:
+        assert b"planted-" not in path.read_bytes(), path
+    assert "planted-" not in log + done.stdout
+
+
+def kill_tree(process: subprocess.Popen[Any]) -> None:
+    """All that the node has started, drivers and workers too, as when a machine is switched off."""
+    tree = psutil.Process(process.pid)
+    for inner in [tree, *tree.children(recursive=True)]:
+        with contextlib.suppress(psutil.NoSuchProcess):
+            inner.kill()
+    process.wait(timeout=60)
+
+
+def newest_checkpoint(work: Path) -> str:
+    """Its number, which grows with the environment steps; empty where there is none."""
+    found = [path.parent.name for path in work.glob("*/*/manifest.json")]
+    return max(found, default="")
+
+
+def wait_for_newer(work: Path, than: str) -> None:
+    for _ in range(1200):
+        if newest_checkpoint(work) > than:
+            return
+        time.sleep(0.1)
+    pytest.fail("no new checkpoint")
