@@ -196,7 +196,9 @@ class Experiment:
         experiment = self._client.get_experiment_by_name(self._name)
         if experiment is None:
             try:
-                return self._client.create_experiment(self._name, self._artefact_location())
+                return self._client.create_experiment(
+                    self._name, self._artefact_location(), tags=names.EXPERIMENT_TAGS
+                )
             except MlflowException as error:
                 if error.error_code != "RESOURCE_ALREADY_EXISTS":
                     raise
@@ -214,8 +216,12 @@ class Experiment:
 
 
 def first_line(error: Exception) -> str:
-    """The first line of an error, without passwords."""
-    lines = str(error).strip().splitlines() or [type(error).__name__]
+    """The first line of an error that says something, without passwords."""
+    lines = [
+        line
+        for line in str(error).strip().splitlines()
+        if line.strip() and not line.startswith("(raised as a result of Query-invoked autoflush")
+    ] or [type(error).__name__]
     return redact(lines[0])
 
 
@@ -233,8 +239,9 @@ def _configure_mlflow() -> None:
     warnings.filterwarnings("ignore", r"The ``noload`` loader strategy", DeprecationWarning)
     # And of its own type hints, met when its model code is imported.
     warnings.filterwarnings("ignore", r".*Any type hint is inferred as AnyType", UserWarning)
-    for chatty in ("mlflow.store.db.utils", "alembic"):
-        logging.getLogger(chatty).setLevel(logging.WARNING)
+    logging.getLogger("alembic").setLevel(logging.WARNING)
+    # It logs pages of traceback about what it raises as well, and the sender says in a line.
+    logging.getLogger("mlflow.store.db.utils").setLevel(logging.CRITICAL)
 
 
 def _open_client(store: TrackingStore) -> MlflowClient:

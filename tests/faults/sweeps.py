@@ -7,13 +7,14 @@ import signal
 import subprocess
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import psutil
 import yaml
 
-from tests.integration.conftest import ENVIRONMENTS, REPOSITORY, SWEEP, Program
+from tests.integration.conftest import ENVIRONMENTS, REPOSITORY, SWEEP, Program, end
 
 FIRST_SIGN = 180.0
 """Seconds that a start may take on a busy machine."""
@@ -27,10 +28,28 @@ def document(**changes: Any) -> dict[str, Any]:
     return whole | changes
 
 
-def program(folder: Path) -> Program:
+@dataclass
+class OwnProgram(Program):
+    """A program whose processes end with the test, however that ends."""
+
+    started: list[subprocess.Popen[str]] = field(default_factory=list)
+
+    def start(self, *options: str) -> subprocess.Popen[str]:
+        self.started.append(super().start(*options))
+        return self.started[-1]
+
+    def end_all(self) -> None:
+        for process in self.started:
+            end(process)
+            for stream in (process.stdout, process.stderr):
+                assert stream is not None
+                stream.close()
+
+
+def program(folder: Path) -> OwnProgram:
     """What runs it in `folder`."""
     paths = os.pathsep.join(map(str, (REPOSITORY, ENVIRONMENTS)))
-    return Program(folder, os.environ | {"PYTHONPATH": paths})
+    return OwnProgram(folder, os.environ | {"PYTHONPATH": paths})
 
 
 def start_until(program: Program, *signs: str) -> subprocess.Popen[str]:

@@ -82,11 +82,13 @@ def test_a_run_whose_worker_dies_again_and_again_fails_with_the_cause(
     process = sweeps.start_until(program, "pretrain/Point/seed0: started")
     for attempt in range(RESTARTS + 1):
         sweeps.kill_a_worker(process)
-        sign = ": FAILED: " if attempt == RESTARTS else "pretrain/Point/seed0: started"
-        sweeps.read_until(process, sign)
+        last = "The same command again continues from the last checkpoint"
+        sign = last if attempt == RESTARTS else "pretrain/Point/seed0: started"
+        output = sweeps.read_until(process, sign)
+    assert ": FAILED: The worker process died" in output
+    assert last in output
     output, errors = process.communicate(timeout=180)
     assert (process.returncode, errors) == (1, ""), output
-    assert "The same command again continues from the last checkpoint" in output
 
 
 @pytest.mark.thorough
