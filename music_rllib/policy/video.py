@@ -64,11 +64,10 @@ def film(
     """
     frames: list[Frame] = []
     results: list[EpisodeResult] = []
+    _check_drawable(policy)
     why_not = use_renderer()
     env = open_task(policy, render_mode="rgb_array", **_size(policy))
     try:
-        if "rgb_array" not in (env.metadata.get("render_modes") or []):
-            raise VideoError(f"{policy.task.env_id} can't be drawn: it has no rgb_array rendering")
         if why_not is not None and hasattr(env.unwrapped, "mujoco_renderer"):
             raise VideoError(why_not)
 
@@ -83,6 +82,14 @@ def film(
     finally:
         env.close()
     return frames, results
+
+
+def _check_drawable(policy: Policy) -> None:
+    env = open_task(policy)
+    modes = env.metadata.get("render_modes") or []
+    env.close()
+    if "rgb_array" not in modes:
+        raise VideoError(f"{policy.task.env_id} can't be drawn: it has no rgb_array rendering")
 
 
 def _size(policy: Policy) -> dict[str, int]:

@@ -146,6 +146,8 @@ TAG_VERSION_PREFIX = "version."
 """Followed by a package or ``python``: ``version.ray``."""
 TAG_CHANGED_PREFIX = "changed."
 """Followed by a param: its newer value (MLflow params never change) after a sweep was changed."""
+EXPERIMENT_TAGS = {"mlflow.experimentKind": "custom_model_development"}
+"""MLflow 3 shows an experiment without it as one of language models: traces, judges, prompts."""
 TAGS_OF_A_MODEL = (
     TAG_SWEEP,
     TAG_SWEEP_ID,

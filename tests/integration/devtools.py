@@ -1,0 +1,123 @@
+"""A page in headless Chromium, driven by its DevTools protocol."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import json
+import subprocess
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+from urllib.request import urlopen
+
+import aiohttp
+
+PATIENCE = 180.0
+
+
+class Page:
+    """One tab. Use it with `async with`."""
+
+    def __init__(self, program: Path, folder: Path, width: int = 1500, height: int = 1000) -> None:
+        self._folder = folder
+        self._command = [
+            str(program),
+            *("--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-sync"),
+            *("--disable-background-networking", "--disable-component-update"),
+            *("--hide-scrollbars", "--remote-debugging-port=0", "--remote-allow-origins=*"),
+            f"--user-data-dir={folder / 'profile'}",
+            f"--window-size={width},{height}",
+            "about:blank",
+        ]
+        self.errors: list[str] = []
+        """What the page logged as an error, or did not catch."""
+        self._answers: dict[int, asyncio.Future[dict[str, Any]]] = {}
+        self._number = 0
+
+    async def __aenter__(self) -> Self:
+        self._process = subprocess.Popen(
+            self._command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        port = await self._port()
+        pages = json.load(urlopen(f"http://127.0.0.1:{port}/json"))
+        address = next(p["webSocketDebuggerUrl"] for p in pages if p["type"] == "page")
+        self._session = aiohttp.ClientSession()
+        self._socket = await self._session.ws_connect(address, max_msg_size=0)
+        self._listening = asyncio.create_task(self._listen())
+        for domain in ("Page", "Runtime", "Log"):
+            await self._send(f"{domain}.enable")
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._listening.cancel()
+        await self._socket.close()
+        await self._session.close()
+        self._process.terminate()
+        self._process.wait(30)
+
+    async def _port(self) -> int:
+        file = self._folder / "profile" / "DevToolsActivePort"
+        deadline = time.monotonic() + PATIENCE
+        while time.monotonic() < deadline:
+            if file.exists() and (text := file.read_text()):
+                return int(text.splitlines()[0])
+            await asyncio.sleep(0.1)
+        raise TimeoutError("Chromium did not start")
+
+    async def _listen(self) -> None:
+        async for message in self._socket:
+            event = json.loads(message.data)
+            if "id" in event:
+                self._answers.pop(event["id"]).set_result(event)
+            elif event["method"] == "Runtime.exceptionThrown":
+                self.errors.append(str(event["params"]["exceptionDetails"]))
+            elif event["method"] == "Log.entryAdded":
+                entry = event["params"]["entry"]
+                if entry["level"] == "error":
+                    self.errors.append(f"{entry['text']} {entry.get('url', '')}")
+
+    async def _send(self, method: str, **params: Any) -> dict[str, Any]:
+        self._number += 1
+        answer = asyncio.get_running_loop().create_future()
+        self._answers[self._number] = answer
+        await self._socket.send_json({"id": self._number, "method": method, "params": params})
+        reply = await asyncio.wait_for(answer, PATIENCE)
+        assert "error" not in reply, reply
+        return reply.get("result", {})  # type: ignore[no-any-return]
+
+    async def go(self, url: str) -> None:
+        """Open `url` anew, even where only what follows its # is another."""
+        await self._send("Page.navigate", url="about:blank")
+        await self._send("Page.navigate", url=url)
+
+    async def evaluate(self, script: str) -> Any:
+        """The value of a JavaScript expression."""
+        reply = await self._send("Runtime.evaluate", expression=script, returnByValue=True)
+        return reply["result"].get("value")
+
+    async def text(self) -> str:
+        """What is to be read on the page."""
+        return str(await self.evaluate("document.body ? document.body.innerText : ''"))
+
+    async def wait_for(self, *words: str) -> str:
+        """The page's text as soon as it has all of `words`."""
+        deadline, text = time.monotonic() + PATIENCE, ""
+        while time.monotonic() < deadline:
+            text = await self.text()
+            if all(word in text for word in words):
+                return text
+            await asyncio.sleep(0.3)
+        missing = [word for word in words if word not in text]
+        raise AssertionError(f"no {missing} in:\n{text[:3000]}\nerrors: {self.errors}")
+
+    async def picture(self, path: Path) -> None:
+        """What the window shows, as PNG."""
+        reply = await self._send("Page.captureScreenshot", format="png")
+        path.write_bytes(base64.b64decode(reply["data"]))
