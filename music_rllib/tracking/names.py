@@ -135,7 +135,7 @@ TAG_REUSED = "reused"
 """``true`` where the node was finished by an earlier sweep and its history was copied here."""
 TAG_PART = "part"
 """Of a searched stage: ``trialN`` for a run that trials were chosen by, ``finalN`` for one on the
-fresh seeds of the final ranking. Never mixed in one estimate: the first are biased by the choice."""
+fresh seeds of the final ranking. Never mixed in one estimate: the choice biases the first."""
 TAG_PRUNED = "pruned"
 """Why a run was stopped early, together with its trial."""
 TAG_FAILURE = "failure"
