@@ -27,7 +27,7 @@ def test_a_killed_worker_then_sigterm_then_a_killed_driver(
     assert f"Another worker goes on from the last checkpoint (1 of {RESTARTS} times)." in output
     process.send_signal(signal.SIGTERM)
     output, errors = process.communicate(timeout=180)
-    assert (process.returncode, errors) == (128 + signal.SIGTERM, ""), output
+    assert process.returncode == 128 + signal.SIGTERM, output + errors
     assert "continue with: python -m music_rllib.sweep" in output
 
     process = sweeps.start_until(program, "finetune", "Results of")
@@ -50,7 +50,7 @@ def test_told_to_stop_in_each_stage(
     if sign == "starting a local Ray":  # nothing to save yet
         assert process.returncode in {128 + number, -number}, output + errors
     else:
-        assert (process.returncode, errors) == (128 + number, ""), output
+        assert process.returncode == 128 + number, output + errors
     # What was saved on the signal is where it goes on: not a step is computed again.
     saved = dict(re.findall(r"\] (\S+): saved at ([\d,]+) env steps", output))
     output = sweeps.finish(program)
@@ -88,7 +88,7 @@ def test_a_run_whose_worker_dies_again_and_again_fails_with_the_cause(
     assert ": FAILED: The worker process died" in output
     assert last in output
     output, errors = process.communicate(timeout=180)
-    assert (process.returncode, errors) == (1, ""), output
+    assert process.returncode == 1, output + errors
 
 
 @pytest.mark.thorough
@@ -108,7 +108,7 @@ def test_killed_twenty_times_at_random_moments(program: Program, unbroken: Path)
             kills += 1
             continue
         output, errors = process.communicate()
-        assert (process.returncode, errors) == (0, ""), output
+        assert process.returncode == 0, output + errors
         comparison.same(unbroken, results)
         results.rename(program.folder / f"done-{kills}")  # once more, from nothing
     sweeps.finish(program)
