@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -55,6 +56,11 @@ _LASTING_ERRORS = frozenset(
 _Item = TypeVar("_Item")
 
 
+_CREDENTIALS_HINT = (
+    " Set MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD in the environment of the sweep."
+)
+
+
 def is_lasting(error: Exception) -> bool:
     """Whether repeating the call cannot help: a refused value, or a run that was deleted."""
     return isinstance(error, MlflowException) and error.error_code in _LASTING_ERRORS
@@ -78,9 +84,11 @@ class Experiment:
         except TrackingError:
             raise
         except Exception as error:
+            answer = first_line(error)
+            hint = _CREDENTIALS_HINT if re.search(r"\b40[13]\b", answer) else ""
             raise TrackingError(
                 f"MLflow at {store.public_uri} must accept the experiment {name!r}, "
-                f"it answered: {first_line(error)}"
+                f"it answered: {answer}{hint}"
             ) from error
 
     def find_run(self, tags: Mapping[str, str]) -> str | None:

@@ -108,6 +108,7 @@ def test_secrets_are_used_and_written_nowhere(
     code, _, errors = sweep_program.run()
     assert code == 2, "without a password nothing must start"
     assert "401" in errors
+    assert "Set MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD" in errors
 
     sweep_program.environment |= PLANTED
     code, output, errors = sweep_program.run()
