@@ -122,7 +122,7 @@ def check_search(storage: Path) -> None:
                 manifest = json.loads((storage / "nodes" / key / "manifest.json").read_text())
                 values.append(manifest["meta"]["result"]["metrics"][names.EVAL_RETURN])
         assert len(values) == 3
-        assert trial["objective"] == [pytest.approx(sum(values) / 2)]
+        assert trial["objective"] == [pytest.approx(sum(values) / 3)]
     (first,) = found["ranking"]
     assert len(first["scores"][0]) == 2
 
