@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
 from music_rllib.reports.analysis import Curve, StageAnalysis, curve
-from music_rllib.reports.conditions import Stage
+from music_rllib.reports.conditions import Condition, Stage
 from music_rllib.reports.data import Sweep
 from music_rllib.reports.figures import (
     METRICS,
@@ -28,11 +29,14 @@ from music_rllib.reports.influence import (
     sensitivity_panels,
 )
 from music_rllib.reports.palette import BARS, Style, style_of
+from music_rllib.reports.parallel import forked_map
 
 __all__ = ["CURVES", "FINALS", "INFLUENCE", "PROFILES", "Drawing", "slug", "stage_drawings"]
 
 FINALS, PROFILES = "Final success rate", "Performance profile"
 INFLUENCE = ("Sensitivity", "Importance of settings", "Parallel coordinates")
+FEW_CURVES = 60
+"""Curves for which more processes would cost more than they save."""
 CURVES = tuple(metric.title for metric in METRICS)
 
 
@@ -64,8 +68,9 @@ def stage_drawings(
 ) -> Iterator[Drawing]:
     """The figures for which there is something to draw or to compare."""
     stage = analysis.stage
+    found = _all_curves(sweep, stage, rng)
     for metric in METRICS:
-        drawing = _curves(sweep, stage, metric, rng)
+        drawing = _curves(stage, metric, found)
         if drawing is not None:
             yield drawing
     scopes = [scope for scope in analysis.scopes if len(scope.finals) > 1]
@@ -90,11 +95,32 @@ def stage_drawings(
     yield from _influence(sweep, analysis)
 
 
-def _curves(sweep: Sweep, stage: Stage, metric: Metric, rng: np.random.Generator) -> Drawing | None:
+def _all_curves(
+    sweep: Sweep, stage: Stage, rng: np.random.Generator
+) -> dict[tuple[str, str], list[Curve]]:
+    """By metric and task."""
+    jobs = list(product(METRICS, stage.tasks, stage.conditions))
+    # Each has its own randomness, so that it is the same in whatever process and order.
+    seeded = list(zip(jobs, rng.spawn(len(jobs)), strict=True))
+
+    def make(job: tuple[tuple[Metric, str, Condition], np.random.Generator]) -> Curve | None:
+        (metric, task, condition), own = job
+        return curve(sweep, condition, task, metric.name, own)
+
+    curves: dict[tuple[str, str], list[Curve]] = {}
+    made = forked_map(make, seeded, few=FEW_CURVES)
+    for (metric, task, _), one in zip(jobs, made, strict=True):
+        if one is not None:
+            curves.setdefault((metric.name, task), []).append(one)
+    return curves
+
+
+def _curves(
+    stage: Stage, metric: Metric, found: Mapping[tuple[str, str], list[Curve]]
+) -> Drawing | None:
     panels, values = [], []
     for task in stage.tasks:
-        found = [curve(sweep, c, task, metric.name, rng) for c in stage.conditions]
-        curves = [one for one in found if one is not None]
+        curves = found.get((metric.name, task), [])
         if not curves:
             continue
         panels.append(curve_panel(metric, task, curves, stage.conditions))

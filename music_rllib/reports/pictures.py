@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import threading
-import warnings
 from collections.abc import Sequence
 from typing import NamedTuple
 
 from music_rllib.reports.figures import files, svg_inline
 from music_rllib.reports.gallery import Drawing
+from music_rllib.reports.parallel import forked_map
 
 __all__ = ["Pictures", "draw_all"]
 
@@ -28,27 +25,9 @@ class Pictures(NamedTuple):
 
 
 def draw_all(drawings: Sequence[Drawing]) -> dict[str, Pictures]:
-    """Draw everything, on as many CPUs as there are; by the drawings' names."""
-    global _DRAWINGS
-    processes = min(len(os.sched_getaffinity(0)), len(drawings))
-    # Drawings hold functions, which can't be sent to another process: it must be a fork of this
-    # one, which is safe only without threads.
-    if len(drawings) <= FEW or processes == 1 or threading.active_count() > 1:
-        return {drawing.name: _draw(drawing) for drawing in drawings}
-    _DRAWINGS = drawings
-    with warnings.catch_warnings():
-        # Python 3.12 counts the idle threads of numerical libraries.
-        warnings.simplefilter("ignore", DeprecationWarning)
-        with multiprocessing.get_context("fork").Pool(processes) as pool:
-            drawn = pool.map(_draw_one, range(len(drawings)), chunksize=1)
+    """Draw everything; by the drawings' names."""
+    drawn = forked_map(_draw, drawings, few=FEW)
     return {drawing.name: pictures for drawing, pictures in zip(drawings, drawn, strict=True)}
-
-
-_DRAWINGS: Sequence[Drawing] = ()
-
-
-def _draw_one(position: int) -> Pictures:
-    return _draw(_DRAWINGS[position])
 
 
 def _draw(drawing: Drawing) -> Pictures:
