@@ -17,7 +17,6 @@ from typing import Any
 
 import pytest
 
-from music_rllib.policy import load_policy
 from music_rllib.tracking import names
 
 pytestmark = pytest.mark.integration
@@ -135,8 +134,10 @@ def check_commands(program: Any) -> None:
     assert code == 0, errors
     chosen = json.loads(output)
     assert chosen["on_fresh_seeds"]
-    policy = load_policy(program.folder / "out")
-    assert policy.task.name == "Point"
+    code, output, errors = command(program, "evaluate", "out", "--episodes", "2", "--json")
+    assert code == 0, errors
+    played = json.loads(output)
+    assert (played["task"], played["node_key"]) == ("Point", chosen["policies"][0]["node"])
     assert (program.folder / "out/run.yaml").is_file()
     for name in ("whole", "points"):
         code, output, _ = command(program, "clean", f"results/{name}", "--all", "--yes", "--json")
