@@ -8,7 +8,7 @@ import sys
 __all__ = ["keep_freed_memory"]
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
-# Activations are below it. Whole batches are above it, and go back to the system: kept as well, they
+# Activations are smaller. Whole batches are larger and go back to the system: kept as well, they
 # had a MUSIC-u run grow by 40 MB per thousand steps, as its heap fell into ever smaller pieces.
 _KEPT_BLOCK = 2 * 2**20
 _KEPT = 128 * 2**20
