@@ -49,7 +49,7 @@ test-unit: venv  ## run the quick tests (under a minute)
 	@$(BIN)/python -m pytest tests/unit $(PYTEST_ARGS)
 
 test-faults: venv  ## kill, fill, cut and corrupt, and compare with unbroken runs (half an hour)
-	@$(BIN)/python -m pytest -m faults $(PYTEST_ARGS)
+	@$(BIN)/python -m pytest -m 'faults or thorough' $(PYTEST_ARGS)
 
 lint: venv  ## ruff: rules and formatting
 	@$(BIN)/ruff check .

@@ -49,13 +49,22 @@ _TIERS = {
 }
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark each test with its folder's tier, so that ``-m`` works without markers in every file."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark each test with its folder's tier, so that ``-m`` works without markers in every file.
+
+    What is thorough, and takes many minutes, is left out unless ``-m`` asks for it.
+    """
     for item in items:
         if item.path.is_relative_to(_TESTS):
             tier = _TIERS.get(item.path.relative_to(_TESTS).parts[0])
             if tier is not None:
                 item.add_marker(tier)
+    if "thorough" in (config.option.markexpr or ""):
+        return
+    thorough = [item for item in items if item.get_closest_marker("thorough")]
+    if thorough:
+        config.hook.pytest_deselected(items=thorough)
+        items[:] = [item for item in items if not item.get_closest_marker("thorough")]
 
 
 # Service -> where its program may be: a name on PATH, or a pattern below the root folder.

@@ -23,8 +23,8 @@ from optuna.exceptions import DuplicatedStudyError, StorageInternalError, Update
 from optuna.storages import BaseStorage, RDBStorage, get_storage
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState, create_trial
-from sqlalchemy.engine import make_url
-from sqlalchemy.exc import ArgumentError, SQLAlchemyError
+from sqlalchemy.engine import URL, make_url
+from sqlalchemy.exc import ArgumentError, IntegrityError, ProgrammingError, SQLAlchemyError
 
 from music_rllib.experiment.files import content_key
 from music_rllib.experiment.sealed import StorageError
@@ -76,11 +76,7 @@ def open_studies(url: str) -> BaseStorage:
             parsed = parsed.set(drivername="postgresql+psycopg2")
         local = parsed.get_backend_name() == "sqlite"
         options: dict[str, Any] = {"connect_args": {"timeout": 60}} if local else {"pool_size": 2}
-        storage = RDBStorage(
-            parsed.render_as_string(hide_password=False),
-            engine_kwargs=options | {"pool_pre_ping": True},
-        )
-        return get_storage(storage)  # with a cache of ended trials
+        return get_storage(_with_tables(parsed, options))  # with a cache of ended trials
     except StorageError:
         raise
     except (
@@ -94,6 +90,25 @@ def open_studies(url: str) -> BaseStorage:
         raise StorageError(
             f"search.storage must be a database that can be used, got {shown}: {redact(cause)}"
         ) from error
+
+
+def _with_tables(url: URL, options: Mapping[str, Any]) -> RDBStorage:
+    """Optuna's storage, its tables made where they are missing.
+
+    Of two drivers that find a new database at the same moment, one fails to make a table that the
+    other is just making, and finds it there when it looks again.
+    """
+    for wait in (0.5, 1.0, 2.0, 4.0, None):
+        try:
+            return RDBStorage(
+                url.render_as_string(hide_password=False),
+                engine_kwargs={**options, "pool_pre_ping": True},
+            )
+        except (IntegrityError, ProgrammingError):
+            if wait is None:
+                raise
+            time.sleep(wait)
+    raise AssertionError("unreachable")
 
 
 def study_names(storage: BaseStorage) -> list[str]:

@@ -22,6 +22,7 @@ from music_rllib.sweep.trainable import STOPPED
 
 __all__ = ["StopSignals"]
 
+
 class StopSignals(tune.Callback):
     """Ctrl-C and SIGTERM end Tune's loop in good order: when every run has saved its state.
 

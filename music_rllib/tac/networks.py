@@ -82,9 +82,10 @@ class Critics(nn.Module):
         if self.bf16:
             with _in_bf16(inputs):
                 hidden = self._hidden(inputs, hidden_layers)
+            hidden = hidden.float()
         else:
             hidden = self._hidden(inputs, hidden_layers)
-        return torch.baddbmm(bias, F.relu(hidden).float(), weight).squeeze(-1)
+        return torch.baddbmm(bias, F.relu(hidden), weight).squeeze(-1)
 
     def _hidden(self, inputs: Tensor, layers: list[tuple[Tensor, Tensor]]) -> Tensor:
         """[B, I] -> [C, B, H], before the last layer's ReLU."""

@@ -29,18 +29,3 @@ def program(tmp_path: Path) -> Iterator[Program]:
     own.write(sweeps.document())
     yield own
     own.end_all()
-
-
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out what takes many minutes, unless `-m` asks for faults."""
-    if "faults" in (config.option.markexpr or ""):
-        return
-    here = Path(__file__).parent
-    thorough = [
-        item
-        for item in items
-        if item.path.is_relative_to(here) and item.get_closest_marker("thorough")
-    ]
-    if thorough:
-        config.hook.pytest_deselected(items=thorough)
-        items[:] = [item for item in items if item not in thorough]

@@ -16,6 +16,7 @@ from tests.faults import comparison, sweeps
 from tests.integration.conftest import Program
 
 
+@pytest.mark.thorough
 def test_a_killed_worker_then_sigterm_then_a_killed_driver(
     program: Program, unbroken: Path
 ) -> None:

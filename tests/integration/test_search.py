@@ -70,6 +70,7 @@ def command(program: Any, *arguments: str) -> tuple[int, str, str]:
     return done.returncode, done.stdout, done.stderr
 
 
+@pytest.mark.thorough
 @pytest.mark.timeout(2 * PATIENCE)
 def test_a_search_stopped_and_resumed_and_what_its_commands_say(
     sweep_program: Any, sweep_document: Document, mlflow_runs: Callable[[], Any], tmp_path: Path

@@ -12,6 +12,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -246,11 +247,44 @@ class Jobs:
         pytest.fail(text)
 
 
-@pytest.mark.timeout(900)  # three programs and two clusters start, one after the other
-def test_job_is_stopped_then_outlives_its_cluster(
-    sweep_document: dict[str, Any], tmp_path: Path
-) -> None:
-    """Stopped in good order; resumed, and its head killed; resumed on a new cluster to its end."""
+@dataclass(frozen=True)
+class Site:
+    """Where jobs run: their checkout, the file that lets their environment hurry, and a home."""
+
+    jobs: Jobs
+    fast: Path
+    home: Path
+
+    @property
+    def storage(self) -> Path:
+        return self.home / "results"
+
+    def stop_one(self, head: Any) -> str:
+        """A job that is stopped after its first checkpoint; its log."""
+        assert self.jobs.submit(head, "one", wait=False).returncode == 0
+        wait_for_newer(self.storage / "work", "")
+        assert self.jobs.call(head, "stop", "one").returncode == 0
+        assert request(head, "/api/jobs/one")["status"] == "STOPPED"
+        log: str = self.jobs.call(head, "logs", "one").stdout
+        assert "stopping, this takes a few seconds" in log
+        assert "Stopped. Finished runs and the last checkpoints are kept" in log
+        return log
+
+    def finish(self, head: Any) -> str:
+        """A job that goes on to the end; its output."""
+        self.fast.touch()
+        done = self.jobs.submit(head, "last")
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert "continues at" in done.stdout
+        assert "pretrain/Point/seed0: finished" in done.stdout
+        assert f"using {self.storage}. Give an absolute path" in done.stdout
+        assert request(head, "/api/jobs/last")["driver_exit_code"] == 0
+        assert len(list((self.storage / "nodes").iterdir())) == 1
+        return str(done.stdout)
+
+
+@pytest.fixture
+def site(sweep_document: dict[str, Any], tmp_path: Path) -> Site:
     document = small(sweep_document)
     document["defaults"] |= {"env_steps": 10_000, "evaluation": {"interval": 400, "episodes": 1}}
     fast = tmp_path / "fast"
@@ -258,46 +292,42 @@ def test_job_is_stopped_then_outlives_its_cluster(
         "env_id": "point_env:Paced-v0",
         "env_kwargs": {"fast": str(fast)},
     }
-    jobs = Jobs(tmp_path / "checkout", document)
     home = tmp_path / "home"
     home.mkdir()
-    storage = home / "results"
-    work = storage / "work"
-    with head_node(home, 1) as head:
+    return Site(Jobs(tmp_path / "checkout", document), fast, home)
+
+
+@pytest.mark.timeout(900)
+def test_job_is_stopped_and_a_later_one_goes_on(site: Site) -> None:
+    with head_node(site.home, 1) as head:
+        site.stop_one(head)
+        site.finish(head)
+
+
+@pytest.mark.thorough
+@pytest.mark.timeout(900)  # four programs and two clusters start, one after the other
+def test_job_is_stopped_then_outlives_its_cluster(site: Site) -> None:
+    """Stopped in good order; resumed, and its head killed; resumed on a new cluster to its end."""
+    jobs, work = site.jobs, site.storage / "work"
+    with head_node(site.home, 1) as head:
         stranger = jobs.submit(head, "stranger", token="another-token-of-some-length-0123456789")
         assert stranger.returncode == 1
         assert "authentication is enabled" in stranger.stderr
-
-        assert jobs.submit(head, "one", wait=False).returncode == 0
-        wait_for_newer(work, "")
-        assert jobs.call(head, "stop", "one").returncode == 0
-        assert request(head, "/api/jobs/one")["status"] == "STOPPED"
-        log = jobs.call(head, "logs", "one").stdout
-        assert "stopping, this takes a few seconds" in log
-        assert "Stopped. Finished runs and the last checkpoints are kept" in log
-
+        log = site.stop_one(head)
         assert jobs.submit(head, "two", wait=False).returncode == 0
         log += jobs.wait_for_log(head, "two", "continues at")
         wait_for_newer(work, newest_checkpoint(work))
         kill_tree(head.process)
-    assert not list((storage / "nodes").glob("*")), "it was to be interrupted before its end"
+    assert not list((site.storage / "nodes").glob("*")), "it was to be interrupted before its end"
 
-    fast.touch()
-    with head_node(home, 1) as head:
-        done = jobs.submit(head, "three")
-        assert done.returncode == 0, done.stdout + done.stderr
-        assert "continues at" in done.stdout
-        assert "pretrain/Point/seed0: finished" in done.stdout
-        assert f"using {storage}. Give an absolute path" in done.stdout
-        assert request(head, "/api/jobs/three")["driver_exit_code"] == 0
-
+    with head_node(site.home, 1) as head:
+        log += site.finish(head)
         wrong = jobs.submit(head, "four", "--storage", "ftp://nowhere")
         assert wrong.returncode == 1, "the client knows no other codes than 0 and 1"
         assert request(head, "/api/jobs/four")["driver_exit_code"] == 2
-    assert len(list((storage / "nodes").iterdir())) == 1
-    for path in [path for path in storage.rglob("*") if path.is_file()]:
+    for path in [path for path in site.storage.rglob("*") if path.is_file()]:
         assert b"planted-" not in path.read_bytes(), path
-    assert "planted-" not in log + done.stdout
+    assert "planted-" not in log
 
 
 def kill_tree(process: subprocess.Popen[Any]) -> None:

@@ -658,7 +658,7 @@ def test_two_hundred_trials_cost_the_driver_no_more_each_than_one_hundred(tmp_pa
 def test_the_same_file_gives_the_same_points_on_another_machine(tmp_path: Path) -> None:
     """Six digits of each: the last bits of a machine's logarithm play no part."""
     driver = Driver(tmp_path, document({}))
-    driver.play(stop_after=2)
+    driver.play()
     assert points(driver.trials())[:2] == FIRST_POINTS
 
 
