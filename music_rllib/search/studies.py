@@ -170,6 +170,8 @@ class Study:
         self._given: set[int] = set()
         """Numbers of the trials that `claim` has given out."""
         self.lay_out()
+        # Before it claims anything: else a driver that opens the study then takes this one for dead.
+        self._storage.set_study_user_attr(self._id, f"{DRIVER}{self._me}", time.time())
         self.release_the_dead()
 
     # -- making it ---------------------------------------------------------------------------
@@ -379,8 +381,10 @@ class Study:
         """Put trials of drivers that are no more back among the waiting ones."""
         now = time.time() if now is None else now
         self.refresh()
+        trials = self.trials()
+        # Looked at after the trials: whoever had claimed one by then had signed before.
         signs = self._storage.get_study_user_attrs(self._id)
-        for trial in self.trials():
+        for trial in trials:
             owner = trial.user_attrs.get(OWNER, "")
             if trial.state is not TrialState.RUNNING or owner == self._me:
                 continue
