@@ -170,7 +170,7 @@ class Study:
         self._given: set[int] = set()
         """Numbers of the trials that `claim` has given out."""
         self.lay_out()
-        # Before it claims anything: else a driver that opens the study then takes this one for dead.
+        # Before it claims anything: a driver that opens the study then would take it for dead.
         self._storage.set_study_user_attr(self._id, f"{DRIVER}{self._me}", time.time())
         self.release_the_dead()
 

@@ -210,8 +210,8 @@ DRIVER = """
 """
 
 
-# Not in every run: it still fails now and then. Two drivers that open a new study in the same moment
-# may both judge its first trials; the cause is open.
+# Not in every run: it still fails now and then. Two drivers that open a new study in the same
+# moment may both judge its first trials; the cause is open.
 @pytest.mark.thorough
 def test_two_drivers_on_postgresql_lose_and_double_no_trial(
     postgresql: str, tmp_path: Path
