@@ -102,7 +102,7 @@ class Driver:
         self.sweep: Sweep = open_sweep(
             config, plan, config.storage, sweep_folder(config.storage, config.name)
         )
-        self._time = 0.0
+        self._time = time.time()  # as another driver's clock, which judges whether this one lives
         self.computed: list[str] = []
         self.pruned: dict[str, str] = {}
         self.campaign = Campaign(
