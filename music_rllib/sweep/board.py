@@ -38,6 +38,9 @@ class Board:
     def __init__(self, plan: Plan, finished: Collection[str]) -> None:
         """Start with the nodes whose keys are in `finished` done, and all others waiting."""
         self._nodes = {node.key: node for node in plan.nodes}
+        seeds = list(dict.fromkeys(node.run.seed for node in plan.nodes))
+        by_seed = sorted(self._nodes.values(), key=lambda node: seeds.index(node.run.seed))
+        self._turns = {node.key: turn for turn, node in enumerate(by_seed)}
         self._until: dict[str, int] = {}
         self.changes = 0
         """Grows whenever something changes."""
@@ -71,9 +74,15 @@ class Board:
         return self.all_handed_out and Status.STARTED not in self._status.values()
 
     def next_ready(self) -> Node | None:
-        """The first waiting node, in the order of the plan, whose input is there."""
+        """The waiting node whose input is there and whose turn it is.
+
+        All of a seed before the next seed, so that a sweep that is cut can compare its settings;
+        within a seed in the order of the plan, and what a search adds in the order it is added.
+        """
         ready = (node for node in self.having(Status.WAITING) if self._input_is_there(node))
-        return next(ready, None)
+        return min(
+            ready, key=lambda node: self._turns.get(node.key, len(self._turns)), default=None
+        )
 
     def _input_is_there(self, node: Node) -> bool:
         if node.input is None or node.input.checkpoint is not None:

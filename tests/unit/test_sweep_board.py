@@ -54,6 +54,16 @@ def test_nodes_wait_for_their_inputs(plan: Plan) -> None:
     assert third.label == "b/FetchPush/tac.entropic_index=1/seed1"
 
 
+def test_one_after_the_other_a_seed_is_done_before_the_next(plan: Plan) -> None:
+    board = Board(plan, finished=())
+    order = []
+    while (ready := board.next_ready()) is not None:
+        board.start(ready.key)
+        board.finish(ready.key)
+        order.append((ready.run.seed, ready.stage))
+    assert order == [(seed, stage) for seed in (0, 1) for stage in "abbbccc"]
+
+
 def test_finished_nodes_are_reused(plan: Plan) -> None:
     keys = [node.key for node in plan.nodes]
     board = Board(plan, finished=keys)
