@@ -69,7 +69,7 @@ VARIANTS: Mapping[Variant, VariantRules] = MappingProxyType(
         "music-u": VariantRules(
             fixed=_fixed("trained", task_reward=False, goals="zero"),
             # Hindsight would put achieved goals in place of the zeros.
-            without_effect=frozenset({"replay.hindsight_k"}),
+            without_effect=frozenset({"replay.hindsight_k", "replay.hindsight_episodes"}),
         ),
         "music-r": VariantRules(
             fixed=_fixed("frozen", task_reward=True),
@@ -85,7 +85,9 @@ VARIANTS: Mapping[Variant, VariantRules] = MappingProxyType(
             fixed=_fixed("frozen", task_reward=True)
             | {"mi_reward_weight": 0.0, "prioritise_replay": True},
             without_effect=_TRAINING_OF_ESTIMATOR
-            | {"music.mi_reward_weight", "music.reward_scale"},
+            | {"music.mi_reward_weight", "music.reward_scale"}
+            # The ranks of the trajectories decide what is replayed.
+            | {"replay.hindsight_episodes"},
             starts_from="estimator",
         ),
     }

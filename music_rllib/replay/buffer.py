@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,6 +98,9 @@ class TrajectoryReplay:
         goal_reward: recomputes rewards of relabelled transitions; needed for hindsight.
         hindsight_k: HER `future` (Andrychowicz et al. 2017): a share k/(1+k) of transitions gets
             a goal that their trajectory achieved later on.
+        hindsight_episodes: `all`; or `moved`: transitions with such a goal come only from
+            trajectories with a later goal that their first state does not reach, as long as
+            there is one (Manela & Biess 2021 filter hindsight goals by the same thought).
         td_exponent: PER (Schaul et al. 2016): draw transitions with probability proportional to
             their absolute TD error to this power. None: uniformly.
 
@@ -113,6 +116,7 @@ class TrajectoryReplay:
         *,
         goal_reward: GoalReward | None = None,
         hindsight_k: float = 0.0,
+        hindsight_episodes: Literal["all", "moved"] = "all",
         td_exponent: float | None = None,
     ) -> None:
         if capacity < layout.horizon:
@@ -126,6 +130,8 @@ class TrajectoryReplay:
         self.layout, self.rng = layout, rng
         self._goal_reward = goal_reward
         self._hindsight_share = hindsight_k / (1.0 + hindsight_k)
+        self._only_moved = hindsight_episodes == "moved" and hindsight_k > 0
+        self._moved = np.zeros(0, np.bool_)
         ring = capacity // layout.horizon * (layout.horizon + 1)
         # Untouched pages of zeros cost nothing: the system hands them out as they are written.
         self._frames = np.zeros((ring, layout.frame), np.float32)
@@ -191,6 +197,8 @@ class TrajectoryReplay:
         self._terminal[end - 1] = trajectory.terminated
         self._starts = np.append(self._starts, start)
         self._lengths = np.append(self._lengths, steps)
+        if self._only_moved:
+            self._moved = np.append(self._moved, self._has_moved(start, steps))
         if self._td is not None:
             self._td.add(start, steps)
         self._write = end + 1
@@ -213,7 +221,24 @@ class TrajectoryReplay:
                 self._td.remove(start, steps)
         self._starts, self._lengths = self._starts[stale:], self._lengths[stale:]
         self._priorities = self._priorities[stale:]
+        self._moved = self._moved[stale:]
         return self._write
+
+    def _has_moved(self, start: int, steps: int) -> bool:
+        """Whether a goal achieved later is not reached by the state that the episode begins in."""
+        assert self._goal_reward is not None
+        achieved = self._frames[start : start + steps + 1, self.layout.network_input :]
+        at_first = np.broadcast_to(achieved[0], achieved.shape)
+        return bool(
+            np.any(self._goal_reward(at_first, achieved) < self._goal_reward(achieved, achieved))
+        )
+
+    def _find_moved(self) -> None:
+        """After loading: what storing would have found out."""
+        if self._only_moved:
+            places = zip(self._starts.tolist(), self._lengths.tolist(), strict=True)
+            moved = [self._has_moved(start, steps) for start, steps in places]
+            self._moved = np.array(moved, np.bool_)
 
     # -- the view of TAC: transitions -----------------------------------------------------
 
@@ -227,13 +252,17 @@ class TrajectoryReplay:
             ValueError: the replay is empty.
         """
         start, step, length = self._draw(count)
+        relabelled = self._hindsight_share > 0
+        if relabelled:
+            chosen = np.flatnonzero(self.rng.random(count) < self._hindsight_share)
+            if self._moved.any():
+                start[chosen], step[chosen], length[chosen] = self._draw_moved(len(chosen))
         row = start + step
         frames, following = self._frames[row], self._frames[row + 1]
         width = self.layout.network_input
         inputs, next_inputs = frames[:, :width].copy(), following[:, :width].copy()
         rewards = self._rewards[row]
-        if self._hindsight_share > 0:
-            chosen = np.flatnonzero(self.rng.random(count) < self._hindsight_share)
+        if relabelled:
             later = self._later_step(step[chosen], length[chosen])
             goals = self._frames[start[chosen] + later, width:]
             inputs[chosen, self.layout.observation :] = goals
@@ -275,6 +304,14 @@ class TrajectoryReplay:
             which = np.searchsorted(ends, drawn, side="right")
             step = drawn - (ends - self._lengths)[which]
         return self._starts[which], step, self._lengths[which]
+
+    def _draw_moved(self, count: int) -> tuple[Rows, Rows, Rows]:
+        """As `_draw`, uniform over the transitions of trajectories that have moved."""
+        starts, lengths = self._starts[self._moved], self._lengths[self._moved]
+        ends = np.cumsum(lengths)
+        drawn = self.rng.integers(0, ends[-1], count)
+        which = np.searchsorted(ends, drawn, side="right")
+        return starts[which], drawn - (ends - lengths)[which], lengths[which]
 
     def _later_step(self, step: NDArray[np.int64], length: NDArray[np.int64]) -> NDArray[np.int64]:
         """Uniform over the states that follow: step + 1 to the episode's last one."""
@@ -373,6 +410,7 @@ class TrajectoryReplay:
             )
         self._priorities = np.array(index["priorities"], np.float64)
         self._ranks = np.cumsum(rank_weights(self._priorities))
+        self._find_moved()
         if self._td is not None:
             self._td.load_packed(self._starts, self._lengths, index["td"])
         self._write = int(index["write"])
@@ -443,6 +481,7 @@ class TrajectoryReplay:
         self._lengths = np.array(state["lengths"], np.int64)
         self._priorities = np.array(state["priorities"], np.float64)
         self._ranks = np.cumsum(rank_weights(self._priorities))
+        self._find_moved()
         if self._td is not None:
             self._td.load_state(state["td"])
         self._write = int(state["write"])

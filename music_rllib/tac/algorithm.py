@@ -82,6 +82,7 @@ class TAC(Algorithm):
             np.random.default_rng((seed_or_entropy(self.config.seed), _REPLAY_STREAM)),
             goal_reward=goal_reward_of(runner.env) if settings.hindsight_k > 0 else None,
             hindsight_k=settings.hindsight_k,
+            hindsight_episodes=settings.hindsight_episodes,
             td_exponent=settings.priority_exponent if self._by_td_error else None,
         )
 

@@ -184,6 +184,11 @@ class TACConfig(AlgorithmConfig):
                 "replay_priority must be 'uniform' with music_prioritise_replay, "
                 f"got {replay.priority!r}: one of them decides what is replayed"
             )
+        if music.prioritise_replay and replay.hindsight_episodes == "moved":
+            self._value_error(
+                "replay_hindsight_episodes must be 'all' with music_prioritise_replay, got "
+                "'moved': one of them decides what is replayed"
+            )
         if music.goals == "zero" and replay.hindsight_k > 0:
             self._value_error(
                 "replay_hindsight_k must be 0 with music_goals='zero' (hindsight would put "

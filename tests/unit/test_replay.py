@@ -1,7 +1,9 @@
 """The replay against a plain list of episodes."""
 
+import dataclasses
 from collections import deque
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,7 +31,7 @@ def matches(achieved: np.ndarray, desired: np.ndarray) -> np.ndarray:
     return np.where(achieved[:, 0] == desired[:, 0], 0.0, -1.0)
 
 
-def replay(capacity: int, **settings: float) -> TrajectoryReplay:
+def replay(capacity: int, **settings: Any) -> TrajectoryReplay:
     return TrajectoryReplay(
         LAYOUT, capacity, np.random.default_rng(0), goal_reward=matches, **settings
     )
@@ -95,6 +97,37 @@ def test_hindsight_takes_goals_achieved_later_and_recomputes_rewards() -> None:
     assert np.bincount(first.astype(int), minlength=6)[1:].min() > 0.17 * len(first)
     # Sampling never writes into the store.
     assert (buffer.state()["frames"][:, 3] == -1.0).all()
+
+
+def resting(number: int, steps: int) -> Trajectory:
+    """An episode that achieves the same goal all the time."""
+    played = episode(number, steps)
+    frames = played.frames.copy()
+    frames[:, 4] = frames[0, 4]
+    return dataclasses.replace(played, frames=frames)
+
+
+def test_hindsight_of_moved_episodes_leaves_out_those_that_reach_every_goal_at_once() -> None:
+    buffer = replay(20, hindsight_k=4.0, hindsight_episodes="moved")
+    buffer.extend([resting(n, 5) for n in range(3)])
+    # Nothing has moved yet: hindsight takes what there is.
+    assert (buffer.sample_transitions(1_000).inputs[:, 3] >= 0).mean() > 0.7
+    buffer.extend([episode(3, 5), episode(4, 2)])  # and the first one is dropped
+    restored = replay(20, hindsight_k=4.0, hindsight_episodes="moved")
+    restored.load_state(buffer.state())
+    for ring in (buffer, restored):
+        batch = ring.sample_transitions(20_000)
+        goal, number, step = batch.inputs[:, 3], batch.inputs[:, 0], batch.inputs[:, 1]
+        relabelled = goal >= 0
+        assert relabelled.mean() == pytest.approx(0.8, abs=0.02)
+        assert set(number[relabelled]) == {3, 4}
+        # Uniform over the seven transitions of those two; the others are so over all that is held.
+        assert (number[relabelled] == 3).mean() == pytest.approx(5 / 7, abs=0.02)
+        assert set(number[~relabelled]) == {1, 2, 3, 4}
+        later = goal[relabelled] - 100 * number[relabelled]
+        assert (later > step[relabelled]).all()
+        reached = later == step[relabelled] + 1
+        np.testing.assert_array_equal(batch.rewards[relabelled], np.where(reached, 0.0, -1.0))
 
 
 def test_trajectories_come_whole_and_in_order() -> None:
