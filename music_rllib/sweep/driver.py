@@ -61,6 +61,7 @@ def run_sweep(
     config: Path | None,
     *,
     dry_run: bool = False,
+    measure: bool = False,
     storage: str | None = None,
     name: str | None = None,
     seeds: str | None = None,
@@ -74,6 +75,7 @@ def run_sweep(
         console: Where progress and results are shown.
         config: The sweep's file; None for the packaged one.
         dry_run: Check everything and show the plan; run nothing.
+        measure: In a dry run, train each kind of run for some seconds and say what all of it takes.
         storage: Replaces the file's `storage`.
         name: Replaces the file's `name`.
         seeds: Replaces the file's `seeds`: how many, or a list with commas.
@@ -92,7 +94,9 @@ def run_sweep(
         loaded = load_sweep(path, name=name, storage=storage, seeds=seeds)
         if must_exist:
             check_begun(loaded)
-        return _sweep(console, loaded, answer, dry_run=dry_run, accept_changes=accept_changes)
+        if dry_run:
+            return _show(console, loaded, answer, measure=measure)
+        return _sweep(console, loaded, answer, accept_changes=accept_changes)
     except (KeyboardInterrupt, SystemExit) as stopped:
         return _code_of(console, stopped)
 
@@ -124,7 +128,7 @@ def resume_sweep(
     """
     try:
         loaded = found.config(seeds)
-        return _sweep(console, loaded, answer, dry_run=False, accept_changes=accept_changes)
+        return _sweep(console, loaded, answer, accept_changes=accept_changes)
     except (KeyboardInterrupt, SystemExit) as stopped:
         return _code_of(console, stopped)
 
@@ -134,7 +138,6 @@ def _sweep(
     config: SweepConfig,
     answer: Callable[[dict[str, Any]], None],
     *,
-    dry_run: bool,
     accept_changes: bool,
 ) -> int:
     """Run the whole program.
@@ -147,18 +150,37 @@ def _sweep(
     """
     opened = _open(console, config)
     changes = changes_since(opened)
-    if dry_run:
-        if changes is not None:
-            console.print(Text(str(changes), style="yellow"), soft_wrap=True)
-        console.print("Dry run: the configuration is sound, nothing was started.")
-        answer(plan_answer(opened, changes))
-        return 0
     if changes is not None and not accept_changes:
         raise BadInputError(str(changes))
     with driving(opened), early:
         code = _drive(console, opened)
     answer(records.read(opened.storage, f"{config.name}/{records.STATE}") or {})
     return code
+
+
+def _show(
+    console: Console,
+    config: SweepConfig,
+    answer: Callable[[dict[str, Any]], None],
+    *,
+    measure: bool,
+) -> int:
+    """Check everything and show the plan, and if asked what it takes."""
+    opened = _open(console, config)
+    changes = changes_since(opened)
+    if changes is not None:
+        console.print(Text(str(changes), style="yellow"), soft_wrap=True)
+    document = plan_answer(opened, changes)
+    if measure:
+        from music_rllib.sweep import cost
+
+        left = cost.kinds(config, opened.plan, opened.finished)
+        costs, slots = cost.measure(config, left, console.print)
+        console.print(cost.cost_table(costs, slots))
+        document["cost"] = cost.cost_document(costs, slots)
+    console.print("Dry run: the configuration is sound, nothing was started.")
+    answer(document)
+    return 0
 
 
 def plan_answer(opened: Sweep, changes: Changes | None = None) -> dict[str, Any]:

@@ -21,6 +21,7 @@ __all__ = [
     "plan_view",
     "ranking_table",
     "results_table",
+    "search_budget",
     "search_runs",
     "search_views",
     "with_interval",
@@ -42,7 +43,7 @@ def plan_view(config: SweepConfig, plan: Plan, finished: Collection[str]) -> Ren
     if searched:
         runs = sum(search_runs(stage, search, len(config.seeds)) for stage, search in searched)
         steps = sum(
-            search_runs(stage, search, len(config.seeds)) * _budget(stage, search)
+            search_runs(stage, search, len(config.seeds)) * search_budget(stage, search)
             for stage, search in searched
         )
         text += f" Searches: up to {runs} runs and {steps:,} env steps more"
@@ -84,7 +85,7 @@ def _stage_row(
 
 def _search_row(stage: Stage, search: SearchSettings, plan: Plan, seeds: int) -> list[str]:
     """What a search takes at most: it may stop trials early, and points may repeat."""
-    studies, budget = len(search.arms()), _budget(stage, search)
+    studies, budget = len(search.arms()), search_budget(stage, search)
     runs = search_runs(stage, search, seeds)
     axes = [f"{name}: {_dimension(one)}" for name, one in search.space.items()]
     axes += [
@@ -109,8 +110,8 @@ def _search_row(stage: Stage, search: SearchSettings, plan: Plan, seeds: int) ->
     ]
 
 
-def _budget(stage: Stage, search: SearchSettings) -> int:
-    """Environment steps of a run, at most."""
+def search_budget(stage: Stage, search: SearchSettings) -> int:
+    """Environment steps of a searched stage's run, at most."""
     ends = search.space.get("env_steps")
     if ends is not None:
         return int(max(ends.ends()))

@@ -14,6 +14,8 @@ examples:
   python -m music_rllib.sweep plan tune_configs/search.yaml
   python -m music_rllib.sweep plan my.yaml --seeds 12
       what it would take with 12 seeds, as the report may advise; finished runs count as done
+  python -m music_rllib.sweep plan my.yaml --measure
+      how long it would take here: some seconds of training for each kind of run
   python -m music_rllib.sweep plan my.yaml --json
       every run known beforehand with its key, the same on every machine
 """
@@ -24,10 +26,16 @@ def register(commands: Commands) -> None:
     parser = commands.add_parser(
         "plan",
         help="check a sweep and show what it would run",
-        description="Check a sweep's file and show what it would run; nothing is started.",
+        description="Check a sweep's file and show what it would run; no run is started.",
         epilog=EPILOG,
     )
     add_sweep_options(parser)
+    parser.add_argument(
+        "--measure",
+        action="store_true",
+        help="Train each kind of run for some seconds on this machine, and say how long all of "
+        "what is left would take on it.",
+    )
     add_json(parser)
     parser.set_defaults(execute=_execute)
 
@@ -39,6 +47,7 @@ def _execute(arguments: argparse.Namespace) -> int:
         console_for(arguments),
         arguments.config,
         dry_run=True,
+        measure=arguments.measure,
         storage=arguments.storage,
         name=arguments.name,
         seeds=arguments.seeds,
