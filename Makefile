@@ -6,6 +6,9 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 CONFIG ?= tune_configs/smoke.yaml
 PYTEST_ARGS ?=
+# The tests of a file stay together and share what they set up.
+JOBS   ?= 2
+PYTEST := $(BIN)/python -m pytest -n $(JOBS) --dist loadscope
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
@@ -18,6 +21,7 @@ help:  ## list the targets
 	@echo "  PYTHON=python3.12    the interpreter for the virtual environment (>= 3.11)"
 	@echo "  CONFIG=my.yaml       the sweep for 'make sweep' (default $(CONFIG))"
 	@echo "  PYTEST_ARGS='-k q'   more arguments for pytest"
+	@echo "  JOBS=4               so many tests at a time (default $(JOBS); each may use two cores)"
 
 venv: $(STAMP)  ## create .venv and install everything, once
 
@@ -43,13 +47,13 @@ sweep: venv  ## train the smoke sweep: MUSIC-u, then MUSIC-r over q, on FetchPus
 	@$(BIN)/python -m music_rllib.sweep $(CONFIG)
 
 test: venv  ## run the whole suite (CI=true: a missing service is a failure, not a skip)
-	@$(BIN)/python -m pytest $(PYTEST_ARGS)
+	@$(PYTEST) $(PYTEST_ARGS)
 
 test-unit: venv  ## run the quick tests (under a minute)
-	@$(BIN)/python -m pytest tests/unit $(PYTEST_ARGS)
+	@$(PYTEST) tests/unit $(PYTEST_ARGS)
 
 test-faults: venv  ## kill, fill, cut and corrupt, and compare with unbroken runs (half an hour)
-	@$(BIN)/python -m pytest -m 'faults or thorough' $(PYTEST_ARGS)
+	@$(PYTEST) -m 'faults or thorough' $(PYTEST_ARGS)
 
 lint: venv  ## ruff: rules and formatting
 	@$(BIN)/ruff check .
