@@ -22,10 +22,11 @@ import psutil
 from music_rllib.experiment.lease import runs_here, this_machine
 from music_rllib.experiment.plan import Node, short
 from music_rllib.experiment.result import Report, RunResult, last_values
+from music_rllib.experiment.settings import VARIANTS
 from music_rllib.experiment.sealed import StorageError
 from music_rllib.sweep import records
 from music_rllib.sweep.board import Status
-from music_rllib.sweep.conditions import best_of, conditions
+from music_rllib.sweep.conditions import Condition, best_of, conditions
 from music_rllib.sweep.listener import Failure, Listener
 from music_rllib.sweep.session import Sweep, plan_document
 from music_rllib.sweep.tables import with_interval
@@ -212,11 +213,21 @@ class Beacon(Listener):
             "stages": stages,
             "env_steps": {"done": steps_done, "left": steps_left},
             "running": running,
-            "best": best_of(conditions(sweep.plan, self._results)),
+            "best": best_of(self._at_the_task()),
             "searches": self.searches(),
             "pruned": [node.key for node in sweep.board.having(Status.PRUNED)],
             "failures": self._failures[-SHOWN_FAILURES:],
         }
+
+    def _at_the_task(self) -> list[Condition]:
+        """Of stages that train for the task: MUSIC-u's success is chance."""
+        aside = {
+            stage.name
+            for stage in self._sweep.config.stages
+            if not VARIANTS[stage.variant].fixed["task_reward"]
+        }
+        found = conditions(self._sweep.plan, self._results)
+        return [one for one in found if one.stage not in aside]
 
     def _speak(self) -> None:
         pause = min(self._interval, 2.0)

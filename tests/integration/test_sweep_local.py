@@ -19,7 +19,7 @@ Runs = Callable[[], dict[str, Any]]
 
 
 EXPECTED = re.compile(
-    r"\[ *\d+:\d\d\] (pretrain/|finetune/|starting a local Ray$|best so far: )"
+    r"\[ *\d+:\d\d\] (pretrain/|finetune/|starting a local Ray$|best so far: finetune )"
     r"|[│┃┏┡└]|Sweep |Results |Storage: |3 runs, |Open MLflow's pages with: "
 )
 """Lines of a sweep in which nothing goes wrong."""
