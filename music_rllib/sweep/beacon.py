@@ -22,8 +22,8 @@ import psutil
 from music_rllib.experiment.lease import runs_here, this_machine
 from music_rllib.experiment.plan import Node, short
 from music_rllib.experiment.result import Report, RunResult, last_values
-from music_rllib.experiment.settings import VARIANTS
 from music_rllib.experiment.sealed import StorageError
+from music_rllib.experiment.settings import VARIANTS
 from music_rllib.sweep import records
 from music_rllib.sweep.board import Status
 from music_rllib.sweep.conditions import Condition, best_of, conditions

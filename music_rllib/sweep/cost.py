@@ -79,8 +79,8 @@ def kinds(config: SweepConfig, plan: Plan, finished: Collection[str]) -> list[Ki
     for node in plan.nodes:
         if node.key not in finished:
             label = f"{node.stage}/{node.run.task.name}"
-            signature = json.dumps([label, node.run.model_dump(mode="json", exclude=dict(_WITHOUT_COST))])
-            groups.setdefault(signature, []).append((label, node.run))
+            alike = node.run.model_dump(mode="json", exclude=dict(_WITHOUT_COST))
+            groups.setdefault(json.dumps([label, alike]), []).append((label, node.run))
     found = [
         Kind(
             label=group[0][0],
