@@ -11,12 +11,11 @@ import pickle
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 
 from music_rllib.envs.registry import Task
 from music_rllib.experiment.lease import Lease
@@ -24,29 +23,19 @@ from music_rllib.experiment.model import Checkpoints
 from music_rllib.experiment.store import NodeStore
 from music_rllib.sweep.trainable import CAUSE, NOTES, STOPPED, NodeJob, RunTrainable
 from tests.integration.test_sweep_trainable import (
-    ENVIRONMENTS,
     compute,
     job,
     nothing_in_the_home_folder,
     numbers,
+    point_environment,
     settings,
 )
 
-__all__ = ["nothing_in_the_home_folder"]
+__all__ = ["nothing_in_the_home_folder", "point_environment"]
 
 pytestmark = pytest.mark.usefixtures("local_ray")
 
 BOMB = "TOUCHED-BY-A-PICKLE"
-
-
-@pytest.fixture(scope="module", autouse=True)
-def point_environment() -> Iterator[None]:
-    sys.path.insert(0, str(ENVIRONMENTS))
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-    sys.path.remove(str(ENVIRONMENTS))
 
 
 @pytest.fixture(scope="module")
