@@ -28,6 +28,7 @@ GROUPS = {
     "checkpoint": "checkpoint",
     "memory": "memory",
     "sweep": "sweep",
+    "report": "report",
 }
 EXAMPLES = """\
 examples:
@@ -79,7 +80,13 @@ def measure(name: str, repeats: int) -> Iterator[Row]:
     torch.set_num_threads(1)
     keep_freed_memory()  # what is compared with gets it too
     if not ray.is_initialized():
-        ray.init(num_cpus=2, include_dashboard=False, logging_level="error", log_to_driver=False)
+        ray.init(
+            address="local",
+            num_cpus=2,
+            include_dashboard=False,
+            logging_level="error",
+            log_to_driver=False,
+        )
     module: Any = importlib.import_module(f"benchmarks.{GROUPS[name]}")
     yield from module.rows(repeats)
 

@@ -46,7 +46,13 @@ def main() -> None:
     from music_rllib.experiment.training import TrainingRun
 
     quiet_third_parties()
-    ray.init(num_cpus=1, include_dashboard=False, logging_level="error", log_to_driver=False)
+    ray.init(
+        address="local",  # and not one that happens to run on this machine
+        num_cpus=1,
+        include_dashboard=False,
+        logging_level="error",
+        log_to_driver=False,
+    )
     training = TrainingRun(settings())
     fill(training, TRANSITIONS)
     training.advance()

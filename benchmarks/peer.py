@@ -133,7 +133,13 @@ def main() -> None:
     if not sys.argv[1].startswith("SB3"):
         import ray
 
-        ray.init(num_cpus=1, include_dashboard=False, logging_level="error", log_to_driver=False)
+        ray.init(
+            address="local",  # and not one that happens to run on this machine
+            num_cpus=1,
+            include_dashboard=False,
+            logging_level="error",
+            log_to_driver=False,
+        )
     quiet_third_parties()
     train = PEERS[sys.argv[1]]()
     while (steps := train()) < WARM_UP + 50:

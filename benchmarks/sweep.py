@@ -107,7 +107,13 @@ def train(seed: int) -> None:
     from music_rllib.experiment.training import TrainingRun
 
     quiet_third_parties()
-    ray.init(num_cpus=1, include_dashboard=False, logging_level="error", log_to_driver=False)
+    ray.init(
+        address="local",  # and not one that happens to run on this machine
+        num_cpus=1,
+        include_dashboard=False,
+        logging_level="error",
+        log_to_driver=False,
+    )
     training = TrainingRun(settings(ENV_STEPS, seed))
     while not training.finished:
         training.advance()

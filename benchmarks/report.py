@@ -1,0 +1,101 @@
+"""A report on 500 runs with 500 points each, as a user makes it, from an embedded MLflow."""
+
+from __future__ import annotations
+
+import sqlite3
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from benchmarks.measure import Row, seconds
+from music_rllib.experiment.config import load_sweep
+from music_rllib.experiment.model import SweepConfig
+from music_rllib.experiment.plan import make_plan
+from music_rllib.sweep.logbook import run_info
+from music_rllib.tracking import Tracker, names
+
+__all__ = ["rows"]
+
+POINTS = 500
+METRICS = (
+    names.EVAL_SUCCESS,
+    names.EVAL_SUCCESS_ANY,
+    names.MI_BOUND,
+    names.MI_REWARD,
+    names.ENTROPY,
+    names.SHANNON_ENTROPY,
+    names.Q_BIAS,
+    names.ENV_STEPS,
+)
+CONFIG = """
+name: large
+tasks: [FetchPush]
+seeds: [{seeds}]
+storage: unused
+defaults: {{env_steps: 500000, evaluation: {{interval: 1000}}}}
+stages:
+  - name: train
+    variant: tac
+    grid: {{tac.entropic_index: [1.0, 1.25, 1.5, 1.75, 2.0], tac.alpha: [.01, .02, .05, .1, .2]}}
+"""
+TARGET = 20.0
+
+
+def rows(repeats: int) -> Iterator[Row]:
+    """Seconds from the command to the finished page and figures."""
+    with TemporaryDirectory() as folder:
+        sweep = make_sweep(Path(folder))
+        command = [sys.executable, "-m", "music_rllib.report", str(sweep)]
+        taken = [
+            seconds(lambda: subprocess.run(command, check=True, capture_output=True))
+            for _ in range(repeats)
+        ]
+        middle = statistics.median(taken)
+        what = f"{len(make_plan(config(Path(folder))).nodes)} runs of {POINTS} points"
+        yield Row("report", what, middle, "s", target=f"<= {TARGET:g} s", met=middle <= TARGET)
+
+
+def config(storage: Path) -> SweepConfig:
+    """500 runs: 25 conditions on 20 seeds."""
+    file = storage / "large.yaml"
+    file.write_text(CONFIG.format(seeds=", ".join(map(str, range(20)))))
+    return load_sweep(file)
+
+
+def make_sweep(storage: Path) -> Path:
+    """The folder of a sweep whose curves climb, with noise."""
+    sweep = config(storage)
+    nodes = make_plan(sweep).nodes
+    with Tracker(sweep_name="large", storage=str(storage), config=sweep.document) as tracker:
+        for node in nodes:
+            tracker.start(run_info(node))
+            tracker.finish(node.key, "FINISHED")
+    rng, now = np.random.default_rng(0), int(time.time() * 1000)
+    with closing(sqlite3.connect(storage / "mlflow.db")) as database, database:
+        runs = [
+            run
+            for (run,) in database.execute(
+                "SELECT run_uuid FROM tags WHERE key = ?", (names.TAG_NODE_KEY,)
+            )
+        ]
+        for run in runs:
+            climb = np.clip(np.linspace(0, rng.uniform(0.2, 1.0), POINTS), 0, 1)
+            for metric in METRICS:
+                values = climb + rng.normal(0, 0.02, POINTS)
+                # Key, value, time, run, whether NaN, step.
+                database.executemany(
+                    "INSERT INTO metrics (key, value, timestamp, run_uuid, is_nan, step) "
+                    "VALUES (?, ?, ?, ?, 0, ?)",
+                    [
+                        (metric, float(value), now + i, run, 1000 * (i + 1))
+                        for i, value in enumerate(values)
+                    ],
+                )
+    return storage / "large"
