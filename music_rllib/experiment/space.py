@@ -235,8 +235,15 @@ class Final(_Strict):
 
     trials: int = Field(3, gt=0)
     """So many of the best; in `compare` mode so many of each value."""
+    baselines: bool = False
+    """The `points_to_evaluate` run again as well, whatever they were worth, as far as they were
+    judged: what the best ones have to beat."""
     seeds: int = Field(5, gt=0)
     """Fresh seeds for each."""
+
+    def most(self, points: int) -> int:
+        """Trials in it at most, of a search with so many `points_to_evaluate`."""
+        return self.trials + (points if self.baselines else 0)
 
 
 class WarmStart(_Strict):

@@ -398,7 +398,7 @@ class Campaign(Listener):
     # -- the final ranking -------------------------------------------------------------------
 
     def _choose(self, search: Search, arm: Arm) -> list[Finalist]:
-        """The best trials of a finished study, to be run on fresh seeds."""
+        """The best trials of a finished study, and its baselines, to be run on fresh seeds."""
         final = search.settings.final
         if final is None:
             return []
@@ -407,8 +407,12 @@ class Campaign(Listener):
         seen: list[Mapping[str, Any]] = []
         for trial in ranked(search.settings, arm.study.trials()):
             values = {**arm.values, **trial.user_attrs[VALUES]}
-            if values in seen or len(finalists) == final.trials:
+            if values in seen:
                 continue  # the same point twice is one finalist
+            # The given points are the study's first trials.
+            baseline = final.baselines and trial.number < len(search.settings.points_to_evaluate)
+            if len(finalists) >= final.trials and not baseline:
+                continue
             seen.append(values)
             runs = self._plan.add_trial(
                 search.stage.name,

@@ -122,7 +122,8 @@ def search_runs(stage: Stage, search: SearchSettings, seeds: int) -> int:
     """Runs of a searched stage at most, with those of the final ranking."""
     trials = search.count * seeds
     if search.final is not None:
-        trials += min(search.final.trials, search.count) * search.final.seeds
+        finalists = search.final.most(len(search.points_to_evaluate))
+        trials += min(finalists, search.count) * search.final.seeds
     return trials * len(search.arms()) * len(stage.tasks)
 
 

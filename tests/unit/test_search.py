@@ -437,6 +437,23 @@ def test_the_ranking_is_of_fresh_seeds(tmp_path: Path) -> None:
     assert pretrained == {0, 1, 2} | {run.seed for run in runs}, "one for each seed, shared"
 
 
+def test_baselines_are_ranked_with_the_best(tmp_path: Path) -> None:
+    points = [
+        {"tac.entropic_index": 2.5, "tac.alpha": 0.5},
+        {"tac.entropic_index": 1.0, "tac.alpha": 0.05},
+    ]
+    final = {"trials": 1, "seeds": 2, "baselines": True}
+    search = {"trials": 5, "points_to_evaluate": points, "final": final}
+    driver = searched(tmp_path, search)
+    found = driver.outcome()
+    trials = found["arms"][0]["trials"]
+    assert [trial["values"] for trial in trials[:2]] == points
+    ranked = {entry["trial"] for entry in found["ranking"]}
+    assert ranked == {0, 1, found["arms"][0]["best"]}
+    runs = [run for run in driver.sweep.plan.runs if run.part.startswith("final")]
+    assert len(runs) == 2 * len(ranked)
+
+
 def test_importance_names_what_matters(tmp_path: Path) -> None:
     def formula(run: RunSettings, share: float) -> float:
         return share * float(run.tac.entropic_index) / 3  # type: ignore[arg-type]
