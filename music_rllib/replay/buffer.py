@@ -344,14 +344,14 @@ class TrajectoryReplay:
         """Number of the oldest trajectory held: they are counted from 0 as they are added."""
         return self.trajectories_added - self.trajectories
 
-    def packed(self, first: int) -> dict[str, NDArray[Any]]:
-        """The trajectories from number `first` (>= `oldest`) on, behind each other.
+    def packed(self, first: int, end: int | None = None) -> dict[str, NDArray[Any]]:
+        """The trajectories from number `first` (>= `oldest`) up to `end`, behind each other.
 
         Returns:
             lengths [N], terminated [N], frames [sum of n+1, D + 2G], actions [sum of n, A],
             rewards [sum of n]: copies. Together with `index()` all that there is.
         """
-        held = slice(first - self.oldest, None)
+        held = slice(first - self.oldest, None if end is None else end - self.oldest)
         starts, lengths = self._starts[held], self._lengths[held]
         steps = ranges(starts, lengths)
         return {

@@ -16,6 +16,9 @@ from music_rllib.replay.buffer import TrajectoryReplay
 
 __all__ = ["Segment", "load_segments", "new_segments"]
 
+MOST = 2_000
+"""Trajectories of a segment: a file is made in memory, some 15 MB for the Fetch tasks."""
+
 Arrays = Mapping[str, NDArray[Any]]
 
 
@@ -43,10 +46,10 @@ def new_segments(
     """
     needed = [segment for segment in stored if segment.end > replay.oldest]
     first = max([replay.oldest, *(segment.end for segment in needed)])
-    end = replay.trajectories_added
-    if first < end:
-        name = write(f"{first:09d}-{end:09d}", replay.packed(first))
-        needed.append(Segment(name, first, end))
+    for begin in range(first, replay.trajectories_added, MOST):
+        end = min(begin + MOST, replay.trajectories_added)
+        name = write(f"{begin:09d}-{end:09d}", replay.packed(begin, end))
+        needed.append(Segment(name, begin, end))
     return needed
 
 

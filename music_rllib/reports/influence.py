@@ -38,6 +38,8 @@ FEWEST_RUNS = 8
 FEWEST_POINTS = 4
 """Of a contour: fewer have no surface."""
 TREES = 32
+MOST_LEVELS = 4
+"""Of a setting that is no number, to be treated as a choice."""
 MOST_PANELS = 12
 """Of sensitivity; where there would be more, only those of all tasks together are drawn."""
 
@@ -212,11 +214,16 @@ def _fanova(rows: Sequence[tuple[Mapping[str, str], float]]) -> dict[str, float]
         numbers = [number for text in texts if (number := _number(text)) is not None]
         if len(set(texts)) < 2:
             continue
+        levels = sorted(set(texts))
         if len(numbers) == len(texts) and name != CHANCE:
             space[name] = FloatDistribution(min(numbers), max(numbers))
             parsed[name] = list(numbers)
+        elif len(levels) > MOST_LEVELS:
+            # Optuna's share of a choice takes time exponential in its levels: places in a row.
+            space[name] = FloatDistribution(0.0, len(levels) - 1.0)
+            parsed[name] = [float(levels.index(text)) for text in texts]
         else:
-            space[name] = CategoricalDistribution(sorted(set(texts)))
+            space[name] = CategoricalDistribution(levels)
             parsed[name] = list(texts)
     before = optuna.logging.get_verbosity()
     optuna.logging.set_verbosity(optuna.logging.WARNING)

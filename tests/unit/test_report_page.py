@@ -382,6 +382,25 @@ def grid_of_settings() -> Sweep:
     return sweep_of(runs)
 
 
+def test_importance_with_many_seeds_is_found_in_seconds() -> None:
+    """As choices their number would be an exponent of the time it takes."""
+    rng = np.random.default_rng(0)
+    sweep = sweep_of(
+        [
+            (one_run(q, seed, params={"tac.alpha": alpha}), climbing(height + rng.normal(0, 0.05)))
+            for q, height in (("1", 0.2), ("1.5", 0.7))
+            for alpha in ("0.1", "0.2", "0.3")
+            for seed in range(30)
+        ]
+    )
+    shares = {
+        one.setting: one.share
+        for one in importances(sweep, analyse(sweep, np.random.default_rng(0))[0])
+    }
+    assert max(shares, key=lambda name: shares[name]) == "tac.entropic_index"
+    assert 0 < shares[CHANCE] < 0.2
+
+
 def test_what_matters_is_found_and_drawn() -> None:
     report = report_on(grid_of_settings())
     (analysis,) = report.analyses
