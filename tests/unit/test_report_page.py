@@ -397,7 +397,7 @@ def test_importance_with_many_seeds_is_found_in_seconds() -> None:
         one.setting: one.share
         for one in importances(sweep, analyse(sweep, np.random.default_rng(0))[0])
     }
-    assert max(shares, key=lambda name: shares[name]) == "tac.entropic_index"
+    assert max(shares, key=lambda name: shares[name]) == "q"
     assert 0 < shares[CHANCE] < 0.2
 
 
