@@ -142,6 +142,7 @@ CHANGES: dict[str, tuple[Any, dict[str, Any]]] = {
     "max_episode_steps": (20, {}),
     "replay.capacity": (200, {}),
     "replay.hindsight_k": (1.0, {}),
+    "replay.hindsight_episodes": ("moved", {}),
     "replay.priority": ("td_error", {}),
     "replay.priority_exponent": (1.0, PER),
     "replay.importance_exponent": (1.0, PER),
