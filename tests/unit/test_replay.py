@@ -142,11 +142,15 @@ def test_trajectories_come_whole_and_in_order() -> None:
     assert (np.diff(shorter[:, :, 1], axis=1) == 1).all()
 
 
-@given(lengths=st.lists(st.integers(1, 5), min_size=1, max_size=12))
-@settings(deadline=None, max_examples=30)
-def test_restored_replay_is_the_same_and_goes_on_the_same(lengths: list[int]) -> None:
-    original, restored = replay(12, hindsight_k=4.0), replay(12, hindsight_k=4.0)
-    original.extend([episode(n, steps) for n, steps in enumerate(lengths)])
+@given(
+    lengths=st.lists(st.integers(1, 5), min_size=1, max_size=12),
+    choice=st.sampled_from(["all", "moved"]),
+)
+@settings(deadline=None, max_examples=40)
+def test_restored_replay_is_the_same_and_goes_on_the_same(lengths: list[int], choice: str) -> None:
+    original, restored = (replay(12, hindsight_k=4.0, hindsight_episodes=choice) for _ in range(2))
+    made = [(resting if n % 2 else episode)(n, steps) for n, steps in enumerate(lengths)]
+    original.extend(made)
     original.sample_transitions(7)
     state = original.state()
     restored.load_state(state)
