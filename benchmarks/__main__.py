@@ -74,19 +74,14 @@ def measure(name: str, repeats: int) -> Iterator[Row]:
     import ray
     import torch
 
+    from benchmarks.measure import start_ray
     from music_rllib._allocator import keep_freed_memory
 
     quiet_third_parties()
     torch.set_num_threads(1)
     keep_freed_memory()  # what is compared with gets it too
     if not ray.is_initialized():
-        ray.init(
-            address="local",
-            num_cpus=2,
-            include_dashboard=False,
-            logging_level="error",
-            log_to_driver=False,
-        )
+        start_ray(2)
     module: Any = importlib.import_module(f"benchmarks.{GROUPS[name]}")
     yield from module.rows(repeats)
 

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-__all__ = ["Row", "interleaved", "ratio_row", "seconds"]
+__all__ = ["Row", "interleaved", "ratio_row", "seconds", "start_ray"]
 
 Turns = dict[str, list[float]]
 
@@ -31,6 +31,19 @@ class Row:
     target: str = ""
     met: bool | None = None
     """Whether the target is met; None where there is none."""
+
+
+def start_ray(cpus: int) -> None:
+    """A quiet Ray of this process's own."""
+    import ray
+
+    ray.init(
+        address="local",  # and not one that happens to run on this machine
+        num_cpus=cpus,
+        include_dashboard=False,
+        logging_level="error",
+        log_to_driver=False,
+    )
 
 
 def seconds(turn: Callable[[], object]) -> float:

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from benchmarks.measure import Row
+from benchmarks.measure import Row, start_ray
 
 __all__ = ["rows"]
 
@@ -37,8 +37,6 @@ def main() -> None:
     """Trains with a full replay for a while, saves, and prints the highest resident memory."""
     from tempfile import TemporaryDirectory
 
-    import ray
-
     from benchmarks.checkpoint import save
     from benchmarks.runs import fill, settings
     from music_rllib._quiet import quiet_third_parties
@@ -46,13 +44,7 @@ def main() -> None:
     from music_rllib.experiment.training import TrainingRun
 
     quiet_third_parties()
-    ray.init(
-        address="local",  # and not one that happens to run on this machine
-        num_cpus=1,
-        include_dashboard=False,
-        logging_level="error",
-        log_to_driver=False,
-    )
+    start_ray(1)
     training = TrainingRun(settings())
     fill(training, TRANSITIONS)
     training.advance()

@@ -131,15 +131,9 @@ def main() -> None:
 
     torch.set_num_threads(1)
     if not sys.argv[1].startswith("SB3"):
-        import ray
+        from benchmarks.measure import start_ray
 
-        ray.init(
-            address="local",  # and not one that happens to run on this machine
-            num_cpus=1,
-            include_dashboard=False,
-            logging_level="error",
-            log_to_driver=False,
-        )
+        start_ray(1)
     quiet_third_parties()
     train = PEERS[sys.argv[1]]()
     while (steps := train()) < WARM_UP + 50:

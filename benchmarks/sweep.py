@@ -14,7 +14,7 @@ from tempfile import TemporaryDirectory
 import ray
 import yaml
 
-from benchmarks.measure import Row, ratio_row
+from benchmarks.measure import Row, ratio_row, start_ray
 from benchmarks.runs import settings
 
 __all__ = ["rows"]
@@ -107,13 +107,7 @@ def train(seed: int) -> None:
     from music_rllib.experiment.training import TrainingRun
 
     quiet_third_parties()
-    ray.init(
-        address="local",  # and not one that happens to run on this machine
-        num_cpus=1,
-        include_dashboard=False,
-        logging_level="error",
-        log_to_driver=False,
-    )
+    start_ray(1)
     training = TrainingRun(settings(ENV_STEPS, seed))
     while not training.finished:
         training.advance()
