@@ -49,7 +49,7 @@ sweep: venv  ## train the smoke sweep: MUSIC-u, then MUSIC-r over q, on FetchPus
 test: venv  ## run the whole suite (CI=true: a missing service is a failure, not a skip)
 	@$(PYTEST) $(PYTEST_ARGS)
 
-test-unit: venv  ## run the quick tests (under a minute)
+test-unit: venv  ## run the quick tests (little more than a minute)
 	@$(PYTEST) tests/unit $(PYTEST_ARGS)
 
 test-faults: venv  ## kill, fill, cut and corrupt, and compare with unbroken runs (half an hour)
