@@ -1,4 +1,4 @@
-"""Run settings laid over each other: variant preset < defaults < stage < grid point.
+"""Run settings laid over each other: variant preset < defaults < stage < its task < grid point.
 
 Each value remembers where it was written, so that an error in the merged settings is reported at
 the line that a person has to change.
@@ -19,7 +19,7 @@ __all__ = ["LAYER_KEYS", "SECTIONS", "Layers", "known_settings", "merge"]
 SECTIONS = ("evaluation", "tac", "music", "replay")
 """Groups of settings; layers replace their fields one by one."""
 LAYER_KEYS = ("env_steps", "num_envs", *SECTIONS)
-"""What `defaults`, a stage and a grid point may set."""
+"""What `defaults`, a stage, its `per_task` and a grid point may set."""
 
 
 def known_settings(path: Path) -> Iterable[str]:
@@ -91,13 +91,13 @@ def merge(
     stage_path: Path,
     point: Mapping[str, tuple[Path, Any]],
 ) -> tuple[Layers, list[Problem]]:
-    """Lay preset, defaults, stage and one point of the stage's grid over each other.
+    """Lay preset, defaults, stage, the stage's `per_task` and one point of its grid over each other.
 
     Args:
         variant: The stage's variant.
         task: The task, whose preset weight applies where nothing else is said.
         defaults: The sweep's `defaults`.
-        stage: The stage's own settings, keys of `LAYER_KEYS` only.
+        stage: The stage's own settings, keys of `LAYER_KEYS` and `per_task` only.
         stage_path: The stage's place in the document.
         point: Dotted key to (place of the value below the stage, value).
 
@@ -108,8 +108,12 @@ def merge(
     without_effect = VARIANTS[variant].without_effect
     layers.lay({"music": preset(variant, task)}, ())
     layers.lay(_with_effect(defaults, without_effect), ("defaults",))
-    layers.lay(_with_effect(stage, without_effect), stage_path)
-    idle = [(*stage_path, *key.split(".")) for key in _idle(stage, without_effect)]
+    task_path = (*stage_path, "per_task", task.name)
+    own = {stage_path: stage, task_path: (stage.get("per_task") or {}).get(task.name) or {}}
+    idle = []
+    for path, settings in own.items():
+        layers.lay(_with_effect(settings, without_effect), path)
+        idle += [(*path, *key.split(".")) for key in _idle(settings, without_effect)]
     problems = []
     for dotted, (below, value) in point.items():
         place = (*stage_path, *below)

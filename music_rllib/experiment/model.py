@@ -135,6 +135,8 @@ class StageHeader(_Strict):
     """Tasks of this stage; null: the sweep's."""
     init_from: InitFrom | None = None
     """What its runs start from. A bare name is short for `{stage: NAME}`."""
+    per_task: dict[str, dict[str, Any]] = Field(default_factory=dict)
+    """Task to settings for it alone, laid over the stage's: `{FetchSlide: {env_steps: 300000}}`."""
     grid: dict[str, Annotated[list[Any], Field(min_length=1)]] = Field(default_factory=dict)
     """Dotted setting to the values it takes; the product of all lists is the stage's trials."""
     search: SearchSettings | None = None

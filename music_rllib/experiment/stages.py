@@ -75,6 +75,7 @@ def resolve_stage(
         tasks = find_tasks(header.tasks, (*path, "tasks"))
     tasks = _with_split(tasks, header, path, findings)
     settings = {key: raw[key] for key in LAYER_KEYS if key in raw}
+    settings["per_task"] = _per_task(header, tasks, path, findings)
 
     def resolve_at(point: Mapping[str, tuple[KeyPath, Any]], found: Findings) -> Point:
         return _resolve_point(header.variant, point, tasks, defaults, settings, seed, path, found)
@@ -144,6 +145,20 @@ def _with_split(
                 f"got {task.name}, which has none",
             )
     return tuple(task for task in tasks if task.has_split)
+
+
+def _per_task(
+    header: StageHeader, tasks: tuple[Task, ...], path: KeyPath, findings: Findings
+) -> dict[str, dict[str, Any]]:
+    """What the stage sets for single tasks; each must be one of its own."""
+    known = [task.name for task in tasks]
+    for name, settings in header.per_task.items():
+        place = (*path, "per_task", name)
+        if name not in known:
+            findings.add(place, f"is not a task of this stage ({', '.join(known)})")
+        for key in settings.keys() - set(LAYER_KEYS):
+            findings.add((*place, key), f"is not a known setting{closest(key, LAYER_KEYS)}")
+    return header.per_task
 
 
 def _grid_points(grid: Mapping[str, list[Any]]) -> list[dict[str, tuple[KeyPath, Any]]]:

@@ -150,6 +150,22 @@ def test_slide_has_half_the_weight_unless_it_is_set(load: Callable[..., SweepCon
     assert {run.music.mi_reward_weight for run in runs.values()} == {0.25}
 
 
+def test_a_tasks_own_settings_lie_between_the_stage_and_its_grid(
+    load: Callable[..., SweepConfig],
+) -> None:
+    stage = {
+        "name": "a",
+        "variant": "tac",
+        "tac": {"tau": 0.2, "lr": 0.2, "gamma": 0.8},
+        "per_task": {"FetchSlide": {"env_steps": 9000, "tac": {"lr": 0.3, "tau": 0.3}}},
+        "grid": {"tac.lr": [0.4]},
+    }
+    runs = load(changed(tasks=["FetchPush", "FetchSlide"], stages=[stage])).stages[0].points[0].runs
+    assert {
+        name: (run.env_steps, run.tac.lr, run.tac.tau, run.tac.gamma) for name, run in runs.items()
+    } == {"FetchPush": (6000, 0.4, 0.2, 0.8), "FetchSlide": (9000, 0.4, 0.3, 0.8)}
+
+
 def test_options_replace_what_the_file_says(load: Callable[..., SweepConfig]) -> None:
     config = load(SOUND, name="other", storage="elsewhere")
     assert (config.name, config.storage) == ("other", "elsewhere")
@@ -228,6 +244,17 @@ BAD: list[tuple[Document, str]] = [
     ),
     (with_stage(0, music={"goals": "environment"}), 'music.goals must be "zero" for music-u'),
     (with_stage(0, init_from="finetune"), "init_from has no effect with variant music-u"),
+    (with_stage(0, per_task={"FetchSlide": {}}), "per_task.FetchSlide is not a task of this stage ("),
+    (with_stage(0, per_task={"FetchPush": {"seed": 1}}), "per_task.FetchPush.seed is not a known"),
+    (with_stage(0, per_task={"FetchPush": 5}), "per_task.FetchPush must be a mapping"),
+    (
+        with_stage(0, per_task={"FetchPush": {"tac": {"lr": -1.0}}}),
+        "stages.pretrain.per_task.FetchPush.tac.lr must be > 0, got -1.0",
+    ),
+    (
+        with_stage(1, per_task={"FetchPush": {"music": {"lr": 0.1}}}),
+        "stages.finetune.per_task.FetchPush.music.lr has no effect with variant music-r",
+    ),
     (with_stage(1, init_from=None), "init_from must be given for music-r, which starts from a t"),
     (with_stage(1, init_from="finetune"), "init_from must be an earlier stage (one of pretrain)"),
     (with_stage(1, init_from="pretran"), "got 'pretran' (did you mean 'pretrain'?)"),
