@@ -78,9 +78,9 @@ stages:
 Settings are laid over each other, later ones winning: what the variant brings along, the `preset`,
 `defaults`, the stage, what its `per_task` has for the task, the point of its `grid`. The groups
 `evaluation`, `tac`, `music` and `replay` are merged field by field. Whatever is wrong is reported
-before anything starts, all of it at once, each with file, line, key, rule and value. YAML is read by
-the rules of YAML 1.2 (`1e-3` is a number, `no` is text), keys may not repeat, and unknown keys are
-errors.
+before anything starts, all of it at once, each with file, line, key, rule and value. YAML is read
+by the rules of YAML 1.2 (`1e-3` is a number, `no` is text), keys may not repeat, and unknown keys
+are errors.
 
 [tune_configs/presets](../tune_configs/presets) has `small` (for two cores), `paper`, `music-2021`
 and `tac-2020`; each file says where its numbers come from.

@@ -91,7 +91,7 @@ def merge(
     stage_path: Path,
     point: Mapping[str, tuple[Path, Any]],
 ) -> tuple[Layers, list[Problem]]:
-    """Lay preset, defaults, stage, the stage's `per_task` and one point of its grid over each other.
+    """Lay preset, defaults, stage, its `per_task` and one point of its grid over each other.
 
     Args:
         variant: The stage's variant.

@@ -15,7 +15,8 @@ import numpy as np
 from music_rllib.reports import statistics as st
 from music_rllib.reports.conditions import Condition, Stage, find_stages
 from music_rllib.reports.data import Ints, Sweep
-from music_rllib.reports.statistics import Array, Estimate
+from music_rllib.reports.races import Race, races
+from music_rllib.reports.statistics import SIGNIFICANCE, Array, Estimate
 from music_rllib.reports.survival import Waits, first_passage, median_wait, median_wait_interval
 from music_rllib.tracking import names
 
@@ -34,7 +35,6 @@ __all__ = [
 ALL_TASKS = "all tasks"
 THRESHOLDS = (0.5, 0.85)
 """Success rates whose first evaluation is looked for; the paper's Figure 4 has 85 %."""
-SIGNIFICANCE = 0.05
 CURVE_POINTS = 101
 """More cannot be told apart in a figure."""
 CURVE_RESAMPLES = 1000
@@ -128,6 +128,8 @@ class StageAnalysis:
     stage: Stage
     scopes: tuple[Scope, ...]
     waits: tuple[Wait, ...]
+    races: tuple[Race, ...]
+    """Of each pair of conditions, to each threshold."""
 
 
 def analyse(sweep: Sweep, rng: np.random.Generator) -> list[StageAnalysis]:
@@ -146,7 +148,14 @@ def _analyse(sweep: Sweep, stage: Stage, rng: np.random.Generator) -> StageAnaly
         for threshold in THRESHOLDS
         if (wait := _wait(sweep, condition, task, threshold, rng)) is not None
     ]
-    return StageAnalysis(stage=stage, scopes=tuple(scopes), waits=tuple(waits))
+    groups = {condition.label: condition.runs for condition in stage.conditions}
+    found = [
+        race
+        for task in stage.tasks
+        for threshold in THRESHOLDS
+        for race in races(sweep, task, groups, threshold, rng)
+    ]
+    return StageAnalysis(stage=stage, scopes=tuple(scopes), waits=tuple(waits), races=tuple(found))
 
 
 def _scope(

@@ -18,6 +18,7 @@ from music_rllib.reports.pictures import draw_all
 from music_rllib.reports.tables import (
     Table,
     improvement_table,
+    races_table,
     runs_table,
     success_table,
     waits_table,
@@ -105,6 +106,7 @@ def write_report(report: Report, folder: Path) -> Path:
 def _tables(report: Report) -> Iterable[Table]:
     yield success_table(report.analyses)
     yield waits_table(report.analyses)
+    yield races_table(report.analyses)
     yield improvement_table(report.analyses)
     yield runs_table(report.sweep)
     yield _curves_table(report.drawings)

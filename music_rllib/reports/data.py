@@ -13,7 +13,16 @@ from numpy.typing import NDArray
 from music_rllib.reports.statistics import Array
 from music_rllib.tracking import names
 
-__all__ = ["Column", "History", "Points", "ReportError", "RunRecord", "Sweep", "columns"]
+__all__ = [
+    "Column",
+    "History",
+    "Points",
+    "ReportError",
+    "RunRecord",
+    "Sweep",
+    "columns",
+    "joined",
+]
 
 Ints = NDArray[np.int64]
 
@@ -71,10 +80,11 @@ def columns(runs: Iterable[Points]) -> dict[str, Column]:
                     time=times[part][last],
                 )
             )
-    return {metric: _joined(found) for metric, found in parts.items()}
+    return {metric: joined(found) for metric, found in parts.items()}
 
 
-def _joined(parts: Sequence[Column]) -> Column:
+def joined(parts: Sequence[Column]) -> Column:
+    """The values of one part after those of the other; at least one part."""
     return Column(
         run=np.concatenate([part.run for part in parts]),
         step=np.concatenate([part.step for part in parts]),

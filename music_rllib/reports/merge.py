@@ -1,4 +1,4 @@
-"""Two exports of one sweep as one: what several sittings on several machines have computed."""
+"""Exports put together: what several sittings, machines and sweeps have computed."""
 
 from __future__ import annotations
 
@@ -7,11 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from music_rllib.reports.data import Column, Ints, RunRecord, Sweep
+from music_rllib.experiment.plan import Plan
+from music_rllib.reports.data import Column, History, Sweep, joined
+from music_rllib.tracking import names
 
-__all__ = ["merged"]
+__all__ = ["merged", "of_plan"]
 
 FINISHED = "FINISHED"
+_Place = tuple[Sweep, int]
+"""A run: the export that has it, and its position there."""
 
 
 def merged(earlier: Sweep, later: Sweep) -> Sweep:
@@ -20,58 +24,65 @@ def merged(earlier: Sweep, later: Sweep) -> Sweep:
     Runs are the same where their node is: the hash of everything that determines their numbers.
     The sweep's own fields are those of `later`.
     """
-    of_later = {run.node_key: run for run in later.runs}
-    of_earlier = {run.node_key: run for run in earlier.runs}
-
-    def earlier_stays(run: RunRecord) -> bool:
-        other = of_later.get(run.node_key)
-        return other is None or (run.status == FINISHED and other.status != FINISHED)
-
-    def later_stays(run: RunRecord) -> bool:
-        other = of_earlier.get(run.node_key)
-        return other is None or not earlier_stays(other)
-
-    first = [i for i, run in enumerate(earlier.runs) if earlier_stays(run)]
-    second = [i for i, run in enumerate(later.runs) if later_stays(run)]
-    runs = [*(earlier.runs[i] for i in first), *(later.runs[i] for i in second)]
-    metrics = sorted(earlier.history.keys() | later.history.keys())
-    history = {
-        metric: joined
-        for metric in metrics
-        if len((joined := _joined(earlier, first, later, second, metric)).run)
-    }
-    return replace(later, runs=runs, history=history)
+    places = list(_best(_places(earlier) + _places(later)).values())
+    runs = [sweep.runs[run] for sweep, run in places]
+    return replace(later, runs=runs, history=_history(places))
 
 
-def _joined(
-    earlier: Sweep, first: Sequence[int], later: Sweep, second: Sequence[int], metric: str
-) -> Column:
-    parts = [
-        *_kept(earlier.history.get(metric), first, 0),
-        *_kept(later.history.get(metric), second, len(first)),
-    ]
-    return Column(
-        run=_concatenated((part.run for part in parts), np.int64),
-        step=_concatenated((part.step for part in parts), np.int64),
-        value=_concatenated((part.value for part in parts), np.float64),
-        time=_concatenated((part.time for part in parts), np.int64),
-    )
+def of_plan(plan: Plan, exports: Iterable[Sweep]) -> Sweep | None:
+    """What is known of a plan's runs, whichever sweep has computed them.
+
+    A run is that of the plan's node with its key: the same settings, seed and source, under
+    whatever names. It gets the plan's name for it, and the plan's order. The sweep's own fields are
+    those of the last export that has a run.
+
+    Returns:
+        None where no export has any of its runs.
+    """
+    found = _best([place for export in exports for place in _places(export)])
+    nodes = [node for node in plan.nodes if node.key in found]
+    if not nodes:
+        return None
+    places = [found[node.key] for node in nodes]
+    runs = []
+    for node, (sweep, position) in zip(nodes, places, strict=True):
+        run = sweep.runs[position]
+        own = {names.TAG_SWEEP: plan.name, names.TAG_STAGE: node.stage}
+        tags = {**run.tags, **own, names.TAG_TRIAL: str(node.trial)}
+        runs.append(replace(run, name=node.label, tags=tags))
+    return replace(places[-1][0], name=plan.name, runs=runs, history=_history(places))
 
 
-def _kept(column: Column | None, runs: Sequence[int], offset: int) -> Iterable[Column]:
-    """The values of `runs`, which become the runs from `offset` on."""
-    if column is None or not runs:
-        return
-    wanted: Ints = np.asarray(runs, dtype=np.int64)
-    place = np.searchsorted(wanted, column.run)
-    chosen = np.flatnonzero(wanted[np.minimum(place, len(wanted) - 1)] == column.run)
-    yield Column(
-        run=place[chosen] + offset,
-        step=column.step[chosen],
-        value=column.value[chosen],
-        time=column.time[chosen],
-    )
+def _places(sweep: Sweep) -> list[_Place]:
+    return [(sweep, position) for position in range(len(sweep.runs))]
 
 
-def _concatenated(parts: Iterable[np.ndarray], kind: type) -> np.ndarray:
-    return np.concatenate([np.empty(0, kind), *parts]).astype(kind)
+def _best(places: Iterable[_Place]) -> dict[str, _Place]:
+    """By node key, in the order in which the keys first came."""
+    best: dict[str, _Place] = {}
+    for sweep, position in places:
+        run = sweep.runs[position]
+        before = best.get(run.node_key)
+        if before is not None and run.status != FINISHED:
+            other, its_position = before
+            if other.runs[its_position].status == FINISHED:
+                continue
+        best[run.node_key] = (sweep, position)
+    return best
+
+
+def _history(places: Sequence[_Place]) -> History:
+    """The metrics of the runs at `places`, numbered in that order."""
+    parts: dict[str, list[Column]] = {}
+    for number, (sweep, position) in enumerate(places):
+        for metric, column in sweep.history.items():
+            begin, end = np.searchsorted(column.run, [position, position + 1])
+            if end > begin:
+                part = Column(
+                    run=np.full(end - begin, number, np.int64),
+                    step=column.step[begin:end],
+                    value=column.value[begin:end],
+                    time=column.time[begin:end],
+                )
+                parts.setdefault(metric, []).append(part)
+    return {metric: joined(parts[metric]) for metric in sorted(parts)}

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
-from music_rllib.reports.analysis import SIGNIFICANCE, StageAnalysis, Wait
+from music_rllib.reports.analysis import StageAnalysis, Wait
 from music_rllib.reports.data import Sweep
 from music_rllib.reports.films import Film, Films
 from music_rllib.reports.gallery import CURVES, FINALS, INFLUENCE, PROFILES, Drawing, slug
@@ -26,6 +26,7 @@ from music_rllib.reports.html import (
 )
 from music_rllib.reports.influence import FEWEST_RUNS, varied
 from music_rllib.reports.pictures import Pictures
+from music_rllib.reports.statistics import SIGNIFICANCE
 from music_rllib.reports.tables import last_success
 from music_rllib.reports.verdict import interval_text, p_text, verdict
 from music_rllib.tracking import names
@@ -114,7 +115,8 @@ def _stage(report: Report, analysis: StageAnalysis) -> str:
         parts.append(f'<div class="verdict">{said}</div>')
     drawn = {drawing.title: drawing for drawing in report.drawings if drawing.stage == stage.name}
     parts += [_figure(report, drawn, title) for title in (CURVES[0], FINALS)]
-    parts += [_final_table(analysis), _waits_table(analysis), _improvement_table(analysis)]
+    parts += [_final_table(analysis), _waits_table(analysis), _races_table(analysis)]
+    parts.append(_improvement_table(analysis))
     parts += [_figure(report, drawn, title) for title in (PROFILES, *INFLUENCE, *CURVES[1:])]
     parts.append(_why_no_influence(report, analysis, drawn))
     return "".join([*parts, "</section>"])
@@ -188,6 +190,30 @@ def _waits_table(analysis: StageAnalysis) -> str:
         rows,
         "First evaluation at or above the success rate. Runs that never got there count as not "
         "there yet at their last evaluation (Kaplan-Meier median): none is left out.",
+    )
+
+
+def _races_table(analysis: StageAnalysis) -> str:
+    if not analysis.races:
+        return ""
+    rows = [
+        (
+            race.task,
+            f"{race.first} before {race.second}",
+            f"{race.threshold * 100:.0f} %",
+            _number(f"{float(race.estimate.value):.2f}"),
+            interval_text(race.estimate),
+            p_text(race.p_value),
+            "yes" if race.decided else "no",
+        )
+        for race in sorted(analysis.races, key=lambda race: (race.threshold, race.task))
+    ]
+    return "<h3>Who gets there sooner</h3>" + table(
+        ("Task", "Pair", "Success", "Probability", "95 % interval", "Permutation", "Decided"),
+        rows,
+        "Probability that a run of the first reaches the success rate in fewer environment steps "
+        "than a run of the second (ties half; whoever ends below it is last). Decided: "
+        f"p < {SIGNIFICANCE:g} after Holm's correction.",
     )
 
 

@@ -22,6 +22,7 @@ from scipy import stats
 
 __all__ = [
     "CONFIDENCE",
+    "SIGNIFICANCE",
     "Array",
     "Estimate",
     "estimate",
@@ -40,6 +41,7 @@ __all__ = [
 Array = NDArray[np.float64]
 
 CONFIDENCE = 0.95
+SIGNIFICANCE = 0.05
 RESAMPLES = 2000
 PERMUTATIONS = 10_000
 MAX_SEEDS = 1000

@@ -11,7 +11,14 @@ from music_rllib.reports.analysis import StageAnalysis
 from music_rllib.reports.data import Sweep
 from music_rllib.tracking import names
 
-__all__ = ["Table", "improvement_table", "runs_table", "success_table", "waits_table"]
+__all__ = [
+    "Table",
+    "improvement_table",
+    "races_table",
+    "runs_table",
+    "success_table",
+    "waits_table",
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,6 +111,33 @@ def waits_table(analyses: Iterable[StageAnalysis]) -> Table:
             )
             for analysis in analyses
             for wait in analysis.waits
+        ],
+    )
+
+
+def races_table(analyses: Iterable[StageAnalysis]) -> Table:
+    """Who gets to each success rate sooner, by pairs of conditions."""
+    return Table(
+        name="probability_sooner",
+        columns=(
+            *("stage", "task", "threshold", "first", "second", "probability_first_sooner"),
+            *("lower", "upper", "p_value_holm", "decided"),
+        ),
+        rows=[
+            (
+                analysis.stage.name,
+                race.task,
+                race.threshold,
+                race.first,
+                race.second,
+                float(race.estimate.value),
+                float(race.estimate.lower),
+                float(race.estimate.upper),
+                race.p_value,
+                race.decided,
+            )
+            for analysis in analyses
+            for race in analysis.races
         ],
     )
 

@@ -244,7 +244,10 @@ BAD: list[tuple[Document, str]] = [
     ),
     (with_stage(0, music={"goals": "environment"}), 'music.goals must be "zero" for music-u'),
     (with_stage(0, init_from="finetune"), "init_from has no effect with variant music-u"),
-    (with_stage(0, per_task={"FetchSlide": {}}), "per_task.FetchSlide is not a task of this stage ("),
+    (
+        with_stage(0, per_task={"FetchSlide": {}}),
+        "FetchSlide is not a task of this stage (",
+    ),
     (with_stage(0, per_task={"FetchPush": {"seed": 1}}), "per_task.FetchPush.seed is not a known"),
     (with_stage(0, per_task={"FetchPush": 5}), "per_task.FetchPush must be a mapping"),
     (

@@ -1,11 +1,14 @@
 """Sittings put together: no run twice, none lost, and each with its own numbers."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from music_rllib.experiment.config import load_sweep
+from music_rllib.experiment.plan import make_plan
 from music_rllib.reports.data import Points, RunRecord, Sweep, columns
-from music_rllib.reports.merge import merged
+from music_rllib.reports.merge import merged, of_plan
 from music_rllib.tracking import names
 
 
@@ -69,3 +72,25 @@ def test_an_unfinished_run_is_the_later_one_and_merging_again_changes_nothing() 
     empty = sweep()
     assert told(merged(empty, whole)) == told(merged(whole, empty)) == told(whole)
     assert np.all(np.diff(merged(whole, whole).history["m"].run) >= 0)
+
+
+def test_a_plans_runs_are_found_in_other_sweeps_exports(tmp_path: Path) -> None:
+    file = tmp_path / "sweep.yaml"
+    file.write_text(
+        "{name: mine, tasks: [FetchPush], seeds: [0, 1, 2], "
+        "stages: [{name: first, variant: tac, grid: {tac.entropic_index: [1.0, 2.0]}}]}"
+    )
+    plan = make_plan(load_sweep(file))
+    keys = [node.key for node in plan.nodes]
+    exports = [
+        sweep(("other", "FINISHED", [9]), (keys[4], "FINISHED", [1, 2]), (keys[0], "KILLED", [3])),
+        sweep((keys[0], "FINISHED", [4]), (keys[4], "FAILED", [5]), run_id="t"),
+    ]
+    found = of_plan(plan, exports)
+    assert found is not None
+    assert told(found) == {keys[0]: ("t-" + keys[0], [4]), keys[4]: ("s-" + keys[4], [1, 2])}
+    assert [(run.name, run.stage, run.tags[names.TAG_TRIAL]) for run in found.runs] == [
+        ("first/FetchPush/tac.entropic_index=1/seed0", "first", "0"),
+        ("first/FetchPush/tac.entropic_index=2/seed1", "first", "1"),
+    ]
+    assert of_plan(plan, [sweep(("other", "FINISHED", [9]))]) is None
