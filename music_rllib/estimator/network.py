@@ -28,8 +28,7 @@ class MutualInformationEstimator(nn.Module):
 
     def forward(self, agent: Tensor, surrounding: Tensor) -> Tensor:
         """[..., X], [..., Y] -> [...] statistics."""
-        hidden = torch.relu(self.agent(agent) + self.surrounding(surrounding))
-        return torch.tanh(self.output(hidden)).squeeze(-1)
+        return self._statistic(self.agent(agent) + self.surrounding(surrounding))
 
     def bound(self, agent: Tensor, surrounding: Tensor, permutations: Tensor) -> Tensor:
         """Bound on I(surrounding; agent) of each trajectory, in nats.
@@ -41,14 +40,18 @@ class MutualInformationEstimator(nn.Module):
         Returns:
             [N]
         """
-        from_agent = self.agent(agent)
         from_surrounding = self.surrounding(surrounding)
+        shuffled = shuffle_time(from_surrounding, permutations)
+        return self._bound(self.agent(agent), from_surrounding, shuffled)
+
+    def _bound(self, from_agent: Tensor, from_surrounding: Tensor, shuffled: Tensor) -> Tensor:
+        """[N, T, H] each, what the first layer makes of the states -> [N]."""
         joint = self._statistic(from_agent + from_surrounding)
-        marginals = self._statistic(from_agent + shuffle_time(from_surrounding, permutations))
-        return donsker_varadhan(joint, marginals)
+        return donsker_varadhan(joint, self._statistic(from_agent + shuffled))
 
     def _statistic(self, preactivation: Tensor) -> Tensor:
-        return torch.tanh(self.output(torch.relu(preactivation))).squeeze(-1)
+        """[..., H] -> [...]; takes over its argument."""
+        return torch.tanh(self.output(torch.relu_(preactivation))).squeeze(-1)
 
     def transition_bound(
         self, agent: Tensor, surrounding: Tensor, *, swapped: bool = True
@@ -63,9 +66,9 @@ class MutualInformationEstimator(nn.Module):
         Returns:
             [B]
         """
-        order = [1, 0] if swapped else [0, 1]
-        permutations = torch.tensor(order, device=agent.device).expand(agent.shape[0], 2)
-        return self.bound(agent, surrounding, permutations)
+        from_surrounding = self.surrounding(surrounding)
+        other = from_surrounding.flip(1) if swapped else from_surrounding
+        return self._bound(self.agent(agent), from_surrounding, other)
 
 
 def intrinsic_reward(bound: Tensor, scale: float) -> Tensor:

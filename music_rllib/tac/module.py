@@ -176,18 +176,26 @@ class EstimatorModule(TorchRLModule, SelfSupervisedLossAPI):
     `hidden_size`, `reward_scale`.
     """
 
+    agent: Tensor
+    surrounding: Tensor
+
     def setup(self) -> None:
         config = self.model_config
-        self.agent_indices = list(config["agent_indices"])
-        self.surrounding_indices = list(config["surrounding_indices"])
+        for half in ("agent", "surrounding"):
+            # A buffer moves to the module's device; it is no weight to be handed over.
+            indices = torch.tensor(config[f"{half}_indices"])
+            self.register_buffer(half, indices, persistent=False)
         self.reward_scale: float = config["reward_scale"]
         self.estimator = MutualInformationEstimator(
-            len(self.agent_indices), len(self.surrounding_indices), config["hidden_size"]
+            len(self.agent), len(self.surrounding), config["hidden_size"]
         )
 
     def split(self, observations: Tensor) -> tuple[Tensor, Tensor]:
         """[..., D] observations -> [..., X] agent state and [..., Y] surrounding state."""
-        return observations[..., self.agent_indices], observations[..., self.surrounding_indices]
+        return (
+            observations.index_select(-1, self.agent),
+            observations.index_select(-1, self.surrounding),
+        )
 
     def bound(self, observations: Tensor, permutations: Tensor) -> Tensor:
         """[N, T, D] trajectories and [N, T] permutations -> [N] bounds in nats."""
