@@ -37,7 +37,7 @@ def _table(document: Mapping[str, Any], group: Mapping[str, Any]) -> Table:
     table.add_column("IQM, 95 %", justify="right")
     for task in tasks if len(tasks) > 1 else ():
         table.add_column(task, justify="right")
-    for name in ("runs", "P(first is better)", ""):
+    for name in ("runs", "P(first is better)", "p", ""):
         table.add_column(name, justify="right")
     for row in rows:
         table.add_row(
@@ -49,6 +49,7 @@ def _table(document: Mapping[str, Any], group: Mapping[str, Any]) -> Table:
             ),
             f"{row['runs']} of {row['planned']}",
             percent(row["best_is_better_with"]),
+            "" if row["p_value"] is None else f"{row['p_value']:.2g}",
             "overlaps" if row["overlaps_best"] else "",
         )
     return table

@@ -11,7 +11,13 @@ from numpy.typing import NDArray
 
 from music_rllib.experiment.plan import Plan, Run, short
 from music_rllib.experiment.result import RunResult
-from music_rllib.reports.statistics import Estimate, estimate, improvement
+from music_rllib.reports.statistics import (
+    Estimate,
+    estimate,
+    holm,
+    improvement,
+    improvement_p_value,
+)
 from music_rllib.tracking import names
 
 __all__ = ["Condition", "best_of", "compared", "conditions"]
@@ -108,16 +114,23 @@ def best_of(found: Sequence[Condition]) -> dict[str, Any] | None:
 
 
 def compared(found: Sequence[Condition], *, maximised: bool = True) -> list[dict[str, Any]]:
-    """Conditions side by side, the best first, each with its chance to be beaten by the first."""
+    """Conditions side by side, the best first, each with its chance to be beaten by the first.
+
+    `p_value` is the permutation test's for that, adjusted for the number of conditions (Holm).
+    """
+    if not found:
+        return []
     sign = 1.0 if maximised else -1.0
-    ordered = sorted(found, key=lambda one: -sign * float(one.estimate().value))
+    first, *others = sorted(found, key=lambda one: -sign * float(one.estimate().value))
+    rivals = [one for one in others if _comparable(first, one)]
+    rng = np.random.default_rng(0)
+    raw = [improvement_p_value(first.scores, one.scores, rng) for one in rivals]
+    p_values = {id(one): p for one, p in zip(rivals, holm(raw), strict=True)}
     rows: list[dict[str, Any]] = []
-    for one in ordered:
+    for one in (first, *others):
         ends = one.estimate()
-        first = ordered[0]
-        same_tasks = first.tasks == one.tasks and one is not first
         better = None
-        if same_tasks and not (np.isnan(first.scores).all(0) | np.isnan(one.scores).all(0)).any():
+        if id(one) in p_values:
             chance = improvement(first.scores, one.scores)
             better = chance if maximised else 1 - chance
         rows.append(
@@ -136,7 +149,15 @@ def compared(found: Sequence[Condition], *, maximised: bool = True) -> list[dict
                 "runs": len(one.runs),
                 "planned": one.planned,
                 "best_is_better_with": better,
+                "p_value": p_values.get(id(one)),
                 "overlaps_best": one is not first and first.estimate().overlaps(ends),
             }
         )
     return rows
+
+
+def _comparable(one: Condition, other: Condition) -> bool:
+    """Whether both have a result on each of the same tasks."""
+    if one.tasks != other.tasks:
+        return False
+    return not any(np.isnan(scores).all(0).any() for scores in (one.scores, other.scores))

@@ -108,8 +108,8 @@ def finish(sweep: Sweep, beacon: Beacon, node: Node, success: float, folder: Pat
 HEIGHTS = {1.0: 0.2, 1.5: 0.8, 2.0: 0.3}
 
 
-def played(storage: str, tmp_path: Path, runs: int = 9) -> Sweep:
-    sweep = opened(storage, tmp_path)
+def played(storage: str, tmp_path: Path, runs: int = 9, seeds: int = 3) -> Sweep:
+    sweep = opened(storage, tmp_path, seeds=list(range(seeds)))
     with Beacon(sweep) as beacon:
         for node in list(sweep.plan.nodes)[:runs]:
             height = HEIGHTS[float(node.run.tac.entropic_index)]  # type: ignore[arg-type]
@@ -134,9 +134,20 @@ def test_status_and_compare(storage: str, tmp_path: Path, program: Program) -> N
     assert first["values"] == {"tac.entropic_index": 1.5}
     assert first["value"] == pytest.approx(0.82)
     assert [row["best_is_better_with"] for row in others] == [1.0, 1.0]
-    assert group["verdict"].startswith("tac.entropic_index = 1.5 is ahead")
+    assert "from so few seeds the gap may be chance" in group["verdict"]
     bad = program("compare", place, "--metric", "nonsense")
     assert (bad.code, "--metric must be one of" in bad.errors) == (2, True)
+
+
+def test_compare_names_a_winner_on_evidence(storage: str, tmp_path: Path, program: Program) -> None:
+    played(storage, tmp_path, runs=15, seeds=5)
+    (group,) = program("compare", f"{storage}/mine", "--json").document["groups"]
+    assert group["verdict"].startswith("tac.entropic_index = 1.5 is ahead")
+    first, *others = group["conditions"]
+    assert first["p_value"] is None
+    # All of 5 runs above all of 5: 2 of 252 relabellings, twice for two comparisons.
+    assert [row["p_value"] for row in others] == pytest.approx([0.016, 0.016], abs=0.005)
+    assert "0.01" in program("compare", f"{storage}/mine").output
 
 
 def test_compare_names_no_winner_without_evidence(

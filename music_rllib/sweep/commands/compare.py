@@ -25,7 +25,8 @@ examples:
 
 Each row is the interquartile mean over tasks and seeds with its 95 % stratified-bootstrap interval.
 Runs on the fresh seeds of a search's final ranking are never mixed with those its trials were
-chosen by. Where two intervals overlap, nothing is said to be better.
+chosen by. A condition is said to be ahead only where its interval overlaps with no other and a
+permutation test (Holm's correction) gives p < 0.05 against each: three seeds are never enough.
 """
 
 
@@ -92,7 +93,10 @@ def _execute(arguments: argparse.Namespace) -> int:
 
 
 def verdict(rows: Sequence[dict[str, Any]], part: str) -> str:
-    """What the intervals allow to be said."""
+    """What intervals and permutation tests allow to be said."""
+    from music_rllib.reports.statistics import SIGNIFICANCE
+    from music_rllib.reports.verdict import p_text
+
     if part == "search":
         return "Trials were chosen by these runs, so their order is biased: fresh seeds count."
     if len(rows) < 2:
@@ -101,4 +105,15 @@ def verdict(rows: Sequence[dict[str, Any]], part: str) -> str:
         return "A condition with a single run has no interval: nothing can be said yet."
     if any(row["overlaps_best"] for row in rows[1:]):
         return "Intervals overlap with that of the first: no winner. More seeds may tell."
-    return f"{rows[0]['label']} is ahead: its interval overlaps with no other."
+    p_values = [row["p_value"] for row in rows[1:]]
+    if any(p is None for p in p_values):
+        return "Not every condition has finished on the same tasks: no winner yet."
+    if max(p_values) >= SIGNIFICANCE:
+        return (
+            "No intervals overlap with that of the first, but from so few seeds the gap may be "
+            f"chance ({p_text(max(p_values))}, permutation test): no winner. More seeds may tell."
+        )
+    return (
+        f"{rows[0]['label']} is ahead: its interval overlaps with no other, and so large a gap "
+        f"comes by chance with {p_text(max(p_values))} at most (permutation test)."
+    )
