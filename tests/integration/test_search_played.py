@@ -1,0 +1,513 @@
+"""Searches: which point comes next, what is stopped, and what is resumed.
+
+Runs are played here by a formula in place of training: everything else is real, the studies'
+database and the node store among it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import random
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+from optuna.exceptions import StorageInternalError
+
+from music_rllib.experiment.settings import RunSettings
+from music_rllib.experiment.space import FINAL_SEED
+from music_rllib.sweep.board import Status
+from music_rllib.tracking import names
+from tests.played_search import SPACE, Document, Driver, document, points, searched, success
+
+
+@pytest.fixture
+def tmp_path(tmp_path: Path) -> Iterator[Path]:
+    """In memory where that can be: a study is written in hundreds of small transactions."""
+    memory = Path("/dev/shm")
+    if not memory.is_dir():
+        yield tmp_path
+        return
+    with tempfile.TemporaryDirectory(dir=memory) as folder:
+        yield Path(folder)
+
+
+# --- judging -----------------------------------------------------------------------------------
+
+
+def test_the_objective_is_the_aggregate_of_a_trials_runs_recomputed(tmp_path: Path) -> None:
+    driver = searched(tmp_path)
+    trials = driver.trials()
+    assert [trial["state"] for trial in trials] == ["judged"] * 6
+    runs = [run for run in driver.sweep.plan.runs if run.part]
+    assert len(runs) == 18
+    for trial in trials:
+        mine = [run for run in runs if run.part == f"trial{trial['number']}"]
+        assert {run.seed for run in mine} == {0, 1, 2}
+        results = [driver.sweep.store.result(run.key) for run in mine]
+        values = sorted(result.metrics[names.EVAL_SUCCESS] for result in results if result)
+        # Three values: a quarter of them is less than one, so none is cut off.
+        assert trial["objective"] == [pytest.approx(sum(values) / 3, abs=1e-12)]
+        assert driver.sweep.plan.node(mine[0].key).run.tac.alpha == trial["values"]["tac.alpha"]
+    best = max(trials, key=lambda trial: float(trial["objective"][0]))
+    assert driver.outcome()["arms"][0]["best"] == best["number"]
+
+
+def test_a_run_without_the_metric_fails_its_trial_and_nothing_else(tmp_path: Path) -> None:
+    def formula(run: RunSettings, share: float) -> float:
+        return math.nan if run.tac.entropic_index == 2.5 else success(run, share)
+
+    space = {"tac.entropic_index": {"choice": [1.0, 2.5]}}
+    driver = Driver(tmp_path, document({"space": space, "sampler": "grid"}), formula)
+    driver.play()
+    good, bad = driver.trials()
+    assert good["state"] == "judged"
+    assert bad["state"] == "failed"
+    assert "evaluation/success_rate is not a finite number" in bad["reason"]
+
+
+# --- choosing ----------------------------------------------------------------------------------
+
+KINDS: list[Document] = [
+    {"sampler": "tpe", "trials": 10},
+    {"sampler": "random"},
+    {"sampler": "cmaes", "trials": 12, "population": 4},
+    {
+        "sampler": "nsga2",
+        "population": 4,
+        "trials": 10,
+        "objective": [{}, {"read": "steps_to", "threshold": 0.5}],
+    },
+    {"sampler": "tpe", "concurrent": 1},
+    {
+        "pruning": {"rungs": [{"seeds": 1, "env_steps": 2000}, {"seeds": 2}], "warm_up": 2},
+        "trials": 10,
+        "concurrent": 3,
+    },
+]
+
+
+@pytest.mark.parametrize("search", KINDS, ids=lambda search: json.dumps(search)[:40])
+def test_a_resumed_study_equals_the_unbroken_one(search: Document, tmp_path: Path) -> None:
+    for folder in ("whole", "broken"):
+        (tmp_path / folder).mkdir()
+    whole = searched(tmp_path / "whole", search)
+    for attempt in range(40):
+        # A driver that is killed: it says nothing, and its trials are left as they are.
+        driver = Driver(tmp_path / "broken", document(search), seed=attempt + 1)
+        driver.play(stop_after=9)
+        if driver.campaign.over:
+            break
+    assert driver.campaign.over
+    assert attempt > 1
+    assert driver.trials() == whole.trials()
+
+
+def test_points_do_not_depend_on_the_order_in_which_runs_end(tmp_path: Path) -> None:
+    found = []
+    for seed in range(3):
+        folder = tmp_path / str(seed)
+        folder.mkdir()
+        driver = Driver(folder, document({"trials": 6, "concurrent": 3}), seed=seed)
+        driver.play(slots=1 + 2 * seed)
+        found.append(driver.trials())
+    assert found[0] == found[1] == found[2]
+
+
+def test_another_seed_of_the_search_chooses_other_points(tmp_path: Path) -> None:
+    found = []
+    for seed in (0, 1):
+        folder = tmp_path / str(seed)
+        folder.mkdir()
+        found.append(points(searched(folder, {"seed": seed}).trials()))
+    assert found[0] != found[1]
+
+
+def test_tpe_learns(tmp_path: Path) -> None:
+    trials = searched(tmp_path, {"trials": 20, "startup_trials": 6}).trials()
+    values = [trial["objective"][0] for trial in trials]
+    assert np.mean(values[12:]) > np.mean(values[:6]) + 0.05
+
+
+def test_given_points_come_first(tmp_path: Path) -> None:
+    given = [{"tac.entropic_index": 1.25, "tac.alpha": 0.1}, {"tac.entropic_index": 2.0}]
+    trials = searched(tmp_path, {"points_to_evaluate": given}).trials()
+    assert trials[0]["values"] == given[0]
+    assert trials[1]["values"]["tac.entropic_index"] == 2.0
+
+
+def test_a_grid_tries_every_point_that_exists(tmp_path: Path) -> None:
+    space = {
+        "tac.bootstrap": {"choice": ["value", "critics"]},
+        "tac.policy_critic": {"choice": ["first", "min"], "when": {"tac.bootstrap": "critics"}},
+        "tac.batch_size": {"int": [64, 128], "step": 64},
+    }
+    driver = searched(tmp_path, {"space": space, "sampler": "grid", "trials": None})
+    found = points(driver.trials())
+    assert len(found) == 2 * (1 + 2)
+    assert found[0] == {"tac.bootstrap": "value", "tac.batch_size": 64}
+    assert all(("tac.policy_critic" in p) == (p["tac.bootstrap"] == "critics") for p in found)
+
+
+def test_conditional_settings_and_choices_of_any_kind(tmp_path: Path) -> None:
+    space = {
+        "tac.alpha": {"choice": [0.1, {"learned": True, "initial": 0.3}]},
+        "tac.bootstrap": {"choice": ["value", "critics"]},
+        "tac.policy_critic": {"choice": ["first", "min"], "when": {"tac.bootstrap": ["critics"]}},
+    }
+
+    def formula(run: RunSettings, share: float) -> float:
+        return share * (0.5 if run.tac.bootstrap == "critics" else 0.4)
+
+    driver = Driver(tmp_path, document({"space": space, "trials": 12}), formula)
+    driver.play()
+    found = points(driver.trials())
+    assert {type(point["tac.alpha"]) for point in found} == {float, dict}
+    assert any("tac.policy_critic" in point for point in found)
+    assert all(("tac.policy_critic" in p) == (p["tac.bootstrap"] == "critics") for p in found)
+
+
+# --- stopping early ----------------------------------------------------------------------------
+
+
+def test_what_is_stopped_early_is_so_for_a_reason_and_costs_less(tmp_path: Path) -> None:
+    pruning = {"rungs": [{"seeds": 1, "env_steps": 2000}, {"seeds": 2}], "warm_up": 3, "keep": 0.3}
+    driver = searched(tmp_path, {"pruning": pruning, "trials": 14})
+    trials = driver.trials()
+    stopped = [trial for trial in trials if trial["state"] == "pruned"]
+    assert stopped
+    assert not any(trial["number"] < 3 for trial in stopped)
+    for trial in stopped:
+        assert "is not among the best" in trial["reason"]
+        assert "interval" in trial["reason"]
+        runs = [run for run in driver.sweep.plan.runs if run.part == f"trial{trial['number']}"]
+        assert len(runs) < 3
+    assert driver.pruned
+    assert set(driver.pruned.values()) <= {trial["reason"] for trial in stopped}
+    best = max((t for t in trials if t["objective"]), key=lambda trial: trial["objective"])
+    assert best["number"] == driver.outcome()["arms"][0]["best"]
+
+
+# --- the final ranking -------------------------------------------------------------------------
+
+
+def test_the_ranking_is_of_fresh_seeds(tmp_path: Path) -> None:
+    def lucky(run: RunSettings, share: float) -> float:
+        """Good where it was searched and nowhere else."""
+        q = float(run.tac.entropic_index)  # type: ignore[arg-type]
+        if q == 2.5 and run.seed < FINAL_SEED:
+            return 0.99 * share
+        return share * (0.6 - 0.1 * abs(q - 1.5)) + 0.01 * (run.seed % 3)
+
+    space = {"tac.entropic_index": {"float": [1.0, 2.5], "step": 0.5}}
+    final = {"trials": 2, "seeds": 4}
+    driver = Driver(tmp_path, document({"space": space, "sampler": "grid", "final": final}), lucky)
+    driver.play()
+    found = driver.outcome()
+    assert found["complete"]
+    assert found["arms"][0]["best"] == 3, "the lucky one was the best in the search"
+    first, second = found["ranking"]
+    assert (first["values"]["tac.entropic_index"], second["values"]["tac.entropic_index"]) == (
+        1.5,
+        2.5,
+    )
+    assert second["selection_bias"][0] > 0.4
+    assert abs(first["selection_bias"][0]) < 0.02
+    assert first["interval"][0][0] <= first["fresh"][0] <= first["interval"][0][1]
+    assert second["best_is_better_with"] == 1.0
+    runs = [run for run in driver.sweep.plan.runs if run.part.startswith("final")]
+    assert {run.seed for run in runs} == {FINAL_SEED + n for n in range(4)}
+    pretrained = {run.seed for run in driver.sweep.plan.runs if run.stage == "pretrain"}
+    assert pretrained == {0, 1, 2} | {run.seed for run in runs}, "one for each seed, shared"
+
+
+def test_baselines_are_ranked_with_the_best(tmp_path: Path) -> None:
+    points = [
+        {"tac.entropic_index": 2.5, "tac.alpha": 0.5},
+        {"tac.entropic_index": 1.0, "tac.alpha": 0.05},
+    ]
+    final = {"trials": 1, "seeds": 2, "baselines": True}
+    search = {"trials": 5, "points_to_evaluate": points, "final": final}
+    driver = searched(tmp_path, search)
+    found = driver.outcome()
+    trials = found["arms"][0]["trials"]
+    assert [trial["values"] for trial in trials[:2]] == points
+    ranked = {entry["trial"] for entry in found["ranking"]}
+    assert ranked == {0, 1, found["arms"][0]["best"]}
+    runs = [run for run in driver.sweep.plan.runs if run.part.startswith("final")]
+    assert len(runs) == 2 * len(ranked)
+
+
+def test_importance_names_what_matters(tmp_path: Path) -> None:
+    def formula(run: RunSettings, share: float) -> float:
+        return share * float(run.tac.entropic_index) / 3  # type: ignore[arg-type]
+
+    driver = Driver(tmp_path, document({"trials": 12, "sampler": "random"}), formula)
+    driver.play()
+    (arm,) = driver.outcome()["arms"]
+    assert next(iter(arm["importance"])) == "tac.entropic_index"
+    assert sum(arm["importance"].values()) == pytest.approx(1.0)
+
+
+# --- comparing, extending, learning from others ------------------------------------------------
+
+
+def test_compare_gives_every_value_the_same_budget_and_seeds(tmp_path: Path) -> None:
+    search = {
+        "mode": "compare",
+        "compare": {"tac.entropic_index": [1.0, 1.5, 2.0]},
+        "space": {"tac.alpha": {"float": [0.005, 0.5], "log": True}},
+        "trials": 4,
+        "final": {"trials": 1, "seeds": 3},
+    }
+    driver = searched(tmp_path, search)
+    found = driver.outcome()
+    assert [arm["values"] for arm in found["arms"]] == [
+        {"tac.entropic_index": q} for q in (1.0, 1.5, 2.0)
+    ]
+    for arm in found["arms"]:
+        assert [trial["state"] for trial in arm["trials"]] == ["judged"] * 4
+    # The same sampler's seed: all begin with the same point.
+    first = {arm["trials"][0]["values"]["tac.alpha"] for arm in found["arms"]}
+    assert len(first) == 1
+    by_q: dict[float, set[int]] = {}
+    for run in driver.sweep.plan.runs:
+        if run.part.startswith("trial"):
+            by_q.setdefault(run.values["tac.entropic_index"], set()).add(run.seed)
+    assert by_q == {1.0: {0, 1, 2}, 1.5: {0, 1, 2}, 2.0: {0, 1, 2}}
+    assert found["ranking"][0]["values"]["tac.entropic_index"] == 1.5
+    assert len(found["ranking"]) == 3
+
+
+def test_more_trials_go_on_where_the_study_ended(tmp_path: Path) -> None:
+    before = searched(tmp_path, {"trials": 5})
+    after = searched(tmp_path, {"trials": 8})
+    assert after.trials()[:5] == before.trials()
+    assert len(after.computed) == 3 * 3
+
+
+def test_more_seeds_pay_only_for_the_new_ones(tmp_path: Path) -> None:
+    before = searched(tmp_path)
+    after = searched(tmp_path, seeds=[0, 1, 2, 3, 4])
+    assert points(after.trials()) == points(before.trials())
+    assert len(after.computed) == 6 * 2 + 2, "of each trial two runs, and what they start from"
+    assert all(len(trial["scores"][0]) == 5 for trial in after.trials())
+
+
+def test_a_finer_grid_pays_only_for_what_is_new(tmp_path: Path) -> None:
+    def grid(step: float) -> Document:
+        space = {"tac.entropic_index": {"float": [1.0, 2.0], "step": step}}
+        return {"space": space, "sampler": "grid", "trials": None}
+
+    searched(tmp_path, grid(0.5))
+    after = searched(tmp_path, grid(0.25))
+    assert len(after.trials()) == 5
+    assert len(after.computed) == 2 * 3
+
+
+def test_a_study_of_another_space_takes_its_points_over(tmp_path: Path) -> None:
+    before = searched(tmp_path, {"trials": 4})
+    wider = SPACE | {"tac.alpha": {"float": [0.001, 0.9], "log": True}}
+    after = searched(tmp_path, {"trials": 6, "space": wider})
+    assert points(after.trials())[:4] == points(before.trials())
+    assert len(after.computed) == 2 * 3
+
+
+def test_a_warm_start_learns_from_an_older_study_and_does_not_rank_it(tmp_path: Path) -> None:
+    searched(tmp_path, {"trials": 12})
+    warm = {"study": "s/finetune", "storage": str(tmp_path / "results/s/study.db")}
+    cold = searched(tmp_path, {"trials": 4}, name="cold").trials()
+    driver = searched(tmp_path, {"trials": 4, "warm_start": warm}, name="warm")
+    assert driver.outcome()["arms"][0]["learnt_from"] == 12
+    assert len(driver.trials()) == 4
+    values = [trial["objective"][0] for trial in driver.trials()]
+    assert np.mean(values) > np.mean([trial["objective"][0] for trial in cold])
+
+
+def test_settings_of_the_pretraining_can_be_searched_and_are_shared(tmp_path: Path) -> None:
+    space = {
+        "pretrain:music.lr": {"choice": [0.001, 0.01]},
+        "tac.alpha": {"choice": [0.05, 0.1, 0.2]},
+    }
+    driver = searched(tmp_path, {"space": space, "sampler": "grid", "trials": None})
+    nodes = [node for node in driver.sweep.plan.nodes if node.stage == "pretrain"]
+    assert len(nodes) == 2 * 3, "one for each of its settings and seed"
+    assert {node.run.music.lr for node in nodes} == {0.001, 0.01}
+    assert len([run for run in driver.sweep.plan.runs if run.part]) == 6 * 3
+
+
+def test_two_drivers_share_a_study(tmp_path: Path) -> None:
+    database = f"sqlite:///{tmp_path}/shared.db"
+    search = {"storage": database, "study": "together", "trials": 10, "concurrent": 3}
+    for folder in ("one", "other", "alone"):
+        (tmp_path / folder).mkdir()
+    one = Driver(tmp_path / "one", document(search))
+    other = Driver(tmp_path / "other", document(search), seed=1)
+    for _ in range(200):
+        for driver in (one, other):
+            try:
+                driver.play(stop_after=len(driver.computed) + 2)
+            except AssertionError:
+                continue  # it waits for what the other one judges
+        if one.campaign.over and other.campaign.over:
+            break
+    assert one.trials() == other.trials()
+    assert [trial["state"] for trial in one.trials()] == ["judged"] * 10
+    by_trial = [{run.part for run in d.sweep.plan.runs if run.part} for d in (one, other)]
+    assert by_trial[0] | by_trial[1] == {f"trial{number}" for number in range(10)}
+    assert not by_trial[0] & by_trial[1]
+    assert all(by_trial)
+    alone = searched(tmp_path / "alone", search | {"storage": None})
+    assert alone.trials() == one.trials()
+
+
+def test_a_dead_drivers_trials_are_taken_over(tmp_path: Path) -> None:
+    search = {"storage": f"sqlite:///{tmp_path}/shared.db", "study": "together"}
+    dead = Driver(tmp_path, document(search))
+    dead.play(stop_after=4)
+    study = dead.campaign.searches[0].arms[0].study
+    held = [trial.number for trial in study.trials() if trial.state.name == "RUNNING"]
+    assert held
+    driver = Driver(tmp_path, document(search))
+    mine = driver.campaign.searches[0].arms[0].study
+    mine.release_the_dead()
+    assert [t.number for t in mine.trials() if t.state.name == "RUNNING"] == held, "it is alive"
+    later = 10_000_000_000.0
+    mine.release_the_dead(later)
+    driver.play()
+    assert [trial["state"] for trial in driver.trials()] == ["judged"] * 6
+
+
+def test_a_driver_that_was_taken_for_dead_changes_nothing_any_more(tmp_path: Path) -> None:
+    search = {"storage": f"sqlite:///{tmp_path}/shared.db", "study": "together"}
+    for folder in ("silent", "other"):
+        (tmp_path / folder).mkdir()
+    silent = Driver(tmp_path / "silent", document(search))
+    silent.play(stop_after=5)
+    other = Driver(tmp_path / "other", document(search))
+    other.campaign.searches[0].arms[0].study.release_the_dead(10_000_000_000.0)
+    other.play()
+    before = other.trials()
+    silent.play()
+    assert silent.trials() == before == other.trials()
+
+
+class Flaky:
+    """A database that is gone now and then."""
+
+    def __init__(self, storage: Any, seed: int) -> None:
+        self._storage, self._rng = storage, random.Random(seed)
+        self.down = 0
+
+    def __getattr__(self, name: str) -> Any:
+        if self._rng.random() < 0.1:
+            self.down += 1
+            raise StorageInternalError("the server closed the connection")
+        return getattr(self._storage, name)
+
+
+def test_a_database_that_comes_and_goes_costs_nothing(tmp_path: Path) -> None:
+    for folder in ("whole", "flaky"):
+        (tmp_path / folder).mkdir()
+    whole = searched(tmp_path / "whole")
+    driver = Driver(tmp_path / "flaky", document({}))
+    study = driver.campaign.searches[0].arms[0].study
+    sound, flaky = study._storage, Flaky(study._storage, 1)
+    study._storage = flaky  # type: ignore[assignment]
+    while not driver.campaign.over:
+        try:
+            driver.play(stop_after=len(driver.computed) + 1)
+        except (AssertionError, StorageInternalError):
+            continue  # nothing to do but wait
+    assert flaky.down > 10
+    study._storage = sound
+    assert driver.trials() == whole.trials()
+
+
+def test_what_a_failed_run_takes_with_it(tmp_path: Path) -> None:
+    driver = Driver(tmp_path, document({}))
+    driver.play(stop_after=3)
+    node = next(n for n in driver.sweep.board.having(Status.WAITING) if n.part)
+    driver.sweep.board.start(node.key)
+    driver.sweep.board.fail(node.key)
+    driver.play()
+    states = [trial["state"] for trial in driver.trials()]
+    assert states.count("failed") == 1
+    assert states.count("judged") == 5
+    (failed,) = [trial for trial in driver.trials() if trial["state"] == "failed"]
+    assert "failed" in failed["reason"]
+
+
+def test_two_hundred_trials_cost_the_driver_no_more_each_than_one_hundred(tmp_path: Path) -> None:
+    driver = Driver(tmp_path, document({"trials": 200, "sampler": "random"}, seeds=[0]))
+    process = psutil.Process()
+    seconds, memory = [], []
+    for until in (51, 101, 151, 201):  # one is the pretraining
+        before = time.process_time()
+        driver.play(stop_after=until)
+        seconds.append(time.process_time() - before)
+        memory.append(process.memory_info().rss)
+    driver.play()
+    assert [trial["state"] for trial in driver.trials()] == ["judged"] * 200
+    assert seconds[3] < 3 * seconds[0], seconds
+    assert memory[3] - memory[0] < 30 * 2**20, memory
+
+
+# --- the same everywhere -----------------------------------------------------------------------
+
+
+def test_the_same_file_gives_the_same_points_on_another_machine(tmp_path: Path) -> None:
+    """Six digits of each: the last bits of a machine's logarithm play no part."""
+    driver = Driver(tmp_path, document({}))
+    driver.play()
+    assert points(driver.trials())[:2] == FIRST_POINTS
+
+
+def test_node_keys_are_the_same_in_another_process(tmp_path: Path) -> None:
+    driver = Driver(tmp_path, document({"trials": 2}))
+    driver.play()
+    code = (
+        "import json, sys; from pathlib import Path\n"
+        "from tests.played_search import Driver, document\n"
+        "driver = Driver(Path(sys.argv[1]), document({'trials': 2})); driver.play()\n"
+        "print(json.dumps([[run.label, run.key] for run in driver.sweep.plan.runs]))"
+    )
+    (tmp_path / "there").mkdir()
+    found = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path / "there")],
+        env=os.environ | {"PYTHONHASHSEED": "12345", "LC_ALL": "C", "TZ": "Asia/Tokyo"},
+        cwd=Path(__file__).parents[2],
+        capture_output=True,
+        check=True,
+        text=True,
+    )
+    here = {run.label: run.key for run in driver.sweep.plan.runs}
+    assert dict(json.loads(found.stdout.splitlines()[-1])) == here
+
+
+FIRST_POINTS: list[Mapping[str, Any]] = [
+    {"tac.entropic_index": 2.5, "tac.alpha": 0.135116},
+    {"tac.entropic_index": 1.5, "tac.alpha": 0.146438},
+]
+
+
+def test_a_password_belongs_into_the_environment(tmp_path: Path) -> None:
+    search = {"storage": "postgresql://me:hidden@127.0.0.1:9/studies"}
+    with pytest.raises(RuntimeError, match="must not hold a password") as error:
+        Driver(tmp_path, document(search))
+    assert "hidden" not in str(error.value)
+
+
+def test_a_database_that_is_not_there(tmp_path: Path) -> None:
+    search = {"storage": "postgresql://me@127.0.0.1:9/studies"}
+    with pytest.raises(RuntimeError, match=r"search.storage must be a database that can be used"):
+        Driver(tmp_path, document(search))

@@ -1,0 +1,167 @@
+"""Searches whose runs are played by a formula in place of training; all else is real."""
+
+from __future__ import annotations
+
+import json
+import math
+import random
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+from ray.tune.search import Searcher
+
+from music_rllib.experiment.config import load_sweep
+from music_rllib.experiment.plan import Node, make_plan
+from music_rllib.experiment.result import HISTORY, Report, RunResult, last_values, to_json_lines
+from music_rllib.experiment.settings import RunSettings
+from music_rllib.sweep.campaign import Campaign
+from music_rllib.sweep.dag_searcher import DagSearcher
+from music_rllib.sweep.places import sweep_folder
+from music_rllib.sweep.searches import open_searches, outcome
+from music_rllib.sweep.session import Sweep, open_sweep
+from music_rllib.tracking import names
+
+Document = dict[str, Any]
+Formula = Callable[[RunSettings, float], float]
+"""Success rate of a run after a fraction of its budget."""
+
+SPACE: Document = {
+    "tac.entropic_index": {"float": [1.0, 2.5], "step": 0.25},
+    "tac.alpha": {"float": [0.005, 0.5], "log": True},
+}
+SEARCH: Document = {"space": SPACE, "trials": 6, "startup_trials": 2, "final": None}
+
+
+def document(search: Document, **changes: Any) -> Document:
+    base: Document = {
+        "name": "s",
+        "tasks": ["FetchPush"],
+        "seeds": [0, 1, 2],
+        "defaults": {"env_steps": 4000, "evaluation": {"interval": 1000, "episodes": 2}},
+        "stages": [
+            {"name": "pretrain", "variant": "music-u"},
+            {
+                "name": "finetune",
+                "variant": "music-r",
+                "init_from": "pretrain",
+                "search": SEARCH | search,
+            },
+        ],
+    }
+    return base | changes
+
+
+def success(run: RunSettings, share: float) -> float:
+    """Best at q = 1.5 and alpha = 0.05, with a spread between seeds."""
+    q, alpha = float(run.tac.entropic_index), float(run.tac.alpha)  # type: ignore[arg-type]
+    height = 0.9 - 0.5 * abs(q - 1.5) - 0.15 * abs(math.log10(alpha / 0.05))
+    return round(share * height + 0.02 * ((7 * run.seed) % 3 - 1), 6)
+
+
+class Driver:
+    """One driver of a sweep; plays Tune with runs that end in random order."""
+
+    def __init__(
+        self, folder: Path, content: Document, formula: Formula = success, seed: int = 0
+    ) -> None:
+        path = folder / "sweep.yaml"
+        path.write_text(yaml.safe_dump(content, sort_keys=False))
+        config = load_sweep(path, storage=str(folder / "results"))
+        plan = make_plan(config)
+        self.sweep: Sweep = open_sweep(
+            config, plan, config.storage, sweep_folder(config.storage, config.name)
+        )
+        self._time = time.time()  # as another driver's clock, which judges whether this one lives
+        self.computed: list[str] = []
+        self.pruned: dict[str, str] = {}
+        self.campaign = Campaign(
+            self.sweep,
+            open_searches(self.sweep),
+            pruned=lambda node, reason: self.pruned.__setitem__(node.label, reason),
+            now=self._clock,
+        )
+        self.campaign.recall()
+        self._formula = formula
+        self._rng = random.Random(seed)
+        self._running: list[tuple[Node, int | None]] = []
+
+    def _clock(self) -> float:
+        self._time += 10.0  # other drivers are looked at each time
+        return self._time
+
+    def play(self, stop_after: int | None = None, slots: int = 2) -> None:
+        """Go on to the end, or until so many pieces of runs have been computed."""
+        board = self.sweep.board
+        searcher = DagSearcher(board, lambda node: {"key": node.key}, self.campaign.advance)
+        running = self._running
+        while stop_after is None or len(self.computed) < stop_after:
+            suggestion = None
+            if len(running) < slots:
+                suggestion = searcher.suggest("t")
+            if suggestion == Searcher.FINISHED and not running:
+                return
+            if isinstance(suggestion, dict):
+                node = board.node(suggestion["key"])
+                running.append((node, board.until(node.key)))
+            elif running:
+                self._compute(*running.pop(self._rng.randrange(len(running))))
+            else:
+                raise AssertionError("Tune would wait for ever")
+
+    def _compute(self, node: Node, until: int | None) -> None:
+        self.computed.append(f"{node.key}/{until}")
+        budget = node.run.env_steps
+        reports = [
+            Report(
+                env_steps=steps,
+                seconds=1.0,
+                timestamp_ms=1,
+                metrics={
+                    names.EVAL_EPISODES: 2.0,
+                    names.EVAL_SUCCESS: self._formula(node.run, steps / budget),
+                },
+            )
+            for steps in range(1000, (until or budget) + 1, 1000)
+        ]
+        self.campaign.reported(node, reports)
+        if until is not None:
+            self.sweep.board.pause(node.key, until)
+            return
+        publish(self.sweep, node, reports)
+        self.sweep.board.finish(node.key)
+
+    def trials(self, arm: int = 0) -> list[dict[str, Any]]:
+        """As plain data, with plain numbers."""
+        (found,) = outcome(self.campaign)
+        trials: list[dict[str, Any]] = json.loads(json.dumps(found["arms"][arm]["trials"]))
+        return trials
+
+    def outcome(self) -> dict[str, Any]:
+        (found,) = outcome(self.campaign)
+        return found
+
+
+def publish(sweep: Sweep, node: Node, reports: list[Report]) -> None:
+    folder = sweep.folder / "made"
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / HISTORY).write_bytes(to_json_lines(reports))
+    result = RunResult(
+        label=node.label,
+        env_steps=reports[-1].env_steps,
+        seconds=1.0,
+        metrics=last_values(reports),
+    )
+    sweep.store.publish(node.key, folder, result)
+
+
+def searched(folder: Path, search: Document | None = None, **changes: Any) -> Driver:
+    driver = Driver(folder, document(search or {}, **changes))
+    driver.play()
+    return driver
+
+
+def points(trials: list[dict[str, Any]]) -> list[Mapping[str, Any]]:
+    return [trial["values"] for trial in trials]
