@@ -20,16 +20,16 @@ from typing import Any, Self
 import psutil
 
 from music_rllib.experiment.lease import runs_here, this_machine
-from music_rllib.experiment.plan import Node, short
+from music_rllib.experiment.model import Stage
+from music_rllib.experiment.plan import Node
 from music_rllib.experiment.result import Report, RunResult, last_values
 from music_rllib.experiment.sealed import StorageError
 from music_rllib.experiment.settings import VARIANTS
 from music_rllib.sweep import records
 from music_rllib.sweep.board import Status
-from music_rllib.sweep.conditions import Condition, best_of, conditions
+from music_rllib.sweep.judgement import best_in_words, best_so_far
 from music_rllib.sweep.listener import Failure, Listener
 from music_rllib.sweep.session import Sweep, plan_document
-from music_rllib.sweep.tables import with_interval
 from music_rllib.tracking import names
 
 __all__ = ["Beacon", "is_alive"]
@@ -159,13 +159,7 @@ class Beacon(Listener):
             for arm in search["arms"]
         ]
         best = state["best"]
-        if best is None:
-            return lines, None
-        values = ", ".join(f"{name} = {short(value)}" for name, value in best["values"].items())
-        return lines, (
-            f"best so far: {best['stage']} {values}".rstrip()
-            + f", success {with_interval(best['value'], best['interval'])} ({best['runs']} runs)"
-        )
+        return lines, None if best is None else f"best so far: {best_in_words(best)}"
 
     # -- speaking ----------------------------------------------------------------------------
 
@@ -208,26 +202,22 @@ class Beacon(Listener):
             }
             for stage in sweep.config.stages
         ]
+        searches = self.searches()
         return {
             "sweep": sweep.config.name,
             "stages": stages,
             "env_steps": {"done": steps_done, "left": steps_left},
             "running": running,
-            "best": best_of(self._at_the_task()),
-            "searches": self.searches(),
+            "best": best_so_far(self._at_the_task(), sweep.plan, self._results, searches),
+            "searches": searches,
             "pruned": [node.key for node in sweep.board.having(Status.PRUNED)],
             "failures": self._failures[-SHOWN_FAILURES:],
         }
 
-    def _at_the_task(self) -> list[Condition]:
-        """Of stages that train for the task: MUSIC-u's success is chance."""
-        aside = {
-            stage.name
-            for stage in self._sweep.config.stages
-            if not VARIANTS[stage.variant].fixed["task_reward"]
-        }
-        found = conditions(self._sweep.plan, self._results)
-        return [one for one in found if one.stage not in aside]
+    def _at_the_task(self) -> list[Stage]:
+        """Stages that train for the task: MUSIC-u's success is chance."""
+        stages = self._sweep.config.stages
+        return [stage for stage in stages if VARIANTS[stage.variant].fixed["task_reward"]]
 
     def _speak(self) -> None:
         pause = min(self._interval, 2.0)

@@ -20,7 +20,7 @@ from music_rllib.reports.statistics import (
 )
 from music_rllib.tracking import names
 
-__all__ = ["Condition", "best_of", "compared", "conditions"]
+__all__ = ["Condition", "compared", "conditions"]
 
 Array = NDArray[np.float64]
 
@@ -38,6 +38,8 @@ class Condition:
     runs: tuple[Run, ...]
     """Those with a result."""
     planned: int
+    complete: bool
+    """Whether every planned run is finished, whatever it reported."""
     scores: Array
     """`[seeds, tasks]`, NaN where there is no result."""
 
@@ -81,6 +83,7 @@ def conditions(
                     seeds=tuple(seeds),
                     runs=tuple(done),
                     planned=len({run.key for run in runs}),
+                    complete=all(run.key in results for run in runs),
                     scores=scores,
                 )
             )
@@ -89,28 +92,6 @@ def conditions(
 
 def _part(run: Run) -> str:
     return "final" if run.part.startswith("final") else "search" if run.part else ""
-
-
-def best_of(found: Sequence[Condition]) -> dict[str, Any] | None:
-    """The condition of the last stage with the highest interquartile mean; fresh seeds count more.
-
-    Returns:
-        As plain data; None where nothing is finished there.
-    """
-    if not found:
-        return None
-    last = [one for one in found if one.stage == found[-1].stage]
-    last = [one for one in last if one.part == "final"] or last
-    best = max(last, key=lambda one: float(one.estimate().value))
-    ends = best.estimate()
-    return {
-        "stage": best.stage,
-        "values": dict(best.values),
-        "value": float(ends.value),
-        "interval": [float(ends.lower), float(ends.upper)],
-        "runs": len(best.runs),
-        "on_fresh_seeds": best.part == "final",
-    }
 
 
 def compared(found: Sequence[Condition], *, maximised: bool = True) -> list[dict[str, Any]]:

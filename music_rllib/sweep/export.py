@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -13,11 +14,16 @@ import yaml
 from music_rllib.experiment.files import write_atomically
 from music_rllib.experiment.plan import Run
 from music_rllib.experiment.sealed import StorageError
+from music_rllib.experiment.space import Objective
+from music_rllib.search.judge import interval
 from music_rllib.sweep import records
 from music_rllib.sweep.conditions import Condition, conditions
 from music_rllib.sweep.frame import BadInputError
+from music_rllib.sweep.judgement import best_of, leader, measure_of
 from music_rllib.sweep.session import Sweep
 from music_rllib.sweep.tables import with_interval
+from music_rllib.tracking import names
+from music_rllib.tracking.redaction import redact
 
 __all__ = ["export_best"]
 
@@ -27,7 +33,7 @@ CHOSEN = "chosen.json"
 def export_best(sweep: Sweep, stage: str | None, output: Path) -> dict[str, Any]:
     """Export the best condition's policy for each of its tasks.
 
-    Of the condition's runs on a task the middle one by its success rate is taken: it stands for
+    Of the condition's runs on a task the middle one by the same measure is taken: it stands for
     what the settings give, where the best one would stand for luck.
 
     Returns:
@@ -37,19 +43,21 @@ def export_best(sweep: Sweep, stage: str | None, output: Path) -> dict[str, Any]
         BadInputError: Nothing is finished, or there is no such stage.
         StorageError: The folder can't be written.
     """
-    best, by = _best(sweep, stage)
-    value = best.estimate()
-    ends = [float(value.lower), float(value.upper)]
+    best, about = _best(sweep, stage)
     fresh = "on fresh seeds" if best.part == "final" else "on the seeds that it was chosen by"
+    rest = "" if best.complete else f", of {best.planned} planned: no condition has all of its runs"
+    number = with_interval(about["value"], about["interval"])
+    by = about.pop("by")
     chosen: dict[str, Any] = {
         "sweep": sweep.config.name,
         "stage": best.stage,
         "values": dict(best.values),
-        "success_rate": float(value.value),
-        "interval": ends,
+        **about,
+        "success_rate": _success(sweep, best),
         "on_fresh_seeds": best.part == "final",
-        "why": f"{best.stage}: {best.label} is first by {by} {fresh}; success rate (interquartile "
-        f"mean, 95 %): {with_interval(float(value.value), ends)} over {len(best.runs)} runs",
+        "why": f"{best.stage}: {best.label} is first by {by} {fresh}; {by} "
+        f"({'' if 'trial' in about else 'interquartile mean, '}95 %): {number} over "
+        f"{len(best.runs)} runs{rest}",
         "policies": [],
     }
     for task in best.tasks:
@@ -65,30 +73,85 @@ def export_best(sweep: Sweep, stage: str | None, output: Path) -> dict[str, Any]
             "folder": str(folder.absolute()),
         }
         chosen["policies"].append(policy)
-        about = {key: value for key, value in chosen.items() if key != "policies"}
-        _export(sweep, run, folder, about | policy)
+        shared = {key: value for key, value in chosen.items() if key != "policies"}
+        _export(sweep, run, folder, shared | policy)
     return chosen
 
 
-def _best(sweep: Sweep, stage: str | None) -> tuple[Condition, str]:
+def _best(sweep: Sweep, stage: str | None) -> tuple[Condition, dict[str, Any]]:
     """The condition, and what it is the best by."""
-    stages = [one.name for one in sweep.config.stages]
-    wanted = stage or stages[-1]
-    if wanted not in stages:
-        raise BadInputError(f"--stage must be one of {', '.join(stages)}, got {wanted!r}")
-    found = [one for one in conditions(sweep.plan, sweep.results()) if one.stage == wanted]
-    if not found:
+    known = {one.name: one for one in sweep.config.stages}
+    wanted = stage or list(known)[-1]
+    if wanted not in known:
+        raise BadInputError(f"--stage must be one of {', '.join(known)}, got {wanted!r}")
+    results = sweep.results()
+    measure = measure_of(known[wanted], sweep.plan, results)
+    of_stage = conditions(sweep.plan, results, measure.metric)
+    of_stage = [one for one in of_stage if one.stage == wanted]
+    settings = known[wanted].search
+    if settings is not None:
+        return _best_trial(sweep, wanted, settings.objectives[0], of_stage)
+    best = best_of(of_stage, measure)
+    if best is None:
         raise BadInputError(
-            f"SWEEP must have a finished run of stage {wanted}, {sweep.config.name} has none"
+            f"SWEEP must have a finished run of stage {wanted} that reported {measure.metric}, "
+            f"{sweep.config.name} has none"
         )
-    for search in records.read(sweep.storage, f"{sweep.config.name}/{records.SEARCH}") or ():
-        if search["stage"] == wanted and search["ranking"]:
-            values = search["ranking"][0]["values"]
-            first = [one for one in found if one.part == "final" and dict(one.values) == values]
-            if first:
-                return first[0], str(search["objectives"][0]["name"])
-    ranked = [one for one in found if one.part == "final"] or found
-    return max(ranked, key=lambda one: float(one.estimate().value)), "success rate"
+    ends = best.estimate()
+    return best, {
+        "by": "success rate" if measure.metric == names.EVAL_SUCCESS else measure.metric,
+        "metric": measure.metric,
+        "direction": "maximize",
+        "value": float(ends.value),
+        "interval": [float(ends.lower), float(ends.upper)],
+    }
+
+
+def _best_trial(
+    sweep: Sweep, stage: str, objective: Objective, found: Sequence[Condition]
+) -> tuple[Condition, dict[str, Any]]:
+    """What the stage's search itself holds to be the best."""
+    search = _search_of(sweep, stage)
+    first = None if search is None else leader(search)
+    if first is None:
+        raise BadInputError(
+            f"SWEEP must have a judged trial of stage {stage}, {sweep.config.name} has none"
+        )
+    part = "final" if first.fresh else "search"
+    best = [one for one in found if one.part == part and dict(one.values) == first.values]
+    if not best:
+        raise BadInputError(
+            f"SWEEP must have the runs of its best trial, {first.trial} of stage {stage}: "
+            f"{redact(sweep.storage)} has none of them"
+        )
+    ends = interval(objective, np.asarray(first.scores, float))
+    direction = "maximize" if objective.maximised else "minimize"
+    return best[0], {
+        "by": f"{objective.label} ({direction})",
+        "trial": first.trial,
+        "metric": objective.label,
+        "direction": direction,
+        "value": first.value,
+        "interval": [float(ends.lower), float(ends.upper)],
+    }
+
+
+def _search_of(sweep: Sweep, stage: str) -> Mapping[str, Any] | None:
+    """What came of a search: with its ranking once it is over, and as far as it is before."""
+    state = records.read(sweep.storage, f"{sweep.config.name}/{records.STATE}") or {}
+    ended = records.read(sweep.storage, f"{sweep.config.name}/{records.SEARCH}") or ()
+    now = [search for search in state.get("searches", ()) if search["stage"] == stage]
+    then = [search for search in ended if search["stage"] == stage]
+    # That of the end is older than a search that goes on, as one that has been extended does.
+    return next(iter(now if now and not now[0]["complete"] else [*then, *now]), None)
+
+
+def _success(sweep: Sweep, best: Condition) -> float | None:
+    """Its success rate, whatever it is the best by."""
+    for one in conditions(sweep.plan, sweep.results()):
+        if (one.stage, one.part, one.values) == (best.stage, best.part, best.values):
+            return float(one.estimate().value)
+    return None
 
 
 def _middle(best: Condition, task: str) -> Run | None:

@@ -13,7 +13,7 @@ from music_rllib.experiment.model import Stage, SweepConfig
 from music_rllib.experiment.plan import node_key, short
 from music_rllib.experiment.space import Rung, SearchSettings
 from music_rllib.reports.statistics import probability_of_improvement
-from music_rllib.search.judge import interval
+from music_rllib.search.judge import aggregate, interval
 from music_rllib.search.studies import DATABASE_ERRORS, REASON, SCORES, VALUES, Study, open_studies
 from music_rllib.sweep.campaign import Arm, Campaign, Finalist, Search, ranked
 from music_rllib.sweep.session import Sweep
@@ -139,7 +139,7 @@ def _search(search: Search, thorough: bool) -> dict[str, Any]:
         ],
         "storage": None if settings.storage is None else redact(settings.storage),
         "arms": arms,
-        "ranking": _ranking(settings, finalists) if thorough else [],
+        "ranking": _ranking(settings, finalists) if thorough else _order(settings, finalists),
         "complete": all(one.scores is not None or one.failure for one in finalists)
         and all(arm.finalists is not None for arm in search.arms),
     }
@@ -221,6 +221,24 @@ def importance(study: Study, settings: SearchSettings) -> dict[str, float]:
     except (ValueError, RuntimeError):  # no setting that all trials have, or no variance
         return {}
     return {name: float(share) for name, share in found.items()}
+
+
+def _order(settings: SearchSettings, finalists: Sequence[Finalist]) -> list[dict[str, Any]]:
+    """The ranking without what takes a while: intervals and comparisons."""
+    rows: list[dict[str, Any]] = [
+        {
+            "trial": one.number,
+            "values": dict(one.values),
+            "fresh": [
+                aggregate(objective, scores)
+                for objective, scores in zip(settings.objectives, one.scores, strict=True)
+            ],
+            "scores": [scores.tolist() for scores in one.scores],
+        }
+        for one in finalists
+        if one.scores is not None
+    ]
+    return sorted(rows, key=lambda row: row["fresh"][0], reverse=settings.objectives[0].maximised)
 
 
 def _ranking(settings: SearchSettings, finalists: Sequence[Finalist]) -> list[dict[str, Any]]:

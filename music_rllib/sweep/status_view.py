@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from music_rllib.experiment.plan import short
-from music_rllib.sweep.tables import with_interval
+from music_rllib.sweep.judgement import best_in_words
 from music_rllib.sweep.words import clock, percent
 
 __all__ = ["status_view"]
@@ -31,7 +31,7 @@ def status_view(state: Mapping[str, Any]) -> RenderableType:
     done, left = state["env_steps"]["done"], state["env_steps"]["left"]
     parts.append(Text(f"Budget: {done:,} env steps spent, {left:,} left of what is known so far"))
     if state["best"] is not None:
-        parts.append(Text(_best(state["best"])))
+        parts.append(Text(f"Best so far: {best_in_words(state['best'])}"))
     parts += [_search(search) for search in state["searches"]]
     parts += [
         Text(
@@ -70,15 +70,6 @@ def _stages(state: Mapping[str, Any]) -> Table:
             *(str(runs.get(name, 0)) for name in shown),
         )
     return table
-
-
-def _best(best: Mapping[str, Any]) -> str:
-    values = ", ".join(f"{name} = {short(value)}" for name, value in best["values"].items())
-    fresh = " on fresh seeds" if best["on_fresh_seeds"] else ""
-    return (
-        f"Best so far: {best['stage']} {values}: success "
-        f"{with_interval(best['value'], best['interval'])}, {best['runs']} runs{fresh}"
-    )
 
 
 def _search(search: Mapping[str, Any]) -> Text:

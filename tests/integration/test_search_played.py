@@ -25,7 +25,11 @@ from optuna.exceptions import StorageInternalError
 
 from music_rllib.experiment.settings import RunSettings
 from music_rllib.experiment.space import FINAL_SEED
+from music_rllib.sweep import cli, records
+from music_rllib.sweep.beacon import Beacon
 from music_rllib.sweep.board import Status
+from music_rllib.sweep.searches import outcome
+from music_rllib.sweep.session import keep_record
 from music_rllib.tracking import names
 from tests.played_search import SPACE, Document, Driver, document, points, searched, success
 
@@ -256,6 +260,90 @@ def test_importance_names_what_matters(tmp_path: Path) -> None:
     (arm,) = driver.outcome()["arms"]
     assert next(iter(arm["importance"])) == "tac.entropic_index"
     assert sum(arm["importance"].values()) == pytest.approx(1.0)
+
+
+def recorded(folder: Path, content: Document) -> Driver:
+    """The sweep as a later driver finds it, and its files as a driver's end leaves them."""
+    driver = Driver(folder, content)
+    driver.campaign.advance()
+    keep_record(driver.sweep)
+    with Beacon(driver.sweep) as beacon:
+        beacon.searches = lambda: outcome(driver.campaign, thorough=False)
+        beacon.end("stopped")
+    if driver.campaign.over:
+        records.keep(driver.sweep, records.SEARCH, records.as_json(outcome(driver.campaign)))
+    return driver
+
+
+def answered(capsys: pytest.CaptureFixture[str], *arguments: str) -> Document:
+    capsys.readouterr()
+    code = cli.main([*arguments, "--json"])
+    output, errors = capsys.readouterr()
+    assert code == 0, errors
+    found: Document = json.loads(output)
+    return found
+
+
+LOWEST: Document = {
+    "space": {"tac.entropic_index": {"choice": [1.0, 1.5, 2.0, 2.5]}},
+    "sampler": "grid",
+    "trials": None,
+    "concurrent": 4,
+    "objective": {"direction": "minimize"},
+}
+
+
+def test_best_and_status_judge_as_the_search_does(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Without a final ranking, with an objective that is to be low, and a lucky half of a trial."""
+
+    def formula(run: RunSettings, share: float) -> float:
+        lucky = run.tac.entropic_index == 2.5
+        return 0.01 if lucky else 0.2 * float(run.tac.entropic_index) + 0.01 * run.seed  # type: ignore[arg-type]
+
+    driver = Driver(tmp_path, document(LOWEST), formula)
+    driver.play(stop_after=3 + 3 * 3 + 1, slots=1)
+    (begun,) = [trial for trial in driver.trials() if trial["state"] != "judged"]
+    assert begun["values"] == {"tac.entropic_index": 2.5}
+    assert any(
+        run.key in driver.sweep.finished
+        for run in driver.sweep.plan.runs
+        if run.part == f"trial{begun['number']}"
+    ), "one seed of it is finished"
+    recorded(tmp_path, document(LOWEST))
+    place = str(tmp_path / "results/s")
+    best = answered(capsys, "status", place)["best"]
+    assert best["values"] == {"tac.entropic_index": 1.0}
+    assert (best["direction"], best["runs"]) == ("minimize", 3)
+    assert best["value"] == pytest.approx(0.21)
+    chosen = answered(capsys, "best", place, "--output", str(tmp_path / "out"))
+    assert chosen["values"] == {"tac.entropic_index": 1.0}
+    said = "finetune: tac.entropic_index = 1 is first by iqm of evaluation/success_rate (minimize)"
+    assert chosen["why"].startswith(said)
+    compared = answered(capsys, "compare", place)
+    assert compared["direction"] == "minimize"
+
+
+def test_the_best_is_the_first_on_fresh_seeds_once_the_ranking_is_there(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def formula(run: RunSettings, share: float) -> float:
+        q = float(run.tac.entropic_index)  # type: ignore[arg-type]
+        return 0.3 - 0.1 * q if run.seed < FINAL_SEED else 0.1 * q
+
+    search = LOWEST | {"final": {"trials": 2, "seeds": 2}}
+    driver = Driver(tmp_path, document(search), formula)
+    driver.play()
+    recorded(tmp_path, document(search))
+    place = str(tmp_path / "results/s")
+    best = answered(capsys, "status", place)["best"]
+    chosen = answered(capsys, "best", place, "--output", str(tmp_path / "out"))
+    # 2.5 was the lowest in the search; of the two that were ranked 2.0 is lower on fresh seeds.
+    for found in (best, chosen):
+        assert found["values"] == {"tac.entropic_index": 2.0}
+        assert found["on_fresh_seeds"]
+        assert found["value"] == pytest.approx(0.2)
 
 
 # --- comparing, extending, learning from others ------------------------------------------------

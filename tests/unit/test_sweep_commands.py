@@ -89,9 +89,16 @@ def opened(storage: str, tmp_path: Path, **changes: Any) -> Sweep:
     return sweep
 
 
-def finish(sweep: Sweep, beacon: Beacon, node: Node, success: float, folder: Path) -> None:
+def finish(
+    sweep: Sweep,
+    beacon: Beacon,
+    node: Node,
+    value: float,
+    folder: Path,
+    metric: str = names.EVAL_SUCCESS,
+) -> None:
     """As if the run had been trained."""
-    metrics = {names.EVAL_SUCCESS: success}
+    metrics = {metric: value}
     report = Report(env_steps=4000, seconds=1.0, timestamp_ms=1, metrics=metrics)
     folder.mkdir(exist_ok=True)
     (folder / HISTORY).write_bytes(to_json_lines([report]))
@@ -178,6 +185,60 @@ def test_best_takes_the_middle_run_of_the_best_condition(
     assert policy["node"] in sweep.finished
     again = program("best", f"{storage}/mine", "--output", "out")
     assert (again.code, "first by success rate" in again.output) == (0, True)
+
+
+def test_a_condition_with_all_its_runs_is_better_than_a_lucky_one(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    sweep = opened(storage, tmp_path)
+    heights = {1.0: 0.2, 1.5: 0.3, 2.0: 0.99}
+
+    def play(beacon: Beacon, *cells: tuple[float, int]) -> None:
+        for node in sweep.plan.nodes:
+            q = float(node.run.tac.entropic_index)  # type: ignore[arg-type]
+            if (q, node.run.seed) in cells:
+                finish(sweep, beacon, node, heights[q], tmp_path / "made")
+
+    with Beacon(sweep) as beacon:
+        play(beacon, (2.0, 0))
+        beacon.end("stopped")
+    assert (
+        "1 of 3 runs (no condition has all of its runs yet)"
+        in program("status", f"{storage}/mine").output
+    )
+    lucky = program("best", f"{storage}/mine", "--output", "lucky", "--json").document
+    assert lucky["values"] == {"tac.entropic_index": 2.0}
+    assert "over 1 runs, of 3 planned: no condition has all of its runs" in lucky["why"]
+    with Beacon(sweep) as beacon:
+        beacon.reused(next(n for n in sweep.plan.nodes if n.key in sweep.finished))
+        play(beacon, (1.0, 0), (1.5, 0), (1.5, 1), (1.5, 2))
+        beacon.end("stopped")
+    whole = program("best", f"{storage}/mine", "--output", "whole", "--json").document
+    assert whole["values"] == {"tac.entropic_index": 1.5}
+    state = program("status", f"{storage}/mine", "--json").document
+    assert (state["best"]["values"], state["best"]["runs"]) == (whole["values"], 3)
+
+
+def test_tasks_without_success_are_judged_by_their_return(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    sweep = opened(storage, tmp_path)
+    with Beacon(sweep) as beacon:
+        for node in list(sweep.plan.nodes):
+            height = -HEIGHTS[float(node.run.tac.entropic_index)]  # type: ignore[arg-type]
+            finish(sweep, beacon, node, height, tmp_path / "made", names.EVAL_RETURN)
+        beacon.end("finished")
+    place = f"{storage}/mine"
+    document = program("compare", place, "--json").document
+    assert document["metric"] == names.EVAL_RETURN
+    assert document["groups"][0]["conditions"][0]["values"] == {"tac.entropic_index": 1.0}
+    chosen = program("best", place, "--output", "out", "--json").document
+    assert chosen["values"] == {"tac.entropic_index": 1.0}
+    assert (chosen["metric"], chosen["value"]) == (names.EVAL_RETURN, pytest.approx(-0.2))
+    assert chosen["success_rate"] is None
+    assert "first by evaluation/episode_return" in chosen["why"]
+    shown = program("status", place).output
+    assert "Best so far: train tac.entropic_index = 1: evaluation/episode_return -0.2" in shown
 
 
 def test_clean_lists_and_deletes_what_no_other_sweep_has(

@@ -25,7 +25,8 @@ def register(commands: Commands) -> None:
         "best",
         help="export the winning policy with its configuration",
         description="Export the policy of the best condition, with its configuration and how it "
-        "was chosen. After a search that is the first of the ranking on fresh seeds.",
+        "was chosen. After a search that is the first of the ranking on fresh seeds, and the best "
+        "judged trial where there is no ranking yet.",
         epilog=EPILOG,
     )
     add_place(parser)

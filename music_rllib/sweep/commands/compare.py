@@ -42,11 +42,13 @@ def register(commands: Commands) -> None:
     parser.add_argument("--stage", help="Of which stage; the last one by default.")
     parser.add_argument(
         "--metric",
-        default="evaluation/success_rate",
-        help="A run's last value of it (%(default)s).",
+        help="A run's last value of it. Without it: what a searched stage's objective reads, else "
+        "evaluation/success_rate, or evaluation/episode_return where tasks have no success.",
     )
     parser.add_argument(
-        "--minimize", action="store_true", help="The metric is better where it is lower."
+        "--minimize",
+        action="store_true",
+        help="The metric is better where it is lower, as that of an objective that says so is.",
     )
     add_json(parser)
     parser.set_defaults(execute=_execute)
@@ -56,17 +58,21 @@ def _execute(arguments: argparse.Namespace) -> int:
     from music_rllib.sweep.compare_view import compare_view
     from music_rllib.sweep.conditions import compared, conditions
     from music_rllib.sweep.find import find_sweep
+    from music_rllib.sweep.judgement import measure_of
 
     found = find_sweep(arguments.sweep, arguments.storage)
     sweep = found.open()
-    stages = [stage.name for stage in sweep.config.stages]
-    stage = arguments.stage or stages[-1]
+    stages = {stage.name: stage for stage in sweep.config.stages}
+    stage = arguments.stage or list(stages)[-1]
     if stage not in stages:
         raise BadInputError(f"--stage must be one of {', '.join(stages)}, got {stage!r}")
     results = sweep.results()
-    everything = conditions(sweep.plan, results, arguments.metric)
+    measure = measure_of(stages[stage], sweep.plan, results)
+    metric = arguments.metric or measure.metric
+    maximised = not arguments.minimize and (measure.maximised or metric != measure.metric)
+    everything = conditions(sweep.plan, results, metric)
     of_stage = [one for one in everything if one.stage == stage]
-    if not of_stage and results:
+    if not of_stage and results and arguments.metric is not None:
         known = sorted({name for result in results.values() for name in result.metrics})
         if arguments.metric not in known:
             raise BadInputError(
@@ -74,15 +80,14 @@ def _execute(arguments: argparse.Namespace) -> int:
             )
     groups: list[dict[str, Any]] = []
     for part, title in (("", ""), ("final", "on fresh seeds"), ("search", "in the search")):
-        rows = compared(
-            [one for one in of_stage if one.part == part], maximised=not arguments.minimize
-        )
+        rows = compared([one for one in of_stage if one.part == part], maximised=maximised)
         if rows:
             groups.append({"part": title, "conditions": rows, "verdict": verdict(rows, part)})
     document = {
         "sweep": found.name,
         "stage": stage,
-        "metric": arguments.metric,
+        "metric": metric,
+        "direction": "maximize" if maximised else "minimize",
         "groups": groups,
     }
     if arguments.json:
