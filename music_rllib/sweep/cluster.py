@@ -14,7 +14,7 @@ from music_rllib._quiet import quiet_third_parties
 from music_rllib.experiment.model import Resources
 from music_rllib.sweep.local import ClusterError, check_cpus, cluster_address
 
-__all__ = ["cluster", "slots"]
+__all__ = ["check_fits", "cluster", "slots"]
 
 OBJECT_STORE_BYTES = 128 * 2**20
 """Enough, as reports are all that workers send; Ray's default takes a third of the memory."""
@@ -53,6 +53,18 @@ def cluster(resources: Resources) -> Iterator[int]:
         yield _slots(resources)
     finally:
         ray.shutdown()
+
+
+def check_fits(resources: Resources) -> None:
+    """Ask Ray, where that can't be known without it, whether it can hold a run.
+
+    Raises:
+        ClusterError: It can't be reached, or can't.
+    """
+    more = set(resources.bundle) - {"CPU"}
+    if more or (cluster_address() is not None and resources.cpus_per_run > 1):
+        with cluster(resources):
+            pass
 
 
 def _slots(resources: Resources) -> int:

@@ -24,6 +24,7 @@ from music_rllib.sweep.frame import FAILED, BadInputError
 from music_rllib.sweep.listener import Listener
 from music_rllib.sweep.local import (
     check_cpus,
+    check_memory_and_gpus,
     check_reachable,
     cluster_address,
 )
@@ -167,6 +168,7 @@ def _show(
 ) -> int:
     """Check everything and show the plan, and if asked what it takes."""
     opened = _open(console, config)
+    _check_searches(opened)
     changes = changes_since(opened)
     if changes is not None:
         console.print(Text(str(changes), style="yellow"), soft_wrap=True)
@@ -218,19 +220,37 @@ def plan_answer(opened: Sweep, changes: Changes | None = None) -> dict[str, Any]
 
 def _drive(console: Console, opened: Sweep) -> int:
     """Run a sweep that nobody else drives."""
-    keep_record(opened)
-    keep_settings(opened)
+    # All that may refuse it comes before it is recorded as a sweep that was begun.
     import_checkpoints(opened.plan, opened.store)
     verify_inputs(opened.board, opened.store)
-    if not opened.board.complete and (address := cluster_address()) is not None:
-        check_reachable(address)
-    if opened.plan.searched:
-        from music_rllib.sweep.searches import check_storages
-
-        check_storages(opened.config)
+    _check_searches(opened)
+    _check_ray(opened)
     tracker = _open_tracker(opened)
     with tracker:
+        keep_record(opened)
+        keep_settings(opened)
         return _compute_and_report(console, opened, tracker)
+
+
+def _check_searches(opened: Sweep) -> None:
+    if opened.plan.searched:
+        from music_rllib.sweep.searches import check_studies
+
+        check_studies(opened)
+
+
+def _check_ray(opened: Sweep) -> None:
+    """Look whether Ray is there and can hold a run, unless nothing is left to compute."""
+    begun = (opened.folder / records.CONFIG).is_file()
+    if opened.board.complete and (begun or not opened.plan.searched):
+        return
+    if (address := cluster_address()) is not None:
+        check_reachable(address)
+    from music_rllib.sweep.cluster import check_fits
+
+    check_fits(opened.config.resources)
+    early.install()  # Ray has set a handler of its own
+    early.check()
 
 
 def _open(console: Console, config: SweepConfig) -> Sweep:
@@ -242,6 +262,7 @@ def _open(console: Console, config: SweepConfig) -> Sweep:
     if cluster_address() is None:
         check_hardware(plan)
     check_cpus(config.resources)
+    check_memory_and_gpus(config.resources)
     storage, remark = resolve_storage(config.storage)
     opened = open_sweep(config, plan, storage, sweep_folder(storage, config.name))
     console.print(plan_view(config, plan, opened.finished))

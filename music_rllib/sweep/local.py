@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+import math
 import os
 import socket
+from pathlib import Path
+
+import psutil
 
 from music_rllib.experiment.model import Resources
 
-__all__ = ["ClusterError", "check_cpus", "check_reachable", "cluster_address"]
+__all__ = [
+    "ClusterError",
+    "check_cpus",
+    "check_memory_and_gpus",
+    "check_reachable",
+    "cluster_address",
+]
 
 
 REACH_SECONDS = 5.0
@@ -60,3 +70,47 @@ def check_cpus(resources: Resources) -> int | None:
                 f"resources.{name} must be <= {here}, the CPUs of this machine, got {asked}"
             )
     return resources.num_cpus
+
+
+MEMORY_LIMITS = ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory.max")
+"""Where a container's limit is, of either version of cgroups."""
+
+
+def check_memory_and_gpus(resources: Resources) -> None:
+    """Look whether this machine has at all what a run reserves, where runs are to run on it.
+
+    Raises:
+        ClusterError: It hasn't.
+    """
+    if cluster_address() is not None:
+        return
+    memory, gpus = resources.memory_per_run, resources.gpus_per_run
+    if memory is not None and memory > (here := _memory() / 2**30):
+        raise ClusterError(
+            f"resources.memory_per_run must be <= {math.floor(here * 10) / 10:g}, the GiB of "
+            f"memory of this machine, got {memory:g}"
+        )
+    if gpus and gpus > (count := _gpus()):
+        raise ClusterError(
+            f"resources.gpus_per_run must be <= {count}, the GPUs of this machine that PyTorch "
+            f"can use, got {gpus:g}"
+        )
+
+
+def _memory() -> int:
+    """Bytes of this machine's memory, or of this container's."""
+    found = [int(psutil.virtual_memory().total)]
+    for place in MEMORY_LIMITS:
+        try:
+            text = Path(place).read_text().strip()
+        except OSError:
+            continue
+        if text.isdecimal():  # or "max"
+            found.append(int(text))
+    return min(found)
+
+
+def _gpus() -> int:
+    import torch  # only where a sweep asks for GPUs
+
+    return torch.cuda.device_count()

@@ -2,24 +2,37 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import optuna
 from optuna.trial import FrozenTrial, TrialState
+from sqlalchemy.engine import make_url
+from sqlalchemy.exc import ArgumentError
 
-from music_rllib.experiment.model import Stage, SweepConfig
+from music_rllib.experiment.model import Stage
 from music_rllib.experiment.plan import node_key, short
-from music_rllib.experiment.space import Rung, SearchSettings
+from music_rllib.experiment.sealed import StorageError
+from music_rllib.experiment.space import Rung, SearchSettings, WarmStart
 from music_rllib.reports.statistics import probability_of_improvement
 from music_rllib.search.judge import aggregate, interval
-from music_rllib.search.studies import DATABASE_ERRORS, REASON, SCORES, VALUES, Study, open_studies
+from music_rllib.search.studies import (
+    DATABASE_ERRORS,
+    REASON,
+    SCORES,
+    VALUES,
+    Study,
+    open_studies,
+    study_names,
+)
 from music_rllib.sweep.campaign import Arm, Campaign, Finalist, Search, ranked
 from music_rllib.sweep.session import Sweep
 from music_rllib.tracking.redaction import redact
 
-__all__ = ["check_storages", "open_searches", "outcome"]
+__all__ = ["check_studies", "open_searches", "outcome"]
 
 STUDY_FILE = "study.db"
 """In the sweep's folder."""
@@ -27,17 +40,64 @@ IMPORTANCE_TRIALS = 4
 """Judged trials from which on the importance of settings is estimated."""
 
 
-def check_storages(config: SweepConfig) -> None:
-    """Reach the databases that searches name.
+def check_studies(sweep: Sweep) -> None:
+    """Reach the databases that searches name, and look for the studies that they learn from.
+
+    No sqlite file is made, so that a sweep that is only planned leaves none.
 
     Raises:
-        StorageError: One can't be used.
+        StorageError: One can't be used, or there is no such study.
     """
-    for stage in config.stages:
-        if stage.search is not None:
-            for url in (stage.search.storage, (stage.search.warm_start or stage.search).storage):
-                if url is not None:
-                    open_studies(url)
+    above: list[tuple[str, str]] = []
+    for stage in sweep.plan.searched:
+        settings = stage.search
+        assert settings is not None
+        own = settings.storage or str(sweep.folder / STUDY_FILE)
+        if settings.storage is not None:
+            _check_database(settings.storage)
+        if (warm := settings.warm_start) is not None:
+            # Those of the stages above are made before this one's.
+            made = [name for name, place in above if place == (warm.storage or own)]
+            if not any(name.startswith(warm.study) or warm.study.startswith(name) for name in made):
+                _check_warm_start(warm, own)
+        above.append((f"{settings.study or sweep.config.name}/{stage.name}", own))
+
+
+def _check_database(url: str) -> None:
+    file = _sqlite_file(url)
+    if file is None or file.exists():
+        open_studies(url)
+    elif not os.access(file.absolute().parent, os.W_OK | os.X_OK):
+        raise StorageError(
+            f"search.storage must be in a folder that can be written, got {redact(url)}"
+        )
+
+
+def _check_warm_start(warm: WarmStart, own: str) -> None:
+    file = _sqlite_file(warm.storage or own)
+    there = file is None or file.exists()
+    if not there and warm.storage is not None:
+        raise StorageError(
+            f"search.warm_start.storage must be a database that exists, got {redact(warm.storage)}"
+        )
+    known = study_names(open_studies(warm.storage or own)) if there else []
+    if not any(name.startswith(warm.study) for name in known):
+        raise StorageError(
+            "search.warm_start.study must be (the beginning of) one of "
+            f"{', '.join(known) or 'none'}, got {warm.study!r}"
+        )
+
+
+def _sqlite_file(url: str) -> Path | None:
+    """The file of a sqlite database; None for any other, and for what is no database's name."""
+    if "://" not in url:
+        return Path(url)
+    try:
+        parsed = make_url(url)
+    except ArgumentError:
+        return None  # to open it says what is wrong
+    in_file = parsed.get_backend_name() == "sqlite" and parsed.database not in (None, ":memory:")
+    return Path(str(parsed.database)) if in_file else None
 
 
 def open_searches(sweep: Sweep) -> list[Search]:

@@ -158,6 +158,86 @@ def test_bad_input_is_refused_before_anything_starts(
     assert not (tmp_path / "results" / "nodes").exists()
 
 
+SPACE: Document = {"tac.alpha": {"float": [0.01, 0.5]}}
+
+
+def searched(**search: Any) -> Document:
+    of_stage = {"name": "a", "variant": "tac", "search": {"space": SPACE, "trials": 2} | search}
+    return document(stages=[of_stage])
+
+
+REFUSED: list[tuple[Document, str]] = [
+    (
+        searched(storage="postgresql://me@127.0.0.1:9/studies"),
+        "search.storage must be a database that can be used, got postgresql://127.0.0.1:9",
+    ),
+    (
+        searched(storage="sqlite:///nowhere/studies.db"),
+        "search.storage must be in a folder that can be written, got sqlite:///nowhere/studies.db",
+    ),
+    (
+        searched(warm_start={"study": "older/a"}),
+        "search.warm_start.study must be (the beginning of) one of none, got 'older/a'",
+    ),
+    (
+        searched(warm_start={"study": "older/a", "storage": "sqlite:///older.db"}),
+        "search.warm_start.storage must be a database that exists, got sqlite:///older.db",
+    ),
+    (
+        document(resources={"num_cpus": 1, "memory_per_run": 1e6}),
+        "resources.memory_per_run must be <= ",
+    ),
+    (
+        document(resources={"num_cpus": 1, "gpus_per_run": 64}),
+        "resources.gpus_per_run must be <= ",
+    ),
+    (document(mlflow={"tracking_uri": "http://127.0.0.1:9"}), "an MLflow server that answers"),
+    (from_checkpoint(Path("nowhere")), "nowhere must hold a handoff"),
+]
+
+
+@pytest.mark.parametrize(("bad", "message"), REFUSED, ids=[message[:30] for _, message in REFUSED])
+def test_a_refused_sweep_is_not_recorded(
+    program: Program, tmp_path: Path, bad: Document, message: str
+) -> None:
+    result = program(bad)
+    assert (result.exit_code, message in result.stderr) == (2, True), result.stderr
+    left = [path.name for path in (tmp_path / "results").rglob("*") if path.is_file()]
+    assert not {*left} & {"config.json", "plan.json", "settings.json", "state.json"}
+    assert not list(tmp_path.rglob("*.db"))
+
+
+@pytest.mark.parametrize("command", [("plan",), ("run", "--dry-run")])
+@pytest.mark.parametrize(
+    ("bad", "message"), REFUSED[:-2], ids=[message[:30] for _, message in REFUSED[:-2]]
+)
+def test_a_plan_is_refused_as_its_sweep_would_be(
+    program: Program, tmp_path: Path, command: tuple[str, ...], bad: Document, message: str
+) -> None:
+    (tmp_path / "sweep.yaml").write_text(yaml.safe_dump(bad))
+    result = program(None, command[0], "sweep.yaml", *command[1:])
+    assert (result.exit_code, message in result.stderr) == (2, True), result.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["sweep.yaml"]
+
+
+def test_a_refused_configuration_does_not_replace_the_one_that_ran(
+    program: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(driver, "_compute_and_report", lambda *_: 0)
+    assert program(document()).exit_code == 0
+    before = (tmp_path / "results/s/config.json").read_text()
+    other = document(seeds=[7], mlflow={"tracking_uri": "http://127.0.0.1:9"})
+    assert program(other).exit_code == 2
+    assert (tmp_path / "results/s/config.json").read_text() == before
+
+
+def test_a_search_may_learn_from_a_stage_above_it(program: Program) -> None:
+    """Its study is made with the sweep's own."""
+    first = searched()["stages"][0]
+    second = searched(warm_start={"study": "s/a"})["stages"][0] | {"name": "b"}
+    assert program(document(stages=[first, second]), "--dry-run").exit_code == 0
+
+
 def test_files_that_are_none(program: Program, tmp_path: Path) -> None:
     result = program(None, "missing.yaml")
     assert (result.exit_code, "missing.yaml: must be an existing file" in result.stderr) == (
