@@ -81,7 +81,8 @@ class Plan:
         self.seeds = tuple(seeds)
         self.runs: list[Run] = []
         self.trials: list[dict[str, Any]] = []
-        """What `add_trial` was called with, as plain data."""
+        """What `add_trial` was called with, each once, as plain data."""
+        self._asked: set[str] = set()
         self._known: set[tuple[str, str]] = set()
         self._nodes: dict[str, Node] = {}
         self._by_cell: dict[tuple[str, int, str, int], Run] = {}
@@ -162,15 +163,16 @@ class Plan:
                 )
                 self._add(run, settings, node_input)
                 runs.append(run)
-        self.trials.append(
-            {
-                "stage": stage,
-                "trial": trial,
-                "values": dict(values),
-                "seeds": list(seeds),
-                "part": part,
-            }
-        )
+        asked = {
+            "stage": stage,
+            "trial": trial,
+            "values": dict(values),
+            "seeds": list(seeds),
+            "part": part,
+        }
+        if repr(asked) not in self._asked:
+            self._asked.add(repr(asked))
+            self.trials.append(asked)
         return runs
 
     def _trial_input(

@@ -134,12 +134,18 @@ class Campaign(Listener):
     # -- going on ----------------------------------------------------------------------------
 
     def recall(self) -> None:
-        """Put the runs of trials that have ended before this driver began into the plan."""
+        """Put the runs of trials that have ended before this driver began into the plan.
+
+        Those that other drivers have judged since are among them when it is done again.
+        """
         for search in self.searches:
-            for arm in search.arms:
-                for trial in arm.study.trials():
-                    if trial.state.is_finished() and VALUES in trial.user_attrs:
-                        self._recall(search, arm, trial)
+            self._recall_trials(search)
+
+    def _recall_trials(self, search: Search) -> None:
+        for arm in search.arms:
+            for trial in arm.study.trials():
+                if trial.state.is_finished() and VALUES in trial.user_attrs:
+                    self._recall(search, arm, trial)
 
     def _recall(self, search: Search, arm: Arm, trial: FrozenTrial) -> None:
         reached = [int(rung) for rung in trial.user_attrs.get(SCORES, {})]
@@ -214,11 +220,13 @@ class Campaign(Listener):
         )
 
     def stop(self) -> None:
-        """This driver ends: let others, or a later one, have its trials."""
+        """This driver ends: let others, or a later one, have its trials, and know of theirs."""
         for search in self.searches:
             for arm in search.arms:
                 with contextlib.suppress(*DATABASE_ERRORS):  # they are taken over in any case
                     arm.study.release()
+        with contextlib.suppress(*DATABASE_ERRORS):  # the plan lacks what others have judged
+            self.recall()
 
     def _advance(self, search: Search) -> bool:
         moved = False
@@ -234,6 +242,7 @@ class Campaign(Listener):
                 moved = True
                 self._begin(search, arm, trial)
         if all(arm.finalists is None and arm.over for arm in search.arms):
+            self._recall_trials(search)
             for arm in search.arms:
                 arm.finalists = self._choose(search, arm)
             moved = True

@@ -433,6 +433,48 @@ def test_settings_of_the_pretraining_can_be_searched_and_are_shared(tmp_path: Pa
     assert len([run for run in driver.sweep.plan.runs if run.part]) == 6 * 3
 
 
+def play_in_turns(*drivers: Driver) -> None:
+    """Until all of them say that the search is over."""
+    for _ in range(200):
+        for driver in drivers:
+            try:
+                driver.play(stop_after=len(driver.computed) + 2)
+            except AssertionError:
+                continue  # it waits for what another one judges
+        if all(driver.campaign.over for driver in drivers):
+            return
+    raise AssertionError("it does not end")
+
+
+def parts_computed(driver: Driver) -> set[str]:
+    nodes = (driver.sweep.plan.node(piece.partition("/")[0]) for piece in driver.computed)
+    return {node.part for node in nodes if node.part}
+
+
+def test_two_sweeps_with_one_study_and_storage_know_all_of_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    database = f"sqlite:///{tmp_path}/shared.db"
+    search = {"storage": database, "study": "together", "trials": 8, "concurrent": 3}
+    drivers = [Driver(tmp_path, document(search, name=name)) for name in ("one", "other")]
+    for driver in drivers:
+        keep_record(driver.sweep)
+    play_in_turns(*drivers)
+    for driver in drivers:
+        driver.campaign.stop()
+        assert parts_computed(driver)
+        with Beacon(driver.sweep) as beacon:
+            beacon.searches = lambda driver=driver: outcome(driver.campaign, thorough=False)
+            beacon.end("finished")
+        place = str(driver.sweep.folder)
+        state = answered(capsys, "status", place)
+        assert state["stages"][1]["trials"] == 8
+        (group,) = answered(capsys, "compare", place)["groups"]
+        assert sum(row["runs"] for row in group["conditions"]) == 8 * 3
+        trials = json.loads((driver.sweep.folder / "plan.json").read_text())["trials"]
+        assert len(trials) == len({json.dumps(trial) for trial in trials})
+
+
 def test_two_drivers_share_a_study(tmp_path: Path) -> None:
     database = f"sqlite:///{tmp_path}/shared.db"
     search = {"storage": database, "study": "together", "trials": 10, "concurrent": 3}
@@ -440,20 +482,16 @@ def test_two_drivers_share_a_study(tmp_path: Path) -> None:
         (tmp_path / folder).mkdir()
     one = Driver(tmp_path / "one", document(search))
     other = Driver(tmp_path / "other", document(search), seed=1)
-    for _ in range(200):
-        for driver in (one, other):
-            try:
-                driver.play(stop_after=len(driver.computed) + 2)
-            except AssertionError:
-                continue  # it waits for what the other one judges
-        if one.campaign.over and other.campaign.over:
-            break
+    play_in_turns(one, other)
     assert one.trials() == other.trials()
     assert [trial["state"] for trial in one.trials()] == ["judged"] * 10
-    by_trial = [{run.part for run in d.sweep.plan.runs if run.part} for d in (one, other)]
-    assert by_trial[0] | by_trial[1] == {f"trial{number}" for number in range(10)}
+    by_trial = [parts_computed(driver) for driver in (one, other)]
+    everything = {f"trial{number}" for number in range(10)}
+    assert by_trial[0] | by_trial[1] == everything
     assert not by_trial[0] & by_trial[1]
     assert all(by_trial)
+    for driver in (one, other):
+        assert {run.part for run in driver.sweep.plan.runs if run.part} == everything
     alone = searched(tmp_path / "alone", search | {"storage": None})
     assert alone.trials() == one.trials()
 
