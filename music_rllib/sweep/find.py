@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,7 +28,11 @@ class Found:
     name: str
 
     def read(self, file: str) -> Any:
-        """One of its records; None where it isn't there."""
+        """One of its records; None where it isn't there.
+
+        Raises:
+            StorageError: It is damaged.
+        """
         return records.read(self.storage, f"{self.name}/{file}")
 
     def config(self, seeds: str | None = None) -> SweepConfig:
@@ -92,11 +95,11 @@ def _found(place: str, storage: str | None) -> Found:
 
 def _others(storage: str) -> list[str]:
     """Names of sweeps in a storage."""
-    return sorted(name for name, _ in sweeps_in(storage))
+    return sorted(other.name for other in sweeps_in(storage))
 
 
-def sweeps_in(storage: str) -> list[tuple[str, Mapping[str, Any]]]:
-    """Name and plan of every sweep in a storage."""
+def sweeps_in(storage: str) -> list[Found]:
+    """Every sweep in a storage that has been planned."""
     import pyarrow.fs as pafs
 
     from music_rllib.experiment.sealed import open_storage
@@ -104,5 +107,10 @@ def sweeps_in(storage: str) -> list[tuple[str, Mapping[str, Any]]]:
     filesystem, root = open_storage(storage)
     selector = pafs.FileSelector(root, allow_not_found=True)
     names = [info.base_name for info in filesystem.get_file_info(selector) if not info.is_file]
-    plans = ((name, records.read(storage, f"{name}/{records.PLAN}")) for name in names)
-    return [(name, plan) for name, plan in plans if isinstance(plan, dict)]
+    plans = [f"{root}/{name}/{records.PLAN}" for name in names]
+    found = filesystem.get_file_info(plans) if plans else []
+    return [
+        Found(storage=storage, name=name)
+        for name, plan in zip(names, found, strict=True)
+        if plan.is_file
+    ]

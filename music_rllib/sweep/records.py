@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from music_rllib.experiment.files import write_atomically
+from music_rllib.experiment.problems import shown
 from music_rllib.experiment.sealed import StorageError, open_storage
 
 if TYPE_CHECKING:
@@ -85,12 +87,70 @@ def write(storage: str, path: str, text: str) -> None:
         raise StorageError(f"{target} must be writable: {error}") from error
 
 
+_STATE_KEYS = {"sweep", "driver", "stages", "env_steps", "running", "best", "searches", "failures"}
+_DRIVER_KEYS = {
+    "pid",
+    "host",
+    "machine",
+    "process_started",
+    "started",
+    "heartbeat",
+    "ended",
+    "outcome",
+}
+
+
+def _is_plan(document: Any) -> bool:
+    nodes = document.get("nodes") if isinstance(document, dict) else None
+    return isinstance(nodes, list) and all(
+        isinstance(node, dict) and {"key", "label"} <= node.keys() for node in nodes
+    )
+
+
+def _is_state(document: Any) -> bool:
+    driver = document.get("driver") if isinstance(document, dict) else None
+    return (
+        isinstance(driver, dict)
+        and document.keys() >= _STATE_KEYS
+        and (driver.keys() >= _DRIVER_KEYS)
+    )
+
+
+def _is_config(document: Any) -> bool:
+    return isinstance(document, dict) and _is_list_of_mappings(document.get("stages"))
+
+
+def _is_list_of_mappings(document: Any) -> bool:
+    return isinstance(document, list) and all(isinstance(one, dict) for one in document)
+
+
+_SOUND: dict[str, Callable[[Any], bool]] = {
+    CONFIG: _is_config,
+    PLAN: _is_plan,
+    STATE: _is_state,
+    SEARCH: _is_list_of_mappings,
+}
+"""Whether a record has what its readers count on."""
+
+
 def read(storage: str, path: str) -> Any:
     """The content of a JSON file below a storage; None where there is none.
 
     Raises:
-        StorageError: It can't be read.
+        StorageError: It can't be read, or isn't the record that its name says.
     """
+    document = _read(storage, path)
+    name = path.rpartition("/")[2]
+    if document is not None and name in _SOUND and not _SOUND[name](document):
+        target = f"{open_storage(storage)[1]}/{path}"
+        raise StorageError(
+            f"{target} must be a sweep's {name.removesuffix('.json')} as its driver writes it, got "
+            f"{shown(document)}: running the sweep again writes it anew"
+        )
+    return document
+
+
+def _read(storage: str, path: str) -> Any:
     filesystem, root = open_storage(storage)
     target = f"{root}/{path}"
     try:

@@ -248,13 +248,99 @@ def test_clean_lists_and_deletes_what_no_other_sweep_has(
     other = opened(storage, tmp_path, name="other", seeds=[0])
     going = program("clean", f"{storage}/mine", "--all", "--json").document
     assert not going["deleted"]
-    assert len(going["items"]) == 9 - 3 + 1
+    places = 1 + (sweep.folder != Path(storage) / "mine")  # a bucket's sweep has files here too
+    assert len(going["items"]) == 9 - 3 + places
+    assert len(going["kept"]) == 3
+    assert all(item["what"].endswith("other has it too") for item in going["kept"])
     done = program("clean", f"{storage}/mine", "--all", "--yes")
-    assert (done.code, "7 deleted." in done.output) == (0, True)
+    assert (done.code, f"{6 + places} deleted." in done.output) == (0, True)
+    assert not sweep.folder.exists()
     kept = {node.key for node in sweep.plan.nodes if sweep.store.is_finished(node.key)}
     assert kept == {node.key for node in other.plan.nodes}
     gone = program("status", f"{storage}/mine")
     assert (gone.code, "sweeps there: other" in gone.errors) == (2, True)
+
+
+SEARCH: dict[str, Any] = {
+    "space": {"tac.alpha": {"choice": [0.1, 0.2, 0.3]}},
+    "sampler": "grid",
+    "storage": "postgresql://me@host/studies",
+    "study": "together",
+}
+
+
+def test_clean_keeps_what_another_sweep_of_the_same_study_counts_on(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    """Each has only the trials that it judged itself in its plan."""
+    stages = [
+        {"name": "pretrain", "variant": "music-u"},
+        {"name": "tune", "variant": "music-r", "init_from": "pretrain", "search": SEARCH},
+    ]
+    alone = [{"name": "apart", "variant": "tac"}]
+    mine, other = (opened(storage, tmp_path, name=n, stages=stages + alone) for n in ("mine", "b"))
+    mine.plan.add_trial("tune", 0, {"tac.alpha": 0.1}, [0, 1, 2], "trial0")
+    other.plan.add_trial("tune", 1, {"tac.alpha": 0.2}, [0, 1, 2], "trial1")
+    for sweep in (mine, other):
+        keep_record(sweep)
+    done = {node.label: node for node in mine.plan.nodes if node.stage != "apart"}
+    (tmp_path / "made").mkdir()
+    (tmp_path / "made" / HISTORY).write_bytes(b"")
+    for node in done.values():
+        result = RunResult(label=node.label, env_steps=1, seconds=1.0, metrics={})
+        mine.store.publish(node.key, tmp_path / "made", result)
+    asked = program("clean", f"{storage}/mine", "--all", "--json").document
+    assert len(done) == 6
+    assert {item["path"].rpartition("/")[2] for item in asked["kept"][:-1]} == {
+        node.key for node in done.values()
+    }
+    assert asked["kept"][-1]["path"] == "postgresql://host/studies"
+    assert "study 'together/tune'" in asked["kept"][-1]["what"]
+    assert program("clean", f"{storage}/mine", "--all", "--yes").code == 0
+    assert all(mine.store.is_finished(node.key) for node in done.values())
+
+
+def test_clean_is_refused_while_a_sweep_runs_that_shares_runs(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    played(storage, tmp_path)
+    apart = opened(storage, tmp_path, name="apart", seeds=[7])
+    with Beacon(apart) as beacon:
+        assert program("clean", f"{storage}/mine").code == 0
+        beacon.end("stopped")
+    other = opened(storage, tmp_path, name="other", seeds=[0])
+    with Beacon(other) as beacon:
+        refused = program("clean", f"{storage}/mine", "--all", "--yes")
+        assert (refused.code, "mine shares 3 with other: stop that first" in refused.errors) == (
+            2,
+            True,
+        )
+        beacon.end("stopped")
+    assert program("clean", f"{storage}/mine").code == 0
+
+
+DAMAGED = {
+    "state.json": ("[]", ("status", "clean")),
+    "plan.json": ("{}", ("compare", "clean")),
+    "config.json": ("[]", ("status", "compare", "best", "clean")),
+}
+
+
+@pytest.mark.parametrize("file", DAMAGED)
+def test_a_damaged_record_is_said(
+    storage: str, tmp_path: Path, program: Program, file: str
+) -> None:
+    played(storage, tmp_path)
+    content, commands = DAMAGED[file]
+    records.keep(opened(storage, tmp_path, name="other"), file, content)
+    message = f"other/{file} must be a sweep's {file[:-5]} as its driver writes it, got {content}"
+    for command in commands:
+        said = program(command, f"{storage}/other")
+        assert (said.code, message in said.errors) == (2, True)
+    # What another sweep shares with it can't be told any more.
+    said = program("clean", f"{storage}/mine", "--all", "--yes")
+    assert (said.code, message in said.errors) == (2, True)
+    assert program("status", f"{storage}/mine").code == 0
 
 
 def test_stop_reaches_the_driver(

@@ -15,8 +15,8 @@ examples:
   python -m music_rllib.sweep clean results/smoke --yes
       delete them
   python -m music_rllib.sweep clean results/smoke --all --yes
-      the sweep's own files and every run that no other sweep in the storage has: MLflow's records
-      stay
+      the sweep's own files and every run that no other sweep in the storage has, nor any whose
+      search shares its study: MLflow's records stay, and studies in a database of their own
 """
 
 
@@ -50,17 +50,27 @@ def _execute(arguments: argparse.Namespace) -> int:
     from music_rllib.sweep.find import find_sweep
 
     found = find_sweep(arguments.sweep, arguments.storage)
-    going = what_can_go(
+    cleaning = what_can_go(
         found, unfinished=arguments.unfinished or arguments.all, everything=arguments.all
     )
+    going = cleaning.items
     if arguments.yes:
-        delete(found, going)
+        delete(found, cleaning)
     if arguments.json:
-        print_json({"sweep": found.name, "deleted": arguments.yes, "items": going})
+        print_json(
+            {
+                "sweep": found.name,
+                "deleted": arguments.yes,
+                "items": going,
+                "kept": cleaning.kept,
+            }
+        )
         return 0
     console = console_for(arguments)
     for item in going:
         console.print(f"{item['path']}  ({item['what']})", soft_wrap=True)
+    for item in cleaning.kept:
+        console.print(f"kept: {item['path']}  ({item['what']})", soft_wrap=True)
     if not going:
         console.print("Nothing to delete.")
     elif not arguments.yes:
