@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -34,13 +35,15 @@ def find_policy(wanted: str, storage: str) -> str:
     if "://" in wanted or wanted.startswith(("models:/", "runs:/")) or Path(wanted).exists():
         return wanted
     filesystem, root = open_storage(storage)
-    labels = dict(_labels(filesystem, root))
+    labels: dict[str, list[str]] = {}
+    for key, label in _labels(filesystem, root):
+        labels.setdefault(key, []).append(label)  # sweeps that share a run call it differently
     nodes = SealedFolders(filesystem, f"{root}/nodes")
     finished = nodes.names()
     unfinished = [key for key in _folders(filesystem, f"{root}/work") if key not in finished]
     keys = _matching(wanted, [*finished, *unfinished], labels)
     if not keys:
-        known = [labels.get(key, key) for key in finished][:_NAMED]
+        known = [labels.get(key, [key])[0] for key in finished][:_NAMED]
         there = f"finished there: {', '.join(known)}" if known else "no run is finished there"
         raise PolicyError(
             f"{wanted!r} must be a folder, or the key or label of a run in {storage}; {there}"
@@ -58,8 +61,8 @@ def find_policy(wanted: str, storage: str) -> str:
     return f"{prefix}/work/{keys[0]}/{checkpoints[-1]}"
 
 
-def _matching(wanted: str, keys: list[str], labels: dict[str, str]) -> list[str]:
-    by_label = [key for key in keys if labels.get(key) == wanted]
+def _matching(wanted: str, keys: list[str], labels: dict[str, list[str]]) -> list[str]:
+    by_label = [key for key in keys if wanted in labels.get(key, ())]
     if by_label:
         return by_label
     if wanted in keys:
@@ -74,10 +77,14 @@ def _labels(filesystem: pafs.FileSystem, root: str) -> Iterator[tuple[str, str]]
         plan = f"{root}/{name}/plan.json"
         if filesystem.get_file_info(plan).type != pafs.FileType.File:
             continue
-        with filesystem.open_input_stream(plan) as stream:
-            document = json.loads(stream.read())
-        for node in document.get("nodes", ()):
-            yield node["key"], node["label"]
+        try:
+            with filesystem.open_input_stream(plan) as stream:
+                nodes = json.loads(stream.read())["nodes"]
+            labels = [(str(node["key"]), str(node["label"])) for node in nodes]
+        except (ValueError, TypeError, KeyError) as error:
+            warnings.warn(f"{plan} is damaged, its labels are not known: {error!r}", stacklevel=2)
+            continue
+        yield from labels
 
 
 def _folders(filesystem: pafs.FileSystem, root: str) -> list[str]:

@@ -205,3 +205,17 @@ def test_is_found_by_key_label_and_place(tmp_path: Path) -> None:
     shutil.rmtree(tmp_path / "nodes")
     with pytest.raises(PolicyError, match="no run is finished there"):
         find_policy("nothing", storage)
+
+
+def test_a_run_that_sweeps_share_is_found_by_the_label_of_each(tmp_path: Path) -> None:
+    Trained(_run()).publish(tmp_path)
+    for sweep in ("first", "second"):
+        (tmp_path / sweep).mkdir()
+        nodes = [{"key": KEY, "label": f"{sweep}/seed=0"}]
+        (tmp_path / sweep / "plan.json").write_text(json.dumps({"nodes": nodes}))
+    place = f"{tmp_path}/nodes/{KEY}"
+    for sweep in ("first", "second"):
+        assert find_policy(f"{sweep}/seed=0", str(tmp_path)) == place
+    (tmp_path / "first" / "plan.json").write_text("[]")
+    with pytest.warns(UserWarning, match=r"first/plan\.json is damaged"):
+        assert find_policy("second/seed=0", str(tmp_path)) == place
