@@ -87,10 +87,10 @@ def load_sweep(
     """
     file = read_yaml(Path(path))
     options: dict[str, Any] = {
-        key: value for key, value in (("name", name), ("storage", storage)) if value
+        key: value for key, value in (("name", name), ("storage", storage)) if value is not None
     }
     document = with_preset(file, _preset_mistakes)
-    if seeds:
+    if seeds is not None:
         options["seeds"] = _seeds(seeds, document.get("seeds"))
     document |= options
     findings = Findings()

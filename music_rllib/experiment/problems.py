@@ -183,6 +183,8 @@ def _rule(details: ErrorDetails, path: Path, known: Callable[[Path], Iterable[st
         rule = f"must be {context['expected']}"
     elif kind == "too_short":
         rule = f"must have at least {context['min_length']} entries"
+    elif kind == "string_too_short" and context["min_length"] == 1:
+        rule = "must not be empty"
     elif kind == "string_pattern_mismatch":
         rule = "must be letters, digits, '.', '_' or '-', and begin with a letter or digit"
     elif kind == "value_error":

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import difflib
 import importlib
 import os
 import pkgutil
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 from types import ModuleType
 
 from music_rllib.sweep import commands as package
@@ -53,6 +55,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = list(sys.argv[1:] if arguments is None else arguments)
     modules = _commands()
     if not given or given[0] not in {*modules, "-h", "--help"}:
+        if given and (meant := _meant(given[0], modules)) is not None:
+            print(
+                f"error: COMMAND must be one of {', '.join(modules)}, or a sweep's YAML file, got "
+                f"{given[0]!r} (did you mean {meant!r}?)",
+                file=sys.stderr,
+            )
+            return BAD_INPUT
         given.insert(0, "run")
     parsed = _parser(modules).parse_args(given)
     try:
@@ -70,6 +79,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
         print(f"error: {redact(str(error))}", file=sys.stderr)
         return BAD_INPUT
+
+
+def _meant(word: str, commands: Iterable[str]) -> str | None:
+    """The command that a word is a mistyped form of, unless it is a file or looks like one."""
+    if word.startswith("-") or {".", "/"} & {*word} or Path(word).exists():
+        return None
+    return next(iter(difflib.get_close_matches(word.lower(), commands, n=1)), None)
 
 
 def _commands() -> dict[str, ModuleType]:
@@ -98,6 +114,15 @@ class _Parser(argparse.ArgumentParser):
     def __init__(self, **options: object) -> None:
         settings = {"formatter_class": Formatter, "allow_abbrev": False} | options
         super().__init__(**settings)  # type: ignore[arg-type]
+
+    def parse_known_args(  # type: ignore[override]
+        self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
+    ) -> tuple[argparse.Namespace, list[str]]:
+        """Refuse what isn't known here: the parser above would show its own usage for it."""
+        found, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            self.error(f"unrecognized arguments: {' '.join(unknown)}")
+        return found, unknown
 
 
 def _bad_input() -> tuple[type[Exception], ...]:

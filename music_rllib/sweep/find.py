@@ -80,6 +80,8 @@ def find_sweep(place: str, storage: str | None) -> Found:
 
 
 def _found(place: str, storage: str | None) -> Found:
+    if not place or storage == "":
+        raise BadInputError(f"{'--storage' if place else 'SWEEP'} must not be empty, got ''")
     if place.endswith((".yaml", ".yml")):
         config = load_sweep(place, storage=storage)
         return Found(storage=resolve_storage(config.storage)[0], name=config.name)
@@ -90,6 +92,13 @@ def _found(place: str, storage: str | None) -> Found:
     if storage is None and Path(place).expanduser().is_dir():
         folder = Path(place).expanduser().absolute()
         return Found(storage=str(folder.parent), name=folder.name)
+    if storage is None and "/" in place:
+        folder = Path(place).expanduser().absolute()
+        others = ", ".join(_others(str(folder.parent))) or "none"
+        raise BadInputError(
+            f"SWEEP must be the folder of a sweep, a sweep's name or its YAML file, got {place}: "
+            f"there is no folder {folder} (sweeps beside it: {others})"
+        )
     return Found(storage=resolve_storage(storage or "results")[0], name=place)
 
 

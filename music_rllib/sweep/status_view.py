@@ -16,7 +16,10 @@ from music_rllib.sweep.words import clock, percent
 
 __all__ = ["status_view"]
 
-_STATES = ("finished", "reused", "started", "waiting", "paused", "pruned", "failed", "skipped")
+_STATES = (
+    *("finished", "reused", "started", "interrupted", "waiting", "paused", "pruned"),
+    *("failed", "skipped"),
+)
 _STYLES = {"finished": "green", "failed": "red", "interrupted": "yellow", "stopped": "yellow"}
 
 

@@ -357,3 +357,47 @@ def test_a_mistyped_option_is_bad_input(
         program(document(), "--dryrun")
     assert stopped.value.code == 2
     assert "unrecognized arguments: --dryrun" in capsys.readouterr().err
+    # With the usage of the command that it was given to.
+    with pytest.raises(SystemExit):
+        program(None, "status", "results/s", "--nope")
+    assert capsys.readouterr().err.startswith("usage: python -m music_rllib.sweep status ")
+
+
+@pytest.mark.parametrize("arguments", [("statsu", "results/x"), ("stauts",), ("Status", "x")])
+def test_a_mistyped_command_is_named(program: Program, arguments: tuple[str, ...]) -> None:
+    result = program(None, *arguments)
+    assert result.exit_code == 2
+    assert f"got {arguments[0]!r} (did you mean 'status'?)" in result.stderr
+
+
+def test_a_file_may_be_called_nearly_as_a_command(program: Program, tmp_path: Path) -> None:
+    (tmp_path / "plans").write_text(yaml.safe_dump(document()))
+    assert program(None, "plans", "--dry-run").exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("run", "sweep.yaml", "--name", ""), "--name must "),
+        (("plan", "sweep.yaml", "--storage", ""), "--storage must not be empty"),
+        (("plan", "sweep.yaml", "--seeds", ""), "--seeds must be a number of seeds"),
+        (("status", "s", "--storage", ""), "--storage must not be empty, got ''"),
+        (("status", "sweep.yaml", "--storage", ""), "--storage must not be empty, got ''"),
+        (("evaluate", "a/seed0", "--storage", ""), "--storage must not be empty, got ''"),
+        (("status", ""), "SWEEP must not be empty, got ''"),
+    ],
+)
+def test_an_empty_option_is_not_left_out(
+    program: Program, tmp_path: Path, arguments: tuple[str, ...], message: str
+) -> None:
+    (tmp_path / "sweep.yaml").write_text(yaml.safe_dump(document()))
+    result = program(None, *arguments)
+    assert (result.exit_code, result.stderr.startswith(f"error: {message}")) == (2, True), (
+        result.stderr
+    )
+
+
+def test_a_folder_that_is_not_there(program: Program, tmp_path: Path) -> None:
+    result = program(None, "status", str(tmp_path / "empty"))
+    assert result.exit_code == 2
+    assert f"got {tmp_path}/empty: there is no folder {tmp_path}/empty (" in result.stderr

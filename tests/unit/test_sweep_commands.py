@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -258,7 +259,7 @@ def test_clean_lists_and_deletes_what_no_other_sweep_has(
     kept = {node.key for node in sweep.plan.nodes if sweep.store.is_finished(node.key)}
     assert kept == {node.key for node in other.plan.nodes}
     gone = program("status", f"{storage}/mine")
-    assert (gone.code, "sweeps there: other" in gone.errors) == (2, True)
+    assert (gone.code, ": other)" in gone.errors) == (2, True)
 
 
 SEARCH: dict[str, Any] = {
@@ -376,6 +377,20 @@ def test_a_driver_that_was_killed_is_interrupted(
     records.keep(sweep, records.STATE, records.as_json(state))
     assert beacon is not None
     assert program("status", f"{storage}/mine", "--json").document["state"] == "interrupted"
+
+
+def test_nothing_runs_after_a_crash(storage: str, tmp_path: Path, program: Program) -> None:
+    sweep = opened(storage, tmp_path)
+    node = sweep.plan.nodes[0]
+    with contextlib.suppress(RuntimeError), Beacon(sweep):
+        sweep.board.start(node.key)
+        raise RuntimeError("out of luck")
+    state = program("status", f"{storage}/mine", "--json").document
+    assert (state["state"], state["running"]) == ("failed", [])
+    assert state["stages"][0]["runs"] == {"interrupted": 1, "waiting": 8}
+    shown = program("status", f"{storage}/mine").output
+    assert node.label not in shown
+    assert "interrupted" in shown
 
 
 def test_the_recorded_configuration_is_the_sweeps(storage: str, tmp_path: Path) -> None:

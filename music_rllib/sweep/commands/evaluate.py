@@ -91,6 +91,8 @@ def _execute(arguments: argparse.Namespace) -> int:
     from music_rllib.policy import PolicyError, find_policy, load_policy
     from music_rllib.policy.video import VideoError
 
+    if not arguments.storage:
+        raise BadInputError("--storage must not be empty, got ''")
     _check_video(arguments.video)
     console = console_for(arguments)
     try:

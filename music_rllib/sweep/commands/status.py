@@ -82,9 +82,19 @@ def state_of(found: Found) -> dict[str, Any]:
     state = found.read(records.STATE)
     if state is None:
         return {"sweep": found.name, "place": found.place, "state": "not started"}
-    alive = is_alive(state)
     outcome = state["driver"]["outcome"]
-    if outcome == "running" and not alive:
-        outcome = "interrupted"
-        state["running"] = []
+    if not is_alive(state):
+        outcome = "interrupted" if outcome == "running" else outcome
+        _nothing_runs(state)
     return {"place": found.place, "state": outcome, **state}
+
+
+def _nothing_runs(state: dict[str, Any]) -> None:
+    """A driver that crashed or was killed has left its runs as they were when it last spoke."""
+    state["running"] = []
+    for stage in state["stages"]:
+        if "started" in stage["runs"]:
+            stage["runs"]["interrupted"] = stage["runs"].pop("started")
+    for search in state["searches"]:
+        for arm in search["arms"] if search["storage"] is None else ():
+            arm["running"] = 0  # nobody else can be at a study of the sweep's own
