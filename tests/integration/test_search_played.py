@@ -6,6 +6,7 @@ database and the node store among it.
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import os
@@ -464,7 +465,7 @@ def test_two_sweeps_with_one_study_and_storage_know_all_of_it(
         driver.campaign.stop()
         assert parts_computed(driver)
         with Beacon(driver.sweep) as beacon:
-            beacon.searches = lambda driver=driver: outcome(driver.campaign, thorough=False)
+            beacon.searches = functools.partial(outcome, driver.campaign, thorough=False)
             beacon.end("finished")
         place = str(driver.sweep.folder)
         state = answered(capsys, "status", place)
