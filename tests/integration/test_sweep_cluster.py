@@ -176,6 +176,7 @@ def test_two_runs_at_a_time_on_two_nodes(
     """Each run waits for the other one, and neither node has room for more than one."""
     document = small(sweep_document)
     document["seeds"] = [0, 1]
+    document["resources"] = {"memory_per_run": 0.05}  # so that Ray is asked before it begins, too
     folder = tmp_path / "meeting"
     folder.mkdir()
     document["environments"]["Point"] |= {
@@ -198,6 +199,7 @@ def test_more_cpus_than_any_node_has(
     assert "resources.cpus_per_run must fit into one node of the cluster, whose largest" in (
         done.stderr
     )
+    assert not list((tmp_path / "results").glob("*/config.json")), "it is no sweep yet"
 
 
 class Jobs:
