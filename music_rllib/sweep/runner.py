@@ -42,6 +42,7 @@ def compute(
     sweep: Sweep,
     listeners: Sequence[Listener],
     on_stop: Callable[[], None],
+    on_ray_gone: Callable[[], None],
     campaign: Campaign | None = None,
 ) -> Outcome:
     """Compute the waiting nodes, and those that searches ask for.
@@ -50,13 +51,15 @@ def compute(
         sweep: Its board says afterwards what became of each node.
         listeners: Are told what happens.
         on_stop: Called, in a signal handler, when the user asks to stop.
+        on_ray_gone: Called, in a thread, where that has also ended Ray, before the process ends.
         campaign: The searches; None where there are none.
 
     Raises:
         ClusterError: Ray can't be reached or can't hold a run.
     """
     resources = sweep.config.resources
-    stopping = StopSignals(on_stop, sweep.config.checkpoints.grace_seconds)
+    grace = sweep.config.checkpoints.grace_seconds
+    stopping = StopSignals(on_stop, grace, on_ray_gone=on_ray_gone)
     events = TuneEvents(sweep.board, sweep.store, listeners, sweep.folder / "failures")
     searcher = DagSearcher(
         sweep.board,
