@@ -159,6 +159,7 @@ def _arm(search: Search, arm: Arm, thorough: bool) -> dict[str, Any]:
         "running": states.count("RUNNING"),
         "trials": [_trial(search, arm, trial, thorough) for trial in trials],
         "best": best[0].number if best else None,
+        "front": [t.number for t in best] if len(search.settings.objectives) > 1 else [],
         "importance": importance(arm.study, search.settings) if thorough else {},
     }
 

@@ -226,7 +226,8 @@ def _trials_table(search: Mapping[str, Any], arm: Mapping[str, Any]) -> Table:
     fixed = ", ".join(f"{name} = {short(value)}" for name, value in arm["values"].items())
     table = Table(
         title=f"Trials of {search['stage']}{f' with {fixed}' if fixed else ''}: "
-        f"{arm['judged']} judged, {arm['pruned']} stopped early, {arm['failed']} failed",
+        f"{arm['judged']} judged, {arm['pruned']} stopped early, {arm['failed']} failed"
+        + ("; in bold what no other is better than in every objective" if arm["front"] else ""),
         title_justify="left",
     )
     names_of = dict.fromkeys(
@@ -251,7 +252,7 @@ def _trials_table(search: Mapping[str, Any], arm: Mapping[str, Any]) -> Table:
             trial["state"],
             trial["reason"] or "",
             style={"failed": "red", "pruned": "dim"}.get(trial["state"])
-            or ("bold" if trial["number"] == arm["best"] else None),
+            or ("bold" if trial["number"] in (arm["best"], *arm["front"]) else None),
         )
     return table
 

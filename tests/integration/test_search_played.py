@@ -176,6 +176,19 @@ def test_conditional_settings_and_choices_of_any_kind(tmp_path: Path) -> None:
     assert all(("tac.policy_critic" in p) == (p["tac.bootstrap"] == "critics") for p in found)
 
 
+def test_of_several_objectives_the_front_is_told(tmp_path: Path) -> None:
+    objectives = [{}, {"read": "steps_to", "threshold": 0.5}]
+    driver = searched(tmp_path, {"objective": objectives, "trials": 8})
+    (arm,) = driver.outcome()["arms"]
+    worth = {t["number"]: (t["objective"][0], -t["objective"][1]) for t in arm["trials"]}
+
+    def beaten(one: tuple[float, float]) -> bool:
+        return any(o != one and o[0] >= one[0] and o[1] >= one[1] for o in worth.values())
+
+    assert set(arm["front"]) == {number for number, one in worth.items() if not beaten(one)}
+    assert arm["front"][0] == arm["best"]
+
+
 # --- stopping early ----------------------------------------------------------------------------
 
 
