@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from music_rllib.envs.registry import closest
 from music_rllib.experiment.model import Point, Source, Stage, StageHeader
-from music_rllib.experiment.problems import Findings, shown
+from music_rllib.experiment.problems import ConfigError, Findings, shown
 from music_rllib.experiment.problems import Path as KeyPath
-from music_rllib.experiment.space import SearchSettings
+from music_rllib.experiment.settings import RunSettings
+from music_rllib.experiment.space import Choice, SearchSettings
 from music_rllib.tracking import names
 
 __all__ = ["check_search", "of_stage", "stages_in"]
@@ -91,54 +93,83 @@ def _check_values(
                 f"got '{stage}:...'",
             )
             return
-    points: list[dict[str, tuple[KeyPath, Any]]] = [
-        {name: (("search", *at), value) for name, (at, value) in corner.items()}
-        for corner in search.corners()
-    ]
-    points += [
-        {name: (("search", "compare", name, position), value)}
-        for name, values in search.compare.items()
-        for position, value in enumerate(values)
-    ]
-    for point in points:
-        resolve_at({name: at for name, at in point.items() if ":" not in name}, findings)
-        if above is not None:
-            _check_above(above, point, place[:-1], findings)
+    problems_before = len(findings.problems)
+    for name, values in search.compare.items():
+        findings.forbid_repeats(values, (*place, "compare", name))
+    for name, dimension in search.space.items():
+        if isinstance(dimension, Choice):
+            findings.forbid_repeats(dimension.choice, (*place, "space", name, "choice"))
+    tried: list[tuple[KeyPath, Any, _Runs]] = []
+    for where, point in _worth_trying(search):
+        if where[-1] not in point:
+            rule = f"must be able to hold, got {shown(search.space[str(where[-1])].when)}"
+            findings.add((*place, *where, "when"), rule)
+            continue
+        own = resolve_at({name: at for name, at in point.items() if ":" not in name}, findings)
+        theirs = None if above is None else _check_above(above, point, place[:-1], findings)
+        tried.append((where, point[str(where[-1])][1], (own.runs, theirs)))
+    if len(findings.problems) == problems_before:
+        _forbid_equal_values(tried, place, findings)
     _check_points(search, place, findings)
+
+
+_Runs = tuple[Mapping[str, RunSettings], Mapping[str, RunSettings] | None]
+"""Settings of a stage's runs by task, and of those that they start from."""
+
+
+def _worth_trying(
+    search: SearchSettings,
+) -> Iterator[tuple[KeyPath, Mapping[str, tuple[KeyPath, Any]]]]:
+    """The place of a value below `search`, and a point that shows whether it is sound."""
+    for name, corner in search.corners():
+        point = {key: (("search", *at), value) for key, (at, value) in corner.items()}
+        yield ("space", name), point
+    for name, values in search.compare.items():
+        for position, value in enumerate(values):
+            yield ("compare", name), {name: (("search", "compare", name, position), value)}
+
+
+def _forbid_equal_values(
+    tried: Sequence[tuple[KeyPath, Any, _Runs]], place: Place, findings: Findings
+) -> None:
+    """Two spellings of one schedule, say: two studies, or two options, of the same runs."""
+    for (where, _, one), (elsewhere, value, other) in itertools.combinations(tried, 2):
+        if where == elsewhere and one == other and other[0]:
+            rule = f"must not have two equal values, got {shown(value)} again"
+            findings.add((*place, *where), rule)
 
 
 def _check_above(
     above: Stage, point: Mapping[str, tuple[KeyPath, Any]], path: Place, findings: Findings
-) -> None:
+) -> Mapping[str, RunSettings] | None:
     """Settings of the stage above, with the problems at their place in this one."""
-    from music_rllib.experiment.problems import ConfigError
-
     theirs = of_stage({name: value for name, (_, value) in point.items()}, above.name)
     if not theirs:
-        return
+        return None
     try:
-        above.resolve(theirs)
+        return above.resolve(theirs).runs
     except ConfigError as error:
         name = next(name for name in point if name.startswith(f"{above.name}:"))
         for line in error.lines:
             findings.add((*path, *point[name][0]), f"in stage {above.name}, {line}")
+        return None
 
 
 def _check_points(search: SearchSettings, place: Place, findings: Findings) -> None:
-    from music_rllib.experiment.space import Choice
+    """Each given value must be in the space, and beside what it depends on.
 
+    The sampler chooses what a point leaves open: a setting that depends on that might be dropped.
+    """
     for position, point in enumerate(search.points_to_evaluate):
-        for name, value in point.items():
-            dimension = search.space[name]
-            if isinstance(dimension, Choice):
-                inside = value in dimension.choice
-                rule = f"must be one of {shown(list(dimension.choice))}"
+        existing: dict[str, Any] = {}
+        for name, dimension in search.space.items():
+            if name not in point:
+                continue
+            here, value = (*place, "points_to_evaluate", position, name), point[name]
+            if not dimension.contains(value):
+                findings.add(here, f"must be {dimension.rule}, got {shown(value)}")
+            elif dimension.applies(existing):
+                existing[name] = value
             else:
-                low, high = dimension.ends()
-                number = isinstance(value, int | float) and not isinstance(value, bool)
-                inside = number and low <= float(str(value)) <= high
-                rule = f"must be in [{low:g}, {high:g}]"
-            if not inside:
-                findings.add(
-                    (*place, "points_to_evaluate", position, name), f"{rule}, got {shown(value)}"
-                )
+                wanted = " and ".join(f"{key}: {shown(one)}" for key, one in dimension.when.items())
+                findings.add(here, f"must only be given beside {wanted}, got {shown(point)}")

@@ -436,13 +436,9 @@ def _fits(values: Mapping[str, Any], settings: SearchSettings) -> bool:
             continue
         if name not in values:
             return False
-        known, value = dimension.values(), values[name]
-        if known is not None:
-            if value not in known:
-                return False
-        elif not dimension.ends()[0] <= value <= dimension.ends()[1]:
+        if not dimension.contains(values[name]):
             return False
-        seen[name] = value
+        seen[name] = values[name]
     return len(seen) == len(values)
 
 

@@ -26,6 +26,7 @@ from optuna.exceptions import StorageInternalError
 from music_rllib.experiment.settings import RunSettings
 from music_rllib.experiment.space import FINAL_SEED
 from music_rllib.sweep.board import Status
+from music_rllib.tac.settings import LearnedAlpha
 from music_rllib.tracking import names
 from tests.played_search import SPACE, Document, Driver, document, points, searched, success
 
@@ -333,6 +334,33 @@ def test_a_study_of_another_space_takes_its_points_over(tmp_path: Path) -> None:
     after = searched(tmp_path, {"trials": 6, "space": wider})
     assert points(after.trials())[:4] == points(before.trials())
     assert len(after.computed) == 2 * 3
+
+
+def test_a_choice_that_becomes_a_range_takes_its_numbers_over(tmp_path: Path) -> None:
+    def formula(run: RunSettings, share: float) -> float:
+        return share * (0.3 if isinstance(run.tac.alpha, LearnedAlpha) else 0.5)
+
+    choice = {"choice": [0.1, 0.2, {"learned": True, "initial": 0.3}]}
+    search = {"space": {"tac.alpha": choice}, "sampler": "grid"}
+    before = Driver(tmp_path, document(search), formula)
+    before.play()
+    assert [trial["state"] for trial in before.trials()] == ["judged"] * 3
+    space = {"tac.alpha": {"float": [0.05, 0.5]}}
+    after = searched(tmp_path, {"space": space, "trials": 3})
+    assert points(after.trials())[:2] == [{"tac.alpha": 0.1}, {"tac.alpha": 0.2}]
+    study = before.outcome()["arms"][0]["study"]
+    warm = {"study": study, "storage": str(tmp_path / "results/s/study.db")}
+    learning = searched(tmp_path, {"space": space, "trials": 1, "warm_start": warm}, name="warm")
+    assert learning.outcome()["arms"][0]["learnt_from"] == 2
+
+
+def test_a_given_point_may_spell_a_choice_otherwise(tmp_path: Path) -> None:
+    search = {
+        "space": {"tac.entropic_index": {"choice": [1.0, 2.0]}},
+        "trials": 1,
+        "points_to_evaluate": [{"tac.entropic_index": 2}],
+    }
+    assert points(searched(tmp_path, search).trials()) == [{"tac.entropic_index": 2.0}]
 
 
 def test_a_warm_start_learns_from_an_older_study_and_does_not_rank_it(tmp_path: Path) -> None:

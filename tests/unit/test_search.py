@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
+from pydantic import ValidationError
 
 from music_rllib.experiment.config import load_sweep
 from music_rllib.experiment.problems import ConfigError
 from music_rllib.experiment.result import Report
-from music_rllib.experiment.space import Objective, Pruning, Rung
+from music_rllib.experiment.space import Objective, Pruning, Rung, SearchSettings
 from music_rllib.search.judge import aggregate, prune, score
 from music_rllib.tracking import names
 from tests.played_search import Document, document
@@ -79,8 +82,60 @@ def test_the_shipped_examples_are_sound(name: str) -> None:
     assert settings.mode == name
 
 
+# --- the space ---------------------------------------------------------------------------------
+
+
+def memory_of(call: Callable[[], Any]) -> int:
+    """Bytes that `call` has allocated at its worst."""
+    tracemalloc.start()
+    try:
+        call()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    ("dimension", "inside", "outside"),
+    [
+        ({"float": [1, 2]}, [1, 1.3, 2.0], [0.9, 2.1, True, "1", {"learned": True}, None]),
+        ({"float": [1, 2], "step": 0.3}, [1, 1.3, 1.9], [1.2, 2, 1.3001]),
+        ({"int": [10, 20_000_000]}, [10, 20.0, 20_000_000], [9, 20.5, False, "20"]),
+        ({"int": [64, 300], "step": 64}, [64, 256], [65, 300]),
+        ({"choice": [1.0, {"a": [1]}]}, [1, {"a": [1.0]}], [True, {"a": [True]}, {"a": 1}, 2]),
+    ],
+)
+def test_which_values_a_dimension_has(
+    dimension: Document, inside: list[Any], outside: list[Any]
+) -> None:
+    found = SearchSettings.model_validate({"space": {"x": dimension}, "trials": 1}).space["x"]
+    assert [value for value in inside if not found.contains(value)] == []
+    assert [value for value in outside if found.contains(value)] == []
+    assert memory_of(lambda: found.contains(15)) < 100_000, "none of the others is made"
+
+
+def test_a_grid_is_counted_before_it_is_made() -> None:
+    numbers = {"int": [1, 1000]}
+    space = {"x": {"choice": ["a", "b"]}, "y": numbers, "z": numbers | {"when": {"x": "a"}}}
+    settings = {"space": space, "sampler": "grid"}
+
+    def refused() -> None:
+        with pytest.raises(ValidationError, match=r"at most 100,000 points .* got 1,001,000 up to"):
+            SearchSettings.model_validate(settings)
+
+    assert memory_of(refused) < 5_000_000
+    space["y"] = {"int": [1, 90]}
+    assert SearchSettings.model_validate(settings).count == 90 * 1000 + 90
+
+
 # --- mistakes ----------------------------------------------------------------------------------
 
+BRANCHES: Document = {
+    "tac.bootstrap": {"choice": ["value", "critics"]},
+    "tac.policy_critic": {"choice": ["first", "min"], "when": {"tac.bootstrap": "critics"}},
+}
+RAMP: Document = {"schedule": "linear", "start": 1.0, "end": 2.0}
+COMPARED: Document = {"mode": "compare", "space": {"tac.alpha": {"float": [0.1, 0.2]}}}
 MISTAKES: list[tuple[Document, str]] = [
     ({"trials": None}, "search.trials must be given with sampler: tpe, got null"),
     (
@@ -125,6 +180,89 @@ MISTAKES: list[tuple[Document, str]] = [
     (
         {"points_to_evaluate": [{"tac.alpha": 3}]},
         "points_to_evaluate[0].tac.alpha must be in [0.005, 0.5], got 3",
+    ),
+    (
+        {
+            "space": {"tac.entropic_index": {"float": [1, 2], "step": 0.5}},
+            "points_to_evaluate": [{"tac.entropic_index": 1.3}],
+        },
+        "points_to_evaluate[0].tac.entropic_index must be in [1, 2] and whole steps of 0.5 from 1, "
+        "got 1.3",
+    ),
+    (
+        {
+            "space": {"tac.batch_size": {"int": [10, 30]}},
+            "points_to_evaluate": [{"tac.batch_size": 20.5}],
+        },
+        "points_to_evaluate[0].tac.batch_size must be a whole number in [10, 30], got 20.5",
+    ),
+    (
+        {
+            "space": {"tac.batch_size": {"int": [64, 256], "step": 64}},
+            "points_to_evaluate": [{"tac.batch_size": 128}, {"tac.batch_size": 100}],
+        },
+        "points_to_evaluate[1].tac.batch_size must be a whole number in [64, 256] and whole steps "
+        "of 64 from 64, got 100",
+    ),
+    (
+        {"space": BRANCHES, "points_to_evaluate": [{"tac.bootstrap": "both"}]},
+        'points_to_evaluate[0].tac.bootstrap must be one of ["value", "critics"], got "both"',
+    ),
+    (
+        {
+            "space": BRANCHES,
+            "points_to_evaluate": [{"tac.bootstrap": "value", "tac.policy_critic": "min"}],
+        },
+        '[0].tac.policy_critic must only be given beside tac.bootstrap: "critics", got {"tac',
+    ),
+    (
+        {"space": BRANCHES, "points_to_evaluate": [{"tac.policy_critic": "min"}]},
+        '[0].tac.policy_critic must only be given beside tac.bootstrap: "critics", got {"tac',
+    ),
+    (
+        {"trials": 2, "points_to_evaluate": [{"tac.alpha": 0.1}] * 3},
+        "points_to_evaluate must not be more than the trials (2), got 3",
+    ),
+    (
+        {
+            "space": {
+                "tac.batch_size": {"int": [64, 256]},
+                "tac.lr": {"float": [0.1, 1], "when": {"tac.batch_size": 300}},
+            }
+        },
+        "space.tac.lr.when must hold values of tac.batch_size, got 300",
+    ),
+    (
+        {
+            "space": BRANCHES
+            | {
+                "tac.tau": {
+                    "float": [0.1, 0.2],
+                    "when": {"tac.bootstrap": "value", "tac.policy_critic": "min"},
+                }
+            }
+        },
+        "space.tac.tau.when must be able to hold, got {",
+    ),
+    (
+        {"sampler": "grid", "space": {"tac.batch_size": {"int": [1, 50_000_000]}}},
+        "space must have at most 100,000 points with sampler: grid, got 50,000,000",
+    ),
+    (
+        COMPARED | {"compare": {"tac.entropic_index": [1.0, 1]}},
+        "search.compare.tac.entropic_index[1] must not repeat, got 1 again",
+    ),
+    (
+        COMPARED | {"compare": {"tac.entropic_index": [RAMP, RAMP | {"begin": 0.1}]}},
+        "search.compare.tac.entropic_index must not have two equal values, got {",
+    ),
+    (
+        {"space": {"tac.batch_size": {"choice": [16, 32, 16]}}},
+        "search.space.tac.batch_size.choice[2] must not repeat, got 16 again",
+    ),
+    (
+        {"space": {"pretrain:tac.entropic_index": {"choice": [RAMP, RAMP | {"begin": 0.1}]}}},
+        "search.space.pretrain:tac.entropic_index must not have two equal values, got {",
     ),
     (
         {"pruning": {"rungs": [{"seeds": 2}, {"seeds": 1}]}},
