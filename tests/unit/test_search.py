@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import tracemalloc
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +73,39 @@ def test_a_trial_is_stopped_only_if_its_interval_says_so() -> None:
     lower = Objective(direction="minimize")
     worse = prune(lower, pruning, scores=np.array([[2.0], [2.1]]), others=others, place="here")
     assert worse.stop
+
+
+@pytest.mark.parametrize("how", ["iqm", "mean", "median", "worst_task"])
+@pytest.mark.parametrize(("tasks", "apart"), [(1, 0.0), (8, 0.0), (8, 20.0)])
+def test_a_trial_as_good_as_its_only_rival_is_seldom_stopped(
+    how: str, tasks: int, apart: float
+) -> None:
+    """With 90 % intervals in one of eight cases or less, however far the tasks are apart."""
+    rng = np.random.default_rng(0)
+    draws = rng.normal(size=(1500, 2, 3, tasks)) + apart * np.arange(tasks)
+    objective, pruning = Objective(aggregate=how), Pruning(rungs=(Rung(seeds=3),))
+    stopped = [
+        prune(objective, pruning, scores=mine, others={0: rival}, place="here").stop
+        for mine, rival in draws
+    ]
+    assert np.mean(stopped) < 0.125 + 2 * math.sqrt(0.125 * 0.875 / len(draws))
+
+
+def test_the_spread_counts_each_seed_of_a_trial_once() -> None:
+    rng = np.random.default_rng(0)
+    whole = {number: rng.normal(size=(4, 1)) for number in range(3)}
+    pruning = Pruning(rungs=(Rung(seeds=2),), keep=0.1)
+
+    def reason(seeds: int, more: Mapping[int, Any]) -> str:
+        others = {number: scores[:seeds] + 50 for number, scores in whole.items()}
+        mine = np.zeros((seeds, 1))
+        return prune(
+            Objective(), pruning, scores=mine, others=others, whole=more, place="here"
+        ).reason
+
+    assert reason(2, whole) == reason(2, {}), "their seeds here tell the spread"
+    assert "[-inf, inf]" in reason(1, {})
+    assert "does not reach" in reason(1, whole), "only their later seeds do"
 
 
 @pytest.mark.parametrize("name", ["search", "compare"])
