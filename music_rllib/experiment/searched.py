@@ -14,7 +14,7 @@ from music_rllib.experiment.settings import RunSettings
 from music_rllib.experiment.space import Choice, SearchSettings
 from music_rllib.tracking import names
 
-__all__ = ["check_search", "of_stage", "stages_in"]
+__all__ = ["check_search", "most_env_steps", "of_stage", "stages_in"]
 
 Place = tuple[str | int, ...]
 ResolveAt = Callable[[Mapping[str, tuple[KeyPath, Any]], Findings], Point]
@@ -48,14 +48,28 @@ def check_search(
     header: StageHeader,
     source: Source | None,
     earlier: Mapping[str, Stage | None],
+    points: Sequence[Point],
+    seeds: int,
     resolve_at: ResolveAt,
     path: KeyPath,
     findings: Findings,
 ) -> None:
-    """Note what is wrong with a stage's `search` and with what it is searched from."""
+    """Note what is wrong with a stage's `search` and with what it is searched from.
+
+    Args:
+        header: The stage, which has a search.
+        source: What its runs start from.
+        earlier: The stages above this one by name; None for one that can't be made out.
+        points: The stage as it is without what is searched.
+        seeds: How many the sweep has; 0 if that isn't known.
+        resolve_at: Makes the stage's settings at a point.
+        path: The stage's place in the document.
+        findings: Takes the problems.
+    """
     search = header.search
     assert search is not None
     place = (*path, "search")
+    problems_before = len(findings.problems)
     if header.grid:
         findings.add((*path, "grid"), "must not be given beside search: put it into the space")
     for position, objective in enumerate(search.objectives):
@@ -74,6 +88,36 @@ def check_search(
             f"search its settings as '{above.name}:...'",
         )
     _check_values(search, above, resolve_at, place, findings)
+    if len(findings.problems) == problems_before:  # the budget is a sound number then
+        _check_rungs(search, seeds, most_env_steps(search, points), place, findings)
+
+
+def most_env_steps(search: SearchSettings, points: Sequence[Point]) -> int:
+    """Environment steps of a searched stage's longest run; 0 if nothing says so.
+
+    Args:
+        search: What is searched or compared.
+        points: The stage as it is without that.
+    """
+    if "env_steps" in search.space:
+        return int(max(search.space["env_steps"].ends()))
+    if "env_steps" in search.compare:
+        return max(int(str(value)) for value in search.compare["env_steps"])
+    return max((run.env_steps for point in points for run in point.runs.values()), default=0)
+
+
+def _check_rungs(
+    search: SearchSettings, seeds: int, env_steps: int, place: Place, findings: Findings
+) -> None:
+    """A rung must be reached before a trial ends, or at its end."""
+    for position, rung in enumerate(search.pruning.rungs if search.pruning else ()):
+        here = (*place, "pruning", "rungs", position)
+        if seeds and rung.seeds is not None and rung.seeds > seeds:
+            rule = f"must be <= {seeds}, the number of the sweep's seeds, got {rung.seeds}"
+            findings.add((*here, "seeds"), rule)
+        if env_steps and rung.env_steps is not None and rung.env_steps > env_steps:
+            rule = f"must be <= {env_steps}, the longest run's env steps, got {rung.env_steps}"
+            findings.add((*here, "env_steps"), rule)
 
 
 def _check_values(

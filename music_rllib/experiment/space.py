@@ -275,13 +275,25 @@ class Objective(_Strict):
         return f"{self.aggregate} of {read}{self.metric}{until}"
 
 
+def _one_or_several(value: Any) -> str:
+    """Which of the two a value claims to be, so that errors speak of that one only."""
+    return "several" if isinstance(value, list | tuple) else "one"
+
+
+Objectives = Annotated[
+    Annotated[Objective, Tag("one")] | Annotated[list[Objective], Tag("several")],
+    Discriminator(_one_or_several),
+]
+
+
 class Rung(_Strict):
     """A point of a trial at which it may be stopped."""
 
     seeds: int | None = Field(None, gt=0)
-    """Its first so many seeds have run; null: all."""
+    """Its first so many seeds have run, no more than the sweep has; null: all."""
     env_steps: int | None = Field(None, gt=0)
-    """Up to so many environment steps, rounded up to the next evaluation; null: to the end."""
+    """Up to so many environment steps, rounded up to the next evaluation, and no more than the
+    longest run has; null: to the end."""
 
 
 class Pruning(_Strict):
@@ -349,7 +361,7 @@ class SearchSettings(_Strict):
     keeps more CPUs busy, less learns sooner. Part of what makes a study reproducible."""
     seed: int = Field(0, ge=0, lt=2**31)
     """Of the choice of points."""
-    objective: Objective | list[Objective] = Objective()
+    objective: Objectives = Objective()
     """What is optimised; a list of several gives a Pareto front."""
     points_to_evaluate: list[dict[str, JsonValue]] = Field(default_factory=list)
     """Points, or parts of points, that are the first trials."""

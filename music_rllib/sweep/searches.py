@@ -11,6 +11,7 @@ from optuna.trial import FrozenTrial, TrialState
 
 from music_rllib.experiment.model import Stage, SweepConfig
 from music_rllib.experiment.plan import node_key, short
+from music_rllib.experiment.searched import most_env_steps
 from music_rllib.experiment.space import Rung, SearchSettings
 from music_rllib.reports.statistics import probability_of_improvement
 from music_rllib.search.judge import interval
@@ -71,13 +72,22 @@ def _open_search(sweep: Sweep, stage: Stage) -> Search:
         )
         for position, values in enumerate(settings.arms())
     ]
-    rungs = [] if settings.pruning is None else list(settings.pruning.rungs)
-    seeds = len(sweep.plan.seeds)
-    rungs = [Rung(seeds=min(r.seeds or seeds, seeds), env_steps=r.env_steps) for r in rungs]
+    return Search(stage=stage, settings=settings, arms=arms, rungs=_rungs(sweep, stage, settings))
+
+
+def _rungs(sweep: Sweep, stage: Stage, settings: SearchSettings) -> tuple[Rung, ...]:
+    """Where a trial is looked at, its end last."""
+    seeds, env_steps = len(sweep.plan.seeds), most_env_steps(settings, stage.points)
     end = Rung(seeds=seeds)
-    return Search(
-        stage=stage, settings=settings, arms=arms, rungs=(*(r for r in rungs if r != end), end)
-    )
+    found = [
+        Rung(
+            seeds=rung.seeds or seeds,
+            # The whole budget is the end of a run, where nothing is paused.
+            env_steps=None if (rung.env_steps or env_steps) >= env_steps else rung.env_steps,
+        )
+        for rung in (settings.pruning.rungs if settings.pruning else ())
+    ]
+    return (*dict.fromkeys(rung for rung in found if rung != end), end)
 
 
 def _names(values: Mapping[str, Any]) -> list[str]:

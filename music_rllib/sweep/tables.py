@@ -12,6 +12,7 @@ from rich.text import Text
 from music_rllib.experiment.model import Source, Stage, SweepConfig
 from music_rllib.experiment.plan import Node, Plan, short
 from music_rllib.experiment.result import RunResult
+from music_rllib.experiment.searched import most_env_steps
 from music_rllib.experiment.space import Choice, Dimension, SearchSettings
 from music_rllib.sweep.board import Status
 from music_rllib.sweep.words import clock, in_words, percent
@@ -112,10 +113,7 @@ def _search_row(stage: Stage, search: SearchSettings, plan: Plan, seeds: int) ->
 
 def search_budget(stage: Stage, search: SearchSettings) -> int:
     """Environment steps of a searched stage's run, at most."""
-    ends = search.space.get("env_steps")
-    if ends is not None:
-        return int(max(ends.ends()))
-    return max(run.env_steps for point in stage.points for run in point.runs.values())
+    return most_env_steps(search, stage.points)
 
 
 def search_runs(stage: Stage, search: SearchSettings, seeds: int) -> int:

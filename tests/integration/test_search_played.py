@@ -211,6 +211,14 @@ def test_what_is_stopped_early_is_so_for_a_reason_and_costs_less(tmp_path: Path)
     assert best["number"] == driver.outcome()["arms"][0]["best"]
 
 
+def test_a_rung_at_the_very_end_is_no_rung(tmp_path: Path) -> None:
+    rungs = [{"seeds": 1, "env_steps": 4000}, {"env_steps": 4000}]
+    driver = searched(tmp_path, {"pruning": {"rungs": rungs, "warm_up": 1}})
+    (search,) = driver.campaign.searches
+    assert [(rung.seeds, rung.env_steps) for rung in search.rungs] == [(1, None), (3, None)]
+    assert "judged" in {trial["state"] for trial in driver.trials()}
+
+
 # --- the final ranking -------------------------------------------------------------------------
 
 

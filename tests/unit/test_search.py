@@ -303,6 +303,26 @@ MISTAKES: list[tuple[Document, str]] = [
         "pruning.rungs must grow in seeds or env_steps and never shrink",
     ),
     (
+        {"pruning": {"rungs": [{"seeds": 1}, {"seeds": 9}]}},
+        "pruning.rungs[1].seeds must be <= 3, the number of the sweep's seeds, got 9",
+    ),
+    (
+        {"pruning": {"rungs": [{"env_steps": 5000}]}},
+        "pruning.rungs[0].env_steps must be <= 4000, the longest run's env steps, got 5000",
+    ),
+    (
+        {
+            "space": {"env_steps": {"int": [6000, 9000], "step": 1000}},
+            "pruning": {"rungs": [{"env_steps": 9000}, {"env_steps": 9001}]},
+        },
+        "pruning.rungs[1].env_steps must be <= 9000, the longest run's env steps, got 9001",
+    ),
+    (
+        COMPARED
+        | {"compare": {"env_steps": [2000, 3000]}, "pruning": {"rungs": [{"env_steps": 4000}]}},
+        "pruning.rungs[0].env_steps must be <= 3000, the longest run's env steps, got 4000",
+    ),
+    (
         {"space": {"warmup:tac.lr": {"float": [0.1, 1]}}},
         "must name settings of this stage or of the one it starts from, which is 'pretrain'",
     ),
@@ -317,3 +337,35 @@ def test_mistakes_in_a_search_are_named(search: Document, message: str, tmp_path
         load_sweep(path)
     assert message in str(error.value)
     assert "sweep.yaml:" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("objective", "message"),
+    [
+        ({"aggregate": "bogus"}, "search.objective.aggregate must be 'iqm', 'mean', 'median' or"),
+        ([{}, {"aggregate": "bogus"}], "search.objective[1].aggregate must be 'iqm', 'mean',"),
+        ("evaluation/return", "search.objective must be a mapping of keys to values, got"),
+    ],
+)
+def test_a_mistake_in_the_objective_is_one_error(
+    objective: Any, message: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "sweep.yaml"
+    path.write_text(yaml.safe_dump(document({"objective": objective})))
+    with pytest.raises(ConfigError) as error:
+        load_sweep(path)
+    (line,) = error.value.lines
+    assert message in line
+
+
+def test_a_rung_may_be_beyond_the_shorter_tasks(tmp_path: Path) -> None:
+    content = document({"pruning": {"rungs": [{"env_steps": 5000}]}})
+    content["tasks"] = ["FetchPush", "FetchSlide"]
+    content["stages"][1]["per_task"] = {"FetchSlide": {"env_steps": 6000}}
+    path = tmp_path / "sweep.yaml"
+    path.write_text(yaml.safe_dump(content))
+    load_sweep(path)
+    content["stages"][1]["per_task"]["FetchSlide"]["env_steps"] = 4500
+    path.write_text(yaml.safe_dump(content))
+    with pytest.raises(ConfigError, match="must be <= 4500"):
+        load_sweep(path)
