@@ -315,15 +315,18 @@ def _open_campaign(
     if not opened.plan.searched:
         return None
     from music_rllib.sweep.campaign import Campaign
-    from music_rllib.sweep.searches import open_searches, outcome
+    from music_rllib.sweep.searches import learnings, open_searches, outcome
 
     def reused(node: Node) -> None:
         logbook.reused(node, opened.store)
         beacon.reused(node)
 
+    searches = open_searches(opened)
+    for line in learnings(searches):
+        display.say(line)
     campaign = Campaign(
         opened,
-        open_searches(opened),
+        searches,
         reused=reused,
         pruned=logbook.pruned,
         say=display.say,

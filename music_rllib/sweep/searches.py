@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,17 +10,25 @@ import optuna
 from optuna.trial import FrozenTrial, TrialState
 
 from music_rllib.experiment.model import Stage, SweepConfig
-from music_rllib.experiment.plan import node_key, short
+from music_rllib.experiment.plan import node_key
 from music_rllib.experiment.searched import most_env_steps
 from music_rllib.experiment.space import Rung, SearchSettings
 from music_rllib.reports.statistics import probability_of_improvement
 from music_rllib.search.judge import interval
-from music_rllib.search.studies import DATABASE_ERRORS, REASON, SCORES, VALUES, Study, open_studies
+from music_rllib.search.studies import (
+    DATABASE_ERRORS,
+    REASON,
+    SCORES,
+    VALUES,
+    Study,
+    open_older,
+    open_studies,
+)
 from music_rllib.sweep.campaign import Arm, Campaign, Finalist, Search, ranked
 from music_rllib.sweep.session import Sweep
 from music_rllib.tracking.redaction import redact
 
-__all__ = ["check_storages", "open_searches", "outcome"]
+__all__ = ["check_storages", "learnings", "open_searches", "outcome"]
 
 STUDY_FILE = "study.db"
 """In the sweep's folder."""
@@ -35,10 +43,12 @@ def check_storages(config: SweepConfig) -> None:
         StorageError: One can't be used.
     """
     for stage in config.stages:
-        if stage.search is not None:
-            for url in (stage.search.storage, (stage.search.warm_start or stage.search).storage):
-                if url is not None:
-                    open_studies(url)
+        if stage.search is None:
+            continue
+        if stage.search.storage is not None:
+            open_studies(stage.search.storage)
+        if stage.search.warm_start is not None and stage.search.warm_start.storage is not None:
+            open_older(stage.search.warm_start.storage)
 
 
 def open_searches(sweep: Sweep) -> list[Search]:
@@ -61,11 +71,10 @@ def _open_search(sweep: Sweep, stage: Stage) -> Search:
             position=position,
             study=Study(
                 storage,
-                "/".join(
-                    (settings.study or sweep.config.name, stage.name, *_names(values)),
-                ),
+                f"{settings.study or sweep.config.name}/{stage.name}",
                 settings,
-                _determined_by(sweep, stage, values),
+                _determined_by(sweep, stage),
+                arm=values,
                 # The sweep's folder is locked by this process, and the file is in it.
                 alone=settings.storage is None,
             ),
@@ -73,6 +82,17 @@ def _open_search(sweep: Sweep, stage: Stage) -> Search:
         for position, values in enumerate(settings.arms())
     ]
     return Search(stage=stage, settings=settings, arms=arms, rungs=_rungs(sweep, stage, settings))
+
+
+def learnings(searches: Sequence[Search]) -> list[str]:
+    """From what each study with a warm start learns, in a line."""
+    return [
+        f"{search.stage.name}{''.join(f' {name}={value}' for name, value in arm.values.items())}: "
+        f"{learnt}"
+        for search in searches
+        for arm in search.arms
+        if (learnt := arm.study.learnt)
+    ]
 
 
 def _rungs(sweep: Sweep, stage: Stage, settings: SearchSettings) -> tuple[Rung, ...]:
@@ -90,11 +110,7 @@ def _rungs(sweep: Sweep, stage: Stage, settings: SearchSettings) -> tuple[Rung, 
     return (*dict.fromkeys(rung for rung in found if rung != end), end)
 
 
-def _names(values: Mapping[str, Any]) -> list[str]:
-    return [f"{name}={short(value)}" for name, value in values.items()]
-
-
-def _determined_by(sweep: Sweep, stage: Stage, values: Mapping[str, Any]) -> dict[str, Any]:
+def _determined_by(sweep: Sweep, stage: Stage) -> dict[str, Any]:
     """What the stage's runs have in common, beside what is searched."""
     (point,) = stage.points
     source = stage.source
@@ -103,7 +119,6 @@ def _determined_by(sweep: Sweep, stage: Stage, values: Mapping[str, Any]) -> dic
         None,
     )
     return {
-        "arm": dict(values),
         "seeds": list(sweep.plan.seeds),
         "runs": {task: node_key(run, None) for task, run in point.runs.items()},
         "source": {
