@@ -600,7 +600,11 @@ def test_the_same_file_gives_the_same_points_on_another_machine(tmp_path: Path) 
     """Six digits of each: the last bits of a machine's logarithm play no part."""
     driver = Driver(tmp_path, document({}))
     driver.play()
-    assert points(driver.trials())[:2] == FIRST_POINTS
+    assert points(driver.trials()) == FIRST_POINTS
+    (tmp_path / "random").mkdir()
+    by_chance = points(searched(tmp_path / "random", {"sampler": "random"}).trials())
+    assert by_chance[:3] == FIRST_POINTS[:3]
+    assert not any(point in FIRST_POINTS for point in by_chance[3:]), "those are TPE's"
 
 
 def test_node_keys_are_the_same_in_another_process(tmp_path: Path) -> None:
@@ -628,6 +632,11 @@ def test_node_keys_are_the_same_in_another_process(tmp_path: Path) -> None:
 FIRST_POINTS: list[Mapping[str, Any]] = [
     {"tac.entropic_index": 2.5, "tac.alpha": 0.135116},
     {"tac.entropic_index": 1.5, "tac.alpha": 0.146438},
+    {"tac.entropic_index": 1.0, "tac.alpha": 0.338515},
+    # From here on TPE has the results of two trials to go by.
+    {"tac.entropic_index": 2.0, "tac.alpha": 0.00672013},
+    {"tac.entropic_index": 1.25, "tac.alpha": 0.0335914},
+    {"tac.entropic_index": 1.75, "tac.alpha": 0.419184},
 ]
 
 
