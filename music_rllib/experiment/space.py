@@ -349,7 +349,7 @@ class SearchSettings(_Strict):
     """Of `compare` mode: dotted setting to the values to tell apart."""
     sampler: Literal["tpe", "random", "grid", "cmaes", "nsga2"] = "tpe"
     """Optuna's TPE, CMA-ES (numbers only) and NSGA-II (several objectives), random, or all points
-    of a grid in order."""
+    of a grid in order, at most 100,000."""
     trials: int | None = Field(None, gt=0)
     """Trials to judge; null with `grid`: all points."""
     startup_trials: int = Field(5, gt=0)
@@ -364,7 +364,8 @@ class SearchSettings(_Strict):
     objective: Objectives = Objective()
     """What is optimised; a list of several gives a Pareto front."""
     points_to_evaluate: list[dict[str, JsonValue]] = Field(default_factory=list)
-    """Points, or parts of points, that are the first trials."""
+    """Points, or parts of points, that are the first trials, just as written. Each value must be
+    one of the space, and one with `when` stand beside what it depends on."""
     pruning: Pruning | None = None
     """null: every trial runs to its end on all seeds."""
     final: Final | None = Final()

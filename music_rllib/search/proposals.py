@@ -99,8 +99,9 @@ class Proposer:
                     distributions=dict(other.distributions),
                 )
             )
-        if number < len(self._points):
-            study.enqueue_trial(_encoded(self._settings.space, self._points[number]))
+        given = self._points[number] if number < len(self._points) else {}
+        if given:
+            study.enqueue_trial(_encoded(self._settings.space, given))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ExperimentalWarning)
             trial = study.ask()
@@ -108,6 +109,8 @@ class Proposer:
             for name, dimension in self._settings.space.items():
                 if dimension.applies(values):
                     values[name] = _suggest(trial, name, dimension)
+                    if name in given and isinstance(dimension, FloatRange):
+                        values[name] = float(given[name])  # not rounded: a person wrote it
         proposal = as_proposal(self._settings.space, values)
         kept = {
             key: value

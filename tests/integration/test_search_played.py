@@ -144,7 +144,7 @@ def test_tpe_learns(tmp_path: Path) -> None:
 
 
 def test_given_points_come_first(tmp_path: Path) -> None:
-    given = [{"tac.entropic_index": 1.25, "tac.alpha": 0.1}, {"tac.entropic_index": 2.0}]
+    given = [{"tac.entropic_index": 1.25, "tac.alpha": 0.123456789}, {"tac.entropic_index": 2.0}]
     trials = searched(tmp_path, {"points_to_evaluate": given}).trials()
     assert trials[0]["values"] == given[0]
     assert trials[1]["values"]["tac.entropic_index"] == 2.0
