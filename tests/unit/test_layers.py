@@ -21,6 +21,7 @@ PACKAGE = Path(__file__).parents[2] / "music_rllib"
 LAYERS: tuple[tuple[str, ...], ...] = (
     (
         "_allocator",
+        "_cluster",
         "_quiet",
         "tsallis",
         "mutual_information",
