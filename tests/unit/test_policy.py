@@ -205,3 +205,27 @@ def test_is_found_by_key_label_and_place(tmp_path: Path) -> None:
     shutil.rmtree(tmp_path / "nodes")
     with pytest.raises(PolicyError, match="no run is finished there"):
         find_policy("nothing", storage)
+
+
+def test_a_folder_of_several_tasks_names_its_sub_folders(tmp_path: Path) -> None:
+    """As `best` leaves the policies of a sweep with several tasks."""
+    for task in ("FetchReach", "Other"):
+        (tmp_path / task).mkdir()
+        Trained(_run()).write(tmp_path / task)
+    (tmp_path / "figures").mkdir()
+    with pytest.raises(PolicyError) as error:
+        load_policy(tmp_path)
+    first, second = tmp_path / "FetchReach", tmp_path / "Other"
+    assert str(error.value) == (
+        f"{tmp_path} must hold one policy, its sub-folders hold one each: "
+        f"give {first} (FetchReach) or {second} (FetchReach)"
+    )
+    assert load_policy(first).task == REACH
+
+
+def test_a_damaged_manifest_is_not_taken_for_a_folder_of_several(tmp_path: Path) -> None:
+    Trained(_run()).write(tmp_path)
+    Trained(_run()).write(tmp_path / "FetchReach")
+    (tmp_path / "handoff" / "handoff.json").write_text("{}")
+    with pytest.raises(PolicyError, match=r"handoff.json must be a handoff manifest"):
+        load_policy(tmp_path)
