@@ -18,7 +18,7 @@ import pytest
 import yaml
 
 import music_rllib
-from cluster.check import ALL, KINDS, check_document, check_file
+from cluster.check import ALL, KINDS, check_document, check_file, strings
 from music_rllib.experiment.config import load_sweep
 
 ROOT = Path(__file__).parents[2]
@@ -279,6 +279,25 @@ def test_token_authentication_is_on_everywhere() -> None:
         assert services[name]["environment"]["RAY_AUTH_MODE"] == "token"
     assert load(RAY)["spec"]["authOptions"] == {"mode": "token"}
     assert load(JOB)["spec"]["rayClusterSpec"]["authOptions"] == {"mode": "token"}
+
+
+def test_your_secret_is_not_the_one_that_kuberay_keeps_its_token_in() -> None:
+    """KubeRay takes an existing Secret of the cluster's name for its own, and starts no pod when
+    `auth_token` isn't in it.
+    """
+    guide = (ROOT / "docs" / "operations.md").read_text()
+    (made,) = re.findall(r"kubectl create secret generic (\S+)", guide)
+    (read,) = re.findall(r"kubectl get secret (\S+)", guide)
+    mounted = set()
+    for name in (RAY, JOB):
+        for place, text in strings(load(name)):
+            if re.search(r"envFrom\.\d+\.secretRef\.name$", place):
+                mounted.add(text)
+    assert mounted == {made}
+    assert read == load(RAY)["metadata"]["name"]
+    # A RayJob's cluster has the job's name and five random letters.
+    assert made != read
+    assert not re.fullmatch(rf"{load(JOB)['metadata']['name']}-\w{{5}}", made)
 
 
 @pytest.mark.parametrize(
