@@ -4,10 +4,10 @@
     python cluster/check.py cluster/onprem.yaml  # one, for instance after a change
 
 The launcher's files are checked by the installed Ray itself (and node types by botocore, where
-that is installed), Serve's by Ray Serve, sweeps by this package, the files of compose and Kubernetes
-by the schemas in `schemas/`. Of Prometheus, Grafana and kustomize only what they can't do without is
-looked at. What a schema can't say is checked too: addresses nobody has put in yet, ports open to the
-world, missing files.
+that is installed), Serve's by Ray Serve, sweeps by this package, those of compose and Kubernetes
+by the schemas in `schemas/`. Of Prometheus, Grafana and kustomize only what they can't do without
+is looked at. What a schema can't say is checked too: addresses nobody has put in yet, ports open
+to the world, missing files.
 
 Exit codes: 0 all is sound, 2 something isn't; one line per problem.
 """
@@ -45,7 +45,9 @@ def _violations(document: Any, validator: Any) -> Problems:
     for error in validator.iter_errors(document):
         deepest = jsonschema.exceptions.best_match([error])
         place = ".".join(str(part) for part in deepest.absolute_path) or "the file"
-        yield f"{place}: {deepest.message[:300]}"
+        forbidden = deepest.validator == "not" and not deepest.validator_value
+        message = "must not be given beside the others" if forbidden else deepest.message[:300]
+        yield f"{place}: {message}"
 
 
 def strings(value: Any, place: str = "") -> Iterator[tuple[str, str]]:
@@ -216,6 +218,7 @@ def check_kuberay(document: dict[str, Any], _: Path, crds: Crds | None = None) -
         yield from _violations(document, jsonschema.Draft7Validator(crds[kind]))
     if not problems:
         yield from _check_secret(document)
+        yield from _check_groups(document)
 
 
 CRD_FILES = {"RayCluster": "ray.io_rayclusters.yaml", "RayJob": "ray.io_rayjobs.yaml"}
@@ -229,6 +232,21 @@ def _check_secret(document: dict[str, Any]) -> Problems:
     for place, text in strings(document):
         if text == name and re.search(r"\.(secretRef|secretKeyRef)\.name$", place):
             yield f"{place}: must be no Secret of the cluster's name, that is KubeRay's own: {name}"
+
+
+def _check_groups(document: dict[str, Any]) -> Problems:
+    """What KubeRay's operator refuses, but no schema can say."""
+    place, spec = "spec", document["spec"]
+    if document["kind"] == "RayJob":
+        place, spec = "spec.rayClusterSpec", spec.get("rayClusterSpec", {})
+    scaled = spec.get("enableInTreeAutoscaling", False)
+    for index, group in enumerate(spec.get("workerGroupSpecs", ())):
+        where = f"{place}.workerGroupSpecs.{index}"
+        least, most = group.get("minReplicas", 0), group.get("maxReplicas", 2**31 - 1)
+        if least > most:
+            yield f"{where}.minReplicas: must be <= maxReplicas, {most}, got {least}"
+        if scaled and group.get("suspend", False):
+            yield f"{where}.suspend: must be false where enableInTreeAutoscaling is true"
 
 
 def read_crds(folder: Path) -> Crds:

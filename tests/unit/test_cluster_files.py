@@ -117,6 +117,31 @@ NODE = "available_node_types/cpu/node_config"
         (JOB, put("spec/submissionMode", "Http"), "Http"),
         (JOB, put(f"{JOB_HEAD}/volumeMounts/0/mountpath", "/x"), "mountpath"),
         (JOB, put("metadata/name", "Sweep_1"), "Sweep_1"),
+        (JOB, put("metadata/name", "1-sweep"), "1-sweep"),
+        (JOB, put("spec/deletionStrategy", {"onSuccess": {"policy": "DeleteAll"}}), "deletionStr"),
+        (JOB, put("spec/preRunningDeadlineSeconds", 0), "preRunningDeadlineSeconds"),
+        (JOB, put("spec/shutdownAfterJobFinishes", False), "ttlSecondsAfterFinished"),
+        (JOB, put("spec/submissionMode", "SidecarMode"), "spec.submitterConfig: must not"),
+        (JOB, put("spec/submissionMode", "InteractiveMode"), "backoffLimit"),
+        (JOB, put("spec/clusterSelector", {"ray.io/cluster": "x"}), "backoffLimit"),
+        (JOB, put("spec/entrypoint", ""), "entrypoint"),
+        (JOB, put("spec/rayClusterSpec/authOptions/enableK8sTokenAuth", True), "enableK8sToken"),
+        (RAY, put("spec/rayVersion", "latest"), "latest"),
+        (RAY, put("spec/authOptions", {"enableK8sTokenAuth": True}), "'mode' is a required"),
+        (
+            RAY,
+            put(
+                "spec/authOptions", {"mode": "token", "enableK8sTokenAuth": True, "secretName": "x"}
+            ),
+            "spec.authOptions.secretName: must not",
+        ),
+        (RAY, put("spec/workerGroupSpecs/0/minReplicas", 9), "must be <= maxReplicas, 8, got 9"),
+        (RAY, put("spec/workerGroupSpecs/0/maxReplicas", 2**31), "maxReplicas"),
+        (RAY, put("spec/workerGroupSpecs/0/suspend", True), "suspend: must be false"),
+        (RAY, put("spec/workerGroupSpecs/0/scaleStrategy", {"workers": []}), "workers"),
+        (RAY, put("spec/gcsFaultToleranceOptions", {}), "redisAddress"),
+        (RAY, put("spec/upgradeStrategy", {"type": "Rolling"}), "Rolling"),
+        (RAY, put("spec/autoscalerOptions/idleTimeoutSeconds", -1), "idleTimeoutSeconds"),
         ("kuberay/storage/storage.yaml", put("spec/accessMode", []), "accessMode"),
         ("serve.yaml", put("http_options/hots", "0.0.0.0"), "hots"),
         ("serve.yaml", put("applications/0/args/replica", 2), "replica"),
@@ -128,6 +153,53 @@ def test_planted_mistake_is_found(name: str, change: Change, expected: str) -> N
     change(document)
     problems = check_document(document, CLUSTER / name)
     assert any(expected in problem for problem in problems), problems
+
+
+RULE = {"policy": "DeleteCluster", "condition": {"jobStatus": "FAILED", "ttlSeconds": 0}}
+POLICY = {"policy": "DeleteNone"}
+
+
+@pytest.mark.parametrize(
+    ("gone", "given"),
+    [
+        # In this mode someone else submits the job.
+        (("entrypoint", "backoffLimit"), {"submissionMode": "InteractiveMode"}),
+        (("rayClusterSpec", "backoffLimit"), {"clusterSelector": {"ray.io/cluster": "x"}}),
+        (("submitterConfig",), {"submissionMode": "SidecarMode"}),
+        ((), {"deletionStrategy": {"onSuccess": POLICY, "onFailure": POLICY}}),
+        (
+            ("shutdownAfterJobFinishes", "ttlSecondsAfterFinished"),
+            {"deletionStrategy": {"deletionRules": [RULE]}},
+        ),
+        ((), {"preRunningDeadlineSeconds": 60, "activeDeadlineSeconds": 60}),
+    ],
+)
+def test_what_kuberay_allows_is_sound(gone: tuple[str, ...], given: dict[str, Any]) -> None:
+    document = load(JOB)
+    spec = {key: value for key, value in document["spec"].items() if key not in gone}
+    assert check_document(document | {"spec": spec | given}, CLUSTER / JOB) == []
+
+
+@pytest.mark.parametrize(
+    "strategy",
+    [
+        {},
+        {"deletionRules": []},
+        {"onSuccess": POLICY},
+        {"onSuccess": POLICY, "onFailure": POLICY, "deletionRules": [RULE]},
+        {"deletionRules": [RULE | {"condition": {"ttlSeconds": 3}}]},
+        {"deletionRules": [RULE | {"condition": {"jobStatus": "STOPPED"}}]},
+        {"onSuccess": {}, "onFailure": POLICY},
+    ],
+)
+def test_half_a_deletion_strategy_is_found(strategy: dict[str, Any]) -> None:
+    document = load(JOB)
+    for key in ("shutdownAfterJobFinishes", "ttlSecondsAfterFinished"):
+        del document["spec"][key]
+    document["spec"]["deletionStrategy"] = strategy
+    problems = check_document(document, CLUSTER / JOB)
+    assert problems
+    assert all(problem.startswith("spec.deletionStrategy") for problem in problems), problems
 
 
 VOLUME = {"type": "volume", "source": "results", "target": "/r"}
