@@ -212,8 +212,24 @@ def _connect(settings: ServeSettings) -> None:
     try:
         _check_room(settings, nodes)
     except _BadInputError:
+        if address is not None and _waits_for_nodes(settings):
+            return
         ray.shutdown()
         raise
+
+
+def _waits_for_nodes(settings: ServeSettings) -> bool:
+    """Whether an autoscaler adds the nodes that replicas have no place on yet; says so."""
+    from music_rllib import _autoscaler
+
+    if not _autoscaler.adds_nodes({"CPU": settings.cpus_per_replica}, settings.replicas):
+        return False
+    print(
+        f"The cluster has no room for {settings.replicas} replicas yet; its autoscaler is asked "
+        "for more nodes, which may take minutes ('ray status' shows what it does).",
+        flush=True,
+    )
+    return True
 
 
 def _check_room(settings: ServeSettings, cpus_of_nodes: Sequence[float]) -> None:

@@ -77,7 +77,15 @@ def compute(
         **({} if campaign is None else {"advance": campaign.advance}),
         stopped=lambda: stopping.received is not None,
     )
-    with cluster(resources) as slots, _tune_folder(sweep) as place, _quiet_tune(slots), stopping:
+    with (
+        cluster(resources) as room,
+        _tune_folder(sweep) as place,
+        _quiet_tune(room.waiting),
+        stopping,
+    ):
+        for listener in listeners:
+            if room.remark is not None:
+                listener.remarked(room.remark)
         tuner = tune.Tuner(
             RunTrainable,
             tune_config=tune.TuneConfig(
@@ -143,10 +151,11 @@ class _quiet_tune:  # noqa: N801
 
     LOGGERS = ("ray.tune.tune", "ray.tune.analysis.experiment_analysis")
 
-    def __init__(self, slots: int) -> None:
+    def __init__(self, waiting: int) -> None:
         self._settings = {
-            # As many trials waiting for an actor as can run: they start side by side.
-            "TUNE_MAX_PENDING_TRIALS_PG": str(slots),
+            # Trials that wait for an actor: as many as can run start side by side, and an
+            # autoscaler adds nodes for those that wait.
+            "TUNE_MAX_PENDING_TRIALS_PG": str(waiting),
             "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",
             "TUNE_PRINT_ALL_TRIAL_ERRORS": "0",
             # Relative paths in a user's environment keep their meaning.
