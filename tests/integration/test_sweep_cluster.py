@@ -262,8 +262,14 @@ def growing_head(folder: Path, home: Path) -> Iterator[Head]:
             time.sleep(0.2)
         yield Head(address, "", folder, environment, process)
     finally:
+        # Nobody ends what belongs to the added nodes when the autoscaler itself is gone.
+        started = psutil.Process(process.pid).children(recursive=True)
         process.terminate()
         process.wait(timeout=60)
+        _, left = psutil.wait_procs(started, timeout=10)
+        for other in left:
+            with contextlib.suppress(psutil.NoSuchProcess):
+                other.kill()
 
 
 @pytest.mark.thorough
