@@ -3,9 +3,11 @@
     python cluster/check.py                      # all of them
     python cluster/check.py cluster/onprem.yaml  # one, for instance after a change
 
-The launcher's files are checked by the installed Ray itself (and node types by botocore, where that
-is installed), Serve's by Ray Serve, the others by the schemas in `schemas/`. What a schema can't
-say is checked too: addresses nobody has put in yet, ports open to the world, missing files.
+The launcher's files are checked by the installed Ray itself (and node types by botocore, where
+that is installed), Serve's by Ray Serve, sweeps by this package, those of compose and Kubernetes
+by the schemas in `schemas/`. Of Prometheus, Grafana and kustomize only what they can't do without
+is looked at. What a schema can't say is checked too: addresses nobody has put in yet, ports open
+to the world, missing files.
 
 Exit codes: 0 all is sound, 2 something isn't; one line per problem.
 """
@@ -19,7 +21,7 @@ import json
 import logging
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +33,8 @@ from referencing.jsonschema import DRAFT7
 HERE = Path(__file__).resolve().parent
 SCHEMAS = HERE / "schemas"
 Problems = Iterator[str]
+Crds = Mapping[str, Any]
+"""Kind to KubeRay's own schema of it."""
 
 
 def _schema(name: str) -> Any:
@@ -41,7 +45,9 @@ def _violations(document: Any, validator: Any) -> Problems:
     for error in validator.iter_errors(document):
         deepest = jsonschema.exceptions.best_match([error])
         place = ".".join(str(part) for part in deepest.absolute_path) or "the file"
-        yield f"{place}: {deepest.message[:300]}"
+        forbidden = deepest.validator == "not" and not deepest.validator_value
+        message = "must not be given beside the others" if forbidden else deepest.message[:300]
+        yield f"{place}: {message}"
 
 
 def strings(value: Any, place: str = "") -> Iterator[tuple[str, str]]:
@@ -75,20 +81,30 @@ def check_launcher(document: dict[str, Any], _: Path) -> Problems:
     try:
         # Ray remarks on file mounts for containers, of which there are none here.
         with contextlib.redirect_stdout(None), contextlib.redirect_stderr(None):
-            validate_config(prepare_config(copy.deepcopy(document)))
-    except Exception as error:  # Ray's own kinds, and those of jsonschema
-        yield str(error).strip().splitlines()[0]
+            prepared = prepare_config(copy.deepcopy(document))
+            validate_config(prepared)
+    except Exception as error:  # Ray's own kinds, those of jsonschema, and those of its own bugs
+        lines = str(error).strip().splitlines()
+        yield lines[0] if lines and not isinstance(error, _ACCIDENTS) else _not_taken(error)
         return
-    for remote, local in document.get("file_mounts", {}).items():
+    for remote, local in (document.get("file_mounts") or {}).items():
         path = Path(local).expanduser()
         if not (path if path.is_absolute() else HERE.parent / path).exists():
             hint = "; run 'ray get-auth-token --generate'" if "auth_token" in local else ""
             yield f"file_mounts.{remote}: {local} must exist{hint}"
-    if document["provider"]["type"] == "aws":
-        yield from _check_instances(document["available_node_types"])
+    if prepared["provider"]["type"] == "aws":
+        yield from _check_instances(prepared["available_node_types"])
     for command in ("head_start_ray_commands", "worker_start_ray_commands"):
-        if "RAY_AUTH_MODE=token" not in " ".join(document.get(command, ())):
+        if "RAY_AUTH_MODE=token" not in " ".join(document.get(command) or ()):
             yield f"{command}: must set RAY_AUTH_MODE=token"
+
+
+_ACCIDENTS = (AttributeError, IndexError, KeyError, TypeError)
+"""What Ray raises where it relies on a key or a type that isn't there."""
+
+
+def _not_taken(error: Exception) -> str:
+    return f"the file: must be a configuration that Ray's launcher takes, which fails: {error!r}"
 
 
 def _check_instances(node_types: dict[str, Any]) -> Problems:
@@ -119,16 +135,17 @@ def check_compose(document: dict[str, Any], path: Path) -> Problems:
     yield from check_placeholders(document)
     if problems:
         return
+    volumes = document.get("volumes") or {}
     for name, service in document["services"].items():
         for port in service.get("ports", ()):
-            if not str(port).startswith("127.0.0.1:"):
+            if not _on_loopback(port):
                 yield f"services.{name}.ports: must be published on 127.0.0.1 only, got {port}"
         for volume in service.get("volumes", ()):
-            source = volume.partition(":")[0]
-            if source.startswith("."):
-                if not (path.parent / source).exists():
-                    yield f"services.{name}.volumes: {source} must exist"
-            elif source not in document.get("volumes", {}):
+            kind, source = _source(volume)
+            # What is elsewhere on the machine may be another one's.
+            if kind == "bind" and source[:1] == "." and not (path.parent / source).exists():
+                yield f"services.{name}.volumes: {source} must exist"
+            elif kind == "volume" and source not in volumes:
                 yield f"services.{name}.volumes: {source} must be listed under volumes"
         for other in service.get("depends_on", ()):
             if other not in document["services"]:
@@ -137,11 +154,42 @@ def check_compose(document: dict[str, Any], path: Path) -> Problems:
             yield from _check_build(name, service["build"], path)
 
 
-def _check_build(name: str, build: dict[str, str], compose: Path) -> Problems:
-    dockerfile = compose.parent / build["context"] / build["dockerfile"]
+def _on_loopback(port: Any) -> bool:
+    """Of the short form `127.0.0.1:8265:8265` or the long one with `host_ip`."""
+    if isinstance(port, dict):
+        return port.get("host_ip") in ("127.0.0.1", "::1")
+    return str(port).startswith(("127.0.0.1:", "[::1]:"))
+
+
+def _source(volume: Any) -> tuple[str, str]:
+    """Kind and source of what is mounted, in the short form or the long one.
+
+    The kind is `bind` for a file or folder of this machine, `volume` for a named volume, and
+    another one for what needs no source.
+    """
+    if isinstance(volume, dict):
+        source = str(volume.get("source", ""))
+        return (str(volume["type"]) if source else "anonymous"), source
+    source, colon, _ = volume.partition(":")
+    if not colon or source.startswith("$"):
+        return "anonymous", ""
+    return ("bind" if source.startswith((".", "/", "~")) else "volume"), source
+
+
+def _check_build(name: str, build: Any, compose: Path) -> Problems:
+    """Whether the Dockerfile and its stage are there; of the short form `build: FOLDER` too."""
+    given = build if isinstance(build, dict) else {"context": build}
+    place = f"services.{name}.build"
+    if "dockerfile_inline" in given or "://" in str(given.get("context", "")):
+        return
+    dockerfile = compose.parent / given.get("context", ".") / given.get("dockerfile", "Dockerfile")
+    if not dockerfile.is_file():
+        yield f"{place}: {dockerfile} must exist"
+        return
     stages = re.findall(r"^FROM \S+ AS (\w+)", dockerfile.read_text(encoding="utf-8"), re.MULTILINE)
-    if build.get("target") not in stages:
-        yield f"services.{name}.build.target: must be one of {stages}, got {build.get('target')}"
+    target = given.get("target")
+    if target is not None and target not in stages:
+        yield f"{place}.target: must be one of {', '.join(stages) or 'none'}, got {target}"
 
 
 # -- KubeRay ------------------------------------------------------------------------------------
@@ -154,21 +202,81 @@ def kuberay_validator() -> Any:
     return jsonschema.Draft7Validator(_schema("kuberay-1.6.json"), registry=registry)
 
 
-def check_kuberay(document: dict[str, Any], _: Path, crds: Path | None = None) -> Problems:
+def check_kuberay(document: dict[str, Any], _: Path, crds: Crds | None = None) -> Problems:
     """A RayCluster or a RayJob."""
-    own = kuberay_validator()
     kind = document.get("kind")
-    definition = {"$ref": f"#/definitions/{kind}"} if kind in ("RayCluster", "RayJob") else {}
-    yield from _violations(document, own.evolve(schema=_schema("kuberay-1.6.json") | definition))
+    if kind not in tuple(CRD_FILES):
+        yield f"kind: must be {' or '.join(CRD_FILES)}, got {kind!r}"
+        return
+    own = kuberay_validator().evolve(
+        schema=_schema("kuberay-1.6.json") | {"$ref": f"#/definitions/{kind}"}
+    )
+    problems = list(_violations(document, own))
+    yield from problems
     yield from check_placeholders(document)
     if crds is not None:
-        yield from _violations(document, jsonschema.Draft7Validator(_from_crd(crds, str(kind))))
+        yield from _violations(document, jsonschema.Draft7Validator(crds[kind]))
+    if not problems:
+        yield from _check_secret(document)
+        yield from _check_groups(document)
 
 
-def _from_crd(folder: Path, kind: str) -> Any:
-    definition = yaml.safe_load((folder / f"ray.io_{kind.lower()}s.yaml").read_text())
-    (version,) = [v for v in definition["spec"]["versions"] if v["name"] == "v1"]
-    return _strict(version["schema"]["openAPIV3Schema"])
+CRD_FILES = {"RayCluster": "ray.io_rayclusters.yaml", "RayJob": "ray.io_rayjobs.yaml"}
+
+
+def _check_secret(document: dict[str, Any]) -> Problems:
+    """KubeRay takes a Secret of the cluster's name for the one with its token."""
+    if document["kind"] != "RayCluster" or "secretName" in document["spec"].get("authOptions", {}):
+        return
+    name = document["metadata"]["name"]
+    for place, text in strings(document):
+        if text == name and re.search(r"\.(secretRef|secretKeyRef)\.name$", place):
+            yield f"{place}: must be no Secret of the cluster's name, that is KubeRay's own: {name}"
+
+
+def _check_groups(document: dict[str, Any]) -> Problems:
+    """What KubeRay's operator refuses, but no schema can say."""
+    place, spec = "spec", document["spec"]
+    if document["kind"] == "RayJob":
+        place, spec = "spec.rayClusterSpec", spec.get("rayClusterSpec", {})
+    scaled = spec.get("enableInTreeAutoscaling", False)
+    for index, group in enumerate(spec.get("workerGroupSpecs", ())):
+        where = f"{place}.workerGroupSpecs.{index}"
+        least, most = group.get("minReplicas", 0), group.get("maxReplicas", 2**31 - 1)
+        if least > most:
+            yield f"{where}.minReplicas: must be <= maxReplicas, {most}, got {least}"
+        if scaled and group.get("suspend", False):
+            yield f"{where}.suspend: must be false where enableInTreeAutoscaling is true"
+
+
+def read_crds(folder: Path) -> Crds:
+    """KubeRay's own schemas.
+
+    Raises:
+        CrdError: They are not there.
+    """
+    schemas = {}
+    for kind, file in CRD_FILES.items():
+        try:
+            definition = yaml.safe_load((folder / file).read_text(encoding="utf-8"))
+            versions = definition["spec"]["versions"]
+            (version,) = [version for version in versions if version["name"] == "v1"]
+            schemas[kind] = _strict(version["schema"]["openAPIV3Schema"])
+        except OSError as error:
+            raise CrdError(
+                f"--crds must be a folder with {' and '.join(CRD_FILES.values())}, got {folder}: "
+                f"{file}: {error.strerror}"
+            ) from error
+        except (KeyError, TypeError, ValueError, yaml.YAMLError) as error:
+            raise CrdError(
+                f"--crds must be a folder with KubeRay's CRDs, but {folder / file} is no CRD with "
+                "a version v1"
+            ) from error
+    return schemas
+
+
+class CrdError(ValueError):
+    """The folder of `--crds` hasn't what it must have."""
 
 
 def _strict(schema: Any) -> Any:
@@ -187,7 +295,11 @@ def _strict(schema: Any) -> Any:
 
 
 def check_claim(document: dict[str, Any], _: Path) -> Problems:
-    """A PersistentVolumeClaim."""
+    """A PersistentVolumeClaim, the one kind of Kubernetes' own that is here."""
+    kind = document.get("kind")
+    if kind != "PersistentVolumeClaim":
+        yield f"kind: must be PersistentVolumeClaim, RayCluster or RayJob, got {kind!r}"
+        return
     schema = _schema("kubernetes-1.34.json") | {
         "$ref": "#/definitions/io.k8s.api.core.v1.PersistentVolumeClaim"
     }
@@ -214,14 +326,24 @@ def check_serve(document: dict[str, Any], _: Path) -> Problems:
         # Serve itself takes unknown keys in silence, for later versions of itself.
         known = ServeDeploySchema.model_validate(document).model_dump(exclude_unset=True)
         yield from _unknown(document, known)
-        for application in document["applications"]:
-            settings = ServeSettings.model_validate(application["args"])
-            open_to_all = document["http_options"]["host"] != "127.0.0.1"
-            if open_to_all and not settings.token_required:
-                yield "applications.args.token_required: must be true where host is not loopback"
     except ValidationError as error:
-        for finding in error.errors():
-            yield f"{'.'.join(map(str, finding['loc']))}: {finding['msg']}"
+        yield from _findings(error)
+        return
+    host = (document.get("http_options") or {}).get("host", "127.0.0.1")
+    for index, application in enumerate(document["applications"]):
+        place = f"applications.{index}.args"
+        try:
+            settings = ServeSettings.model_validate(application.get("args") or {})
+        except ValidationError as error:
+            yield from _findings(error, f"{place}.")
+            continue
+        if host not in ("127.0.0.1", "::1", "localhost") and not settings.token_required:
+            yield f"{place}.token_required: must be true where host is not loopback, got {host}"
+
+
+def _findings(error: Any, above: str = "") -> Problems:
+    for finding in error.errors():
+        yield f"{above}{'.'.join(map(str, finding['loc']))}: {finding['msg']}"
 
 
 def _unknown(given: Any, known: Any, place: str = "") -> Problems:
@@ -236,44 +358,118 @@ def _unknown(given: Any, known: Any, place: str = "") -> Problems:
             yield from _unknown(*pair, f"{place}{index}.")
 
 
+# -- the small ones -----------------------------------------------------------------------------
+
+
+def check_sweep(_: dict[str, Any], path: Path) -> Problems:
+    """As `python -m music_rllib.sweep` does."""
+    from music_rllib.experiment.config import load_sweep
+    from music_rllib.experiment.problems import ConfigError
+
+    try:
+        load_sweep(path)
+    except ConfigError as error:
+        yield from str(error).splitlines()
+
+
+def check_prometheus(document: dict[str, Any], _: Path) -> Problems:
+    """Jobs by name and something to scrape; `promtool check config` knows the rest."""
+    names = set()
+    for index, job in enumerate(_mappings(document["scrape_configs"])):
+        place = f"scrape_configs.{index}"
+        if job is None:
+            yield f"{place}: must be a mapping"
+            continue
+        name = job.get("job_name")
+        if not isinstance(name, str) or name in names:
+            yield f"{place}.job_name: must be a name of its own, got {name!r}"
+        names.add(name)
+        if not any(key == "static_configs" or key.endswith("_sd_configs") for key in job):
+            yield f"{place}: must have static_configs or a kind of *_sd_configs"
+
+
+def check_datasource(document: dict[str, Any], _: Path) -> Problems:
+    """Grafana's datasources: what each must have; Grafana says the rest in its log."""
+    if document.get("apiVersion") != 1:
+        yield f"apiVersion: must be 1, got {document.get('apiVersion')!r}"
+    for index, source in enumerate(_mappings(document["datasources"])):
+        if source is None:
+            yield f"datasources.{index}: must be a mapping"
+            continue
+        for key in ("name", "type", "url"):
+            if not isinstance(source.get(key), str):
+                yield f"datasources.{index}.{key}: must be a text, got {source.get(key)!r}"
+
+
+def check_kustomization(document: dict[str, Any], path: Path) -> Problems:
+    """The files that it puts together; `kubectl kustomize FOLDER` knows the rest."""
+    if not isinstance(document["resources"], list):
+        yield "resources: must be a list"
+        return
+    for index, resource in enumerate(document["resources"]):
+        target = path.parent / str(resource)
+        there = target.is_file() or (target / "kustomization.yaml").is_file()
+        if not there and "://" not in str(resource):
+            place = f"resources.{index}"
+            yield f"{place}: {resource} must be a file or a folder with kustomization.yaml"
+
+
+def _mappings(entries: Any) -> list[dict[str, Any] | None]:
+    """The entries of a list; None for what is no mapping."""
+    given = entries if isinstance(entries, list) else [entries]
+    return [entry if isinstance(entry, dict) else None for entry in given]
+
+
 # -- which file is what -------------------------------------------------------------------------
 
 
-def check_file(path: Path, crds: Path | None = None) -> list[str]:
+def check_file(path: Path, crds: Crds | None = None) -> list[str]:
     """What is wrong with one file; its content says what kind it is."""
     try:
         document = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError) as error:
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         return [str(error).replace("\n", " ")]
     return check_document(document, path, crds)
 
 
-def check_document(document: Any, path: Path, crds: Path | None = None) -> list[str]:
+def check_document(document: Any, path: Path, crds: Crds | None = None) -> list[str]:
     """The same of a file's content; paths in it are relative to `path`."""
     if not isinstance(document, dict):
         return ["must be a mapping"]
-    if document.get("apiVersion") == "ray.io/v1":
+    if str(document.get("apiVersion")).startswith("ray.io/"):
         return list(check_kuberay(document, path, crds))
     for key, check in KINDS.items():
         if key in document:
             return list(check(document, path))
-    return [f"must be one of {', '.join(KINDS)} by its keys"]
+    found = ", ".join(map(str, document)) or "none"
+    return [f"must be of a kind that has one of the keys {', '.join(KINDS)}, got {found}"]
 
 
 KINDS: dict[str, Callable[[dict[str, Any], Path], Problems]] = {
     "provider": check_launcher,
     "services": check_compose,
     "applications": check_serve,
+    "stages": check_sweep,
+    "scrape_configs": check_prometheus,
+    "datasources": check_datasource,
+    "resources": check_kustomization,
     "apiVersion": check_claim,
 }
+"""The first key that a file has says what it is: a sweep may have `resources` too."""
 ALL = (
     "aws.yaml",
     "compose.yaml",
+    "grafana-datasource.yml",
+    "kuberay/raycluster/kustomization.yaml",
     "kuberay/raycluster/raycluster.yaml",
+    "kuberay/rayjob/kustomization.yaml",
     "kuberay/rayjob/rayjob.yaml",
+    "kuberay/storage/kustomization.yaml",
     "kuberay/storage/storage.yaml",
     "onprem.yaml",
+    "prometheus.yml",
     "serve.yaml",
+    "sweep.yaml",
 )
 
 
@@ -285,9 +481,14 @@ def main() -> int:
     parser.add_argument("files", nargs="*", type=Path, help="instead of all files of cluster/")
     parser.add_argument("--crds", type=Path, metavar="FOLDER", help="KubeRay's own CRDs")
     arguments = parser.parse_args()
+    try:
+        crds = None if arguments.crds is None else read_crds(arguments.crds)
+    except CrdError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
     wrong = 0
     for path in arguments.files or [HERE / name for name in ALL]:
-        problems = check_file(path, arguments.crds)
+        problems = check_file(path, crds)
         wrong += len(problems)
         print(f"{path}: {'sound' if not problems else ''}", file=sys.stdout)
         for problem in problems:

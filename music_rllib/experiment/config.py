@@ -127,14 +127,13 @@ def _resolve(file: YamlFile, document: dict[str, Any], findings: Findings) -> Sw
     names = document.get("tasks")
     names = [name for name in names if isinstance(name, str)] if isinstance(names, list) else []
     known_tasks = _tasks(names, ("tasks",), registry, document, findings)
-    seed = header.seeds[0] if header else 0
     stages: dict[str, Stage | None] = {}
     for index, raw in _raw_stages(document, findings):
         stage = resolve_stage(
             raw,
             ("stages", index),
             defaults=defaults,
-            seed=seed,
+            seeds=header.seeds if header else (),
             sweep_tasks=known_tasks,
             find_tasks=lambda names, path: _tasks(names, path, registry, document, findings),
             earlier=stages,

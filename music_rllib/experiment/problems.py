@@ -25,6 +25,7 @@ __all__ = [
     "in_words",
     "known_fields",
     "lookup",
+    "same",
     "shown",
 ]
 
@@ -60,6 +61,17 @@ def shown(value: Any, limit: int = 60) -> str:
         text = repr(value)
     text = {"NaN": "nan", "Infinity": "inf", "-Infinity": "-inf"}.get(text, text)
     return text if len(text) <= limit else text[: limit - 3] + "..."
+
+
+def same(one: Any, other: Any) -> bool:
+    """Whether two values are equal as settings: 1 and 1.0 are, 1 and true are not."""
+    if isinstance(one, bool) or isinstance(other, bool):
+        return one is other
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
+    if isinstance(one, list | tuple) and isinstance(other, list | tuple):
+        return len(one) == len(other) and all(map(same, one, other))
+    return bool(one == other)
 
 
 def lookup(document: Any, path: Iterable[str | int]) -> Any:
@@ -236,9 +248,6 @@ class Findings:
         """Note entries of the list `values` that are there twice; 1 and 1.0 are the same."""
         seen: list[Any] = []
         for position, value in enumerate(values if isinstance(values, list | tuple) else ()):
-            if any(
-                value == other and isinstance(value, bool) == isinstance(other, bool)
-                for other in seen
-            ):
+            if any(same(value, other) for other in seen):
                 self.add((*path, position), f"must not repeat, got {shown(value)} again")
             seen.append(value)

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from music_rllib.envs.registry import closest
 from music_rllib.experiment.model import Point, Source, Stage, StageHeader
-from music_rllib.experiment.problems import Findings, shown
+from music_rllib.experiment.problems import ConfigError, Findings, shown
 from music_rllib.experiment.problems import Path as KeyPath
-from music_rllib.experiment.space import SearchSettings
+from music_rllib.experiment.settings import RunSettings
+from music_rllib.experiment.space import Choice, SearchSettings
 from music_rllib.tracking import names
 
-__all__ = ["check_search", "of_stage", "stages_in"]
+__all__ = ["check_search", "most_env_steps", "of_stage", "stages_in"]
 
 Place = tuple[str | int, ...]
 ResolveAt = Callable[[Mapping[str, tuple[KeyPath, Any]], Findings], Point]
@@ -46,14 +48,28 @@ def check_search(
     header: StageHeader,
     source: Source | None,
     earlier: Mapping[str, Stage | None],
+    points: Sequence[Point],
+    seeds: int,
     resolve_at: ResolveAt,
     path: KeyPath,
     findings: Findings,
 ) -> None:
-    """Note what is wrong with a stage's `search` and with what it is searched from."""
+    """Note what is wrong with a stage's `search` and with what it is searched from.
+
+    Args:
+        header: The stage, which has a search.
+        source: What its runs start from.
+        earlier: The stages above this one by name; None for one that can't be made out.
+        points: The stage as it is without what is searched.
+        seeds: How many the sweep has; 0 if that isn't known.
+        resolve_at: Makes the stage's settings at a point.
+        path: The stage's place in the document.
+        findings: Takes the problems.
+    """
     search = header.search
     assert search is not None
     place = (*path, "search")
+    problems_before = len(findings.problems)
     if header.grid:
         findings.add((*path, "grid"), "must not be given beside search: put it into the space")
     for position, objective in enumerate(search.objectives):
@@ -72,6 +88,36 @@ def check_search(
             f"search its settings as '{above.name}:...'",
         )
     _check_values(search, above, resolve_at, place, findings)
+    if len(findings.problems) == problems_before:  # the budget is a sound number then
+        _check_rungs(search, seeds, most_env_steps(search, points), place, findings)
+
+
+def most_env_steps(search: SearchSettings, points: Sequence[Point]) -> int:
+    """Environment steps of a searched stage's longest run; 0 if nothing says so.
+
+    Args:
+        search: What is searched or compared.
+        points: The stage as it is without that.
+    """
+    if "env_steps" in search.space:
+        return int(max(search.space["env_steps"].ends()))
+    if "env_steps" in search.compare:
+        return max(int(str(value)) for value in search.compare["env_steps"])
+    return max((run.env_steps for point in points for run in point.runs.values()), default=0)
+
+
+def _check_rungs(
+    search: SearchSettings, seeds: int, env_steps: int, place: Place, findings: Findings
+) -> None:
+    """A rung must be reached before a trial ends, or at its end."""
+    for position, rung in enumerate(search.pruning.rungs if search.pruning else ()):
+        here = (*place, "pruning", "rungs", position)
+        if seeds and rung.seeds is not None and rung.seeds > seeds:
+            rule = f"must be <= {seeds}, the number of the sweep's seeds, got {rung.seeds}"
+            findings.add((*here, "seeds"), rule)
+        if env_steps and rung.env_steps is not None and rung.env_steps > env_steps:
+            rule = f"must be <= {env_steps}, the longest run's env steps, got {rung.env_steps}"
+            findings.add((*here, "env_steps"), rule)
 
 
 def _check_values(
@@ -91,54 +137,83 @@ def _check_values(
                 f"got '{stage}:...'",
             )
             return
-    points: list[dict[str, tuple[KeyPath, Any]]] = [
-        {name: (("search", *at), value) for name, (at, value) in corner.items()}
-        for corner in search.corners()
-    ]
-    points += [
-        {name: (("search", "compare", name, position), value)}
-        for name, values in search.compare.items()
-        for position, value in enumerate(values)
-    ]
-    for point in points:
-        resolve_at({name: at for name, at in point.items() if ":" not in name}, findings)
-        if above is not None:
-            _check_above(above, point, place[:-1], findings)
+    problems_before = len(findings.problems)
+    for name, values in search.compare.items():
+        findings.forbid_repeats(values, (*place, "compare", name))
+    for name, dimension in search.space.items():
+        if isinstance(dimension, Choice):
+            findings.forbid_repeats(dimension.choice, (*place, "space", name, "choice"))
+    tried: list[tuple[KeyPath, Any, _Runs]] = []
+    for where, point in _worth_trying(search):
+        if where[-1] not in point:
+            rule = f"must be able to hold, got {shown(search.space[str(where[-1])].when)}"
+            findings.add((*place, *where, "when"), rule)
+            continue
+        own = resolve_at({name: at for name, at in point.items() if ":" not in name}, findings)
+        theirs = None if above is None else _check_above(above, point, place[:-1], findings)
+        tried.append((where, point[str(where[-1])][1], (own.runs, theirs)))
+    if len(findings.problems) == problems_before:
+        _forbid_equal_values(tried, place, findings)
     _check_points(search, place, findings)
+
+
+_Runs = tuple[Mapping[str, RunSettings], Mapping[str, RunSettings] | None]
+"""Settings of a stage's runs by task, and of those that they start from."""
+
+
+def _worth_trying(
+    search: SearchSettings,
+) -> Iterator[tuple[KeyPath, Mapping[str, tuple[KeyPath, Any]]]]:
+    """The place of a value below `search`, and a point that shows whether it is sound."""
+    for name, corner in search.corners():
+        point = {key: (("search", *at), value) for key, (at, value) in corner.items()}
+        yield ("space", name), point
+    for name, values in search.compare.items():
+        for position, value in enumerate(values):
+            yield ("compare", name), {name: (("search", "compare", name, position), value)}
+
+
+def _forbid_equal_values(
+    tried: Sequence[tuple[KeyPath, Any, _Runs]], place: Place, findings: Findings
+) -> None:
+    """Two spellings of one schedule, say: two studies, or two options, of the same runs."""
+    for (where, _, one), (elsewhere, value, other) in itertools.combinations(tried, 2):
+        if where == elsewhere and one == other and other[0]:
+            rule = f"must not have two equal values, got {shown(value)} again"
+            findings.add((*place, *where), rule)
 
 
 def _check_above(
     above: Stage, point: Mapping[str, tuple[KeyPath, Any]], path: Place, findings: Findings
-) -> None:
+) -> Mapping[str, RunSettings] | None:
     """Settings of the stage above, with the problems at their place in this one."""
-    from music_rllib.experiment.problems import ConfigError
-
     theirs = of_stage({name: value for name, (_, value) in point.items()}, above.name)
     if not theirs:
-        return
+        return None
     try:
-        above.resolve(theirs)
+        return above.resolve(theirs).runs
     except ConfigError as error:
         name = next(name for name in point if name.startswith(f"{above.name}:"))
         for line in error.lines:
             findings.add((*path, *point[name][0]), f"in stage {above.name}, {line}")
+        return None
 
 
 def _check_points(search: SearchSettings, place: Place, findings: Findings) -> None:
-    from music_rllib.experiment.space import Choice
+    """Each given value must be in the space, and beside what it depends on.
 
+    The sampler chooses what a point leaves open: a setting that depends on that might be dropped.
+    """
     for position, point in enumerate(search.points_to_evaluate):
-        for name, value in point.items():
-            dimension = search.space[name]
-            if isinstance(dimension, Choice):
-                inside = value in dimension.choice
-                rule = f"must be one of {shown(list(dimension.choice))}"
+        existing: dict[str, Any] = {}
+        for name, dimension in search.space.items():
+            if name not in point:
+                continue
+            here, value = (*place, "points_to_evaluate", position, name), point[name]
+            if not dimension.contains(value):
+                findings.add(here, f"must be {dimension.rule}, got {shown(value)}")
+            elif dimension.applies(existing):
+                existing[name] = value
             else:
-                low, high = dimension.ends()
-                number = isinstance(value, int | float) and not isinstance(value, bool)
-                inside = number and low <= float(str(value)) <= high
-                rule = f"must be in [{low:g}, {high:g}]"
-            if not inside:
-                findings.add(
-                    (*place, "points_to_evaluate", position, name), f"{rule}, got {shown(value)}"
-                )
+                wanted = " and ".join(f"{key}: {shown(one)}" for key, one in dimension.when.items())
+                findings.add(here, f"must only be given beside {wanted}, got {shown(point)}")

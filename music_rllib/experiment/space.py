@@ -5,7 +5,8 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Any, Literal, Self
+from functools import cached_property
+from typing import Annotated, Any, Literal, Self, TypeGuard
 
 from pydantic import (
     BaseModel,
@@ -16,6 +17,8 @@ from pydantic import (
     Tag,
     model_validator,
 )
+
+from music_rllib.experiment.problems import same, shown
 
 __all__ = [
     "FINAL_SEED",
@@ -34,6 +37,9 @@ __all__ = [
 FINAL_SEED = 1_000_000
 """First of the fresh seeds of the final ranking: no search uses seeds from here on."""
 
+MOST_GRID_POINTS = 100_000
+"""Of a search with `sampler: grid`: far more than anyone can train, and still quick to list."""
+
 
 class _Strict(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -50,9 +56,24 @@ class _Dimension(_Strict):
     def applies(self, chosen: Mapping[str, Any]) -> bool:
         """Whether this dimension exists beside the values that are chosen already."""
         return all(
-            name in chosen and chosen[name] in (wanted if isinstance(wanted, list) else [wanted])
+            name in chosen and any(same(chosen[name], value) for value in _listed(wanted))
             for name, wanted in self.when.items()
         )
+
+
+def _listed(wanted: JsonValue) -> list[JsonValue]:
+    """The values that one setting of `when` may have."""
+    return wanted if isinstance(wanted, list) else [wanted]
+
+
+def _is_number(value: Any) -> TypeGuard[float]:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _in_steps(low: float, high: float, step: float | None) -> str:
+    """`in [1, 2] and whole steps of 0.5 from 1`."""
+    steps = "" if step is None else f" and whole steps of {step:g} from {low:g}"
+    return f"in [{low:g}, {high:g}]{steps}"
 
 
 class FloatRange(_Dimension):
@@ -77,16 +98,33 @@ class FloatRange(_Dimension):
     @property
     def reachable(self) -> tuple[float, float]:
         """The ends, the upper one a whole number of steps above the lower."""
-        values = self.values()
-        return (values[0], values[-1]) if values else self.bounds
+        return self.bounds if self.size is None else (self._at(0), self._at(self.size - 1))
+
+    @property
+    def size(self) -> int | None:
+        """Number of values; None where they can't be counted."""
+        low, high = self.bounds
+        return None if self.step is None else int((high - low) / self.step + 1e-9) + 1
+
+    def _at(self, position: int) -> float:
+        return float(f"{self.bounds[0] + position * (self.step or 0.0):.12g}")
 
     def values(self) -> tuple[Any, ...] | None:
         """All values, for a grid; None where they can't be listed."""
-        if self.step is None:
-            return None
-        low, high = self.bounds
-        count = int((high - low) / self.step + 1e-9) + 1
-        return tuple(float(f"{low + index * self.step:.12g}") for index in range(count))
+        return None if self.size is None else tuple(self._at(at) for at in range(self.size))
+
+    def contains(self, value: Any) -> bool:
+        """Whether it is one of the values, however many there are."""
+        low, high = self.reachable
+        if not (_is_number(value) and low <= value <= high):
+            return False
+        steps = 0.0 if self.step is None else (value - low) / self.step
+        return abs(steps - round(steps)) < 1e-8  # Optuna's tolerance
+
+    @property
+    def rule(self) -> str:
+        """What a value must be, in words."""
+        return _in_steps(*self.bounds, self.step)
 
 
 class IntRange(_Dimension):
@@ -114,9 +152,24 @@ class IntRange(_Dimension):
         low, high = self.bounds
         return low, low + (high - low) // self.step * self.step
 
+    @property
+    def size(self) -> int | None:
+        """Number of values."""
+        return (self.bounds[1] - self.bounds[0]) // self.step + 1
+
     def values(self) -> tuple[Any, ...] | None:
         """All values, for a grid."""
         return tuple(range(self.bounds[0], self.bounds[1] + 1, self.step))
+
+    def contains(self, value: Any) -> bool:
+        """Whether it is one of the values, however many there are."""
+        low, high = self.bounds
+        return _is_number(value) and low <= value <= high and (value - low) % self.step == 0
+
+    @property
+    def rule(self) -> str:
+        """What a value must be, in words."""
+        return f"a whole number {_in_steps(*self.bounds, None if self.step == 1 else self.step)}"
 
 
 class Choice(_Dimension):
@@ -129,9 +182,23 @@ class Choice(_Dimension):
         """Values that must be sound for all of them to be."""
         return tuple(self.choice)
 
+    @property
+    def size(self) -> int | None:
+        """Number of values."""
+        return len(self.choice)
+
     def values(self) -> tuple[Any, ...] | None:
         """All values, for a grid."""
         return tuple(self.choice)
+
+    def contains(self, value: Any) -> bool:
+        """Whether it is one of the values."""
+        return any(same(value, one) for one in self.choice)
+
+    @property
+    def rule(self) -> str:
+        """What a value must be, in words."""
+        return f"one of {shown(self.choice)}"
 
 
 def _kind(value: Any) -> str | None:
@@ -208,13 +275,25 @@ class Objective(_Strict):
         return f"{self.aggregate} of {read}{self.metric}{until}"
 
 
+def _one_or_several(value: Any) -> str:
+    """Which of the two a value claims to be, so that errors speak of that one only."""
+    return "several" if isinstance(value, list | tuple) else "one"
+
+
+Objectives = Annotated[
+    Annotated[Objective, Tag("one")] | Annotated[list[Objective], Tag("several")],
+    Discriminator(_one_or_several),
+]
+
+
 class Rung(_Strict):
     """A point of a trial at which it may be stopped."""
 
     seeds: int | None = Field(None, gt=0)
-    """Its first so many seeds have run; null: all."""
+    """Its first so many seeds have run, no more than the sweep has; null: all."""
     env_steps: int | None = Field(None, gt=0)
-    """Up to so many environment steps, rounded up to the next evaluation; null: to the end."""
+    """Up to so many environment steps, rounded up to the next evaluation, and no more than the
+    longest run has; null: to the end."""
 
 
 class Pruning(_Strict):
@@ -270,7 +349,7 @@ class SearchSettings(_Strict):
     """Of `compare` mode: dotted setting to the values to tell apart."""
     sampler: Literal["tpe", "random", "grid", "cmaes", "nsga2"] = "tpe"
     """Optuna's TPE, CMA-ES (numbers only) and NSGA-II (several objectives), random, or all points
-    of a grid in order."""
+    of a grid in order, at most 100,000."""
     trials: int | None = Field(None, gt=0)
     """Trials to judge; null with `grid`: all points."""
     startup_trials: int = Field(5, gt=0)
@@ -282,10 +361,11 @@ class SearchSettings(_Strict):
     keeps more CPUs busy, less learns sooner. Part of what makes a study reproducible."""
     seed: int = Field(0, ge=0, lt=2**31)
     """Of the choice of points."""
-    objective: Objective | list[Objective] = Objective()
+    objective: Objectives = Objective()
     """What is optimised; a list of several gives a Pareto front."""
     points_to_evaluate: list[dict[str, JsonValue]] = Field(default_factory=list)
-    """Points, or parts of points, that are the first trials."""
+    """Points, or parts of points, that are the first trials, just as written. Each value must be
+    one of the space, and one with `when` stand beside what it depends on."""
     pruning: Pruning | None = None
     """null: every trial runs to its end on all seeds."""
     final: Final | None = Final()
@@ -303,23 +383,32 @@ class SearchSettings(_Strict):
         """One, or several."""
         return tuple(self.objective) if isinstance(self.objective, list) else (self.objective,)
 
-    @property
+    @cached_property
     def count(self) -> int:
         """Trials of each study."""
         grid = self.grid() if self.sampler == "grid" else []
         return min(self.trials or len(grid), len(grid)) if grid else (self.trials or 0)
 
     def grid(self) -> list[dict[str, Any]]:
-        """All points, the last dimension varying fastest."""
+        """All points, the last dimension varying fastest.
+
+        Raises:
+            ValueError: There are too many to list.
+        """
         points: list[dict[str, Any]] = [{}]
         for name, dimension in self.space.items():
+            exists = [dimension.applies(point) for point in points]
+            size = sum((dimension.size or 0) if there else 1 for there in exists)
+            if size > MOST_GRID_POINTS:  # counted before any of them is made
+                raise ValueError(
+                    f"space must have at most {MOST_GRID_POINTS:,} points with sampler: grid, "
+                    f"got {size:,} up to {name}"
+                )
             values = dimension.values() or ()
             points = [
                 {**point, **extra}
-                for point in points
-                for extra in (
-                    [{name: value} for value in values] if dimension.applies(point) else [{}]
-                )
+                for point, there in zip(points, exists, strict=True)
+                for extra in ([{name: value} for value in values] if there else [{}])
             ]
         return points
 
@@ -328,18 +417,19 @@ class SearchSettings(_Strict):
         choices = [[(name, value) for value in values] for name, values in self.compare.items()]
         return [dict(pairs) for pairs in itertools.product(*choices)]
 
-    def corners(self) -> Iterator[dict[str, tuple[tuple[str | int, ...], Any]]]:
+    def corners(self) -> Iterator[tuple[str, dict[str, tuple[tuple[str | int, ...], Any]]]]:
         """Points that show whether the space's ends are sound: each end once, the rest at first.
 
         Yields:
-            Dotted setting to (place below `search`, value).
+            The setting that is at its end, and the point: dotted setting to (place below `search`,
+            value).
         """
         middle = {
             name: (("space", name), dimension.ends()[0]) for name, dimension in self.space.items()
         }
         for name, dimension in self.space.items():
             for value in dimension.ends():
-                yield self._existing(middle | {name: (("space", name), value)}, keep=name)
+                yield name, self._existing(middle | {name: (("space", name), value)}, keep=name)
 
     def _existing(
         self, point: dict[str, tuple[tuple[str | int, ...], Any]], keep: str
@@ -349,8 +439,7 @@ class SearchSettings(_Strict):
         todo = [keep]
         while todo:
             for name, wanted in self.space[todo.pop()].when.items():
-                value = wanted[0] if isinstance(wanted, list) else wanted
-                point[name] = (("space", name), value)
+                point[name] = (("space", name), _listed(wanted)[0])
                 todo.append(name)
         found: dict[str, tuple[tuple[str | int, ...], Any]] = {}
         for name, dimension in self.space.items():
@@ -371,9 +460,9 @@ class SearchSettings(_Strict):
                 if other not in names[:position]:
                     yield f"space.{name}.when must name settings that stand above it, got {other!r}"
                     continue
-                above = self.space[other]
-                values = wanted if isinstance(wanted, list) else [wanted]
-                if isinstance(above, Choice) and any(v not in above.choice for v in values):
+                # An empty list is a mistake too: with either, this setting never exists.
+                values = _listed(wanted)
+                if not values or not all(map(self.space[other].contains, values)):
                     yield f"space.{name}.when must hold values of {other}, got {json.dumps(wanted)}"
         for name in self.compare:
             if name in self.space:
@@ -382,6 +471,11 @@ class SearchSettings(_Strict):
             yield f"compare must be given with mode: compare, and only there, got mode: {self.mode}"
         yield from self._broken_sampler()
         yield from self._broken_pruning()
+        if self.trials is not None and len(self.points_to_evaluate) > self.trials:
+            yield (
+                f"points_to_evaluate must not be more than the trials ({self.trials}), "
+                f"got {len(self.points_to_evaluate)}"
+            )
         for point in self.points_to_evaluate:
             for name in point:
                 if name not in self.space:
@@ -392,8 +486,9 @@ class SearchSettings(_Strict):
     def _broken_sampler(self) -> Iterator[str]:
         if self.sampler == "grid":
             for name, dimension in self.space.items():
-                if dimension.values() is None:
+                if dimension.size is None:
                     yield f"space.{name} must have a step to be part of a grid, got none"
+            self.grid()  # which says so if it is too large
         elif self.trials is None:
             yield f"trials must be given with sampler: {self.sampler}, got null"
         if self.sampler == "cmaes":

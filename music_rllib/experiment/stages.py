@@ -41,7 +41,7 @@ def resolve_stage(
     path: KeyPath,
     *,
     defaults: Mapping[str, Any],
-    seed: int,
+    seeds: tuple[int, ...],
     sweep_tasks: tuple[Task, ...],
     find_tasks: FindTasks,
     earlier: Mapping[str, Stage | None],
@@ -53,7 +53,8 @@ def resolve_stage(
         raw: The entry.
         path: Its place in the document.
         defaults: The sweep's `defaults`.
-        seed: Goes into the settings; the plan puts in the others.
+        seeds: The sweep's, if they are known; the first goes into the settings, the plan puts
+            in the others.
         sweep_tasks: The tasks of a stage that names none.
         find_tasks: Looks tasks up by name, noting those it doesn't find.
         earlier: The stages above this one by name; None for one that can't be made out.
@@ -74,6 +75,7 @@ def resolve_stage(
         findings.forbid_repeats(header.tasks, (*path, "tasks"))
         tasks = find_tasks(header.tasks, (*path, "tasks"))
     tasks = _with_split(tasks, header, path, findings)
+    seed = seeds[0] if seeds else 0
     settings = {key: raw[key] for key in LAYER_KEYS if key in raw}
     settings["per_task"] = _per_task(header, tasks, path, findings)
 
@@ -85,7 +87,7 @@ def resolve_stage(
         _forbid_equal_points(points, path, findings)
     source = _source(header, path, find_tasks, findings)
     if header.search is not None:
-        check_search(header, source, earlier, resolve_at, path, findings)
+        check_search(header, source, earlier, points, len(seeds), resolve_at, path, findings)
     stage = Stage(
         name=header.name,
         variant=header.variant,

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import json
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,6 +20,7 @@ from pydantic import ValidationError
 
 from music_rllib.envs.make import check_action_space, make_env, observation_sizes
 from music_rllib.envs.registry import Task
+from music_rllib.experiment.handoff import MANIFEST as HANDOFF_FILE
 from music_rllib.experiment.handoff import HandoffError, HandoffInfo, open_handoff, read_handoff
 from music_rllib.experiment.sealed import MANIFEST, SealedFolders, StorageError, open_storage
 from music_rllib.experiment.settings import RunSettings
@@ -32,6 +33,8 @@ RUN_FILE = "run.json"
 """A run's settings, in its node and in its checkpoints."""
 MLFLOW_FILE = "policy.safetensors"
 """The policy in an MLflow model."""
+NAMED = 8
+"""Sub-folders that a message lists."""
 
 
 class PolicyError(ValueError):
@@ -112,13 +115,17 @@ def policy_from_folder(folder: Path) -> Policy:
     """The policy in a local node, checkpoint or handoff, or in an MLflow model's folder.
 
     Raises:
-        PolicyError: there are weights, but they don't belong to their task or settings.
+        PolicyError: there are weights, but they don't belong to their task or settings, or there
+            are several policies in sub-folders.
         HandoffError: there are none.
     """
     for inside in (MLFLOW_FILE, f"artifacts/{MLFLOW_FILE}"):
         if (folder / inside).is_file():
             return _from_file(folder / inside)
-    above, manifest = open_handoff(folder)
+    try:
+        above, manifest = open_handoff(folder)
+    except HandoffError as error:
+        raise _several(folder) or error from None
     info = manifest.info
     wanted = ["policy", "normaliser"] if info.architecture.normalise_observations else ["policy"]
     parts = read_handoff(above, wanted, info.task)
@@ -129,6 +136,26 @@ def policy_from_folder(folder: Path) -> Policy:
     except ValueError as error:
         raise PolicyError(f"{above} must fit the task {info.task.name}: {error}") from error
     return _policy(network)
+
+
+def _several(folder: Path) -> PolicyError | None:
+    """What to say of a folder with policies in its sub-folders only; None for another one.
+
+    `best` leaves such a folder where a sweep has several tasks.
+    """
+    if (folder / "handoff").exists() or (folder / HANDOFF_FILE).exists():
+        return None  # there is one, and the error says what is wrong with it
+    found = []
+    for below in sorted(folder.glob("*/")):
+        with contextlib.suppress(HandoffError):
+            found.append(f"{below} ({open_handoff(below)[1].info.task.name})")
+    if not found:
+        return None
+    more = f" and {len(found) - NAMED} more" if len(found) > NAMED else ""
+    return PolicyError(
+        f"{folder} must hold one policy, its sub-folders hold one each: give "
+        f"{' or '.join(found[:NAMED])}{more}"
+    )
 
 
 def _network(
@@ -194,7 +221,7 @@ def _from_mlflow(uri: str) -> Policy:
         ) from error
 
 
-@contextmanager
+@contextlib.contextmanager
 def _local_copy(place: str) -> Iterator[Path]:
     """A sealed folder's verified copy; another local folder as it is."""
     filesystem, root = open_storage(place)

@@ -104,22 +104,23 @@ def prune(
     *,
     scores: Array,
     others: Mapping[int, Array],
-    whole: Sequence[Array] = (),
+    whole: Mapping[int, Array] | None = None,
     place: str,
 ) -> Verdict:
     """Whether a trial that has reached a rung is stopped there.
 
     It goes on if it is in the best part of those that have reached the rung, and it goes on too if
     its interval reaches the best of them: then its place may be bad luck. The interval is that of a
-    mean, with the spread between seeds that earlier trials have in common: a few runs of one trial
-    tell little about theirs.
+    mean over as many runs as the aggregate hangs on, with the spread between seeds that earlier
+    trials have in common: a few runs of one trial tell little about theirs.
 
     Args:
         objective: What counts.
         pruning: The rules.
         scores: The trial's runs so far, `[seeds, tasks]`.
         others: Trial number to the same of each earlier trial that reached this rung.
-        whole: All runs of earlier trials that went to their end, `[seeds, tasks]` each.
+        whole: Trial number to all runs of each earlier trial that went to its end; they tell the
+            spread of those with a single seed at this rung.
         place: The rung in words.
     """
     sign = 1.0 if objective.maximised else -1.0
@@ -132,7 +133,12 @@ def prune(
     bar, best = ranked[kept - 1], max(theirs.values())
     if mine >= bar:
         return Verdict(stop=False, reason=f"{place}: among the best {kept} of {len(ranked)}")
-    half = _half_width(scores, [*others.values(), *whole], pruning.confidence)
+    # A seed that is at this rung and at the end too must not count as two.
+    known = [
+        values if len(values) > 1 else (whole or {}).get(number, values)
+        for number, values in others.items()
+    ]
+    half = _half_width(objective, scores, known, pruning.confidence)
     ends = f"[{sign * mine - half:.4g}, {sign * mine + half:.4g}]"
     if mine + half >= best:
         return Verdict(
@@ -150,8 +156,10 @@ def prune(
     )
 
 
-def _half_width(scores: Array, others: Sequence[Array], confidence: float) -> float:
-    """Of the interval around a trial's mean; infinite where no two seeds tell the spread."""
+def _half_width(
+    objective: Objective, scores: Array, others: Sequence[Array], confidence: float
+) -> float:
+    """Of the interval around a trial's number; infinite where no two seeds tell the spread."""
     squares, freedom = 0.0, 0
     for values in (scores, *others):
         squares += float(np.sum((values - values.mean(axis=0)) ** 2))
@@ -159,4 +167,22 @@ def _half_width(scores: Array, others: Sequence[Array], confidence: float) -> fl
     if freedom == 0:
         return math.inf
     spread = math.sqrt(squares / freedom)
-    return float(stats.t.ppf((1 + confidence) / 2, freedom)) * spread / math.sqrt(scores.size)
+    quantile = float(stats.t.ppf((1 + confidence) / 2, freedom))
+    return quantile * spread / math.sqrt(_runs_behind(objective, scores))
+
+
+def _runs_behind(objective: Objective, scores: Array) -> float:
+    """How many runs a mean must have to vary as much as the aggregate does, at the least.
+
+    It is as if the tasks were far apart, as success rates of easy and hard ones are: then the worst
+    task is one of them, the median is that of one, and the middle half is half of them.
+    """
+    seeds, runs = len(scores), int(scores.size)
+    match objective.aggregate:
+        case "mean":
+            return runs
+        case "iqm":
+            return runs - 2 * (runs // 4)  # what it does not cut off
+        case "median":
+            return seeds * 2 / math.pi  # its efficiency on normal numbers
+    return seeds

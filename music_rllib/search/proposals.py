@@ -26,6 +26,7 @@ from optuna.exceptions import ExperimentalWarning
 from optuna.samplers import BaseSampler, CmaEsSampler, NSGAIISampler, RandomSampler, TPESampler
 from optuna.trial import FrozenTrial, TrialState, create_trial
 
+from music_rllib.experiment.problems import same
 from music_rllib.experiment.space import Choice, Dimension, FloatRange, IntRange, SearchSettings
 
 __all__ = ["Proposal", "Proposer", "as_proposal", "decoded", "seed_of"]
@@ -98,8 +99,9 @@ class Proposer:
                     distributions=dict(other.distributions),
                 )
             )
-        if number < len(self._points):
-            study.enqueue_trial(_encoded(self._settings.space, self._points[number]))
+        given = self._points[number] if number < len(self._points) else {}
+        if given:
+            study.enqueue_trial(_encoded(self._settings.space, given))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ExperimentalWarning)
             trial = study.ask()
@@ -107,6 +109,8 @@ class Proposer:
             for name, dimension in self._settings.space.items():
                 if dimension.applies(values):
                     values[name] = _suggest(trial, name, dimension)
+                    if name in given and isinstance(dimension, FloatRange):
+                        values[name] = float(given[name])  # not rounded: a person wrote it
         proposal = as_proposal(self._settings.space, values)
         kept = {
             key: value
@@ -192,10 +196,14 @@ def _json(value: Any) -> str:
 
 
 def _encoded(space: Mapping[str, Dimension], values: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        name: _plain(value) if isinstance(space[name], Choice) else value
-        for name, value in values.items()
-    }
+    return {name: _param(space[name], value) for name, value in values.items()}
+
+
+def _param(dimension: Dimension, value: Any) -> Any:
+    if isinstance(dimension, Choice):
+        # As the choice spells it: Optuna must find 1 among [1.0, 1.5].
+        return _plain(next(one for one in dimension.choice if same(one, value)))
+    return value
 
 
 def decoded(dimension: Dimension, param: Any) -> Any:

@@ -15,6 +15,7 @@ import time
 import uuid
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import optuna
@@ -27,12 +28,24 @@ from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError, IntegrityError, ProgrammingError, SQLAlchemyError
 
 from music_rllib.experiment.files import content_key
+from music_rllib.experiment.plan import short
+from music_rllib.experiment.problems import same
 from music_rllib.experiment.sealed import StorageError
-from music_rllib.experiment.space import SearchSettings
+from music_rllib.experiment.space import SearchSettings, WarmStart
 from music_rllib.search.proposals import Proposal, Proposer, as_proposal
 from music_rllib.tracking.redaction import redact
 
-__all__ = ["DATABASE_ERRORS", "REASON", "SCORES", "VALUES", "Study", "open_studies", "study_names"]
+__all__ = [
+    "DATABASE_ERRORS",
+    "REASON",
+    "SCORES",
+    "VALUES",
+    "Study",
+    "no_study_error",
+    "open_older",
+    "open_studies",
+    "study_names",
+]
 
 DATABASE_ERRORS = (StorageInternalError, SQLAlchemyError)
 """A database that doesn't answer, or not now."""
@@ -41,42 +54,52 @@ LEASE_SECONDS = 120.0
 """After so long without a sign of life a driver on another machine counts as dead."""
 SIGN_SECONDS = 20.0
 
-FINGERPRINT, SETTINGS, POINTS, PRIOR, BASE = (
+FINGERPRINT, SETTINGS, POINTS, PRIOR, LEARNT, BASE, SEARCH, ARM = (
     "music_rllib:fingerprint",
     "music_rllib:settings",
     "music_rllib:points",
     "music_rllib:prior",
+    "music_rllib:learnt",
     "music_rllib:base",
+    "music_rllib:search",
+    "music_rllib:arm",
 )
 OWNER, VALUES, REASON, SCORES = "owner", "values", "reason", "scores"
 DRIVER = "driver:"
 
 
-def open_studies(url: str) -> BaseStorage:
+def open_studies(
+    url: str, *, setting: str = "search.storage", must_exist: bool = False
+) -> BaseStorage:
     """Open Optuna's storage.
 
     Args:
         url: SQLAlchemy's URL, or the path of a sqlite file. PostgreSQL's password comes from
             `PGPASSWORD` or a password file.
+        setting: Where the user has named it, for messages.
+        must_exist: Change nothing: refuse a sqlite file that isn't there, or has no studies in it.
 
     Raises:
         StorageError: The database can't be reached.
     """
+    shown = redact(url)
     if "://" not in url:
         url = f"sqlite:///{url}"
-    shown = redact(url)
     try:
         parsed = make_url(url)
         if parsed.password:
             raise StorageError(
-                f"search.storage must not hold a password, got one in {shown}: put it into the "
+                f"{setting} must not hold a password, got one in {shown}: put it into the "
                 "environment as PGPASSWORD, or into ~/.pgpass"
             )
         if parsed.drivername == "postgresql":
             parsed = parsed.set(drivername="postgresql+psycopg2")
         local = parsed.get_backend_name() == "sqlite"
+        if must_exist and local and not Path(parsed.database or "").is_file():
+            raise StorageError(f"{setting} must be an sqlite file that is there, got {shown}")
         options: dict[str, Any] = {"connect_args": {"timeout": 60}} if local else {"pool_size": 2}
-        return get_storage(_with_tables(parsed, options))  # with a cache of ended trials
+        # With a cache of ended trials.
+        return get_storage(_with_tables(parsed, options, make=not must_exist))
     except StorageError:
         raise
     except (
@@ -88,21 +111,22 @@ def open_studies(url: str) -> BaseStorage:
     ) as error:
         cause = str(error.__cause__ or error).strip().splitlines()[0]
         raise StorageError(
-            f"search.storage must be a database that can be used, got {shown}: {redact(cause)}"
+            f"{setting} must be a database that can be used, got {shown}: {redact(cause)}"
         ) from error
 
 
-def _with_tables(url: URL, options: Mapping[str, Any]) -> RDBStorage:
-    """Optuna's storage, its tables made where they are missing.
+def _with_tables(url: URL, options: Mapping[str, Any], *, make: bool) -> RDBStorage:
+    """Optuna's storage, its tables made where they are missing if `make` says so.
 
     Of two drivers that find a new database at the same moment, one fails to make a table that the
     other is just making, and finds it there when it looks again.
     """
-    for wait in (0.5, 1.0, 2.0, 4.0, None):
+    for wait in (0.5, 1.0, 2.0, 4.0, None) if make else (None,):
         try:
             return RDBStorage(
                 url.render_as_string(hide_password=False),
                 engine_kwargs={**options, "pool_pre_ping": True},
+                skip_table_creation=not make,
             )
         except (IntegrityError, ProgrammingError):
             if wait is None:
@@ -111,13 +135,41 @@ def _with_tables(url: URL, options: Mapping[str, Any]) -> RDBStorage:
     raise AssertionError("unreachable")
 
 
+def open_older(url: str) -> BaseStorage:
+    """Open the storage of a warm start, which must be there.
+
+    Raises:
+        StorageError: It isn't, or can't be reached.
+    """
+    return open_studies(url, setting="search.warm_start.storage", must_exist=True)
+
+
 def study_names(storage: BaseStorage) -> list[str]:
-    """All studies, the oldest first."""
+    """The oldest first."""
     return [one.study_name for one in _studies(storage)]
 
 
+def no_study_error(warm: WarmStart, known: Sequence[str]) -> StorageError:
+    """That none of the `known` studies is the one to learn from."""
+    if known:
+        rule = f"must be (the beginning of) one of {', '.join(known)}, got {warm.study!r}"
+    else:
+        place = "the search's own storage" if warm.storage is None else redact(warm.storage)
+        rule = (
+            f"must be (the beginning of) a study's name, got {warm.study!r}: there are no other "
+            f"studies in {place}"
+        )
+    return StorageError(f"search.warm_start.study {rule}")
+
+
 def _studies(storage: BaseStorage) -> list[Any]:
+    """The oldest first."""
     return sorted(storage.get_all_studies(), key=lambda one: int(one._study_id))
+
+
+def _search_of(study: Any) -> str:
+    """What the studies of one search have in common; its own name for one that doesn't say."""
+    return str(study.user_attrs.get(SEARCH, study.study_name))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,6 +180,8 @@ class Identity:
     """`sweep/stage`, with the compared values behind it."""
     fingerprint: str
     """Hash of all that determines its points and values."""
+    search: str
+    """The same for all compared values: theirs are the studies of one search."""
 
     @property
     def name(self) -> str:
@@ -145,21 +199,26 @@ class Study:
         settings: SearchSettings,
         determined_by: Mapping[str, Any],
         *,
+        arm: Mapping[str, Any],
         alone: bool,
     ) -> None:
         """Open or make the study.
 
         Args:
             storage: Where it is.
-            base: Its name without the hash.
+            base: Its search's name, `sweep/stage`.
             settings: How it is searched.
             determined_by: What else determines its values, as plain data.
+            arm: The compared values that are its own, if there are any.
             alone: No other driver can be at work: whatever is running was left by a dead one.
         """
         self.settings = settings
         self._storage = storage
+        self._arm = dict(arm)
         self.identity = Identity(
-            base=base, fingerprint=content_key([_of_study(settings), determined_by])
+            base="/".join((base, *(f"{name}={short(value)}" for name, value in arm.items()))),
+            fingerprint=content_key([_of_study(settings), {**determined_by, "arm": self._arm}]),
+            search=f"{base} @{content_key([_of_study(settings), determined_by])}",
         )
         self._alone = alone
         self._me = f"{socket.gethostname()}:{os.getpid()}:{uuid.uuid4().hex[:8]}"
@@ -177,31 +236,45 @@ class Study:
     # -- making it ---------------------------------------------------------------------------
 
     def _open(self) -> tuple[int, list[dict[str, Any]], list[FrozenTrial]]:
-        name = self.identity.name
+        try:
+            return self._once_made(self._storage.get_study_id_from_name(self.identity.name))
+        except KeyError:
+            pass  # it is to be made
         directions = [
             StudyDirection.MAXIMIZE if one.maximised else StudyDirection.MINIMIZE
             for one in self.settings.objectives
         ]
         # All but the name must be there before another driver sees the study: prepared first.
-        points = [*self.settings.points_to_evaluate, *self._taken_over()]
-        prior = self._warm_start()
+        contents = self._contents()
         try:
-            study = self._storage.create_new_study(directions, study_name=name)
+            study = self._storage.create_new_study(directions, study_name=self.identity.name)
         except DuplicatedStudyError:
-            study = self._storage.get_study_id_from_name(name)
-            return self._wait_until_made(study)
-        attributes = {
+            return self._once_made(self._storage.get_study_id_from_name(self.identity.name))
+        return self._fill(study, contents)
+
+    def _contents(self) -> dict[str, Any]:
+        """What is kept with a new study: from then on it holds, whatever becomes of older ones."""
+        prior, learnt = self._warm_start()
+        return {
             FINGERPRINT: self.identity.fingerprint,
             BASE: self.identity.base,
+            SEARCH: self.identity.search,
+            ARM: self._arm,
             SETTINGS: _of_study(self.settings),
             PRIOR: [_as_data(trial) for trial in prior],
-            POINTS: points,  # last: it says that all is there
+            LEARNT: learnt,
+            POINTS: [*self.settings.points_to_evaluate, *self._taken_over()],
         }
-        for key, value in attributes.items():
-            self._storage.set_study_user_attr(study, key, value)
-        return study, points, prior
 
-    def _wait_until_made(self, study: int) -> tuple[int, list[dict[str, Any]], list[FrozenTrial]]:
+    def _fill(
+        self, study: int, contents: Mapping[str, Any]
+    ) -> tuple[int, list[dict[str, Any]], list[FrozenTrial]]:
+        for key, value in contents.items():  # the points are the last: they say that all is there
+            self._storage.set_study_user_attr(study, key, value)
+        prior = [_from_data(data, self.settings) for data in contents[PRIOR]]
+        return study, contents[POINTS], prior
+
+    def _once_made(self, study: int) -> tuple[int, list[dict[str, Any]], list[FrozenTrial]]:
         for _ in range(100):
             attributes = self._storage.get_study_user_attrs(study)
             if POINTS in attributes:
@@ -209,10 +282,7 @@ class Study:
                 return study, attributes[POINTS], prior
             time.sleep(0.1)
         # Its maker died in between: nothing has been searched with it yet.
-        points = [*self.settings.points_to_evaluate, *self._taken_over()]
-        self._storage.set_study_user_attr(study, PRIOR, [])
-        self._storage.set_study_user_attr(study, POINTS, points)
-        return study, points, []
+        return self._fill(study, self._contents())
 
     def _taken_over(self) -> list[dict[str, Any]]:
         """Points of the newest study of the same name that was judged otherwise: they come first.
@@ -243,29 +313,58 @@ class Study:
                 points.append(values)
         return points
 
-    def _warm_start(self) -> list[FrozenTrial]:
-        """Finished trials of the study to learn from, as far as they fit the space."""
+    def _warm_start(self) -> tuple[list[FrozenTrial], str]:
+        """Trials of older studies to learn from, as far as they fit, and in words which they are.
+
+        Raises:
+            StorageError: There are none.
+        """
         warm = self.settings.warm_start
         if warm is None:
-            return []
-        storage = self._storage if warm.storage is None else open_studies(warm.storage)
-        found = [one for one in _studies(storage) if one.study_name.startswith(warm.study)]
-        found = [one for one in found if one.study_name != self.identity.name]
-        if not found:
-            known = ", ".join(study_names(storage)) or "none"
+            return [], ""
+        storage = self._storage if warm.storage is None else open_older(warm.storage)
+        older = self._older(storage, warm)
+        prior, ended = [], 0
+        for study in older:
+            for trial in storage.get_all_trials(study._study_id, deepcopy=False):
+                ended += trial.state.is_finished()
+                values = self._as_mine(study, trial)
+                if values is not None:
+                    data = {"values": values, "judged": list(trial.values)}
+                    prior.append(_from_data(data, self.settings))
+        names = ", ".join(study.study_name for study in older)
+        if not prior:
             raise StorageError(
-                f"search.warm_start.study must be (the beginning of) one of {known}, "
-                f"got {warm.study!r}"
+                f"search.warm_start.study must have judged trials that {self.identity.base} can "
+                f"learn from, got {names}, none of whose {ended} trials has the same objectives "
+                "and lies in the space"
             )
-        prior = []
-        for trial in storage.get_all_trials(found[-1]._study_id, deepcopy=False):
-            if trial.state is not TrialState.COMPLETE or trial.values is None:
-                continue
-            values = trial.user_attrs.get(VALUES, dict(trial.params))
-            if len(trial.values) == len(self.settings.objectives) and _fits(values, self.settings):
-                data = {"values": values, "judged": list(trial.values)}
-                prior.append(_from_data(data, self.settings))
-        return prior
+        return prior, f"learnt from {len(prior)} of {ended} trials of {names}"
+
+    def _older(self, storage: BaseStorage, warm: WarmStart) -> list[Any]:
+        """Studies of the newest search whose names begin as is wished: one, or compared ones."""
+        others = [
+            one for one in _studies(storage) if one.user_attrs.get(SEARCH) != self.identity.search
+        ]
+        found = [one for one in others if one.study_name.startswith(warm.study)]
+        if found:
+            newest = _search_of(found[-1])
+            return [one for one in found if _search_of(one) == newest]
+        raise no_study_error(warm, [one.study_name for one in others])
+
+    def _as_mine(self, study: Any, trial: FrozenTrial) -> dict[str, Any] | None:
+        """The point of another study's trial as one of this study's; None if it can't be one."""
+        objectives = self.settings.objectives
+        maximised = [one is StudyDirection.MAXIMIZE for one in study.directions]
+        if trial.state is not TrialState.COMPLETE or trial.values is None:
+            return None
+        if maximised != [one.maximised for one in objectives]:
+            return None
+        values = study.user_attrs.get(ARM, {}) | trial.user_attrs.get(VALUES, dict(trial.params))
+        for name, value in self._arm.items():
+            if name in values and not same(values.pop(name), value):
+                return None  # it tells of another compared value
+        return values if _fits(values, self.settings) else None
 
     def lay_out(self) -> None:
         """Make the trials that aren't there yet, waiting."""
@@ -298,6 +397,11 @@ class Study:
     def prior(self) -> int:
         """Trials of an older study that it learns from."""
         return len(self._storage.get_study_user_attrs(self._id).get(PRIOR, []))
+
+    @property
+    def learnt(self) -> str:
+        """From which trials of which studies it learns, in words; empty if from none."""
+        return str(self._storage.get_study_user_attrs(self._id).get(LEARNT, ""))
 
     # -- working on it -----------------------------------------------------------------------
 
@@ -436,13 +540,9 @@ def _fits(values: Mapping[str, Any], settings: SearchSettings) -> bool:
             continue
         if name not in values:
             return False
-        known, value = dimension.values(), values[name]
-        if known is not None:
-            if value not in known:
-                return False
-        elif not dimension.ends()[0] <= value <= dimension.ends()[1]:
+        if not dimension.contains(values[name]):
             return False
-        seen[name] = value
+        seen[name] = values[name]
     return len(seen) == len(values)
 
 

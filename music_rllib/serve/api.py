@@ -10,12 +10,13 @@ from typing import Annotated, Any
 import numpy as np
 from fastapi import Body, Depends, FastAPI, HTTPException, Request
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import JSONResponse
+from fastapi.responses import HTMLResponse, JSONResponse
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from starlette.exceptions import HTTPException as StarletteHTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 import music_rllib
+from music_rllib.serve.docs_page import docs_page
 from music_rllib.serve.protocol import (
     Answer,
     Array,
@@ -64,6 +65,8 @@ def make_api(facts: PolicyFacts, act: Act, token_sha256: str | None = None) -> F
         summary=f"Actions for {facts.task}",
         description=DESCRIPTION,
         version=music_rllib.__version__,
+        # Both load scripts from a CDN; `_add_docs` makes a page that needs no network.
+        docs_url=None,
         redoc_url=None,
     )
     api.add_middleware(_BodyLimit, limit=body.max_bytes)
@@ -101,7 +104,16 @@ def make_api(facts: PolicyFacts, act: Act, token_sha256: str | None = None) -> F
         body.annotation, Body(openapi_examples={"zeros": {"value": body.example}})
     ]
     api.post("/act", dependencies=protected, responses=failures)(act_on)
+    _add_docs(api)
     return api
+
+
+def _add_docs(api: FastAPI) -> None:
+    """`GET /docs`, for people; it isn't part of the OpenAPI document that it shows."""
+
+    @api.get("/docs", include_in_schema=False)
+    async def docs(request: Request) -> HTMLResponse:
+        return HTMLResponse(docs_page(api.openapi(), str(request.base_url)))
 
 
 def _only(

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from ipaddress import ip_address
 from typing import TYPE_CHECKING, Any
 
+from music_rllib._cluster import ClusterError, check_reachable, cluster_address
 from music_rllib.serve.protocol import TOKEN_VARIABLE
 
 if TYPE_CHECKING:
@@ -23,7 +24,8 @@ __all__ = ["main"]
 BAD_INPUT = 2
 DESCRIPTION = """\
 Serve a trained policy over HTTP with Ray Serve: POST /act takes a goal observation, or a batch of
-them, and answers with actions; GET /health, GET /policy; GET /docs is the OpenAPI page.
+them, and answers with actions; GET /health, GET /policy. GET /docs describes them on a page, GET
+/openapi.json for programs.
 """
 EPILOG = f"""\
 examples:
@@ -49,6 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         _check_exposure(arguments.host)
         _check_port(arguments.host, arguments.port)
+        _check_cluster()
         return _serve(arguments)
     except _BadInputError as error:
         print(f"error: {error}", file=sys.stderr)
@@ -79,17 +82,24 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _port(text: str) -> int:
-    port = int(text)
+    port = _whole(text)
     if not 0 < port < 2**16:
         raise argparse.ArgumentTypeError(f"must be in 1..65535, got {port}")
     return port
 
 
 def _positive(text: str) -> int:
-    number = int(text)
+    number = _whole(text)
     if number < 1:
         raise argparse.ArgumentTypeError(f"must be >= 1, got {number}")
     return number
+
+
+def _whole(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be a whole number, got {text!r}") from None
 
 
 def _check_exposure(host: str) -> None:
@@ -106,7 +116,7 @@ def _check_exposure(host: str) -> None:
 
 def _check_port(host: str, port: int) -> None:
     """Ray Serve itself would say so only in a worker's log."""
-    if os.environ.get("RAY_ADDRESS"):
+    if cluster_address() is not None:
         return  # it will be another machine that listens
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
@@ -120,6 +130,17 @@ def _check_port(host: str, port: int) -> None:
         ) from error
 
 
+def _check_cluster() -> None:
+    """Before anything is loaded for it; Ray itself would go on trying for minutes."""
+    address = cluster_address()
+    if address is None:
+        return
+    try:
+        check_reachable(address)
+    except ClusterError as error:
+        raise _BadInputError(str(error)) from error
+
+
 def _serve(arguments: argparse.Namespace) -> int:
     try:
         from ray import serve
@@ -127,6 +148,7 @@ def _serve(arguments: argparse.Namespace) -> int:
         raise _BadInputError(
             f"Ray Serve must be installed (pip install 'music_rllib[serve]'): {error}"
         ) from error
+    from music_rllib.experiment.sealed import StorageError
     from music_rllib.policy import PolicyError
     from music_rllib.serve.application import ServeSettings, app
 
@@ -135,9 +157,9 @@ def _serve(arguments: argparse.Namespace) -> int:
     )
     try:
         application = app(settings)
-    except PolicyError as error:
+    except (PolicyError, StorageError) as error:
         raise _BadInputError(str(error)) from error
-    if not os.environ.get("RAY_ADDRESS"):
+    if cluster_address() is None:
         _check_room(settings, [len(os.sched_getaffinity(0))])
     stop = _stop_signal()
     _connect(settings)
@@ -169,14 +191,14 @@ def _connect(settings: ServeSettings) -> None:
     from music_rllib._quiet import quiet_third_parties
 
     options: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.WARNING}
-    address = os.environ.get("RAY_ADDRESS")
-    if not address:
+    address = cluster_address()
+    if address is None:
         options |= {"address": "local", "include_dashboard": False}
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         ray.init(runtime_env={"worker_process_setup_hook": quiet_third_parties}, **options)
     except (ConnectionError, RuntimeError, ValueError) as error:
-        if not address:
+        if address is None:
             raise
         raise _BadInputError(
             f"RAY_ADDRESS must be a Ray cluster that can be reached, got {address!r}: "
@@ -190,8 +212,24 @@ def _connect(settings: ServeSettings) -> None:
     try:
         _check_room(settings, nodes)
     except _BadInputError:
+        if address is not None and _waits_for_nodes(settings):
+            return
         ray.shutdown()
         raise
+
+
+def _waits_for_nodes(settings: ServeSettings) -> bool:
+    """Whether an autoscaler adds the nodes that replicas have no place on yet; says so."""
+    from music_rllib import _autoscaler
+
+    if not _autoscaler.adds_nodes({"CPU": settings.cpus_per_replica}, settings.replicas):
+        return False
+    print(
+        f"The cluster has no room for {settings.replicas} replicas yet; its autoscaler is asked "
+        "for more nodes, which may take minutes ('ray status' shows what it does).",
+        flush=True,
+    )
+    return True
 
 
 def _check_room(settings: ServeSettings, cpus_of_nodes: Sequence[float]) -> None:
@@ -237,12 +275,14 @@ def _run(application: Any, arguments: argparse.Namespace, serve: Any) -> None:
     serve.run(application, name=APPLICATION, route_prefix="/", logging_config=QUIET)
     shown = f"[{host}]" if ":" in host else host
     print(f"Serving {arguments.policy} at http://{shown}:{port}", flush=True)
-    print(f"POST /act, GET /health, GET /policy; try it at http://{shown}:{port}/docs", flush=True)
+    print(
+        f"POST /act, GET /health, GET /policy; described at http://{shown}:{port}/docs", flush=True
+    )
 
 
 def _shut_down(serve: Any) -> None:
     # Others may serve on a cluster too; a local Ray ends with all that runs on it.
-    if os.environ.get("RAY_ADDRESS"):
+    if cluster_address() is not None:
         serve.delete(APPLICATION)
     _disconnect()
     print("Stopped.", flush=True)

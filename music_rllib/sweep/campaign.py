@@ -363,7 +363,7 @@ class Campaign(Listener):
         at, end = str(active.rung), str(len(search.rungs) - 1)
         kept = {other.number: other.user_attrs.get(SCORES, {}) for other in earlier}
         others = {n: np.asarray(scores[at][0]) for n, scores in kept.items() if at in scores}
-        whole = [np.asarray(scores[end][0]) for scores in kept.values() if end in scores]
+        whole = {n: np.asarray(scores[end][0]) for n, scores in kept.items() if end in scores}
         rung = search.rungs[active.rung]
         steps = "" if rung.env_steps is None else f" after {rung.env_steps:,} env steps"
         verdict = prune(

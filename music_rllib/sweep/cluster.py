@@ -6,26 +6,63 @@ import contextlib
 import logging
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import ray
 
+from music_rllib import _autoscaler
 from music_rllib._quiet import quiet_third_parties
 from music_rllib.experiment.model import Resources
 from music_rllib.sweep.local import ClusterError, check_cpus, cluster_address
 
-__all__ = ["check_fits", "cluster", "slots"]
+__all__ = ["Room", "check_fits", "cluster", "slots"]
 
 OBJECT_STORE_BYTES = 128 * 2**20
 """Enough, as reports are all that workers send; Ray's default takes a third of the memory."""
 
 
+WAITING = 200
+"""Runs that wait at most where nodes are added for those that wait; Tune's own default."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Room:
+    """What a cluster has for runs."""
+
+    now: int
+    """Runs that fit at once into the nodes that there are; 0 only where it grows."""
+    grows: bool = False
+    """Whether nodes may be added for what waits."""
+
+    @property
+    def at_once(self) -> int:
+        """Runs at a time that can be counted on."""
+        return max(self.now, 1)
+
+    @property
+    def waiting(self) -> int:
+        """How many runs to let wait for a place, beside those that have one."""
+        return max(self.now, WAITING) if self.grows else self.now
+
+    @property
+    def remark(self) -> str | None:
+        """What a person should know who sees nothing happen."""
+        if self.now:
+            return None
+        return (
+            "no node of the cluster can hold a run yet; its autoscaler is asked for one, which may "
+            "take minutes ('ray status' shows what it does)"
+        )
+
+
 @contextlib.contextmanager
-def cluster(resources: Resources) -> Iterator[int]:
-    """Connect to Ray, and give how many runs fit at once.
+def cluster(resources: Resources) -> Iterator[Room]:
+    """Connect to Ray, and say what it has for runs.
 
     Raises:
-        ClusterError: There is no cluster at the address, or no node of it can hold a run.
+        ClusterError: There is no cluster at the address, or no node can hold a run: none of
+            those that there are, and none that an autoscaler would add.
     """
     address = cluster_address()
     options: dict[str, Any] = {
@@ -50,7 +87,7 @@ def cluster(resources: Resources) -> Iterator[int]:
             f"{str(error).strip().splitlines()[0]}"
         ) from error
     try:
-        yield _slots(resources)
+        yield _room(resources)
     finally:
         ray.shutdown()
 
@@ -67,9 +104,17 @@ def check_fits(resources: Resources) -> None:
             pass
 
 
-def _slots(resources: Resources) -> int:
+def _room(resources: Resources) -> Room:
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
-    return slots(resources, nodes, local=cluster_address() is None)
+    if cluster_address() is None:
+        return Room(now=slots(resources, nodes, local=True))
+    try:
+        now = slots(resources, nodes, local=False)
+    except ClusterError:
+        if not _autoscaler.adds_nodes(resources.bundle):
+            raise
+        return Room(now=0, grows=True)
+    return Room(now=now, grows=_autoscaler.is_there())
 
 
 def slots(resources: Resources, nodes: Sequence[Mapping[str, float]], *, local: bool) -> int:
@@ -81,7 +126,7 @@ def slots(resources: Resources, nodes: Sequence[Mapping[str, float]], *, local: 
         local: Whether this is the Ray of one sweep; for the message.
 
     Raises:
-        ClusterError: Not even one fits, and none ever will.
+        ClusterError: Not even one fits.
     """
     bundle = resources.bundle
     count = sum(

@@ -123,12 +123,14 @@ def measure(
     Raises:
         ClusterError: Ray can't be reached or can't hold a run.
     """
-    with cluster(config.resources) as slots:
+    with cluster(config.resources) as room:
+        if room.remark is not None:
+            say(room.remark)
         costs = []
         for number, kind in enumerate(found, 1):
             say(f"measuring {number} of {len(found)}: {kind.label}")
             costs.append(_measure_one(kind, config.resources.gpus_per_run))
-        return costs, slots
+        return costs, room.at_once
 
 
 def _measure_one(kind: Kind, gpus: float) -> Cost:

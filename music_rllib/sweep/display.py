@@ -98,6 +98,9 @@ class Display(Listener):
     def noted(self, node: Node, text: str) -> None:
         self.say(f"{node.label}: {text}")
 
+    def remarked(self, text: str) -> None:
+        self.say(text, "yellow")
+
     def finished(self, node: Node, result: RunResult) -> None:
         self._running.pop(node.key, None)
         self.say(

@@ -336,15 +336,18 @@ def _open_campaign(
     if not opened.plan.searched:
         return None
     from music_rllib.sweep.campaign import Campaign
-    from music_rllib.sweep.searches import open_searches, outcome
+    from music_rllib.sweep.searches import learnings, open_searches, outcome
 
     def reused(node: Node) -> None:
         logbook.reused(node, opened.store)
         beacon.reused(node)
 
+    searches = open_searches(opened)
+    for line in learnings(searches):
+        display.say(line)
     campaign = Campaign(
         opened,
-        open_searches(opened),
+        searches,
         reused=reused,
         pruned=logbook.pruned,
         say=display.say,
@@ -393,13 +396,21 @@ def _compute(
     def on_stop() -> None:
         display.say("stopping, this takes a few seconds; Ctrl-C again stops at once", "yellow")
 
+    def on_ray_gone() -> None:
+        display.say("Ray was told to stop as well, so no more can be saved now", "yellow")
+        beacon.end("stopped")
+        display.say(_how_to_continue())
+
     try:
-        return compute(opened, listeners, on_stop, campaign).stopped_by
+        return compute(opened, listeners, on_stop, on_ray_gone, campaign).stopped_by
     finally:
         gauges.close()
 
 
 def _say_how_to_continue(console: Console) -> None:
+    console.print(Text(_how_to_continue()), soft_wrap=True)
+
+
+def _how_to_continue() -> str:
     command = shlex.join(["python", "-m", "music_rllib.sweep", *sys.argv[1:]])
-    text = f"Stopped. Finished runs and the last checkpoints are kept; continue with: {command}"
-    console.print(Text(text), soft_wrap=True)
+    return f"Stopped. Finished runs and the last checkpoints are kept; continue with: {command}"

@@ -32,6 +32,9 @@ class Listener:
     def noted(self, node: Node, text: str) -> None:
         """Something that a person should know, but no failure."""
 
+    def remarked(self, text: str) -> None:
+        """The same of the whole sweep."""
+
     def finished(self, node: Node, result: RunResult) -> None:
         """The node is in the store."""
 

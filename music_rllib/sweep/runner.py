@@ -42,6 +42,7 @@ def compute(
     sweep: Sweep,
     listeners: Sequence[Listener],
     on_stop: Callable[[], None],
+    on_ray_gone: Callable[[], None],
     campaign: Campaign | None = None,
 ) -> Outcome:
     """Compute the waiting nodes, and those that searches ask for.
@@ -50,13 +51,15 @@ def compute(
         sweep: Its board says afterwards what became of each node.
         listeners: Are told what happens.
         on_stop: Called, in a signal handler, when the user asks to stop.
+        on_ray_gone: Called, in a thread, where that has also ended Ray, before the process ends.
         campaign: The searches; None where there are none.
 
     Raises:
         ClusterError: Ray can't be reached or can't hold a run.
     """
     resources = sweep.config.resources
-    stopping = StopSignals(on_stop, sweep.config.checkpoints.grace_seconds)
+    grace = sweep.config.checkpoints.grace_seconds
+    stopping = StopSignals(on_stop, grace, on_ray_gone=on_ray_gone)
     events = TuneEvents(sweep.board, sweep.store, listeners, sweep.folder / "failures")
     searcher = DagSearcher(
         sweep.board,
@@ -74,7 +77,15 @@ def compute(
         **({} if campaign is None else {"advance": campaign.advance}),
         stopped=lambda: stopping.received is not None,
     )
-    with cluster(resources) as slots, _tune_folder(sweep) as place, _quiet_tune(slots), stopping:
+    with (
+        cluster(resources) as room,
+        _tune_folder(sweep) as place,
+        _quiet_tune(room.waiting),
+        stopping,
+    ):
+        for listener in listeners:
+            if room.remark is not None:
+                listener.remarked(room.remark)
         tuner = tune.Tuner(
             RunTrainable,
             tune_config=tune.TuneConfig(
@@ -140,10 +151,11 @@ class _quiet_tune:  # noqa: N801
 
     LOGGERS = ("ray.tune.tune", "ray.tune.analysis.experiment_analysis")
 
-    def __init__(self, slots: int) -> None:
+    def __init__(self, waiting: int) -> None:
         self._settings = {
-            # As many trials waiting for an actor as can run: they start side by side.
-            "TUNE_MAX_PENDING_TRIALS_PG": str(slots),
+            # Trials that wait for an actor: as many as can run start side by side, and an
+            # autoscaler adds nodes for those that wait.
+            "TUNE_MAX_PENDING_TRIALS_PG": str(waiting),
             "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",
             "TUNE_PRINT_ALL_TRIAL_ERRORS": "0",
             # Relative paths in a user's environment keep their meaning.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,10 @@ from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError
 
 from music_rllib.experiment.model import Stage
-from music_rllib.experiment.plan import node_key, short
+from music_rllib.experiment.plan import node_key
 from music_rllib.experiment.sealed import StorageError
-from music_rllib.experiment.space import Rung, SearchSettings, WarmStart
+from music_rllib.experiment.searched import most_env_steps
+from music_rllib.experiment.space import Rung, SearchSettings
 from music_rllib.reports.statistics import probability_of_improvement
 from music_rllib.search.judge import aggregate, interval
 from music_rllib.search.studies import (
@@ -25,6 +26,8 @@ from music_rllib.search.studies import (
     SCORES,
     VALUES,
     Study,
+    no_study_error,
+    open_older,
     open_studies,
     study_names,
 )
@@ -32,7 +35,7 @@ from music_rllib.sweep.campaign import Arm, Campaign, Finalist, Search, ranked
 from music_rllib.sweep.session import Sweep
 from music_rllib.tracking.redaction import redact
 
-__all__ = ["check_studies", "open_searches", "outcome"]
+__all__ = ["check_studies", "learnings", "open_searches", "outcome"]
 
 STUDY_FILE = "study.db"
 """In the sweep's folder."""
@@ -52,15 +55,18 @@ def check_studies(sweep: Sweep) -> None:
     for stage in sweep.plan.searched:
         settings = stage.search
         assert settings is not None
-        own = settings.storage or str(sweep.folder / STUDY_FILE)
         if settings.storage is not None:
             _check_database(settings.storage)
-        if (warm := settings.warm_start) is not None:
-            # Those of the stages above are made before this one's.
-            made = [name for name, place in above if place == (warm.storage or own)]
-            if not any(name.startswith(warm.study) or warm.study.startswith(name) for name in made):
-                _check_warm_start(warm, own)
-        above.append((f"{settings.study or sweep.config.name}/{stage.name}", own))
+        base, own = _base(sweep, stage), settings.storage or str(sweep.folder / STUDY_FILE)
+        if settings.warm_start is not None:
+            _check_warm_start(settings, base, own, above)
+        above.append((base, own))
+
+
+def _base(sweep: Sweep, stage: Stage) -> str:
+    """What its studies' names begin with."""
+    assert stage.search is not None
+    return f"{stage.search.study or sweep.config.name}/{stage.name}"
 
 
 def _check_database(url: str) -> None:
@@ -73,19 +79,23 @@ def _check_database(url: str) -> None:
         )
 
 
-def _check_warm_start(warm: WarmStart, own: str) -> None:
-    file = _sqlite_file(warm.storage or own)
-    there = file is None or file.exists()
-    if not there and warm.storage is not None:
-        raise StorageError(
-            f"search.warm_start.storage must be a database that exists, got {redact(warm.storage)}"
-        )
-    known = study_names(open_studies(warm.storage or own)) if there else []
-    if not any(name.startswith(warm.study) for name in known):
-        raise StorageError(
-            "search.warm_start.study must be (the beginning of) one of "
-            f"{', '.join(known) or 'none'}, got {warm.study!r}"
-        )
+def _check_warm_start(
+    settings: SearchSettings, base: str, own: str, above: Sequence[tuple[str, str]]
+) -> None:
+    """Args: `base` and `own`, the storage, of the search, and those of the stages above it."""
+    warm = settings.warm_start
+    assert warm is not None
+    file = _sqlite_file(own)
+    mine = study_names(open_studies(own)) if file is None or file.exists() else []
+    if any(name.startswith((f"{base} @", f"{base}/")) for name in mine):
+        return  # it has learnt already, and looks no more
+    known = mine if warm.storage is None else study_names(open_older(warm.storage))
+    # Those of the stages above are made before this one's.
+    made = [name for name, place in above if place == (warm.storage or own)]
+    if any(name.startswith(warm.study) for name in known):
+        return
+    if not any(name.startswith(warm.study) or warm.study.startswith(name) for name in made):
+        raise no_study_error(warm, known)
 
 
 def _sqlite_file(url: str) -> Path | None:
@@ -120,31 +130,46 @@ def _open_search(sweep: Sweep, stage: Stage) -> Search:
             position=position,
             study=Study(
                 storage,
-                "/".join(
-                    (settings.study or sweep.config.name, stage.name, *_names(values)),
-                ),
+                _base(sweep, stage),
                 settings,
-                _determined_by(sweep, stage, values),
+                _determined_by(sweep, stage),
+                arm=values,
                 # The sweep's folder is locked by this process, and the file is in it.
                 alone=settings.storage is None,
             ),
         )
         for position, values in enumerate(settings.arms())
     ]
-    rungs = [] if settings.pruning is None else list(settings.pruning.rungs)
-    seeds = len(sweep.plan.seeds)
-    rungs = [Rung(seeds=min(r.seeds or seeds, seeds), env_steps=r.env_steps) for r in rungs]
+    return Search(stage=stage, settings=settings, arms=arms, rungs=_rungs(sweep, stage, settings))
+
+
+def learnings(searches: Sequence[Search]) -> list[str]:
+    """From what each study with a warm start learns, in a line."""
+    return [
+        f"{search.stage.name}{''.join(f' {name}={value}' for name, value in arm.values.items())}: "
+        f"{learnt}"
+        for search in searches
+        for arm in search.arms
+        if (learnt := arm.study.learnt)
+    ]
+
+
+def _rungs(sweep: Sweep, stage: Stage, settings: SearchSettings) -> tuple[Rung, ...]:
+    """Where a trial is looked at, its end last."""
+    seeds, env_steps = len(sweep.plan.seeds), most_env_steps(settings, stage.points)
     end = Rung(seeds=seeds)
-    return Search(
-        stage=stage, settings=settings, arms=arms, rungs=(*(r for r in rungs if r != end), end)
-    )
+    found = [
+        Rung(
+            seeds=rung.seeds or seeds,
+            # The whole budget is the end of a run, where nothing is paused.
+            env_steps=None if (rung.env_steps or env_steps) >= env_steps else rung.env_steps,
+        )
+        for rung in (settings.pruning.rungs if settings.pruning else ())
+    ]
+    return (*dict.fromkeys(rung for rung in found if rung != end), end)
 
 
-def _names(values: Mapping[str, Any]) -> list[str]:
-    return [f"{name}={short(value)}" for name, value in values.items()]
-
-
-def _determined_by(sweep: Sweep, stage: Stage, values: Mapping[str, Any]) -> dict[str, Any]:
+def _determined_by(sweep: Sweep, stage: Stage) -> dict[str, Any]:
     """What the stage's runs have in common, beside what is searched."""
     (point,) = stage.points
     source = stage.source
@@ -153,7 +178,6 @@ def _determined_by(sweep: Sweep, stage: Stage, values: Mapping[str, Any]) -> dic
         None,
     )
     return {
-        "arm": dict(values),
         "seeds": list(sweep.plan.seeds),
         "runs": {task: node_key(run, None) for task, run in point.runs.items()},
         "source": {
@@ -219,6 +243,7 @@ def _arm(search: Search, arm: Arm, thorough: bool) -> dict[str, Any]:
         "running": states.count("RUNNING"),
         "trials": [_trial(search, arm, trial, thorough) for trial in trials],
         "best": best[0].number if best else None,
+        "front": [t.number for t in best] if len(search.settings.objectives) > 1 else [],
         "importance": importance(arm.study, search.settings) if thorough else {},
     }
 

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Any
 
+import psutil
 from ray import tune
 from ray.tune.experiment import Trial
 
@@ -27,7 +28,8 @@ class StopSignals(tune.Callback):
     """Ctrl-C and SIGTERM end Tune's loop in good order: when every run has saved its state.
 
     That takes as long as a round of training, some seconds at most; after the grace time the loop
-    ends in any case, and what has not been saved is computed again later.
+    ends in any case, and what has not been saved is computed again later. So it is where a local
+    Ray gets the signal, too, as from `timeout` and Slurm, which signal a whole process group.
     """
 
     def __init__(
@@ -35,8 +37,12 @@ class StopSignals(tune.Callback):
         on_stop: Callable[[], None],
         grace_seconds: float = 30.0,
         now: Callable[[], float] = time.monotonic,
+        on_ray_gone: Callable[[], None] = lambda: None,
     ) -> None:
-        """Call `on_stop` at the first signal, and wait for runs so long at most."""
+        """Call `on_stop` at the first signal, and wait for runs so long at most.
+
+        `on_ray_gone` is called, in a thread, before the process ends because its Ray has ended.
+        """
         self.received: int | None = None
         self.flag = StopFlag(f"stop-{uuid.uuid4().hex}")
         self._on_stop = on_stop
@@ -47,6 +53,10 @@ class StopSignals(tune.Callback):
         """Trials with something to save."""
         self._before: dict[int, Any] = {}
         self._end_loop: Callable[[], None] | None = None
+        self._on_ray_gone = on_ray_gone
+        self._daemons: list[psutil.Process] = []
+        """Of a local Ray, without which nothing can be saved."""
+        self._left = threading.Event()
 
     def __getstate__(self) -> dict[str, Any]:
         return {}
@@ -57,9 +67,12 @@ class StopSignals(tune.Callback):
             early.install()
             early.check()
             self._before = {number: signal.getsignal(number) for number in SIGNALS}
+        children = psutil.Process().children()
+        self._daemons = [child for child in children if child.name() in {"gcs_server", "raylet"}]
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._left.set()
         for number, handler in self._before.items():
             signal.signal(number, handler)
         if self.received is not None:
@@ -133,11 +146,19 @@ class StopSignals(tune.Callback):
             signal.signal(each, self._stop_at_once)
         # Not in here: the main thread may be in the middle of talking to Ray.
         threading.Thread(target=self._tell_workers, daemon=True).start()
+        threading.Thread(target=self._watch_ray, args=(number,), daemon=True).start()
         self._on_stop()
 
     def _tell_workers(self) -> None:
         with contextlib.suppress(Exception):
             self.flag.set()
+
+    def _watch_ray(self, number: int) -> None:
+        """Whoever waits for a Ray that is gone waits for a minute, and is then aborted by it."""
+        while self._daemons and not self._left.wait(0.2):
+            if not all(map(_is_alive, self._daemons)):
+                self._on_ray_gone()
+                self._stop_at_once(number, None)
 
     def _stop_at_once(self, number: int, frame: FrameType | None) -> None:
         """As `kill -9` would, which a sweep survives; Ray's processes end with their driver."""
@@ -145,3 +166,10 @@ class StopSignals(tune.Callback):
         with contextlib.suppress(OSError):
             os.write(sys.stdout.fileno(), show_cursor)
         os._exit(128 + number)
+
+
+def _is_alive(process: psutil.Process) -> bool:
+    try:
+        return bool(process.is_running() and process.status() != psutil.STATUS_ZOMBIE)
+    except psutil.NoSuchProcess:
+        return False

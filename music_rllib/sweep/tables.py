@@ -12,6 +12,7 @@ from rich.text import Text
 from music_rllib.experiment.model import Source, Stage, SweepConfig
 from music_rllib.experiment.plan import Node, Plan, short
 from music_rllib.experiment.result import RunResult
+from music_rllib.experiment.searched import most_env_steps
 from music_rllib.experiment.space import Choice, Dimension, SearchSettings
 from music_rllib.sweep.board import Status
 from music_rllib.sweep.words import clock, in_words, percent
@@ -112,10 +113,7 @@ def _search_row(stage: Stage, search: SearchSettings, plan: Plan, seeds: int) ->
 
 def search_budget(stage: Stage, search: SearchSettings) -> int:
     """Environment steps of a searched stage's run, at most."""
-    ends = search.space.get("env_steps")
-    if ends is not None:
-        return int(max(ends.ends()))
-    return max(run.env_steps for point in stage.points for run in point.runs.values())
+    return most_env_steps(search, stage.points)
 
 
 def search_runs(stage: Stage, search: SearchSettings, seeds: int) -> int:
@@ -226,7 +224,8 @@ def _trials_table(search: Mapping[str, Any], arm: Mapping[str, Any]) -> Table:
     fixed = ", ".join(f"{name} = {short(value)}" for name, value in arm["values"].items())
     table = Table(
         title=f"Trials of {search['stage']}{f' with {fixed}' if fixed else ''}: "
-        f"{arm['judged']} judged, {arm['pruned']} stopped early, {arm['failed']} failed",
+        f"{arm['judged']} judged, {arm['pruned']} stopped early, {arm['failed']} failed"
+        + ("; in bold what no other is better than in every objective" if arm["front"] else ""),
         title_justify="left",
     )
     names_of = dict.fromkeys(
@@ -251,7 +250,7 @@ def _trials_table(search: Mapping[str, Any], arm: Mapping[str, Any]) -> Table:
             trial["state"],
             trial["reason"] or "",
             style={"failed": "red", "pruned": "dim"}.get(trial["state"])
-            or ("bold" if trial["number"] == arm["best"] else None),
+            or ("bold" if trial["number"] in (arm["best"], *arm["front"]) else None),
         )
     return table
 

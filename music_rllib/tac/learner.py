@@ -25,7 +25,7 @@ from ray.rllib.core.learner.torch.torch_learner import TorchLearner
 from ray.rllib.core.learner.training_data import TrainingData
 from ray.rllib.policy.sample_batch import MultiAgentBatch
 from ray.rllib.utils.metrics import NUM_ENV_STEPS_SAMPLED_LIFETIME
-from ray.rllib.utils.typing import ModuleID, ResultDict, StateDict
+from ray.rllib.utils.typing import ModuleID, ParamDict, ResultDict, StateDict
 from torch import Tensor
 
 from music_rllib._allocator import keep_freed_memory
@@ -173,6 +173,12 @@ class TACLearner(TorchLearner):
         self._log_history(history)
         self.after_gradient_based_update(timesteps=timesteps or {})
         return self.metrics.reduce()
+
+    def postprocess_gradients(self, gradients_dict: ParamDict) -> ParamDict:
+        """RLlib sorts them by module and optimizer first; for nothing where nothing is clipped."""
+        if self.config.grad_clip is None and not self.config.log_gradients:
+            return gradients_dict
+        return super().postprocess_gradients(gradients_dict)
 
     def _minibatches(self, batch: MultiAgentBatch) -> Iterator[Minibatch]:
         """Cuts the batch up; random numbers of all its updates are drawn here, in one go."""

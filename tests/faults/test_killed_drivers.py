@@ -61,6 +61,22 @@ def test_told_to_stop_in_each_stage(
 
 
 @pytest.mark.thorough
+def test_a_signal_to_the_whole_process_group_costs_an_interval_and_no_number(
+    program: Program, unbroken: Path
+) -> None:
+    """As `timeout` and Slurm send it: Ray ends as well, before anything can be saved."""
+    process = sweeps.start_until(program, "pretrain/Point/seed0: started")
+    time.sleep(1.0)
+    os.killpg(process.pid, signal.SIGTERM)
+    output, errors = process.communicate(timeout=30)
+    assert process.returncode == 128 + signal.SIGTERM, output + errors
+    assert "Ray was told to stop as well" in output
+    assert "continue with: python -m music_rllib.sweep" in output
+    sweeps.finish(program)
+    comparison.same(unbroken, program.folder / "results")
+
+
+@pytest.mark.thorough
 def test_a_second_signal_ends_it_at_once(program: Program, unbroken: Path) -> None:
     process = sweeps.start_until(program, "pretrain/Point/seed0: started")
     process.send_signal(signal.SIGINT)

@@ -18,6 +18,7 @@ from typing import Any
 import pytest
 
 from music_rllib.tracking import names
+from tests.faults import comparison
 
 pytestmark = pytest.mark.integration
 
@@ -25,8 +26,13 @@ Document = dict[str, Any]
 ROOT = Path(__file__).parents[2]
 
 
+WORTH = names.ALPHA
+"""What a trial is worth: a metric that says its alpha, so that it is sure which one is stopped."""
+STOPPED = 3
+
+
 def searched(sweep_document: Document) -> Document:
-    """A search over very short runs."""
+    """A search over very short runs; trial 3 is the worst by far of those before it."""
     sweep_document["seeds"] = [0, 1, 2]
     sweep_document["defaults"] |= {
         "env_steps": 400,
@@ -42,9 +48,13 @@ def searched(sweep_document: Document) -> Document:
                     "tac.entropic_index": {"float": [1.0, 2.0], "step": 0.5},
                     "tac.alpha": {"float": [0.01, 0.5], "log": True},
                 },
+                "points_to_evaluate": [
+                    {"tac.entropic_index": q, "tac.alpha": alpha}
+                    for q, alpha in ((1.0, 0.4), (1.5, 0.5), (2.0, 0.3), (1.0, 0.01))
+                ],
                 "trials": 6,
                 "startup_trials": 3,
-                "objective": {"metric": names.EVAL_RETURN, "aggregate": "mean"},
+                "objective": {"metric": WORTH, "aggregate": "mean"},
                 "pruning": {"rungs": [{"seeds": 2}], "warm_up": 3},
                 "final": {"trials": 1, "seeds": 2},
             },
@@ -89,15 +99,16 @@ def test_a_search_stopped_and_resumed_and_what_its_commands_say(
     state = json.loads(output)
     assert state["driver"]["outcome"] == "finished"
     check_search(sweep_program.folder / "results")
-    # Never interrupted, and judged by the runs that are there: the same study.
-    code, _, errors = command(sweep_program, "sweep.yaml", "--name", "whole")
+    # Never interrupted, and with no run to reuse: the same study, and the same numbers in each run.
+    code, _, errors = command(sweep_program, "sweep.yaml", "--storage", "unbroken")
     assert code == 0, errors
     resumed, whole = (
-        json.loads((sweep_program.folder / f"results/{name}/search.json").read_text())[0]
-        for name in ("points", "whole")
+        json.loads((sweep_program.folder / f"{storage}/points/search.json").read_text())[0]
+        for storage in ("results", "unbroken")
     )
     assert resumed["arms"][0]["trials"] == whole["arms"][0]["trials"]
     assert resumed["ranking"] == whole["ranking"]
+    assert comparison.nodes(tmp_path / "results") == comparison.nodes(tmp_path / "unbroken")
     check_commands(sweep_program)
     runs = mlflow_runs()
     parts = {run.data.tags[names.TAG_PART] for run in runs.values() if "part" in run.data.tags}
@@ -111,16 +122,19 @@ def check_search(storage: Path) -> None:
     plan = json.loads((storage / "points/plan.json").read_text())
     labels = {node["label"]: node["key"] for node in plan["nodes"]}
     assert found["complete"]
-    for trial in found["arms"][0]["trials"]:
+    trials = found["arms"][0]["trials"]
+    assert trials[STOPPED]["state"] == "pruned"
+    for trial in trials:
         assert trial["state"] in {"judged", "pruned"}
-        if trial["state"] == "pruned":
-            assert trial["reason"]
-            continue
         values = []
         for label, key in labels.items():
             if f"/trial{trial['number']}/" in label:
                 manifest = json.loads((storage / "nodes" / key / "manifest.json").read_text())
-                values.append(manifest["meta"]["result"]["metrics"][names.EVAL_RETURN])
+                values.append(manifest["meta"]["result"]["metrics"][WORTH])
+        if trial["state"] == "pruned":
+            assert "is not among the best" in trial["reason"]
+            assert len(values) == 2
+            continue
         assert len(values) == 3
         assert trial["objective"] == [pytest.approx(sum(values) / 3)]
     (first,) = found["ranking"]
@@ -140,10 +154,9 @@ def check_commands(program: Any) -> None:
     played = json.loads(output)
     assert (played["task"], played["node_key"]) == ("Point", chosen["policies"][0]["node"])
     assert (program.folder / "out/run.yaml").is_file()
-    for name in ("whole", "points"):
-        code, output, _ = command(program, "clean", f"results/{name}", "--all", "--yes", "--json")
-        assert (code, json.loads(output)["deleted"]) == (0, True)
-        assert not (program.folder / "results" / name).exists()
+    code, output, _ = command(program, "clean", "results/points", "--all", "--yes", "--json")
+    assert (code, json.loads(output)["deleted"]) == (0, True)
+    assert not (program.folder / "results/points").exists()
     assert not list((program.folder / "results/nodes").iterdir())
 
 
@@ -192,12 +205,11 @@ def postgresql_programs() -> Path:
 DRIVER = """
     import sys, time
     from pathlib import Path
-    sys.path.insert(0, sys.argv[1])
-    from test_search import Driver, document
+    from tests.played_search import Driver, document
 
-    folder = Path(sys.argv[2])
-    search = {"storage": sys.argv[3], "study": "together", "trials": 24, "concurrent": 6}
-    driver = Driver(folder, document(search), seed=int(sys.argv[4]))
+    folder = Path(sys.argv[1])
+    search = {"storage": sys.argv[2], "study": "together", "trials": 24, "concurrent": 6}
+    driver = Driver(folder, document(search), seed=int(sys.argv[3]))
     while not driver.campaign.over:
         try:
             driver.play(slots=2)
@@ -219,7 +231,7 @@ def test_two_drivers_on_postgresql_lose_and_double_no_trial(
     for seed, name in enumerate(("one", "other")):
         (tmp_path / name).mkdir()
         code = textwrap.dedent(DRIVER)
-        arguments = [str(ROOT / "tests/unit"), str(tmp_path / name), postgresql, str(seed)]
+        arguments = [str(tmp_path / name), postgresql, str(seed)]
         drivers.append(
             subprocess.Popen(
                 [sys.executable, "-c", code, *arguments],

@@ -24,13 +24,15 @@ import psutil
 import pytest
 from optuna.exceptions import StorageInternalError
 
+from music_rllib.experiment.sealed import StorageError
 from music_rllib.experiment.settings import RunSettings
 from music_rllib.experiment.space import FINAL_SEED
 from music_rllib.sweep import cli, records
 from music_rllib.sweep.beacon import Beacon
 from music_rllib.sweep.board import Status
-from music_rllib.sweep.searches import outcome
+from music_rllib.sweep.searches import learnings, outcome
 from music_rllib.sweep.session import keep_record
+from music_rllib.tac.settings import LearnedAlpha
 from music_rllib.tracking import names
 from tests.played_search import SPACE, Document, Driver, document, points, searched, success
 
@@ -144,7 +146,7 @@ def test_tpe_learns(tmp_path: Path) -> None:
 
 
 def test_given_points_come_first(tmp_path: Path) -> None:
-    given = [{"tac.entropic_index": 1.25, "tac.alpha": 0.1}, {"tac.entropic_index": 2.0}]
+    given = [{"tac.entropic_index": 1.25, "tac.alpha": 0.123456789}, {"tac.entropic_index": 2.0}]
     trials = searched(tmp_path, {"points_to_evaluate": given}).trials()
     assert trials[0]["values"] == given[0]
     assert trials[1]["values"]["tac.entropic_index"] == 2.0
@@ -181,6 +183,19 @@ def test_conditional_settings_and_choices_of_any_kind(tmp_path: Path) -> None:
     assert all(("tac.policy_critic" in p) == (p["tac.bootstrap"] == "critics") for p in found)
 
 
+def test_of_several_objectives_the_front_is_told(tmp_path: Path) -> None:
+    objectives = [{}, {"read": "steps_to", "threshold": 0.5}]
+    driver = searched(tmp_path, {"objective": objectives, "trials": 8})
+    (arm,) = driver.outcome()["arms"]
+    worth = {t["number"]: (t["objective"][0], -t["objective"][1]) for t in arm["trials"]}
+
+    def beaten(one: tuple[float, float]) -> bool:
+        return any(o != one and o[0] >= one[0] and o[1] >= one[1] for o in worth.values())
+
+    assert set(arm["front"]) == {number for number, one in worth.items() if not beaten(one)}
+    assert arm["front"][0] == arm["best"]
+
+
 # --- stopping early ----------------------------------------------------------------------------
 
 
@@ -200,6 +215,14 @@ def test_what_is_stopped_early_is_so_for_a_reason_and_costs_less(tmp_path: Path)
     assert set(driver.pruned.values()) <= {trial["reason"] for trial in stopped}
     best = max((t for t in trials if t["objective"]), key=lambda trial: trial["objective"])
     assert best["number"] == driver.outcome()["arms"][0]["best"]
+
+
+def test_a_rung_at_the_very_end_is_no_rung(tmp_path: Path) -> None:
+    rungs = [{"seeds": 1, "env_steps": 4000}, {"env_steps": 4000}]
+    driver = searched(tmp_path, {"pruning": {"rungs": rungs, "warm_up": 1}})
+    (search,) = driver.campaign.searches
+    assert [(rung.seeds, rung.env_steps) for rung in search.rungs] == [(1, None), (3, None)]
+    assert "judged" in {trial["state"] for trial in driver.trials()}
 
 
 # --- the final ranking -------------------------------------------------------------------------
@@ -411,6 +434,33 @@ def test_a_study_of_another_space_takes_its_points_over(tmp_path: Path) -> None:
     assert len(after.computed) == 2 * 3
 
 
+def test_a_choice_that_becomes_a_range_takes_its_numbers_over(tmp_path: Path) -> None:
+    def formula(run: RunSettings, share: float) -> float:
+        return share * (0.3 if isinstance(run.tac.alpha, LearnedAlpha) else 0.5)
+
+    choice = {"choice": [0.1, 0.2, {"learned": True, "initial": 0.3}]}
+    search = {"space": {"tac.alpha": choice}, "sampler": "grid"}
+    before = Driver(tmp_path, document(search), formula)
+    before.play()
+    assert [trial["state"] for trial in before.trials()] == ["judged"] * 3
+    space = {"tac.alpha": {"float": [0.05, 0.5]}}
+    after = searched(tmp_path, {"space": space, "trials": 3})
+    assert points(after.trials())[:2] == [{"tac.alpha": 0.1}, {"tac.alpha": 0.2}]
+    study = before.outcome()["arms"][0]["study"]
+    warm = {"study": study, "storage": str(tmp_path / "results/s/study.db")}
+    learning = searched(tmp_path, {"space": space, "trials": 1, "warm_start": warm}, name="warm")
+    assert learning.outcome()["arms"][0]["learnt_from"] == 2
+
+
+def test_a_given_point_may_spell_a_choice_otherwise(tmp_path: Path) -> None:
+    search = {
+        "space": {"tac.entropic_index": {"choice": [1.0, 2.0]}},
+        "trials": 1,
+        "points_to_evaluate": [{"tac.entropic_index": 2}],
+    }
+    assert points(searched(tmp_path, search).trials()) == [{"tac.entropic_index": 2.0}]
+
+
 def test_a_warm_start_learns_from_an_older_study_and_does_not_rank_it(tmp_path: Path) -> None:
     searched(tmp_path, {"trials": 12})
     warm = {"study": "s/finetune", "storage": str(tmp_path / "results/s/study.db")}
@@ -420,6 +470,80 @@ def test_a_warm_start_learns_from_an_older_study_and_does_not_rank_it(tmp_path: 
     assert len(driver.trials()) == 4
     values = [trial["objective"][0] for trial in driver.trials()]
     assert np.mean(values) > np.mean([trial["objective"][0] for trial in cold])
+
+
+COMPARED: Document = {
+    "mode": "compare",
+    "compare": {"tac.entropic_index": [1.0, 1.5]},
+    "space": {"tac.alpha": SPACE["tac.alpha"]},
+    "trials": 2,
+}
+
+
+def warm_from(folder: Path, study: str) -> Document:
+    return {"study": study, "storage": str(folder / "results/s/study.db")}
+
+
+def test_a_warm_start_learns_from_every_value_of_a_comparison(tmp_path: Path) -> None:
+    searched(tmp_path, COMPARED, seeds=[0])
+    narrow = SPACE | {"tac.entropic_index": {"float": [1.0, 1.25], "step": 0.25}}
+    for space, count in ((SPACE, 4), (narrow, 2)):
+        search = {"trials": 1, "warm_start": warm_from(tmp_path, "s/finetune"), "space": space}
+        driver = searched(tmp_path, search, name=f"warm{count}", seeds=[0])
+        (arm,) = driver.outcome()["arms"]
+        assert arm["learnt_from"] == count
+        (line,) = learnings(driver.campaign.searches)
+        assert line.startswith(f"finetune: learnt from {count} of 4 trials of s/finetune/tac.")
+
+
+def test_a_comparison_learns_for_each_value_from_trials_with_it(tmp_path: Path) -> None:
+    before = searched(tmp_path, COMPARED, seeds=[0])
+    warm = {"warm_start": warm_from(tmp_path, "s/fine")}
+    driver = searched(tmp_path, COMPARED | warm, name="warm", seeds=[0])
+    theirs = before.outcome()["arms"]
+    for number, arm in enumerate(driver.outcome()["arms"]):
+        prior = driver.campaign.searches[0].arms[number].study._open()[2]
+        assert [list(trial.values) for trial in prior] == [
+            trial["objective"] for trial in theirs[number]["trials"]
+        ]
+        assert arm["learnt_from"] == 2
+    (tmp_path / "results/s/study.db").unlink()
+    again = Driver(tmp_path, document(COMPARED | warm, name="warm", seeds=[0]))
+    assert [arm["learnt_from"] for arm in again.outcome()["arms"]] == [2, 2], "as it was made"
+
+
+def test_a_warm_start_that_would_learn_nothing_is_refused(tmp_path: Path) -> None:
+    searched(tmp_path, {"trials": 2}, seeds=[0])
+    content = document(COMPARED | {"warm_start": warm_from(tmp_path, "s/")}, name="warm", seeds=[0])
+    content["stages"][1]["search"]["compare"] = {"tac.entropic_index": [7.0, 8.0]}
+    message = (
+        r"search.warm_start.study must have judged trials that warm/finetune/tac.entropic_index=7 "
+        r"can learn from, got s/finetune @\w+, none of whose 2 trials has the same objectives and "
+        "lies in the space"
+    )
+    with pytest.raises(StorageError, match=message):
+        Driver(tmp_path, content)
+
+
+def test_a_warm_start_from_what_is_not_there(tmp_path: Path) -> None:
+    gone = tmp_path / "results/mistyped/study.db"
+    search = {"warm_start": {"study": "s", "storage": str(gone)}}
+    message = r"search.warm_start.storage must be an sqlite file that is there, got .*/study.db"
+    with pytest.raises(StorageError, match=message):
+        Driver(tmp_path, document(search))
+    assert not gone.exists()
+    assert not gone.parent.exists()
+    message = r"search.warm_start.study must be \(the beginning of\) a study's name, got 's': there"
+    with pytest.raises(StorageError, match=f"{message} are no other studies in the search's own"):
+        Driver(tmp_path, document({"warm_start": {"study": "s"}}))
+    searched(tmp_path, {"trials": 1}, seeds=[0])
+    with pytest.raises(StorageError, match=r"must be \(the beginning of\) one of s/finetune @"):
+        Driver(tmp_path, document({"warm_start": warm_from(tmp_path, "x")}, name="warm"))
+    (tmp_path / "other.db").touch()
+    search = {"warm_start": {"study": "s", "storage": str(tmp_path / "other.db")}}
+    with pytest.raises(StorageError, match=r"warm_start.storage must be a database that can be"):
+        Driver(tmp_path, document(search))
+    assert (tmp_path / "other.db").stat().st_size == 0
 
 
 def test_settings_of_the_pretraining_can_be_searched_and_are_shared(tmp_path: Path) -> None:
@@ -596,7 +720,11 @@ def test_the_same_file_gives_the_same_points_on_another_machine(tmp_path: Path) 
     """Six digits of each: the last bits of a machine's logarithm play no part."""
     driver = Driver(tmp_path, document({}))
     driver.play()
-    assert points(driver.trials())[:2] == FIRST_POINTS
+    assert points(driver.trials()) == FIRST_POINTS
+    (tmp_path / "random").mkdir()
+    by_chance = points(searched(tmp_path / "random", {"sampler": "random"}).trials())
+    assert by_chance[:3] == FIRST_POINTS[:3]
+    assert not any(point in FIRST_POINTS for point in by_chance[3:]), "those are TPE's"
 
 
 def test_node_keys_are_the_same_in_another_process(tmp_path: Path) -> None:
@@ -624,6 +752,11 @@ def test_node_keys_are_the_same_in_another_process(tmp_path: Path) -> None:
 FIRST_POINTS: list[Mapping[str, Any]] = [
     {"tac.entropic_index": 2.5, "tac.alpha": 0.135116},
     {"tac.entropic_index": 1.5, "tac.alpha": 0.146438},
+    {"tac.entropic_index": 1.0, "tac.alpha": 0.338515},
+    # From here on TPE has the results of two trials to go by.
+    {"tac.entropic_index": 2.0, "tac.alpha": 0.00672013},
+    {"tac.entropic_index": 1.25, "tac.alpha": 0.0335914},
+    {"tac.entropic_index": 1.75, "tac.alpha": 0.419184},
 ]
 
 

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import psutil
 import pytest
+import ray
 import requests
 import yaml
 
@@ -200,6 +201,96 @@ def test_more_cpus_than_any_node_has(
         done.stderr
     )
     assert not list((tmp_path / "results").glob("*/config.json")), "it is no sweep yet"
+
+
+FAKE_HEAD = "f" * 51 + "00000"
+"""Node id by which Ray's provider of make-believe nodes knows the head."""
+
+
+COMMANDS = (
+    *("initialization_commands", "setup_commands", "head_setup_commands", "worker_setup_commands"),
+    *("head_start_ray_commands", "worker_start_ray_commands", "cluster_synced_files"),
+    *("rsync_exclude", "rsync_filter"),
+)
+"""What the launcher's configuration must have, and is empty where nothing is launched."""
+
+
+@contextlib.contextmanager
+def growing_head(folder: Path, home: Path) -> Iterator[Head]:
+    """A head with one CPU, whose autoscaler adds nodes with three, all of them processes here.
+
+    `ray.cluster_utils.AutoscalingCluster` isn't used: it stops every Ray of the machine, and needs
+    a file that Ray's wheel doesn't have.
+    """
+    (port,) = free_ports(1)
+    # The nodes that are added are at this address, and so must be the head.
+    here = ray.util.get_node_ip_address()
+    address = f"{here}:{port}"
+    module = "ray.autoscaler._private.fake_multi_node.node_provider.FakeMultiNodeProvider"
+    provider = {"type": "external", "module": module, "gcs_address": address}
+    provider |= {"launch_multiple": True, "head_node_id": FAKE_HEAD}
+    worker = {"resources": {"CPU": 3, "object_store_memory": 10**8}, "max_workers": 2}
+    types = {
+        "ray.head.default": {"resources": {"CPU": 1}, "node_config": {}, "max_workers": 0},
+        "cpu": worker | {"node_config": {}, "min_workers": 0},
+    }
+    config = {"cluster_name": "growing", "max_workers": 2, "provider": provider}
+    config |= {"available_node_types": types, "head_node_type": "ray.head.default"}
+    config |= {"upscaling_speed": 10, "idle_timeout_minutes": 5}
+    empty = ("auth", "docker", "file_mounts")
+    config |= {key: {} for key in empty} | {key: [] for key in COMMANDS}
+    (folder / "autoscaling.json").write_text(json.dumps(config))
+    environment = os.environ | {
+        "PATH": f"{BIN}{os.pathsep}{os.environ['PATH']}",
+        "HOME": str(home),
+        "PYTHONPATH": str(ENVIRONMENTS),
+        "RAY_AUTH_MODE": "token",
+        "RAY_AUTH_TOKEN": TOKEN,
+        "RAY_FAKE_CLUSTER": "1",
+        "RAY_enable_autoscaler_v2": "1",
+        "RAY_CLOUD_INSTANCE_ID": FAKE_HEAD,
+        "RAY_OVERRIDE_NODE_ID_FOR_TESTING": FAKE_HEAD,
+        "RAY_NODE_TYPE_NAME": "ray.head.default",
+    }
+    options = ["--head", f"--port={port}", f"--temp-dir={folder / 'ray'}"]
+    options += [f"--node-ip-address={here}", "--include-dashboard=false"]
+    options += [f"--autoscaling-config={folder / 'autoscaling.json'}"]
+    process = ray_start(folder, environment, 1, *options)
+    for name in ("RAY_CLOUD_INSTANCE_ID", "RAY_OVERRIDE_NODE_ID_FOR_TESTING"):
+        del environment[name]  # of the head only
+    try:
+        while "block forever" not in (folder / "log").read_text():
+            assert process.poll() is None, (folder / "log").read_text()
+            time.sleep(0.2)
+        yield Head(address, "", folder, environment, process)
+    finally:
+        # Nobody ends what belongs to the added nodes when the autoscaler itself is gone.
+        started = psutil.Process(process.pid).children(recursive=True)
+        process.terminate()
+        process.wait(timeout=60)
+        _, left = psutil.wait_procs(started, timeout=10)
+        for other in left:
+            with contextlib.suppress(psutil.NoSuchProcess):
+                other.kill()
+
+
+@pytest.mark.thorough
+def test_a_cluster_grows_for_runs_that_no_node_of_it_could_hold(
+    sweep_document: dict[str, Any], tmp_path: Path
+) -> None:
+    # Not pytest's folder: Ray's sockets need a short path.
+    place = tempfile.TemporaryDirectory(prefix="ray", ignore_cleanup_errors=True)
+    with place as folder, growing_head(Path(folder), tmp_path) as head:
+        sweep_document["resources"] = {"gpus_per_run": 1}
+        refused = run_sweep(head, sweep_document, tmp_path)
+        assert refused.returncode == 2, refused.stderr
+        log = (Path(folder) / "log").read_text()
+        assert "resources.gpus_per_run must fit into one node" in refused.stderr, log
+
+        document = small(sweep_document) | {"resources": {"cpus_per_run": 2}}
+        done = run_sweep(head, document, tmp_path)
+        assert (done.returncode, done.stderr) == (0, ""), done.stdout
+        assert "its autoscaler is asked for one" in done.stdout
 
 
 class Jobs:

@@ -18,7 +18,15 @@ import pytest
 import yaml
 
 import music_rllib
-from cluster.check import ALL, KINDS, check_document, check_file
+from cluster.check import (
+    ALL,
+    KINDS,
+    check_document,
+    check_file,
+    main,
+    read_crds,
+    strings,
+)
 from music_rllib.experiment.config import load_sweep
 
 ROOT = Path(__file__).parents[2]
@@ -109,6 +117,31 @@ NODE = "available_node_types/cpu/node_config"
         (JOB, put("spec/submissionMode", "Http"), "Http"),
         (JOB, put(f"{JOB_HEAD}/volumeMounts/0/mountpath", "/x"), "mountpath"),
         (JOB, put("metadata/name", "Sweep_1"), "Sweep_1"),
+        (JOB, put("metadata/name", "1-sweep"), "1-sweep"),
+        (JOB, put("spec/deletionStrategy", {"onSuccess": {"policy": "DeleteAll"}}), "deletionStr"),
+        (JOB, put("spec/preRunningDeadlineSeconds", 0), "preRunningDeadlineSeconds"),
+        (JOB, put("spec/shutdownAfterJobFinishes", False), "ttlSecondsAfterFinished"),
+        (JOB, put("spec/submissionMode", "SidecarMode"), "spec.submitterConfig: must not"),
+        (JOB, put("spec/submissionMode", "InteractiveMode"), "backoffLimit"),
+        (JOB, put("spec/clusterSelector", {"ray.io/cluster": "x"}), "backoffLimit"),
+        (JOB, put("spec/entrypoint", ""), "entrypoint"),
+        (JOB, put("spec/rayClusterSpec/authOptions/enableK8sTokenAuth", True), "enableK8sToken"),
+        (RAY, put("spec/rayVersion", "latest"), "latest"),
+        (RAY, put("spec/authOptions", {"enableK8sTokenAuth": True}), "'mode' is a required"),
+        (
+            RAY,
+            put(
+                "spec/authOptions", {"mode": "token", "enableK8sTokenAuth": True, "secretName": "x"}
+            ),
+            "spec.authOptions.secretName: must not",
+        ),
+        (RAY, put("spec/workerGroupSpecs/0/minReplicas", 9), "must be <= maxReplicas, 8, got 9"),
+        (RAY, put("spec/workerGroupSpecs/0/maxReplicas", 2**31), "maxReplicas"),
+        (RAY, put("spec/workerGroupSpecs/0/suspend", True), "suspend: must be false"),
+        (RAY, put("spec/workerGroupSpecs/0/scaleStrategy", {"workers": []}), "workers"),
+        (RAY, put("spec/gcsFaultToleranceOptions", {}), "redisAddress"),
+        (RAY, put("spec/upgradeStrategy", {"type": "Rolling"}), "Rolling"),
+        (RAY, put("spec/autoscalerOptions/idleTimeoutSeconds", -1), "idleTimeoutSeconds"),
         ("kuberay/storage/storage.yaml", put("spec/accessMode", []), "accessMode"),
         ("serve.yaml", put("http_options/hots", "0.0.0.0"), "hots"),
         ("serve.yaml", put("applications/0/args/replica", 2), "replica"),
@@ -120,6 +153,189 @@ def test_planted_mistake_is_found(name: str, change: Change, expected: str) -> N
     change(document)
     problems = check_document(document, CLUSTER / name)
     assert any(expected in problem for problem in problems), problems
+
+
+RULE = {"policy": "DeleteCluster", "condition": {"jobStatus": "FAILED", "ttlSeconds": 0}}
+POLICY = {"policy": "DeleteNone"}
+
+
+@pytest.mark.parametrize(
+    ("gone", "given"),
+    [
+        # In this mode someone else submits the job.
+        (("entrypoint", "backoffLimit"), {"submissionMode": "InteractiveMode"}),
+        (("rayClusterSpec", "backoffLimit"), {"clusterSelector": {"ray.io/cluster": "x"}}),
+        (("submitterConfig",), {"submissionMode": "SidecarMode"}),
+        ((), {"deletionStrategy": {"onSuccess": POLICY, "onFailure": POLICY}}),
+        (
+            ("shutdownAfterJobFinishes", "ttlSecondsAfterFinished"),
+            {"deletionStrategy": {"deletionRules": [RULE]}},
+        ),
+        ((), {"preRunningDeadlineSeconds": 60, "activeDeadlineSeconds": 60}),
+    ],
+)
+def test_what_kuberay_allows_is_sound(gone: tuple[str, ...], given: dict[str, Any]) -> None:
+    document = load(JOB)
+    spec = {key: value for key, value in document["spec"].items() if key not in gone}
+    assert check_document(document | {"spec": spec | given}, CLUSTER / JOB) == []
+
+
+@pytest.mark.parametrize(
+    "strategy",
+    [
+        {},
+        {"deletionRules": []},
+        {"onSuccess": POLICY},
+        {"onSuccess": POLICY, "onFailure": POLICY, "deletionRules": [RULE]},
+        {"deletionRules": [RULE | {"condition": {"ttlSeconds": 3}}]},
+        {"deletionRules": [RULE | {"condition": {"jobStatus": "STOPPED"}}]},
+        {"onSuccess": {}, "onFailure": POLICY},
+    ],
+)
+def test_half_a_deletion_strategy_is_found(strategy: dict[str, Any]) -> None:
+    document = load(JOB)
+    for key in ("shutdownAfterJobFinishes", "ttlSecondsAfterFinished"):
+        del document["spec"][key]
+    document["spec"]["deletionStrategy"] = strategy
+    problems = check_document(document, CLUSTER / JOB)
+    assert problems
+    assert all(problem.startswith("spec.deletionStrategy") for problem in problems), problems
+
+
+VOLUME = {"type": "volume", "source": "results", "target": "/r"}
+LOOPBACK = {"target": 80, "published": "80", "host_ip": "127.0.0.1"}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        put("services/mlflow/volumes", [VOLUME]),
+        put("services/mlflow/volumes", ["/anonymous", "/srv/data:/data", "${DATA:-./x}:/data"]),
+        put("services/mlflow/volumes", [{"type": "tmpfs", "target": "/tmp"}]),
+        put("services/mlflow/ports", [LOOPBACK, "[::1]:80:80"]),
+        put("services/mlflow/depends_on", {"postgres": {"condition": "service_started"}}),
+        put("services/head/build", {"context": "https://example.org/x.git"}),
+    ],
+)
+def test_every_form_that_compose_knows_is_taken(change: Change) -> None:
+    document = load("compose.yaml")
+    change(document)
+    assert check_document(document, CLUSTER / "compose.yaml") == []
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (put("services/mlflow/volumes", [VOLUME | {"source": "artefacts"}]), "under volumes"),
+        (put("services/mlflow/volumes", ["./none:/x"]), "./none must exist"),
+        (
+            put("services/mlflow/volumes", [{"type": "bind", "source": "./none", "target": "/x"}]),
+            "./none must exist",
+        ),
+        (put("services/mlflow/ports", [LOOPBACK | {"host_ip": "0.0.0.0"}]), "127.0.0.1 only"),
+        (put("services/mlflow/ports", [80]), "127.0.0.1 only"),
+        (put("services/head/build", "kuberay"), "Dockerfile must exist"),
+        (put("services/head/build/target", "rya"), "target: must be one of"),
+    ],
+)
+def test_mistakes_are_found_in_every_form_of_compose(change: Change, expected: str) -> None:
+    document = load("compose.yaml")
+    change(document)
+    # Services share parts of the file.
+    problems = set(check_document(document, CLUSTER / "compose.yaml"))
+    assert problems
+    assert all(expected in problem for problem in problems), problems
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("provider: {type: aws}", "head_start_ray_commands: must set RAY_AUTH_MODE=token"),
+        ("provider: 3", "must be a configuration that Ray's launcher takes"),
+        ("provider: {}", "the file: must be"),
+        ("applications: [{name: p, import_path: 'a:b'}]", "applications.0.args.policy: Field req"),
+        ("applications: 3", "applications: Input should be"),
+        ("services: 3", "services: 3 is not of type 'object'"),
+        ("{apiVersion: ray.io/v1, kind: RayService}", "kind: must be RayCluster or RayJob, got"),
+        ("{apiVersion: ray.io/v1, kind: [1]}", "kind: must be RayCluster or RayJob, got [1]"),
+        ("{apiVersion: ray.io/v1, kind: RayCluster}", "'metadata' is a required property"),
+        ("{apiVersion: v1, kind: Secret}", "kind: must be PersistentVolumeClaim"),
+        ("scrape_configs: [3]", "scrape_configs.0: must be a mapping"),
+        ("scrape_configs: [{static_configs: []}]", "job_name: must be a name of its own, got None"),
+        ("scrape_configs: [{job_name: a}]", "must have static_configs or a kind of *_sd_configs"),
+        ("{apiVersion: 2, datasources: []}", "apiVersion: must be 1, got 2"),
+        ("{apiVersion: 1, datasources: [{name: a}]}", "datasources.0.type: must be a text"),
+        ("resources: [none.yaml]", "resources.0: none.yaml must be a file or a folder with"),
+        ("resources: none.yaml", "resources: must be a list"),
+        ("{stages: [], seed: 1}", "seed"),
+        ("{a: 1, b: 2}", "must be of a kind that has one of the keys provider, services, "),
+        ("[]", "must be a mapping"),
+        ("a: 1\n---\nb: 1", "expected a single document"),
+        ("\x00", "unacceptable character"),
+    ],
+)
+def test_what_is_far_from_any_schema_is_a_problem_and_no_crash(
+    text: str, expected: str, tmp_path: Path
+) -> None:
+    (tmp_path / "file.yaml").write_text(text)
+    problems = check_file(tmp_path / "file.yaml")
+    assert any(expected in problem for problem in problems), problems
+
+
+def test_a_secret_of_the_clusters_name_is_a_problem() -> None:
+    document = load(RAY)
+    put(f"{HEAD}/envFrom/0/secretRef/name", "music-rllib")(document)
+    (problem,) = check_document(document, CLUSTER / RAY)
+    assert "must be no Secret of the cluster's name" in problem
+    document["spec"]["authOptions"]["secretName"] = "mine"
+    assert check_document(document, CLUSTER / RAY) == []
+
+
+def crds(folder: Path, **properties: Any) -> Path:
+    """CRDs of which only the top is there."""
+    for kind in ("rayclusters", "rayjobs"):
+        schema = {"type": "object", "properties": properties}
+        version = {"name": "v1", "schema": {"openAPIV3Schema": schema}}
+        text = yaml.safe_dump({"spec": {"versions": [version]}})
+        (folder / f"ray.io_{kind}.yaml").write_text(text)
+    return folder
+
+
+def test_files_are_held_against_kuberays_own_crds(tmp_path: Path) -> None:
+    any_object = {"type": "object"}
+    text = {"type": "string"}
+    top = {"apiVersion": text, "kind": text, "metadata": any_object}
+    folder = crds(tmp_path, **top, spec=any_object)
+    assert check_file(CLUSTER / RAY, read_crds(folder)) == []
+    assert check_file(CLUSTER / "serve.yaml", read_crds(folder)) == []
+    (problem,) = check_file(CLUSTER / JOB, read_crds(crds(tmp_path, **top)))
+    assert "'spec' was unexpected" in problem
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, "--crds must be a folder with ray.io_rayclusters.yaml and ray.io_rayjobs.yaml, got"),
+        ("x: [", "is no CRD with a version v1"),
+        ("{spec: {versions: [{name: v2}]}}", "is no CRD with a version v1"),
+        ("3", "is no CRD with a version v1"),
+    ],
+)
+def test_a_folder_without_crds_is_refused(
+    text: str | None,
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    if text is not None:
+        (tmp_path / "ray.io_rayclusters.yaml").write_text(text)
+    monkeypatch.setattr(sys, "argv", ["check.py", "--crds", str(tmp_path), str(CLUSTER / RAY)])
+    assert main() == 2
+    output, errors = capsys.readouterr()
+    assert output == ""
+    assert errors.startswith("error: --crds ")
+    assert message in errors
 
 
 def test_the_command_says_what_is_wrong(tmp_path: Path) -> None:
@@ -139,11 +355,11 @@ def test_the_command_says_what_is_wrong(tmp_path: Path) -> None:
 
 def test_every_file_with_a_schema_is_checked() -> None:
     """A new file must not stay unchecked."""
-    others = {"grafana-datasource.yml", "prometheus.yml", "sweep.yaml"}
-    for path in CLUSTER.rglob("*.y*ml"):
-        name = path.relative_to(CLUSTER).as_posix()
-        assert name in ALL or name in others or path.name == "kustomization.yaml", name
-    assert len(KINDS) == 4
+    found = {path.relative_to(CLUSTER).as_posix() for path in CLUSTER.rglob("*.y*ml")}
+    assert found == set(ALL)
+    # Each kind is the one of some file, so that none is untried.
+    kinds = {next(key for key in KINDS if key in load(name)) for name in ALL}
+    assert kinds == set(KINDS)
 
 
 # -- what must agree with the rest of the project ---------------------------------------------
@@ -279,6 +495,25 @@ def test_token_authentication_is_on_everywhere() -> None:
         assert services[name]["environment"]["RAY_AUTH_MODE"] == "token"
     assert load(RAY)["spec"]["authOptions"] == {"mode": "token"}
     assert load(JOB)["spec"]["rayClusterSpec"]["authOptions"] == {"mode": "token"}
+
+
+def test_your_secret_is_not_the_one_that_kuberay_keeps_its_token_in() -> None:
+    """KubeRay takes an existing Secret of the cluster's name for its own, and starts no pod when
+    `auth_token` isn't in it.
+    """
+    guide = (ROOT / "docs" / "operations.md").read_text()
+    (made,) = re.findall(r"kubectl create secret generic (\S+)", guide)
+    (read,) = re.findall(r"kubectl get secret (\S+)", guide)
+    mounted = set()
+    for name in (RAY, JOB):
+        for place, text in strings(load(name)):
+            if re.search(r"envFrom\.\d+\.secretRef\.name$", place):
+                mounted.add(text)
+    assert mounted == {made}
+    assert read == load(RAY)["metadata"]["name"]
+    # A RayJob's cluster has the job's name and five random letters.
+    assert made != read
+    assert not re.fullmatch(rf"{load(JOB)['metadata']['name']}-\w{{5}}", made)
 
 
 @pytest.mark.parametrize(

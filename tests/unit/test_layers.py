@@ -21,6 +21,8 @@ PACKAGE = Path(__file__).parents[2] / "music_rllib"
 LAYERS: tuple[tuple[str, ...], ...] = (
     (
         "_allocator",
+        "_autoscaler",
+        "_cluster",
         "_quiet",
         "tsallis",
         "mutual_information",
@@ -41,6 +43,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
 
 # Only these may load Ray; everything else is usable, and tested, without it.
 MAY_LOAD_RAY = (
+    "_autoscaler",
     "tac.algorithm",
     "tac.config",
     "tac.env_runner",

@@ -166,3 +166,21 @@ def test_keys_are_the_same_in_another_process_with_other_hash_seeds(tmp_path: Pa
         text=True,
     )
     assert json.loads(found.stdout) == [node.key for node in sweep.nodes]
+
+
+def test_keys_are_the_same_on_another_machine(tmp_path: Path) -> None:
+    """Finished runs are found again by these strings, wherever and whenever they were made.
+
+    They change with a setting's default, a new setting or `ALGORITHM_VERSION`, and then every run
+    is trained anew: put new ones in only where that is meant.
+    """
+    sweep = plan(tmp_path, stages=[PRETRAIN, FINETUNE])
+    assert {node.label: node.key for node in sweep.nodes} == KEYS
+
+
+KEYS = {
+    "pretrain/FetchPush/seed0": "cc3633961479f4eba8e8",
+    "finetune/FetchPush/tac.entropic_index=1/seed0": "114f4269fa291261ddf3",
+    "finetune/FetchPush/tac.entropic_index=1.5/seed0": "2429de382d2fc45ca2c8",
+    "finetune/FetchPush/tac.entropic_index=2/seed0": "f95441a1d346df33391d",
+}

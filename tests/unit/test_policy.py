@@ -219,3 +219,27 @@ def test_a_run_that_sweeps_share_is_found_by_the_label_of_each(tmp_path: Path) -
     (tmp_path / "first" / "plan.json").write_text("[]")
     with pytest.warns(UserWarning, match=r"first/plan\.json is damaged"):
         assert find_policy("second/seed=0", str(tmp_path)) == place
+
+
+def test_a_folder_of_several_tasks_names_its_sub_folders(tmp_path: Path) -> None:
+    """As `best` leaves the policies of a sweep with several tasks."""
+    for task in ("FetchReach", "Other"):
+        (tmp_path / task).mkdir()
+        Trained(_run()).write(tmp_path / task)
+    (tmp_path / "figures").mkdir()
+    with pytest.raises(PolicyError) as error:
+        load_policy(tmp_path)
+    first, second = tmp_path / "FetchReach", tmp_path / "Other"
+    assert str(error.value) == (
+        f"{tmp_path} must hold one policy, its sub-folders hold one each: "
+        f"give {first} (FetchReach) or {second} (FetchReach)"
+    )
+    assert load_policy(first).task == REACH
+
+
+def test_a_damaged_manifest_is_not_taken_for_a_folder_of_several(tmp_path: Path) -> None:
+    Trained(_run()).write(tmp_path)
+    Trained(_run()).write(tmp_path / "FetchReach")
+    (tmp_path / "handoff" / "handoff.json").write_text("{}")
+    with pytest.raises(PolicyError, match=r"handoff.json must be a handoff manifest"):
+        load_policy(tmp_path)

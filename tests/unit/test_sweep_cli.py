@@ -177,11 +177,11 @@ REFUSED: list[tuple[Document, str]] = [
     ),
     (
         searched(warm_start={"study": "older/a"}),
-        "search.warm_start.study must be (the beginning of) one of none, got 'older/a'",
+        "search.warm_start.study must be (the beginning of) a study's name, got 'older/a': there",
     ),
     (
         searched(warm_start={"study": "older/a", "storage": "sqlite:///older.db"}),
-        "search.warm_start.storage must be a database that exists, got sqlite:///older.db",
+        "search.warm_start.storage must be an sqlite file that is there, got sqlite:///older.db",
     ),
     (
         document(resources={"num_cpus": 1, "memory_per_run": 1e6}),

@@ -100,7 +100,6 @@ def _execute(arguments: argparse.Namespace) -> int:
 def verdict(rows: Sequence[dict[str, Any]], part: str) -> str:
     """What intervals and permutation tests allow to be said."""
     from music_rllib.reports.statistics import SIGNIFICANCE
-    from music_rllib.reports.verdict import p_text
 
     if part == "search":
         return "Trials were chosen by these runs, so their order is biased: fresh seeds count."
@@ -116,9 +115,9 @@ def verdict(rows: Sequence[dict[str, Any]], part: str) -> str:
     if max(p_values) >= SIGNIFICANCE:
         return (
             "No intervals overlap with that of the first, but from so few seeds the gap may be "
-            f"chance ({p_text(max(p_values))}, permutation test): no winner. More seeds may tell."
+            f"chance (p = {max(p_values):.2g}, permutation test): no winner. More seeds may tell."
         )
     return (
         f"{rows[0]['label']} is ahead: its interval overlaps with no other, and so large a gap "
-        f"comes by chance with {p_text(max(p_values))} at most (permutation test)."
+        f"comes by chance with p = {max(p_values):.2g} at most (permutation test)."
     )

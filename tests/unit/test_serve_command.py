@@ -1,0 +1,66 @@
+"""`python -m music_rllib.serve` with input that it refuses, before any Ray is started."""
+
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+
+import pytest
+
+from music_rllib.serve.command import main
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """What is said to arguments that are answered with code 2."""
+    try:
+        code: int | str | None = main(arguments)
+    except SystemExit as stopped:  # argparse's own way
+        code = stopped.code
+    output, errors = capsys.readouterr()
+    assert (code, output) == (2, "")
+    return errors
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["x", "--port", "abc"], "argument --port: must be a whole number, got 'abc'"),
+        (["x", "--port", "8e3"], "argument --port: must be a whole number, got '8e3'"),
+        (["x", "--port", "0"], "argument --port: must be in 1..65535, got 0"),
+        (["x", "--replicas", "1.5"], "argument --replicas: must be a whole number, got '1.5'"),
+        (["x", "--replicas", "0"], "argument --replicas: must be >= 1, got 0"),
+    ],
+)
+def test_numbers_are_refused_with_their_rule(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert refused(capsys, *arguments).endswith(f"{message}\n")
+
+
+def free_port() -> str:
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        return str(probe.getsockname()[1])
+
+
+def test_a_storage_without_meaning_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    errors = refused(capsys, "xx", "--storage", "ftp://x", "--port", free_port())
+    assert errors.startswith("error: storage must be a folder or an s3:// or gs:// URI")
+    assert errors.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("address", "message"),
+    [
+        ("127.0.0.1:1", "must be HOST:PORT of a Ray cluster that answers, got '127.0.0.1:1'"),
+        ("127.0.0.1:99999", "must be HOST:PORT of a Ray cluster that answers"),
+        ("http://127.0.0.1:8265", "an http address is for 'ray job submit'"),
+    ],
+)
+def test_a_cluster_that_does_not_answer_is_said_at_once(
+    address: str, message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("RAY_ADDRESS", address)
+    errors = refused(capsys, "xx", "--storage", str(Path.cwd()))
+    assert errors.startswith("error: RAY_ADDRESS ")
+    assert message in errors
+    assert errors.count("\n") == 1
