@@ -3,9 +3,11 @@
 python docs/generate_results.py            # writes them
 python docs/generate_results.py --check    # exit code 1 where the page is out of date
 
-The page's words are in docs/results/page.md. Where that says `{{ runs NAME }}`,
-`{{ success NAME }}` or `{{ metric NAME METRIC }}`, a table is put of the sweep that is exported to
-docs/results/data/NAME:
+The page's words are in docs/results/page.md. Where that says `{{ KIND NAME }}`, a table is put of
+the sweep NAME: of all of its runs that any export in docs/results/data has, whichever sweep
+computed them, if tune_configs has a sweep of that name, and else of the export
+docs/results/data/NAME. KIND is `runs`, `success`, `stages`, `races` or `effects`, with stages
+behind NAME if not all are meant, or `metric`, with metrics.
 
     python -m music_rllib.report results/NAME --export docs/results/data/NAME --add
 """
@@ -15,16 +17,23 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from music_rllib.experiment.config import load_sweep
+from music_rllib.experiment.plan import make_plan
 from music_rllib.reports import statistics as st
 from music_rllib.reports.analysis import Final, StageAnalysis, analyse
 from music_rllib.reports.archive import is_archive, read_archive
+from music_rllib.reports.conditions import Condition, Stage, find_stages
 from music_rllib.reports.data import Sweep
 from music_rllib.reports.figures import files
 from music_rllib.reports.gallery import slug, stage_drawings
+from music_rllib.reports.merge import of_plan
+from music_rllib.reports.races import races
 from music_rllib.reports.survival import Waits, first_passage, median_wait, median_wait_interval
 from music_rllib.reports.verdict import verdict
 from music_rllib.tracking import names
@@ -32,6 +41,7 @@ from music_rllib.tracking import names
 FOLDER = Path(__file__).parent
 PAGE, TEMPLATE = FOLDER / "results.md", FOLDER / "results" / "page.md"
 DATA, FIGURES = FOLDER / "results" / "data", FOLDER / "results" / "figures"
+CONFIGS = FOLDER.parent / "tune_configs"
 THRESHOLD = 0.9
 DIFFERENCE = 0.1
 """In success rate, which a reader would want to see: how many seeds would likely show it?"""
@@ -52,6 +62,8 @@ def main() -> int:
         return int(current != text)
     PAGE.write_text(text, encoding="utf-8")
     FIGURES.mkdir(parents=True, exist_ok=True)
+    for stale in FIGURES.glob("*.svg"):
+        stale.unlink()
     for name, content in figures.items():
         (FIGURES / name).write_bytes(content)
     return 0
@@ -61,18 +73,37 @@ def page(figures: dict[str, bytes]) -> str:
     """The template with its tables filled in; the figures that it shows go into `figures`."""
     tables: dict[str, Callable[..., Iterable[str]]] = {
         "runs": runs_table,
-        "success": lambda sweep: success(sweep, figures),
+        "success": lambda sweep, *stages: success(sweep, figures, stages),
+        "stages": stages_table,
+        "races": races_table,
+        "effects": effects_table,
         "metric": metric_table,
     }
 
     def fill(match: re.Match[str]) -> str:
         kind, name, *rest = match[1].split()
-        if not is_archive(DATA / name):
-            return NOT_RUN
-        return "\n".join(tables[kind](read_archive(DATA / name), *rest))
+        sweep = sweep_called(name)
+        return NOT_RUN if sweep is None else "\n".join(tables[kind](sweep, *rest))
 
     template = TEMPLATE.read_text("utf-8")
     return f"{NOTICE}\n\n{re.sub(r'{{ (.*?) }}', fill, template)}"
+
+
+@cache
+def sweep_called(name: str) -> Sweep | None:
+    """What has been exported of a sweep's runs; None where nothing has."""
+    for file in sorted(CONFIGS.glob("**/*.yaml")):
+        if f"name: {name}\n" in file.read_text("utf-8"):
+            plan = make_plan(load_sweep(file))
+            if not plan.searched:
+                return of_plan(plan, exports())
+    return read_archive(DATA / name) if is_archive(DATA / name) else None
+
+
+@cache
+def exports() -> list[Sweep]:
+    """All that there are."""
+    return [read_archive(folder) for folder in sorted(DATA.iterdir()) if is_archive(folder)]
 
 
 # -- every run ----------------------------------------------------------------------------------
@@ -116,10 +147,12 @@ def provenance(sweep: Sweep) -> str:
 # -- success rates -------------------------------------------------------------------------------
 
 
-def success(sweep: Sweep, figures: dict[str, bytes]) -> Iterator[str]:
+def success(sweep: Sweep, figures: dict[str, bytes], stages: Sequence[str] = ()) -> Iterator[str]:
     """Per stage: final success and steps to the threshold, what may be said, and the curves."""
     rng = np.random.default_rng(0)
     for analysis in analyse(sweep, rng):
+        if stages and analysis.stage.name not in stages:
+            continue
         yield from success_table(sweep, analysis, rng)
         yield ""
         for scope in analysis.scopes:
@@ -130,29 +163,51 @@ def success(sweep: Sweep, figures: dict[str, bytes]) -> Iterator[str]:
 
 def success_table(sweep: Sweep, analysis: StageAnalysis, rng: np.random.Generator) -> Iterator[str]:
     """One row per task and condition."""
-    yield _row(
-        "task",
-        f"{analysis.stage.variant}",
-        "finished",
-        "success, last evaluation: IQM [95 %]",
-        f"steps to {_percent(THRESHOLD)}: median [95 %]",
-        "got there",
-    )
-    yield _rule(6)
+    yield _row("task", f"{analysis.stage.variant}", *_OUTCOME)
+    yield _rule(2 + len(_OUTCOME))
     for task in analysis.stage.tasks:
-        (scope,) = [scope for scope in analysis.scopes if scope.name == task]
-        finals = {final.condition: final for final in scope.finals}
-        for condition in analysis.stage.conditions:
-            runs = [i for i in condition.runs if sweep.runs[i].task == task]
-            if runs:
-                done = sum(sweep.runs[i].status == "FINISHED" for i in runs)
-                yield _row(
-                    task,
-                    condition.label,
+        for condition, cells in outcomes(sweep, analysis, task, rng):
+            yield _row(task, condition.label, *cells)
+
+
+def stages_table(sweep: Sweep, *stages: str) -> Iterator[str]:
+    """One row per task, stage and condition: stages side by side."""
+    rng = np.random.default_rng(0)
+    yield _row("task", "stage", "condition", *_OUTCOME)
+    yield _rule(3 + len(_OUTCOME))
+    for analysis in analyse(sweep, rng):
+        if not stages or analysis.stage.name in stages:
+            for task in analysis.stage.tasks:
+                for condition, cells in outcomes(sweep, analysis, task, rng):
+                    yield _row(task, analysis.stage.name, condition.label, *cells)
+
+
+_OUTCOME = (
+    "finished",
+    "success, last evaluation: IQM [95 %]",
+    f"steps to {100 * THRESHOLD:.0f} %: median [95 %]",
+    "got there",
+)
+
+
+def outcomes(
+    sweep: Sweep, analysis: StageAnalysis, task: str, rng: np.random.Generator
+) -> Iterator[tuple[Condition, tuple[str, ...]]]:
+    """Each condition with a run of the task, and what `_OUTCOME` names."""
+    (scope,) = [scope for scope in analysis.scopes if scope.name == task]
+    finals = {final.condition: final for final in scope.finals}
+    for condition in analysis.stage.conditions:
+        runs = [i for i in condition.runs if sweep.runs[i].task == task]
+        if runs:
+            done = sum(sweep.runs[i].status == "FINISHED" for i in runs)
+            yield (
+                condition,
+                (
                     f"{done} of {len(runs)}",
                     _interval(finals.get(condition)),
                     *waits(sweep, runs, rng),
-                )
+                ),
+            )
 
 
 def waits(sweep: Sweep, runs: Sequence[int], rng: np.random.Generator) -> tuple[str, str]:
@@ -185,6 +240,51 @@ def curves(
             described = f"{drawing.title} of {sweep.name}, {analysis.stage.name}"
             yield f"![{described}](results/figures/{name})"
             yield ""
+
+
+def races_table(sweep: Sweep, *stages: str) -> Iterator[str]:
+    """Who gets to the threshold sooner, each condition against each, also between stages."""
+    groups: dict[str, Sequence[int]] = {}
+    for stage in _some(sweep, stages):
+        for condition in stage.conditions:
+            several = len(stage.conditions) > 1
+            name = f"{stage.name}, {condition.label}" if several else stage.name
+            groups[name] = condition.runs
+    yield from _races(sweep, groups)
+
+
+def effects_table(sweep: Sweep, *stages: str) -> Iterator[str]:
+    """The same of each stage over all q, and of each q over all stages."""
+    by_stage: dict[str, list[int]] = {}
+    by_q: dict[str, list[int]] = {}
+    for stage in _some(sweep, stages):
+        for condition in stage.conditions:
+            by_stage.setdefault(f"{stage.name}, all q", []).extend(condition.runs)
+            by_q.setdefault(f"q = {condition.entropic_index}", []).extend(condition.runs)
+    yield from _races(sweep, by_stage, by_q)
+
+
+def _some(sweep: Sweep, stages: Sequence[str]) -> list[Stage]:
+    return [stage for stage in find_stages(sweep) if not stages or stage.name in stages]
+
+
+def _races(sweep: Sweep, *questions: dict[str, Any]) -> Iterator[str]:
+    """Of each question all pairs of its groups, corrected for their number."""
+    rng = np.random.default_rng(0)
+    yield _row("task", "sooner at", "than", "runs", "probability [95 %]", "p", "decided")
+    yield _rule(7)
+    for task in dict.fromkeys(run.task for run in sweep.runs):
+        for groups in questions:
+            for race in races(sweep, task, groups, THRESHOLD, rng):
+                yield _row(
+                    race.task,
+                    race.first,
+                    race.second,
+                    " / ".join(map(str, race.runs)),
+                    _spread(race.estimate),
+                    f"{race.p_value:.2g}",
+                    "yes" if race.decided else "no",
+                )
 
 
 # -- other metrics ------------------------------------------------------------------------------
