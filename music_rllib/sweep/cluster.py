@@ -92,16 +92,20 @@ def cluster(resources: Resources) -> Iterator[Room]:
         ray.shutdown()
 
 
-def check_fits(resources: Resources) -> None:
+def check_fits(resources: Resources) -> str | None:
     """Ask Ray, where that can't be known without it, whether it can hold a run.
+
+    Returns:
+        What a person should know who will have to wait for it.
 
     Raises:
         ClusterError: It can't be reached, or can't.
     """
     more = set(resources.bundle) - {"CPU"}
     if more or (cluster_address() is not None and resources.cpus_per_run > 1):
-        with cluster(resources):
-            pass
+        with cluster(resources) as room:
+            return room.remark
+    return None
 
 
 def _room(resources: Resources) -> Room:

@@ -224,7 +224,7 @@ def _drive(console: Console, opened: Sweep) -> int:
     import_checkpoints(opened.plan, opened.store)
     verify_inputs(opened.board, opened.store)
     _check_searches(opened)
-    _check_ray(opened)
+    _check_ray(console, opened)
     tracker = _open_tracker(opened)
     with tracker:
         keep_record(opened)
@@ -239,7 +239,7 @@ def _check_searches(opened: Sweep) -> None:
         check_studies(opened)
 
 
-def _check_ray(opened: Sweep) -> None:
+def _check_ray(console: Console, opened: Sweep) -> None:
     """Look whether Ray is there and can hold a run, unless nothing is left to compute."""
     begun = (opened.folder / records.CONFIG).is_file()
     if opened.board.complete and (begun or not opened.plan.searched):
@@ -248,7 +248,8 @@ def _check_ray(opened: Sweep) -> None:
         check_reachable(address)
     from music_rllib.sweep.cluster import check_fits
 
-    check_fits(opened.config.resources)
+    if remark := check_fits(opened.config.resources):
+        console.print(Text(remark, style="yellow"), soft_wrap=True)
     early.install()  # Ray has set a handler of its own
     early.check()
 
