@@ -52,7 +52,7 @@ test: venv  ## run the whole suite (CI=true: a missing service is a failure, not
 test-unit: venv  ## run the quick tests (little more than a minute)
 	@$(PYTEST) tests/unit $(PYTEST_ARGS)
 
-test-faults: venv  ## kill, fill, cut and corrupt, and compare with unbroken runs (13 minutes)
+test-faults: venv  ## kill, fill, cut and corrupt, and compare with unbroken runs (a quarter of an hour)
 	@$(PYTEST) -m 'faults or thorough' $(PYTEST_ARGS)
 
 lint: venv  ## ruff: rules and formatting
