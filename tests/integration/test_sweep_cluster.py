@@ -227,7 +227,7 @@ def growing_head(folder: Path, home: Path) -> Iterator[Head]:
     here = ray.util.get_node_ip_address()
     address = f"{here}:{port}"
     module = "ray.autoscaler._private.fake_multi_node.node_provider.FakeMultiNodeProvider"
-    provider = {"type": "external", "module": module, "gcs_address": address}
+    provider: dict[str, Any] = {"type": "external", "module": module, "gcs_address": address}
     provider |= {"launch_multiple": True, "head_node_id": FAKE_HEAD}
     worker = {"resources": {"CPU": 3, "object_store_memory": 10**8}, "max_workers": 2}
     types = {
