@@ -83,6 +83,15 @@ class Delivery:
                 send = self._experiment.log_policy
             self.spool.send_artefact(name, partial(send, run_id, name))
 
+    @property
+    def ended(self) -> bool:
+        """Whether the run has ended and MLflow has all of it."""
+        return (
+            self.spool.finished is not None
+            and not self.spool.undelivered
+            and not self.spool.queued_artefacts()
+        )
+
     def cancel(self) -> None:
         """Send nothing more after the request that is under way."""
         self._cancelled = True

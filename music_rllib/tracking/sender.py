@@ -46,7 +46,8 @@ class Sender(threading.Thread):
 
     A failure that can pass (server down, busy, disk full) ends the round, and the lane that met
     it goes to the back, so that one bad run cannot keep the others waiting. After a lasting one
-    (a refused value, a deleted run) the lane rests until the sweep is started again.
+    (a refused value, a deleted run) the lane rests until the sweep is started again. A run that
+    ended and is delivered whole is forgotten, so that a round costs what is under way.
     """
 
     def __init__(self, store: str) -> None:
@@ -61,10 +62,11 @@ class Sender(threading.Thread):
         self._error: str | None = None
 
     def add(self, delivery: Delivery) -> None:
-        """Deliver this spool as well."""
+        """Deliver what is, or will be, in this spool; again, where it was forgotten."""
         with self._change:
-            self._records.append(_Lane(delivery, delivery.send_records))
-            self._artefacts.append(_Lane(delivery, delivery.send_artefacts))
+            if not any(lane.delivery is delivery for lane in self._records):
+                self._records.append(_Lane(delivery, delivery.send_records))
+                self._artefacts.append(_Lane(delivery, delivery.send_artefacts))
         self.wake()
 
     def wake(self) -> None:
@@ -77,7 +79,7 @@ class Sender(threading.Thread):
         """What is still to be sent, and why it has not been."""
         with self._change:
             lanes = list(self._records)
-            refused = [lane.refused for lane in (*lanes, *self._artefacts) if lane.refused]
+            refused = [lane.refused for lane in self._lanes() if lane.refused]
         return Backlog(
             records=sum(lane.delivery.spool.undelivered for lane in lanes),
             artefacts=sum(len(lane.delivery.spool.queued_artefacts()) for lane in lanes),
@@ -129,7 +131,24 @@ class Sender(threading.Thread):
         if self._error is not None:
             logger.warning("MLflow at %s accepts again what was waiting", self._store)
         self._failures, self._error = 0, None
+        self._forget_ended()
         return True
+
+    def _forget_ended(self) -> None:
+        # Whoever puts something into a spool calls `add` after it: either it is seen here, or
+        # `add` comes after this.
+        with self._change:
+            resting = {lane.delivery for lane in self._lanes() if lane.refused is not None}
+            kept = {
+                lane.delivery
+                for lane in self._records
+                if lane.delivery in resting or not lane.delivery.ended
+            }
+            self._records = [lane for lane in self._records if lane.delivery in kept]
+            self._artefacts = [lane for lane in self._artefacts if lane.delivery in kept]
+
+    def _lanes(self) -> list[_Lane]:
+        return [*self._records, *self._artefacts]
 
     def _attempt(self, lane: _Lane, lanes: list[_Lane]) -> bool:
         try:

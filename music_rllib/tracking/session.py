@@ -148,6 +148,7 @@ class Session:
         for folder in sorted((self.folder / "runs").glob("*")):
             if has_undelivered(folder):
                 self.open_run(folder.name)
+                self.wake(folder.name)
         self._sender.start()
 
     def open_run(self, node_key: str) -> Spool:
@@ -168,7 +169,6 @@ class Session:
                 self._find_source,
             )
             self._runs[node_key] = delivery
-            self._sender.add(delivery)
         return self._runs[node_key].spool
 
     def run_id(self, node_key: str) -> str | None:
@@ -176,9 +176,9 @@ class Session:
         delivery = self._runs.get(node_key)
         return None if delivery is None else delivery.run_id
 
-    def wake(self) -> None:
-        """Say that a spool has something new."""
-        self._sender.wake()
+    def wake(self, node_key: str | None = None) -> None:
+        """Say that a run's spool has something new; without a key, that of the sweep's own run."""
+        self._sender.add(self.parent if node_key is None else self._runs[node_key])
 
     def backlog(self) -> Backlog:
         """What MLflow does not have yet."""

@@ -148,7 +148,7 @@ class Tracker:
         """
         self._append(run.node_key, self._opening(run, time.time()))
         self._open[run.node_key].put_artefact(names.ARTEFACT_RUN_CONFIG, _yaml(run.config))
-        self._session.wake()
+        self._session.wake(run.node_key)
 
     def log(
         self,
@@ -173,7 +173,7 @@ class Tracker:
         self._started(node_key)
         when = time.time() if timestamp is None else timestamp
         self._append(node_key, [self._metrics(metrics, env_steps, when)])
-        self._session.wake()
+        self._session.wake(node_key)
 
     def finish(
         self,
@@ -200,7 +200,7 @@ class Tracker:
             spool.put_artefact(name, file)
         self._append(node_key, [_finish(status, time.time(), failure)])
         del self._open[node_key]
-        self._session.wake()
+        self._session.wake(node_key)
 
     def log_history(
         self, run: RunInfo, history: Iterable[Point], artefacts: Mapping[str, Path] | None = None
@@ -229,7 +229,7 @@ class Tracker:
         for name, file in (artefacts or {}).items():
             spool.put_artefact(name, file)
         spool.append(records)
-        self._session.wake()
+        self._session.wake(run.node_key)
         return True
 
     def put_sweep_artefact(self, name: str, content: str | bytes | Path) -> None:

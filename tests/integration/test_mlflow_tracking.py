@@ -234,6 +234,20 @@ def test_a_failed_run_that_succeeds_later_shows_no_failure(
     assert names.TAG_FAILURE not in run.data.tags
 
 
+def test_a_run_that_ends_and_goes_on_again_and_again_loses_nothing(
+    storage: Path, tracker_on: MakeTracker
+) -> None:
+    """As a search does with a run that it stops at each rung."""
+    tracker = tracker_on()
+    for step in STEPS:
+        tracker.start(run_info("a"))
+        tracker.log("a", values(step), step)
+        tracker.finish("a", "KILLED")
+        time.sleep(0.06 if step % 4000 else 0.6)  # while it is delivered, or after it
+    assert not tracker.close()
+    assert logged_steps(client_of(storage), runs_of(client_of(storage))["finetune/a"]) == STEPS
+
+
 def test_a_sweep_that_was_deleted_and_begun_anew_has_runs_of_its_own(
     storage: Path, tracker_on: MakeTracker
 ) -> None:
