@@ -29,6 +29,9 @@ TARGETS = ".prometheus"
 """Folder beside the sweeps' own: NAME.json says where this Ray's metrics are. Prometheus' file_sd
 reads it, and wants all of them in one folder."""
 SET_SECONDS = 2.0
+KEPT = 100
+"""Runs that are over and still shown, the newest ones: what is exported every few seconds must not
+grow with a sweep of thousands."""
 RUN_TAGS = ("sweep", "stage", "variant", "task", "q", "seed", "run")
 SWEEP_TAGS = ("sweep",)
 
@@ -80,9 +83,12 @@ class Gauges(Listener):
         self._values: dict[str, tuple[dict[str, str], dict[str, float]]] = {}
         """Node key to tags and values by gauge."""
         self._last: dict[str, Report] = {}
+        self._ended: dict[str, None] = {}
+        """Node keys, in the order in which they ended."""
 
     def reported(self, node: Node, reports: list[Report]) -> None:
         """Keep the newest values."""
+        self._ended.pop(node.key, None)
         _, values = self._values.setdefault(node.key, (self._tags(node), {}))
         for report in reports:
             for gauge, metric in _METRICS.items():
@@ -104,6 +110,10 @@ class Gauges(Listener):
         """It trains no more."""
         self._over(node)
 
+    def paused(self, node: Node) -> None:
+        """It trains no more, or goes on some time."""
+        self._over(node)
+
     def tick(self) -> None:
         """Set them again, now and then."""
         if self._now() < self._next:
@@ -121,6 +131,11 @@ class Gauges(Listener):
     def _over(self, node: Node) -> None:
         _, values = self._values.setdefault(node.key, (self._tags(node), {}))
         values.update(dict.fromkeys(_RATES, 0.0))
+        self._last.pop(node.key, None)
+        self._ended[node.key] = None
+        while len(self._ended) > KEPT:
+            oldest = next(iter(self._ended))
+            del self._ended[oldest], self._values[oldest]
 
     def _tags(self, node: Node) -> dict[str, str]:
         return {

@@ -7,8 +7,10 @@ needed to load it.
 
 from __future__ import annotations
 
+import contextlib
 import shutil
-from collections.abc import Mapping
+import sys
+from collections.abc import Iterator, Mapping
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -69,7 +71,7 @@ def write_model(file: Path, folder: Path, *, run_id: str, model_id: str) -> Poli
     from mlflow.models import Model
 
     policy = PolicyNetwork.from_file(file)
-    with TemporaryDirectory() as temporary:
+    with TemporaryDirectory() as temporary, _without_new_modules():
         code, artefact = Path(temporary, "policy_model.py"), Path(temporary, ARTEFACT)
         code.write_text(Path(network.__file__).read_text() + MODEL_CODE)
         shutil.copyfile(file, artefact)
@@ -86,6 +88,16 @@ def write_model(file: Path, folder: Path, *, run_id: str, model_id: str) -> Poli
             metadata=_metadata(policy),
         )
     return policy
+
+
+@contextlib.contextmanager
+def _without_new_modules() -> Iterator[None]:
+    """MLflow runs a model's code as a module of its own, and would keep one for each model."""
+    try:
+        yield
+    finally:
+        for name in [name for name in sys.modules if name.startswith("code_model_")]:
+            del sys.modules[name]
 
 
 _REQUIREMENTS = ("mlflow", "numpy", "safetensors")
