@@ -28,11 +28,12 @@ GROUPS = {
     "checkpoint": "checkpoint",
     "memory": "memory",
     "sweep": "sweep",
+    "search": "search",
     "report": "report",
 }
 EXAMPLES = """\
 examples:
-  python -m benchmarks                       the whole table, about 30 minutes on an idle machine
+  python -m benchmarks                       the whole table, about 40 minutes on an idle machine
   python -m benchmarks step environment      two groups of it
   python -m benchmarks --repeats 9 step      more turns
 

@@ -1,0 +1,125 @@
+"""A search of many tiny trials: whether the driver's memory and time per trial stay flat."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+import psutil
+import ray
+import yaml
+
+from benchmarks.measure import Row
+
+__all__ = ["rows"]
+
+GROUP = "search"
+TRIALS, SETTLED, AT_A_TIME = 200, 40, 2
+"""Until `SETTLED` the driver imports and caches what it does once."""
+LOOK_SECONDS = 1.0
+DOCUMENT: dict[str, Any] = {
+    "name": "search",
+    "tasks": ["Pendulum"],
+    "seeds": [0],
+    "resources": {"num_cpus": AT_A_TIME},
+    "environments": {"Pendulum": {"env_id": "Pendulum-v1", "horizon": 200, "success_key": None}},
+    "defaults": {
+        "env_steps": 600,
+        "num_envs": 2,
+        "evaluation": {"interval": 300, "episodes": 1},
+        "tac": {"random_steps": 200, "hidden_sizes": [16], "batch_size": 16, "replay_ratio": 0.2},
+    },
+    "stages": [
+        {
+            "name": "train",
+            "variant": "tac",
+            "search": {
+                "space": {
+                    "tac.entropic_index": {"float": [1.0, 2.5]},
+                    "tac.alpha": {"float": [0.01, 0.5], "log": True},
+                },
+                "objective": {"metric": "evaluation/episode_return", "aggregate": "mean"},
+                "trials": TRIALS,
+                "final": None,
+            },
+        }
+    ],
+}
+
+
+class Look(NamedTuple):
+    """What a driver has used when so many trials were judged."""
+
+    trials: int
+    seconds: float
+    cpu_seconds: float
+    memory_mb: float
+
+
+def rows(repeats: int) -> Iterator[Row]:
+    """One round, which takes some ten minutes."""
+    del repeats
+    ray.shutdown()  # the sweep brings its own
+    looks = watched_search()
+    settled = [look for look in looks if look.trials >= SETTLED]
+    begin, end = settled[0], settled[-1]
+    passed = end.trials - begin.trials
+    growth, _ = statistics.linear_regression(
+        [look.trials for look in settled], [look.memory_mb for look in settled]
+    )
+    yield Row(GROUP, f"driver's memory after {begin.trials} trials", begin.memory_mb, "MB")
+    yield Row(GROUP, f"driver's memory after {end.trials} trials", end.memory_mb, "MB")
+    yield Row(GROUP, "its growth, a trial", growth, "MB")
+    yield Row(GROUP, "driver's CPU, a trial", (end.cpu_seconds - begin.cpu_seconds) / passed, "s")
+    middle = min(settled, key=lambda look: abs(look.trials - (begin.trials + end.trials) / 2))
+    early = (middle.seconds - begin.seconds) / (middle.trials - begin.trials)
+    late = (end.seconds - middle.seconds) / (end.trials - middle.trials)
+    yield Row(GROUP, f"wall time a trial, {AT_A_TIME} at a time", late, "s",
+              against="the first half's", ratio=late / early)  # fmt: skip
+
+
+def watched_search() -> list[Look]:
+    """Look at a whole search's driver from outside."""
+    with TemporaryDirectory() as folder:
+        file = Path(folder, "search.yaml")
+        file.write_text(yaml.safe_dump(DOCUMENT | {"storage": f"{folder}/results"}))
+        state = Path(folder, "results", DOCUMENT["name"], "state.json")
+        command = [sys.executable, "-m", "music_rllib.sweep", str(file)]
+        driver = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+        looks: list[Look] = []
+        begin = time.monotonic()
+        try:
+            while driver.poll() is None:
+                with contextlib.suppress(psutil.Error):  # it has just ended
+                    looks += _look(psutil.Process(driver.pid), state, begin)
+                time.sleep(LOOK_SECONDS)
+        finally:
+            driver.terminate()
+            driver.wait()
+    if driver.returncode:
+        raise RuntimeError(f"the search ended with {driver.returncode}")
+    return looks
+
+
+def _look(driver: psutil.Process, state: Path, begin: float) -> list[Look]:
+    if not state.exists():
+        return []
+    (search,) = json.loads(state.read_text())["searches"] or [None]
+    if search is None:
+        return []
+    used, cpu = driver.memory_info().rss / 1e6, driver.cpu_times()
+    judged = search["arms"][0]["judged"]
+    return [Look(judged, time.monotonic() - begin, cpu.user + cpu.system, used)]
+
+
+if __name__ == "__main__":
+    for row in rows(1):
+        print(row)
