@@ -11,6 +11,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -37,6 +38,19 @@ _METRICS = {
 }
 
 
+_PLACES = re.compile(r"^(?P<name>storage: | *tracking_uri: )(?P<place>.+)$", re.MULTILINE)
+_LOCAL = re.compile(r"(sqlite:///)/(?:.*/)?([^/]+/[^/]+)|(?:file://)?/(?:.*/)?([^/]+)/*")
+
+
+def _without_folders(place: str) -> str:
+    """`place` without what leads to it on this machine; servers, buckets and relative paths stay.
+
+    Of a sqlite file its folder is kept, as it is with the default storage: `results/mlflow.db`.
+    """
+    local = _LOCAL.fullmatch(place)
+    return local.expand(r"\1\2\3") if local else place
+
+
 def is_archive(folder: Path) -> bool:
     """Whether `folder` holds an exported sweep."""
     return (folder / _HEADER).is_file()
@@ -45,11 +59,18 @@ def is_archive(folder: Path) -> bool:
 def write_archive(sweep: Sweep, folder: Path, file_format: Format = "parquet") -> None:
     """Write `sweep` into `folder`; a sweep that was exported there before is replaced.
 
+    An export is what one publishes, so it doesn't say in which folder of a machine the sweep was.
+
     Raises:
         ReportError: where the folder is not writable.
     """
     header = {"version": VERSION, "format": file_format}
     header |= {name: getattr(sweep, name) for name in _OWN_FIELDS}
+    header |= {"source": _without_folders(sweep.source)}
+    if sweep.config is not None:
+        header["config"] = _PLACES.sub(
+            lambda found: found["name"] + _without_folders(found["place"]), sweep.config
+        )
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for stale in get_args(Format):

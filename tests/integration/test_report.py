@@ -157,6 +157,7 @@ def test_an_exported_sweep_is_the_same_sweep(
     assert {f"metrics.{table_format}", f"runs.{table_format}", "sweep.json"} == {
         path.name for path in exported.iterdir()
     }
+    assert str(sweep_folder.parent) not in (exported / "sweep.json").read_text()
     (exported / f"metrics.{table_format}").unlink()
     broken = run(exported)
     assert broken.exit_code == 2
