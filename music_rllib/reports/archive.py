@@ -64,7 +64,7 @@ def write_archive(sweep: Sweep, folder: Path, file_format: Format = "parquet") -
     Raises:
         ReportError: where the folder is not writable.
     """
-    header = {"version": VERSION, "format": file_format}
+    header: dict[str, Any] = {"version": VERSION, "format": file_format}
     header |= {name: getattr(sweep, name) for name in _OWN_FIELDS}
     header |= {"source": _without_folders(sweep.source)}
     if sweep.config is not None:

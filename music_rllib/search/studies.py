@@ -15,40 +15,31 @@ import time
 import uuid
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import optuna
 import psutil
-from optuna.exceptions import DuplicatedStudyError, StorageInternalError, UpdateFinishedTrialError
-from optuna.storages import BaseStorage, RDBStorage, get_storage
+from optuna.exceptions import DuplicatedStudyError, UpdateFinishedTrialError
+from optuna.storages import BaseStorage
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState, create_trial
-from sqlalchemy.engine import URL, make_url
-from sqlalchemy.exc import ArgumentError, IntegrityError, ProgrammingError, SQLAlchemyError
 
 from music_rllib.experiment.files import content_key
 from music_rllib.experiment.plan import short
 from music_rllib.experiment.problems import same
 from music_rllib.experiment.sealed import StorageError
 from music_rllib.experiment.space import SearchSettings, WarmStart
+from music_rllib.search.database import open_older, studies_of
 from music_rllib.search.proposals import Proposal, Proposer, as_proposal
 from music_rllib.tracking.redaction import redact
 
 __all__ = [
-    "DATABASE_ERRORS",
     "REASON",
     "SCORES",
     "VALUES",
     "Study",
     "no_study_error",
-    "open_older",
-    "open_studies",
-    "study_names",
 ]
-
-DATABASE_ERRORS = (StorageInternalError, SQLAlchemyError)
-"""A database that doesn't answer, or not now."""
 
 LEASE_SECONDS = 120.0
 """After so long without a sign of life a driver on another machine counts as dead."""
@@ -68,87 +59,6 @@ OWNER, VALUES, REASON, SCORES = "owner", "values", "reason", "scores"
 DRIVER = "driver:"
 
 
-def open_studies(
-    url: str, *, setting: str = "search.storage", must_exist: bool = False
-) -> BaseStorage:
-    """Open Optuna's storage.
-
-    Args:
-        url: SQLAlchemy's URL, or the path of a sqlite file. PostgreSQL's password comes from
-            `PGPASSWORD` or a password file.
-        setting: Where the user has named it, for messages.
-        must_exist: Change nothing: refuse a sqlite file that isn't there, or has no studies in it.
-
-    Raises:
-        StorageError: The database can't be reached.
-    """
-    shown = redact(url)
-    if "://" not in url:
-        url = f"sqlite:///{url}"
-    try:
-        parsed = make_url(url)
-        if parsed.password:
-            raise StorageError(
-                f"{setting} must not hold a password, got one in {shown}: put it into the "
-                "environment as PGPASSWORD, or into ~/.pgpass"
-            )
-        if parsed.drivername == "postgresql":
-            parsed = parsed.set(drivername="postgresql+psycopg2")
-        local = parsed.get_backend_name() == "sqlite"
-        if must_exist and local and not Path(parsed.database or "").is_file():
-            raise StorageError(f"{setting} must be an sqlite file that is there, got {shown}")
-        options: dict[str, Any] = {"connect_args": {"timeout": 60}} if local else {"pool_size": 2}
-        # With a cache of ended trials.
-        return get_storage(_with_tables(parsed, options, make=not must_exist))
-    except StorageError:
-        raise
-    except (
-        ArgumentError,
-        ImportError,
-        StorageInternalError,
-        SQLAlchemyError,
-        RuntimeError,
-    ) as error:
-        cause = str(error.__cause__ or error).strip().splitlines()[0]
-        raise StorageError(
-            f"{setting} must be a database that can be used, got {shown}: {redact(cause)}"
-        ) from error
-
-
-def _with_tables(url: URL, options: Mapping[str, Any], *, make: bool) -> RDBStorage:
-    """Optuna's storage, its tables made where they are missing if `make` says so.
-
-    Of two drivers that find a new database at the same moment, one fails to make a table that the
-    other is just making, and finds it there when it looks again.
-    """
-    for wait in (0.5, 1.0, 2.0, 4.0, None) if make else (None,):
-        try:
-            return RDBStorage(
-                url.render_as_string(hide_password=False),
-                engine_kwargs={**options, "pool_pre_ping": True},
-                skip_table_creation=not make,
-            )
-        except (IntegrityError, ProgrammingError):
-            if wait is None:
-                raise
-            time.sleep(wait)
-    raise AssertionError("unreachable")
-
-
-def open_older(url: str) -> BaseStorage:
-    """Open the storage of a warm start, which must be there.
-
-    Raises:
-        StorageError: It isn't, or can't be reached.
-    """
-    return open_studies(url, setting="search.warm_start.storage", must_exist=True)
-
-
-def study_names(storage: BaseStorage) -> list[str]:
-    """The oldest first."""
-    return [one.study_name for one in _studies(storage)]
-
-
 def no_study_error(warm: WarmStart, known: Sequence[str]) -> StorageError:
     """That none of the `known` studies is the one to learn from."""
     if known:
@@ -160,11 +70,6 @@ def no_study_error(warm: WarmStart, known: Sequence[str]) -> StorageError:
             f"studies in {place}"
         )
     return StorageError(f"search.warm_start.study {rule}")
-
-
-def _studies(storage: BaseStorage) -> list[Any]:
-    """The oldest first."""
-    return sorted(storage.get_all_studies(), key=lambda one: int(one._study_id))
 
 
 def _search_of(study: Any) -> str:
@@ -294,7 +199,7 @@ class Study:
             return []
         older = [
             one
-            for one in _studies(self._storage)
+            for one in studies_of(self._storage)
             if one.user_attrs.get(BASE) == self.identity.base
             and one.study_name != self.identity.name
         ]
@@ -344,7 +249,7 @@ class Study:
     def _older(self, storage: BaseStorage, warm: WarmStart) -> list[Any]:
         """Studies of the newest search whose names begin as is wished: one, or compared ones."""
         others = [
-            one for one in _studies(storage) if one.user_attrs.get(SEARCH) != self.identity.search
+            one for one in studies_of(storage) if one.user_attrs.get(SEARCH) != self.identity.search
         ]
         found = [one for one in others if one.study_name.startswith(warm.study)]
         if found:

@@ -18,8 +18,9 @@ from music_rllib.experiment.problems import ConfigError
 from music_rllib.experiment.result import Report
 from music_rllib.experiment.sealed import DamagedError
 from music_rllib.experiment.space import FINAL_SEED, Rung, SearchSettings
+from music_rllib.search.database import DATABASE_ERRORS
 from music_rllib.search.judge import aggregate, prune, score
-from music_rllib.search.studies import DATABASE_ERRORS, SCORES, VALUES, Study
+from music_rllib.search.studies import SCORES, VALUES, Study
 from music_rllib.sweep.board import Status
 from music_rllib.sweep.listener import Failure, Listener
 from music_rllib.sweep.session import Sweep

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,27 +9,20 @@ from typing import Any
 import numpy as np
 import optuna
 from optuna.trial import FrozenTrial, TrialState
-from sqlalchemy.engine import make_url
-from sqlalchemy.exc import ArgumentError
 
 from music_rllib.experiment.model import Stage
 from music_rllib.experiment.plan import node_key
-from music_rllib.experiment.sealed import StorageError
 from music_rllib.experiment.searched import most_env_steps
-from music_rllib.experiment.space import Rung, SearchSettings
+from music_rllib.experiment.space import Rung, SearchSettings, WarmStart
 from music_rllib.reports.statistics import probability_of_improvement
-from music_rllib.search.judge import aggregate, interval
-from music_rllib.search.studies import (
+from music_rllib.search.database import (
     DATABASE_ERRORS,
-    REASON,
-    SCORES,
-    VALUES,
-    Study,
-    no_study_error,
-    open_older,
+    known_studies,
     open_studies,
-    study_names,
+    same_database,
 )
+from music_rllib.search.judge import aggregate, interval
+from music_rllib.search.studies import REASON, SCORES, VALUES, Study, no_study_error
 from music_rllib.sweep.campaign import Arm, Campaign, Finalist, Search, ranked
 from music_rllib.sweep.session import Sweep
 from music_rllib.tracking.redaction import redact
@@ -46,7 +38,7 @@ IMPORTANCE_TRIALS = 4
 def check_studies(sweep: Sweep) -> None:
     """Reach the databases that searches name, and look for the studies that they learn from.
 
-    No sqlite file is made, so that a sweep that is only planned leaves none.
+    Nothing is made there, so that a sweep that is only planned leaves nothing.
 
     Raises:
         StorageError: One can't be used, or there is no such study.
@@ -55,11 +47,11 @@ def check_studies(sweep: Sweep) -> None:
     for stage in sweep.plan.searched:
         settings = stage.search
         assert settings is not None
-        if settings.storage is not None:
-            _check_database(settings.storage)
         base, own = _base(sweep, stage), settings.storage or str(sweep.folder / STUDY_FILE)
+        # The sweep's folder need not be there yet.
+        mine = known_studies(own) if settings.storage or Path(own).exists() else []
         if settings.warm_start is not None:
-            _check_warm_start(settings, base, own, above)
+            _check_warm_start(settings.warm_start, base, own, mine, above)
         above.append((base, own))
 
 
@@ -69,45 +61,27 @@ def _base(sweep: Sweep, stage: Stage) -> str:
     return f"{stage.search.study or sweep.config.name}/{stage.name}"
 
 
-def _check_database(url: str) -> None:
-    file = _sqlite_file(url)
-    if file is None or file.exists():
-        open_studies(url)
-    elif not os.access(file.absolute().parent, os.W_OK | os.X_OK):
-        raise StorageError(
-            f"search.storage must be in a folder that can be written, got {redact(url)}"
-        )
-
-
 def _check_warm_start(
-    settings: SearchSettings, base: str, own: str, above: Sequence[tuple[str, str]]
+    warm: WarmStart, base: str, own: str, mine: Sequence[str], above: Sequence[tuple[str, str]]
 ) -> None:
-    """Args: `base` and `own`, the storage, of the search, and those of the stages above it."""
-    warm = settings.warm_start
-    assert warm is not None
-    file = _sqlite_file(own)
-    mine = study_names(open_studies(own)) if file is None or file.exists() else []
+    """Look for the study to learn from.
+
+    Args:
+        warm: Names it.
+        base: What the names of the search's own studies begin with.
+        own: The search's storage.
+        mine: The studies in it.
+        above: `base` and `own` of the stages above.
+    """
     if any(name.startswith((f"{base} @", f"{base}/")) for name in mine):
         return  # it has learnt already, and looks no more
-    known = mine if warm.storage is None else study_names(open_older(warm.storage))
+    known = mine if warm.storage is None else known_studies(warm.storage, must_exist=True)
     # Those of the stages above are made before this one's.
-    made = [name for name, place in above if place == (warm.storage or own)]
+    made = [name for name, place in above if same_database(place, warm.storage or own)]
     if any(name.startswith(warm.study) for name in known):
         return
     if not any(name.startswith(warm.study) or warm.study.startswith(name) for name in made):
         raise no_study_error(warm, known)
-
-
-def _sqlite_file(url: str) -> Path | None:
-    """The file of a sqlite database; None for any other, and for what is no database's name."""
-    if "://" not in url:
-        return Path(url)
-    try:
-        parsed = make_url(url)
-    except ArgumentError:
-        return None  # to open it says what is wrong
-    in_file = parsed.get_backend_name() == "sqlite" and parsed.database not in (None, ":memory:")
-    return Path(str(parsed.database)) if in_file else None
 
 
 def open_searches(sweep: Sweep) -> list[Search]:

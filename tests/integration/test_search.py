@@ -17,6 +17,7 @@ from typing import Any
 
 import pytest
 
+from music_rllib.search.database import known_studies
 from music_rllib.tracking import names
 from tests.faults import comparison
 
@@ -222,6 +223,22 @@ DRIVER = """
     mine = sorted({run.part for run in driver.sweep.plan.runs if run.part and run.key in keys})
     print(json.dumps([mine, driver.trials()]))
 """
+
+
+def test_a_plan_leaves_nothing_in_a_database(
+    postgresql: str, sweep_program: Any, sweep_document: Document
+) -> None:
+    from sqlalchemy import create_engine, inspect
+
+    document = searched(sweep_document)
+    document["stages"][0]["search"] |= {"storage": postgresql}
+    sweep_program.write(document)
+    code, _, complaint = command(sweep_program, "plan", "sweep.yaml")
+    assert code == 0, complaint
+    engine = create_engine(postgresql.replace("postgresql:", "postgresql+psycopg2:"))
+    assert inspect(engine).get_table_names() == []
+    engine.dispose()
+    assert known_studies(postgresql) == []
 
 
 def test_two_drivers_on_postgresql_lose_and_double_no_trial(

@@ -17,6 +17,7 @@ from music_rllib.experiment.config import load_sweep
 from music_rllib.experiment.problems import ConfigError
 from music_rllib.experiment.result import Report
 from music_rllib.experiment.space import Objective, Pruning, Rung, SearchSettings
+from music_rllib.search.database import same_database
 from music_rllib.search.judge import aggregate, prune, score
 from music_rllib.tracking import names
 from tests.played_search import Document, document
@@ -369,3 +370,22 @@ def test_a_rung_may_be_beyond_the_shorter_tasks(tmp_path: Path) -> None:
     path.write_text(yaml.safe_dump(content))
     with pytest.raises(ConfigError, match="must be <= 4500"):
         load_sweep(path)
+
+
+@pytest.mark.parametrize(
+    ("other", "same"),
+    [
+        ("studies.db", True),
+        ("sqlite:///studies.db", True),
+        ("./here/../studies.db", True),
+        ("{here}/studies.db", True),
+        ("sqlite:///{here}/studies.db", True),
+        ("others.db", False),
+        ("postgresql://host/studies.db", False),
+    ],
+)
+def test_a_database_is_known_by_any_of_its_names(
+    other: str, same: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert same_database("studies.db", other.format(here=tmp_path)) is same
