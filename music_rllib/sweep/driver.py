@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.text import Text
 
+from music_rllib._allocator import give_back_freed_memory
 from music_rllib.experiment.config import load_sweep
 from music_rllib.experiment.model import SweepConfig
 from music_rllib.experiment.plan import Node, make_plan
@@ -220,6 +221,7 @@ def plan_answer(opened: Sweep, changes: Changes | None = None) -> dict[str, Any]
 
 def _drive(console: Console, opened: Sweep) -> int:
     """Run a sweep that nobody else drives."""
+    give_back_freed_memory()
     # All that may refuse it comes before it is recorded as a sweep that was begun.
     import_checkpoints(opened.plan, opened.store)
     verify_inputs(opened.board, opened.store)
