@@ -6,8 +6,8 @@ python docs/generate_results.py --check    # exit code 1 where the page is out o
 The page's words are in docs/results/page.md. Where that says `{{ KIND NAME }}`, a table is put of
 the sweep NAME: of all of its runs that any export in docs/results/data has, whichever sweep
 computed them, if tune_configs has a sweep of that name, and else of the export
-docs/results/data/NAME. KIND is `runs`, `success`, `stages`, `races` or `effects`, with stages
-behind NAME if not all are meant, or `metric`, with metrics.
+docs/results/data/NAME. KIND is `runs`, `success`, `stages`, `curves`, `races` or `effects`, with
+stages behind NAME if not all are meant, or `metric`, with metrics.
 
     python -m music_rllib.report results/NAME --export docs/results/data/NAME --add
 """
@@ -31,7 +31,7 @@ from music_rllib.reports.archive import is_archive, read_archive
 from music_rllib.reports.conditions import Condition, Stage, find_stages
 from music_rllib.reports.data import Sweep
 from music_rllib.reports.figures import files
-from music_rllib.reports.gallery import slug, stage_drawings
+from music_rllib.reports.gallery import Drawing, drawing_of_stages, slug, stage_drawings
 from music_rllib.reports.merge import of_plan
 from music_rllib.reports.races import races
 from music_rllib.reports.survival import Waits, first_passage, median_wait, median_wait_interval
@@ -75,6 +75,7 @@ def page(figures: dict[str, bytes]) -> str:
         "runs": runs_table,
         "success": lambda sweep, *stages: success(sweep, figures, stages),
         "stages": stages_table,
+        "curves": lambda sweep, *stages: stage_curves(sweep, figures, stages),
         "races": races_table,
         "effects": effects_table,
         "metric": metric_table,
@@ -235,11 +236,22 @@ def curves(
     """The figure of success rates."""
     for drawing in stage_drawings(sweep, analysis, rng):
         if drawing.title == "Success rate":
-            name = f"{slug(sweep.name)}-{drawing.name}.svg"
-            figures[name] = files(drawing.panels, drawing.legend)["svg"]
-            described = f"{drawing.title} of {sweep.name}, {analysis.stage.name}"
-            yield f"![{described}](results/figures/{name})"
+            yield from figure(sweep, drawing, figures)
             yield ""
+
+
+def stage_curves(sweep: Sweep, figures: dict[str, bytes], stages: Sequence[str]) -> Iterator[str]:
+    """The figure of success rates of several stages."""
+    drawing = drawing_of_stages(sweep, _some(sweep, stages), np.random.default_rng(0))
+    assert drawing is not None, f"{sweep.name} must have two stages of {stages}"
+    yield from figure(sweep, drawing, figures)
+
+
+def figure(sweep: Sweep, drawing: Drawing, figures: dict[str, bytes]) -> Iterator[str]:
+    """Puts the drawing into `figures` and shows it."""
+    name = f"{slug(sweep.name)}-{drawing.name}.svg"
+    figures[name] = files(drawing.panels, drawing.legend)["svg"]
+    yield f"![{drawing.title} of {sweep.name}, {drawing.stage}](results/figures/{name})"
 
 
 def races_table(sweep: Sweep, *stages: str) -> Iterator[str]:

@@ -11,7 +11,7 @@ from music_rllib.reports.analysis import analyse
 from music_rllib.reports.data import ReportError, Sweep
 from music_rllib.reports.figures import METRICS
 from music_rllib.reports.films import make_films
-from music_rllib.reports.gallery import Drawing, stage_drawings
+from music_rllib.reports.gallery import Drawing, drawing_of_stages, stage_drawings
 from music_rllib.reports.missing import missing
 from music_rllib.reports.page import Report, render
 from music_rllib.reports.pictures import draw_all
@@ -59,6 +59,9 @@ def build_report(
     """
     analyses = analyse(sweep, rng)
     drawings = [d for analysis in analyses for d in stage_drawings(sweep, analysis, rng)]
+    together = drawing_of_stages(sweep, [analysis.stage for analysis in analyses], rng)
+    if together is not None:
+        drawings.append(together)
     return Report(
         sweep=sweep,
         analyses=analyses,

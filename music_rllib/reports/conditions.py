@@ -8,17 +8,19 @@ number of their trial, which changes when a sweep is extended.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from music_rllib.reports.data import RunRecord, Sweep
 from music_rllib.tracking import names
 
-__all__ = ["Condition", "Stage", "find_stages"]
+__all__ = ["SIDE_BY_SIDE", "Condition", "Stage", "find_stages", "side_by_side"]
 
 Values = tuple[tuple[str, str], ...]
 """(setting, value) pairs."""
 
 ENTROPIC_INDEX = "q"
+SIDE_BY_SIDE = "stages side by side"
+_WITHOUT_TASK_REWARD = ("music-u",)
 # Settings that may be schedules, and so several params: a tag says each in words.
 _IN_WORDS = {
     "tac.entropic_index": (ENTROPIC_INDEX, names.TAG_ENTROPIC_INDEX),
@@ -55,6 +57,30 @@ class Stage:
     seeds: tuple[str, ...]
     conditions: tuple[Condition, ...]
     runs: tuple[int, ...]
+
+    @property
+    def has_task_reward(self) -> bool:
+        """Whether success is its aim."""
+        return self.variant not in _WITHOUT_TASK_REWARD
+
+
+def side_by_side(stages: Sequence[Stage]) -> Stage | None:
+    """All conditions that train for the task as those of one stage; None if one stage has them."""
+    compared = [stage for stage in stages if stage.has_task_reward]
+    if len(compared) < 2:
+        return None
+    return Stage(
+        name=SIDE_BY_SIDE,
+        variant=" and ".join(dict.fromkeys(stage.variant for stage in compared)),
+        tasks=tuple(dict.fromkeys(task for stage in compared for task in stage.tasks)),
+        seeds=tuple(sorted({seed for stage in compared for seed in stage.seeds}, key=_number)),
+        runs=tuple(run for stage in compared for run in stage.runs),
+        conditions=tuple(
+            replace(condition, others=(("stage", stage.name), *condition.others))
+            for stage in compared
+            for condition in stage.conditions
+        ),
+    )
 
 
 def find_stages(sweep: Sweep) -> list[Stage]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -50,6 +50,8 @@ PANEL = (4.3, 3.0)
 """Width and height in inches, at which 10 pt are readable on a page of 400 px."""
 _LEFT, _RIGHT, _BOTTOM, _TOP_WITH_EPOCHS = 0.84, 0.2, 0.52, 0.62
 """A panel's margins in inches."""
+_HANDLE, _LETTER = 0.6, 0.08
+"""Widths in inches in a legend."""
 TARGET = 0.85
 """Success rate that Figure 4 of the paper waits for."""
 
@@ -107,7 +109,7 @@ class Panel:
 
 
 def curve_panel(
-    metric: Metric, task: str, curves: Sequence[Curve], siblings: tuple[Condition, ...]
+    metric: Metric, task: str, curves: Sequence[Curve], styles: Mapping[Condition, Style]
 ) -> Panel:
     """`metric` against environment steps, one line with its band per condition.
 
@@ -117,7 +119,7 @@ def curve_panel(
 
     def draw(axes: Axes) -> None:
         for curve in curves:
-            _draw_curve(axes, curve, style_of(curve.condition, siblings))
+            _draw_curve(axes, curve, styles[curve.condition])
         axes.set_ylabel(metric.axis)
         axes.set_xlabel("environment steps")
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -221,7 +223,8 @@ def _settings(ink: str, grid: str) -> Any:
 
 def _drawn(panels: Sequence[Panel], legend: Legend, *, opaque: bool) -> Figure:
     """Margins are fixed: matplotlib's own layout takes longer than everything else together."""
-    columns = max(1, 2 * len(panels))
+    longest = max((len(label) for label, _ in legend), default=0)
+    columns = max(1, int(PANEL[0] * len(panels) / (_HANDLE + _LETTER * longest)))
     below = 0.28 * math.ceil(len(legend) / columns)
     width, height = PANEL[0] * len(panels), PANEL[1] + below
     figure = Figure(figsize=(width, height))

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
 
 from music_rllib.reports.analysis import Curve, StageAnalysis, curve
-from music_rllib.reports.conditions import Condition, Stage
+from music_rllib.reports.conditions import Condition, Stage, side_by_side
 from music_rllib.reports.data import Sweep
 from music_rllib.reports.figures import (
     METRICS,
@@ -28,10 +28,19 @@ from music_rllib.reports.influence import (
     parallel_panel,
     sensitivity_panels,
 )
-from music_rllib.reports.palette import BARS, Style, style_of
+from music_rllib.reports.palette import BARS, Style, style_of, styles_by_stage, styles_of
 from music_rllib.reports.parallel import forked_map
 
-__all__ = ["CURVES", "FINALS", "INFLUENCE", "PROFILES", "Drawing", "slug", "stage_drawings"]
+__all__ = [
+    "CURVES",
+    "FINALS",
+    "INFLUENCE",
+    "PROFILES",
+    "Drawing",
+    "drawing_of_stages",
+    "slug",
+    "stage_drawings",
+]
 
 FINALS, PROFILES = "Final success rate", "Performance profile"
 INFLUENCE = ("Sensitivity", "Importance of settings", "Parallel coordinates")
@@ -70,7 +79,7 @@ def stage_drawings(
     stage = analysis.stage
     found = _all_curves(sweep, stage, rng)
     for metric in METRICS:
-        drawing = _curves(stage, metric, found)
+        drawing = _curves(stage, metric, found, styles_of(stage.conditions))
         if drawing is not None:
             yield drawing
     scopes = [scope for scope in analysis.scopes if len(scope.finals) > 1]
@@ -95,11 +104,34 @@ def stage_drawings(
     yield from _influence(sweep, analysis)
 
 
+def drawing_of_stages(
+    sweep: Sweep, stages: Sequence[Stage], rng: np.random.Generator
+) -> Drawing | None:
+    """Success rates of all stages that train for the task in one figure; None for a single one."""
+    together = side_by_side(stages)
+    if together is None:
+        return None
+    found = _all_curves(sweep, together, rng, METRICS[:1])
+    styles = styles_by_stage(together.conditions)
+    drawing = _curves(together, METRICS[0], found, styles)
+    if drawing is None:
+        return None
+    legend = [(_named_by_stage(condition), style) for condition, style in styles.items()]
+    # Each stage's own drawing has the values.
+    return replace(drawing, legend=legend, values=())
+
+
+def _named_by_stage(condition: Condition) -> str:
+    (_, stage), *others = condition.others
+    rest = replace(condition, others=tuple(others))
+    return f"{stage}, {rest.label}"
+
+
 def _all_curves(
-    sweep: Sweep, stage: Stage, rng: np.random.Generator
+    sweep: Sweep, stage: Stage, rng: np.random.Generator, metrics: Sequence[Metric] = METRICS
 ) -> dict[tuple[str, str], list[Curve]]:
     """By metric and task."""
-    jobs = list(product(METRICS, stage.tasks, stage.conditions))
+    jobs = list(product(metrics, stage.tasks, stage.conditions))
     # Each has its own randomness, so that it is the same in whatever process and order.
     seeded = list(zip(jobs, rng.spawn(len(jobs)), strict=True))
 
@@ -116,14 +148,17 @@ def _all_curves(
 
 
 def _curves(
-    stage: Stage, metric: Metric, found: Mapping[tuple[str, str], list[Curve]]
+    stage: Stage,
+    metric: Metric,
+    found: Mapping[tuple[str, str], list[Curve]],
+    styles: Mapping[Condition, Style],
 ) -> Drawing | None:
     panels, values = [], []
     for task in stage.tasks:
         curves = found.get((metric.name, task), [])
         if not curves:
             continue
-        panels.append(curve_panel(metric, task, curves, stage.conditions))
+        panels.append(curve_panel(metric, task, curves, styles))
         for one in curves:
             head = (stage.name, task, one.condition.label, metric.name)
             values += [(*head, *row) for row in _rows(one)]

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 
 from music_rllib.reports.analysis import StageAnalysis, Wait
+from music_rllib.reports.conditions import SIDE_BY_SIDE
 from music_rllib.reports.data import Sweep
 from music_rllib.reports.films import Film, Films
 from music_rllib.reports.gallery import CURVES, FINALS, INFLUENCE, PROFILES, Drawing, slug
@@ -34,7 +35,6 @@ from music_rllib.tracking import names
 __all__ = ["Report", "render"]
 
 DASH = "–"
-_WITHOUT_TASK_REWARD = ("music-u",)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +59,7 @@ def render(report: Report) -> str:
     """The page as HTML that needs nothing else."""
     sections = [
         _head(report),
+        _side_by_side(report),
         # What comes of a sweep is in its last stage.
         *(_stage(report, analysis) for analysis in reversed(report.analyses)),
         _films(report.films),
@@ -96,6 +97,13 @@ def _head(report: Report) -> str:
     return "".join(parts)
 
 
+def _side_by_side(report: Report) -> str:
+    drawn = {drawing.title: drawing for drawing in report.drawings if drawing.stage == SIDE_BY_SIDE}
+    if not drawn:
+        return ""
+    return f"<section><h2>Stages side by side</h2>{_figure(report, drawn, CURVES[0])}</section>"
+
+
 def _stage(report: Report, analysis: StageAnalysis) -> str:
     stage = analysis.stage
     seeds = ", ".join(stage.seeds)
@@ -108,7 +116,7 @@ def _stage(report: Report, analysis: StageAnalysis) -> str:
             "soft",
         ),
     ]
-    if stage.variant in _WITHOUT_TASK_REWARD:
+    if not stage.has_task_reward:
         parts.append(paragraph("It trains without the task's reward: success is not its aim."))
     for scope in analysis.scopes:
         said = "".join(paragraph(line) for line in verdict(scope, report.difference))

@@ -14,7 +14,17 @@ import numpy as np
 
 from music_rllib.reports.conditions import Condition
 
-__all__ = ["BARS", "DARK", "LIGHT", "Style", "colour_of", "marker_of", "style_of"]
+__all__ = [
+    "BARS",
+    "DARK",
+    "LIGHT",
+    "Style",
+    "colour_of",
+    "marker_of",
+    "style_of",
+    "styles_by_stage",
+    "styles_of",
+]
 
 LIGHT, DARK = "#ffffff", "#14171c"
 """The two papers."""
@@ -26,6 +36,7 @@ _ANCHORS = (
     (2.0, "#009e73"),
     (3.0, "#a0522d"),
 )
+_BY_STAGE = tuple(colour for _, colour in (*_ANCHORS[1:], _ANCHORS[0]))
 _UNKNOWN = "#808080"
 BARS = ("#1f7fc4", "#808080")
 """Of settings, and of what is only chance."""
@@ -70,6 +81,25 @@ def style_of(condition: Condition, siblings: tuple[Condition, ...]) -> Style:
         marker=marker_of(condition.entropic_index),
         line=_LINES[same.index(condition) % len(_LINES)],
     )
+
+
+def styles_of(conditions: tuple[Condition, ...]) -> dict[Condition, Style]:
+    """Of the conditions of one stage."""
+    return {condition: style_of(condition, conditions) for condition in conditions}
+
+
+def styles_by_stage(conditions: tuple[Condition, ...]) -> dict[Condition, Style]:
+    """Of conditions of several stages: colour by stage; marker and line by q."""
+    stages = list(dict.fromkeys(condition.others[0] for condition in conditions))
+    indices = list(dict.fromkeys(condition.entropic_index for condition in conditions))
+    return {
+        condition: Style(
+            colour=_BY_STAGE[stages.index(condition.others[0]) % len(_BY_STAGE)],
+            marker=marker_of(condition.entropic_index),
+            line=_LINES[indices.index(condition.entropic_index) % len(_LINES)],
+        )
+        for condition in conditions
+    }
 
 
 def _number(entropic_index: str) -> float | None:

@@ -13,8 +13,9 @@ import pytest
 
 from music_rllib.reports.analysis import THRESHOLDS, Scope, analyse
 from music_rllib.reports.build import build_report, write_report
-from music_rllib.reports.conditions import find_stages
+from music_rllib.reports.conditions import SIDE_BY_SIDE, find_stages
 from music_rllib.reports.data import Points, RunRecord, Sweep, columns
+from music_rllib.reports.figures import _drawn
 from music_rllib.reports.gallery import INFLUENCE
 from music_rllib.reports.influence import CHANCE, importances
 from music_rllib.reports.missing import planned_runs
@@ -332,6 +333,48 @@ def test_any_state_of_a_sweep_has_a_page(state: str) -> None:
     assert not shown.open
     assert len(shown.ids) == len(set(shown.ids))
     assert "nan" not in re.findall(r"[a-z]+", shown.text.replace("NaN", ""))
+
+
+STAGES = {"pretrain": "music-u", "plain": "tac", "with-a-rather-long-name": "music-r"}
+
+
+def of_stages(*stages: str) -> Sweep:
+    return sweep_of(
+        [
+            (one_run(q, seed, stage=stage, **{names.TAG_VARIANT: STAGES[stage]}), climbing(0.5))
+            for stage in stages
+            for q in ("1.0", "1.5")
+            for seed in range(2)
+        ]
+    )
+
+
+def test_stages_that_train_for_the_task_are_drawn_side_by_side() -> None:
+    report = report_on(of_stages(*STAGES))
+    (drawing,) = [one for one in report.drawings if one.stage == SIDE_BY_SIDE]
+    named = [(label, style.colour, style.line) for label, style in drawing.legend]
+    assert [label for label, _, _ in named] == [
+        f"{stage}, q = {q}" for stage in list(STAGES)[1:] for q in ("1.0", "1.5")
+    ]
+    colours = [colour for _, colour, _ in named]
+    assert colours[0] == colours[1] != colours[2] == colours[3]
+    assert len(set(named)) == 4
+    page = render(report)
+    assert f'id="{drawing.name}"' in page
+    assert page.index("Stages side by side") < page.index("Stage pretrain")
+    for one in (of_stages("pretrain", "plain"), of_stages("plain")):
+        assert "side by side" not in render(report_on(one))
+
+
+def test_a_legend_stays_inside_its_figure() -> None:
+    report = report_on(of_stages(*STAGES))
+    (drawing,) = [one for one in report.drawings if one.stage == SIDE_BY_SIDE]
+    for panels in (drawing.panels, drawing.panels * 2, drawing.panels * 3):
+        figure = _drawn(panels, drawing.legend, opaque=True)
+        figure.canvas.draw()
+        box, whole = figure.legends[0].get_window_extent(), figure.bbox
+        assert 0 <= box.x0 < box.x1 <= whole.x1
+        assert 0 <= box.y0 < box.y1 < figure.axes[0].get_window_extent().y0
 
 
 def test_figures_of_an_earlier_report_go_and_the_same_sweep_is_the_same_file(
