@@ -2,8 +2,8 @@
 
 The values that the paper compares have colours of Okabe and Ito's palette, which colour-blind
 readers tell apart, darkened or lightened until each stands out from white and from black paper.
-Between them the colour is mixed, so any q has one, by a function of q alone. Only where stages stand
-side by side is the colour the stage's.
+Between them the colour is mixed, so any q has one, by a function of q alone. Only where stages
+stand side by side is the colour the stage's.
 """
 
 from __future__ import annotations

@@ -341,7 +341,7 @@ STAGES = {"pretrain": "music-u", "plain": "tac", "with-a-rather-long-name": "mus
 def of_stages(*stages: str) -> Sweep:
     return sweep_of(
         [
-            (one_run(q, seed, stage=stage, **{names.TAG_VARIANT: STAGES[stage]}), climbing(0.5))
+            (one_run(q, seed, stage=stage, variant=STAGES[stage]), climbing(0.5))
             for stage in stages
             for q in ("1.0", "1.5")
             for seed in range(2)
