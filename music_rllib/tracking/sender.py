@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import random
 import threading
@@ -136,8 +137,8 @@ class Sender(threading.Thread):
 
     def _forget_ended(self) -> None:
         # Whoever puts something into a spool calls `add` after it: either it is seen here, or
-        # `add` comes after this.
-        with self._change:
+        # `add` comes after this. A storage that doesn't answer must not end the thread.
+        with self._change, contextlib.suppress(OSError):
             resting = {lane.delivery for lane in self._lanes() if lane.refused is not None}
             kept = {
                 lane.delivery
