@@ -7,10 +7,9 @@ needed to load it.
 
 from __future__ import annotations
 
-import contextlib
+import functools
 import shutil
-import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,7 +22,8 @@ __all__ = ["MODEL_NAME", "write_model"]
 
 MODEL_NAME = "policy"
 """Name of the logged model, and of its artefact folder."""
-ARTEFACT = "policy.safetensors"
+_POLICY_FILE = Path("artifacts", "policy.safetensors")
+"""The policy in a model's folder."""
 
 MODEL_CODE = '''
 
@@ -67,51 +67,65 @@ def write_model(file: Path, folder: Path, *, run_id: str, model_id: str) -> Poli
     Raises:
         PolicyFileError: the file isn't a policy.
     """
-    import mlflow.pyfunc
     from mlflow.models import Model
+    from mlflow.models.model import MLMODEL_FILE_NAME
 
     policy = PolicyNetwork.from_file(file)
-    with TemporaryDirectory() as temporary, _without_new_modules():
-        code, artefact = Path(temporary, "policy_model.py"), Path(temporary, ARTEFACT)
-        code.write_text(Path(network.__file__).read_text() + MODEL_CODE)
-        shutil.copyfile(file, artefact)
-        mlflow.pyfunc.save_model(
-            folder,
-            mlflow_model=Model(run_id=run_id, model_id=model_id),
-            python_model=str(code),
-            artifacts={"policy": str(artefact)},
-            # No signature: it would refuse what environments give (float64, one observation, an
-            # achieved goal); the policy checks sizes itself.
-            signature=False,
-            input_example=_example(policy),
-            pip_requirements=[f"{name}=={version(name)}" for name in _REQUIREMENTS],
-            metadata=_metadata(policy),
-        )
+    for name, content in _files(policy.observation_size, policy.goal_size).items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(content)
+    shutil.copyfile(file, folder / _POLICY_FILE)
+    described = Model.load(folder)
+    size = sum(part.stat().st_size for part in folder.rglob("*") if part.is_file())
+    Model(
+        run_id=run_id,
+        model_id=model_id,
+        flavors=described.flavors,
+        saved_input_example_info=described.saved_input_example_info,
+        model_size_bytes=size,
+        metadata=_metadata(policy),
+    ).save(folder / MLMODEL_FILE_NAME)
     return policy
 
 
-@contextlib.contextmanager
-def _without_new_modules() -> Iterator[None]:
-    """MLflow runs a model's code as a module of its own, and would keep one for each model."""
-    try:
-        yield
-    finally:
-        for name in [name for name in sys.modules if name.startswith("code_model_")]:
-            del sys.modules[name]
+@functools.cache
+def _files(observation_size: int, goal_size: int) -> Mapping[Path, bytes]:
+    """The files of a model for observations of these sizes, its policy empty.
+
+    MLflow runs a model's code when it saves one, and keeps what has run for as long as the process
+    lives: a driver that tracks thousands of runs has it done once.
+    """
+    import mlflow.pyfunc
+
+    with TemporaryDirectory() as temporary:
+        code, policy = Path(temporary, "policy_model.py"), Path(temporary, _POLICY_FILE.name)
+        code.write_text(Path(network.__file__).read_text() + MODEL_CODE)
+        policy.touch()
+        folder = Path(temporary, "model")
+        mlflow.pyfunc.save_model(
+            folder,
+            python_model=str(code),
+            artifacts={"policy": str(policy)},
+            # No signature: it would refuse what environments give (float64, one observation, an
+            # achieved goal); the policy checks sizes itself.
+            signature=False,
+            input_example=_example(observation_size, goal_size),
+            pip_requirements=[f"{name}=={version(name)}" for name in _REQUIREMENTS],
+        )
+        files = [file for file in folder.rglob("*") if file.is_file()]
+        return {file.relative_to(folder): file.read_bytes() for file in files}
 
 
 _REQUIREMENTS = ("mlflow", "numpy", "safetensors")
 
 
-def _example(policy: PolicyNetwork) -> Any:
+def _example(observation_size: int, goal_size: int) -> Any:
     import numpy as np
 
-    if not policy.goal_size:
-        return np.zeros((1, policy.observation_size), np.float32)
-    return {
-        "observation": np.zeros((1, policy.observation_size), np.float32),
-        "desired_goal": np.zeros((1, policy.goal_size), np.float32),
-    }
+    observation = np.zeros((1, observation_size), np.float32)
+    if not goal_size:
+        return observation
+    return {"observation": observation, "desired_goal": np.zeros((1, goal_size), np.float32)}
 
 
 def _metadata(policy: PolicyNetwork) -> Mapping[str, Any]:

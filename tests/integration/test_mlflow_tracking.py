@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import gc
 import json
 import os
 import shutil
@@ -16,15 +18,18 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.request import urlopen
 
+import mlflow
 import numpy as np
 import pytest
 from mlflow import MlflowClient
 from mlflow.entities import Run
+from mlflow.models import Model
 from typer.testing import CliRunner
 
 from music_rllib.policy import PolicyNetwork
 from music_rllib.tracking import Point, RunInfo, Tracker, TrackingError, deliver, names
 from music_rllib.tracking.__main__ import app
+from music_rllib.tracking.policy_model import write_model
 
 MakeTracker = Callable[..., Tracker]
 STEPS = list(range(2000, 22_000, 2000))
@@ -342,6 +347,32 @@ def test_a_final_policy_is_a_model_that_loads_and_acts(
     single, batch = json.loads(done.stdout)
     np.testing.assert_allclose(single, np.tanh([0.5, 5.0]), atol=1e-6)
     np.testing.assert_allclose(batch, [np.tanh([0.0, -0.5])], atol=1e-6)
+
+
+@pytest.mark.filterwarnings("ignore:.*type hint:UserWarning")  # when MLflow is first imported
+def test_each_model_has_its_own_policy_and_leaves_nothing_in_memory(
+    tmp_path: Path, policy: Path
+) -> None:
+    alive = []
+    for run in range(3):
+        network = dataclasses.replace(
+            PolicyNetwork.from_file(policy),
+            biases=(np.full(2, run, np.float32),),
+            about={"seed": run},
+        )
+        policy.write_bytes(network.to_bytes())
+        folder = tmp_path / f"model-{run}"
+        write_model(policy, folder, run_id=f"run-{run}", model_id=f"m-{run}")
+        gc.collect()
+        alive.append(sum(type(thing) is type for thing in gc.get_objects()))
+    assert alive[0] == alive[1] == alive[2], "classes of the model's code"
+    for run in range(3):
+        described = Model.load(tmp_path / f"model-{run}")
+        assert (described.run_id, described.model_id) == (f"run-{run}", f"m-{run}")
+        assert described.metadata["seed"] == run
+        loaded = mlflow.pyfunc.load_model(str(tmp_path / f"model-{run}"))
+        acted = loaded.predict(np.zeros(3, np.float32))
+        np.testing.assert_allclose(acted, np.tanh([run, run]), atol=1e-6)
 
 
 def test_more_metrics_than_one_request_may_hold(storage: Path, tracker_on: MakeTracker) -> None:
