@@ -128,5 +128,5 @@ def _example(observation_size: int, goal_size: int) -> Any:
     return {"observation": observation, "desired_goal": np.zeros((1, goal_size), np.float32)}
 
 
-def _metadata(policy: PolicyNetwork) -> Mapping[str, Any]:
+def _metadata(policy: PolicyNetwork) -> dict[str, Any]:
     return {"input_size": policy.input_size, "action_size": policy.action_size, **policy.about}

@@ -369,7 +369,7 @@ def test_each_model_has_its_own_policy_and_leaves_nothing_in_memory(
     for run in range(3):
         described = Model.load(tmp_path / f"model-{run}")
         assert (described.run_id, described.model_id) == (f"run-{run}", f"m-{run}")
-        assert described.metadata["seed"] == run
+        assert (described.metadata or {})["seed"] == run
         loaded = mlflow.pyfunc.load_model(str(tmp_path / f"model-{run}"))
         acted = loaded.predict(np.zeros(3, np.float32))
         np.testing.assert_allclose(acted, np.tanh([run, run]), atol=1e-6)
