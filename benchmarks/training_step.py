@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import statistics
-import time
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from typing import Any
@@ -29,7 +28,13 @@ VARIANTS: dict[str, dict[str, Any]] = {
 }
 
 
-def algorithm(hindsight_k: float = 0.0, estimator: str = "none", **training: Any) -> TAC:
+def algorithm(
+    hindsight_k: float = 0.0,
+    estimator: str = "none",
+    gpus: int = 0,
+    graphs: bool = True,
+    **training: Any,
+) -> TAC:
     """TAC on FetchPush, 10,000 random transitions in its replay."""
     config = TACConfig().environment("FetchPush-v4").env_runners(num_envs_per_env_runner=4)
     config.training(entropic_index=1.5, alpha=0.05, random_steps=10_000, **training)
@@ -41,7 +46,10 @@ def algorithm(hindsight_k: float = 0.0, estimator: str = "none", **training: Any
         estimator=estimator,
         mi_reward_weight=weight,
     )
+    config.learners(num_gpus_per_learner=gpus)
     algo: TAC = config.build_algo()
+    if not graphs:
+        algo.learner_group._learner._captured = None
     while len(algo.replay) < 10_000:
         algo.training_step()
     return algo
@@ -136,16 +144,26 @@ def rows(repeats: int) -> Iterator[Row]:
 
 
 def on_gpu(repeats: int) -> Iterator[Row]:
-    """Updates a second with the Learner on the GPU, at two batch sizes."""
+    """Updates a second with the Learner on the GPU, captured as a CUDA graph and not."""
     for batch in (256, 4096):
-        algo = algorithm(hindsight_k=4.0, batch_size=batch)
-        turn = updates(algo)
+        turns = {
+            "captured": updates(algorithm(hindsight_k=4.0, batch_size=batch, gpus=1)),
+            "launched": updates(algorithm(hindsight_k=4.0, batch_size=batch, gpus=1, graphs=False)),
+        }
+        taken = interleaved({name: _waited_for(turn) for name, turn in turns.items()}, repeats)
+        ratios = [a / b for a, b in zip(taken["launched"], taken["captured"], strict=True)]
+        rate = UPDATES / statistics.median(taken["captured"])
+        yield ratio_row(
+            GROUP, f"TAC, HER, GPU, batch {batch}", rate, "updates/s",
+            against="launched from Python (speed)", ratios=ratios,
+        )  # fmt: skip
+        share = 100 * (1 - 1 / statistics.median(ratios))
+        yield Row(GROUP, f"time that launching takes, batch {batch}", share, "%")
+
+
+def _waited_for(turn: Callable[[], None]) -> Callable[[], None]:
+    def whole() -> None:
         turn()
-        times = []
-        for _ in range(repeats):
-            begin = time.perf_counter()
-            turn()
-            torch.cuda.synchronize()
-            times.append(time.perf_counter() - begin)
-        rate = UPDATES / statistics.median(times)
-        yield Row(GROUP, f"TAC, HER, GPU, batch {batch}", rate, "updates/s")
+        torch.cuda.synchronize()
+
+    return whole

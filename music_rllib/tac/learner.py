@@ -13,8 +13,8 @@ of every network and one of the estimator.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -35,6 +35,7 @@ from music_rllib.replay.buffer import Trajectory
 from music_rllib.schedules import value_at
 from music_rllib.tac import diagnostics, losses
 from music_rllib.tac.forward import Bootstrap, TACForward
+from music_rllib.tac.graphs import CapturedUpdate, CudaRecorder
 from music_rllib.tac.module import ESTIMATOR_MODULE, EstimatorModule, TACModule, choose_action
 from music_rllib.tac.networks import RunningNormaliser
 from music_rllib.tac.precision import check_precision
@@ -47,7 +48,20 @@ __all__ = ["GRAD_UPDATES", "NonFiniteLossError", "TACLearner"]
 GRAD_UPDATES = "grad_updates"
 PRIORITY_CLIP = 2e-4
 """MUSIC-p: largest bound (nats) of one step that counts for its trajectory's priority."""
+METRICS, TD_ERRORS = "metrics", "td_errors"
 Minibatch = dict[ModuleID, dict[str, Tensor]]
+FlatMinibatch = Mapping[tuple[ModuleID, str], Tensor]
+
+
+class _Constants(NamedTuple):
+    """What an update depends on and what is no tensor: captured, it stays as it was."""
+
+    entropic_index: float
+    mi_reward_weight: float
+    alpha: float | None
+    """None: learned, and a tensor."""
+    swapped: bool
+    """Whether the two frames of a transition are swapped for the intrinsic reward."""
 
 
 class NonFiniteLossError(RuntimeError):
@@ -73,12 +87,21 @@ class TACLearner(TorchLearner):
         self._generator = torch.Generator(device=self._device).manual_seed(seed + 7919)
         self._grad_updates = 0
         self._aux: dict[str, Tensor] = {}
+        self._metrics_of_update: list[str] = []
         self._td_errors: list[Tensor] = []
         self._set_schedules(0)
         self._target_entropy = self._resolve_target_entropy()
         pairs = self._policy_module.get_target_network_pairs()
         self._online: list[Tensor] = [p for online, _ in pairs for p in online.parameters()]
         self._targets: list[Tensor] = [p for _, target in pairs for p in target.parameters()]
+        self._captured = self._captured_step() if self._device.type == "cuda" else None
+
+    def _captured_step(self) -> CapturedUpdate[_Constants] | None:
+        """Updates as CUDA graphs; None where RLlib looks at gradients, or exchanges them."""
+        config = self.config
+        if config.grad_clip is not None or config.log_gradients or config.num_learners > 1:
+            return None
+        return CapturedUpdate(self._step, CudaRecorder(self._device))
 
     @property
     def _policy_module(self) -> TACModule:
@@ -112,7 +135,9 @@ class TACLearner(TorchLearner):
         self.register_optimizer(
             module_id=module_id,
             optimizer_name=name,
-            optimizer=torch.optim.Adam(params, lr=lr, fused=True),
+            optimizer=torch.optim.Adam(
+                params, lr=lr, fused=True, capturable=self._device.type == "cuda"
+            ),
             params=params,
             lr_or_lr_schedule=lr,
         )
@@ -138,7 +163,7 @@ class TACLearner(TorchLearner):
         self._entropic_index = value_at(settings.entropic_index, env_steps, total)
         self._mi_reward_weight = value_at(self._music.mi_reward_weight, env_steps, total)
         if not isinstance(settings.alpha, LearnedAlpha):
-            self._alpha: Tensor | float = value_at(settings.alpha, env_steps, total)
+            self._alpha: float = value_at(settings.alpha, env_steps, total)
         else:
             self._target_entropy = self._resolve_target_entropy()
 
@@ -162,14 +187,16 @@ class TACLearner(TorchLearner):
             batch = training_data.batch
         assert batch is not None
         self._weights_seq_no += 1
-        history: list[dict[str, Tensor]] = []
-        for minibatch in self._minibatches(self._convert_batch_type(batch)):
-            self._aux = {}
-            self._update(self._priced(minibatch))
+        history: list[Tensor] = []
+        step = self._captured or self._step
+        for minibatch, constants in self._minibatches(self._convert_batch_type(batch)):
+            outputs = step(minibatch, constants)
             self._grad_updates += 1
             if self._grad_updates % self._settings.target_update_interval == 0:
                 torch._foreach_lerp_(self._targets, self._online, self._settings.tau)
-            history.append(self._aux)
+            history.append(outputs[METRICS])
+            if TD_ERRORS in outputs:
+                self._td_errors.append(outputs[TD_ERRORS])
         self._log_history(history)
         self.after_gradient_based_update(timesteps=timesteps or {})
         return self.metrics.reduce()
@@ -180,24 +207,50 @@ class TACLearner(TorchLearner):
             return gradients_dict
         return super().postprocess_gradients(gradients_dict)
 
-    def _minibatches(self, batch: MultiAgentBatch) -> Iterator[Minibatch]:
+    def _step(self, minibatch: FlatMinibatch, constants: _Constants) -> dict[str, Tensor]:
+        """One update of every network but the targets; nothing in it waits for the device.
+
+        Returns:
+            `METRICS` [M], in the order of `_metrics_of_update`, and `TD_ERRORS` [B] where the
+            replay wants them.
+        """
+        columns: Minibatch = {}
+        for (module_id, name), values in minibatch.items():
+            columns.setdefault(module_id, {})[name] = values
+        self._aux = {}
+        self._update(self._priced(columns, swapped=constants.swapped))
+        outputs = {}
+        if (td_errors := self._aux.pop(TD_ERRORS, None)) is not None:
+            outputs[TD_ERRORS] = td_errors
+        self._metrics_of_update = list(self._aux)
+        outputs[METRICS] = torch.stack([value.float() for value in self._aux.values()])
+        return outputs
+
+    def _minibatches(self, batch: MultiAgentBatch) -> Iterator[tuple[FlatMinibatch, _Constants]]:
         """Cuts the batch up; random numbers of all its updates are drawn here, in one go."""
         columns: Minibatch = {mid: dict(b) for mid, b in batch.policy_batches.items()}
         rows = {DEFAULT_MODULE_ID: self._settings.batch_size}
         policy = columns[DEFAULT_MODULE_ID]
         policy |= self._policy_noise(policy[Columns.ACTIONS])
         updates = len(policy[Columns.ACTIONS]) // self._settings.batch_size
+        swapped = [True] * updates
         if self._music.shuffle == "random":
-            policy["swapped"] = self._coin_per_minibatch(updates)
+            swapped = self._coins(updates)
         if ESTIMATOR_MODULE in columns:
             rows[ESTIMATOR_MODULE] = self._music.batch_trajectories
             trajectories = columns[ESTIMATOR_MODULE]
             trajectories["permutations"] = self._permutations(trajectories[Columns.OBS], updates)
         for k in range(updates):
-            yield {
-                mid: {name: values[k * n : (k + 1) * n] for name, values in columns[mid].items()}
+            minibatch = {
+                (mid, name): values[k * n : (k + 1) * n]
                 for mid, n in rows.items()
+                for name, values in columns[mid].items()
             }
+            yield minibatch, self._constants(swapped=swapped[k])
+
+    def _constants(self, *, swapped: bool) -> _Constants:
+        alpha = self._alpha if not isinstance(self._settings.alpha, LearnedAlpha) else None
+        return _Constants(self._entropic_index, self._mi_reward_weight, alpha, swapped)
 
     def _policy_noise(self, actions: Tensor) -> dict[str, Tensor]:
         """Standard normal numbers for the policy's actions, and the next ones where needed."""
@@ -209,10 +262,10 @@ class TACLearner(TorchLearner):
     def _normal(self, shape: tuple[int, ...]) -> Tensor:
         return torch.randn(shape, generator=self._generator, device=self._device)
 
-    def _coin_per_minibatch(self, updates: int) -> Tensor:
-        """[K*B] the original's shuffle of two frames: for a whole minibatch swapped or not."""
-        coins = torch.rand(updates, generator=self._generator, device=self._device) < 0.5
-        return coins.repeat_interleave(self._settings.batch_size)
+    def _coins(self, updates: int) -> list[bool]:
+        """The original's shuffle of two frames: for a whole minibatch swapped or not."""
+        drawn = torch.rand(updates, generator=self._generator, device=self._device) < 0.5
+        return drawn.tolist()
 
     def _permutations(self, trajectories: Tensor, updates: int) -> Tensor:
         rows, frames = trajectories.shape[:2]
@@ -221,13 +274,12 @@ class TACLearner(TorchLearner):
         per_minibatch = time_permutations(updates, frames, self._generator)
         return per_minibatch.repeat_interleave(rows // updates, dim=0)
 
-    def _priced(self, minibatch: Minibatch) -> Minibatch:
+    def _priced(self, minibatch: Minibatch, *, swapped: bool) -> Minibatch:
         """The minibatch with the reward that is learned from: task and intrinsic, weighted."""
         estimator = self._estimator
         if estimator is None:
             return minibatch
         policy = minibatch[DEFAULT_MODULE_ID]
-        swapped = bool(policy["swapped"][0]) if "swapped" in policy else True
         intrinsic = estimator.reward(policy[Columns.OBS], policy[Columns.NEXT_OBS], swapped=swapped)
         reward = self._total_reward(policy[Columns.REWARDS], intrinsic)
         self._aux |= diagnostics.of_intrinsic_reward(intrinsic)
@@ -302,17 +354,17 @@ class TACLearner(TorchLearner):
             forward, self._entropic_index, settings.entropy_form, settings.log_std_bounds
         )
         if self.config.replay_priority == "td_error":
-            self._td_errors.append((forward.q_values.detach() - target).abs().mean(0))
+            self._aux[TD_ERRORS] = (forward.q_values.detach() - target).abs().mean(0)
 
     def observe_bound(self, bound: Tensor) -> None:
         """Called by the estimator's module with the mean bound of its minibatch, in nats."""
         self._aux[names.MI_BOUND] = bound
 
-    def _log_history(self, history: list[dict[str, Tensor]]) -> None:
+    def _log_history(self, history: list[Tensor]) -> None:
+        """Means of the updates' metrics, [M] each."""
         if not history:
             return
-        keys = list(history[0])
-        table = torch.stack([torch.stack([step[key].float() for key in keys]) for step in history])
+        keys, table = self._metrics_of_update, torch.stack(history)
         self._check_finite(keys, table)
         log = self.metrics.log_value
         for key, mean in zip(keys, table.mean(0).tolist(), strict=True):
@@ -425,6 +477,11 @@ class TACLearner(TorchLearner):
         # RLlib keeps newer weights over older ones; restoring means what the state says.
         self._weights_seq_no = 0
         super().set_state(state)
+        for optimizer in self._optimizer_parameters:
+            for group in optimizer.param_groups:  # a state may come from another device
+                group["capturable"] = self._device.type == "cuda"
+        if self._captured is not None:
+            self._captured.forget()
         if "tac" in state:
             self._generator.set_state(torch.from_numpy(state["tac"]["generator"].copy()))
             self._grad_updates = int(state["tac"][GRAD_UPDATES])

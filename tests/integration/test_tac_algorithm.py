@@ -42,7 +42,10 @@ def build(
     config.env_runners(
         num_envs_per_env_runner=2, num_env_runners=(where or {}).get("num_env_runners", 0)
     )
-    config.learners(num_learners=(where or {}).get("num_learners", 0))
+    learners = {"num_learners": 0, "num_gpus_per_learner": 0}
+    config.learners(
+        **{name: (where or {}).get(name, default) for name, default in learners.items()}
+    )
     config.reporting(min_sample_timesteps_per_iteration=1)
     config.training(**{**SMALL, "total_env_steps": 1_000, **settings})
     config.replay(**{"capacity": 10_000, **replay})
