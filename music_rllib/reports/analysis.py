@@ -6,14 +6,14 @@ take every run as far as it went: one that failed or is still running is censore
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 
 import numpy as np
 
 from music_rllib.reports import statistics as st
-from music_rllib.reports.conditions import Condition, Stage, find_stages
+from music_rllib.reports.conditions import Condition, Stage, find_stages, shared_runs
 from music_rllib.reports.data import Ints, Sweep
 from music_rllib.reports.races import Race, races
 from music_rllib.reports.statistics import SIGNIFICANCE, Array, Estimate
@@ -30,6 +30,7 @@ __all__ = [
     "Wait",
     "analyse",
     "curve",
+    "races_of_stages",
 ]
 
 ALL_TASKS = "all tasks"
@@ -149,13 +150,30 @@ def _analyse(sweep: Sweep, stage: Stage, rng: np.random.Generator) -> StageAnaly
         if (wait := _wait(sweep, condition, task, threshold, rng)) is not None
     ]
     groups = {condition.label: condition.runs for condition in stage.conditions}
-    found = [
+    found = _races(sweep, stage.tasks, groups, rng)
+    return StageAnalysis(stage=stage, scopes=tuple(scopes), waits=tuple(waits), races=found)
+
+
+def races_of_stages(
+    sweep: Sweep, stages: Sequence[Stage], rng: np.random.Generator
+) -> tuple[Race, ...]:
+    """Each pair of stages that train for the task, over the conditions that all of them have."""
+    tasks = dict.fromkeys(task for stage in stages for task in stage.tasks)
+    return _races(sweep, tuple(tasks), shared_runs(stages), rng)
+
+
+def _races(
+    sweep: Sweep,
+    tasks: Sequence[str],
+    groups: Mapping[str, Sequence[int]],
+    rng: np.random.Generator,
+) -> tuple[Race, ...]:
+    return tuple(
         race
-        for task in stage.tasks
+        for task in tasks
         for threshold in THRESHOLDS
         for race in races(sweep, task, groups, threshold, rng)
-    ]
-    return StageAnalysis(stage=stage, scopes=tuple(scopes), waits=tuple(waits), races=tuple(found))
+    )
 
 
 def _scope(

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from music_rllib.reports.analysis import analyse
+from music_rllib.reports.analysis import analyse, races_of_stages
 from music_rllib.reports.data import ReportError, Sweep
 from music_rllib.reports.figures import METRICS
 from music_rllib.reports.films import make_films
@@ -59,12 +59,14 @@ def build_report(
     """
     analyses = analyse(sweep, rng)
     drawings = [d for analysis in analyses for d in stage_drawings(sweep, analysis, rng)]
-    together = drawing_of_stages(sweep, [analysis.stage for analysis in analyses], rng)
+    stages = [analysis.stage for analysis in analyses]
+    together = drawing_of_stages(sweep, stages, rng)
     if together is not None:
         drawings.append(together)
     return Report(
         sweep=sweep,
         analyses=analyses,
+        races=races_of_stages(sweep, stages, rng),
         drawings=drawings,
         pictures=draw_all(drawings),
         missing=missing(sweep, analyses, undelivered),
@@ -109,7 +111,7 @@ def write_report(report: Report, folder: Path) -> Path:
 def _tables(report: Report) -> Iterable[Table]:
     yield success_table(report.analyses)
     yield waits_table(report.analyses)
-    yield races_table(report.analyses)
+    yield races_table(report.analyses, report.races)
     yield improvement_table(report.analyses)
     yield runs_table(report.sweep)
     yield _curves_table(report.drawings)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from music_rllib.reports.data import RunRecord, Sweep
 from music_rllib.tracking import names
 
-__all__ = ["SIDE_BY_SIDE", "Condition", "Stage", "find_stages", "side_by_side"]
+__all__ = ["SIDE_BY_SIDE", "Condition", "Stage", "find_stages", "shared_runs", "side_by_side"]
 
 Values = tuple[tuple[str, str], ...]
 """(setting, value) pairs."""
@@ -81,6 +81,21 @@ def side_by_side(stages: Sequence[Stage]) -> Stage | None:
             for condition in stage.conditions
         ),
     )
+
+
+def shared_runs(stages: Sequence[Stage]) -> dict[str, list[int]]:
+    """Stages that train for the task, each with its runs of the conditions that all of them have.
+
+    So stages are compared over the same q and settings; empty where they have none in common.
+    """
+    compared = [stage for stage in stages if stage.has_task_reward]
+    by_label = [{c.label: c.runs for c in stage.conditions} for stage in compared]
+    shared = set.intersection(*map(set, by_label)) if len(compared) > 1 else set()
+    return {
+        stage.name: [run for label, runs in conditions.items() if label in shared for run in runs]
+        for stage, conditions in zip(compared, by_label, strict=True)
+        if shared
+    }
 
 
 def find_stages(sweep: Sweep) -> list[Stage]:

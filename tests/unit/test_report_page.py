@@ -366,6 +366,29 @@ def test_stages_that_train_for_the_task_are_drawn_side_by_side() -> None:
         assert "side by side" not in render(report_on(one))
 
 
+def test_stages_race_over_the_conditions_that_all_of_them_have() -> None:
+    finals = {"plain": {"1.0": 0.9, "1.5": 0.6, "2.0": 1.0}, "reward": {"1.0": 1.0, "1.5": 0.8}}
+    sweep = sweep_of(
+        [
+            (one_run(q, seed, stage=stage, variant="tac"), climbing(final))
+            for stage, of_stage in finals.items()
+            for q, final in of_stage.items()
+            for seed in range(2)
+        ]
+    )
+    report = report_on(sweep)
+    # To 50 %: 200,000 / final / 2 steps, the next evaluation; q = 2 has nobody to race with.
+    (race,) = [race for race in report.races if race.threshold == 0.5]
+    assert (race.first, race.second, race.runs) == ("reward", "plain", (4, 4))
+    assert float(race.estimate.value) == (4 + 4 + 0 + 4) / 16
+    shown = render(report)
+    assert shown.index("reward before plain") < shown.index("Stage plain")
+    assert "all of these stages have" in shown
+    lone = of_stages("plain")
+    assert not report_on(lone).races
+    assert "all of these stages have" not in render(report_on(lone))
+
+
 def test_a_legend_stays_inside_its_figure() -> None:
     report = report_on(of_stages(*STAGES))
     (drawing,) = [one for one in report.drawings if one.stage == SIDE_BY_SIDE]
