@@ -26,6 +26,7 @@ from mlflow.entities import (
     RunTag,
 )
 from mlflow.exceptions import MlflowException
+from mlflow.tracking._tracking_service import utils
 
 from music_rllib.tracking import names
 from music_rllib.tracking.errors import TrackingError
@@ -157,6 +158,7 @@ class Experiment:
         """Store ``file`` as the artefact ``name`` (its last part is the file's name)."""
         folder = name.rpartition("/")[0]
         self._client.log_artifact(run_id, str(file), folder or None)
+        _forget_repository(run_id)
 
     def log_policy(self, run_id: str, name: str, file: Path) -> None:
         """Store the policy in `file` as the run's logged model; a finished one stays as it is.
@@ -176,6 +178,7 @@ class Experiment:
             folder = Path(temporary, "model")
             policy = write_model(file, folder, run_id=run_id, model_id=model.model_id)
             self._client.log_model_artifacts(model.model_id, str(folder))
+            _forget_repository(model.model_id)
         steps = int(policy.about.get("env_steps", 0))
         outputs = self._client.get_run(run_id).outputs
         if not outputs or model.model_id not in [o.model_id for o in outputs.model_outputs]:
@@ -275,3 +278,8 @@ def _open_client(store: TrackingStore) -> MlflowClient:
 def _chunks(items: Sequence[_Item], size: int) -> Iterator[Sequence[_Item]]:
     for begin in range(0, len(items), size):
         yield items[begin : begin + size]
+
+
+def _forget_repository(owner: str) -> None:
+    """MLflow keeps what it uploads with, a thread pool and queues, for 1,024 runs and models."""
+    getattr(utils, "_artifact_repos_cache", {}).pop(owner, None)

@@ -24,6 +24,7 @@ import pytest
 from mlflow import MlflowClient
 from mlflow.entities import Run
 from mlflow.models import Model
+from mlflow.tracking._tracking_service import utils as tracking_utils
 from typer.testing import CliRunner
 
 from music_rllib.policy import PolicyNetwork
@@ -332,6 +333,8 @@ def test_a_final_policy_is_a_model_that_loads_and_acts(
     client = client_of(storage)
     run = runs_of(client)["finetune/a"]
     (model,) = client.search_logged_models([run.info.experiment_id])
+    kept = tracking_utils._artifact_repos_cache
+    assert not {run.info.run_id, model.model_id} & kept.keys(), "in memory, for good"
     assert (model.name, model.status, model.source_run_id) == ("policy", "READY", run.info.run_id)
     assert model.tags[names.TAG_TASK] == "FetchPush"
     assert run.outputs is not None
