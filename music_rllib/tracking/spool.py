@@ -20,7 +20,7 @@ import os
 import shutil
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -92,6 +92,7 @@ class Spool:
         self.path = folder / "spool.jsonl"
         self.outbox = folder / "outbox"
         self.start: Start | None = None
+        """The first one, without its params: they are many, and a sweep has many spools."""
         self.finished: Status | None = None
         self.records = 0
         self._last_step: dict[str, int] = {}
@@ -235,7 +236,7 @@ class Spool:
         if isinstance(record, Metrics):
             self._last_step.update(dict.fromkeys(record.values, record.step))
         elif isinstance(record, Start):
-            self.start = self.start or record
+            self.start = self.start or replace(record, params={})
             self.finished = None
         else:
             self.finished = record.status
