@@ -123,11 +123,19 @@ def runs_table(sweep: Sweep) -> Iterator[str]:
             run.status.lower(),
             f"{sweep.last_step(position):,}",
             _percent(values[-1]) if len(values) else "",
-            f"{passage[0]:,.0f}" if passage and passage[1] else "not",
+            _first(passage),
             _clock(run.seconds),
         )
     yield ""
     yield provenance(sweep)
+
+
+def _first(passage: tuple[float, bool] | None) -> str:
+    """The step of a first passage; empty where the task has no success rate."""
+    if passage is None:
+        return ""
+    steps, reached = passage
+    return f"{steps:,.0f}" if reached else "not"
 
 
 def provenance(sweep: Sweep) -> str:
@@ -315,7 +323,7 @@ def metric_table(sweep: Sweep, *metrics: str) -> Iterator[str]:
                 for metric in metrics:
                     last = [last_value(sweep, runs.get(seed), metric) for seed in seeds]
                     told = st.estimate(np.array(last)[:, np.newaxis], rng)
-                    numbers = [f"{value:.2f}" if np.isfinite(value) else "" for value in last]
+                    numbers = [_number(value) if np.isfinite(value) else "" for value in last]
                     yield _row(task, condition.label, f"`{metric}`", *numbers, _spread(told))
 
 
@@ -351,9 +359,13 @@ def _interval(final: Final | None) -> str:
 def _spread(found: st.Estimate) -> str:
     if not np.isfinite(found.value):
         return ""
-    if not found.has_interval:
-        return f"{float(found.value):.2f}"
-    return f"{float(found.value):.2f} [{float(found.lower):.2f}, {float(found.upper):.2f}]"
+    value, lower, upper = (_number(float(x)) for x in (found.value, found.lower, found.upper))
+    return f"{value} [{lower}, {upper}]" if found.has_interval else value
+
+
+def _number(value: float) -> str:
+    """Returns of hundreds need no fractions."""
+    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.2f}"
 
 
 def _percent(share: float) -> str:
