@@ -94,7 +94,7 @@ class _FastFetch:
         if np.shape(action) != self._low.shape:
             raise ValueError("Action dimension mismatch")
         env = self._env
-        self._control(np.clip(action, self._low, self._high))
+        self._control(np.minimum(np.maximum(action, self._low), self._high))
         mujoco.mj_step(self._model, self._data, nstep=env.n_substeps)
         if env.block_gripper:
             for address in self._finger_qpos:
@@ -126,7 +126,7 @@ class _FastFetch:
         env, dt, qvel = self._env, self._dt, self._qvel
         linear, angular = self._linear, self._angular
         mujoco.mj_jacSite(self._model, self._data, linear, None, self._grip)
-        grip_velocity = (linear @ qvel) * dt
+        grip_velocity = linear.dot(qvel) * dt
         observation = np.empty(25 if self._has_object else 10)
         observation[0:3] = self._grip_position
         fingers = 3
@@ -135,8 +135,8 @@ class _FastFetch:
             observation[3:6] = self._object_position
             observation[6:9] = self._object_position - self._grip_position
             observation[11:14] = _euler(self._object_rotation.tolist())
-            observation[14:17] = (linear @ qvel) * dt - grip_velocity
-            observation[17:20] = (angular @ qvel) * dt
+            observation[14:17] = linear.dot(qvel) * dt - grip_velocity
+            observation[17:20] = angular.dot(qvel) * dt
             fingers = 9
         for i in range(2):
             observation[fingers + i] = self._qpos[self._finger_qpos[i]]

@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-__all__ = ["PolicySample", "deterministic_action", "sample_squashed"]
+__all__ = ["PolicySample", "deterministic_action", "sample_squashed", "squashed_action"]
 
 _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 _LOG_2 = math.log(2.0)
@@ -33,10 +33,19 @@ def sample_squashed(mean: Tensor, log_std: Tensor, noise: Tensor) -> PolicySampl
     The Jacobian log(1 - tanh(u)^2) is taken as 2 (log 2 - u - softplus(-2u)), which does not
     lose its digits where tanh saturates (Haarnoja et al. 2018, app. C; absent in paper eq. 11).
     """
-    raw = mean + log_std.exp() * noise
+    raw = _before_tanh(mean, log_std, noise)
     log_normal = -0.5 * noise.square() - log_std - _HALF_LOG_2PI
     log_jacobian = 2.0 * (_LOG_2 - raw - F.softplus(-2.0 * raw))
     return PolicySample(torch.tanh(raw), log_normal - log_jacobian)
+
+
+def squashed_action(mean: Tensor, log_std: Tensor, noise: Tensor) -> Tensor:
+    """The action of `sample_squashed` [B, A] alone: to act takes no density."""
+    return torch.tanh(_before_tanh(mean, log_std, noise))
+
+
+def _before_tanh(mean: Tensor, log_std: Tensor, noise: Tensor) -> Tensor:
+    return mean + log_std.exp() * noise
 
 
 def deterministic_action(mean: Tensor) -> Tensor:

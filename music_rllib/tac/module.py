@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from music_rllib.envs.make import observation_sizes
 from music_rllib.estimator.network import MutualInformationEstimator, intrinsic_reward
-from music_rllib.tac.distribution import deterministic_action, sample_squashed
+from music_rllib.tac.distribution import deterministic_action, sample_squashed, squashed_action
 from music_rllib.tac.forward import Bootstrap, TACForward
 from music_rllib.tac.networks import Critics, Perceptron, RunningNormaliser
 from music_rllib.tac.settings import LearnedAlpha, TACSettings
@@ -80,7 +80,7 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
         mean, log_std = self.policy_parameters(self.normaliser(inputs))
         if noise is None or log_std is None:
             return deterministic_action(mean)
-        return sample_squashed(mean, log_std, noise).action
+        return squashed_action(mean, log_std, noise)
 
     def _forward_inference(self, batch: dict[str, Any], **kwargs: Any) -> dict[str, Any]:
         return {Columns.ACTIONS: self.act(_network_inputs(batch[Columns.OBS]))}
