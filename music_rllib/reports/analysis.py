@@ -6,14 +6,15 @@ take every run as far as it went: one that failed or is still running is censore
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 
 import numpy as np
 
 from music_rllib.reports import statistics as st
-from music_rllib.reports.conditions import Condition, Stage, find_stages, shared_runs
+from music_rllib.reports.conditions import Condition, Stage, find_stages, stage_by_stage
 from music_rllib.reports.data import Ints, Sweep
 from music_rllib.reports.races import Race, races
 from music_rllib.reports.statistics import SIGNIFICANCE, Array, Estimate
@@ -29,8 +30,8 @@ __all__ = [
     "StageAnalysis",
     "Wait",
     "analyse",
+    "analyse_stages",
     "curve",
-    "races_of_stages",
 ]
 
 ALL_TASKS = "all tasks"
@@ -150,30 +151,25 @@ def _analyse(sweep: Sweep, stage: Stage, rng: np.random.Generator) -> StageAnaly
         if (wait := _wait(sweep, condition, task, threshold, rng)) is not None
     ]
     groups = {condition.label: condition.runs for condition in stage.conditions}
-    found = _races(sweep, stage.tasks, groups, rng)
-    return StageAnalysis(stage=stage, scopes=tuple(scopes), waits=tuple(waits), races=found)
-
-
-def races_of_stages(
-    sweep: Sweep, stages: Sequence[Stage], rng: np.random.Generator
-) -> tuple[Race, ...]:
-    """Each pair of stages that train for the task, over the conditions that all of them have."""
-    tasks = dict.fromkeys(task for stage in stages for task in stage.tasks)
-    return _races(sweep, tuple(tasks), shared_runs(stages), rng)
-
-
-def _races(
-    sweep: Sweep,
-    tasks: Sequence[str],
-    groups: Mapping[str, Sequence[int]],
-    rng: np.random.Generator,
-) -> tuple[Race, ...]:
-    return tuple(
+    found = [
         race
-        for task in tasks
+        for task in stage.tasks
         for threshold in THRESHOLDS
         for race in races(sweep, task, groups, threshold, rng)
-    )
+    ]
+    return StageAnalysis(stage=stage, scopes=tuple(scopes), waits=tuple(waits), races=tuple(found))
+
+
+def analyse_stages(
+    sweep: Sweep, stages: Sequence[Stage], rng: np.random.Generator
+) -> StageAnalysis | None:
+    """Stages that train for the task against each other, over the conditions that all have.
+
+    Returns:
+        None where there is nothing to compare.
+    """
+    together = stage_by_stage(stages)
+    return None if together is None else _analyse(sweep, together, rng)
 
 
 def _scope(
@@ -215,13 +211,17 @@ def _final_scores(sweep: Sweep, condition: Condition, tasks: Sequence[str]) -> A
     Seeds that have not finished on every task are left out: otherwise the task with more runs would
     weigh more in one condition than in another.
     """
-    found: dict[str, dict[str, float]] = {}
+    found: dict[tuple[str, int], dict[str, float]] = {}
+    seen: Counter[tuple[str, str]] = Counter()
     for run in condition.runs:
         record = sweep.runs[run]
+        # A condition of several q has a seed several times, in the same order on every task.
+        row = (record.seed, seen[record.seed, record.task])
+        seen[record.seed, record.task] += 1
         if record.task in tasks and record.status == "FINISHED":
             values = sweep.series(run, names.EVAL_SUCCESS)[1]
             if len(values) and not np.isnan(values[-1]):
-                found.setdefault(record.seed, {})[record.task] = float(values[-1])
+                found.setdefault(row, {})[record.task] = float(values[-1])
     complete = [scores for scores in found.values() if len(scores) == len(tasks)]
     rows = [[scores[task] for task in tasks] for scores in complete]
     return np.array(rows, dtype=float).reshape(len(rows), len(tasks))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from music_rllib.reports.analysis import analyse, races_of_stages
+from music_rllib.reports.analysis import analyse, analyse_stages
 from music_rllib.reports.data import ReportError, Sweep
 from music_rllib.reports.figures import METRICS
 from music_rllib.reports.films import make_films
@@ -66,7 +66,7 @@ def build_report(
     return Report(
         sweep=sweep,
         analyses=analyses,
-        races=races_of_stages(sweep, stages, rng),
+        together=analyse_stages(sweep, stages, rng),
         drawings=drawings,
         pictures=draw_all(drawings),
         missing=missing(sweep, analyses, undelivered),
@@ -109,10 +109,11 @@ def write_report(report: Report, folder: Path) -> Path:
 
 
 def _tables(report: Report) -> Iterable[Table]:
+    pairs = [*report.analyses, *([report.together] if report.together else [])]
     yield success_table(report.analyses)
     yield waits_table(report.analyses)
-    yield races_table(report.analyses, report.races)
-    yield improvement_table(report.analyses)
+    yield races_table(pairs)
+    yield improvement_table(pairs)
     yield runs_table(report.sweep)
     yield _curves_table(report.drawings)
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from music_rllib.reports.data import RunRecord, Sweep
 from music_rllib.tracking import names
 
-__all__ = ["SIDE_BY_SIDE", "Condition", "Stage", "find_stages", "shared_runs", "side_by_side"]
+__all__ = ["SIDE_BY_SIDE", "Condition", "Stage", "find_stages", "side_by_side", "stage_by_stage"]
 
 Values = tuple[tuple[str, str], ...]
 """(setting, value) pairs."""
@@ -34,7 +34,7 @@ class Condition:
     """Runs that differ in their task and seed only."""
 
     entropic_index: str
-    """In words; what its colour depends on."""
+    """In words; what its colour depends on. Empty: of several."""
     others: Values
     """What else tells it from the stage's other conditions."""
     runs: tuple[int, ...]
@@ -44,7 +44,7 @@ class Condition:
     def label(self) -> str:
         """`q = 1.5, α = 0.1`."""
         pairs = ((ENTROPIC_INDEX, self.entropic_index), *self.others)
-        return ", ".join(f"{name} = {value}" for name, value in pairs)
+        return ", ".join(f"{name} = {value}" for name, value in pairs if value)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,19 +83,25 @@ def side_by_side(stages: Sequence[Stage]) -> Stage | None:
     )
 
 
-def shared_runs(stages: Sequence[Stage]) -> dict[str, list[int]]:
-    """Stages that train for the task, each with its runs of the conditions that all of them have.
+def stage_by_stage(stages: Sequence[Stage]) -> Stage | None:
+    """Each stage that trains for the task as one condition: its runs of what all of them have.
 
-    So stages are compared over the same q and settings; empty where they have none in common.
+    So stages are compared over the same q and settings; None where they have none in common.
     """
+    together = side_by_side(stages)
     compared = [stage for stage in stages if stage.has_task_reward]
-    by_label = [{c.label: c.runs for c in stage.conditions} for stage in compared]
-    shared = set.intersection(*map(set, by_label)) if len(compared) > 1 else set()
-    return {
-        stage.name: [run for label, runs in conditions.items() if label in shared for run in runs]
-        for stage, conditions in zip(compared, by_label, strict=True)
-        if shared
-    }
+    labels = [{condition.label for condition in stage.conditions} for stage in compared]
+    if together is None or not (shared := set.intersection(*labels)):
+        return None
+    conditions = [
+        Condition(
+            entropic_index="",
+            others=(("stage", stage.name),),
+            runs=tuple(r for one in stage.conditions if one.label in shared for r in one.runs),
+        )
+        for stage in compared
+    ]
+    return replace(together, conditions=tuple(conditions))
 
 
 def find_stages(sweep: Sweep) -> list[Stage]:

@@ -27,7 +27,6 @@ from music_rllib.reports.html import (
 )
 from music_rllib.reports.influence import FEWEST_RUNS, varied
 from music_rllib.reports.pictures import Pictures
-from music_rllib.reports.races import Race
 from music_rllib.reports.statistics import SIGNIFICANCE
 from music_rllib.reports.tables import last_success
 from music_rllib.reports.verdict import interval_text, p_text, verdict
@@ -44,8 +43,8 @@ class Report:
 
     sweep: Sweep
     analyses: Sequence[StageAnalysis]
-    races: Sequence[Race]
-    """Between stages."""
+    together: StageAnalysis | None
+    """Stages against each other; None where there is nothing to compare."""
     drawings: Sequence[Drawing]
     pictures: Mapping[str, Pictures]
     """By the drawings' names."""
@@ -104,13 +103,11 @@ def _side_by_side(report: Report) -> str:
     drawn = {drawing.title: drawing for drawing in report.drawings if drawing.stage == SIDE_BY_SIDE}
     if not drawn:
         return ""
-    return (
-        f"<section><h2>Stages side by side</h2>{_figure(report, drawn, CURVES[0])}"
-        f"{_races_table(report.races, _SHARED)}</section>"
-    )
-
-
-_SHARED = " Runs of the conditions that all of these stages have."
+    parts = [_figure(report, drawn, CURVES[0])]
+    if report.together is not None:
+        parts += [_races_table(report.together), _improvement_table(report.together)]
+        parts.append(paragraph("Of each stage the runs of the conditions that all have.", "soft"))
+    return f"<section><h2>Stages side by side</h2>{''.join(parts)}</section>"
 
 
 def _stage(report: Report, analysis: StageAnalysis) -> str:
@@ -132,7 +129,7 @@ def _stage(report: Report, analysis: StageAnalysis) -> str:
         parts.append(f'<div class="verdict">{said}</div>')
     drawn = {drawing.title: drawing for drawing in report.drawings if drawing.stage == stage.name}
     parts += [_figure(report, drawn, title) for title in (CURVES[0], FINALS)]
-    parts += [_final_table(analysis), _waits_table(analysis), _races_table(analysis.races)]
+    parts += [_final_table(analysis), _waits_table(analysis), _races_table(analysis)]
     parts.append(_improvement_table(analysis))
     parts += [_figure(report, drawn, title) for title in (PROFILES, *INFLUENCE, *CURVES[1:])]
     parts.append(_why_no_influence(report, analysis, drawn))
@@ -210,8 +207,8 @@ def _waits_table(analysis: StageAnalysis) -> str:
     )
 
 
-def _races_table(races: Sequence[Race], which: str = "") -> str:
-    if not races:
+def _races_table(analysis: StageAnalysis) -> str:
+    if not analysis.races:
         return ""
     rows = [
         (
@@ -223,14 +220,14 @@ def _races_table(races: Sequence[Race], which: str = "") -> str:
             p_text(race.p_value),
             "yes" if race.decided else "no",
         )
-        for race in sorted(races, key=lambda race: (race.threshold, race.task))
+        for race in sorted(analysis.races, key=lambda race: (race.threshold, race.task))
     ]
     return "<h3>Who gets there sooner</h3>" + table(
         ("Task", "Pair", "Success", "Probability", "95 % interval", "Permutation", "Decided"),
         rows,
         "Probability that a run of the first reaches the success rate in fewer environment steps "
         "than a run of the second (ties half; whoever ends below it is last). Decided: "
-        f"p < {SIGNIFICANCE:g} after Holm's correction.{which}",
+        f"p < {SIGNIFICANCE:g} after Holm's correction.",
     )
 
 

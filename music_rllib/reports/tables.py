@@ -8,9 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from music_rllib.reports.analysis import StageAnalysis
-from music_rllib.reports.conditions import SIDE_BY_SIDE
 from music_rllib.reports.data import Sweep
-from music_rllib.reports.races import Race
 from music_rllib.tracking import names
 
 __all__ = [
@@ -117,10 +115,8 @@ def waits_table(analyses: Iterable[StageAnalysis]) -> Table:
     )
 
 
-def races_table(analyses: Iterable[StageAnalysis], between_stages: Sequence[Race]) -> Table:
-    """Who gets to each success rate sooner, by pairs of conditions, and of stages."""
-    found = [(analysis.stage.name, race) for analysis in analyses for race in analysis.races]
-    found += [(SIDE_BY_SIDE, race) for race in between_stages]
+def races_table(analyses: Iterable[StageAnalysis]) -> Table:
+    """Who gets to each success rate sooner, by pairs of conditions."""
     return Table(
         name="probability_sooner",
         columns=(
@@ -129,7 +125,7 @@ def races_table(analyses: Iterable[StageAnalysis], between_stages: Sequence[Race
         ),
         rows=[
             (
-                stage,
+                analysis.stage.name,
                 race.task,
                 race.threshold,
                 race.first,
@@ -140,7 +136,8 @@ def races_table(analyses: Iterable[StageAnalysis], between_stages: Sequence[Race
                 race.p_value,
                 race.decided,
             )
-            for stage, race in found
+            for analysis in analyses
+            for race in analysis.races
         ],
     )
 

@@ -130,7 +130,7 @@ class CudaRecorder:
 
     def warm_up(self, function: Callable[[], Tensors]) -> Tensors:
         """Runs it on the stream of the captures, where autograd then finds its nodes."""
-        current = torch.cuda.current_stream()
+        current = torch.cuda.current_stream(self._stream.device)
         self._stream.wait_stream(current)
         with torch.cuda.stream(self._stream):
             outputs = function()

@@ -378,15 +378,19 @@ def test_stages_race_over_the_conditions_that_all_of_them_have() -> None:
     )
     report = report_on(sweep)
     # To 50 %: 200,000 / final / 2 steps, the next evaluation; q = 2 has nobody to race with.
-    (race,) = [race for race in report.races if race.threshold == 0.5]
-    assert (race.first, race.second, race.runs) == ("reward", "plain", (4, 4))
+    assert report.together is not None
+    (race,) = [race for race in report.together.races if race.threshold == 0.5]
+    assert (race.first, race.second, race.runs) == ("stage = reward", "stage = plain", (4, 4))
     assert float(race.estimate.value) == (4 + 4 + 0 + 4) / 16
+    (scope,) = report.together.scopes
+    (pair,) = scope.comparisons
+    assert [final.runs for final in (pair.first, pair.second)] == [4, 4]
+    # At the end: 1 and 0.8 against 0.9 and 0.6, twice each.
+    assert float(pair.estimate.value) == 12 / 16
     shown = render(report)
-    assert shown.index("reward before plain") < shown.index("Stage plain")
-    assert "all of these stages have" in shown
-    lone = of_stages("plain")
-    assert not report_on(lone).races
-    assert "all of these stages have" not in render(report_on(lone))
+    before, over = (f"stage = reward {word} stage = plain" for word in ("before", "over"))
+    assert shown.index(before) < shown.index(over) < shown.index("Stage plain")
+    assert report_on(of_stages("plain")).together is None
 
 
 def test_a_legend_stays_inside_its_figure() -> None:
