@@ -313,7 +313,9 @@ def _races(sweep: Sweep, *questions: dict[str, Any]) -> Iterator[str]:
 def metric_table(sweep: Sweep, *metrics: str) -> Iterator[str]:
     """Last values of metrics, run by run, and their interquartile mean with its interval."""
     rng = np.random.default_rng(0)
-    for analysis in analyse(sweep, rng):
+    for position, analysis in enumerate(analyse(sweep, rng)):
+        if position:
+            yield ""
         seeds = analysis.stage.seeds
         yield _row("task", "condition", "metric", *(f"seed {seed}" for seed in seeds), "IQM [95 %]")
         yield _rule(len(seeds) + 4)
