@@ -13,7 +13,7 @@ import pytest
 
 from music_rllib.reports.analysis import THRESHOLDS, Scope, analyse
 from music_rllib.reports.build import build_report, write_report
-from music_rllib.reports.conditions import SIDE_BY_SIDE, find_stages
+from music_rllib.reports.conditions import SIDE_BY_SIDE, find_stages, stage_by_stage
 from music_rllib.reports.data import Points, RunRecord, Sweep, columns
 from music_rllib.reports.figures import _drawn
 from music_rllib.reports.gallery import INFLUENCE
@@ -390,7 +390,7 @@ def test_stages_race_over_the_conditions_that_all_of_them_have() -> None:
     shown = render(report)
     before, over = (f"stage = reward {word} stage = plain" for word in ("before", "over"))
     assert shown.index(before) < shown.index(over) < shown.index("Stage plain")
-    assert report_on(of_stages("plain")).together is None
+    assert stage_by_stage(find_stages(of_stages("plain"))) is None
 
 
 def test_a_legend_stays_inside_its_figure() -> None:
