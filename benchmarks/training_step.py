@@ -12,6 +12,7 @@ import torch
 from benchmarks.measure import Row, interleaved, ratio_row
 from benchmarks.raw_torch import HIDDEN, RawUpdate
 from music_rllib import TACConfig
+from music_rllib.tac import fused
 from music_rllib.tac.algorithm import TAC
 from music_rllib.tac.precision import has_bf16
 
@@ -79,11 +80,12 @@ def products() -> Callable[[], None]:
     """A turn of matrix products with the FLOPs of `UPDATES` updates, at the networks' size."""
     width = HIDDEN[0]
     left, right = torch.randn(BATCH, width), torch.randn(width, width)
+    multiply = fused.product if fused.is_fused(left) else torch.matmul
     count = round(UPDATES * flops(INPUTS, ACTIONS, HIDDEN, BATCH) / (2 * BATCH * width * width))
 
     def turn() -> None:
         for _ in range(count):
-            left @ right
+            multiply(left, right)
 
     return turn
 

@@ -31,6 +31,13 @@ from tests.integration.test_tac_algorithm import (
 
 pytestmark = pytest.mark.usefixtures("local_ray")
 
+
+@pytest.fixture(autouse=True)
+def layer_by_layer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a GPU: the fused perceptron is the CPU's own."""
+    monkeypatch.setattr("music_rllib.tac.fused._has_onednn", lambda: False)
+
+
 Function = Callable[[], Mapping[Any, Tensor]]
 # Their results, or their arguments, depend on what the device has computed: reading that waits.
 WAITING = {

@@ -1,0 +1,176 @@
+"""A multi-layer perceptron as one node of autograd's graph, its products by oneDNN.
+
+PyTorch leaves float32 products on a CPU to MKL, which uses AVX-512 on Intel's CPUs only. oneDNN,
+which PyTorch has too, uses it on any: on an AMD EPYC it is twice as fast (docs/performance.md).
+
+Shape legend: B rows, I inputs, H units of a layer, O outputs, C networks.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from music_rllib.tac.precision import cpu_flags
+
+__all__ = ["FEWEST_ROWS", "is_fused", "perceptron", "product"]
+
+FEWEST_ROWS = 64
+"""With fewer, as in acting, oneDNN takes longer to call than it saves."""
+_NARROW = 16
+"""Likewise matrices with fewer rows or columns."""
+
+# Overloads, since to choose one at each call takes a tenth of a small product's time. The first has
+# no public name; it is what torch.compile makes of a linear layer on a CPU.
+try:
+    _linear_pointwise: Any = torch.ops.mkldnn._linear_pointwise.default
+except AttributeError:
+    _linear_pointwise = None
+_pass_where_positive = torch.ops.aten.threshold_backward.grad_input
+
+
+def is_fused(inputs: Tensor) -> bool:
+    """Whether `perceptron` takes these inputs, and gains by it."""
+    return (
+        inputs.device.type == "cpu"
+        and inputs.dtype == torch.float32
+        and inputs.ndim == 2
+        and len(inputs) >= FEWEST_ROWS
+        and _has_onednn()
+    )
+
+
+@functools.cache
+def _has_onednn() -> bool:
+    """Decided by the machine and not by a measurement: a seed has to give the same numbers."""
+    return (
+        torch.backends.mkldnn.is_available()
+        and _linear_pointwise is not None
+        and "avx512f" in cpu_flags()
+    )
+
+
+def perceptron(inputs: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> Tensor:
+    """ReLU between the layers, a linear output; can be differentiated once.
+
+    Args:
+        inputs: [B, I], for which `is_fused`.
+        weights: of each layer [H, I], as `nn.Linear` has them; of C networks at once [C, I, H].
+        biases: of each layer [H], or [C, 1, H].
+
+    Returns:
+        [B, O], or [C, B, O].
+    """
+    output: Tensor = _Perceptron.apply(inputs, *weights, *biases)  # type: ignore[no-untyped-call]
+    return output
+
+
+class _Perceptron(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, inputs: Tensor, *parameters: Tensor) -> Tensor:
+        outputs: list[Tensor] = []
+        kept: list[Tensor] = []
+        for weights, biases in _networks(parameters):
+            hidden = _hidden(inputs, weights[:-1], biases[:-1])
+            outputs.append(torch.addmm(biases[-1], hidden[-1], weights[-1].t()))
+            kept += hidden
+        ctx.save_for_backward(*parameters, *kept)
+        return torch.stack(outputs) if _are_stacked(parameters) else outputs[0]
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        for_inputs, *for_parameters = ctx.needs_input_grad
+        count, layers = len(for_parameters), len(for_parameters) // 2
+        parameters, kept = ctx.saved_tensors[:count], ctx.saved_tensors[count:]
+        wanted = _Wanted(for_inputs, for_parameters[0], stacked=_are_stacked(parameters))
+        starts = gradient.unbind() if wanted.stacked else [gradient]
+        gradients = [
+            _gradients(start, weights, kept[c * layers : (c + 1) * layers], wanted)
+            for c, (start, (weights, _)) in enumerate(
+                zip(starts, _networks(parameters), strict=True)
+            )
+        ]
+        if not wanted.stacked:
+            return gradients[0]
+        of_inputs, *of_parameters = zip(*gradients, strict=True)
+        return (
+            functools.reduce(torch.add, of_inputs) if for_inputs else None,
+            *(torch.stack(each) if wanted.parameters else None for each in of_parameters),
+        )
+
+
+class _Wanted(NamedTuple):
+    inputs: bool
+    parameters: bool
+    stacked: bool
+    """Whether weights are [I, H] and biases [1, H]: one of C networks."""
+
+
+Network = tuple[Sequence[Tensor], Sequence[Tensor]]
+
+
+def _are_stacked(parameters: Sequence[Tensor]) -> bool:
+    return parameters[0].ndim == 3
+
+
+def _networks(parameters: Sequence[Tensor]) -> list[Network]:
+    """Weights [H, I] and biases [H] of each."""
+    layers = len(parameters) // 2
+    weights, biases = parameters[:layers], parameters[layers:]
+    if not _are_stacked(parameters):
+        return [(weights, biases)]
+    return list(
+        zip(
+            zip(*(weight.transpose(1, 2).unbind() for weight in weights), strict=True),
+            zip(*(bias.squeeze(1).unbind() for bias in biases), strict=True),
+            strict=True,
+        )
+    )
+
+
+def _hidden(inputs: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> list[Tensor]:
+    """What enters each layer, that of the output included."""
+    hidden = [inputs]
+    for weight, bias in zip(weights, biases, strict=True):
+        hidden.append(_linear(hidden[-1], weight, bias, "relu"))
+    return hidden
+
+
+def _gradients(
+    gradient: Tensor, weights: Sequence[Tensor], entered: Sequence[Tensor], wanted: _Wanted
+) -> tuple[Tensor | None, ...]:
+    """From the output's gradient [B, O]: of the inputs, the weights and the biases of a network."""
+    layers = len(weights)
+    of_weights: list[Tensor | None] = [None] * layers
+    of_biases: list[Tensor | None] = [None] * layers
+    for layer in reversed(range(layers)):
+        below = entered[layer]
+        if wanted.parameters:
+            left, right = (below, gradient) if wanted.stacked else (gradient, below)
+            of_weights[layer] = product(left.t(), right.t())
+            of_biases[layer] = gradient.sum(0, keepdim=wanted.stacked)
+        if layer > 0 or wanted.inputs:
+            gradient = product(gradient, weights[layer].t())
+        if layer > 0:
+            # Where ReLU gave 0 nothing passes. In place: the product is nobody else's.
+            _pass_where_positive(gradient, below, 0, grad_input=gradient)
+    return gradient if wanted.inputs else None, *of_weights, *of_biases
+
+
+def _linear(inputs: Tensor, weight: Tensor, bias: Tensor | None, activation: str) -> Tensor:
+    """[B, I], [H, I], [H] -> [B, H]."""
+    output: Tensor = _linear_pointwise(inputs, weight, bias, activation, [], "")
+    return output
+
+
+def product(left: Tensor, right: Tensor) -> Tensor:
+    """[M, K], [N, K] -> [M, N], float32 on a CPU with oneDNN."""
+    if min(len(left), len(right), left.shape[1]) < _NARROW:
+        return left @ right.t()
+    return _linear(left, right, None, "none")

@@ -1,0 +1,102 @@
+"""The fused perceptron against the same layers one by one, in float64.
+
+Where the CPU has no AVX-512 it is never taken, and there is nothing to compare it with.
+"""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from music_rllib.tac import fused
+from music_rllib.tac.networks import Critics, Perceptron
+
+INPUTS, ROWS = 31, 96
+
+
+def networks(hidden: list[int]) -> dict[str, nn.Module]:
+    torch.manual_seed(0)
+    return {
+        "policy": Perceptron(INPUTS, hidden, 8),
+        "policy of a hand": Perceptron(INPUTS, hidden, 40),
+        "value": Perceptron(INPUTS, hidden, 1),
+        "twin critics": Critics(INPUTS, hidden),
+        "a single critic": Critics(INPUTS, hidden, 1),
+    }
+
+
+def with_gradients(network: nn.Module, inputs: Tensor, **kwargs: bool) -> dict[str, Tensor]:
+    """Output, and gradients of its sum, which all are the same number, and a curved function."""
+    inputs = inputs.clone().requires_grad_(True)
+    network.zero_grad(set_to_none=True)
+    output = network(inputs, **kwargs)
+    output.sum().backward(retain_graph=True)
+    (output * output.detach().cos()).sum().backward()
+    grads = {name: p.grad for name, p in network.named_parameters() if p.grad is not None}
+    return {"output": output.detach(), "inputs": inputs.grad, **grads}
+
+
+pytestmark = pytest.mark.filterwarnings("error")
+only_where_fused = pytest.mark.parametrize(
+    "hidden",
+    [[128, 128, 128], [64], [17, 200]] if fused.is_fused(torch.zeros(ROWS, INPUTS)) else [],
+    ids=str,
+)
+
+
+@only_where_fused
+@pytest.mark.parametrize("frozen", [False, True])
+def test_same_values_and_gradients_as_layer_by_layer(hidden: list[int], frozen: bool) -> None:
+    inputs = torch.randn(ROWS, INPUTS)
+    for name, network in networks(hidden).items():
+        only_critics = {"frozen": frozen} if isinstance(network, Critics) else {}
+        found = with_gradients(network, inputs, **only_critics)
+        exact = with_gradients(network.double(), inputs.double(), **only_critics)
+        assert found.keys() == exact.keys(), name
+        assert len(found) == 2 if only_critics.get("frozen") else len(found) > 3
+        for part, values in found.items():
+            scale = float(exact[part].abs().max())
+            torch.testing.assert_close(
+                values.double(), exact[part], rtol=0, atol=3e-6 * scale, msg=f"{name}: {part}"
+            )
+
+
+@only_where_fused
+def test_the_same_bits_each_time_and_wherever_the_numbers_lie(hidden: list[int]) -> None:
+    memory = torch.randn(ROWS * INPUTS + 64)
+    for network in networks(hidden).values():
+        places = [memory[o : o + ROWS * INPUTS].view(ROWS, INPUTS) for o in (0, 1, 3, 16)]
+        inputs = places[0].clone()
+        first = with_gradients(network, inputs)
+        for place in places:
+            place.copy_(inputs)
+            again = with_gradients(network, place)
+            assert all(torch.equal(again[part], values) for part, values in first.items())
+
+
+@only_where_fused
+def test_only_what_learns_has_gradients(hidden: list[int]) -> None:
+    inputs = torch.randn(ROWS, INPUTS)
+    for network in networks(hidden).values():
+        network.requires_grad_(False)
+        assert not network(inputs).requires_grad
+        assert with_gradients(network, inputs).keys() == {"output", "inputs"}
+
+
+def test_few_rows_and_other_types_go_layer_by_layer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(fused, "_has_onednn", lambda: True)
+    assert fused.is_fused(torch.zeros(fused.FEWEST_ROWS, 3))
+    assert not fused.is_fused(torch.zeros(fused.FEWEST_ROWS - 1, 3))
+    assert not fused.is_fused(torch.zeros(ROWS, 3, dtype=torch.float64))
+    assert not fused.is_fused(torch.zeros(2, ROWS, 3))
+
+
+def test_a_machine_without_avx512_has_no_use_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    for flags in (frozenset(), frozenset({"avx2"})):
+        monkeypatch.setattr(fused, "cpu_flags", lambda flags=flags: flags)
+        assert not fused._has_onednn.__wrapped__()
+    monkeypatch.setattr(fused, "_has_onednn", lambda: False)
+    assert not fused.is_fused(torch.zeros(ROWS, 3))
