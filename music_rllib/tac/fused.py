@@ -55,59 +55,71 @@ def _has_onednn() -> bool:
     )
 
 
-def perceptron(inputs: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> Tensor:
+def perceptron(
+    inputs: Tensor,
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor],
+    *,
+    learned: Tensor | None = None,
+) -> Tensor:
     """ReLU between the layers, a linear output; can be differentiated once.
 
     Args:
         inputs: [B, I], for which `is_fused`.
         weights: of each layer [H, I], as `nn.Linear` has them; of C networks at once [C, I, H].
         biases: of each layer [H], or [C, 1, H].
+        learned: [B', I] that stand before the inputs. Weights and biases then have their gradients
+            from these alone, which get none themselves.
 
     Returns:
-        [B, O], or [C, B, O].
+        [B, O], or [C, B, O]; with B' + B rows where there are `learned` ones.
     """
-    output: Tensor = _Perceptron.apply(inputs, *weights, *biases)  # type: ignore[no-untyped-call]
+    output: Tensor = _Perceptron.apply(inputs, learned, *weights, *biases)  # type: ignore[no-untyped-call]
     return output
 
 
 class _Perceptron(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, inputs: Tensor, *parameters: Tensor) -> Tensor:
+    def forward(ctx: Any, inputs: Tensor, learned: Tensor | None, *parameters: Tensor) -> Tensor:
+        rows = inputs if learned is None else torch.cat([learned, inputs])
         outputs: list[Tensor] = []
-        kept: list[Tensor] = []
+        entered: list[Tensor] = []
         for weights, biases in _networks(parameters):
-            hidden = _hidden(inputs, weights[:-1], biases[:-1])
+            hidden = _hidden(rows, weights[:-1], biases[:-1])
             outputs.append(torch.addmm(biases[-1], hidden[-1], weights[-1].t()))
-            kept += hidden
-        ctx.save_for_backward(*parameters, *kept)
+            entered += hidden
+        ctx.save_for_backward(*parameters, *entered)
+        ctx.learned = None if learned is None else len(learned)
         return torch.stack(outputs) if _are_stacked(parameters) else outputs[0]
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        for_inputs, *for_parameters = ctx.needs_input_grad
+        for_inputs, _, *for_parameters = ctx.needs_input_grad
         count, layers = len(for_parameters), len(for_parameters) // 2
-        parameters, kept = ctx.saved_tensors[:count], ctx.saved_tensors[count:]
-        wanted = _Wanted(for_inputs, for_parameters[0], stacked=_are_stacked(parameters))
-        starts = gradient.unbind() if wanted.stacked else [gradient]
+        parameters, entered = ctx.saved_tensors[:count], ctx.saved_tensors[count:]
+        stacked = _are_stacked(parameters)
+        wanted = _Wanted(for_inputs, for_parameters[0], ctx.learned, stacked)
+        starts = gradient.unbind() if stacked else [gradient]
         gradients = [
-            _gradients(start, weights, kept[c * layers : (c + 1) * layers], wanted)
+            _gradients(start, weights, entered[c * layers : (c + 1) * layers], wanted)
             for c, (start, (weights, _)) in enumerate(
                 zip(starts, _networks(parameters), strict=True)
             )
         ]
-        if not wanted.stacked:
-            return gradients[0]
-        of_inputs, *of_parameters = zip(*gradients, strict=True)
-        return (
-            functools.reduce(torch.add, of_inputs) if for_inputs else None,
-            *(torch.stack(each) if wanted.parameters else None for each in of_parameters),
-        )
+        of_inputs, *of_parameters = gradients[0]
+        if stacked:
+            networks = list(zip(*gradients, strict=True))
+            of_inputs = functools.reduce(torch.add, networks[0]) if for_inputs else None
+            of_parameters = [torch.stack(n) if wanted.parameters else None for n in networks[1:]]
+        return (of_inputs, None, *of_parameters)
 
 
 class _Wanted(NamedTuple):
     inputs: bool
     parameters: bool
+    learned: int | None
+    """The first rows, which the parameters learn from and the inputs' gradients leave out."""
     stacked: bool
     """Whether weights are [I, H] and biases [1, H]: one of C networks."""
 
@@ -152,15 +164,16 @@ def _gradients(
     for layer in reversed(range(layers)):
         below = entered[layer]
         if wanted.parameters:
-            left, right = (below, gradient) if wanted.stacked else (gradient, below)
+            of_output, of_input = gradient[: wanted.learned], below[: wanted.learned]
+            left, right = (of_input, of_output) if wanted.stacked else (of_output, of_input)
             of_weights[layer] = product(left.t(), right.t())
-            of_biases[layer] = gradient.sum(0, keepdim=wanted.stacked)
-        if layer > 0 or wanted.inputs:
-            gradient = product(gradient, weights[layer].t())
+            of_biases[layer] = of_output.sum(0, keepdim=wanted.stacked)
         if layer > 0:
+            gradient = product(gradient, weights[layer].t())
             # Where ReLU gave 0 nothing passes. In place: the product is nobody else's.
             _pass_where_positive(gradient, below, 0, grad_input=gradient)
-    return gradient if wanted.inputs else None, *of_weights, *of_biases
+    of_inputs = product(gradient[wanted.learned :], weights[0].t()) if wanted.inputs else None
+    return of_inputs, *of_weights, *of_biases
 
 
 def _linear(inputs: Tensor, weight: Tensor, bias: Tensor | None, activation: str) -> Tensor:

@@ -97,15 +97,18 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
         inputs = self.normaliser(batch[Columns.OBS])
         mean, log_std = self.policy_parameters(inputs)
         action, log_density = choose_action(mean, log_std, batch.get("noise"))
+        # The policy's loss wants gradients of its action only.
+        q_values, q_of_policy = self.critics.learn_and_ask(
+            torch.cat([inputs, batch[Columns.ACTIONS]], -1), torch.cat([inputs, action], -1)
+        )
         return {
             "tac": TACForward(
                 action=action,
                 log_density=log_density,
                 mean=mean,
                 log_std=log_std,
-                q_values=self.critics(torch.cat([inputs, batch[Columns.ACTIONS]], -1)),
-                # Frozen critics: the policy's loss wants gradients of the action only.
-                q_of_policy=self.critics(torch.cat([inputs, action], -1), frozen=True),
+                q_values=q_values,
+                q_of_policy=q_of_policy,
                 value=self.value(inputs).squeeze(-1) if self._has_value else None,
                 next=self.forward_target(batch),
             )

@@ -102,6 +102,19 @@ class Critics(nn.Module):
             hidden = self._hidden(inputs, hidden_layers)
         return torch.baddbmm(bias, hidden, weight).squeeze(-1)
 
+    def learn_and_ask(self, learned: Tensor, asked: Tensor) -> tuple[Tensor, Tensor]:
+        """Values of two minibatches, [B, I] -> [C, B] each.
+
+        Args:
+            learned: the weights get their gradients from these, which get none.
+            asked: gradients reach these only.
+        """
+        if self.bf16 or not fused.is_fused(learned):
+            return self(learned), self(asked, frozen=True)
+        weights, biases = list(self.weights), list(self.biases)
+        values = fused.perceptron(asked, weights, biases, learned=learned).squeeze(-1)
+        return values[:, : len(learned)], values[:, len(learned) :]
+
     def _hidden(self, inputs: Tensor, layers: list[tuple[Tensor, Tensor]]) -> Tensor:
         """[B, I] -> [C, B, H]."""
         (first_weight, first_bias), *others = layers

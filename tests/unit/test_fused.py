@@ -63,6 +63,29 @@ def test_same_values_and_gradients_as_layer_by_layer(hidden: list[int], frozen: 
 
 
 @only_where_fused
+@pytest.mark.parametrize("count", [1, 2])
+def test_critics_learn_from_one_minibatch_and_are_asked_about_another(
+    hidden: list[int], count: int
+) -> None:
+    def gradients(critics: Critics, *, together: bool) -> tuple[Tensor, ...]:
+        both = torch.randn(2, ROWS, INPUTS, generator=torch.Generator().manual_seed(1))
+        learned, asked = both[0], both[1].requires_grad_(True)
+        if together:
+            values, answers = critics.learn_and_ask(learned, asked)
+        else:
+            values, answers = critics(learned), critics(asked, frozen=True)
+        loss = values.square().sum() + answers.amin(0).sum()
+        return values, answers, *torch.autograd.grad(loss, [asked, *critics.parameters()])
+
+    torch.manual_seed(0)
+    critics = Critics(INPUTS, hidden, count)
+    for one, two in zip(
+        gradients(critics, together=True), gradients(critics, together=False), strict=True
+    ):
+        torch.testing.assert_close(one, two, rtol=0, atol=3e-6 * float(two.abs().max()))
+
+
+@only_where_fused
 def test_the_same_bits_each_time_and_wherever_the_numbers_lie(hidden: list[int]) -> None:
     memory = torch.randn(ROWS * INPUTS + 64)
     for network in networks(hidden).values():
