@@ -61,5 +61,6 @@ class RawUpdate:
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         self.optimizer.step()
-        torch._foreach_lerp_(self.targets, self.online, 0.005)
+        with torch.no_grad():
+            torch._foreach_lerp_(self.targets, self.online, 0.005)
         return loss.detach()

@@ -193,13 +193,17 @@ class TACLearner(TorchLearner):
             outputs = step(minibatch, constants)
             self._grad_updates += 1
             if self._grad_updates % self._settings.target_update_interval == 0:
-                torch._foreach_lerp_(self._targets, self._online, self._settings.tau)
+                self._average()
             history.append(outputs[METRICS])
             if TD_ERRORS in outputs:
                 self._td_errors.append(outputs[TD_ERRORS])
         self._log_history(history)
         self.after_gradient_based_update(timesteps=timesteps or {})
         return self.metrics.reduce()
+
+    @torch.no_grad()  # else the targets keep a graph of all their averages
+    def _average(self) -> None:
+        torch._foreach_lerp_(self._targets, self._online, self._settings.tau)
 
     def postprocess_gradients(self, gradients_dict: ParamDict) -> ParamDict:
         """RLlib sorts them by module and optimizer first; for nothing where nothing is clipped."""

@@ -213,6 +213,16 @@ def test_other_backbones_and_per_resume_exactly_too(
     assert fingerprint(resumed, 1) == fingerprint(unbroken, 1)
 
 
+@pytest.mark.parametrize("settings", [HER, DDPG], ids=["tac", "ddpg"])
+def test_target_networks_keep_no_history_of_their_averages(settings: dict[str, Any]) -> None:
+    """With one, each average of an update would stay in memory, half a kilobyte a tensor."""
+    algo = build(**settings)
+    fingerprint(algo, 2)
+    learner = algo.learner_group._learner
+    assert learner._targets
+    assert all(target.is_leaf and not target.requires_grad for target in learner._targets)
+
+
 def test_q_bias_is_what_its_definition_says() -> None:
     """With critics that say 3 and a target value of -7, the bias can be computed by hand."""
     algo = build(music=None, alpha=0.0, gamma=0.9)
