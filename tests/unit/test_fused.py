@@ -1,9 +1,11 @@
 """The fused perceptron against the same layers one by one, in float64.
 
-Where the CPU has no AVX-512 it is never taken, and there is nothing to compare it with.
+oneDNN computes it on every CPU; where there is no AVX-512 it just is not taken.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import pytest
 import torch
@@ -38,14 +40,23 @@ def with_gradients(network: nn.Module, inputs: Tensor, **kwargs: bool) -> dict[s
 
 
 pytestmark = pytest.mark.filterwarnings("error")
-only_where_fused = pytest.mark.parametrize(
-    "hidden",
-    [[128, 128, 128], [64], [17, 200]] if fused.is_fused(torch.zeros(ROWS, INPUTS)) else [],
-    ids=str,
-)
 
 
-@only_where_fused
+def with_onednn(test: Any) -> Any:
+    """For several sizes, on a CPU of any kind."""
+    return pytest.mark.parametrize("hidden", [[128, 128, 128], [64], [17, 200]], ids=str)(
+        pytest.mark.usefixtures("onednn")(test)
+    )
+
+
+@pytest.fixture
+def onednn(monkeypatch: pytest.MonkeyPatch) -> None:
+    if fused._linear_pointwise is None:
+        pytest.skip("this build of PyTorch has no oneDNN")
+    monkeypatch.setattr(fused, "_has_onednn", lambda: True)
+
+
+@with_onednn
 @pytest.mark.parametrize("frozen", [False, True])
 def test_same_values_and_gradients_as_layer_by_layer(hidden: list[int], frozen: bool) -> None:
     inputs = torch.randn(ROWS, INPUTS)
@@ -62,7 +73,7 @@ def test_same_values_and_gradients_as_layer_by_layer(hidden: list[int], frozen: 
             )
 
 
-@only_where_fused
+@with_onednn
 @pytest.mark.parametrize("count", [1, 2])
 def test_critics_learn_from_one_minibatch_and_are_asked_about_another(
     hidden: list[int], count: int
@@ -85,7 +96,7 @@ def test_critics_learn_from_one_minibatch_and_are_asked_about_another(
         torch.testing.assert_close(one, two, rtol=0, atol=3e-6 * float(two.detach().abs().max()))
 
 
-@only_where_fused
+@with_onednn
 def test_the_same_bits_each_time_and_wherever_the_numbers_lie(hidden: list[int]) -> None:
     memory = torch.randn(ROWS * INPUTS + 64)
     for network in networks(hidden).values():
@@ -98,7 +109,7 @@ def test_the_same_bits_each_time_and_wherever_the_numbers_lie(hidden: list[int])
             assert all(torch.equal(again[part], values) for part, values in first.items())
 
 
-@only_where_fused
+@with_onednn
 def test_only_what_learns_has_gradients(hidden: list[int]) -> None:
     inputs = torch.randn(ROWS, INPUTS)
     for network in networks(hidden).values():
