@@ -14,6 +14,7 @@ import numpy as np
 
 from benchmarks.measure import Row, interleaved, ratio_row
 from music_rllib import TACConfig
+from music_rllib.envs.make import make_env
 from music_rllib.tac.env_runner import TrajectoryEnvRunner
 
 __all__ = ["rows"]
@@ -32,6 +33,7 @@ def runner(count: int) -> TrajectoryEnvRunner:
 
 def stock_loop() -> Callable[[], None]:
     """An episode of the environment as Gymnasium makes it, with random actions."""
+    make_env(ENV_ID).close()  # registers the robotics tasks
     env = gym.make(ENV_ID)
     actions = np.random.default_rng(0).uniform(-1, 1, (HORIZON, 4)).astype(np.float32)
 
