@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
+from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 from music_rllib.replay.priorities import TDPriorities, ranges, rank_weights
@@ -258,7 +259,7 @@ class TrajectoryReplay:
             if self._moved.any():
                 start[chosen], step[chosen], length[chosen] = self._draw_moved(len(chosen))
         row = start + step
-        frames, following = self._frames[row], self._frames[row + 1]
+        frames, following = self._frames_of(row)
         width = self.layout.network_input
         inputs, next_inputs = frames[:, :width].copy(), following[:, :width].copy()
         rewards = self._rewards[row]
@@ -276,6 +277,13 @@ class TrajectoryReplay:
         return Transitions(
             inputs, self._actions[row], rewards, discounts, next_inputs, weights, row
         )
+
+    def _frames_of(self, rows: Rows) -> tuple[Floats, Floats]:
+        """Both frames of transitions, [B, frame] each: they lie behind each other, so one read."""
+        frames, width = self._frames, self.layout.frame
+        pairs = as_strided(frames, (len(frames) - 1, 2 * width), frames.strides, writeable=False)
+        both = pairs[rows]
+        return both[:, :width], both[:, width:]
 
     def update_priorities(self, rows: Rows, errors: Floats) -> None:
         """PER: takes over the absolute TD errors [B] of transitions drawn from `rows` [B]."""
