@@ -41,9 +41,11 @@ def _ranking(scope: Scope, where: str) -> str:
         )
     lonely = [final for final in scope.finals if final.seeds < 2]
     if lonely:
-        which = "every condition" if len(lonely) == len(scope.finals) else _names(lonely)
+        every = len(lonely) == len(scope.finals)
+        have = "has" if every or len(lonely) == 1 else "have"
+        which = "every condition" if every else _names(lonely)
         return (
-            f"No winner {where}: {which} has a single seed, so there is no interval and no "
+            f"No winner {where}: {which} {have} a single seed, so there is no interval and no "
             f"evidence. Highest so far is {_said(best)}."
         )
     rivals = [pair.second if pair.first is best else pair.first for pair in open_pairs]

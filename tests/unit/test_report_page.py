@@ -158,6 +158,7 @@ def test_two_seeds_far_apart_are_no_evidence() -> None:
     [
         ({"1.5": [0.5, 0.6]}, "Only one condition has finished"),
         ({"1": [0.1], "1.5": [0.9]}, "every condition has a single seed, so there is no interval"),
+        ({"1": [0.1], "1.5": [0.9], "2": [0.5, 0.6]}, "q = 1 and q = 1.5 have a single seed"),
         ({"1": [0.1, 0.1], "1.5": [0.1, 0.1]}, "All seeds ended alike"),
     ],
 )
