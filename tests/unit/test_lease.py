@@ -53,8 +53,8 @@ def test_a_held_lease_is_refused_and_its_holder_named(place: LeaseFile) -> None:
 def test_an_expired_lease_is_taken_over_and_its_old_owner_writes_no_more(place: LeaseFile) -> None:
     theirs, mine = elsewhere(seconds=-1.0), Lease.of_this_process("mine")
     assert place.acquire(theirs) is None
-    held = HeldLease(place, theirs)
     assert place.acquire(mine) is None
+    held = HeldLease(place, theirs)  # not before: its owner would renew it at once
     with pytest.raises(
         LeaseLostError, match=r"lease\.json must name this process .* it names mine"
     ):
