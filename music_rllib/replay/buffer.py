@@ -1,13 +1,14 @@
 """Replay of whole trajectories in one array, seen as transitions or as trajectories.
 
-All frames (states) of all trajectories lie behind each other in one float32 ring, a frame's
-observation, desired goal and achieved goal side by side: a transition is two neighbouring rows.
-A trajectory of n steps takes n + 1 frames and is never split by the ring's end, so a replay of
-capacity C holds exactly C transitions of full episodes, fewer where episodes end early.
+All steps of all trajectories lie behind each other in one float32 ring. A row is the frame
+(observation, desired goal, achieved goal), then the action taken there, its reward, and whether it
+was terminal: a transition is two neighbouring rows, one stretch of memory. A trajectory of n steps
+takes n + 1 rows and is never split by the ring's end, so a replay of capacity C holds exactly C
+transitions of full episodes, fewer where episodes end early.
 
-Memory, h being the longest episode: ``(4 (D + 2G + A + 1) + 1) bytes * C (h + 1)/h`` plus 16 bytes
-a trajectory, claimed from the system as it fills. A million FetchPush transitions: 148 MB.
-Prioritised replay by TD error adds 8 bytes a frame and a tree of 16 to 32.
+Memory, h being the longest episode: ``4 (D + 2G + A + 2) bytes * C (h + 1)/h`` plus 16 bytes a
+trajectory, claimed from the system as it fills. A million FetchPush transitions: 151 MB.
+Prioritised replay by TD error adds 8 bytes a row and a tree of 16 to 32.
 
 Shape legend: B transitions, N trajectories, T frames, D observation, G goal, A action.
 """
@@ -19,10 +20,9 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
-from music_rllib.replay.priorities import TDPriorities, ranges, rank_weights
+from music_rllib.replay.priorities import TDPriorities, WeightedDraws, ranges, rank_weights
 
 __all__ = ["ReplayLayout", "Trajectory", "TrajectoryReplay", "Transitions"]
 
@@ -89,6 +89,38 @@ class Transitions:
     """[B] where they lie, for `update_priorities`."""
 
 
+@dataclass(frozen=True)
+class _Places:
+    """Where the transitions of some trajectories lie, to draw from."""
+
+    starts: Rows
+    lengths: Rows
+    ends: Rows
+    """[N] transitions up to the end of each trajectory."""
+    equal: bool
+    """Whether all are of one length."""
+
+    @classmethod
+    def of(cls, starts: Rows, lengths: Rows) -> _Places:
+        equal = len(lengths) > 0 and bool(lengths.min() == lengths.max())
+        return cls(starts, lengths, np.cumsum(lengths), equal)
+
+    @property
+    def total(self) -> int:
+        """Transitions of all."""
+        return int(self.ends[-1]) if len(self.ends) else 0
+
+    def draw(self, rng: np.random.Generator, count: int) -> tuple[Rows, Rows, Rows]:
+        """First row, step and length of their trajectory, of `count` transitions; [B] each."""
+        drawn = rng.integers(0, self.total, count)
+        if self.equal:
+            which, step = np.divmod(drawn, self.lengths[0])
+        else:
+            which = np.searchsorted(self.ends, drawn, side="right")
+            step = drawn - (self.ends - self.lengths)[which]
+        return self.starts[which], step, self.lengths[which]
+
+
 class TrajectoryReplay:
     """Ring of trajectories with uniform transition sampling, hindsight, and a trajectory view.
 
@@ -133,16 +165,17 @@ class TrajectoryReplay:
         self._hindsight_share = hindsight_k / (1.0 + hindsight_k)
         self._only_moved = hindsight_episodes == "moved" and hindsight_k > 0
         self._moved = np.zeros(0, np.bool_)
+        self._places: tuple[_Places, _Places] | None = None
         ring = capacity // layout.horizon * (layout.horizon + 1)
         # Untouched pages of zeros cost nothing: the system hands them out as they are written.
-        self._frames = np.zeros((ring, layout.frame), np.float32)
-        self._actions = np.zeros((ring, layout.action), np.float32)
-        self._rewards = np.zeros(ring, np.float32)
-        self._terminal = np.zeros(ring, np.bool_)
+        self._steps = np.zeros((ring, layout.frame + layout.action + 2), np.float32)
+        self._frames = self._steps[:, : layout.frame]
+        self._actions = self._steps[:, layout.frame : -2]
+        self._rewards, self._terminal = self._steps[:, -2], self._steps[:, -1]
         self._starts = np.zeros(0, np.int64)
         self._lengths = np.zeros(0, np.int64)
         self._priorities = np.zeros(0, np.float64)
-        self._ranks = np.zeros(0, np.float64)
+        self._by_rank: WeightedDraws | None = None
         self._write = 0
         self._used = 0
         self.trajectories_added = 0
@@ -150,7 +183,7 @@ class TrajectoryReplay:
 
     def __len__(self) -> int:
         """Transitions held."""
-        return int(self._lengths.sum())
+        return self._all_and_moved()[0].total
 
     @property
     def trajectories(self) -> int:
@@ -164,9 +197,8 @@ class TrajectoryReplay:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the arrays when full."""
-        arrays = (self._frames, self._actions, self._rewards, self._terminal)
-        return sum(array.nbytes for array in arrays)
+        """Bytes of the ring when full."""
+        return self._steps.nbytes
 
     # -- storing --------------------------------------------------------------------------
 
@@ -183,7 +215,11 @@ class TrajectoryReplay:
             if priorities is not None:
                 self._priorities = np.append(self._priorities, priorities[i])
         if priorities is not None:
-            self._ranks = np.cumsum(rank_weights(self._priorities))
+            self._rank()
+
+    def _rank(self) -> None:
+        if len(self._priorities):
+            self._by_rank = WeightedDraws(rank_weights(self._priorities))
 
     def _store(self, trajectory: Trajectory) -> None:
         steps = len(trajectory)
@@ -194,7 +230,7 @@ class TrajectoryReplay:
         self._frames[start : end + 1] = trajectory.frames
         self._actions[start:end] = trajectory.actions
         self._rewards[start:end] = trajectory.rewards
-        self._terminal[start : end + 1] = False
+        self._terminal[start : end + 1] = 0.0
         self._terminal[end - 1] = trajectory.terminated
         self._starts = np.append(self._starts, start)
         self._lengths = np.append(self._lengths, steps)
@@ -205,6 +241,7 @@ class TrajectoryReplay:
         self._write = end + 1
         self._used = max(self._used, self._write)
         self.trajectories_added += 1
+        self._places = None
 
     def _make_room(self, frames: int) -> int:
         """Start of `frames` free consecutive frames; the oldest trajectories there are dropped."""
@@ -240,6 +277,17 @@ class TrajectoryReplay:
             places = zip(self._starts.tolist(), self._lengths.tolist(), strict=True)
             moved = [self._has_moved(start, steps) for start, steps in places]
             self._moved = np.array(moved, np.bool_)
+        self._places = None
+
+    def _all_and_moved(self) -> tuple[_Places, _Places]:
+        """Kept between minibatches: to find them anew takes time that grows with the replay."""
+        if self._places is None:
+            moved = self._moved if self._only_moved else slice(0)
+            self._places = (
+                _Places.of(self._starts, self._lengths),
+                _Places.of(self._starts[moved], self._lengths[moved]),
+            )
+        return self._places
 
     # -- the view of TAC: transitions -----------------------------------------------------
 
@@ -256,34 +304,41 @@ class TrajectoryReplay:
         relabelled = self._hindsight_share > 0
         if relabelled:
             chosen = np.flatnonzero(self.rng.random(count) < self._hindsight_share)
-            if self._moved.any():
-                start[chosen], step[chosen], length[chosen] = self._draw_moved(len(chosen))
+            _, moved = self._all_and_moved()
+            if moved.total:
+                start[chosen], step[chosen], length[chosen] = moved.draw(self.rng, len(chosen))
         row = start + step
-        frames, following = self._frames_of(row)
-        width = self.layout.network_input
-        inputs, next_inputs = frames[:, :width].copy(), following[:, :width].copy()
-        rewards = self._rewards[row]
+        width, frame = self.layout.network_input, self.layout.frame
+        after = self._steps.shape[1]
+        both = self._read(row, 0, after + frame)
+        inputs, next_inputs = both[:, :width].copy(), both[:, after : after + width].copy()
+        actions, rewards = both[:, frame : after - 2].copy(), both[:, after - 2].copy()
         if relabelled:
             later = self._later_step(step[chosen], length[chosen])
-            goals = self._frames[start[chosen] + later, width:]
+            goals = self._read(start[chosen] + later, width, self.layout.goal)
             inputs[chosen, self.layout.observation :] = goals
             next_inputs[chosen, self.layout.observation :] = goals
             assert self._goal_reward is not None
-            rewards[chosen] = self._goal_reward(following[chosen, width:], goals)
-        discounts = 1.0 - self._terminal[row].astype(np.float32)
+            rewards[chosen] = self._goal_reward(both[chosen, after + width :], goals)
         weights = None
         if self._td is not None:
             weights = self._td.importance_weights(row, len(self), importance_exponent)
-        return Transitions(
-            inputs, self._actions[row], rewards, discounts, next_inputs, weights, row
-        )
+        discounts = 1.0 - both[:, after - 1]
+        return Transitions(inputs, actions, rewards, discounts, next_inputs, weights, row)
 
-    def _frames_of(self, rows: Rows) -> tuple[Floats, Floats]:
-        """Both frames of transitions, [B, frame] each: they lie behind each other, so one read."""
-        frames, width = self._frames, self.layout.frame
-        pairs = as_strided(frames, (len(frames) - 1, 2 * width), frames.strides, writeable=False)
-        both = pairs[rows]
-        return both[:, :width], both[:, width:]
+    def _read(self, rows: Rows, first: int, count: int) -> Floats:
+        """`count` numbers of each row from column `first` on, and on into the row after it.
+
+        Args:
+            rows: [...] rows of the ring.
+
+        Returns:
+            [..., count], a copy. Each stretch is copied as a whole, not number by number.
+        """
+        stretch, stride = np.dtype((np.void, 4 * count)), self._steps.strides[0]
+        fitting = (self._steps.nbytes - 4 * (first + count)) // stride + 1
+        stretches = np.ndarray((fitting,), stretch, self._steps.data, 4 * first, (stride,))
+        return stretches[rows].view(np.float32).reshape(*rows.shape, count)
 
     def update_priorities(self, rows: Rows, errors: Floats) -> None:
         """PER: takes over the absolute TD errors [B] of transitions drawn from `rows` [B]."""
@@ -297,29 +352,11 @@ class TrajectoryReplay:
             raise ValueError("cannot sample from an empty replay: collect an episode first")
         if self._td is not None:
             return self._td.draw(self.rng.random(count))
-        if len(self._ranks):
-            which = np.searchsorted(
-                self._ranks, self.rng.random(count) * self._ranks[-1], side="right"
-            )
+        if self._by_rank is not None:
+            which = self._by_rank.draw(self.rng.random(count))
             length = self._lengths[which]
             return self._starts[which], (self.rng.random(count) * length).astype(np.int64), length
-        drawn = self.rng.integers(0, total, count)
-        shortest, longest = self._lengths.min(), self._lengths.max()
-        if shortest == longest:
-            which, step = np.divmod(drawn, longest)
-        else:
-            ends = np.cumsum(self._lengths)
-            which = np.searchsorted(ends, drawn, side="right")
-            step = drawn - (ends - self._lengths)[which]
-        return self._starts[which], step, self._lengths[which]
-
-    def _draw_moved(self, count: int) -> tuple[Rows, Rows, Rows]:
-        """As `_draw`, uniform over the transitions of trajectories that have moved."""
-        starts, lengths = self._starts[self._moved], self._lengths[self._moved]
-        ends = np.cumsum(lengths)
-        drawn = self.rng.integers(0, ends[-1], count)
-        which = np.searchsorted(ends, drawn, side="right")
-        return starts[which], drawn - (ends - lengths)[which], lengths[which]
+        return self._all_and_moved()[0].draw(self.rng, count)
 
     def _later_step(self, step: NDArray[np.int64], length: NDArray[np.int64]) -> NDArray[np.int64]:
         """Uniform over the states that follow: step + 1 to the episode's last one."""
@@ -343,7 +380,7 @@ class TrajectoryReplay:
         slack = self._lengths[which] - steps + 1
         offset = (self.rng.random(count) * slack).astype(np.int64)
         rows = (self._starts[which] + offset)[:, None] + np.arange(steps + 1)
-        return self._frames[rows, : self.layout.observation]
+        return self._read(rows, 0, self.layout.observation)
 
     # -- checkpoints ----------------------------------------------------------------------
 
@@ -364,7 +401,7 @@ class TrajectoryReplay:
         steps = ranges(starts, lengths)
         return {
             "lengths": lengths.copy(),
-            "terminated": self._terminal[starts + lengths - 1],
+            "terminated": self._terminal[starts + lengths - 1] > 0,
             "frames": self._frames[ranges(starts, lengths + 1)],
             "actions": self._actions[steps],
             "rewards": self._rewards[steps],
@@ -417,7 +454,7 @@ class TrajectoryReplay:
                 f"trajectory {wanted} must be in the checkpoint's files, as those before it"
             )
         self._priorities = np.array(index["priorities"], np.float64)
-        self._ranks = np.cumsum(rank_weights(self._priorities))
+        self._rank()
         self._find_moved()
         if self._td is not None:
             self._td.load_packed(self._starts, self._lengths, index["td"])
@@ -458,7 +495,7 @@ class TrajectoryReplay:
             "frames": self._frames[:used].copy(),
             "actions": self._actions[:used].copy(),
             "rewards": self._rewards[:used].copy(),
-            "terminal": self._terminal[:used].copy(),
+            "terminal": self._terminal[:used] > 0,
             "starts": self._starts.copy(),
             "lengths": self._lengths.copy(),
             "priorities": self._priorities.copy(),
@@ -488,7 +525,7 @@ class TrajectoryReplay:
         self._starts = np.array(state["starts"], np.int64)
         self._lengths = np.array(state["lengths"], np.int64)
         self._priorities = np.array(state["priorities"], np.float64)
-        self._ranks = np.cumsum(rank_weights(self._priorities))
+        self._rank()
         self._find_moved()
         if self._td is not None:
             self._td.load_state(state["td"])
