@@ -7,7 +7,7 @@ The page's words are in docs/results/page.md. Where that says `{{ KIND NAME }}`,
 the sweep NAME: of all of its runs that any export in docs/results/data has, whichever sweep
 computed them, if tune_configs has a sweep of that name, and else of the export
 docs/results/data/NAME. KIND is `runs`, `success`, `stages`, `curves`, `races` or `effects`, with
-stages behind NAME if not all are meant, or `metric`, with metrics.
+stages behind NAME if not all are meant, `metric`, with metrics, or `search`.
 
     python -m music_rllib.report results/NAME --export docs/results/data/NAME --add
 """
@@ -34,6 +34,7 @@ from music_rllib.reports.figures import files
 from music_rllib.reports.gallery import Drawing, drawing_of_stages, slug, stage_drawings
 from music_rllib.reports.merge import of_plan
 from music_rllib.reports.races import races
+from music_rllib.reports.searches import search_in_words, search_tables
 from music_rllib.reports.survival import Waits, first_passage, median_wait, median_wait_interval
 from music_rllib.reports.verdict import verdict
 from music_rllib.tracking import names
@@ -79,6 +80,7 @@ def page(figures: dict[str, bytes]) -> str:
         "races": races_table,
         "effects": effects_table,
         "metric": metric_table,
+        "search": search_text,
     }
 
     def fill(match: re.Match[str]) -> str:
@@ -335,6 +337,22 @@ def last_value(sweep: Sweep, run: int | None, metric: str) -> float:
         return float("nan")
     _, values = sweep.series(run, metric)
     return float(values[-1]) if len(values) else float("nan")
+
+
+# -- searches ------------------------------------------------------------------------------------
+
+
+def search_text(sweep: Sweep) -> Iterator[str]:
+    """How it searched, its ranking on fresh seeds, importances and trials."""
+    for search in sweep.searches:
+        yield search_in_words(search)
+        for found in search_tables(search):
+            yield f"\n**{found.title}.** {found.note}\n"
+            yield _row(*found.header)
+            yield _rule(len(found.header))
+            yield from (_row(*row) for row in found.rows)
+    yield ""
+    yield provenance(sweep)
 
 
 # -- words ---------------------------------------------------------------------------------------

@@ -90,6 +90,8 @@ class Scope:
     tasks: int
     finals: tuple[Final, ...]
     """Of the conditions with a seed that has finished on every task in the scope."""
+    compared: tuple[Final, ...]
+    """Those that may be held against each other: of a search the ones on fresh seeds."""
     comparisons: tuple[Comparison, ...]
     spread: float | None
     """Standard deviation between seeds; None from single seeds."""
@@ -150,7 +152,7 @@ def _analyse(sweep: Sweep, stage: Stage, rng: np.random.Generator) -> StageAnaly
         for threshold in THRESHOLDS
         if (wait := _wait(sweep, condition, task, threshold, rng)) is not None
     ]
-    groups = {condition.label: condition.runs for condition in stage.conditions}
+    groups = {condition.label: condition.runs for condition in stage.compared}
     found = [
         race
         for task in stage.tasks
@@ -181,11 +183,13 @@ def _scope(
         if len(scores):
             estimate = st.estimate(scores, rng)
             finals.append(Final(condition=condition, scores=scores, estimate=estimate))
+    compared = tuple(final for final in finals if final.condition in stage.compared)
     return Scope(
         name=name,
         tasks=len(tasks),
         finals=tuple(finals),
-        comparisons=_comparisons(finals, rng),
+        compared=compared,
+        comparisons=_comparisons(compared, rng),
         spread=st.pooled_spread([final.scores for final in finals]),
     )
 

@@ -6,6 +6,8 @@
     one row per run: its number, MLflow's id, and a column per tag (`tag.`) and param (`param.`).
 `metrics.csv` or `metrics.parquet`
     one row per value: the run's number, metric, environment steps, value, time in ms.
+`search.json`
+    of a sweep that searched: trials, importance of settings, ranking on fresh seeds.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ __all__ = ["Format", "is_archive", "read_archive", "write_archive"]
 
 Format = Literal["csv", "parquet"]
 VERSION = 1
-_HEADER = "sweep.json"
+_HEADER, _SEARCHES = "sweep.json", "search.json"
 _OWN_FIELDS = ("name", "status", "run_id", "experiment_id", "started", "source", "tags", "config")
 _RUN_FIELDS = ("run_id", "name", "status", "started", "ended")
 _METRICS = {
@@ -78,8 +80,10 @@ def write_archive(sweep: Sweep, folder: Path, file_format: Format = "parquet") -
                 (folder / f"{table}.{stale}").unlink(missing_ok=True)
         _write(_runs_table(sweep.runs), folder / f"runs.{file_format}")
         _write(_metrics_table(sweep), folder / f"metrics.{file_format}")
-        text = json.dumps(header, indent=1, ensure_ascii=False) + "\n"
-        (folder / _HEADER).write_text(text, encoding="utf-8")
+        (folder / _SEARCHES).unlink(missing_ok=True)
+        if sweep.searches:
+            _write_json([_without_place(found) for found in sweep.searches], folder / _SEARCHES)
+        _write_json(header, folder / _HEADER)
     except OSError as error:
         raise ReportError(f"{folder} must be writable: {error}") from error
 
@@ -97,9 +101,24 @@ def read_archive(folder: Path) -> Sweep:
         own = {name: header[name] for name in _OWN_FIELDS}
         runs = _read(folder / f"runs.{header['format']}")
         metrics = _read(folder / f"metrics.{header['format']}", _METRICS)
-        return Sweep(**own, runs=_records(runs), history=_history(metrics, runs.num_rows))
+        searches = folder / _SEARCHES
+        return Sweep(
+            **own,
+            runs=_records(runs),
+            history=_history(metrics, runs.num_rows),
+            searches=json.loads(searches.read_text("utf-8")) if searches.exists() else (),
+        )
     except (OSError, KeyError, TypeError, ValueError, pa.ArrowException) as error:
         raise ReportError(f"{folder} must hold an exported sweep: {error}") from error
+
+
+def _without_place(search: Mapping[str, Any]) -> dict[str, Any]:
+    storage = search.get("storage")
+    return {**search, "storage": None if storage is None else _without_folders(storage)}
+
+
+def _write_json(document: Any, file: Path) -> None:
+    file.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 def _runs_table(runs: Sequence[RunRecord]) -> pa.Table:

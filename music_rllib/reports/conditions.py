@@ -20,6 +20,8 @@ Values = tuple[tuple[str, str], ...]
 
 ENTROPIC_INDEX = "q"
 SIDE_BY_SIDE = "stages side by side"
+SEEDS, FRESH, SEARCHED = "seeds", "fresh", "search"
+"""Of a search: the seeds that trials were chosen by, and those of the ranking at its end."""
 _WITHOUT_TASK_REWARD = ("music-u",)
 # Settings that may be schedules, and so several params: a tag says each in words.
 _IN_WORDS = {
@@ -57,6 +59,16 @@ class Stage:
     seeds: tuple[str, ...]
     conditions: tuple[Condition, ...]
     runs: tuple[int, ...]
+
+    @property
+    def compared(self) -> tuple[Condition, ...]:
+        """Conditions that may be held against each other: of a search those on fresh seeds.
+
+        The best of its trials is so by selection, too, on the seeds that it was chosen by.
+        """
+        if not any(name == SEEDS for one in self.conditions for name, _ in one.others):
+            return self.conditions
+        return tuple(one for one in self.conditions if (SEEDS, FRESH) in one.others)
 
     @property
     def has_task_reward(self) -> bool:
@@ -121,8 +133,7 @@ def find_stages(sweep: Sweep) -> list[Stage]:
         record = sweep.runs[run]
         own = tuple((n, settings[run][n]) for n in varying[record.stage] if n in settings[run])
         if part := record.tags.get(names.TAG_PART):
-            # Trials of a search were chosen by some runs: those on fresh seeds are told apart.
-            own += (("seeds", "fresh" if part.startswith("final") else "search"),)
+            own += ((SEEDS, FRESH if part.startswith("final") else SEARCHED),)
         source = by_key.get(record.tags.get(names.TAG_SOURCE_NODE, ""))
         if source is None or source == run:
             return own

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -168,6 +168,8 @@ class Sweep:
     """The configuration as YAML; None where it was not kept."""
     runs: Sequence[RunRecord] = field(repr=False)
     history: History = field(repr=False)
+    searches: Sequence[Mapping[str, Any]] = field(default=(), repr=False)
+    """What its searches found: trials, importance, ranking; as their driver keeps it."""
 
     def series(self, run: int, metric: str) -> tuple[Ints, Array]:
         """Steps and values of a metric of `runs[run]`, `[points]` each; empty where it has none."""

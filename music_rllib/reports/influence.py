@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from music_rllib.reports.analysis import Final, Scope, StageAnalysis
-from music_rllib.reports.conditions import ENTROPIC_INDEX, Condition
+from music_rllib.reports.conditions import ENTROPIC_INDEX, SEEDS, Condition
 from music_rllib.reports.data import Sweep
 from music_rllib.reports.figures import Panel
 from music_rllib.reports.palette import BARS, colour_of, style_of
@@ -59,11 +59,12 @@ def settings_of(condition: Condition) -> dict[str, str]:
 
 
 def varied(conditions: Sequence[Condition]) -> list[str]:
-    """Settings that have more than one value, q first."""
+    """Settings that have more than one value, q first; which seeds a search used is none."""
     found: dict[str, set[str]] = {}
     for condition in conditions:
         for name, value in settings_of(condition).items():
-            found.setdefault(name, set()).add(value)
+            if name != SEEDS:
+                found.setdefault(name, set()).add(value)
     return [name for name, values in found.items() if len(values) > 1]
 
 

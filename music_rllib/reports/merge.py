@@ -22,11 +22,12 @@ def merged(earlier: Sweep, later: Sweep) -> Sweep:
     """Every run of either; of a run that both have, the finished one, or else the later one.
 
     Runs are the same where their node is: the hash of everything that determines their numbers.
-    The sweep's own fields are those of `later`.
+    The sweep's own fields are those of `later`, what searches found that of the last to have any.
     """
     places = list(_best(_places(earlier) + _places(later)).values())
     runs = [sweep.runs[run] for sweep, run in places]
-    return replace(later, runs=runs, history=_history(places))
+    searches = later.searches or earlier.searches
+    return replace(later, runs=runs, history=_history(places), searches=searches)
 
 
 def of_plan(plan: Plan, exports: Iterable[Sweep]) -> Sweep | None:
@@ -50,7 +51,8 @@ def of_plan(plan: Plan, exports: Iterable[Sweep]) -> Sweep | None:
         own = {names.TAG_SWEEP: plan.name, names.TAG_STAGE: node.stage}
         tags = {**run.tags, **own, names.TAG_TRIAL: str(node.trial)}
         runs.append(replace(run, name=node.label, tags=tags))
-    return replace(places[-1][0], name=plan.name, runs=runs, history=_history(places))
+    last = places[-1][0]
+    return replace(last, name=plan.name, runs=runs, history=_history(places), searches=())
 
 
 def _places(sweep: Sweep) -> list[_Place]:

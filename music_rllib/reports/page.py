@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from typing import Any
 
 from music_rllib.reports.analysis import StageAnalysis, Wait
 from music_rllib.reports.conditions import SIDE_BY_SIDE
@@ -27,6 +28,7 @@ from music_rllib.reports.html import (
 )
 from music_rllib.reports.influence import FEWEST_RUNS, varied
 from music_rllib.reports.pictures import Pictures
+from music_rllib.reports.searches import search_in_words, search_tables
 from music_rllib.reports.statistics import SIGNIFICANCE
 from music_rllib.reports.tables import last_success
 from music_rllib.reports.verdict import interval_text, p_text, verdict
@@ -35,6 +37,10 @@ from music_rllib.tracking import names
 __all__ = ["Report", "render"]
 
 DASH = "–"
+MOST_ROWS = 30
+"""Of a search's table; a longer one is folded."""
+LONG = 40
+"""Characters from which on a cell has several lines."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,6 +67,7 @@ def render(report: Report) -> str:
     """The page as HTML that needs nothing else."""
     sections = [
         _head(report),
+        *map(_search, report.sweep.searches),
         _side_by_side(report),
         # What comes of a sweep is in its last stage.
         *(_stage(report, analysis) for analysis in reversed(report.analyses)),
@@ -97,6 +104,25 @@ def _head(report: Report) -> str:
         links = " ".join(link(s.name, f"#stage-{slug(s.name)}") for s in reversed(stages))
         parts.append(f'<nav class="soft">Stages: {links}</nav>')
     return "".join(parts)
+
+
+def _search(search: Mapping[str, Any]) -> str:
+    parts = [f"<section><h2>Search of stage {text(search['stage'])}</h2>"]
+    parts.append(paragraph(search_in_words(search)))
+    for found in search_tables(search):
+        rows = [[_cell(shown) for shown in row] for row in found.rows]
+        shown = table(found.header, rows, found.note)
+        parts.append(
+            f"<details><summary><strong>{text(found.title)}</strong></summary>{shown}</details>"
+            if len(rows) > MOST_ROWS
+            else f"<h3>{text(found.title)}</h3>{shown}"
+        )
+    return "".join([*parts, "</section>"])
+
+
+def _cell(shown: str) -> Cell:
+    is_number = shown.rstrip(" %").replace(".", "").replace("-", "").isdigit()
+    return _number(shown) if is_number else Cell(text(shown), "long" * (len(shown) > LONG))
 
 
 def _side_by_side(report: Report) -> str:

@@ -7,6 +7,7 @@ large sweep. Where the store is a database, the values are read from its `metric
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import tempfile
@@ -60,19 +61,21 @@ def read_mlflow(
             raise ReportError(_no_such_sweep(client, store, name))
         experiment_id = str(found.experiment_id)
         parent = _parent(client, experiment_id, name, sweep_id)
-        children = _search(client, experiment_id, {names.TAG_PARENT_RUN: parent.info.run_id})
+        run_id = parent.info.run_id
+        children = _search(client, experiment_id, {names.TAG_PARENT_RUN: run_id})
         runs = [_record(run) for run in children]
         return Sweep(
             name=name,
             status=parent.info.status,
-            run_id=parent.info.run_id,
+            run_id=run_id,
             experiment_id=experiment_id,
             started=parent.info.start_time,
             source=store.public_uri,
             tags=dict(parent.data.tags),
-            config=_artefact(client, parent.info.run_id, names.ARTEFACT_SWEEP_CONFIG),
+            config=_artefact(client, run_id, names.ARTEFACT_SWEEP_CONFIG),
             runs=runs,
             history=_history(client, store, children, metrics),
+            searches=json.loads(_artefact(client, run_id, names.ARTEFACT_SEARCH) or "[]"),
         )
     except ReportError:
         raise

@@ -22,14 +22,19 @@ def verdict(scope: Scope, difference: float) -> list[str]:
     where = "over all tasks together" if scope.name == ALL_TASKS else f"on {scope.name}"
     if not scope.finals:
         return [f"No condition has finished {where}: there is nothing to compare yet."]
-    if len(scope.finals) == 1:
-        only = scope.finals[0]
+    if not scope.compared:
+        return [
+            f"Nothing is ranked {where}: no trial of the search has finished on fresh seeds. On "
+            "those that they are chosen by, trials are not compared: the best is so by luck, too."
+        ]
+    if len(scope.compared) == 1:
+        only = scope.compared[0]
         return [f"Only one condition has finished {where}, so nothing is compared: {_said(only)}."]
     return [_ranking(scope, where), *_how_many_seeds(scope, difference)]
 
 
 def _ranking(scope: Scope, where: str) -> str:
-    best = max(scope.finals, key=lambda final: float(final.estimate.value))
+    best = max(scope.compared, key=lambda final: float(final.estimate.value))
     own = [pair for pair in scope.comparisons if best in (pair.first, pair.second)]
     open_pairs = [pair for pair in own if not pair.decided]
     if not open_pairs:
@@ -39,9 +44,9 @@ def _ranking(scope: Scope, where: str) -> str:
             f"no other, and so large a gap comes by chance with {p_text(worst)} at most "
             f"(permutation test, Holm's correction)."
         )
-    lonely = [final for final in scope.finals if final.seeds < 2]
+    lonely = [final for final in scope.compared if final.seeds < 2]
     if lonely:
-        every = len(lonely) == len(scope.finals)
+        every = len(lonely) == len(scope.compared)
         have = "has" if every or len(lonely) == 1 else "have"
         which = "every condition" if every else _names(lonely)
         return (
@@ -65,7 +70,7 @@ def _how_many_seeds(scope: Scope, difference: float) -> list[str]:
     """Where something is undecided: the seeds that would likely decide it."""
     if all(pair.decided for pair in scope.comparisons):
         return []
-    seeds = min(final.seeds for final in scope.finals)
+    seeds = min(final.seeds for final in scope.compared)
     if scope.spread is None:
         return ["How many seeds would decide it can be estimated from two seeds on."]
     if scope.spread == 0:

@@ -48,6 +48,59 @@ stages:
     init_from: pretrain
     grid: {tac.entropic_index: [1.0, 1.5]}
 """
+Q = "tac.entropic_index"
+WORTH = {"name": "iqm of evaluation/success_rate", "direction": "maximize"}
+SEARCHES = [
+    {
+        "stage": "finetune",
+        "mode": "search",
+        "sampler": "tpe",
+        "objectives": [WORTH],
+        "storage": "sqlite:////home/someone/studies/all.db",
+        "arms": [
+            {
+                "values": {},
+                "importance": {Q: 0.9},
+                "trials": [
+                    {
+                        "number": 0,
+                        "state": "judged",
+                        "values": {Q: 1.25},
+                        "objective": [0.8125],
+                        "interval": [[0.75, None]],
+                        "reason": None,
+                    },
+                    {
+                        "number": 1,
+                        "state": "pruned",
+                        "values": {Q: 2.0},
+                        "objective": None,
+                        "reason": "0.1 is not among the best <2>",
+                    },
+                    {
+                        "number": 2,
+                        "state": "waiting",
+                        "values": {},
+                        "objective": None,
+                        "reason": None,
+                    },
+                ],
+            }
+        ],
+        "ranking": [
+            {
+                "trial": 0,
+                "values": {Q: 1.25},
+                "searched": [0.8125],
+                "fresh": [0.6875],
+                "interval": [[0.5, 0.75]],
+                "scores": [[[0.5], [0.75]]],
+            },
+            {"trial": None, "values": {Q: 1.0}, "failure": "no memory"},
+        ],
+    }
+]
+"""As `search.json` has it."""
 FAILED = 3
 """Position of the run that failed."""
 FAILURE = "ValueError: the <simulation> broke"
@@ -92,6 +145,7 @@ def sweep_folder(nodes: list[Node], tmp_path_factory: pytest.TempPathFactory) ->
                 tracker.finish(node.key, "FAILED", failure=FAILURE)
             else:
                 tracker.finish(node.key, "FINISHED")
+        tracker.put_sweep_artefact(names.ARTEFACT_SEARCH, json.dumps(SEARCHES))
     return storage / "tiny"
 
 
@@ -154,14 +208,27 @@ def test_an_exported_sweep_is_the_same_sweep(
     check_content(read_archive(exported), nodes)
     original, again = find_sweep(str(sweep_folder)).sweep, read_archive(exported)
     assert [vars(record) for record in again.runs] == [vars(record) for record in original.runs]
-    assert {f"metrics.{table_format}", f"runs.{table_format}", "sweep.json"} == {
+    assert {f"metrics.{table_format}", f"runs.{table_format}", "sweep.json", "search.json"} == {
         path.name for path in exported.iterdir()
     }
     assert str(sweep_folder.parent) not in (exported / "sweep.json").read_text()
+    assert list(original.searches) == SEARCHES
+    assert again.searches == [SEARCHES[0] | {"storage": "sqlite:///studies/all.db"}]
     (exported / f"metrics.{table_format}").unlink()
     broken = run(exported)
     assert broken.exit_code == 2
     assert f"{exported} must hold an exported sweep" in broken.stderr
+
+
+def test_the_page_shows_what_a_search_found(page: Path) -> None:
+    text = re.sub(r"<[^>]+>", "|", page.read_text().partition("Stage finetune")[0])
+    cells = [cell for cell in text.split("|") if cell]
+    assert "trials: 1 judged, 1 pruned." in text
+    ranked = cells[cells.index("Best is better with") + 1 :]
+    assert ranked[:8] == ["1", "0", "1.25", "0.69", "0.50 to 0.75", "2", "0.81", "–"]
+    assert "failed: no memory" in ranked
+    assert ranked[ranked.index(Q) + 1] == "90 %"
+    assert "0.1 is not among the best &lt;2&gt;" in ranked
 
 
 def test_a_report_needs_neither_ray_nor_mlflow_for_an_exported_sweep(

@@ -17,7 +17,7 @@ from music_rllib.reports.conditions import SIDE_BY_SIDE, find_stages, stage_by_s
 from music_rllib.reports.data import Points, RunRecord, Sweep, columns
 from music_rllib.reports.figures import _drawn
 from music_rllib.reports.gallery import INFLUENCE
-from music_rllib.reports.influence import CHANCE, importances
+from music_rllib.reports.influence import CHANCE, importances, varied
 from music_rllib.reports.missing import planned_runs
 from music_rllib.reports.page import Report, render
 from music_rllib.reports.palette import DARK, LIGHT, colour_of, marker_of
@@ -164,6 +164,34 @@ def test_two_seeds_far_apart_are_no_evidence() -> None:
 )
 def test_too_little_is_said_to_be_too_little(finals: dict[str, list[float]], expected: str) -> None:
     assert expected in said_about(compared(finals))
+
+
+def searched(*runs: tuple[str, int, str, float]) -> Sweep:
+    """A search's runs, as (q, seed, part, final success rate)."""
+    return sweep_of(
+        [(one_run(q, seed, part=part), climbing(final)) for q, seed, part, final in runs]
+    )
+
+
+TRIALS = [("1", 0, "trial0", 0.5), ("1.2", 0, "trial1", 1.0), ("1.4", 0, "trial2", 0.9)]
+
+
+def test_trials_of_a_search_are_not_compared_on_the_seeds_that_chose_them() -> None:
+    sweep = searched(*TRIALS)
+    (analysis,) = analyse(sweep, np.random.default_rng(0))
+    assert (analysis.races, analysis.scopes[0].comparisons) == ((), ())
+    assert len(analysis.scopes[0].finals) == 3, "they are in the table all the same"
+    assert said_about(sweep).startswith("Nothing is ranked on FetchPush: no trial of the search")
+
+
+def test_of_a_search_the_ranking_on_fresh_seeds_is_what_is_said() -> None:
+    fresh = [("1.2", seed, "final1", 0.6) for seed in (7, 8)]
+    fresh += [("1", seed, "final0", 0.7) for seed in (7, 8)]
+    said = said_about(searched(*TRIALS, *fresh))
+    assert "q = 1, seeds = fresh with 0.70" in said
+    assert "1.00" not in said, "the best of the trials, by luck"
+    (stage,) = find_stages(searched(*TRIALS, *fresh))
+    assert varied(stage.conditions) == ["q"]
 
 
 def test_a_run_that_failed_has_no_final_rate_but_counts_as_waiting() -> None:
