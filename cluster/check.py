@@ -195,11 +195,17 @@ def _check_build(name: str, build: Any, compose: Path) -> Problems:
 # -- KubeRay ------------------------------------------------------------------------------------
 
 
+QUANTITY = "io.k8s.apimachinery.pkg.api.resource.Quantity"
+
+
 def kuberay_validator() -> Any:
     """For RayCluster and RayJob, pods included."""
-    core = DRAFT7.create_resource(_schema("kubernetes-1.34.json"))
-    registry: Registry[Any] = Registry().with_resource("kubernetes-1.34.json", core)
-    return jsonschema.Draft7Validator(_schema("kuberay-1.6.json"), registry=registry)
+    own, core = _schema("kuberay-1.6.json"), _schema("kubernetes-1.34.json")
+    # Kubernetes itself takes any number and text for a start.
+    core["definitions"][QUANTITY] = own["definitions"]["Quantity"]
+    resource = DRAFT7.create_resource(core)
+    registry: Registry[Any] = Registry().with_resource("kubernetes-1.34.json", resource)
+    return jsonschema.Draft7Validator(own, registry=registry)
 
 
 def check_kuberay(document: dict[str, Any], _: Path, crds: Crds | None = None) -> Problems:
@@ -219,6 +225,7 @@ def check_kuberay(document: dict[str, Any], _: Path, crds: Crds | None = None) -
     if not problems:
         yield from _check_secret(document)
         yield from _check_groups(document)
+        yield from _check_twins(document)
 
 
 CRD_FILES = {"RayCluster": "ray.io_rayclusters.yaml", "RayJob": "ray.io_rayjobs.yaml"}
@@ -239,6 +246,10 @@ def _check_groups(document: dict[str, Any]) -> Problems:
     place, spec = "spec", document["spec"]
     if document["kind"] == "RayJob":
         place, spec = "spec.rayClusterSpec", spec.get("rayClusterSpec", {})
+    if spec.get("authOptions", {}).get("mode") == "token":
+        version = tuple(map(int, re.findall(r"\d+", spec["rayVersion"])[:2]))
+        if version < (2, 52):
+            yield f"{place}.rayVersion: must be >= 2.52.0 for mode: token, got {spec['rayVersion']}"
     scaled = spec.get("enableInTreeAutoscaling", False)
     for index, group in enumerate(spec.get("workerGroupSpecs", ())):
         where = f"{place}.workerGroupSpecs.{index}"
@@ -247,6 +258,39 @@ def _check_groups(document: dict[str, Any]) -> Problems:
             yield f"{where}.minReplicas: must be <= maxReplicas, {most}, got {least}"
         if scaled and group.get("suspend", False):
             yield f"{where}.suspend: must be false where enableInTreeAutoscaling is true"
+
+
+_TOLD_APART_BY = {
+    **dict.fromkeys(("containers", "initContainers", "volumes", "env"), ("name",)),
+    "volumeMounts": ("mountPath",),
+    "ports": ("containerPort", "port", "protocol"),  # of containers, of services
+}
+"""Lists of a pod whose entries must differ in these keys."""
+
+
+def _check_twins(value: Any, place: str = "") -> Problems:
+    """What the API server refuses in lists that are maps to it."""
+    if isinstance(value, list):
+        for index, inner in enumerate(value):
+            yield from _check_twins(inner, f"{place}.{index}")
+    if not isinstance(value, dict):
+        return
+    for name, inner in value.items():
+        where = f"{place}.{name}".removeprefix(".")
+        yield from _check_twins(inner, where)
+        if name in _TOLD_APART_BY and isinstance(inner, list):
+            yield from _check_list(inner, where, _TOLD_APART_BY[name])
+
+
+def _check_list(entries: list[Any], place: str, keys: tuple[str, ...]) -> Problems:
+    seen = set()
+    for index, entry in enumerate(entries):
+        values = tuple(entry.get(key, "TCP" if key == "protocol" else None) for key in keys)
+        if values in seen:
+            pairs = zip(keys, values, strict=True)
+            told = " and ".join(f"{key} {value}" for key, value in pairs if value is not None)
+            yield f"{place}.{index}: must be the only one with {told}"
+        seen.add(values)
 
 
 def read_crds(folder: Path) -> Crds:
@@ -287,7 +331,13 @@ def _strict(schema: Any) -> Any:
         return schema
     strict = {key: _strict(inner) for key, inner in schema.items()}
     if strict.get("x-kubernetes-int-or-string"):
-        strict = {"type": ["integer", "string"]}
+        pattern = {key: strict[key] for key in ("pattern",) if key in strict}
+        strict = {"type": ["integer", "string"], **pattern}
+    fields = strict.get("properties")
+    if isinstance(fields, dict) and isinstance(strict.get("required"), list):
+        # Defaults are filled in before anything is checked.
+        given = [name for name in strict["required"] if "default" not in fields.get(name, {})]
+        strict["required"] = given
     if "properties" in strict and "additionalProperties" not in strict:
         # `metadata` is declared without its fields.
         strict["additionalProperties"] = False

@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 import yaml
+from jsonschema import Draft7Validator
 
 import music_rllib
 from cluster.check import (
@@ -85,6 +86,9 @@ def put(place: str, value: Any) -> Change:
     return change
 
 
+A = {"name": "A", "value": "b"}
+PORT, UDP, TCP = {"containerPort": 8000}, {"protocol": "UDP"}, {"protocol": "TCP"}
+MOUNT = {"name": "results", "mountPath": "/x"}
 HEAD = "spec/headGroupSpec/template/spec/containers/0"
 JOB_HEAD = f"spec/rayClusterSpec/{HEAD.removeprefix('spec/')}"
 NODE = "available_node_types/cpu/node_config"
@@ -127,6 +131,18 @@ NODE = "available_node_types/cpu/node_config"
         (JOB, put("spec/entrypoint", ""), "entrypoint"),
         (JOB, put("spec/rayClusterSpec/authOptions/enableK8sTokenAuth", True), "enableK8sToken"),
         (RAY, put("spec/rayVersion", "latest"), "latest"),
+        (RAY, put("spec/rayVersion", "2.51.0"), "rayVersion: must be >= 2.52.0 for mode: token"),
+        (RAY, put("metadata/name", "r" * 54), "metadata.name"),
+        (JOB, put("metadata/name", "j" * 48), "metadata.name"),
+        (RAY, put(f"{HEAD}/resources/limits/cpu", 0.5), "resources.limits.cpu"),
+        (RAY, put(f"{HEAD}/resources/limits/memory", "8 GB"), "resources.limits.memory"),
+        (RAY, put(f"{HEAD}/env", [A, A]), "env.1: must be the only one with name A"),
+        (
+            RAY,
+            put(f"{HEAD}/ports", [PORT, PORT | UDP, PORT | TCP]),
+            "ports.2: must be the only one",
+        ),
+        (JOB, put(f"{JOB_HEAD}/volumeMounts", [MOUNT, MOUNT]), "with mountPath /x"),
         (RAY, put("spec/authOptions", {"enableK8sTokenAuth": True}), "'mode' is a required"),
         (
             RAY,
@@ -282,6 +298,27 @@ def test_what_is_far_from_any_schema_is_a_problem_and_no_crash(
     assert any(expected in problem for problem in problems), problems
 
 
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        (RAY, put("metadata/name", "r" * 53)),
+        (JOB, put("metadata/name", "j" * 47)),
+        (RAY, put(f"{HEAD}/resources/limits", {"cpu": "500m", "memory": "1.5Gi", "x.y/z": 1})),
+        (RAY, put(f"{HEAD}/resources/limits", {"cpu": ".5", "memory": "2e9"})),
+        (RAY, put(f"{HEAD}/ports", [PORT, PORT | UDP])),
+        (RAY, put("spec/rayVersion", "2.100.0")),
+        (
+            RAY,
+            put("spec/headGroupSpec/headService", {"spec": {"ports": [{"port": 1}, {"port": 2}]}}),
+        ),
+    ],
+)
+def test_every_form_that_kuberay_knows_is_taken(name: str, change: Change) -> None:
+    document = load(name)
+    change(document)
+    assert check_document(document, CLUSTER / name) == []
+
+
 def test_a_secret_of_the_clusters_name_is_a_problem() -> None:
     document = load(RAY)
     put(f"{HEAD}/envFrom/0/secretRef/name", "music-rllib")(document)
@@ -310,6 +347,22 @@ def test_files_are_held_against_kuberays_own_crds(tmp_path: Path) -> None:
     assert check_file(CLUSTER / "serve.yaml", read_crds(folder)) == []
     (problem,) = check_file(CLUSTER / JOB, read_crds(crds(tmp_path, **top)))
     assert "'spec' was unexpected" in problem
+
+
+def test_crds_apply_their_defaults_and_the_form_of_quantities(tmp_path: Path) -> None:
+    cpu = {"x-kubernetes-int-or-string": True, "pattern": "^[0-9]+m?$"}
+    spec = {
+        "type": "object",
+        "required": ["cpu", "minReplicas"],
+        "properties": {"cpu": cpu, "minReplicas": {"type": "integer", "default": 0}},
+    }
+    schema = read_crds(crds(tmp_path, spec=spec))["RayCluster"]
+    told = {
+        value: Draft7Validator(schema).is_valid({"spec": {"cpu": value}})
+        for value in (1, "500m", "8 GB", 0.5)
+    }
+    assert told == {1: True, "500m": True, "8 GB": False, 0.5: False}
+    assert not Draft7Validator(schema).is_valid({"spec": {}})
 
 
 @pytest.mark.parametrize(
