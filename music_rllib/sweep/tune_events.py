@@ -85,6 +85,12 @@ class TuneEvents(Callback):
         self, iteration: int, trials: list[Trial], trial: Trial, **info: Any
     ) -> None:
         """The trial says that it is done; the store has the last word."""
+        try:
+            self._completed(trial)
+        finally:
+            _let_go(trial)
+
+    def _completed(self, trial: Trial) -> None:
         node = self._node(trial)
         if (cause := trial.last_result.get(CAUSE)) is not None:
             self._fail(node, cause, trial.last_result[TRACEBACK])
@@ -159,3 +165,10 @@ def _text_of(trial: Trial) -> str:
         return Path(trial.error_file).read_text(encoding="utf-8")
     except OSError as error:
         return f"The cause is unknown: {error}"
+
+
+def _let_go(trial: Trial) -> None:
+    """Tune keeps every trial; of one that is done nobody needs averages and reported lines."""
+    known = trial.run_metadata
+    known.metric_analysis, known.metric_n_steps = {}, {}
+    known.last_result = {**known.last_result, REPORTS: "", NOTES: []}
