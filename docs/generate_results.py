@@ -343,9 +343,12 @@ def last_value(sweep: Sweep, run: int | None, metric: str) -> float:
 
 
 def search_text(sweep: Sweep) -> Iterator[str]:
-    """How it searched, its ranking on fresh seeds, importances and trials."""
+    """How it searched, its ranking on fresh seeds, importances, trials, and what may be said."""
+    analyses = {found.stage.name: found for found in analyse(sweep, np.random.default_rng(0))}
     for search in sweep.searches:
         yield search_in_words(search)
+        for scope in analyses[search["stage"]].scopes:
+            yield f"\n{' '.join(verdict(scope, DIFFERENCE))}"
         for found in search_tables(search):
             yield f"\n**{found.title}.** {found.note}\n"
             yield _row(*found.header)
