@@ -9,7 +9,7 @@ from itertools import product
 
 import numpy as np
 
-from music_rllib.reports.analysis import Curve, StageAnalysis, curve
+from music_rllib.reports.analysis import Curve, Scope, StageAnalysis, curve
 from music_rllib.reports.conditions import Condition, Stage, side_by_side
 from music_rllib.reports.data import Sweep
 from music_rllib.reports.figures import (
@@ -76,15 +76,33 @@ def stage_drawings(
     sweep: Sweep, analysis: StageAnalysis, rng: np.random.Generator
 ) -> Iterator[Drawing]:
     """The figures for which there is something to draw or to compare."""
-    stage = analysis.stage
+    stage = _shown(sweep, analysis.stage)
     found = _all_curves(sweep, stage, rng)
     for metric in METRICS:
         drawing = _curves(stage, metric, found, styles_of(stage.conditions))
         if drawing is not None:
             yield drawing
-    scopes = [scope for scope in analysis.scopes if len(scope.finals) > 1]
-    if not scopes:
-        return
+    of_shown = [replace(s, finals=s.compared) if s.compared else s for s in analysis.scopes]
+    scopes = [scope for scope in of_shown if len(scope.finals) > 1]
+    if scopes:
+        yield from _finals(stage, scopes, rng)
+    if any(len(scope.finals) > 1 for scope in analysis.scopes):
+        yield from _influence(sweep, analysis)
+
+
+def _shown(sweep: Sweep, stage: Stage) -> Stage:
+    """Of a search only what is ranked, as soon as there is any: its trials are too many to see."""
+    if stage.compared in ((), stage.conditions):
+        return stage
+    seeds = {sweep.runs[run].seed for one in stage.compared for run in one.runs}
+    return replace(
+        stage,
+        conditions=stage.compared,
+        seeds=tuple(seed for seed in stage.seeds if seed in seeds),
+    )
+
+
+def _finals(stage: Stage, scopes: Sequence[Scope], rng: np.random.Generator) -> Iterator[Drawing]:
     legend = _legend(stage)
     yield Drawing(
         stage=stage.name,
@@ -101,7 +119,6 @@ def stage_drawings(
         panels=tuple(profile_panel(scope, stage.conditions, rng) for scope in scopes),
         legend=legend,
     )
-    yield from _influence(sweep, analysis)
 
 
 def drawing_of_stages(

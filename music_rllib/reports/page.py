@@ -148,6 +148,10 @@ def _stage(report: Report, analysis: StageAnalysis) -> str:
             "soft",
         ),
     ]
+    if stage.compared not in ((), stage.conditions):
+        parts.append(
+            paragraph("Curves and comparisons are of the runs on fresh seeds; tables have all.")
+        )
     if not stage.has_task_reward:
         parts.append(paragraph("It trains without the task's reward: success is not its aim."))
     for scope in analysis.scopes:

@@ -194,6 +194,17 @@ def test_of_a_search_the_ranking_on_fresh_seeds_is_what_is_said() -> None:
     assert varied(stage.conditions) == ["q"]
 
 
+def test_of_a_search_the_ranking_is_drawn_as_soon_as_there_is_one() -> None:
+    fresh = [(q, seed, "final1", 0.6) for q in ("1", "1.2") for seed in (7, 8)]
+
+    def drawn(sweep: Sweep) -> set[str]:
+        (curves, *_) = report_on(sweep).drawings
+        return {label for label, _ in curves.legend}
+
+    assert drawn(searched(*TRIALS)) == {f"q = {q}, seeds = search" for q in ("1", "1.2", "1.4")}
+    assert drawn(searched(*TRIALS, *fresh)) == {f"q = {q}, seeds = fresh" for q in ("1", "1.2")}
+
+
 def test_a_run_that_failed_has_no_final_rate_but_counts_as_waiting() -> None:
     failed = one_run("1", 1, status="FAILED")
     sweep = sweep_of([(one_run("1", 0), climbing(0.9)), (failed, climbing(0.9, upto=60_000))])
