@@ -80,7 +80,7 @@ def page(figures: dict[str, bytes]) -> str:
         "races": races_table,
         "effects": effects_table,
         "metric": metric_table,
-        "search": search_text,
+        "search": lambda sweep: search_text(sweep, figures),
     }
 
     def fill(match: re.Match[str]) -> str:
@@ -342,9 +342,10 @@ def last_value(sweep: Sweep, run: int | None, metric: str) -> float:
 # -- searches ------------------------------------------------------------------------------------
 
 
-def search_text(sweep: Sweep) -> Iterator[str]:
+def search_text(sweep: Sweep, figures: dict[str, bytes]) -> Iterator[str]:
     """How it searched, its ranking on fresh seeds, importances, trials, and what may be said."""
-    analyses = {found.stage.name: found for found in analyse(sweep, np.random.default_rng(0))}
+    rng = np.random.default_rng(0)
+    analyses = {found.stage.name: found for found in analyse(sweep, rng)}
     for search in sweep.searches:
         yield search_in_words(search)
         for scope in analyses[search["stage"]].scopes:
@@ -354,7 +355,11 @@ def search_text(sweep: Sweep) -> Iterator[str]:
             yield _row(*found.header)
             yield _rule(len(found.header))
             yield from (_row(*row) for row in found.rows)
-    yield ""
+        yield ""
+        for drawing in stage_drawings(sweep, analyses[search["stage"]], rng):
+            if drawing.title == "Importance of settings":
+                yield from figure(sweep, drawing, figures)
+                yield ""
     yield provenance(sweep)
 
 

@@ -305,7 +305,13 @@ def _column(texts: Sequence[str]) -> tuple[list[float], list[tuple[float, str]]]
     shown = distinct
     if len(distinct) > 6:
         shown = [distinct[i] for i in np.linspace(0, len(distinct) - 1, 6).astype(int)]
-    return [height[text] for text in texts], [(height[text], text[:12]) for text in shown]
+    return [height[text] for text in texts], [(height[t], _tick(t)) for t in shown]
+
+
+def _tick(text: str) -> str:
+    """What a search draws has six digits."""
+    number = _number(text)
+    return f"{number:.3g}" if number is not None and len(text) > 6 and "." in text else text[:12]
 
 
 def _short(name: str) -> str:
