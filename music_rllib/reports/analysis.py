@@ -170,7 +170,7 @@ def analyse_stages(
     Returns:
         None where there is nothing to compare.
     """
-    together = stage_by_stage(stages)
+    together = stage_by_stage(sweep, stages)
     return None if together is None else _analyse(sweep, together, rng)
 
 

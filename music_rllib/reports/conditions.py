@@ -95,21 +95,34 @@ def side_by_side(stages: Sequence[Stage]) -> Stage | None:
     )
 
 
-def stage_by_stage(stages: Sequence[Stage]) -> Stage | None:
+def stage_by_stage(sweep: Sweep, stages: Sequence[Stage]) -> Stage | None:
     """Each stage that trains for the task as one condition: its runs of what all of them have.
 
-    So stages are compared over the same q and settings; None where they have none in common.
+    So on each task stages are compared over the same q and settings; None where they have none in
+    common.
     """
     together = side_by_side(stages)
     compared = [stage for stage in stages if stage.has_task_reward]
-    labels = [{condition.label for condition in stage.conditions} for stage in compared]
-    if together is None or not (shared := set.intersection(*labels)):
+    cells = [
+        {
+            (sweep.runs[run].task, condition.label)
+            for condition in stage.conditions
+            for run in condition.runs
+        }
+        for stage in compared
+    ]
+    if together is None or not (shared := set.intersection(*cells)):
         return None
     conditions = [
         Condition(
             entropic_index="",
             others=(("stage", stage.name),),
-            runs=tuple(r for one in stage.conditions if one.label in shared for r in one.runs),
+            runs=tuple(
+                run
+                for one in stage.conditions
+                for run in one.runs
+                if (sweep.runs[run].task, one.label) in shared
+            ),
         )
         for stage in compared
     ]

@@ -430,7 +430,26 @@ def test_stages_race_over_the_conditions_that_all_of_them_have() -> None:
     shown = render(report)
     before, over = (f"stage = reward {word} stage = plain" for word in ("before", "over"))
     assert shown.index(before) < shown.index(over) < shown.index("Stage plain")
-    assert stage_by_stage(find_stages(of_stages("plain"))) is None
+    plain = of_stages("plain")
+    assert stage_by_stage(plain, find_stages(plain)) is None
+
+
+def test_stages_are_compared_over_what_both_have_on_each_task() -> None:
+    """Otherwise what q does would pass for what the stage does."""
+    cells = [
+        *(("plain", "FetchPush", q) for q in ("1", "1.5")),
+        *(("reward", "FetchPush", q) for q in ("1", "1.5")),
+        ("plain", "FetchSlide", "1.5"),
+        *(("reward", "FetchSlide", q) for q in ("1", "1.5")),
+    ]
+    sweep = sweep_of(
+        [(one_run(q, 0, stage=stage, task=task), climbing(0.9)) for stage, task, q in cells]
+    )
+    together = stage_by_stage(sweep, find_stages(sweep))
+    assert together is not None
+    for condition in together.conditions:
+        found = [(sweep.runs[run].task, sweep.runs[run].entropic_index) for run in condition.runs]
+        assert found == [("FetchPush", "1"), ("FetchPush", "1.5"), ("FetchSlide", "1.5")]
 
 
 def test_a_legend_stays_inside_its_figure() -> None:
