@@ -210,6 +210,12 @@ DRIVER = """
 
     folder = Path(sys.argv[1])
     search = {"storage": sys.argv[2], "study": "together", "trials": 24, "concurrent": 6}
+    # Together: one that is ready sooner could do all before the other has begun.
+    (folder / "ready").touch()
+    patience = time.monotonic() + 120
+    while len(list(folder.parent.glob("*/ready"))) < 2:
+        assert time.monotonic() < patience, "the other driver never came"
+        time.sleep(0.01)
     driver = Driver(folder, document(search), seed=int(sys.argv[3]))
     while not driver.campaign.over:
         try:
