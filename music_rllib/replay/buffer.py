@@ -117,7 +117,7 @@ class _Places:
             which, step = np.divmod(drawn, self.lengths[0])
         else:
             which = np.searchsorted(self.ends, drawn, side="right")
-            step = drawn - (self.ends - self.lengths)[which]
+            step = drawn - (self.ends[which] - self.lengths[which])
         return self.starts[which], step, self.lengths[which]
 
 

@@ -110,7 +110,7 @@ def _search(search: Mapping[str, Any]) -> str:
     parts = [f"<section><h2>Search of stage {text(search['stage'])}</h2>"]
     parts.append(paragraph(search_in_words(search)))
     for found in search_tables(search):
-        rows = [[_cell(shown) for shown in row] for row in found.rows]
+        rows = [[_search_cell(shown) for shown in row] for row in found.rows]
         shown = table(found.header, rows, found.note)
         parts.append(
             f"<details><summary><strong>{text(found.title)}</strong></summary>{shown}</details>"
@@ -120,7 +120,7 @@ def _search(search: Mapping[str, Any]) -> str:
     return "".join([*parts, "</section>"])
 
 
-def _cell(shown: str) -> Cell:
+def _search_cell(shown: str) -> Cell:
     is_number = shown.rstrip(" %").replace(".", "").replace("-", "").isdigit()
     return _number(shown) if is_number else Cell(text(shown), "long" * (len(shown) > LONG))
 
