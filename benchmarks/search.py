@@ -1,8 +1,12 @@
-"""A search of many tiny trials: whether the driver's memory and time per trial stay flat."""
+"""A search of many tiny trials: whether the driver's memory and time per trial stay flat.
+
+`python -m benchmarks.search 600` runs as many trials.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import copy
 import json
 import statistics
 import subprocess
@@ -17,13 +21,14 @@ import psutil
 import ray
 import yaml
 
-from benchmarks.measure import Row
+from benchmarks.measure import Row, ratio_row
 
 __all__ = ["rows"]
 
 GROUP = "search"
 TRIALS, SETTLED, AT_A_TIME = 200, 40, 2
 """Until `SETTLED` the driver imports and caches what it does once."""
+FLAT = 1.1
 LOOK_SECONDS = 1.0
 DOCUMENT: dict[str, Any] = {
     "name": "search",
@@ -47,7 +52,6 @@ DOCUMENT: dict[str, Any] = {
                     "tac.alpha": {"float": [0.01, 0.5], "log": True},
                 },
                 "objective": {"metric": "evaluation/episode_return", "aggregate": "mean"},
-                "trials": TRIALS,
                 "final": None,
             },
         }
@@ -64,33 +68,43 @@ class Look(NamedTuple):
     memory_mb: float
 
 
-def rows(repeats: int) -> Iterator[Row]:
-    """One round, which takes some ten minutes."""
+def rows(repeats: int, trials: int = TRIALS) -> Iterator[Row]:
+    """One round; 200 trials take some seven minutes."""
     del repeats
     ray.shutdown()  # the sweep brings its own
-    looks = watched_search()
-    settled = [look for look in looks if look.trials >= SETTLED]
-    begin, end = settled[0], settled[-1]
+    looks = watched_search(trials)
+    # With the last trial judged, the importance of settings and the report are worked out.
+    searching = [look for look in looks if SETTLED <= look.trials < trials]
+    begin, end = searching[0], searching[-1]
     passed = end.trials - begin.trials
+    yield ratio_row(
+        GROUP, f"driver's memory after {end.trials} trials", end.memory_mb, "MB",
+        against=f"after {begin.trials} trials", ratios=[end.memory_mb / begin.memory_mb],
+        at_most=FLAT,
+    )  # fmt: skip
     growth, _ = statistics.linear_regression(
-        [look.trials for look in settled], [look.memory_mb for look in settled]
+        [look.trials for look in searching], [look.memory_mb for look in searching]
     )
-    yield Row(GROUP, f"driver's memory after {begin.trials} trials", begin.memory_mb, "MB")
-    yield Row(GROUP, f"driver's memory after {end.trials} trials", end.memory_mb, "MB")
     yield Row(GROUP, "its growth, a trial", growth, "MB")
+    most = max(look.memory_mb for look in looks)
+    yield Row(GROUP, "its largest, with the analyses at the end", most, "MB")
     yield Row(GROUP, "driver's CPU, a trial", (end.cpu_seconds - begin.cpu_seconds) / passed, "s")
-    middle = min(settled, key=lambda look: abs(look.trials - (begin.trials + end.trials) / 2))
+    middle = min(searching, key=lambda look: abs(look.trials - (begin.trials + end.trials) / 2))
     early = (middle.seconds - begin.seconds) / (middle.trials - begin.trials)
     late = (end.seconds - middle.seconds) / (end.trials - middle.trials)
-    yield Row(GROUP, f"wall time a trial, {AT_A_TIME} at a time", late, "s",
-              against="the first half's", ratio=late / early)  # fmt: skip
+    yield ratio_row(
+        GROUP, f"wall time a trial, {AT_A_TIME} at a time", late, "s",
+        against="the first half's", ratios=[late / early], at_most=FLAT,
+    )  # fmt: skip
 
 
-def watched_search() -> list[Look]:
+def watched_search(trials: int) -> list[Look]:
     """Look at a whole search's driver from outside."""
+    document = copy.deepcopy(DOCUMENT)
+    document["stages"][0]["search"]["trials"] = trials
     with TemporaryDirectory() as folder:
         file = Path(folder, "search.yaml")
-        file.write_text(yaml.safe_dump(DOCUMENT | {"storage": f"{folder}/results"}))
+        file.write_text(yaml.safe_dump(document | {"storage": f"{folder}/results"}))
         state = Path(folder, "results", DOCUMENT["name"], "state.json")
         command = [sys.executable, "-m", "music_rllib.sweep", str(file)]
         driver = subprocess.Popen(command, stdout=subprocess.DEVNULL)
@@ -121,5 +135,5 @@ def _look(driver: psutil.Process, state: Path, begin: float) -> list[Look]:
 
 
 if __name__ == "__main__":
-    for row in rows(1):
+    for row in rows(1, *map(int, sys.argv[1:])):
         print(row)
