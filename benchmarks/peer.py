@@ -42,8 +42,8 @@ def ours(replay_ratio: float, precision: str = "float32") -> Callable[[], int]:
     return some_more
 
 
-def rllib_sac(*, plain: bool) -> Callable[[], int]:
-    """RLlib's SAC at one update an environment step, without hindsight (it has none)."""
+def rllib_sac(env_steps: int, updates: int, *, plain: bool) -> Callable[[], int]:
+    """RLlib's SAC with so many updates after so many steps, without hindsight (it has none)."""
     import gymnasium as gym
     from ray.rllib.algorithms.sac import SACConfig
     from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
@@ -59,10 +59,11 @@ def rllib_sac(*, plain: bool) -> Callable[[], int]:
         return gym.wrappers.FlattenObservation(kept)
 
     register_env("flat-push", flat)
-    config = SACConfig().environment("flat-push").env_runners(num_env_runners=0)
+    config = SACConfig().environment("flat-push")
+    config.env_runners(num_env_runners=0, rollout_fragment_length=env_steps)
     config.training(
         train_batch_size_per_learner=BATCH,
-        training_intensity=BATCH,
+        training_intensity=BATCH * updates / env_steps,
         num_steps_sampled_before_learning_starts=WARM_UP,
         initial_alpha=0.05,
     )
@@ -116,8 +117,10 @@ PEERS: dict[str, Callable[[], Callable[[], int]]] = {
     "ours": lambda: ours(1.0),
     "ours, ratio 0.4": lambda: ours(0.4),
     "ours, bf16": lambda: ours(1.0, "bf16"),
-    "RLlib SAC": lambda: rllib_sac(plain=False),
-    "RLlib SAC, same networks": lambda: rllib_sac(plain=True),
+    "RLlib SAC": lambda: rllib_sac(1, 1, plain=False),
+    "RLlib SAC, same networks": lambda: rllib_sac(1, 1, plain=True),
+    "RLlib SAC, ratio 0.4": lambda: rllib_sac(5, 2, plain=False),
+    "RLlib SAC, same networks, ratio 0.4": lambda: rllib_sac(5, 2, plain=True),
     "SB3 SAC+HER": lambda: sb3_sac(1, 1),
     "SB3 SAC+HER, ratio 0.4": lambda: sb3_sac(5, 2),
 }

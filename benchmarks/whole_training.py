@@ -23,6 +23,8 @@ COMPARED = (
     ("ours", "RLlib SAC", None),
     ("ours", "RLlib SAC, same networks", 5.0),
     ("ours", "SB3 SAC+HER", 1.5),
+    ("ours, ratio 0.4", "RLlib SAC, ratio 0.4", None),
+    ("ours, ratio 0.4", "RLlib SAC, same networks, ratio 0.4", None),
     ("ours, ratio 0.4", "SB3 SAC+HER, ratio 0.4", None),
     ("ours, bf16", "ours", None),
 )
