@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import time
+import weakref
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -50,8 +51,13 @@ def open_studies(
         file = _file_of(parsed)
         if must_exist and file is not None and not file.is_file():
             raise StorageError(f"{setting} must be an sqlite file that is there, got {redact(url)}")
-        # With a cache of ended trials.
-        return get_storage(_with_tables(parsed, make=not must_exist))
+        if must_exist and not _has_studies(parsed):
+            raise StorageError(f"{setting} must be a database with studies, got {redact(url)}")
+        database = _with_tables(parsed, make=not must_exist)
+        storage = get_storage(database)  # with a cache of ended trials
+        # Optuna leaves its connections open, of which Python >= 3.13 warns.
+        weakref.finalize(storage, database.engine.dispose)
+        return storage
 
 
 def open_older(url: str) -> BaseStorage:
@@ -88,13 +94,17 @@ def known_studies(url: str, *, must_exist: bool = False) -> list[str]:
                     f"{setting} must be in a folder that can be written, got {redact(url)}"
                 )
             return []
-        engine = create_engine(parsed, **_engine_options(parsed))
-        try:
-            if not inspect(engine).has_table("studies"):
-                return []
-        finally:
-            engine.dispose()
+        if not _has_studies(parsed):
+            return []
         return [one.study_name for one in studies_of(open_studies(url))]
+
+
+def _has_studies(url: URL) -> bool:
+    engine = create_engine(url, **_engine_options(url))
+    try:
+        return inspect(engine).has_table("studies")
+    finally:
+        engine.dispose()
 
 
 def studies_of(storage: BaseStorage) -> list[Any]:

@@ -541,7 +541,7 @@ def test_a_warm_start_from_what_is_not_there(tmp_path: Path) -> None:
         Driver(tmp_path, document({"warm_start": warm_from(tmp_path, "x")}, name="warm"))
     (tmp_path / "other.db").touch()
     search = {"warm_start": {"study": "s", "storage": str(tmp_path / "other.db")}}
-    with pytest.raises(StorageError, match=r"warm_start.storage must be a database that can be"):
+    with pytest.raises(StorageError, match=r"warm_start.storage must be a database with studies"):
         Driver(tmp_path, document(search))
     assert (tmp_path / "other.db").stat().st_size == 0
 
