@@ -33,7 +33,7 @@ GROUPS = {
 }
 EXAMPLES = """\
 examples:
-  python -m benchmarks                       the whole table, about 40 minutes on an idle machine
+  python -m benchmarks                       the whole table, half an hour on an idle machine
   python -m benchmarks step environment      two groups of it
   python -m benchmarks --repeats 9 step      more turns
 
