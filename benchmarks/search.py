@@ -73,8 +73,8 @@ def rows(repeats: int, trials: int = TRIALS) -> Iterator[Row]:
     del repeats
     ray.shutdown()  # the sweep brings its own
     looks = watched_search(trials)
-    # With the last trials judged, the importance of settings and the report are worked out.
-    searching = [look for look in looks if SETTLED <= look.trials <= trials - AT_A_TIME]
+    # After the last trials, which the state tells of a little later, come importances and report.
+    searching = [look for look in looks if SETTLED <= look.trials < trials - 2 * AT_A_TIME]
     begin, end = searching[0], searching[-1]
     passed = end.trials - begin.trials
     yield ratio_row(
