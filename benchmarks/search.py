@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import copy
 import json
@@ -134,6 +135,16 @@ def _look(driver: psutil.Process, state: Path, begin: float) -> list[Look]:
     return [Look(judged, time.monotonic() - begin, cpu.user + cpu.system, used)]
 
 
-if __name__ == "__main__":
-    for row in rows(1, *map(int, sys.argv[1:])):
+def main() -> None:
+    """Print the rows of a search with as many trials as are asked for."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.search", description=__doc__)
+    parser.add_argument("trials", nargs="?", type=int, default=TRIALS, help=f"default {TRIALS}")
+    trials = parser.parse_args().trials
+    if trials < 2 * SETTLED:
+        parser.error(f"trials must be >= {2 * SETTLED}, got {trials}")
+    for row in rows(1, trials):
         print(row)
+
+
+if __name__ == "__main__":
+    main()
