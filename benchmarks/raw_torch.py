@@ -12,6 +12,7 @@ from torch import Tensor
 from music_rllib.tac import losses
 from music_rllib.tac.distribution import sample_squashed
 from music_rllib.tac.networks import Critics, Perceptron, RunningNormaliser
+from music_rllib.tac.optimizer import FusedAdam
 from music_rllib.tsallis import ln_q_of_policy
 
 HIDDEN = (256, 256, 256)
@@ -33,7 +34,7 @@ class RawUpdate:
         self.normaliser = RunningNormaliser(inputs, epsilon=0.01, clip=5.0)
         self.normaliser.update(torch.randn(1000, inputs))
         trained = [*self.policy.parameters(), *self.critics.parameters(), *self.value.parameters()]
-        self.optimizer = torch.optim.Adam(trained, lr=1e-3, fused=True)
+        self.optimizer = FusedAdam(trained, lr=1e-3)
         self.targets: list[Tensor] = list(self.target.parameters())
         self.online: list[Tensor] = list(self.value.parameters())
         self.obs, self.next_obs = torch.randn(2, batch, inputs)

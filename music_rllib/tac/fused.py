@@ -31,6 +31,7 @@ try:
     _linear_pointwise: Any = torch.ops.mkldnn._linear_pointwise.default
 except AttributeError:
     _linear_pointwise = None
+_shuffle_channels = torch.ops.aten.native_channel_shuffle.default
 _pass_where_positive = torch.ops.aten.threshold_backward.grad_input
 
 
@@ -40,7 +41,7 @@ def is_fused(inputs: Tensor) -> bool:
         inputs.device.type == "cpu"
         and inputs.dtype == torch.float32
         and inputs.ndim == 2
-        and len(inputs) >= FEWEST_ROWS
+        and inputs.shape[0] >= FEWEST_ROWS
         and _has_onednn()
     )
 
@@ -55,57 +56,75 @@ def _has_onednn() -> bool:
     )
 
 
-def perceptron(
-    inputs: Tensor,
-    weights: Sequence[Tensor],
-    biases: Sequence[Tensor],
-    *,
-    learned: Tensor | None = None,
-) -> Tensor:
+def perceptron(inputs: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> Tensor:
     """ReLU between the layers, a linear output; can be differentiated once.
 
     Args:
         inputs: [B, I], for which `is_fused`.
         weights: of each layer [H, I], as `nn.Linear` has them; of C networks at once [C, I, H].
         biases: of each layer [H], or [C, 1, H].
-        learned: [B', I] that stand before the inputs. Weights and biases then have their gradients
-            from these alone, which get none themselves.
 
     Returns:
-        [B, O], or [C, B, O]; with B' + B rows where there are `learned` ones.
+        [B, O], or [C, B, O].
     """
-    output: Tensor = _Perceptron.apply(inputs, learned, *weights, *biases)  # type: ignore[no-untyped-call]
+    output: Tensor = _Perceptron.apply(inputs, None, *weights, *biases)  # type: ignore[no-untyped-call]
     return output
+
+
+def learn_and_ask(
+    learned: Tensor, asked: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]
+) -> tuple[Tensor, Tensor]:
+    """C networks on two minibatches at once: [B, I] -> [C, B, O] each.
+
+    Args:
+        learned: weights and biases get their gradients from these, which get none.
+        asked: get gradients, and give none to weights and biases.
+        weights: of each layer [C, I, H].
+        biases: of each layer [C, 1, H].
+    """
+    outputs: tuple[Tensor, Tensor]
+    outputs = _Perceptron.apply(asked, learned, *weights, *biases)  # type: ignore[no-untyped-call]
+    return outputs
 
 
 class _Perceptron(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, inputs: Tensor, learned: Tensor | None, *parameters: Tensor) -> Tensor:
+    def forward(
+        ctx: Any, inputs: Tensor, learned: Tensor | None, *parameters: Tensor
+    ) -> Tensor | tuple[Tensor, Tensor]:
         rows = inputs if learned is None else torch.cat([learned, inputs])
+        networks = _networks(parameters)
         outputs: list[Tensor] = []
         entered: list[Tensor] = []
-        for weights, biases in _networks(parameters):
+        for weights, biases in networks:
             hidden = _hidden(rows, weights[:-1], biases[:-1])
             outputs.append(torch.addmm(biases[-1], hidden[-1], weights[-1].t()))
             entered += hidden
+        # The parameters only to be told of a change: what is used of them are the views.
         ctx.save_for_backward(*parameters, *entered)
+        ctx.weights = [weights for weights, _ in networks]
         ctx.learned = None if learned is None else len(learned)
-        return torch.stack(outputs) if _are_stacked(parameters) else outputs[0]
+        if not _are_stacked(parameters):
+            return outputs[0]
+        if learned is None:
+            return torch.stack(outputs)
+        halves = [output.split([len(learned), len(inputs)]) for output in outputs]
+        of_learned, of_inputs = zip(*halves, strict=True)
+        return torch.stack(of_learned), torch.stack(of_inputs)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *of_outputs: Tensor) -> tuple[Tensor | None, ...]:
         for_inputs, _, *for_parameters = ctx.needs_input_grad
-        count, layers = len(for_parameters), len(for_parameters) // 2
-        parameters, entered = ctx.saved_tensors[:count], ctx.saved_tensors[count:]
-        stacked = _are_stacked(parameters)
+        parameters = ctx.saved_tensors[: len(for_parameters)]
+        entered = ctx.saved_tensors[len(for_parameters) :]
+        layers, stacked = len(for_parameters) // 2, _are_stacked(parameters)
+        gradient = of_outputs[0] if ctx.learned is None else torch.cat(of_outputs, 1)
         wanted = _Wanted(for_inputs, for_parameters[0], ctx.learned, stacked)
         starts = gradient.unbind() if stacked else [gradient]
         gradients = [
             _gradients(start, weights, entered[c * layers : (c + 1) * layers], wanted)
-            for c, (start, (weights, _)) in enumerate(
-                zip(starts, _networks(parameters), strict=True)
-            )
+            for c, (start, weights) in enumerate(zip(starts, ctx.weights, strict=True))
         ]
         of_inputs, *of_parameters = gradients[0]
         if stacked:
@@ -139,7 +158,7 @@ def _networks(parameters: Sequence[Tensor]) -> list[Network]:
         return [(weights, biases)]
     return list(
         zip(
-            zip(*(weight.transpose(1, 2).unbind() for weight in weights), strict=True),
+            zip(*(weight.mT.unbind() for weight in weights), strict=True),
             zip(*(bias.squeeze(1).unbind() for bias in biases), strict=True),
             strict=True,
         )
@@ -164,9 +183,11 @@ def _gradients(
     for layer in reversed(range(layers)):
         below = entered[layer]
         if wanted.parameters:
-            of_output, of_input = gradient[: wanted.learned], below[: wanted.learned]
+            of_output, of_input = gradient, below
+            if wanted.learned is not None:
+                of_output, of_input = gradient[: wanted.learned], below[: wanted.learned]
             left, right = (of_input, of_output) if wanted.stacked else (of_output, of_input)
-            of_weights[layer] = product(left.t(), right.t())
+            of_weights[layer] = _summed_outer(left, right)
             of_biases[layer] = of_output.sum(0, keepdim=wanted.stacked)
         if layer > 0:
             gradient = product(gradient, weights[layer].t())
@@ -184,6 +205,29 @@ def _linear(inputs: Tensor, weight: Tensor, bias: Tensor | None, activation: str
 
 def product(left: Tensor, right: Tensor) -> Tensor:
     """[M, K], [N, K] -> [M, N], float32 on a CPU with oneDNN."""
-    if min(len(left), len(right), left.shape[1]) < _NARROW:
+    rows, inner = left.shape
+    if rows < _NARROW or inner < _NARROW or right.shape[0] < _NARROW:
         return left @ right.t()
     return _linear(left, right, None, "none")
+
+
+def _summed_outer(left: Tensor, right: Tensor) -> Tensor:
+    """[B, M], [B, N] -> [M, N], the sum of the rows' outer products."""
+    # oneDNN takes a copy of the first factor, which is transposed: cheaper of the narrower one.
+    if _NARROW <= right.shape[1] < left.shape[1] // 2:
+        return product(_transposed(right), left.t()).t().contiguous()
+    if left.shape[1] < _NARROW or right.shape[1] < _NARROW:
+        return left.t() @ right
+    return product(_transposed(left), right.t())
+
+
+def _transposed(matrix: Tensor) -> Tensor:
+    """[M, N] -> [N, M], a copy, in two thirds of the time of `t().contiguous()`.
+
+    With their channels last, M groups of N channels are shuffled by a transposition in AVX-512.
+    """
+    rows, columns = matrix.shape
+    size = rows * columns
+    channels = matrix.contiguous().as_strided((1, size, 1, 1), (size, 1, size, size))
+    transposed: Tensor = _shuffle_channels(channels, rows).as_strided((columns, rows), (rows, 1))
+    return transposed

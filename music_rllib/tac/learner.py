@@ -38,6 +38,7 @@ from music_rllib.tac.forward import Bootstrap, TACForward
 from music_rllib.tac.graphs import CapturedUpdate, CudaRecorder
 from music_rllib.tac.module import ESTIMATOR_MODULE, EstimatorModule, TACModule, choose_action
 from music_rllib.tac.networks import RunningNormaliser
+from music_rllib.tac.optimizer import FusedAdam
 from music_rllib.tac.precision import check_precision
 from music_rllib.tac.settings import LearnedAlpha, TACSettings
 from music_rllib.tracking import names
@@ -48,7 +49,7 @@ __all__ = ["GRAD_UPDATES", "NonFiniteLossError", "TACLearner"]
 GRAD_UPDATES = "grad_updates"
 PRIORITY_CLIP = 2e-4
 """MUSIC-p: largest bound (nats) of one step that counts for its trajectory's priority."""
-METRICS, TD_ERRORS = "metrics", "td_errors"
+LOSSES = "losses"
 Minibatch = dict[ModuleID, dict[str, Tensor]]
 FlatMinibatch = Mapping[tuple[ModuleID, str], Tensor]
 
@@ -86,9 +87,10 @@ class TACLearner(TorchLearner):
         seed = self.config.seed if self.config.seed is not None else torch.seed()
         self._generator = torch.Generator(device=self._device).manual_seed(seed + 7919)
         self._grad_updates = 0
-        self._aux: dict[str, Tensor] = {}
-        self._metrics_of_update: list[str] = []
-        self._td_errors: list[Tensor] = []
+        self._losses: dict[str, Tensor] = {}
+        self._observed: dict[str, Tensor] = {}
+        self._names_of_losses: list[str] = []
+        self._td_errors: Tensor | None = None
         self._set_schedules(0)
         self._target_entropy = self._resolve_target_entropy()
         pairs = self._policy_module.get_target_network_pairs()
@@ -135,9 +137,7 @@ class TACLearner(TorchLearner):
         self.register_optimizer(
             module_id=module_id,
             optimizer_name=name,
-            optimizer=torch.optim.Adam(
-                params, lr=lr, fused=True, capturable=self._device.type == "cuda"
-            ),
+            optimizer=FusedAdam(params, lr),
             params=params,
             lr_or_lr_schedule=lr,
         )
@@ -187,17 +187,16 @@ class TACLearner(TorchLearner):
             batch = training_data.batch
         assert batch is not None
         self._weights_seq_no += 1
-        history: list[Tensor] = []
+        history: list[Mapping[str, Tensor]] = []
         step = self._captured or self._step
         for minibatch, constants in self._minibatches(self._convert_batch_type(batch)):
             outputs = step(minibatch, constants)
             self._grad_updates += 1
             if self._grad_updates % self._settings.target_update_interval == 0:
                 self._average()
-            history.append(outputs[METRICS])
-            if TD_ERRORS in outputs:
-                self._td_errors.append(outputs[TD_ERRORS])
-        self._log_history(history)
+            history.append(outputs)
+        if history:
+            self._log_history(history)
         self.after_gradient_based_update(timesteps=timesteps or {})
         return self.metrics.reduce()
 
@@ -215,20 +214,15 @@ class TACLearner(TorchLearner):
         """One update of every network but the targets; nothing in it waits for the device.
 
         Returns:
-            `METRICS` [M], in the order of `_metrics_of_update`, and `TD_ERRORS` [B] where the
-            replay wants them.
+            `LOSSES` [M], in the order of `_names_of_losses`, and what `_diagnosed` takes.
         """
         columns: Minibatch = {}
         for (module_id, name), values in minibatch.items():
             columns.setdefault(module_id, {})[name] = values
-        self._aux = {}
+        self._losses, self._observed = {}, {}
         self._update(self._priced(columns, swapped=constants.swapped))
-        outputs = {}
-        if (td_errors := self._aux.pop(TD_ERRORS, None)) is not None:
-            outputs[TD_ERRORS] = td_errors
-        self._metrics_of_update = list(self._aux)
-        outputs[METRICS] = torch.stack([value.float() for value in self._aux.values()])
-        return outputs
+        self._names_of_losses = list(self._losses)
+        return {LOSSES: torch.stack(list(self._losses.values())), **self._observed}
 
     def _minibatches(self, batch: MultiAgentBatch) -> Iterator[tuple[FlatMinibatch, _Constants]]:
         """Cuts the batch up; random numbers of all its updates are drawn here, in one go."""
@@ -286,7 +280,7 @@ class TACLearner(TorchLearner):
         policy = minibatch[DEFAULT_MODULE_ID]
         intrinsic = estimator.reward(policy[Columns.OBS], policy[Columns.NEXT_OBS], swapped=swapped)
         reward = self._total_reward(policy[Columns.REWARDS], intrinsic)
-        self._aux |= diagnostics.of_intrinsic_reward(intrinsic)
+        self._observed["intrinsic"] = intrinsic
         return {**minibatch, DEFAULT_MODULE_ID: {**policy, Columns.REWARDS: reward}}
 
     def _total_reward(self, task: Tensor, intrinsic: Tensor) -> Tensor:
@@ -317,7 +311,7 @@ class TACLearner(TorchLearner):
         if forward.value is not None:
             value = losses.value_loss(forward.value, forward.q_of_policy, ln_q_pi, alpha)
             total = total + value
-            self._aux[names.VALUE_LOSS] = value.detach()
+            self._losses[names.VALUE_LOSS] = value.detach()
         if isinstance(settings.alpha, LearnedAlpha):
             log_alpha = self._policy_module.log_alpha
             total = total + losses.alpha_loss(log_alpha, -ln_q_pi.mean(), self._target_entropy)
@@ -346,29 +340,25 @@ class TACLearner(TorchLearner):
     def _observe(
         self, forward: TACForward, target: Tensor, *, critic: Tensor, policy: Tensor
     ) -> None:
-        """Keeps one minibatch's metrics as tensors: reading them out here would wait for them."""
-        settings = self._settings
-        self._aux |= {
-            names.CRITIC_LOSS: critic.detach(),
-            names.POLICY_LOSS: policy.detach(),
-            names.Q_MEAN: forward.q_values.detach().mean(),
-        }
-        self._aux |= diagnostics.of_targets(target, settings.target_bounds)
-        self._aux |= diagnostics.of_policy(
-            forward, self._entropic_index, settings.entropy_form, settings.log_std_bounds
-        )
-        if self.config.replay_priority == "td_error":
-            self._aux[TD_ERRORS] = (forward.q_values.detach() - target).abs().mean(0)
+        """Keeps what is measured of one minibatch: reading it out here would wait for it."""
+        self._losses |= {names.CRITIC_LOSS: critic.detach(), names.POLICY_LOSS: policy.detach()}
+        self._observed |= {"q_values": forward.q_values.detach(), "targets": target}
+        if forward.log_density is not None and forward.log_std is not None:
+            self._observed |= {
+                "log_density": forward.log_density.detach(),
+                "log_std": forward.log_std.detach(),
+            }
 
     def observe_bound(self, bound: Tensor) -> None:
         """Called by the estimator's module with the mean bound of its minibatch, in nats."""
-        self._aux[names.MI_BOUND] = bound
+        self._losses[names.MI_BOUND] = bound
 
-    def _log_history(self, history: list[Tensor]) -> None:
-        """Means of the updates' metrics, [M] each."""
-        if not history:
-            return
-        keys, table = self._metrics_of_update, torch.stack(history)
+    def _log_history(self, history: Sequence[Mapping[str, Tensor]]) -> None:
+        """Means of the updates' metrics; `history` has what `_step` returned of each."""
+        columns = {name: torch.stack([outputs[name] for outputs in history]) for name in history[0]}
+        losses_of_updates = dict(zip(self._names_of_losses, columns.pop(LOSSES).T, strict=True))
+        metrics = losses_of_updates | self._diagnosed(columns)
+        keys, table = list(metrics), torch.stack([m.float() for m in metrics.values()], dim=1)
         self._check_finite(keys, table)
         log = self.metrics.log_value
         for key, mean in zip(keys, table.mean(0).tolist(), strict=True):
@@ -377,6 +367,26 @@ class TACLearner(TorchLearner):
         log((DEFAULT_MODULE_ID, names.MI_REWARD_WEIGHT), self._mi_reward_weight, window=1)
         log((DEFAULT_MODULE_ID, names.ALPHA), float(self._current_alpha()), window=1)
         log((ALL_MODULES, GRAD_UPDATES), self._grad_updates, window=1)
+
+    def _diagnosed(self, observed: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Metrics of K updates, [K] each, from what was observed of them, [K, ...] each."""
+        settings = self._settings
+        q_values, targets = observed["q_values"], observed["targets"]
+        metrics = {names.Q_MEAN: q_values.mean((1, 2))}
+        metrics |= diagnostics.of_targets(targets, settings.target_bounds)
+        if "log_density" in observed:
+            metrics |= diagnostics.of_policy(
+                observed["log_density"],
+                observed["log_std"],
+                self._entropic_index,
+                settings.entropy_form,
+                settings.log_std_bounds,
+            )
+        if "intrinsic" in observed:
+            metrics |= diagnostics.of_intrinsic_reward(observed["intrinsic"])
+        if self.config.replay_priority == "td_error":
+            self._td_errors = (q_values - targets.unsqueeze(1)).abs().mean(1).flatten()
+        return metrics
 
     def _check_finite(self, keys: list[str], table: Tensor) -> None:
         """A NaN never leaves the networks again, so looking once a call is enough."""
@@ -454,8 +464,9 @@ class TACLearner(TorchLearner):
 
     def take_td_errors(self) -> NDArray[np.float32]:
         """[K*B] absolute TD errors of the last call's transitions, for prioritised replay."""
-        errors = torch.cat(self._td_errors).cpu().numpy()
-        self._td_errors = []
+        assert self._td_errors is not None
+        errors: NDArray[np.float32] = self._td_errors.cpu().numpy()
+        self._td_errors = None
         return errors
 
     def _tensor(self, arrays: Sequence[NDArray[Any]]) -> Tensor:

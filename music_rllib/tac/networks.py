@@ -112,8 +112,8 @@ class Critics(nn.Module):
         if self.bf16 or not fused.is_fused(learned):
             return self(learned), self(asked, frozen=True)
         weights, biases = list(self.weights), list(self.biases)
-        values = fused.perceptron(asked, weights, biases, learned=learned).squeeze(-1)
-        return values[:, : len(learned)], values[:, len(learned) :]
+        values = fused.learn_and_ask(learned, asked, weights, biases)
+        return values[0].squeeze(-1), values[1].squeeze(-1)
 
     def _hidden(self, inputs: Tensor, layers: list[tuple[Tensor, Tensor]]) -> Tensor:
         """[B, I] -> [C, B, H]."""

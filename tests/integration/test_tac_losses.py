@@ -46,7 +46,7 @@ def minibatch(seed: int = 0) -> dict[str, Tensor]:
 
 def tac_loss(built: TACLearner, batch: dict[str, Tensor]) -> Tensor:
     forward = built.module[DEFAULT_MODULE_ID].forward_train(batch)
-    built._aux = {}
+    built._losses, built._observed = {}, {}
     loss: Tensor = built.compute_loss_for_module(
         module_id=DEFAULT_MODULE_ID, config=built.config, batch=batch, fwd_out=forward
     )
@@ -178,8 +178,9 @@ def test_metrics_stay_finite_where_the_losses_do() -> None:
     module.policy[-1].bias.data[:ACTION], module.policy[-1].bias.data[ACTION:] = 5.0, -20.0
     loss = tac_loss(built, {name: values.float() for name, values in minibatch().items()})
     assert torch.isfinite(loss)
-    assert float(built._aux[names.CLIPPED_DENSITIES]) == 1.0
-    for name, value in built._aux.items():
+    metrics = built._diagnosed({name: values[None] for name, values in built._observed.items()})
+    assert float(metrics[names.CLIPPED_DENSITIES]) == 1.0
+    for name, value in (metrics | built._losses).items():
         assert torch.isfinite(value), name
 
 

@@ -1,0 +1,84 @@
+"""Adam, which goes to its kernel by the shortest way.
+
+`torch.optim.Adam` sorts its tensors anew at each step, by a device and type that never change, and
+counts the steps of each one by one: 0.15 ms of an update that takes 7.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+__all__ = ["FusedAdam"]
+
+
+class _Moments(NamedTuple):
+    """Adam's state, in the order of the P parameters."""
+
+    means: list[Tensor]
+    squares: list[Tensor]
+    steps: list[Tensor]
+    """Views of `counts`, as the kernel wants them."""
+    counts: Tensor
+    """[P] steps so far, counted at once."""
+
+
+class FusedAdam(torch.optim.Adam):
+    """`torch.optim.Adam(fused=True)` of one parameter group: same state, same bits.
+
+    Args:
+        parameters: of one device.
+        lr: learning rate.
+    """
+
+    def __init__(self, parameters: Iterable[Tensor], lr: float) -> None:
+        parameters = list(parameters)
+        on_gpu = parameters[0].device.type == "cuda"
+        super().__init__(parameters, lr=lr, fused=True, capturable=on_gpu)
+        self._state_seen: Any = None
+        self._moments: _Moments | None = None
+
+    @torch.no_grad()
+    def step(self, closure: Any = None) -> Any:
+        """One step from the parameters' gradients."""
+        group = self.param_groups[0]
+        parameters = group["params"]
+        gradients = [parameter.grad for parameter in parameters]
+        # Torch's own way makes the state at the first step, leaves out what has no gradient, and
+        # on a GPU, where steps are captured, its Python costs nothing.
+        plain = len(self.state) < len(parameters) or any(gradient is None for gradient in gradients)
+        if plain or group["capturable"] or closure is not None:
+            return super().step(closure)
+        moments = self._ordered_moments()
+        moments.counts.add_(1)
+        beta1, beta2 = group["betas"]
+        torch._fused_adam_(
+            parameters, gradients, moments.means, moments.squares, [], moments.steps,
+            lr=group["lr"], beta1=beta1, beta2=beta2, weight_decay=group["weight_decay"],
+            eps=group["eps"], amsgrad=group["amsgrad"], maximize=group["maximize"],
+        )  # fmt: skip
+        return None
+
+    def _ordered_moments(self) -> _Moments:
+        if self._moments is None or self._state_seen is not self.state:  # loaded meanwhile
+            states = [self.state[parameter] for parameter in self.param_groups[0]["params"]]
+            counts = torch.stack([state["step"] for state in states])
+            for state, count in zip(states, counts.unbind(), strict=True):
+                state["step"] = count
+            means, squares, steps = (
+                [state[key] for state in states] for key in ("exp_avg", "exp_avg_sq", "step")
+            )
+            self._moments = _Moments(means, squares, steps, counts)
+            self._state_seen = self.state
+        return self._moments
+
+    def zero_grad(self, set_to_none: bool = True) -> None:
+        """Forgets the gradients."""
+        if set_to_none:
+            for parameter in self.param_groups[0]["params"]:
+                parameter.grad = None
+        else:
+            super().zero_grad(set_to_none=False)
