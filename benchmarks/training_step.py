@@ -20,6 +20,8 @@ __all__ = ["rows"]
 
 GROUP = "training step"
 UPDATES = 50
+ROUNDS = 3
+"""Of `repeats`: a turn takes a third of a second, and the machine's memory has slower minutes."""
 BATCH, INPUTS, ACTIONS = 256, 28, 4
 VARIANTS: dict[str, dict[str, Any]] = {
     "TAC": {},
@@ -124,7 +126,7 @@ def rows(repeats: int) -> Iterator[Row]:
     if has_bf16():
         turns["raw, bf16"] = raw_updates(bf16=True)
         turns["TAC, HER, bf16"] = updates(algorithm(hindsight_k=4.0, precision="bf16"))
-    taken = interleaved(turns, repeats)
+    taken = interleaved(turns, ROUNDS * repeats)
     for name, floor in product(("raw", "TAC, HER"), floors):
         ratios = [a / b for a, b in zip(taken[name], taken[floor], strict=True)]
         yield ratio_row(
