@@ -1,7 +1,10 @@
 """Mutual-information oracles of algorithms: known values, invariances, the two-frame reward."""
 
+from collections.abc import Callable
+
 import pytest
 import torch
+from torch import Tensor
 
 from benchmarks.gaussians import capped_optimum, trained_bound, true_information
 from music_rllib.estimator.network import MutualInformationEstimator, intrinsic_reward
@@ -48,6 +51,31 @@ def test_transition_bound_is_the_bound_written_out() -> None:
     joint = (estimator(x[:, 0], y[:, 0]) + estimator(x[:, 1], y[:, 1])) / 2
     crossed = (estimator(x[:, 0], y[:, 1]).exp() + estimator(x[:, 1], y[:, 0]).exp()) / 2
     torch.testing.assert_close(estimator.transition_bound(x, y), joint - crossed.log())
+
+
+def test_bound_and_gradients_are_those_of_layer_by_layer() -> None:
+    generator = torch.Generator().manual_seed(2)
+    estimator = MutualInformationEstimator(3, 2, hidden_size=20).double()
+    x, y = (torch.randn(4, 11, n, generator=generator).double() for n in (3, 2))
+    permutations = time_permutations(4, 11, generator)
+
+    def statistics(agent: Tensor, surrounding: Tensor) -> Tensor:
+        hidden = torch.relu(estimator.agent(agent) + estimator.surrounding(surrounding))
+        return torch.tanh(estimator.output(hidden)).squeeze(-1)
+
+    def layer_by_layer(agent: Tensor, surrounding: Tensor) -> Tensor:
+        shuffled = shuffle_time(surrounding, permutations)
+        return donsker_varadhan(statistics(agent, surrounding), statistics(agent, shuffled))
+
+    def with_gradients(bound: Callable[[Tensor, Tensor], Tensor]) -> list[Tensor]:
+        halves = [half.clone().requires_grad_() for half in (x, y)]
+        values = bound(*halves)
+        wanted = [*halves, *estimator.parameters()]
+        return [values, *torch.autograd.grad(values.square().sum(), wanted)]
+
+    ours = with_gradients(lambda a, s: estimator.bound(a, s, permutations))
+    for one, other in zip(ours, with_gradients(layer_by_layer), strict=True):
+        torch.testing.assert_close(one, other)
 
 
 def test_resting_surroundings_earn_the_smallest_reward() -> None:
