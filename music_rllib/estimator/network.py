@@ -102,7 +102,7 @@ class _Statistic(torch.autograd.Function):
         weighted = torch.cat([rows * slope.unsqueeze(1), slope.unsqueeze(1)], 1)
         of_first = (weighted.t() @ on) * output
         of_rows = (slope.unsqueeze(1) * on * output) @ weight if ctx.needs_input_grad[0] else None
-        of_output = (slope @ hidden).unsqueeze(0)
+        of_output = slope.unsqueeze(0) @ hidden
         return of_rows, of_first[:-1].t(), of_first[-1], of_output, slope.sum().unsqueeze(0)
 
 
