@@ -5,65 +5,55 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Iterator
+from contextlib import closing
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from benchmarks.measure import Row
+import numpy as np
+
+from benchmarks.measure import Row, seconds
 from benchmarks.runs import fill, settings
+from benchmarks.sampling import random_trajectory
 from music_rllib.experiment.store import NodeStore, WorkFolder
 from music_rllib.experiment.training import TrainingRun
 
 __all__ = ["rows"]
 
 GROUP = "checkpoint"
+COLUMNS = (
+    ("first save", "s"),
+    ("first save", "MB"),
+    ("save 10,000 steps later", "s"),
+    ("save 10,000 steps later", "MB"),
+    ("restore", "s"),
+)
 
 
 def rows(repeats: int) -> Iterator[Row]:
     """Seconds and megabytes, on the disk of the temporary folder."""
     for transitions in (100_000, 1_000_000):
-        training = TrainingRun(settings())
-        with TemporaryDirectory() as folder:
-            work = NodeStore(folder).work_folder("0" * 20)
-            fill(training, transitions)
-            yield from measured(training, work, Path(folder), transitions, repeats)
-        training.close()
+        turns = [turn(transitions) for _ in range(repeats)]
+        for (what, unit), values in zip(COLUMNS, zip(*turns, strict=True), strict=True):
+            yield Row(
+                GROUP, f"{transitions:,} transitions: {what}", statistics.median(values), unit
+            )
 
 
-def measured(
-    training: TrainingRun, work: WorkFolder, folder: Path, transitions: int, repeats: int
-) -> Iterator[Row]:
-    """The first checkpoint writes the whole replay, the others what 10,000 steps added."""
-    what = f"{transitions:,} transitions"
-    first, size = save(training, work, folder, 1)
-    yield Row(GROUP, f"{what}: first save", first, "s")
-    yield Row(GROUP, f"{what}: first save", size, "MB")
-    later = []
-    for i in range(repeats):
-        fill(training, len(training.algorithm.replay))
-        add(training, 200)
-        later.append(save(training, work, folder, 2 + i))
-    yield Row(GROUP, f"{what}: save 10,000 steps later", _median(later, 0), "s")
-    yield Row(GROUP, f"{what}: save 10,000 steps later", _median(later, 1), "MB")
-    restored = []
-    for _ in range(repeats):
-        other = TrainingRun(settings())
-        begin = time.perf_counter()
-        with work.newest() as saved:
+def turn(transitions: int) -> tuple[float, ...]:
+    """The first checkpoint writes the whole replay, the next one what 10,000 steps added."""
+    with TemporaryDirectory() as folder, closing(TrainingRun(settings())) as training:
+        work = NodeStore(folder).work_folder("0" * 20)
+        replay = training.algorithm.replay
+        fill(replay, transitions)
+        first = save(training, work, Path(folder), 1)
+        rng = np.random.default_rng(1)
+        replay.extend([random_trajectory(rng) for _ in range(200)])
+        later = save(training, work, Path(folder), 2)
+        with closing(TrainingRun(settings())) as other, work.newest() as saved:
             assert saved is not None
-            other.restore(saved)
-        restored.append(time.perf_counter() - begin)
-        other.close()
-    yield Row(GROUP, f"{what}: restore", statistics.median(restored), "s")
-
-
-def add(training: TrainingRun, trajectories: int) -> None:
-    """What 50 times as many environment steps would add."""
-    import numpy as np
-
-    from benchmarks.sampling import random_trajectory
-
-    rng = np.random.default_rng(1)
-    training.algorithm.replay.extend([random_trajectory(rng) for _ in range(trajectories)])
+            restoring = seconds(partial(other.restore, saved))
+    return *first, *later, restoring
 
 
 def save(training: TrainingRun, work: WorkFolder, folder: Path, step: int) -> tuple[float, float]:
@@ -79,7 +69,3 @@ def save(training: TrainingRun, work: WorkFolder, folder: Path, step: int) -> tu
 
 def _files(folder: Path) -> dict[Path, int]:
     return {path: path.stat().st_size for path in folder.rglob("*") if path.is_file()}
-
-
-def _median(pairs: list[tuple[float, float]], index: int) -> float:
-    return statistics.median(pair[index] for pair in pairs)

@@ -6,6 +6,7 @@ import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 __all__ = ["Row", "interleaved", "ratio_row", "seconds", "start_ray"]
 
@@ -33,17 +34,14 @@ class Row:
     """Whether the target is met; None where there is none."""
 
 
-def start_ray(cpus: int) -> None:
-    """A quiet Ray of this process's own."""
+def start_ray(cpus: int, address: str = "local") -> None:
+    """A quiet Ray of this process's own, not one that happens to run; or the one at `address`."""
     import ray
 
-    ray.init(
-        address="local",  # and not one that happens to run on this machine
-        num_cpus=cpus,
-        include_dashboard=False,
-        logging_level="error",
-        log_to_driver=False,
-    )
+    quiet: dict[str, Any] = {"logging_level": "error", "log_to_driver": False}
+    if address == "local":
+        quiet |= {"num_cpus": cpus, "include_dashboard": False}
+    ray.init(address, **quiet)
 
 
 def seconds(turn: Callable[[], object]) -> float:

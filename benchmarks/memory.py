@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import statistics
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -19,18 +20,23 @@ LIMIT = 1.2
 
 def rows(repeats: int) -> Iterator[Row]:
     """Resident memory at its highest: Ray's client, torch, networks, replay, a checkpoint."""
-    del repeats  # it does not vary
+    peak = statistics.median(peak_gigabytes() for _ in range(repeats))
+    yield Row(
+        "memory", f"one trial, {TRANSITIONS:,} transitions", peak, "GB",
+        target=f"<= {LIMIT:g}", met=peak <= LIMIT,
+    )  # fmt: skip
+
+
+def peak_gigabytes() -> float:
+    """Of a trial's process, as it says itself."""
     finished = subprocess.run(
         [sys.executable, "-m", "benchmarks.memory"],
         stdout=subprocess.PIPE,
         env=os.environ | {"OMP_NUM_THREADS": "1"},
         check=True,
     )
-    peak = json.loads(finished.stdout.splitlines()[-1])["peak_gb"]
-    yield Row(
-        "memory", f"one trial, {TRANSITIONS:,} transitions", peak, "GB",
-        target=f"<= {LIMIT:g}", met=peak <= LIMIT,
-    )  # fmt: skip
+    peak: float = json.loads(finished.stdout.splitlines()[-1])["peak_gb"]
+    return peak
 
 
 def main() -> None:
@@ -46,7 +52,7 @@ def main() -> None:
     quiet_third_parties()
     start_ray(1)
     training = TrainingRun(settings())
-    fill(training, TRANSITIONS)
+    fill(training.algorithm.replay, TRANSITIONS)
     training.advance()
     with TemporaryDirectory() as folder:
         save(training, NodeStore(folder).work_folder("0" * 20), Path(folder), 1)

@@ -7,7 +7,7 @@ import numpy as np
 from benchmarks.sampling import LAYOUT, random_trajectory
 from music_rllib.envs.registry import BUILT_IN_TASKS
 from music_rllib.experiment.settings import RunSettings
-from music_rllib.experiment.training import TrainingRun
+from music_rllib.replay.buffer import TrajectoryReplay
 
 __all__ = ["fill", "settings"]
 
@@ -27,10 +27,10 @@ def settings(env_steps: int = 10**6, seed: int = 0) -> RunSettings:
     )
 
 
-def fill(training: TrainingRun, transitions: int) -> None:
+def fill(replay: TrajectoryReplay, transitions: int) -> None:
     """Adds random trajectories until the replay holds so many transitions."""
     rng = np.random.default_rng(0)
     some = [random_trajectory(rng) for _ in range(100)]
-    while len(training.algorithm.replay) < transitions:
-        training.algorithm.replay.extend(some)
-    assert training.algorithm.replay.layout == LAYOUT
+    while len(replay) < transitions:
+        replay.extend(some)
+    assert replay.layout == LAYOUT

@@ -11,6 +11,7 @@ import torch
 
 from benchmarks.measure import Row, interleaved, ratio_row
 from benchmarks.raw_torch import HIDDEN, RawUpdate
+from benchmarks.runs import fill
 from music_rllib import TACConfig
 from music_rllib.tac import fused
 from music_rllib.tac.algorithm import TAC
@@ -26,22 +27,30 @@ BATCH, INPUTS, ACTIONS = 256, 28, 4
 VARIANTS: dict[str, dict[str, Any]] = {
     "TAC": {},
     "TAC, HER": {"hindsight_k": 4.0},
+    "TAC, HER, 1,000,000 transitions": {"hindsight_k": 4.0, "transitions": 10**6},
     "TAC, HER, frozen estimator": {"hindsight_k": 4.0, "estimator": "frozen"},
     "TAC, HER, trained estimator": {"hindsight_k": 4.0, "estimator": "trained"},
 }
+
+PEERS = {
+    "TAC, HER, 1,000,000 transitions": ("10,000 transitions", "TAC, HER", 1.05),
+    "TAC, HER, trained estimator": ("TAC, HER", "TAC, HER", 1.35),
+}
+"""What a variant is compared with in place of raw torch, what that is called, and the target."""
 
 
 def algorithm(
     hindsight_k: float = 0.0,
     estimator: str = "none",
+    transitions: int = 10_000,
     gpus: int = 0,
     graphs: bool = True,
     **training: Any,
 ) -> TAC:
-    """TAC on FetchPush, 10,000 random transitions in its replay."""
+    """TAC on FetchPush, 10,000 transitions of random actions in its replay, or more, made up."""
     config = TACConfig().environment("FetchPush-v4").env_runners(num_envs_per_env_runner=4)
     config.training(entropic_index=1.5, alpha=0.05, random_steps=10_000, **training)
-    config.replay(capacity=10_000, hindsight_k=hindsight_k).debugging(seed=0)
+    config.replay(capacity=transitions, hindsight_k=hindsight_k).debugging(seed=0)
     weight = 0.0 if estimator == "none" else 1.0
     config.music(
         agent_indices=range(3),
@@ -55,6 +64,7 @@ def algorithm(
         algo.learner_group._learner._captured = None
     while len(algo.replay) < 10_000:
         algo.training_step()
+    fill(algo.replay, transitions)
     return algo
 
 
@@ -137,10 +147,7 @@ def rows(repeats: int) -> Iterator[Row]:
         if name == "raw" or name in floors:
             continue
         rate = UPDATES / statistics.median(times)
-        against, peer, limit = "raw torch", taken["raw"], 1.12
-        if name == "TAC, HER, trained estimator":
-            against, peer, limit = "TAC, HER", taken["TAC, HER"], 1.35
-        elif "bf16" in name:
+        if "bf16" in name:
             name = name.replace(", bf16", "") + ", bf16"
             without = name.removesuffix(", bf16")
             ratios = [a / b for a, b in zip(taken[without], times, strict=True)]
@@ -149,7 +156,8 @@ def rows(repeats: int) -> Iterator[Row]:
                 at_least=1.5 if "amx_bf16" in cpu_flags() else None,
             )  # fmt: skip
             continue
-        ratios = [a / b for a, b in zip(times, peer, strict=True)]
+        against, peer, limit = PEERS.get(name, ("raw torch", "raw", 1.12))
+        ratios = [a / b for a, b in zip(times, taken[peer], strict=True)]
         yield ratio_row(
             GROUP, name, rate, "updates/s", against=f"{against} (time)", ratios=ratios,
             at_most=limit,
