@@ -33,7 +33,7 @@ GROUPS = {
 }
 EXAMPLES = """\
 examples:
-  python -m benchmarks                       the whole table, half an hour on an idle machine
+  python -m benchmarks                       the whole table, three quarters of an hour
   python -m benchmarks step environment      two groups of it
   python -m benchmarks --repeats 9 step      more turns
 

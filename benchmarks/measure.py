@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import statistics
+import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-__all__ = ["Row", "interleaved", "ratio_row", "seconds", "start_ray"]
+__all__ = ["Row", "interleaved", "ratio_row", "seconds", "start_ray", "told_turns"]
 
 Turns = dict[str, list[float]]
 
@@ -60,6 +61,13 @@ def interleaved(turns: Mapping[str, Callable[[], object]], repeats: int) -> Turn
         for name, turn in turns.items():
             taken[name].append(seconds(turn))
     return taken
+
+
+def told_turns(repeats: int) -> Iterator[int]:
+    """The turns' numbers; says which one begins, where a turn takes a minute and more."""
+    for turn in range(repeats):
+        print(f"  turn {turn + 1} of {repeats}", file=sys.stderr, flush=True)
+        yield turn
 
 
 def ratio_row(

@@ -15,7 +15,7 @@ from tempfile import TemporaryDirectory
 import ray
 import yaml
 
-from benchmarks.measure import Row, ratio_row, start_ray
+from benchmarks.measure import Row, ratio_row, start_ray, told_turns
 from benchmarks.runs import settings
 
 __all__ = ["rows"]
@@ -29,7 +29,7 @@ def rows(repeats: int) -> Iterator[Row]:
     """A round of the eight runs takes minutes, of the start-up seconds."""
     yield from start_up(repeats)
     ray.shutdown()  # the sweep brings its own
-    rounds = [(sweep(), bare_runs(), bare_runs(one_ray=True)) for _ in range(repeats)]
+    rounds = [(sweep(), bare_runs(), bare_runs(one_ray=True)) for _ in told_turns(repeats)]
     wholes, bares, sharing = zip(*rounds, strict=True)
     what = f"{RUNS} runs of {ENV_STEPS:,} steps"
     yield ratio_row(

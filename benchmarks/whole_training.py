@@ -11,7 +11,7 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
-from benchmarks.measure import Row, ratio_row
+from benchmarks.measure import Row, ratio_row, told_turns
 from music_rllib.tac.precision import has_bf16
 
 __all__ = ["rows"]
@@ -80,7 +80,7 @@ def rows(repeats: int) -> Iterator[Row]:
             peers[name] = Peer(name)
             peers[name].wait()  # one after the other, on a machine of few cores
         speeds: dict[str, list[float]] = {name: [] for name in peers}
-        for _ in range(repeats):
+        for _ in told_turns(repeats):
             for name, peer in peers.items():
                 speeds[name].append(peer.turn())
     finally:
