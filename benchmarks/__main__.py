@@ -8,7 +8,7 @@ import json
 import os
 import platform
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -59,15 +59,30 @@ def main() -> int:
         parser.error(f"GROUP must be one of {', '.join(GROUPS)}, got {', '.join(sorted(unknown))}")
     if arguments.repeats < 1:
         parser.error(f"--repeats must be >= 1, got {arguments.repeats}")
+    try:
+        arguments.output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        parser.error(f"--output can't be a folder to write to: {error}")
     prepare_environment()
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    return run(arguments.groups or list(GROUPS), arguments.repeats, arguments.output)
+
+
+def run(groups: Sequence[str], repeats: int, folder: Path) -> int:
+    """Measures the groups, one after the other; the files have what is measured so far."""
     rows: list[Row] = []
-    before = os.getloadavg()[0]
-    for name in arguments.groups or GROUPS:
-        print(f"measuring: {name}", file=sys.stderr, flush=True)
-        rows += measure(name, arguments.repeats)
-        report(rows, before, arguments.output)
-    return 0
+    before, code = os.getloadavg()[0], 0
+    try:
+        for number, name in enumerate(groups, 1):
+            print(f"measuring: {name} ({number} of {len(groups)})", file=sys.stderr, flush=True)
+            rows += measure(name, repeats)
+            write(rows, _machine(before), folder)
+    except KeyboardInterrupt:
+        print("stopped: the table has the groups before", file=sys.stderr)
+        code = 130
+    if rows:
+        report(rows, _machine(before), folder)
+    return code
 
 
 def measure(name: str, repeats: int) -> Iterator[Row]:
@@ -87,25 +102,39 @@ def measure(name: str, repeats: int) -> Iterator[Row]:
     yield from module.rows(repeats)
 
 
-def report(rows: list[Row], load_before: float, folder: Path) -> None:
-    """Prints the table so far and writes it as JSON and Markdown."""
+def write(rows: list[Row], machine: dict[str, Any], folder: Path) -> None:
+    """The table as JSON and Markdown."""
+    document = {"machine": machine, "rows": [asdict(row) for row in rows]}
+    (folder / "bench.json").write_text(json.dumps(document, indent=1) + "\n")
+    (folder / "bench.md").write_text(as_markdown(rows) + f"\n{_described(machine)}\n")
+
+
+def report(rows: list[Row], machine: dict[str, Any], folder: Path) -> None:
+    """Prints the table, what it says of the targets, and where it is."""
     from rich.console import Console
 
-    machine = {
+    console = Console(width=max(110, Console().width), highlight=False, soft_wrap=True)
+    console.print(as_table(rows))
+    console.print(_described(machine))
+    missed = [row for row in rows if row.met is False]
+    console.print(f"targets: {sum(row.met is True for row in rows)} met, {len(missed)} missed")
+    for row in missed:
+        console.print(f"  missed: {row.group}, {row.what}, {row.against}: asked {row.target}")
+    console.print(f"written to {folder / 'bench.md'} and bench.json")
+
+
+def _machine(load_before: float) -> dict[str, Any]:
+    return {
         "cpu": _cpu(),
         "cores": os.cpu_count(),
         "python": platform.python_version(),
         "load_average_before": round(load_before, 2),
         "load_average_after": round(os.getloadavg()[0], 2),
     }
-    described = ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in machine.items())
-    console = Console(width=max(110, Console().width))
-    console.print(as_table(rows))
-    console.print(described)
-    folder.mkdir(parents=True, exist_ok=True)
-    document = {"machine": machine, "rows": [asdict(row) for row in rows]}
-    (folder / "bench.json").write_text(json.dumps(document, indent=1) + "\n")
-    (folder / "bench.md").write_text(as_markdown(rows) + f"\n{described}\n")
+
+
+def _described(machine: dict[str, Any]) -> str:
+    return ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in machine.items())
 
 
 COLUMNS = ("group", "what", "value", "against", "ratio", "range", "target", "met")

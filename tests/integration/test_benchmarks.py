@@ -1,0 +1,62 @@
+"""`python -m benchmarks` as a user runs it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks.measure import ratio_row
+
+ROOT = Path(__file__).parents[2]
+
+
+def bench(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "benchmarks", *map(str, arguments)]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+
+
+def test_a_group_is_measured_printed_and_written(tmp_path: Path) -> None:
+    finished = bench("--repeats", "1", "--output", tmp_path / "bench", "replay")
+    assert finished.returncode == 0, finished.stderr
+    document = json.loads((tmp_path / "bench" / "bench.json").read_text())
+    values = {row["what"]: row for row in document["rows"]}
+    hindsight = values["HER, 20,000 trajectories: a minibatch"]
+    assert hindsight["target"] == "<= 0.25"
+    assert hindsight["value"] > values["uniform, 20,000 trajectories"]["value"] > 0
+    assert "load_average_before" in document["machine"]
+    table = (tmp_path / "bench" / "bench.md").read_text()
+    assert all(f"| {what} |" in table for what in values)
+    assert f"written to {tmp_path / 'bench' / 'bench.md'}" in finished.stdout
+
+
+def test_bad_input_is_refused_before_anything_is_measured(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for arguments, told in (
+        (["nothing"], "GROUP must be one of step, environment"),
+        (["--repeats", "0", "replay"], "--repeats must be >= 1, got 0"),
+        (["--output", str(tmp_path / "file"), "replay"], "--output can't be a folder"),
+    ):
+        finished = bench(*arguments)
+        assert finished.returncode == 2
+        assert told in finished.stderr
+        assert "measuring" not in finished.stderr
+
+
+@pytest.mark.parametrize(
+    ("limits", "target", "met"),
+    [
+        ({"at_most": 1.1}, "<= 1.1", True),
+        ({"at_most": 1.0}, "<= 1", False),
+        ({"at_least": 1.0}, ">= 1", True),
+        ({"at_least": 1.1}, ">= 1.1", False),
+        ({}, "", None),
+    ],
+)
+def test_a_target_is_for_the_median(limits: dict[str, float], target: str, met: bool) -> None:
+    row = ratio_row("group", "what", 1.0, "s", against="that", ratios=[1.05, 9.0, 0.1], **limits)
+    assert (row.ratio, row.low, row.high) == (1.05, 0.1, 9.0)
+    assert (row.target, row.met) == (target, met)
