@@ -38,7 +38,11 @@ def rows(repeats: int) -> Iterator[Row]:
         ratios=[whole / bare for whole, bare in zip(wholes, bares, strict=True)], at_most=1.05,
     )  # fmt: skip
     added = [whole - bare for whole, bare in zip(wholes, sharing, strict=True)]
-    yield Row(GROUP, f"{what}: more than bare runs that share a Ray", statistics.median(added), "s")
+    yield ratio_row(
+        GROUP, f"{what}: more than bare runs that share a Ray", statistics.median(added), "s",
+        against="these (time of the whole)",
+        ratios=[whole / bare for whole, bare in zip(wholes, sharing, strict=True)],
+    )  # fmt: skip
 
 
 def sweep() -> float:
