@@ -24,18 +24,23 @@ import numpy as np
 
 from music_rllib.experiment.config import load_sweep
 from music_rllib.experiment.plan import make_plan
-from music_rllib.reports import statistics as st
-from music_rllib.reports.analysis import Final, StageAnalysis, analyse
 from music_rllib.reports.archive import is_archive, read_archive
-from music_rllib.reports.conditions import Condition, Stage, find_stages
-from music_rllib.reports.data import Sweep
 from music_rllib.reports.figures import files
 from music_rllib.reports.gallery import Drawing, drawing_of_stages, slug, stage_drawings
 from music_rllib.reports.merge import of_plan
-from music_rllib.reports.races import races
 from music_rllib.reports.searches import search_in_words, search_tables
-from music_rllib.reports.survival import Waits, first_passage, median_wait, median_wait_interval
-from music_rllib.reports.verdict import verdict
+from music_rllib.results import statistics as st
+from music_rllib.results.analysis import Final, StageAnalysis, analyse
+from music_rllib.results.conditions import Condition, Stage, find_stages
+from music_rllib.results.data import Sweep
+from music_rllib.results.races import races
+from music_rllib.results.time_to_threshold import (
+    Waits,
+    first_passage,
+    median_wait,
+    median_wait_interval,
+)
+from music_rllib.results.verdict import verdict
 from music_rllib.tracking import names
 
 FOLDER = Path(__file__).parent

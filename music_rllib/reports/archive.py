@@ -22,7 +22,7 @@ import numpy as np
 import pyarrow as pa
 from pyarrow import csv, parquet
 
-from music_rllib.reports.data import Column, ReportError, RunRecord, Sweep
+from music_rllib.results.data import Column, ReportError, RunRecord, Sweep
 
 __all__ = ["Format", "is_archive", "read_archive", "write_archive"]
 

@@ -7,8 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from music_rllib.reports.analysis import analyse, analyse_stages
-from music_rllib.reports.data import ReportError, Sweep
 from music_rllib.reports.figures import METRICS
 from music_rllib.reports.films import make_films
 from music_rllib.reports.gallery import Drawing, drawing_of_stages, stage_drawings
@@ -23,6 +21,8 @@ from music_rllib.reports.tables import (
     success_table,
     waits_table,
 )
+from music_rllib.results.analysis import analyse, analyse_stages
+from music_rllib.results.data import ReportError, Sweep
 from music_rllib.tracking import names
 from music_rllib.tracking.store import TrackingStore
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from music_rllib.reports.data import ReportError
+from music_rllib.results.data import ReportError
 from music_rllib.tracking import names
 from music_rllib.tracking.errors import TrackingError
 from music_rllib.tracking.redaction import redact
@@ -163,7 +163,7 @@ def _report(
 
     from music_rllib.reports.build import WANTED, build_report, write_report
     from music_rllib.reports.locate import find_sweep
-    from music_rllib.reports.verdict import verdict
+    from music_rllib.results.verdict import verdict
 
     found = find_sweep(place, storage=storage, tracking_uri=tracking_uri, metrics=WANTED)
     made = build_report(

@@ -22,11 +22,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter
 
-from music_rllib.reports import statistics as st
-from music_rllib.reports.analysis import Curve, Final, Scope
-from music_rllib.reports.conditions import Condition
 from music_rllib.reports.palette import Style, style_of
-from music_rllib.reports.statistics import Array, Estimate
+from music_rllib.results import statistics as st
+from music_rllib.results.analysis import Curve, Final, Scope
+from music_rllib.results.conditions import Condition
+from music_rllib.results.statistics import Array, Estimate
 from music_rllib.tracking import names
 
 __all__ = [

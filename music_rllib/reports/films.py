@@ -9,11 +9,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-from music_rllib.reports.analysis import StageAnalysis
-from music_rllib.reports.data import ReportError, Sweep
 from music_rllib.reports.gallery import slug
 from music_rllib.reports.query import download_policy
 from music_rllib.reports.tables import last_success
+from music_rllib.results.analysis import StageAnalysis
+from music_rllib.results.data import ReportError, Sweep
 from music_rllib.tracking.store import TrackingStore
 
 if TYPE_CHECKING:

@@ -9,9 +9,6 @@ from itertools import product
 
 import numpy as np
 
-from music_rllib.reports.analysis import Curve, Scope, StageAnalysis, curve
-from music_rllib.reports.conditions import Condition, Stage, side_by_side
-from music_rllib.reports.data import Sweep
 from music_rllib.reports.figures import (
     METRICS,
     Legend,
@@ -30,6 +27,9 @@ from music_rllib.reports.influence import (
 )
 from music_rllib.reports.palette import BARS, Style, style_of, styles_by_stage, styles_of
 from music_rllib.reports.parallel import forked_map
+from music_rllib.results.analysis import Curve, Scope, StageAnalysis, curve
+from music_rllib.results.conditions import Condition, Stage, side_by_side
+from music_rllib.results.data import Sweep
 
 __all__ = [
     "CURVES",

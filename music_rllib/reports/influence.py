@@ -11,12 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.axes import Axes
 
-from music_rllib.reports.analysis import Final, Scope, StageAnalysis
-from music_rllib.reports.conditions import ENTROPIC_INDEX, SEEDS, Condition
-from music_rllib.reports.data import Sweep
 from music_rllib.reports.figures import Panel
 from music_rllib.reports.palette import BARS, colour_of, style_of
-from music_rllib.reports.statistics import Array
+from music_rllib.results.analysis import Final, Scope, StageAnalysis
+from music_rllib.results.conditions import ENTROPIC_INDEX, SEEDS, Condition
+from music_rllib.results.data import Sweep
+from music_rllib.results.statistics import Array
 from music_rllib.tracking import names
 
 __all__ = [

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from music_rllib.reports.archive import is_archive, read_archive
-from music_rllib.reports.data import Sweep
 from music_rllib.reports.query import read_mlflow
+from music_rllib.results.data import Sweep
 from music_rllib.tracking.spool import has_undelivered
 from music_rllib.tracking.store import TrackingStore, local_folder, resolve_store
 

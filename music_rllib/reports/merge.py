@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from music_rllib.experiment.plan import Plan
-from music_rllib.reports.data import Column, History, Sweep, joined
+from music_rllib.results.data import Column, History, Sweep, joined
 from music_rllib.tracking import names
 
 __all__ = ["merged", "of_plan"]

@@ -7,8 +7,8 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from music_rllib.reports.analysis import StageAnalysis
-from music_rllib.reports.data import Sweep
+from music_rllib.results.analysis import StageAnalysis
+from music_rllib.results.data import Sweep
 from music_rllib.tracking import names
 
 __all__ = ["missing", "planned_runs"]

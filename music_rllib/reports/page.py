@@ -10,9 +10,6 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
-from music_rllib.reports.analysis import StageAnalysis, Wait
-from music_rllib.reports.conditions import SIDE_BY_SIDE
-from music_rllib.reports.data import Sweep
 from music_rllib.reports.films import Film, Films
 from music_rllib.reports.gallery import CURVES, FINALS, INFLUENCE, PROFILES, Drawing, slug
 from music_rllib.reports.html import (
@@ -29,9 +26,12 @@ from music_rllib.reports.html import (
 from music_rllib.reports.influence import FEWEST_RUNS, varied
 from music_rllib.reports.pictures import Pictures
 from music_rllib.reports.searches import search_in_words, search_tables
-from music_rllib.reports.statistics import SIGNIFICANCE
 from music_rllib.reports.tables import last_success
-from music_rllib.reports.verdict import interval_text, p_text, verdict
+from music_rllib.results.analysis import StageAnalysis, Wait
+from music_rllib.results.conditions import SIDE_BY_SIDE
+from music_rllib.results.data import Sweep
+from music_rllib.results.statistics import SIGNIFICANCE
+from music_rllib.results.verdict import interval_text, p_text, verdict
 from music_rllib.tracking import names
 
 __all__ = ["Report", "render"]

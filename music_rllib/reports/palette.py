@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
-from music_rllib.reports.conditions import Condition
+from music_rllib.results.conditions import Condition
 
 __all__ = [
     "BARS",

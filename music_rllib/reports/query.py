@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from music_rllib.reports.data import Column, Points, ReportError, RunRecord, Sweep, columns
+from music_rllib.results.data import Column, Points, ReportError, RunRecord, Sweep, columns
 from music_rllib.tracking import names
 from music_rllib.tracking.redaction import redact
 from music_rllib.tracking.store import TrackingStore, check_reachable

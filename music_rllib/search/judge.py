@@ -15,7 +15,7 @@ from scipy import stats
 
 from music_rllib.experiment.result import Report
 from music_rllib.experiment.space import Objective, Pruning
-from music_rllib.reports.statistics import Estimate, estimate, interquartile_mean
+from music_rllib.results.statistics import Estimate, estimate, interquartile_mean
 from music_rllib.tracking import names
 
 __all__ = ["Verdict", "aggregate", "interval", "prune", "score"]

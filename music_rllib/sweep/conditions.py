@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from music_rllib.experiment.plan import Plan, Run, short
 from music_rllib.experiment.result import RunResult
-from music_rllib.reports.statistics import (
+from music_rllib.results.statistics import (
     Estimate,
     estimate,
     holm,

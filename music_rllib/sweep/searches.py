@@ -14,7 +14,7 @@ from music_rllib.experiment.model import Stage
 from music_rllib.experiment.plan import node_key
 from music_rllib.experiment.searched import most_env_steps
 from music_rllib.experiment.space import Rung, SearchSettings, WarmStart
-from music_rllib.reports.statistics import probability_of_improvement
+from music_rllib.results.statistics import probability_of_improvement
 from music_rllib.search.database import (
     DATABASE_ERRORS,
     known_studies,

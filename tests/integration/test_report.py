@@ -25,9 +25,9 @@ from music_rllib.experiment.plan import Node, make_plan
 from music_rllib.reports.archive import Format, read_archive
 from music_rllib.reports.build import PAGE
 from music_rllib.reports.cli import app
-from music_rllib.reports.data import Sweep
 from music_rllib.reports.locate import find_sweep
 from music_rllib.reports.query import read_mlflow
+from music_rllib.results.data import Sweep
 from music_rllib.sweep.logbook import run_info
 from music_rllib.tracking import Tracker, names, resolve_store
 

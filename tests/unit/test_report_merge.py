@@ -7,8 +7,8 @@ import numpy as np
 
 from music_rllib.experiment.config import load_sweep
 from music_rllib.experiment.plan import make_plan
-from music_rllib.reports.data import Points, RunRecord, Sweep, columns
 from music_rllib.reports.merge import merged, of_plan
+from music_rllib.results.data import Points, RunRecord, Sweep, columns
 from music_rllib.tracking import names
 
 

@@ -11,10 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from music_rllib.reports.analysis import THRESHOLDS, Scope, analyse
 from music_rllib.reports.build import build_report, write_report
-from music_rllib.reports.conditions import SIDE_BY_SIDE, find_stages, stage_by_stage
-from music_rllib.reports.data import Points, RunRecord, Sweep, columns
 from music_rllib.reports.figures import _drawn
 from music_rllib.reports.gallery import INFLUENCE
 from music_rllib.reports.influence import CHANCE, importances, varied
@@ -22,7 +19,10 @@ from music_rllib.reports.missing import planned_runs
 from music_rllib.reports.page import Report, render
 from music_rllib.reports.palette import DARK, LIGHT, colour_of, marker_of
 from music_rllib.reports.pictures import draw_all
-from music_rllib.reports.verdict import verdict
+from music_rllib.results.analysis import THRESHOLDS, Scope, analyse
+from music_rllib.results.conditions import SIDE_BY_SIDE, find_stages, stage_by_stage
+from music_rllib.results.data import Points, RunRecord, Sweep, columns
+from music_rllib.results.verdict import verdict
 from music_rllib.tracking import names
 
 STEPS = range(20_000, 200_001, 20_000)

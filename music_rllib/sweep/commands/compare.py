@@ -99,7 +99,7 @@ def _execute(arguments: argparse.Namespace) -> int:
 
 def verdict(rows: Sequence[dict[str, Any]], part: str) -> str:
     """What intervals and permutation tests allow to be said."""
-    from music_rllib.reports.statistics import SIGNIFICANCE
+    from music_rllib.results.statistics import SIGNIFICANCE
 
     if part == "search":
         return "Trials were chosen by these runs, so their order is biased: fresh seeds count."

@@ -12,10 +12,10 @@ from itertools import combinations
 
 import numpy as np
 
-from music_rllib.reports import statistics as st
-from music_rllib.reports.data import Sweep
-from music_rllib.reports.statistics import SIGNIFICANCE, Array, Estimate
-from music_rllib.reports.survival import first_passage
+from music_rllib.results import statistics as st
+from music_rllib.results.data import Sweep
+from music_rllib.results.statistics import SIGNIFICANCE, Array, Estimate
+from music_rllib.results.time_to_threshold import first_passage
 from music_rllib.tracking import names
 
 __all__ = ["Race", "races"]

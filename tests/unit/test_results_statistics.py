@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as st_numpy
 from scipy import stats
 
-from music_rllib.reports import statistics as s
-from music_rllib.reports.survival import (
+from music_rllib.results import statistics as s
+from music_rllib.results.time_to_threshold import (
     Waits,
     first_passage,
     median_wait,

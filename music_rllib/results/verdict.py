@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from music_rllib.reports.analysis import ALL_TASKS, Final, Scope
-from music_rllib.reports.statistics import Estimate, seeds_to_decide
+from music_rllib.results.analysis import ALL_TASKS, Final, Scope
+from music_rllib.results.statistics import Estimate, seeds_to_decide
 
 __all__ = ["interval_text", "p_text", "verdict"]
 

@@ -13,12 +13,17 @@ from itertools import combinations
 
 import numpy as np
 
-from music_rllib.reports import statistics as st
-from music_rllib.reports.conditions import Condition, Stage, find_stages, stage_by_stage
-from music_rllib.reports.data import Ints, Sweep
-from music_rllib.reports.races import Race, races
-from music_rllib.reports.statistics import SIGNIFICANCE, Array, Estimate
-from music_rllib.reports.survival import Waits, first_passage, median_wait, median_wait_interval
+from music_rllib.results import statistics as st
+from music_rllib.results.conditions import Condition, Stage, find_stages, stage_by_stage
+from music_rllib.results.data import Ints, Sweep
+from music_rllib.results.races import Race, races
+from music_rllib.results.statistics import SIGNIFICANCE, Array, Estimate
+from music_rllib.results.time_to_threshold import (
+    Waits,
+    first_passage,
+    median_wait,
+    median_wait_interval,
+)
 from music_rllib.tracking import names
 
 __all__ = [

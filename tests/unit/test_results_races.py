@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from music_rllib.reports.data import Points, RunRecord, Sweep, columns
-from music_rllib.reports.races import Race, races
+from music_rllib.results.data import Points, RunRecord, Sweep, columns
+from music_rllib.results.races import Race, races
 from music_rllib.tracking import names
 
 BUDGET = 10

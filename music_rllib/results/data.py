@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from music_rllib.reports.statistics import Array
+from music_rllib.results.statistics import Array
 from music_rllib.tracking import names
 
 __all__ = [

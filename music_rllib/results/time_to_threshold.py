@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from music_rllib.reports.statistics import CONFIDENCE, RESAMPLES, Array
+from music_rllib.results.statistics import CONFIDENCE, RESAMPLES, Array
 
 __all__ = ["Waits", "first_passage", "median_wait", "median_wait_interval"]
 
