@@ -46,6 +46,9 @@ _CHATTY_LOGGERS = (
     "optuna.study._optimize",
 )
 
+LOCAL_RAY_BEYOND_LOOPBACK = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
+"""0: Ray's address is 127.0.0.1, and no other node can join. Read while Ray is imported."""
+
 
 class _DropExpected(logging.Filter):
     """Drop the records whose message begins with one of ``beginnings``; errors always pass."""
@@ -73,7 +76,18 @@ def prepare_environment() -> None:
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
     # MLflow reads the commit through GitPython, which complains at length where git is missing.
     os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
+    _keep_local_ray_on_loopback()
     _authenticate_local_ray()
+
+
+def _keep_local_ray_on_loopback() -> None:
+    """Have a local Ray listen on loopback only, unless a cluster has been chosen.
+
+    Left alone, every process of it listens on all addresses, its ``/metrics`` without a token.
+    Ray's own setting for this is named after the systems on which it is the default.
+    """
+    if "RAY_ADDRESS" not in os.environ:
+        os.environ.setdefault(LOCAL_RAY_BEYOND_LOOPBACK, "0")
 
 
 def _authenticate_local_ray() -> None:

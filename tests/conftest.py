@@ -27,10 +27,16 @@ for _name in ("FORCE_COLOR", "RAY_ADDRESS", "MLFLOW_TRACKING_URI", "MLFLOW_RUN_I
 import hypothesis
 import pytest
 
-from music_rllib._quiet import prepare_environment, quiet_third_parties
+from music_rllib._quiet import (
+    LOCAL_RAY_BEYOND_LOOPBACK,
+    prepare_environment,
+    quiet_third_parties,
+)
 
 prepare_environment()
 quiet_third_parties()
+# Tests start clusters as well; each program of ours that they start decides for itself.
+os.environ.pop(LOCAL_RAY_BEYOND_LOOPBACK)
 
 # No deadline: the machine is shared. Reproducible where a failure cannot be replayed from the
 # local example database.

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 import yaml
 
@@ -103,6 +104,18 @@ def end(process: subprocess.Popen[str]) -> None:
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
     process.wait()
+
+
+def listening(process: subprocess.Popen[Any]) -> dict[str, set[str]]:
+    """Address to the names of the processes below `process` that listen there."""
+    found: dict[str, set[str]] = {}
+    own = psutil.Process(process.pid)
+    for one in [own, *own.children(recursive=True)]:
+        with contextlib.suppress(psutil.NoSuchProcess):
+            for connection in one.net_connections("inet"):
+                if connection.status == psutil.CONN_LISTEN:
+                    found.setdefault(connection.laddr.ip, set()).add(one.name())
+    return found
 
 
 @pytest.fixture

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +18,7 @@ import requests
 
 from benchmarks.serve import random_policy
 from music_rllib.policy import Policy, load_policy
+from tests.integration.conftest import listening
 
 TOKEN = "a-planted-token"
 
@@ -107,6 +109,13 @@ def test_the_token_is_needed_and_kept_out_of_sight(service: Service) -> None:
     assert len(notes) > 10
     for path in notes:
         assert TOKEN.encode() not in path.read_bytes(), path
+
+
+def test_nothing_of_it_listens_beyond_loopback(service: Service) -> None:
+    """Neither the service, which was asked for loopback, nor Ray, with its `/metrics`."""
+    places = listening(service.process)
+    assert "raylet" in set.union(*places.values())
+    assert all(ip_address(place.removeprefix("::ffff:")).is_loopback for place in places), places
 
 
 def test_fuzzing_finds_no_server_error(service: Service, tmp_path: Path) -> None:

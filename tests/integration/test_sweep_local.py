@@ -4,6 +4,7 @@ import json
 import re
 import signal
 from collections.abc import Callable
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 from mlflow import MlflowClient
 
 from music_rllib.tracking import names
+from tests.integration.conftest import listening
 
 pytestmark = pytest.mark.integration
 
@@ -172,6 +174,9 @@ def test_a_second_driver_is_refused_and_sigterm_stops_the_first_in_good_order(
     sweep_document["defaults"]["env_steps"] = 12_000
     sweep_program.write(sweep_document)
     first = sweep_program.start_until(": started")
+    places = listening(first)
+    assert "raylet" in set.union(*places.values())
+    assert all(ip_address(place.removeprefix("::ffff:")).is_loopback for place in places), places
     code, _, errors = sweep_program.run()
     assert code == 2
     assert "must be used by one process at a time" in errors

@@ -84,12 +84,17 @@ def test_importing_the_robotics_environments_says_nothing() -> None:
 # --- the environment -----------------------------------------------------------------------
 
 
+LOOPBACK_ONLY = _quiet.LOCAL_RAY_BEYOND_LOOPBACK
+
+
 @pytest.fixture
 def bare(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     """An environment in which nothing has been chosen."""
     for name in list(os.environ):
         if name.startswith(("RAY_", "MLFLOW_")):
             monkeypatch.delenv(name)
+    monkeypatch.setenv(LOOPBACK_ONLY, "")  # so that it is gone again after the test
+    monkeypatch.delenv(LOOPBACK_ONLY)
     return monkeypatch
 
 
@@ -125,3 +130,16 @@ def test_what_the_user_has_set_is_kept(bare: pytest.MonkeyPatch) -> None:
     _quiet.prepare_environment()
     assert os.environ["RAY_USAGE_STATS_ENABLED"] == "1"
     assert os.environ["RAY_AUTH_TOKEN"] == "mine"
+
+
+@pytest.mark.parametrize(
+    ("chosen", "expected"),
+    [({}, "0"), ({LOOPBACK_ONLY: "1"}, "1"), ({"RAY_ADDRESS": "head:6379"}, None)],
+)
+def test_a_local_ray_stays_on_loopback_unless_asked(
+    bare: pytest.MonkeyPatch, chosen: dict[str, str], expected: str | None
+) -> None:
+    for name, value in chosen.items():
+        bare.setenv(name, value)
+    _quiet.prepare_environment()
+    assert os.environ.get(LOOPBACK_ONLY) == expected
