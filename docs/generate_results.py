@@ -53,6 +53,8 @@ DIFFERENCE = 0.1
 NOTICE = (
     "<!-- Written by docs/generate_results.py from docs/results/page.md and docs/results/data. -->"
 )
+EARLIER = ("2",)
+"""Versions of the algorithm whose runs are shown where there are none of a later one."""
 NOT_RUN = "*Not run yet.*"
 
 
@@ -103,7 +105,8 @@ def sweep_called(name: str) -> Sweep | None:
         if f"name: {name}\n" in file.read_text("utf-8"):
             plan = make_plan(load_sweep(file))
             if not plan.searched:
-                return of_plan(plan, exports())
+                earlier = [make_plan(load_sweep(file), algorithm=version) for version in EARLIER]
+                return of_plan(plan, exports(), *earlier)
     return read_archive(DATA / name) if is_archive(DATA / name) else None
 
 
@@ -152,11 +155,15 @@ def provenance(sweep: Sweep) -> str:
             f"{tag.removeprefix(names.TAG_VERSION_PREFIX)} {value}"
             for run in sweep.runs
             for tag, value in run.tags.items()
-            if tag.startswith(names.TAG_VERSION_PREFIX)
+            if tag.startswith(names.TAG_VERSION_PREFIX) and tag != names.TAG_ALGORITHM
         }
     )
     episodes = _all_of(run.params.get("evaluation.episodes", "") for run in sweep.runs)
-    return f"{episodes} evaluation episodes; commit {commits}; {', '.join(versions)}."
+    algorithm = _all_of(run.tags.get(names.TAG_ALGORITHM, EARLIER[0]) for run in sweep.runs)
+    return (
+        f"{episodes} evaluation episodes; algorithm {algorithm}; commit {commits}; "
+        f"{', '.join(versions)}."
+    )
 
 
 # -- success rates -------------------------------------------------------------------------------

@@ -75,10 +75,13 @@ class Node:
 class Plan:
     """All that a sweep asks for; searched stages get their runs as their trials are chosen."""
 
-    def __init__(self, name: str, seeds: Sequence[int] = ()) -> None:
-        """An empty plan of a sweep with these seeds."""
+    def __init__(
+        self, name: str, seeds: Sequence[int] = (), *, algorithm: str | None = None
+    ) -> None:
+        """An empty plan of a sweep with these seeds, under this or an `algorithm` of its own."""
         self.name = name
         self.seeds = tuple(seeds)
+        self.algorithm = algorithm or ALGORITHM_VERSION
         self.runs: list[Run] = []
         self.trials: list[dict[str, Any]] = []
         """What `add_trial` was called with, each once, as plain data."""
@@ -158,7 +161,7 @@ class Plan:
                     values=dict(values),
                     task=task.name,
                     seed=seed,
-                    key=node_key(settings, node_input.key if node_input else None),
+                    key=self._key(settings, node_input),
                     part=part,
                 )
                 self._add(run, settings, node_input)
@@ -192,7 +195,7 @@ class Plan:
             values=theirs,
             task=task.name,
             seed=seed,
-            key=node_key(settings, node_input.key if node_input else None),
+            key=self._key(settings, node_input),
         )
         self._add(run, settings, node_input)
         return Input(key=run.key, task=task)
@@ -212,6 +215,9 @@ class Plan:
         )
         self._nodes.setdefault(run.key, node)
 
+    def _key(self, settings: RunSettings, node_input: Input | None) -> str:
+        return node_key(settings, node_input.key if node_input else None, self.algorithm)
+
     def node(self, key: str) -> Node:
         """The node with this key."""
         return self._nodes[key]
@@ -227,14 +233,13 @@ class Plan:
     ) -> None:
         settings = point.runs[task.name].model_copy(update={"seed": seed})
         node_input, values = self._input(stage.source, source_trial, task, seed)
-        key = node_key(settings, node_input.key if node_input else None)
         run = Run(
             stage=stage.name,
             trial=trial,
             values={**values, **point.values},
             task=task.name,
             seed=seed,
-            key=key,
+            key=self._key(settings, node_input),
         )
         self._by_cell[stage.name, trial, task.name, seed] = run
         self._add(run, settings, node_input)
@@ -272,19 +277,24 @@ def short(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def node_key(run: RunSettings, source: str | None) -> str:
+def node_key(run: RunSettings, source: str | None, algorithm: str | None = None) -> str:
     """Key of the node that computes `run` from the weights of node `source`.
 
     Depends on all that determines the numbers and on nothing else: not on names, on where things
     are stored, on MLflow or on resources. The same on every machine.
+
+    Args:
+        run: The settings.
+        source: Key of the node that the run starts from, if any.
+        algorithm: Version of what is computed; None: this one.
     """
-    settings = run.model_dump(mode="json") | {"task": run.task.identity()}
-    return content_key({"run": settings, "source": source, "algorithm": ALGORITHM_VERSION})
+    content = {"run": run.identity(), "source": source, "algorithm": algorithm or ALGORITHM_VERSION}
+    return content_key(content)
 
 
-def make_plan(config: SweepConfig) -> Plan:
-    """Lay out a valid sweep."""
-    plan = Plan(config.name, config.seeds)
+def make_plan(config: SweepConfig, *, algorithm: str | None = None) -> Plan:
+    """Lay out a valid sweep, with the keys of this or of an earlier version of the algorithm."""
+    plan = Plan(config.name, config.seeds, algorithm=algorithm)
     varied = {
         stage.source.stage
         for stage in config.stages

@@ -109,6 +109,10 @@ def contradiction(variant: Variant, fixed: Any, got: Any) -> str:
     return f"must be {json.dumps(fixed)} for {variant}, got {json.dumps(got)}"
 
 
+YOUNGER: tuple[tuple[str, str], ...] = ()
+"""Section and name of settings that came after keys of finished runs had been written down."""
+
+
 class _Frozen(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -136,6 +140,20 @@ class RunSettings(_Frozen):
     tac: TACSettings = TACSettings()
     music: MusicSettings = MusicSettings()
     replay: ReplaySettings = ReplaySettings()
+
+    def identity(self) -> dict[str, Any]:
+        """All that determines the numbers, as plain data; the task without what does not.
+
+        A setting of `YOUNGER` is left out where it has its default: runs that do not use it keep
+        the identity that they had before there was one.
+        """
+        settings = self.model_dump(mode="json") | {"task": self.task.identity()}
+        for section, name in YOUNGER:
+            part: BaseModel = getattr(self, section)
+            default = type(part).model_fields[name].get_default(call_default_factory=True)
+            if getattr(part, name) == default:
+                del settings[section][name]
+        return settings
 
     @model_validator(mode="after")
     def _variant_holds(self) -> Self:

@@ -30,25 +30,35 @@ def merged(earlier: Sweep, later: Sweep) -> Sweep:
     return replace(later, runs=runs, history=_history(places), searches=searches)
 
 
-def of_plan(plan: Plan, exports: Iterable[Sweep]) -> Sweep | None:
+def of_plan(plan: Plan, exports: Iterable[Sweep], *earlier: Plan) -> Sweep | None:
     """What is known of a plan's runs, whichever sweep has computed them.
 
     A run is that of the plan's node with its key: the same settings, seed and source, under
     whatever names. It gets the plan's name for it, and the plan's order. The sweep's own fields are
     those of the last export that has a run.
 
+    Args:
+        plan: It.
+        exports: Where to look.
+        earlier: The same plan under earlier versions of the algorithm, for runs that have not been
+            made since.
+
     Returns:
         None where no export has any of its runs.
     """
     found = _best([place for export in exports for place in _places(export)])
-    nodes = [node for node in plan.nodes if node.key in found]
+    # A run has the same position in each plan.
+    versions = zip(*([(node, one) for node in one.nodes] for one in (plan, *earlier)), strict=True)
+    known = [next((pair for pair in pairs if pair[0].key in found), None) for pairs in versions]
+    nodes = [pair for pair in known if pair is not None]
     if not nodes:
         return None
-    places = [found[node.key] for node in nodes]
+    places = [found[node.key] for node, _ in nodes]
     runs = []
-    for node, (sweep, position) in zip(nodes, places, strict=True):
+    for (node, version), (sweep, position) in zip(nodes, places, strict=True):
         run = sweep.runs[position]
         own = {names.TAG_SWEEP: plan.name, names.TAG_STAGE: node.stage}
+        own[names.TAG_ALGORITHM] = version.algorithm
         tags = {**run.tags, **own, names.TAG_TRIAL: str(node.trial)}
         runs.append(replace(run, name=node.label, tags=tags))
     last = places[-1][0]

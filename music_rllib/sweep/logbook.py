@@ -20,6 +20,7 @@ from music_rllib.schedules import Linear, Piecewise, value_at
 from music_rllib.sweep.listener import Failure, Listener
 from music_rllib.sweep.words import in_words
 from music_rllib.tac.settings import LearnedAlpha
+from music_rllib.tac.version import ALGORITHM_VERSION
 from music_rllib.tracking import names
 from music_rllib.tracking.errors import TrackingError
 from music_rllib.tracking.sender import Backlog
@@ -52,6 +53,7 @@ def run_info(node: Node) -> RunInfo:
             names.TAG_ALPHA: in_words(alpha),
             names.TAG_MI_REWARD_WEIGHT: in_words(weight),
             names.TAG_CONFIG_HASH: content_key(config),
+            names.TAG_ALGORITHM: ALGORITHM_VERSION,
             names.TAG_SOURCE_NODE: node.input.key if node.input else None,
         },
         settings={

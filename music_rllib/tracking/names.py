@@ -144,6 +144,8 @@ TAG_GIT_COMMIT = "git_commit"
 """Commit of the code, with ``-dirty`` where tracked files were changed."""
 TAG_VERSION_PREFIX = "version."
 """Followed by a package or ``python``: ``version.ray``."""
+TAG_ALGORITHM = TAG_VERSION_PREFIX + "algorithm"
+"""Version of what is computed; runs without this tag are of version 2."""
 TAG_CHANGED_PREFIX = "changed."
 """Followed by a param: its newer value (MLflow params never change) after a sweep was changed."""
 EXPERIMENT_TAGS = {"mlflow.experimentKind": "custom_model_development"}

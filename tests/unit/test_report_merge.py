@@ -9,6 +9,7 @@ from music_rllib.experiment.config import load_sweep
 from music_rllib.experiment.plan import make_plan
 from music_rllib.reports.merge import merged, of_plan
 from music_rllib.results.data import Points, RunRecord, Sweep, columns
+from music_rllib.tac.version import ALGORITHM_VERSION
 from music_rllib.tracking import names
 
 
@@ -94,3 +95,27 @@ def test_a_plans_runs_are_found_in_other_sweeps_exports(tmp_path: Path) -> None:
         ("first/FetchPush/tac.entropic_index=2/seed1", "first", "1"),
     ]
     assert of_plan(plan, [sweep(("other", "FINISHED", [9]))]) is None
+
+
+def test_runs_of_an_earlier_version_are_found_where_there_are_none_of_a_later_one(
+    tmp_path: Path,
+) -> None:
+    """Of a run and of what starts from it; each says which version it is of."""
+    file = tmp_path / "sweep.yaml"
+    file.write_text(
+        "{name: mine, tasks: [FetchPush], seeds: [0, 1], stages: [{name: u, variant: music-u},"
+        " {name: r, variant: music-r, init_from: u}]}"
+    )
+    plan, earlier = make_plan(load_sweep(file)), make_plan(load_sweep(file), algorithm="2")
+    now, before = ([node.key for node in one.nodes] for one in (plan, earlier))
+    assert not set(now) & set(before)
+    exports = [
+        sweep(*((key, "FINISHED", [2.0]) for key in before)),
+        sweep((now[1], "FINISHED", [3])),
+    ]
+    found = of_plan(plan, exports, earlier)
+    assert found is not None
+    expected = [before[0], now[1], *before[2:]]
+    assert [run.node_key for run in found.runs] == expected
+    algorithms = [run.tags[names.TAG_ALGORITHM] for run in found.runs]
+    assert algorithms == ["2", ALGORITHM_VERSION, "2", "2"]
