@@ -11,7 +11,8 @@ from torch import Tensor
 
 from music_rllib.tac import losses
 from music_rllib.tac.distribution import sample_squashed
-from music_rllib.tac.networks import Critics, Perceptron, RunningNormaliser
+from music_rllib.tac.networks import Critics, Perceptron
+from music_rllib.tac.normaliser import RunningNormaliser
 from music_rllib.tac.optimizer import FusedAdam
 from music_rllib.tsallis import ln_q_of_policy
 

@@ -19,6 +19,7 @@ from music_rllib.replay.segments import Segment, load_segments, new_segments
 from music_rllib.tac.algorithm import TAC
 from music_rllib.tac.config import TACConfig
 from music_rllib.tac.env_runner import DISPLACEMENT, MOVED, SUCCESS_ANY, SUCCESS_LAST
+from music_rllib.tac.normaliser import for_another_run
 from music_rllib.tracking import names
 
 __all__ = ["Paused", "TrainingRun", "algorithm_config"]
@@ -99,6 +100,8 @@ class TrainingRun:
             config.learners(num_gpus_per_learner=gpus)
         self.algorithm: TAC = config.build_algo()
         if handoff:
+            if "normaliser" in handoff:
+                handoff = {**handoff, "normaliser": for_another_run(handoff["normaliser"])}
             self.algorithm.set_parts(handoff)
         self._rounds: defaultdict[str, list[float]] = defaultdict(list)
         """What has been measured since the last report."""

@@ -39,6 +39,7 @@ from music_rllib.schedules import value_at
 from music_rllib.tac.config import TACConfig
 from music_rllib.tac.env_runner import Episode, TrajectoryEnvRunner, seed_or_entropy
 from music_rllib.tac.module import ESTIMATOR_MODULE
+from music_rllib.tac.normaliser import in_this_form
 
 __all__ = ["TAC"]
 
@@ -284,6 +285,8 @@ class TAC(Algorithm):
             ValueError: an unknown network, or tensors that are missing, unknown or of other shape.
         """
         own = self.get_parts()
+        if "normaliser" in parts:
+            parts = {**parts, "normaliser": in_this_form(parts["normaliser"])}
         for part, arrays in parts.items():
             _check_same_tensors(part, own.get(part), arrays)
         modules: dict[str, dict[str, NDArray[Any]]] = {}

@@ -37,7 +37,7 @@ from music_rllib.tac import diagnostics, losses
 from music_rllib.tac.forward import Bootstrap, TACForward
 from music_rllib.tac.graphs import CapturedUpdate, CudaRecorder
 from music_rllib.tac.module import ESTIMATOR_MODULE, EstimatorModule, TACModule, choose_action
-from music_rllib.tac.networks import RunningNormaliser
+from music_rllib.tac.normaliser import RunningNormaliser
 from music_rllib.tac.optimizer import FusedAdam
 from music_rllib.tac.precision import check_precision
 from music_rllib.tac.settings import LearnedAlpha, TACSettings

@@ -16,7 +16,8 @@ from music_rllib.envs.make import observation_sizes
 from music_rllib.estimator.network import MutualInformationEstimator, intrinsic_reward
 from music_rllib.tac.distribution import deterministic_action, sample_squashed, squashed_action
 from music_rllib.tac.forward import Bootstrap, TACForward
-from music_rllib.tac.networks import Critics, Perceptron, RunningNormaliser
+from music_rllib.tac.networks import Critics, Perceptron
+from music_rllib.tac.normaliser import RunningNormaliser
 from music_rllib.tac.settings import LearnedAlpha, TACSettings
 
 __all__ = [

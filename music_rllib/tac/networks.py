@@ -1,4 +1,4 @@
-"""The networks of TAC: multi-layer perceptrons, twin critics as one batched network, normaliser.
+"""The networks of TAC: multi-layer perceptrons, twin critics as one batched network.
 
 Shape legend: B batch, I input features, O outputs, C critics.
 
@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from music_rllib.tac import fused
 
-__all__ = ["Critics", "Perceptron", "RunningNormaliser"]
+__all__ = ["Critics", "Perceptron"]
 
 
 class Perceptron(nn.Sequential):
@@ -130,54 +130,3 @@ class Critics(nn.Module):
     def _layers(self, frozen: bool) -> Iterator[tuple[Tensor, Tensor]]:
         for weight, bias in zip(self.weights, self.biases, strict=True):
             yield (weight.detach(), bias.detach()) if frozen else (weight, bias)
-
-
-_ROUNDING = 1e-12
-"""Variance, as a share of the squared mean, below which it is only float64's rounding."""
-
-
-class RunningNormaliser(nn.Module):
-    """Running mean and standard deviation per feature; clips what it normalises.
-
-    The moments live in float64 buffers, so they are part of the module's state: environment
-    runners, checkpoints and handoffs get them with the weights.
-    """
-
-    count: Tensor
-    total: Tensor
-    total_square: Tensor
-    mean: Tensor
-    inverse_std: Tensor
-
-    def __init__(self, features: int, *, epsilon: float, clip: float) -> None:
-        super().__init__()
-        self.epsilon, self.clip = epsilon, clip
-        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
-        self.register_buffer("total", torch.zeros(features, dtype=torch.float64))
-        self.register_buffer("total_square", torch.zeros(features, dtype=torch.float64))
-        self.register_buffer("mean", torch.zeros(features))
-        self.register_buffer("inverse_std", torch.ones(features))
-
-    def forward(self, values: Tensor) -> Tensor:
-        """[..., I] -> [..., I]: (x - mean) / max(std, epsilon), clipped to plus/minus `clip`.
-
-        0 for a feature that has been the same in all observations.
-        """
-        return ((values - self.mean) * self.inverse_std).clamp(-self.clip, self.clip)
-
-    @torch.no_grad()
-    def update(self, values: Tensor) -> None:
-        """Takes [B, I] more observations into the moments."""
-        values = values.to(self.total)
-        self.count += values.shape[0]
-        self.total += values.sum(0)
-        self.total_square += values.square().sum(0)
-        mean = self.total / self.count
-        variance = (self.total_square / self.count - mean.square()).clamp(min=0.0)
-        scale = 1.0 / variance.sqrt().clamp(min=self.epsilon)
-        # What was constant so far taught the networks nothing: it becomes 0 whatever it is later.
-        # MUSIC-u is trained on goals of 0 and evaluated with real ones, which would otherwise enter
-        # as -5 or 5, through weights that were never learned.
-        constant = variance <= _ROUNDING * mean.square()
-        self.mean.copy_(mean)
-        self.inverse_std.copy_(torch.where(constant, 0.0, scale))

@@ -16,7 +16,8 @@ from music_rllib.experiment.sealed import SealedFolders, open_storage
 from music_rllib.experiment.settings import RunSettings
 from music_rllib.policy import PolicyError, PolicyNetwork, find_policy, load_policy
 from music_rllib.policy.network import PolicyFileError
-from music_rllib.tac.networks import Perceptron, RunningNormaliser
+from music_rllib.tac.networks import Perceptron
+from music_rllib.tac.normaliser import RunningNormaliser
 
 REACH = BUILT_IN_TASKS["FetchReach"]
 KEY, OTHER = "0123456789abcdef0123", "0123ffffffffffffffff"

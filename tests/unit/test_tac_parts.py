@@ -1,4 +1,4 @@
-"""Distribution, networks and normaliser of TAC, each against an independent computation."""
+"""Distribution and networks of TAC, each against an independent computation."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from scipy import integrate
 from torch import nn
 
 from music_rllib.tac.distribution import deterministic_action, sample_squashed
-from music_rllib.tac.networks import Critics, Perceptron, RunningNormaliser
+from music_rllib.tac.networks import Critics, Perceptron
 
 
 @pytest.mark.parametrize(("mean", "log_std"), [(0.0, -1.0), (0.8, 0.0), (-1.5, 0.5)])
@@ -77,39 +77,3 @@ def test_frozen_critics_pass_gradients_to_their_inputs_only() -> None:
     assert inputs.grad is not None
     assert inputs.grad.abs().sum() > 0
     assert all(parameter.grad is None for parameter in critics.parameters())
-
-
-def test_normaliser_has_the_moments_of_all_it_has_seen() -> None:
-    rng = np.random.default_rng(0)
-    data = rng.normal([3.0, -200.0, 0.5], [0.1, 30.0, 1e-9], size=(1000, 3))
-    normaliser = RunningNormaliser(3, epsilon=0.01, clip=5.0)
-    for part in np.array_split(data, 7):
-        normaliser.update(torch.from_numpy(part))
-    expected = (data - data.mean(0)) / np.maximum(data.std(0), 0.01)
-    got = normaliser(torch.from_numpy(data).float()).numpy()
-    np.testing.assert_allclose(got, np.clip(expected, -5, 5), atol=2e-3)
-    assert float(normaliser(torch.tensor([1e9, 0.0, 0.0]))[0]) == 5.0
-
-
-def test_a_feature_that_never_varied_says_nothing_later() -> None:
-    normaliser = RunningNormaliser(3, epsilon=0.01, clip=5.0)
-    for size in (7, 1000, 13):
-        seen = torch.tensor([0.0, 1.34, 0.0]).repeat(size, 1)
-        seen[:, 2] = torch.linspace(-1, 1, size) if size > 1 else 0.5
-        normaliser.update(seen)
-    assert normaliser(torch.tensor([1.3, 0.7, 0.0])).tolist()[:2] == [0.0, 0.0]
-    assert float(normaliser(torch.tensor([0.0, 1.34, 0.9]))[2]) > 1
-    normaliser.update(torch.tensor([[1.3, 0.7, 0.0]]))
-    assert (normaliser(torch.tensor([1.3, 0.7, 0.0]))[:2].abs() > 1).all()
-
-
-def test_normaliser_is_part_of_the_state_and_changes_nothing_before_its_first_update() -> None:
-    fresh = RunningNormaliser(2, epsilon=0.01, clip=5.0)
-    torch.testing.assert_close(fresh(torch.tensor([1.0, -2.0])), torch.tensor([1.0, -2.0]))
-    fresh.update(torch.randn(10, 2))
-    copy = RunningNormaliser(2, epsilon=0.01, clip=5.0)
-    copy.load_state_dict(fresh.state_dict())
-    more = torch.randn(5, 2)
-    fresh.update(more)
-    copy.update(more)
-    torch.testing.assert_close(fresh.mean, copy.mean, rtol=0, atol=0)
