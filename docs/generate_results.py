@@ -411,8 +411,8 @@ def search_text(sweep: Sweep, figures: dict[str, bytes]) -> Iterator[str]:
 # -- words ---------------------------------------------------------------------------------------
 
 
-def _row(*cells: str) -> str:
-    return "| " + " | ".join(cells) + " |"
+def _row(*cells: object) -> str:
+    return "| " + " | ".join(map(str, cells)) + " |"
 
 
 def _rule(columns: int) -> str:

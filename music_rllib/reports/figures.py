@@ -170,8 +170,11 @@ def finals_panel(scope: Scope, siblings: tuple[Condition, ...]) -> Panel:
     return Panel(title=scope.name, draw=draw)
 
 
-def svg_inline(panel: Panel, name: str, description: str) -> str:
-    """A panel as an SVG element for the page; ids begin with `name`, to be the page's only ones."""
+def svg_inline(panel: Panel, name: str) -> str:
+    """A panel as an SVG element for the page; ids begin with `name`, to be the page's only ones.
+
+    Matplotlib escapes the texts in it.
+    """
     with mpl.rc_context(_settings(_INK, _GRID)):
         drawn = _drawn([panel], [], opaque=False)
         buffer = io.StringIO()
@@ -182,7 +185,7 @@ def svg_inline(panel: Panel, name: str, description: str) -> str:
     text = text.replace(_INK, "currentColor").replace(_GRID, "var(--grid)")
     size = re.search(r'width="([\d.]+)pt" height="([\d.]+)pt"', text)
     assert size is not None, "matplotlib gives an SVG a size in points"
-    text = text.replace(size[0], f'role="img" aria-label="{description}"')
+    text = text.replace(size[0], "")
     return re.sub(r">\s+<", "><", text)
 
 
@@ -216,6 +219,8 @@ def _settings(ink: str, grid: str) -> Any:
         "xtick.labelsize": 9,
         "ytick.labelsize": 9,
         "svg.fonttype": "none",
+        # A task may be called $x_{1$.
+        "text.parse_math": False,
         # The same figure is the same file.
         "svg.hashsalt": "music_rllib",
     }

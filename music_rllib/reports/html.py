@@ -1,107 +1,102 @@
-"""The few pieces of HTML that the page is made of. Every text is escaped here."""
+"""The page's pieces as plain data; `page.html` makes HTML of them and escapes every text."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from html import escape
+from functools import cached_property
 from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from music_rllib.reports.palette import Style
 
-__all__ = ["Cell", "bullets", "document", "facts", "legend", "link", "paragraph", "table", "text"]
+__all__ = ["Cell", "Figure", "TextTable", "document", "number"]
 
-# Nothing may be fetched, whatever finds its way into a page.
-_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; media-src data:"
+# Nothing may be fetched or run, whatever finds its way into a page. Matplotlib's drawings have
+# style attributes, for which no hash can stand.
+_POLICY = (
+    "default-src 'none'; style-src 'unsafe-inline'; img-src data:; media-src data:; "
+    "base-uri 'none'; form-action 'none'"
+)
 _DASHES = {"solid": "", "dashed": "6 3", "dashdot": "6 2 1.5 2", "dotted": "1.5 2.5"}
-
 _MARKS = {"o": "●", "s": "■", "D": "◆", "^": "▲", "v": "▼", "P": "✚", "X": "✖", "*": "★"}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Cell:
     """A table's cell that is more than short text."""
 
-    html: str
+    text: str
     kind: str = ""
-    """`number` or `long`."""
+    """`number`, which stands right, or `long`, which has several lines."""
+    code: bool = False
+    url: str | None = None
+    """Where it leads."""
 
 
-def text(value: object) -> str:
-    """`value` as HTML."""
-    return escape(str(value))
+def number(shown: str) -> Cell:
+    """A number that is text already."""
+    return Cell(text=shown, kind="number")
 
 
-def paragraph(value: str, kind: str = "") -> str:
-    """One paragraph of text."""
-    return f"<p{_class(kind)}>{text(value)}</p>"
+@dataclass(frozen=True, kw_only=True)
+class TextTable:
+    """A table of the page; one without rows is not shown."""
 
+    title: str
+    note: str = ""
+    header: Sequence[str]
+    rows: Sequence[Sequence[object]]
+    """Texts, numbers and cells."""
+    long: bool = False
+    """Whether it is folded."""
 
-def bullets(lines: Iterable[str]) -> str:
-    """A list of texts."""
-    return "<ul>" + "".join(f"<li>{text(line)}</li>" for line in lines) + "</ul>"
+    @cached_property
+    def cells(self) -> list[list[Cell]]:
+        """The rows, each value as a cell."""
+        return [[_cell(value) for value in row] for row in self.rows]
 
-
-def link(label: str, url: str | None) -> str:
-    """A link, or the label alone where there is nowhere to go."""
-    return text(label) if url is None else f'<a href="{escape(url)}">{text(label)}</a>'
-
-
-def facts(pairs: Iterable[tuple[str, object]]) -> str:
-    """Short facts, side by side where there is room."""
-    items = (f"<div><dt>{text(name)}</dt><dd>{text(value)}</dd></div>" for name, value in pairs)
-    return f'<dl class="facts">{"".join(items)}</dl>'
-
-
-def table(header: Sequence[str], rows: Iterable[Sequence[object]], caption: str = "") -> str:
-    """A table that scrolls by itself where it is too wide; numbers stand right."""
-    body = [[cell if isinstance(cell, Cell) else _cell(cell) for cell in row] for row in rows]
-    kinds = [cell.kind for cell in body[0]] if body else [""] * len(header)
-    heads = "".join(
-        f'<th scope="col"{_class(kind)}>{text(name)}</th>'
-        for name, kind in zip(header, kinds, strict=True)
-    )
-    lines = "".join(
-        "<tr>" + "".join(f"<td{_class(cell.kind)}>{cell.html}</td>" for cell in row) + "</tr>"
-        for row in body
-    )
-    # Not a <caption>, which would be as wide as the table and scroll with it.
-    title = paragraph(caption, "soft") if caption else ""
-    return (
-        f'{title}<div class="wide"><table><thead><tr>{heads}</tr></thead>'
-        f"<tbody>{lines}</tbody></table></div>"
-    )
-
-
-def legend(entries: Iterable[tuple[str, Style]]) -> str:
-    """Which line is which."""
-    items = []
-    for label, style in entries:
-        dash = _DASHES[style.line]
-        pattern = f' stroke-dasharray="{dash}"' if dash else ""
-        items.append(
-            '<li><svg width="30" height="10" aria-hidden="true"><line x1="1" y1="5" x2="29" y2="5" '
-            f'stroke="{style.colour}" stroke-width="3"{pattern}/></svg>'
-            f'<span style="color:{style.colour}" aria-hidden="true">{_MARKS[style.marker]}</span>'
-            f"{text(label)}</li>"
-        )
-    return f'<ul class="legend">{"".join(items)}</ul>'
-
-
-def document(title: str, body: str) -> str:
-    """The whole page, with its style inside."""
-    style = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
-    return (
-        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{text(title)}</title><style>{style}</style></head>\n<body>{body}</body></html>\n"
-    )
+    @property
+    def heads(self) -> list[tuple[str, str]]:
+        """Each column's name, and the kind of its first cell."""
+        kinds = [cell.kind for cell in self.cells[0]] if self.cells else [""] * len(self.header)
+        return list(zip(self.header, kinds, strict=True))
 
 
 def _cell(value: object) -> Cell:
-    return Cell(text(value), "number" if isinstance(value, int | float) else "")
+    if isinstance(value, Cell):
+        return value
+    return Cell(text=str(value), kind="number" if isinstance(value, int | float) else "")
 
 
-def _class(kind: str) -> str:
-    return f' class="{kind}"' if kind else ""
+@dataclass(frozen=True, kw_only=True)
+class Figure:
+    """A drawing of the page."""
+
+    name: str
+    title: str
+    caption: str
+    legend: Sequence[tuple[str, Style]]
+    panels: Sequence[tuple[str, str]]
+    """What each shows in words, and its SVG element."""
+
+
+_PAGES = Environment(
+    loader=FileSystemLoader(Path(__file__).parent),
+    autoescape=True,
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+)
+
+
+def document(**content: Any) -> str:
+    """The whole page, with its style inside; what `page.html` names is the `content`."""
+    style = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
+    page = _PAGES.get_template("page.html")
+    return (
+        page.render(style=style, policy=_POLICY, dashes=_DASHES, marks=_MARKS, **content).strip()
+        + "\n"
+    )

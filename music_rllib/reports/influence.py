@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.ticker import LogFormatter
 
 from music_rllib.reports.figures import Panel
 from music_rllib.reports.palette import BARS, colour_of, style_of
@@ -160,6 +161,9 @@ def _lines(
         places = [at(final) for final in finals]
         if min(places) > 0 and max(places) / min(places) > 5:
             axes.set_xscale("log")
+            # The scale's own labels are formulas, which nothing is read as.
+            axes.xaxis.set_major_formatter(LogFormatter())
+            axes.xaxis.set_minor_formatter(LogFormatter())
         axes.set_ylim(-0.03, 1.03)
         axes.set_xlabel(f"{name} (log scale)" if axes.get_xscale() == "log" else name)
         axes.set_ylabel("final success rate")

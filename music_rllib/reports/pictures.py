@@ -32,7 +32,6 @@ def draw_all(drawings: Sequence[Drawing]) -> dict[str, Pictures]:
 
 def _draw(drawing: Drawing) -> Pictures:
     inline = tuple(
-        svg_inline(panel, f"{drawing.name}-{number}", f"{drawing.title}, {panel.title}")
-        for number, panel in enumerate(drawing.panels)
+        svg_inline(panel, f"{drawing.name}-{number}") for number, panel in enumerate(drawing.panels)
     )
     return Pictures(inline, files(drawing.panels, drawing.legend))

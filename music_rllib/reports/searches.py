@@ -3,24 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
-__all__ = ["TextTable", "search_in_words", "search_tables"]
+from music_rllib.reports.html import TextTable
+
+__all__ = ["search_in_words", "search_tables"]
 
 Found = Mapping[str, Any]
 """One search, one of its arms, trials or ranked settings, as in `search.json`."""
 DASH = "–"
-
-
-@dataclass(frozen=True, kw_only=True)
-class TextTable:
-    """A table whose cells are all text."""
-
-    title: str
-    note: str
-    header: Sequence[str]
-    rows: Sequence[Sequence[str]]
 
 
 def search_in_words(search: Found) -> str:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
 import shutil
 import signal
 import socket
+import sqlite3
 import subprocess
 import sys
 import time
@@ -222,7 +224,7 @@ def test_an_exported_sweep_is_the_same_sweep(
 
 def test_the_page_shows_what_a_search_found(page: Path) -> None:
     text = re.sub(r"<[^>]+>", "|", page.read_text().partition("Stage finetune")[0])
-    cells = [cell for cell in text.split("|") if cell]
+    cells = [cell for cell in text.split("|") if cell.strip()]
     assert "trials: 1 judged, 1 pruned." in text
     ranked = cells[cells.index("Best is better with") + 1 :]
     assert ranked[:8] == ["1", "0", "1.25", "0.69", "0.50 to 0.75", "2", "0.81", "–"]
@@ -401,6 +403,59 @@ def test_the_console_and_the_network_are_watched(browser: Browser, tmp_path: Pat
     browser.open(bad)
     assert any("nothing is not defined" in line for line in browser.console)
     assert browser.requests == {"http://127.0.0.1:9/x.png"}
+
+
+SCRIPT = """"'><script>document.body.dataset.ran = 1</script>
+<img src=x onerror="document.body.dataset.ran = 1"><svg onload="document.body.dataset.ran = 1">"""
+
+
+@pytest.fixture(scope="module")
+def hostile_store(sweep_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Somebody's MLflow, with a script in each tag, param and name that a report shows."""
+    copy = tmp_path_factory.mktemp("hostile") / "mlflow.db"
+    shutil.copy(sweep_folder.parent / "mlflow.db", copy)
+    shown = (names.TAG_STAGE, names.TAG_TASK, names.TAG_ENTROPIC_INDEX, names.TAG_FAILURE)
+    with contextlib.closing(sqlite3.connect(copy)) as database, database:
+        database.execute("update params set value = value || ?", [SCRIPT])
+        database.execute("update runs set name = name || ?", [SCRIPT])
+        for tag in (*shown, names.TAG_VARIANT, names.TAG_GIT_COMMIT):
+            database.execute("update tags set value = value || ? where key = ?", [SCRIPT, tag])
+    return f"sqlite:///{copy}"
+
+
+@pytest.mark.parametrize("kind", ["store", "export"])
+def test_a_script_in_somebody_s_sweep_does_not_run(
+    browser: Browser, hostile_store: str, sweep_folder: Path, tmp_path: Path, kind: str
+) -> None:
+    place: list[str | Path] = ["tiny", "--tracking-uri", hostile_store]
+    if kind == "export":
+        assert run(*place, "--export", tmp_path / "published").exit_code == 0
+        place = [tmp_path / "published"]
+    made = run(*place, "--output", tmp_path / "report")
+    assert made.exit_code == 0, made.output
+    page = tmp_path / "report" / PAGE
+    # Without the page's policy, which would stop a script that got into it.
+    bare = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", page.read_text())
+    (tmp_path / "bare.html").write_text(bare)
+    for one in (page, tmp_path / "bare.html"):
+        dom = browser.open(one)
+        assert "data-ran" not in dom.partition("<body")[2].partition(">")[0]
+        assert dom.count("&lt;script&gt;") > 20
+        assert not browser.console
+        assert not browser.requests
+
+
+def test_the_page_s_policy_stops_a_script_that_got_into_it(
+    browser: Browser, page: Path, tmp_path: Path
+) -> None:
+    """And the test above could not fail otherwise."""
+    injected = page.read_text().replace("</body>", f"{SCRIPT}</body>")
+    (tmp_path / "injected.html").write_text(injected)
+    assert "<body>" in browser.open(tmp_path / "injected.html")
+    assert any("Content Security Policy" in line for line in browser.console)
+    bare = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", injected)
+    (tmp_path / "bare.html").write_text(bare)
+    assert '<body data-ran="1">' in browser.open(tmp_path / "bare.html")
 
 
 @pytest.mark.parametrize("width, dark", [(400, False), (1200, True)])

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from html import unescape
 from html.parser import HTMLParser
 from itertools import combinations, product
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -286,10 +289,14 @@ class Page(HTMLParser):
         self.ids: list[str] = []
         self.fetched: list[str] = []
         self.open: list[str] = []
+        self.tags: set[str] = set()
+        self.handlers: list[str] = []
         self.feed(html)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         found = dict(attrs)
+        self.tags.add(tag)
+        self.handlers += [name for name in found if name.startswith("on")]
         self.ids += [str(found["id"])] if "id" in found else []
         for name in ("src", "href", "xlink:href", "srcset", "data"):
             if tag != "a" and not str(found.get(name, "#")).startswith("#"):
@@ -373,6 +380,65 @@ def test_any_state_of_a_sweep_has_a_page(state: str) -> None:
     assert not shown.open
     assert len(shown.ids) == len(set(shown.ids))
     assert "nan" not in re.findall(r"[a-z]+", shown.text.replace("NaN", ""))
+
+
+SCRIPT = "\"'><script>steal()</script><img src=//evil/x onerror=steal()><!-- $x_{1$ {{ 7*7 }} &"
+
+
+def hostile() -> Sweep:
+    """Somebody's sweep: a script in every text of it."""
+    tags = {names.TAG_ALPHA: SCRIPT, "failure": SCRIPT, "variant": SCRIPT}
+    runs = [
+        one_run(q, seed, task=SCRIPT, stage=stage, params={SCRIPT: q}, **tags)
+        for stage in (SCRIPT, f"{SCRIPT}2")
+        for q in ("1", "1.5", SCRIPT)
+        for seed in (0, 1)
+    ]
+    runs.append(one_run("1", 2, task=SCRIPT, stage=SCRIPT, status="FAILED", **tags))  # type: ignore[arg-type]
+    runs = [replace(run, name=SCRIPT, run_id=f"{SCRIPT}{i}") for i, run in enumerate(runs)]
+    search = {
+        "stage": SCRIPT,
+        "mode": SCRIPT,
+        "sampler": SCRIPT,
+        "objectives": [{"name": SCRIPT, "direction": SCRIPT}],
+        "arms": [
+            {
+                "values": {SCRIPT: SCRIPT},
+                "importance": {SCRIPT: 0.5},
+                "trials": [
+                    {"number": 0, "state": SCRIPT, "values": {SCRIPT: SCRIPT}, "reason": SCRIPT}
+                ],
+            }
+        ],
+        "ranking": [{"trial": SCRIPT, "values": {SCRIPT: SCRIPT}, "failure": SCRIPT}],
+    }
+    return replace(
+        sweep_of([(run, climbing(0.5)) for run in runs], status=SCRIPT, config=SCRIPT),
+        name=SCRIPT,
+        run_id=SCRIPT,
+        experiment_id=SCRIPT,
+        source=f"http://{SCRIPT}",
+        tags={names.TAG_GIT_COMMIT: SCRIPT, f"{names.TAG_VERSION_PREFIX}{SCRIPT}": SCRIPT},
+        searches=[search],
+    )
+
+
+def test_a_script_in_any_text_of_a_sweep_is_shown_as_text() -> None:
+    made = replace(report_on(hostile()), command=SCRIPT, missing=[SCRIPT])
+    page = render(made)
+    shown, harmless = Page(page), Page(render(report_on(grid_of_settings())))
+    assert shown.tags <= harmless.tags | {"nav", "a", "pre"}
+    assert not shown.handlers
+    assert not shown.fetched
+    assert not shown.open
+    # Whatever the page shows, it shows whole: no text ended a tag, or was taken for a formula.
+    assert shown.text.count(SCRIPT) > 50
+    assert page.count("&lt;script&gt;steal()") == page.count("script&gt;steal()")
+    labels = re.findall(r'<div role="img" aria-label="([^"]*)">', page)
+    assert unescape(labels[0]) == f"Success rate, {SCRIPT}"
+    for drawn in made.pictures.values():
+        elements = ElementTree.fromstring(drawn.files["svg"]).iter()
+        assert "script" not in {element.tag.rpartition("}")[2] for element in elements}
 
 
 STAGES = {"pretrain": "music-u", "plain": "tac", "with-a-rather-long-name": "music-r"}
