@@ -35,6 +35,16 @@ def test_exp_q_undoes_ln_q(x: float, q: float) -> None:
     assert float(exp_q(ln_q(f64(x), q), q)) == pytest.approx(x, rel=1e-6)
 
 
+@pytest.mark.parametrize("q", [0.1, 0.5, 1.2, 1.5, 2.0, 3.0, 5.0])
+def test_gradients_in_float32_are_the_slope_on_both_sides_of_the_bound(q: float) -> None:
+    log_x = torch.linspace(-8.0, 8.0, 2001, requires_grad=True)
+    ln_q_of_log(log_x, q, max_exponent=MAX_EXPONENT).sum().backward()
+    exponent = (q - 1.0) * log_x.detach().double()
+    # The gradient of expm1 is its value + 1, which has the digits of 1.
+    expected = exponent.clamp(max=MAX_EXPONENT).exp()
+    torch.testing.assert_close(log_x.grad.double(), expected, rtol=2e-6, atol=2e-7)
+
+
 @given(y=st.floats(-3, 3), q=orders)
 def test_ln_q_undoes_exp_q_exactly_where_its_argument_is_positive(y: float, q: float) -> None:
     margin = 1 + (q - 1) * y
