@@ -20,6 +20,7 @@ __all__ = [
     "goal_reward_of",
     "is_gymnasium_id",
     "make_env",
+    "moved_distance_of",
     "observation_sizes",
 ]
 
@@ -140,6 +141,34 @@ def goal_reward_of(env: Env) -> GoalReward:
     if not sound:
         raise ValueError(_not_vectorised(env, "rewards change with the batch or the simulator"))
     return reward
+
+
+MOVED_SHARE = 0.2
+"""Share of a task's success distance from which on what is achieved counts as moved: 1 cm in the
+Fetch tasks, as for the metric `evaluation/object_moved_share`."""
+
+
+def moved_distance_of(env: Env, reward: GoalReward) -> float | None:
+    """How far achieved goals must be apart for `hindsight_episodes: moved`; resets `env`.
+
+    Returns:
+        None where the reward decides: a sparse one does not change within the success distance.
+        A dense one tells any two goals apart, a resting object's jitter included.
+
+    Raises:
+        ValueError: a dense reward, and the environment does not say its success distance.
+    """
+    start = np.asarray(env.reset(seed=0)[0]["achieved_goal"], np.float32)[None]
+    jitter = np.float32(1e-6) * np.maximum(1.0, np.abs(start))
+    if np.array_equal(reward(start, start + jitter), reward(start, start)):
+        return None
+    distance = getattr(env.unwrapped, "distance_threshold", None)
+    if isinstance(distance, int | float) and distance > 0:
+        return MOVED_SHARE * distance
+    raise ValueError(
+        "replay.hindsight_episodes must be all, or the task must have a moved_distance: "
+        f"{_name(env)} has dense rewards and no distance_threshold, so any jitter is a move"
+    )
 
 
 def _is_vectorised(reward: GoalReward, env: Env) -> bool:

@@ -79,6 +79,10 @@ class Task(BaseModel):
     """Further arguments of `gymnasium.make`."""
     mi_reward_weight: float = Field(1.0, ge=0)
     """MUSIC-r's weight of the intrinsic reward where a sweep doesn't set it."""
+    moved_distance: float | None = Field(None, gt=0)
+    """Distance, in the goal's units, from which on what is achieved has moved, for
+    `replay.hindsight_episodes: moved`. null: where the task's reward no longer takes it for the
+    same; with dense rewards a fifth of the environment's `distance_threshold`."""
 
     @model_validator(mode="after")
     def _split_is_sound(self) -> Self:
@@ -100,8 +104,8 @@ class Task(BaseModel):
         return bool(self.surrounding_indices)
 
     def identity(self) -> dict[str, Any]:
-        """All that determines what the task is: neither its name nor a default for settings."""
-        return self.model_dump(mode="json", exclude={"name", "mi_reward_weight"})
+        """All that determines what the task is: neither its name nor how it is trained on."""
+        return self.model_dump(mode="json", exclude={"name", "mi_reward_weight", "moved_distance"})
 
 
 def _fetch(name: str, *, split: bool = True, mi_reward_weight: float = 1.0) -> Task:

@@ -148,6 +148,8 @@ class RunSettings(_Frozen):
         the identity that they had before there was one.
         """
         settings = self.model_dump(mode="json") | {"task": self.task.identity()}
+        if self.replay.hindsight_episodes == "moved" and self.task.moved_distance is not None:
+            settings["task"]["moved_distance"] = self.task.moved_distance
         for section, name in YOUNGER:
             part: BaseModel = getattr(self, section)
             default = type(part).model_fields[name].get_default(call_default_factory=True)

@@ -57,7 +57,7 @@ def algorithm_config(run: RunSettings) -> TACConfig:
         surrounding_indices=run.task.surrounding_indices,
         **dict(run.music),
     )
-    config.replay(**dict(run.replay))
+    config.replay(moved_distance=run.task.moved_distance, **dict(run.replay))
     config.success_key = run.task.success_key
     # Evaluations are asked for by `TrainingRun`, at given environment steps.
     config.evaluation(

@@ -22,6 +22,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from music_rllib.replay.places import Places
 from music_rllib.replay.priorities import TDPriorities, WeightedDraws, ranges, rank_weights
 
 __all__ = ["ReplayLayout", "Trajectory", "TrajectoryReplay", "Transitions"]
@@ -89,38 +90,6 @@ class Transitions:
     """[B] where they lie, for `update_priorities`."""
 
 
-@dataclass(frozen=True)
-class _Places:
-    """Where the transitions of some trajectories lie, to draw from."""
-
-    starts: Rows
-    lengths: Rows
-    ends: Rows
-    """[N] transitions up to the end of each trajectory."""
-    equal: bool
-    """Whether all are of one length."""
-
-    @classmethod
-    def of(cls, starts: Rows, lengths: Rows) -> _Places:
-        equal = len(lengths) > 0 and bool(lengths.min() == lengths.max())
-        return cls(starts, lengths, np.cumsum(lengths), equal)
-
-    @property
-    def total(self) -> int:
-        """Transitions of all."""
-        return int(self.ends[-1]) if len(self.ends) else 0
-
-    def draw(self, rng: np.random.Generator, count: int) -> tuple[Rows, Rows, Rows]:
-        """First row, step and length of their trajectory, of `count` transitions; [B] each."""
-        drawn = rng.integers(0, self.total, count)
-        if self.equal:
-            which, step = np.divmod(drawn, self.lengths[0])
-        else:
-            which = np.searchsorted(self.ends, drawn, side="right")
-            step = drawn - (self.ends[which] - self.lengths[which])
-        return self.starts[which], step, self.lengths[which]
-
-
 class TrajectoryReplay:
     """Ring of trajectories with uniform transition sampling, hindsight, and a trajectory view.
 
@@ -132,8 +101,12 @@ class TrajectoryReplay:
         hindsight_k: HER `future` (Andrychowicz et al. 2017): a share k/(1+k) of transitions gets
             a goal that their trajectory achieved later on.
         hindsight_episodes: `all`; or `moved`: transitions with such a goal come only from
-            trajectories with a later goal that their first state does not reach, as long as
-            there is one (Manela & Biess 2021 filter hindsight goals by the same thought).
+            trajectories that have moved (Manela & Biess 2021 filter hindsight goals by the same
+            thought), but from none of them more than `MOST_OF_ONE_EPISODE`: where they are too
+            few for that, the rest comes from all.
+        moved_distance: a trajectory has moved where it achieves a goal farther than this from
+            the one it begins with. None: one that its first state does not reach by
+            `goal_reward`, which must be sparse then.
         td_exponent: PER (Schaul et al. 2016): draw transitions with probability proportional to
             their absolute TD error to this power. None: uniformly.
 
@@ -150,6 +123,7 @@ class TrajectoryReplay:
         goal_reward: GoalReward | None = None,
         hindsight_k: float = 0.0,
         hindsight_episodes: Literal["all", "moved"] = "all",
+        moved_distance: float | None = None,
         td_exponent: float | None = None,
     ) -> None:
         if capacity < layout.horizon:
@@ -164,8 +138,9 @@ class TrajectoryReplay:
         self._goal_reward = goal_reward
         self._hindsight_share = hindsight_k / (1.0 + hindsight_k)
         self._only_moved = hindsight_episodes == "moved" and hindsight_k > 0
+        self._moved_distance = moved_distance
         self._moved = np.zeros(0, np.bool_)
-        self._places: tuple[_Places, _Places] | None = None
+        self._places: tuple[Places, Places] | None = None
         ring = capacity // layout.horizon * (layout.horizon + 1)
         # Untouched pages of zeros cost nothing: the system hands them out as they are written.
         self._steps = np.zeros((ring, layout.frame + layout.action + 2), np.float32)
@@ -193,7 +168,7 @@ class TrajectoryReplay:
     @property
     def longest(self) -> int:
         """Steps of the longest trajectory held; 0 if there is none."""
-        return int(self._lengths.max(initial=0))
+        return self._all_and_moved()[0].longest
 
     @property
     def nbytes(self) -> int:
@@ -266,6 +241,9 @@ class TrajectoryReplay:
         """Whether a goal achieved later is not reached by the state that the episode begins in."""
         assert self._goal_reward is not None
         achieved = self._frames[start : start + steps + 1, self.layout.network_input :]
+        if self._moved_distance is not None:
+            away = np.linalg.norm(achieved - achieved[0], axis=1)
+            return bool(away.max() > self._moved_distance)
         at_first = np.broadcast_to(achieved[0], achieved.shape)
         return bool(
             np.any(self._goal_reward(at_first, achieved) < self._goal_reward(achieved, achieved))
@@ -279,13 +257,13 @@ class TrajectoryReplay:
             self._moved = np.array(moved, np.bool_)
         self._places = None
 
-    def _all_and_moved(self) -> tuple[_Places, _Places]:
+    def _all_and_moved(self) -> tuple[Places, Places]:
         """Kept between minibatches: to find them anew takes time that grows with the replay."""
         if self._places is None:
             moved = self._moved if self._only_moved else slice(0)
             self._places = (
-                _Places.of(self._starts, self._lengths),
-                _Places.of(self._starts[moved], self._lengths[moved]),
+                Places.of(self._starts, self._lengths),
+                Places.of(self._starts[moved], self._lengths[moved]),
             )
         return self._places
 
@@ -306,7 +284,8 @@ class TrajectoryReplay:
             chosen = np.flatnonzero(self.rng.random(count) < self._hindsight_share)
             _, moved = self._all_and_moved()
             if moved.total:
-                start[chosen], step[chosen], length[chosen] = moved.draw(self.rng, len(chosen))
+                part = chosen[moved.few_of_one(self.rng, len(chosen), self._hindsight_share)]
+                start[part], step[part], length[part] = moved.draw(self.rng, len(part))
         row = start + step
         width, frame = self.layout.network_input, self.layout.frame
         after = self._steps.shape[1]

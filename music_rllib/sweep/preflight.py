@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Set
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -43,8 +44,8 @@ def check_environments(plan: Plan) -> None:
             runs.setdefault(node.run.task.name, []).append(node.run)
     problems = []
     for name, of_task in runs.items():
-        hindsight = any(run.replay.hindsight_k > 0 for run in of_task)
-        misfits = _misfits(of_task[0].task, hindsight=hindsight)
+        hindsight = {run.replay.hindsight_episodes for run in of_task if run.replay.hindsight_k > 0}
+        misfits = _misfits(of_task[0].task, hindsight)
         problems += [f"environments.{name}: {line}" for line in misfits]
     if problems:
         raise TaskError("\n".join(problems))
@@ -70,7 +71,7 @@ def check_hardware(plan: Plan) -> None:
         raise HardwareError(str(error)) from error
 
 
-def _misfits(task: Task, *, hindsight: bool) -> list[str]:
+def _misfits(task: Task, hindsight: Set[str]) -> list[str]:
     from music_rllib.envs.make import make_env
 
     try:
@@ -78,15 +79,21 @@ def _misfits(task: Task, *, hindsight: bool) -> list[str]:
     except Exception as error:  # a user's environment may raise anything
         return [f"env_id must name an environment that can be made, got {task.env_id!r}: {error}"]
     try:
-        return _misfits_of(task, env, hindsight=hindsight)
+        return _misfits_of(task, env, hindsight)
     except Exception as error:
         return [f"env_id must name an environment that can be played, got {error!r}"]
     finally:
         env.close()
 
 
-def _misfits_of(task: Task, env: Env, *, hindsight: bool) -> list[str]:
-    from music_rllib.envs.make import check_action_space, goal_reward_of, observation_sizes
+def _misfits_of(task: Task, env: Env, hindsight: Set[str]) -> list[str]:
+    """What is wrong, where some runs take `hindsight` from all episodes, or from moved ones."""
+    from music_rllib.envs.make import (
+        check_action_space,
+        goal_reward_of,
+        moved_distance_of,
+        observation_sizes,
+    )
 
     try:
         check_action_space(env.action_space)
@@ -109,7 +116,9 @@ def _misfits_of(task: Task, env: Env, *, hindsight: bool) -> list[str]:
         problems.append("must have goals for replay.hindsight_k > 0, its observations have none")
     elif hindsight:
         try:
-            goal_reward_of(env)
+            reward = goal_reward_of(env)
+            if "moved" in hindsight and task.moved_distance is None:
+                moved_distance_of(env, reward)
         except ValueError as error:
             problems.append(str(error))
     return problems

@@ -33,7 +33,7 @@ from ray.rllib.utils.metrics import (
 )
 from ray.rllib.utils.typing import StateDict
 
-from music_rllib.envs.make import goal_reward_of
+from music_rllib.envs.make import goal_reward_of, moved_distance_of
 from music_rllib.replay.buffer import TrajectoryReplay, Transitions
 from music_rllib.schedules import value_at
 from music_rllib.tac.config import TACConfig
@@ -77,13 +77,18 @@ class TAC(Algorithm):
     def _make_replay(self) -> TrajectoryReplay:
         settings = self._replay_settings
         runner = self._a_runner_with_environments()
+        goal_reward = goal_reward_of(runner.env) if settings.hindsight_k > 0 else None
+        moved_distance = self.config.moved_distance
+        if goal_reward and settings.hindsight_episodes == "moved" and moved_distance is None:
+            moved_distance = moved_distance_of(runner.env, goal_reward)
         return TrajectoryReplay(
             runner.layout,
             settings.capacity,
             np.random.default_rng((seed_or_entropy(self.config.seed), _REPLAY_STREAM)),
-            goal_reward=goal_reward_of(runner.env) if settings.hindsight_k > 0 else None,
+            goal_reward=goal_reward,
             hindsight_k=settings.hindsight_k,
             hindsight_episodes=settings.hindsight_episodes,
+            moved_distance=moved_distance,
             td_exponent=settings.priority_exponent if self._by_td_error else None,
         )
 

@@ -55,6 +55,7 @@ class TACConfig(AlgorithmConfig):
         self.agent_indices: tuple[int, ...] = ()
         self.surrounding_indices: tuple[int, ...] = ()
         self.success_key: str | None = "is_success"
+        self.moved_distance: float | None = None
         self.framework_str = "torch"
         self.env_runner_cls = TrajectoryEnvRunner
         # One iteration is one episode per sub-environment, and what is learned from it.
@@ -125,10 +126,22 @@ class TACConfig(AlgorithmConfig):
             self.surrounding_indices = tuple(surrounding_indices)
         return self
 
-    def replay(self, **settings: Any) -> Self:
-        """Sets fields of `ReplaySettings`; an unknown one raises TypeError."""
+    def replay(self, *, moved_distance: float | None = NotProvided, **settings: Any) -> Self:
+        """Sets the replay and hindsight up.
+
+        Args:
+            moved_distance: how far what is achieved must get from where it was at first, in its
+                own units, for `hindsight_episodes: moved`. None: the task's reward decides, or
+                where it is dense a fifth of the environment's `distance_threshold`.
+            **settings: fields of `ReplaySettings`.
+
+        Raises:
+            TypeError: an unknown setting.
+        """
         _reject_unknown("replay", settings, ReplaySettings)
         self._set(settings, "replay_")
+        if moved_distance is not NotProvided:
+            self.moved_distance = moved_distance
         return self
 
     def _set(self, settings: Mapping[str, Any], prefix: str) -> None:

@@ -18,7 +18,7 @@ PUSH: dict[str, Any] = {
 }
 
 
-def check(folder: Path, task: dict[str, Any], *, hindsight_k: float = 0.0) -> None:
+def check(folder: Path, task: dict[str, Any], **replay: Any) -> None:
     document = {
         "name": "s",
         "tasks": ["Mine"],
@@ -26,7 +26,7 @@ def check(folder: Path, task: dict[str, Any], *, hindsight_k: float = 0.0) -> No
         "defaults": {"env_steps": 2000},
         # Only one of the stages has hindsight.
         "stages": [
-            {"name": "with", "variant": "tac", "replay": {"hindsight_k": hindsight_k}},
+            {"name": "with", "variant": "tac", "replay": replay},
             {"name": "without", "variant": "tac"},
         ],
     }
@@ -84,6 +84,15 @@ def test_what_does_not_fit_is_said(task: dict[str, Any], rule: str, tmp_path: Pa
         check(tmp_path, task, hindsight_k=4.0)
     (line,) = str(caught.value).splitlines()
     assert line.startswith(f"environments.Mine: {rule}")
+
+
+def test_dense_rewards_need_a_distance_for_hindsight_from_moved_episodes(tmp_path: Path) -> None:
+    maze = {"env_id": "PointMaze_UMazeDense-v3", "horizon": 100, "success_key": "success"}
+    check(tmp_path, maze, hindsight_k=4.0)
+    moved: dict[str, Any] = {"hindsight_k": 4.0, "hindsight_episodes": "moved"}
+    with pytest.raises(TaskError, match="or the task must have a moved_distance: PointMaze_UMaze"):
+        check(tmp_path, maze, **moved)
+    check(tmp_path, maze | {"moved_distance": 0.1}, **moved)
 
 
 def test_all_that_does_not_fit_is_said_at_once(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from music_rllib.experiment.plan import node_key
 from music_rllib.experiment.result import from_json_lines
 from music_rllib.experiment.settings import RunSettings, Variant, handed_over, preset
 from music_rllib.experiment.store import NodeStore
+from music_rllib.experiment.training import TrainingRun
 from music_rllib.policy import find_policy, load_policy
 from music_rllib.sweep.trainable import NOTES, REPORTS, NodeJob, RunTrainable
 from music_rllib.tracking import names
@@ -147,6 +148,21 @@ def test_music_f_begins_with_the_agent_that_it_was_handed(tmp_path: Path) -> Non
     normalised = begun.algorithm.env_runner.module.normaliser(torch.from_numpy(inputs)).numpy()
     np.testing.assert_allclose(normalised[:, 4:].std(axis=0), 1.0, rtol=1e-5)
     begun.close()
+
+
+@pytest.mark.usefixtures("local_ray")
+def test_a_task_says_from_which_distance_on_something_has_moved() -> None:
+    def weights(far: float | None, episodes: str) -> Any:
+        task = POINT.model_copy(update={"moved_distance": far})
+        replay = {"hindsight_k": 4.0, "hindsight_episodes": episodes}
+        run = TrainingRun(settings("tac", task=task, replay=replay))
+        run.advance()
+        run.close()
+        return run.modules()["policy"]["0.weight"]
+
+    # Farther than anything gets there, and as far as the reward tells apart.
+    np.testing.assert_array_equal(weights(100.0, "moved"), weights(None, "all"))
+    assert (weights(None, "moved") != weights(None, "all")).any()
 
 
 @pytest.mark.usefixtures("local_ray")

@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from music_rllib.envs.make import make_env
+from music_rllib.envs.make import goal_reward_of, make_env, moved_distance_of
 from music_rllib.envs.registry import BUILT_IN_TASKS
 
 FETCH = [task.env_id for task in BUILT_IN_TASKS.values() if task.env_id.startswith("Fetch")]
@@ -78,3 +78,11 @@ def test_an_action_of_another_size_is_refused() -> None:
     env.reset(seed=0)
     with pytest.raises(ValueError, match="Action dimension mismatch"):
         env.step(np.zeros(3, np.float32))
+
+
+@pytest.mark.parametrize(("reward_type", "distance"), [("sparse", None), ("dense", 0.01)])
+def test_moved_is_what_a_sparse_reward_says_and_a_fifth_of_the_threshold_of_a_dense_one(
+    reward_type: str, distance: float | None
+) -> None:
+    env = make_env("FetchPush-v4", reward_type=reward_type)
+    assert moved_distance_of(env, goal_reward_of(env)) == pytest.approx(distance)

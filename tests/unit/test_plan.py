@@ -137,6 +137,13 @@ def test_every_setting_is_part_of_the_key(changes: dict[str, Any]) -> None:
     assert node_key(settings(**changes), None) != node_key(settings(), None)
 
 
+def test_what_counts_as_moved_is_part_of_the_key_where_it_counts() -> None:
+    task = BUILT_IN_TASKS["FetchPush"].model_copy(update={"moved_distance": 0.02})
+    assert node_key(settings(task=task), None) == node_key(settings(), None)
+    moved = {"replay": {"hindsight_episodes": "moved"}}
+    assert node_key(settings(task=task, **moved), None) != node_key(settings(**moved), None)
+
+
 def test_source_and_algorithm_version_are_part_of_the_key(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

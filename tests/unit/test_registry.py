@@ -69,7 +69,8 @@ def test_unsound_tasks_are_rejected(change: dict[str, object], rule: str) -> Non
 
 def test_identity_ignores_what_does_not_change_the_environment() -> None:
     push = BUILT_IN_TASKS["FetchPush"]
-    renamed = push.model_copy(update={"name": "Mine", "mi_reward_weight": 0.3})
+    trained_otherwise = {"mi_reward_weight": 0.3, "moved_distance": 0.02}
+    renamed = push.model_copy(update={"name": "Mine", **trained_otherwise})
     assert renamed.identity() == push.identity()
     for change in (
         {"env_id": "FetchSlide-v4"},

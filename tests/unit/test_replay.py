@@ -107,27 +107,89 @@ def resting(number: int, steps: int) -> Trajectory:
     return dataclasses.replace(played, frames=frames)
 
 
+def moving_replay(**settings: Any) -> TrajectoryReplay:
+    return replay(1100, hindsight_k=4.0, hindsight_episodes="moved", **settings)
+
+
 def test_hindsight_of_moved_episodes_leaves_out_those_that_reach_every_goal_at_once() -> None:
-    buffer = replay(20, hindsight_k=4.0, hindsight_episodes="moved")
+    buffer = moving_replay()
     buffer.extend([resting(n, 5) for n in range(3)])
     # Nothing has moved yet: hindsight takes what there is.
     assert (buffer.sample_transitions(1_000).inputs[:, 3] >= 0).mean() > 0.7
-    buffer.extend([episode(3, 5), episode(4, 2)])  # and the first one is dropped
-    restored = replay(20, hindsight_k=4.0, hindsight_episodes="moved")
+    buffer.extend([episode(n, 5 if n % 2 else 3) for n in range(3, 15)])
+    restored = moving_replay()
     restored.load_state(buffer.state())
     for ring in (buffer, restored):
         batch = ring.sample_transitions(20_000)
         goal, number, step = batch.inputs[:, 3], batch.inputs[:, 0], batch.inputs[:, 1]
         relabelled = goal >= 0
         assert relabelled.mean() == pytest.approx(0.8, abs=0.02)
-        assert set(number[relabelled]) == {3, 4}
-        # Uniform over the seven transitions of those two; the others are so over all that is held.
-        assert (number[relabelled] == 3).mean() == pytest.approx(5 / 7, abs=0.02)
-        assert set(number[~relabelled]) == {1, 2, 3, 4}
+        assert set(number[relabelled]) == set(range(3, 15))
+        # Uniform over the 48 transitions of those; the others are so over all that is held.
+        assert (number[relabelled] % 2 == 1).mean() == pytest.approx(30 / 48, abs=0.02)
+        assert set(number[~relabelled]) == set(range(15))
         later = goal[relabelled] - 100 * number[relabelled]
         assert (later > step[relabelled]).all()
         reached = later == step[relabelled] + 1
         np.testing.assert_array_equal(batch.rewards[relabelled], np.where(reached, 0.0, -1.0))
+
+
+@pytest.mark.parametrize(
+    ("moved", "others", "share"),
+    [
+        # A tenth each and what they get as some of all, in place of .8 over their number.
+        ([5], 200, 0.1),
+        ([5, 5, 5], 100, 0.1),
+        # Of unequal ones the longest gets a tenth, each transition as much as any other.
+        ([5, 1, 1], 200, 0.1),
+        # From eight on it does not bind.
+        ([5] * 10, 100, 0.08),
+    ],
+)
+def test_no_moved_episode_fills_more_than_a_tenth_of_a_minibatch(
+    moved: list[int], others: int, share: float
+) -> None:
+    buffer, again = moving_replay(), moving_replay()
+    buffer.extend([resting(n, 5) for n in range(others)])
+    buffer.extend([episode(others + n, steps) for n, steps in enumerate(moved)])
+    again.load_state(buffer.state())
+    batch, repeated = buffer.sample_transitions(40_000), again.sample_transitions(40_000)
+    np.testing.assert_array_equal(batch.inputs, repeated.inputs)
+    of_first = (batch.inputs[:, 0] == others).mean()
+    assert share - 0.01 < of_first < share + 5 / (5 * others) + 0.01
+    assert (batch.inputs[:, 3] >= 0).mean() == pytest.approx(0.8, abs=0.01)
+    counts = np.bincount(batch.inputs[:, 0].astype(int))[others:]
+    np.testing.assert_allclose(counts / counts[0], np.array(moved) / moved[0], atol=0.15)
+
+
+def dense(achieved: np.ndarray, desired: np.ndarray) -> np.ndarray:
+    away: np.ndarray = np.abs(achieved[:, 0] - desired[:, 0])
+    return -away
+
+
+@pytest.mark.parametrize("jitter", [1e-6, 0.049])
+def test_where_a_distance_is_given_jitter_is_no_move_even_with_dense_rewards(jitter: float) -> None:
+    def shaken(number: int, by: float) -> Trajectory:
+        played = resting(number, 5)
+        frames = played.frames.copy()
+        frames[:, 4] = 1.3
+        frames[3, 4] += by
+        return dataclasses.replace(played, frames=frames)
+
+    buffer = TrajectoryReplay(
+        LAYOUT,
+        500,
+        np.random.default_rng(0),
+        goal_reward=dense,
+        hindsight_k=4.0,
+        hindsight_episodes="moved",
+        moved_distance=0.05,
+    )
+    buffer.extend(
+        [shaken(n, jitter) for n in range(50)] + [shaken(50 + n, -0.06) for n in range(9)]
+    )
+    batch = buffer.sample_transitions(5_000)
+    assert batch.inputs[batch.inputs[:, 3] >= 0, 0].min() == 50
 
 
 def test_trajectories_come_whole_and_in_order() -> None:
