@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Annotated, Any, Self
 
@@ -32,7 +32,15 @@ from pydantic import (
     model_validator,
 )
 
-__all__ = ["BUILT_IN_TASKS", "Task", "TaskRegistry", "UnknownTaskError", "closest"]
+__all__ = [
+    "BUILT_IN_TASKS",
+    "Indices",
+    "Task",
+    "TaskRegistry",
+    "UnknownTaskError",
+    "check_split",
+    "closest",
+]
 
 _RANGE = re.compile(r"(\d+):(\d+)")
 
@@ -54,6 +62,24 @@ Indices = Annotated[
     BeforeValidator(_expand_range, json_schema_input_type=tuple[int, ...] | str),
 ]
 """Positions in the observation vector: a list, or a half-open range `a:b` as in Python."""
+
+
+def check_split(agent_indices: Sequence[int], surrounding_indices: Sequence[int]) -> None:
+    """Whether these can be agent and surrounding state; both empty: there is no split.
+
+    Raises:
+        ValueError: one is missing, or an index is there twice, in one of them or in both.
+    """
+    if bool(agent_indices) != bool(surrounding_indices):
+        missing = "surrounding_indices" if agent_indices else "agent_indices"
+        raise ValueError(f"{missing} must be given too: a split needs both parts")
+    parts = (("agent_indices", agent_indices), ("surrounding_indices", surrounding_indices))
+    for name, indices in parts:
+        if len(set(indices)) < len(indices):
+            raise ValueError(f"{name} must not repeat an index, got {list(indices)}")
+    shared = sorted(set(agent_indices) & set(surrounding_indices))
+    if shared:
+        raise ValueError(f"agent and surrounding indices must not overlap, both have {shared}")
 
 
 class Task(BaseModel):
@@ -86,16 +112,7 @@ class Task(BaseModel):
 
     @model_validator(mode="after")
     def _split_is_sound(self) -> Self:
-        agent, surrounding = self.agent_indices, self.surrounding_indices
-        if bool(agent) != bool(surrounding):
-            missing = "surrounding_indices" if agent else "agent_indices"
-            raise ValueError(f"{missing} must be given too: a split needs both parts")
-        for name, indices in (("agent_indices", agent), ("surrounding_indices", surrounding)):
-            if len(set(indices)) < len(indices):
-                raise ValueError(f"{name} must not repeat an index, got {list(indices)}")
-        shared = sorted(set(agent) & set(surrounding))
-        if shared:
-            raise ValueError(f"agent and surrounding indices must not overlap, both have {shared}")
+        check_split(self.agent_indices, self.surrounding_indices)
         return self
 
     @property

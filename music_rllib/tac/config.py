@@ -13,6 +13,7 @@ from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 from ray.tune.search.sample import Domain
 
 from music_rllib._quiet import quiet_third_parties
+from music_rllib.envs.registry import Indices, check_split
 from music_rllib.estimator.settings import MusicSettings
 from music_rllib.replay.settings import ReplaySettings
 from music_rllib.schedules import Linear
@@ -117,6 +118,7 @@ class TACConfig(AlgorithmConfig):
 
         Raises:
             TypeError: an unknown setting.
+            ValueError: the two overlap, or repeat an index.
         """
         _reject_unknown("music", settings, MusicSettings)
         self._set(settings, "music_")
@@ -124,6 +126,8 @@ class TACConfig(AlgorithmConfig):
             self.agent_indices = tuple(agent_indices)
         if surrounding_indices is not NotProvided:
             self.surrounding_indices = tuple(surrounding_indices)
+        if self.agent_indices and self.surrounding_indices:  # one may still be to come
+            check_split(self.agent_indices, self.surrounding_indices)
         return self
 
     def replay(self, *, moved_distance: float | None = NotProvided, **settings: Any) -> Self:
@@ -222,6 +226,7 @@ class TACConfig(AlgorithmConfig):
                 "MUSIC needs to know the agent's and the surrounding state: set "
                 "music(agent_indices=[...], surrounding_indices=[...])"
             )
+        check_split(self.agent_indices, self.surrounding_indices)
 
     # -- what RLlib builds from it --------------------------------------------------------
 
@@ -267,7 +272,7 @@ _CHECKS: dict[str, TypeAdapter[Any]] = {
     prefix + name: TypeAdapter(field.rebuild_annotation(), config=ConfigDict(allow_inf_nan=False))
     for settings, prefix in _OWNED
     for name, field in settings.model_fields.items()
-}
+} | {name: TypeAdapter(Indices) for name in ("agent_indices", "surrounding_indices")}
 """The rule of each field by itself; rules between fields are checked by `validate()`."""
 _KINDS = frozenset(
     {"constant", "linear", "piecewise", "scheduled", "learned", "policy", "gaussian_noise"}

@@ -28,8 +28,6 @@ class TACForward(NamedTuple):
     """[B, A] of the current policy at the batch's states."""
     log_density: Tensor | None
     """[B, A] of that action; None for a deterministic policy."""
-    mean: Tensor
-    """[B, A] before tanh."""
     log_std: Tensor | None
     """[B, A]; None for a deterministic policy."""
     q_values: Tensor

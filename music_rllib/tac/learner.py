@@ -306,7 +306,7 @@ class TACLearner(TorchLearner):
         improved = losses.policy_value(forward.q_of_policy, settings.policy_critic)
         policy = losses.policy_loss(improved, ln_q_pi, alpha)
         if settings.action_l2 > 0:
-            policy = policy + settings.action_l2 * forward.mean.square().mean()
+            policy = policy + settings.action_l2 * forward.action.square().mean()
         total = critic + policy
         if forward.value is not None:
             value = losses.value_loss(forward.value, forward.q_of_policy, ln_q_pi, alpha)

@@ -106,7 +106,6 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
             "tac": TACForward(
                 action=action,
                 log_density=log_density,
-                mean=mean,
                 log_std=log_std,
                 q_values=q_values,
                 q_of_policy=q_of_policy,

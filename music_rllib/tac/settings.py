@@ -112,7 +112,7 @@ class TACSettings(_Frozen):
     behaviour: Behaviour = "policy"
     """Acting during training: sample the policy, or the original MUSIC's noise."""
     action_l2: float = Field(0.0, ge=0)
-    """Weight of the mean squared pre-tanh action in the policy's loss (original MUSIC: 1.0)."""
+    """Weight of the policy's mean squared action, in [-1, 1], in its loss (original MUSIC: 1.0)."""
     max_episode_steps: int | None = Field(None, gt=0)
     """Truncate episodes here; needed where the environment has no time limit of its own."""
 

@@ -113,7 +113,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "frames shuffled as in 2021": {"music": {**MUSIC_U, "shuffle": "random"}},
     "q and alpha scheduled": {"entropic_index": RAMP, "alpha": {**RAMP, "start": 0.1}},
     "alpha learned": {"alpha": {"learned": True}, "bootstrap": "critics"},
-    "ddpg": {**DDPG, "target_update_interval": 2},
+    "ddpg": {**DDPG, "target_update_interval": 2, "action_l2": 1.0},
     "per": PER,
 }
 

@@ -288,6 +288,12 @@ def test_a_bad_setting_is_refused_where_it_is_made(settings: dict[str, Any], mes
     [
         (lambda c: c.training(policy="deterministic"), "alpha must be 0 for policy: deterministic"),
         (lambda c: c.music(estimator="trained", mi_reward_weight=1.0), "set music.agent_indices"),
+        (lambda c: c.music(agent_indices=[0, 1, 2], surrounding_indices=[2, 3]), r"overlap.*\[2\]"),
+        (lambda c: c.music(agent_indices=[0]).music(surrounding_indices=range(2)), "overlap"),
+        (lambda c: c.music(agent_indices=[1, 1], surrounding_indices=[2]), "must not repeat an"),
+        (lambda c: c.music(agent_indices=[0, 1]), "surrounding_indices must be given too"),
+        (lambda c: c.update_from_dict({"agent_indices": [0], "surrounding_indices": [0]}), "overl"),
+        (lambda c: c.music(agent_indices=[-1], surrounding_indices=[2]), r"agent_indices.*got -1"),
         (lambda c: c.music(goals="zero").replay(hindsight_k=4.0), "hindsight_k must be 0 with"),
         (lambda c: c.learners(num_learners=2), "num_learners must be 0 or 1, got 2"),
         (

@@ -211,3 +211,36 @@ def test_automatic_target_entropy_is_sacs_at_q_1() -> None:
     assert learner(alpha={"learned": True})._target_entropy == pytest.approx(-ACTION)
     at_2 = learner(alpha={"learned": True}, entropic_index=2.0)._target_entropy
     assert at_2 == pytest.approx(-ACTION * (np.e - 1))
+
+
+@pytest.mark.parametrize("policy", ["stochastic", "deterministic"])
+@pytest.mark.parametrize("rows", [4, 64])
+def test_action_l2_penalises_the_squashed_action(policy: str, rows: int) -> None:
+    """d tanh(u)^2 / du = 2 tanh(u) (1 - tanh(u)^2), by hand below; 64 rows are fused."""
+    ddpg = {"bootstrap": "critics", "alpha": 0.0, "behaviour": {"kind": "gaussian_noise"}}
+    settings: dict[str, Any] = ddpg if policy == "deterministic" else {"alpha": 0.0}
+    built = learner(policy=policy, action_l2=1.0, policy_critic="first", **settings)
+    module = built.module[DEFAULT_MODULE_ID].float()
+    for parameter in module.parameters():
+        parameter.data.zero_()
+    batch = {
+        name: values[:1].repeat(rows, 1).float()
+        for name, values in minibatch().items()
+        if values.ndim == 2
+    }
+    batch |= {"rewards": torch.zeros(rows), "discounts": torch.ones(rows)}
+    for mean, noise, expected in (
+        (0.0, 0.0, 0.0),
+        (0.5, 0.0, 0.72686),
+        (2.0, 0.0, 0.13622),
+        (-1.0, 0.0, -0.63970),
+        (1.5, 0.5, 0.13622),
+    ):
+        if policy == "deterministic":
+            mean, noise = mean + noise, 0.0
+        module.policy[-1].bias.data[:ACTION] = mean
+        batch["noise"][:] = noise
+        gradient = gradients(tac_loss(built, batch), module)["policy.4.bias"][:ACTION]
+        torch.testing.assert_close(
+            gradient, torch.full((ACTION,), expected / ACTION), atol=1e-5, rtol=0
+        )
