@@ -11,6 +11,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from music_rllib._quiet import drop_farama_notice
+from music_rllib.envs.numbers import are_usable, bad_number
 from music_rllib.replay.buffer import GoalReward
 
 __all__ = [
@@ -21,6 +22,7 @@ __all__ = [
     "is_gymnasium_id",
     "make_env",
     "moved_distance_of",
+    "name_of",
     "observation_sizes",
 ]
 
@@ -128,11 +130,16 @@ def goal_reward_of(env: Env) -> GoalReward:
     if compute is None or not isinstance(env.observation_space, spaces.Dict):
         raise ValueError(
             "replay.hindsight_k must be 0 without a goal environment: "
-            f"{_name(env)} has no goals with a compute_reward"
+            f"{name_of(env)} has no goals with a compute_reward"
         )
 
     def reward(achieved: NDArray[np.float32], desired: NDArray[np.float32]) -> NDArray[Any]:
-        return np.asarray(compute(achieved, desired, {}), dtype=np.float32)
+        rewards = np.asarray(compute(achieved, desired, {}), dtype=np.float32)
+        if not are_usable(rewards.ravel()):
+            error = bad_number([("compute_reward", rewards.ravel())], name_of(env))
+            if error is not None:
+                raise error
+        return rewards
 
     try:
         sound = _is_vectorised(reward, env)
@@ -167,7 +174,7 @@ def moved_distance_of(env: Env, reward: GoalReward) -> float | None:
         return MOVED_SHARE * distance
     raise ValueError(
         "replay.hindsight_episodes must be all, or the task must have a moved_distance: "
-        f"{_name(env)} has dense rewards and no distance_threshold, so any jitter is a move"
+        f"{name_of(env)} has dense rewards and no distance_threshold, so any jitter is a move"
     )
 
 
@@ -188,9 +195,10 @@ def _is_vectorised(reward: GoalReward, env: Env) -> bool:
 def _not_vectorised(env: Env, reason: str) -> str:
     return (
         "replay.hindsight_k must be 0 where compute_reward does not price every row of a batch by "
-        f"itself: with {_name(env)}, {reason}"
+        f"itself: with {name_of(env)}, {reason}"
     )
 
 
-def _name(env: Env) -> str:
+def name_of(env: Env) -> str:
+    """The environment's id, or its class where it has none."""
     return env.spec.id if env.spec is not None else type(env.unwrapped).__name__

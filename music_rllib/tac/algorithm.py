@@ -34,6 +34,7 @@ from ray.rllib.utils.metrics import (
 from ray.rllib.utils.typing import StateDict
 
 from music_rllib.envs.make import goal_reward_of, moved_distance_of
+from music_rllib.envs.numbers import BadNumberError
 from music_rllib.replay.buffer import TrajectoryReplay, Transitions
 from music_rllib.schedules import value_at
 from music_rllib.tac.config import TACConfig
@@ -168,15 +169,21 @@ class TAC(Algorithm):
 
         Raises:
             RuntimeError: one did not come back.
+            BadNumberError: an environment returned something that nothing can be learned from.
         """
 
         def play_and_tell(runner: TrajectoryEnvRunner) -> tuple[Any, tuple[int, StateDict]]:
-            return play(runner), _stream_of(runner)
+            try:
+                return play(runner), _stream_of(runner)
+            except BadNumberError as error:  # raised, it would be taken for the runner's death
+                return error, _stream_of(runner)
 
         samples: dict[int, tuple[list[Episode], Any]] = {}
         give_up = time.monotonic() + REVIVE_SECONDS
         while missing := self._runner_states.keys() - samples.keys():
             for sample, (index, state) in self._ask_runners(play_and_tell, missing):
+                if isinstance(sample, BadNumberError):
+                    raise sample
                 samples[index], self._runner_states[index] = sample, state
             if self._runner_states.keys() - samples.keys():
                 if time.monotonic() > give_up:

@@ -9,7 +9,6 @@ between calls holds no simulator state: a checkpoint of a few integers resumes i
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -40,10 +39,13 @@ from music_rllib.envs.make import (
     episode_limit,
     is_gymnasium_id,
     make_env,
+    name_of,
     observation_sizes,
 )
-from music_rllib.replay.buffer import ReplayLayout, Trajectory
+from music_rllib.envs.numbers import BadNumberError
+from music_rllib.replay.buffer import ReplayLayout
 from music_rllib.tac.module import TACModule
+from music_rllib.tac.recording import Episode, Recording
 from music_rllib.tac.settings import GaussianNoise, TACSettings
 
 __all__ = [
@@ -64,64 +66,6 @@ MOVED_THRESHOLD = 0.01
 """Distance (metres in the Fetch tasks) from its start beyond which the object counts as moved."""
 
 Floats = NDArray[np.float32]
-
-
-@dataclass(frozen=True)
-class Episode(Trajectory):
-    """A finished episode, and whether each of its steps was a success."""
-
-    successes: NDArray[np.bool_] | None
-    """[n]; None where the environment does not say."""
-
-    def env_steps(self) -> int:
-        return len(self)
-
-    def agent_steps(self) -> int:
-        return len(self)
-
-
-class _Recording:
-    """Arrays of an episode that is being played."""
-
-    def __init__(self, layout: ReplayLayout, *, zero_goal: bool) -> None:
-        self._layout, self._zero_goal = layout, zero_goal
-        self._frames = np.zeros((layout.horizon + 1, layout.frame), np.float32)
-        self._actions = np.zeros((layout.horizon, layout.action), np.float32)
-        self._rewards = np.zeros(layout.horizon, np.float32)
-        self._successes: list[bool] = []
-        self.steps = 0
-
-    def see(self, observation: Any) -> None:
-        frame, layout = self._frames[self.steps], self._layout
-        if layout.goal == 0:
-            frame[:] = observation
-            return
-        frame[: layout.observation] = observation["observation"]
-        if not self._zero_goal:
-            frame[layout.observation : layout.network_input] = observation["desired_goal"]
-        frame[layout.network_input :] = observation["achieved_goal"]
-
-    @property
-    def network_input(self) -> Floats:
-        return self._frames[self.steps, : self._layout.network_input]
-
-    def step(self, action: Floats, reward: float, success: float | None, observation: Any) -> None:
-        self._actions[self.steps] = action
-        self._rewards[self.steps] = reward
-        if success is not None:
-            self._successes.append(bool(success))
-        self.steps += 1
-        self.see(observation)
-
-    def finish(self, *, terminated: bool) -> Episode:
-        n = self.steps
-        return Episode(
-            self._frames[: n + 1],
-            self._actions[:n],
-            self._rewards[:n],
-            terminated,
-            np.array(self._successes) if self._successes else None,
-        )
 
 
 class TrajectoryEnvRunner(EnvRunner, Checkpointable):
@@ -231,27 +175,49 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
 
     def _play(self, count: int, *, explore: bool, random_actions: bool) -> list[Episode]:
         """One episode in each of the first `count` sub-environments."""
-        recordings = [self._begin(env) for env in self.envs[:count]]
+        recordings = [self._begin(i) for i in range(count)]
         finished: dict[int, Episode] = {}
         while len(finished) < count:
             playing = [i for i in range(count) if i not in finished]
             inputs = np.stack([recordings[i].network_input for i in playing])
             actions = self._act(inputs, explore=explore, random_actions=random_actions)
+            if not actions.ravel().dot(actions.ravel()) <= actions.size:
+                raise self._bad_action(actions, inputs, [recordings[i] for i in playing])
             for i, action, scaled in zip(playing, actions, self._to_env(actions), strict=True):
                 ended = self._step(self.envs[i], recordings[i], action, scaled)
                 if ended is not None:
                     finished[i] = recordings[i].finish(terminated=ended)
         return [finished[i] for i in range(count)]
 
-    def _begin(self, env: Env) -> _Recording:
-        seed = np.random.SeedSequence((*self._entropy, self._episodes_started))
+    def _begin(self, index: int) -> Recording:
+        """Starts the next episode in sub-environment `index`."""
+        entropy = np.random.SeedSequence((*self._entropy, self._episodes_started))
         self._episodes_started += 1
-        observation, _ = env.reset(seed=int(seed.generate_state(1)[0]))
-        recording = _Recording(self.layout, zero_goal=self._zero_goals)
+        seed = int(entropy.generate_state(1)[0])
+        observation, _ = self.envs[index].reset(seed=seed)
+        worker = f" of worker {self.worker_index}" if self.worker_index else ""
+        name = (
+            f"{name_of(self.envs[index])}, sub-environment {index}{worker}, "
+            f"{'evaluation' if self.config.in_evaluation else 'training'} episode "
+            f"{self._episodes_started} (reset with seed {seed})"
+        )
+        recording = Recording(self.layout, zero_goal=self._zero_goals, name=name)
         recording.see(observation)
         return recording
 
-    def _step(self, env: Env, recording: _Recording, action: Floats, scaled: Floats) -> bool | None:
+    def _bad_action(
+        self, actions: Floats, inputs: Floats, recordings: list[Recording]
+    ) -> BadNumberError:
+        """The observations were finite, so it is the networks that are not, or are exceeded."""
+        row, dimension = np.argwhere(~(np.abs(actions) <= 1.0))[0]
+        return BadNumberError(
+            f"{recordings[row].place}: the policy's action[{dimension}] is "
+            f"{actions[row, dimension]:g}, it must be within +-1\n"
+            "The networks' weights are not finite, or the observation is too large for them (its "
+            f"largest entry is {np.abs(inputs[row]).max():g})."
+        )
+
+    def _step(self, env: Env, recording: Recording, action: Floats, scaled: Floats) -> bool | None:
         """One step; at the episode's end whether it terminated, before that None."""
         observation, reward, terminated, truncated, info = env.step(scaled)
         success = info.get(self._success_key) if self._success_key else None

@@ -19,9 +19,10 @@ class Point(gym.Env[dict[str, Array], Array]):
 
     Args:
         fail_at: the environment's lifetime step at which it raises; for tests of failures.
+        nan_at: the one at which the object's position is NaN.
     """
 
-    def __init__(self, fail_at: int | None = None) -> None:
+    def __init__(self, fail_at: int | None = None, nan_at: int | None = None) -> None:
         self.observation_space = spaces.Dict(
             {
                 "observation": spaces.Box(-2, 2, (4,), np.float32),
@@ -32,7 +33,7 @@ class Point(gym.Env[dict[str, Array], Array]):
         self.action_space = spaces.Box(-1, 1, (2,), np.float32)
         self._state = np.zeros(4, np.float32)
         self._goal = np.zeros(2, np.float32)
-        self._fail_at = fail_at
+        self._fail_at, self._nan_at = fail_at, nan_at
         self._steps = 0
 
     def compute_reward(self, achieved: Array, desired: Array, info: Any) -> Array:
@@ -53,6 +54,8 @@ class Point(gym.Env[dict[str, Array], Array]):
             raise RuntimeError("the gripper fell off\nlook at the second screw")
         moved = self._state + np.concatenate([0.1 * action, 0.05 * action])
         self._state = np.clip(moved, -2, 2).astype(np.float32)
+        if self._steps == self._nan_at:
+            self._state[2:] = np.nan
         observation = self._observation()
         reward = float(self.compute_reward(observation["achieved_goal"], self._goal, {}))
         return observation, reward, False, False, {"is_success": float(reward == 0)}

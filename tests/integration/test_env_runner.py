@@ -1,11 +1,14 @@
 """The episode runner on real environments: whole episodes, seeds, goals, action bounds."""
 
+import re
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 
+from music_rllib.envs.numbers import BadNumberError
 from music_rllib.tac.config import TACConfig
 from music_rllib.tac.env_runner import TrajectoryEnvRunner
 
@@ -152,3 +155,40 @@ def test_unusable_observations_and_missing_time_limit_are_named() -> None:
         runner(Picture, max_episode_steps=5)
     with pytest.raises(ValueError, match=r"max_episode_steps must be set: the environment has no"):
         runner(Countdown)
+
+
+@pytest.mark.parametrize("bad", [np.nan, -np.inf, 1e30])
+def test_a_bad_number_is_named_with_its_environment_episode_and_step(bad: float) -> None:
+    class Spoilt(Countdown):
+        """In the second sub-environment's second episode the first step returns it."""
+
+        def __init__(self, config: Any = None) -> None:
+            super().__init__(config)
+            self.episodes = -10 * (config.vector_index == 0)
+
+        def reset(self, **arguments: Any) -> tuple[Any, dict[str, Any]]:
+            self.episodes += 1
+            return super().reset(**arguments)
+
+        def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+            observation, *rest = super().step(action)
+            observation[1] = bad if self.episodes == 2 else 0.0
+            return observation, *rest
+
+    made = runner(Spoilt, num_envs=2, max_episode_steps=6)
+    made.sample()
+    with pytest.raises(BadNumberError) as caught:
+        made.sample()
+    assert re.match(
+        r"Spoilt, sub-environment 1, training episode 4 \(reset with seed \d+\), step 1: "
+        rf"observation\[1\] is {re.escape(f'{bad:g}')}, ",
+        str(caught.value),
+    )
+
+
+def test_no_action_that_is_not_finite_reaches_an_environment() -> None:
+    made = runner(Countdown, num_envs=2, max_episode_steps=6)
+    made.module.state_dict()["policy.2.bias"][0] = float("nan")
+    with pytest.raises(BadNumberError, match=r"step 0: the policy's action\[0\] is nan, it must"):
+        made.sample()
+    assert not any(env.seen for env in made.envs if isinstance(env, Countdown))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,7 +21,7 @@ from music_rllib.experiment.settings import RunSettings, Variant, handed_over, p
 from music_rllib.experiment.store import NodeStore
 from music_rllib.experiment.training import TrainingRun
 from music_rllib.policy import find_policy, load_policy
-from music_rllib.sweep.trainable import NOTES, REPORTS, NodeJob, RunTrainable
+from music_rllib.sweep.trainable import CAUSE, NOTES, REPORTS, NodeJob, RunTrainable
 from music_rllib.tracking import names
 
 pytestmark = pytest.mark.integration
@@ -182,6 +183,29 @@ def test_a_cut_run_ends_with_the_numbers_of_an_unbroken_one(
     assert told == [200, 400, 600, 800], "the driver may not have heard of the first ones"
     assert numbers(tmp_path / "b", cut) == numbers(tmp_path / "a", unbroken)
     assert NodeStore(str(tmp_path / "b")).work_folder(cut.key).names() == []
+
+
+@pytest.mark.usefixtures("local_ray")
+def test_a_nan_from_the_environment_is_named_and_the_last_checkpoint_stays(tmp_path: Path) -> None:
+    task = POINT.model_copy(update={"env_kwargs": {"nan_at": 150}})
+    node = job(tmp_path, settings("tac", task=task))
+    *_, last = compute(node)
+    assert last["done"]
+    first, second = last[CAUSE].splitlines()
+    # An evaluation of one episode each went before, of environments of their own.
+    assert re.fullmatch(
+        r"BadNumberError: Point-v0, sub-environment 0, training episode 15 \(reset with seed \d+\),"
+        r" step 10: observation\[2\] is nan, every number must be finite and within \+-1e\+15",
+        first,
+    )
+    assert second.endswith("its last checkpoint is good.")
+    with NodeStore(str(tmp_path)).work_folder(node.key).newest(print) as saved:
+        assert saved is not None
+        again = TrainingRun(node.run)
+        again.restore(saved)
+        assert again.env_steps == 200
+        assert all(np.isfinite(a).all() for m in again.modules().values() for a in m.values())
+        again.close()
 
 
 @pytest.mark.usefixtures("local_ray")

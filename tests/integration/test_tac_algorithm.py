@@ -3,11 +3,14 @@
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from ray import tune
 
 from music_rllib import TACConfig
+from music_rllib.envs.make import make_env
+from music_rllib.envs.numbers import BadNumberError
 from music_rllib.estimator.settings import MusicSettings
 from music_rllib.replay.settings import ReplaySettings
 from music_rllib.tac.algorithm import TAC
@@ -263,6 +266,32 @@ def test_remote_runners_and_learner_learn_and_resume_like_local_ones(
     assert algo.evaluate()["env_runners"]["episode_return_mean"] <= 0
     for one in (algo, resumed):
         one.stop()
+
+
+@pytest.mark.parametrize("runners", [0, 1])
+def test_a_bad_reward_stops_training_and_never_reaches_the_replay(runners: int) -> None:
+    def spoilt(context: Any) -> gym.Env[Any, Any]:
+        class Spoilt(gym.Wrapper[Any, Any, Any, Any]):
+            steps = 0
+
+            def step(self, action: Any) -> Any:
+                observation, reward, *rest = self.env.step(action)
+                self.steps += 1
+                return observation, float("nan") if self.steps == 130 else reward, *rest
+
+        return Spoilt(make_env("FetchReach-v4"))
+
+    tune.register_env("Spoilt", spoilt)
+    algo = build("Spoilt", where={"num_env_runners": runners})
+    for _ in range(2):
+        algo.train()
+    weights = weight_sums(algo)
+    with pytest.raises(BadNumberError, match=r"^FetchReach-v4, sub-env.* step 30: reward is nan"):
+        algo.train()
+    assert algo.replay.trajectories == 4
+    assert np.isfinite(algo.replay.packed(0)["rewards"]).all()
+    assert weight_sums(algo) == weights
+    algo.stop()
 
 
 @pytest.mark.parametrize(

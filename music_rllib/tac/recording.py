@@ -1,0 +1,109 @@
+"""Arrays of an episode while it is played, from numbers that are looked at as they come in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from music_rllib.envs.numbers import LARGEST, are_usable, bad_number
+from music_rllib.replay.buffer import ReplayLayout, Trajectory
+
+__all__ = ["Episode", "Recording"]
+
+Floats = NDArray[np.float32]
+_PARTS = ("observation", "desired_goal", "achieved_goal")
+
+
+@dataclass(frozen=True)
+class Episode(Trajectory):
+    """A finished episode, and whether each of its steps was a success."""
+
+    successes: NDArray[np.bool_] | None
+    """[n]; None where the environment does not say."""
+
+    def env_steps(self) -> int:
+        return len(self)
+
+    def agent_steps(self) -> int:
+        return len(self)
+
+
+class Recording:
+    """An episode that is being played.
+
+    Args:
+        layout: sizes of its arrays.
+        zero_goal: desired goals are taken for zeros.
+        name: of environment and episode, for messages.
+    """
+
+    def __init__(self, layout: ReplayLayout, *, zero_goal: bool, name: str) -> None:
+        self._layout, self._zero_goal, self._name = layout, zero_goal, name
+        self._frames = np.zeros((layout.horizon + 1, layout.frame), np.float32)
+        self._actions = np.zeros((layout.horizon, layout.action), np.float32)
+        self._rewards = np.zeros(layout.horizon, np.float32)
+        self._successes: list[bool] = []
+        self.steps = 0
+
+    @property
+    def place(self) -> str:
+        """Where the episode stands, for messages."""
+        return f"{self._name}, step {self.steps}"
+
+    def see(self, observation: Any) -> None:
+        """Takes in the next observation.
+
+        Raises:
+            BadNumberError: something in it is NaN, infinite or absurd.
+        """
+        frame, layout = self._frames[self.steps], self._layout
+        if layout.goal == 0:
+            frame[:] = observation
+        else:
+            frame[: layout.observation] = observation["observation"]
+            if not self._zero_goal:
+                frame[layout.observation : layout.network_input] = observation["desired_goal"]
+            frame[layout.network_input :] = observation["achieved_goal"]
+        if not are_usable(frame):
+            given = {"observation": observation} if layout.goal == 0 else observation
+            error = bad_number(
+                [(name, given[name]) for name in _PARTS if name in given], self.place
+            )
+            if error is not None:
+                raise error
+
+    @property
+    def network_input(self) -> Floats:
+        """[I] what the policy sees now."""
+        return self._frames[self.steps, : self._layout.network_input]
+
+    def step(self, action: Floats, reward: float, success: float | None, observation: Any) -> None:
+        """Takes in a step.
+
+        Raises:
+            BadNumberError: something that the environment returned is NaN, infinite or absurd.
+        """
+        self._actions[self.steps] = action
+        self._rewards[self.steps] = reward
+        if success is not None:
+            self._successes.append(bool(success))
+        self.steps += 1
+        if not abs(reward) <= LARGEST:
+            error = bad_number([("reward", reward)], self.place)
+            assert error is not None
+            raise error
+        self.see(observation)
+
+    def finish(self, *, terminated: bool) -> Episode:
+        """The episode, when it is over."""
+        n = self.steps
+        return Episode(
+            self._frames[: n + 1],
+            self._actions[:n],
+            self._rewards[:n],
+            terminated,
+            np.array(self._successes) if self._successes else None,
+        )

@@ -1,0 +1,81 @@
+"""NaN, infinity and absurd numbers from an environment go no further than where they come in."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from music_rllib.envs.numbers import LARGEST, BadNumberError, are_usable, bad_number
+from music_rllib.replay.buffer import ReplayLayout
+from music_rllib.tac.recording import Recording
+
+BAD = st.sampled_from([np.nan, np.inf, -np.inf, 1e30, -1e30, 2 * LARGEST])
+SOUND = st.lists(st.floats(-1e12, 1e12), min_size=1, max_size=80)
+LAYOUT = ReplayLayout(observation=5, action=2, goal=2, horizon=4)
+
+
+@given(values=SOUND)
+def test_what_can_be_learned_from_passes(values: list[float]) -> None:
+    assert are_usable(np.array(values, np.float32))
+    assert bad_number([("observation", values)], "here") is None
+
+
+@given(values=SOUND, bad=BAD, data=st.data())
+def test_one_bad_number_among_any_others_is_found_and_named(
+    values: list[float], bad: float, data: st.DataObject
+) -> None:
+    place = data.draw(st.integers(0, len(values) - 1))
+    values[place] = bad
+    assert not are_usable(np.array(values, np.float32))
+    error = bad_number([("reward", 1.0), ("observation", values)], "Env-v0, step 3")
+    assert str(error).startswith(f"Env-v0, step 3: observation[{place}] is {bad:g}, every number")
+
+
+def observation(**changes: tuple[int, float]) -> dict[str, Any]:
+    parts = {"observation": np.zeros(5), "desired_goal": np.ones(2), "achieved_goal": np.ones(2)}
+    for name, (index, value) in changes.items():
+        parts[name][index] = value
+    return parts
+
+
+def begun(*, zero_goal: bool = False) -> Recording:
+    recording = Recording(LAYOUT, zero_goal=zero_goal, name="Env-v0, sub-environment 2")
+    recording.see(observation())
+    return recording
+
+
+def take(recording: Recording, seen: Any, reward: float = -1.0) -> None:
+    recording.step(np.zeros(2, np.float32), reward, None, seen)
+
+
+@pytest.mark.parametrize(
+    ("seen", "reward", "named"),
+    [
+        (observation(observation=(4, np.nan)), 0.0, r"observation\[4\] is nan"),
+        (observation(desired_goal=(1, np.inf)), 0.0, r"desired_goal\[1\] is inf"),
+        (observation(achieved_goal=(0, -1e30)), 0.0, r"achieved_goal\[0\] is -1e\+30"),
+        (observation(), np.nan, "reward is nan"),
+        (observation(), -np.inf, "reward is -inf"),
+        (observation(), 1e30, r"reward is 1e\+30"),
+    ],
+)
+def test_a_step_that_returns_one_ends_the_episode_with_its_place(
+    seen: Any, reward: float, named: str
+) -> None:
+    recording = begun()
+    take(recording, observation())
+    with pytest.raises(BadNumberError, match=f"^Env-v0, sub-environment 2, step 2: {named}, every"):
+        take(recording, seen, reward)
+
+
+def test_large_numbers_that_float32_holds_well_pass_and_so_does_a_goal_nobody_sees() -> None:
+    recording = begun(zero_goal=True)
+    take(recording, observation(observation=(0, 9e14), desired_goal=(0, np.nan)), 9e14)
+    take(recording, {**observation(), "observation": np.full(5, 9e14)})
+    assert recording.finish(terminated=False).frames[1, 0] == np.float32(9e14)
+    flat = ReplayLayout(observation=3, action=1, goal=0, horizon=2)
+    recording = Recording(flat, zero_goal=False, name="Flat-v0")
+    with pytest.raises(BadNumberError, match=r"^Flat-v0, step 0: observation\[1\] is nan"):
+        recording.see(np.array([0.0, np.nan, 1.0]))
