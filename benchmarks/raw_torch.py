@@ -50,14 +50,13 @@ class RawUpdate:
         mean, log_std = self.policy(obs).chunk(2, -1)
         sample = sample_squashed(mean, log_std.clamp(-20, 2), torch.randn_like(mean))
         ln_q_pi = ln_q_of_policy(sample.log_density, self.q, "per_dimension")
-        q_data, q_policy = self.critics.learn_and_ask(
-            torch.cat([obs, self.actions], -1), torch.cat([obs, sample.action], -1)
-        )
+        q_data = self.critics(torch.cat([obs, self.actions], -1))
+        q_policy = self.critics(torch.cat([obs, sample.action], -1), frozen=True)
         value = self.value(obs).squeeze(-1)
         target = losses.critic_target(self.reward, self.discount, next_value, 0.98)
         loss = (
             losses.critic_loss(q_data, target)
-            + losses.value_loss(value, q_policy, ln_q_pi, self.alpha)
+            + losses.value_loss(value, losses.value_target(q_policy, ln_q_pi, self.alpha))
             + losses.policy_loss(q_policy.amin(0), ln_q_pi, self.alpha)
         )
         self.optimizer.zero_grad(set_to_none=True)

@@ -36,6 +36,7 @@ from music_rllib.schedules import value_at
 from music_rllib.tac import diagnostics, losses
 from music_rllib.tac.forward import Bootstrap, TACForward
 from music_rllib.tac.graphs import CapturedUpdate, CudaRecorder
+from music_rllib.tac.kernels.update import DirectUpdate
 from music_rllib.tac.module import ESTIMATOR_MODULE, EstimatorModule, TACModule, choose_action
 from music_rllib.tac.normaliser import RunningNormaliser
 from music_rllib.tac.optimizer import FusedAdam
@@ -65,6 +66,18 @@ class _Constants(NamedTuple):
     """Whether the two frames of a transition are swapped for the intrinsic reward."""
 
 
+class _Loss(NamedTuple):
+    """The losses of a minibatch, and what their derivatives are made of."""
+
+    total: Tensor
+    target: Tensor
+    """[B] of the critics."""
+    value_target: Tensor
+    """[B] of the value network, where there is one."""
+    excess_entropy: Tensor
+    """[] S_q of the policy less its target: the derivative by log alpha, where that is learned."""
+
+
 class NonFiniteLossError(RuntimeError):
     """A loss became infinite or NaN; the message names it and the update."""
 
@@ -82,6 +95,7 @@ class TACLearner(TorchLearner):
         # A driver-side algorithm would otherwise use every core for 256-row products, and with
         # another trial beside it run twenty times slower; the sums would also change.
         torch.set_num_threads(self.config.torch_threads)
+        self._adam: dict[str, FusedAdam] = {}
         super().build()
         check_precision(self._settings.precision, self._device)
         seed = self.config.seed if self.config.seed is not None else torch.seed()
@@ -96,14 +110,25 @@ class TACLearner(TorchLearner):
         pairs = self._policy_module.get_target_network_pairs()
         self._online: list[Tensor] = [p for online, _ in pairs for p in online.parameters()]
         self._targets: list[Tensor] = [p for _, target in pairs for p in target.parameters()]
-        self._captured = self._captured_step() if self._device.type == "cuda" else None
+        on_gpu, plain = self._device.type == "cuda", self._keeps_gradients_to_itself
+        self._captured: CapturedUpdate[_Constants] | None = None
+        if on_gpu and plain:
+            self._captured = CapturedUpdate(self._step, CudaRecorder(self._device))
+        standard = not on_gpu and plain and self._is_standard
+        self._direct = DirectUpdate(self._policy_module) if standard else None
 
-    def _captured_step(self) -> CapturedUpdate[_Constants] | None:
-        """Updates as CUDA graphs; None where RLlib looks at gradients, or exchanges them."""
+    @property
+    def _keeps_gradients_to_itself(self) -> bool:
+        """Whether RLlib neither looks at gradients nor exchanges them."""
         config = self.config
-        if config.grad_clip is not None or config.log_gradients or config.num_learners > 1:
-            return None
-        return CapturedUpdate(self._step, CudaRecorder(self._device))
+        return config.grad_clip is None and not config.log_gradients and config.num_learners <= 1
+
+    @property
+    def _is_standard(self) -> bool:
+        """Whether networks and losses are those that `DirectUpdate` has the derivatives of."""
+        own_loss = type(self).compute_loss_for_module is TACLearner.compute_loss_for_module
+        own_networks = type(self._policy_module) is TACModule
+        return own_loss and own_networks and self._settings.precision == "float32"
 
     @property
     def _policy_module(self) -> TACModule:
@@ -134,10 +159,11 @@ class TACLearner(TorchLearner):
             self._register(module_id, "alpha", [log_alpha], self._settings.alpha.lr)
 
     def _register(self, module_id: ModuleID, name: str, params: list[Tensor], lr: float) -> None:
+        self._adam[name] = FusedAdam(params, lr)
         self.register_optimizer(
             module_id=module_id,
             optimizer_name=name,
-            optimizer=FusedAdam(params, lr),
+            optimizer=self._adam[name],
             params=params,
             lr_or_lr_schedule=lr,
         )
@@ -187,6 +213,8 @@ class TACLearner(TorchLearner):
             batch = training_data.batch
         assert batch is not None
         self._weights_seq_no += 1
+        if self._direct is not None and not self._direct.flat.is_in_use:
+            self._direct = DirectUpdate(self._policy_module)
         history: list[Mapping[str, Tensor]] = []
         step = self._captured or self._step
         for minibatch, constants in self._minibatches(self._convert_batch_type(batch)):
@@ -220,7 +248,11 @@ class TACLearner(TorchLearner):
         for (module_id, name), values in minibatch.items():
             columns.setdefault(module_id, {})[name] = values
         self._losses, self._observed = {}, {}
-        self._update(self._priced(columns, swapped=constants.swapped))
+        priced = self._priced(columns, swapped=constants.swapped)
+        if self._direct is None:
+            self._update(priced)
+        else:
+            self._update_directly(self._direct, priced)
         self._names_of_losses = list(self._losses)
         return {LOSSES: torch.stack(list(self._losses.values())), **self._observed}
 
@@ -292,7 +324,9 @@ class TACLearner(TorchLearner):
     def compute_loss_for_module(
         self, *, module_id: ModuleID, config: Any, batch: dict[str, Any], fwd_out: dict[str, Any]
     ) -> Tensor:
-        forward: TACForward = fwd_out["tac"]
+        return self._loss(fwd_out["tac"], batch).total
+
+    def _loss(self, forward: TACForward, batch: Mapping[str, Tensor]) -> _Loss:
         settings, alpha = self._settings, self._current_alpha()
         target = losses.critic_target(
             batch[Columns.REWARDS],
@@ -308,15 +342,49 @@ class TACLearner(TorchLearner):
         if settings.action_l2 > 0:
             policy = policy + settings.action_l2 * forward.action.square().mean()
         total = critic + policy
+        value_target = losses.value_target(forward.q_of_policy, ln_q_pi, alpha)
         if forward.value is not None:
-            value = losses.value_loss(forward.value, forward.q_of_policy, ln_q_pi, alpha)
+            value = losses.value_loss(forward.value, value_target)
             total = total + value
             self._losses[names.VALUE_LOSS] = value.detach()
+        excess = -ln_q_pi.mean().detach() - self._target_entropy
         if isinstance(settings.alpha, LearnedAlpha):
-            log_alpha = self._policy_module.log_alpha
-            total = total + losses.alpha_loss(log_alpha, -ln_q_pi.mean(), self._target_entropy)
+            total = total + losses.alpha_loss(self._policy_module.log_alpha, excess)
         self._observe(forward, target, critic=critic, policy=policy)
-        return total
+        return _Loss(total, target, value_target, excess)
+
+    def _update_directly(self, direct: DirectUpdate, minibatch: Minibatch) -> None:
+        """RLlib's `_update` without its detours and, for the policy's module, without autograd."""
+        batch = minibatch[DEFAULT_MODULE_ID]
+        forward = direct.forward(batch)
+        with torch.no_grad():
+            loss = self._loss(forward, batch)
+        direct.backward(
+            forward,
+            batch,
+            target=loss.target,
+            value_target=loss.value_target,
+            entropic_index=self._entropic_index,
+            alpha=self._current_alpha(),
+        )
+        self._adam["networks"].step_flat(direct.flat)
+        if "alpha" in self._adam:
+            self._policy_module.log_alpha.grad = loss.excess_entropy
+            self._adam["alpha"].step()
+        if "estimator" in self._adam:
+            self._train_estimator(minibatch[ESTIMATOR_MODULE])
+
+    def _train_estimator(self, batch: dict[str, Tensor]) -> None:
+        module = self.module[ESTIMATOR_MODULE].unwrapped()
+        self._adam["estimator"].zero_grad()
+        module.compute_self_supervised_loss(
+            learner=self,
+            module_id=ESTIMATOR_MODULE,
+            config=self.config,
+            batch=batch,
+            fwd_out=module.forward_train(batch),
+        ).backward()
+        self._adam["estimator"].step()
 
     def _ln_q(self, log_density: Tensor | None) -> Tensor:
         """[B, A] -> [B] ln_q of the policy's density; 0 for a deterministic policy."""

@@ -14,6 +14,7 @@ __all__ = [
     "policy_loss",
     "policy_value",
     "value_loss",
+    "value_target",
 ]
 
 
@@ -53,17 +54,22 @@ def critic_loss(q_values: Tensor, target: Tensor, weights: Tensor | None = None)
     return 0.5 * squares.mean(-1).sum()
 
 
-def value_loss(
-    value: Tensor, q_of_policy: Tensor, ln_q_pi: Tensor, alpha: Tensor | float
-) -> Tensor:
-    """Paper eq. 8, with the action drawn from the policy as its Algorithm has it.
+def value_target(q_of_policy: Tensor, ln_q_pi: Tensor, alpha: Tensor | float) -> Tensor:
+    """What the value network learns (paper eq. 8).
 
     Args:
-        value: [B]
-        q_of_policy: [C, B] critics at the policy's action; the smaller one counts.
+        q_of_policy: [C, B] critics at an action drawn from the policy, as the paper's Algorithm
+            has it; the smaller one counts.
         ln_q_pi: [B] ln_q of the policy's density at that action.
+
+    Returns:
+        [B], without gradient.
     """
-    target = (q_of_policy.amin(0) - alpha * ln_q_pi).detach()
+    return (q_of_policy.amin(0) - alpha * ln_q_pi).detach()
+
+
+def value_loss(value: Tensor, target: Tensor) -> Tensor:
+    """Paper eq. 8. Both inputs [B]."""
     return 0.5 * (value - target).square().mean()
 
 
@@ -77,6 +83,10 @@ def policy_loss(value_of_policy: Tensor, ln_q_pi: Tensor, alpha: Tensor | float)
     return (alpha * ln_q_pi - value_of_policy).mean()
 
 
-def alpha_loss(log_alpha: Tensor, entropy: Tensor, target_entropy: float) -> Tensor:
-    """Drives S_q of the policy ([] nats at q = 1) to its target (Haarnoja et al. 2018b, eq. 18)."""
-    return log_alpha * (entropy.detach() - target_entropy)
+def alpha_loss(log_alpha: Tensor, excess_entropy: Tensor) -> Tensor:
+    """Drives S_q of the policy to its target (Haarnoja et al. 2018b, eq. 18).
+
+    Args:
+        excess_entropy: [] S_q less its target, without gradient.
+    """
+    return log_alpha * excess_entropy

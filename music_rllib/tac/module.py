@@ -70,9 +70,13 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
 
     def policy_parameters(self, normalised: Tensor) -> tuple[Tensor, Tensor | None]:
         """[B, I] -> mean [B, A] before tanh, log standard deviation [B, A] within its bounds."""
+        return self.distribution(self.policy(normalised))
+
+    def distribution(self, outputs: Tensor) -> tuple[Tensor, Tensor | None]:
+        """What the outputs of the policy's network stand for: mean and log standard deviation."""
         if self.deterministic:
-            return self.policy(normalised), None
-        mean, log_std = self.policy(normalised).chunk(2, dim=-1)
+            return outputs, None
+        mean, log_std = outputs.chunk(2, dim=-1)
         return mean, log_std.clamp(*self.settings.log_std_bounds)
 
     @torch.no_grad()
@@ -98,17 +102,13 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
         inputs = self.normaliser(batch[Columns.OBS])
         mean, log_std = self.policy_parameters(inputs)
         action, log_density = choose_action(mean, log_std, batch.get("noise"))
-        # The policy's loss wants gradients of its action only.
-        q_values, q_of_policy = self.critics.learn_and_ask(
-            torch.cat([inputs, batch[Columns.ACTIONS]], -1), torch.cat([inputs, action], -1)
-        )
         return {
             "tac": TACForward(
                 action=action,
                 log_density=log_density,
                 log_std=log_std,
-                q_values=q_values,
-                q_of_policy=q_of_policy,
+                q_values=self.critics(torch.cat([inputs, batch[Columns.ACTIONS]], -1)),
+                q_of_policy=self.critics(torch.cat([inputs, action], -1), frozen=True),
                 value=self.value(inputs).squeeze(-1) if self._has_value else None,
                 next=self.forward_target(batch),
             )

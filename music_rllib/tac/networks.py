@@ -16,8 +16,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from music_rllib.tac import fused
-
 __all__ = ["Critics", "Perceptron"]
 
 
@@ -36,9 +34,6 @@ class Perceptron(nn.Sequential):
         self._linear = [layer for layer in self if isinstance(layer, nn.Linear)]
 
     def forward(self, inputs: Tensor) -> Tensor:
-        if not self.bf16 and fused.is_fused(inputs):
-            weights, biases = [x.weight for x in self._linear], [x.bias for x in self._linear]
-            return fused.perceptron(inputs, weights, biases)
         *hidden_layers, last = self._linear
         if self.bf16:
             with _in_bf16(inputs):
@@ -90,9 +85,6 @@ class Critics(nn.Module):
             frozen: gradients reach the inputs only. The policy's step needs just those, and a
                 third of its work is saved.
         """
-        if not self.bf16 and fused.is_fused(inputs):
-            weights, biases = zip(*self._layers(frozen), strict=True)
-            return fused.perceptron(inputs, weights, biases).squeeze(-1)
         *hidden_layers, (weight, bias) = self._layers(frozen)
         if self.bf16:
             with _in_bf16(inputs):
@@ -101,19 +93,6 @@ class Critics(nn.Module):
         else:
             hidden = self._hidden(inputs, hidden_layers)
         return torch.baddbmm(bias, hidden, weight).squeeze(-1)
-
-    def learn_and_ask(self, learned: Tensor, asked: Tensor) -> tuple[Tensor, Tensor]:
-        """Values of two minibatches, [B, I] -> [C, B] each.
-
-        Args:
-            learned: the weights get their gradients from these, which get none.
-            asked: gradients reach these only.
-        """
-        if self.bf16 or not fused.is_fused(learned):
-            return self(learned), self(asked, frozen=True)
-        weights, biases = list(self.weights), list(self.biases)
-        values = fused.learn_and_ask(learned, asked, weights, biases)
-        return values[0].squeeze(-1), values[1].squeeze(-1)
 
     def _hidden(self, inputs: Tensor, layers: list[tuple[Tensor, Tensor]]) -> Tensor:
         """[B, I] -> [C, B, H]."""

@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from music_rllib.tac.kernels.flat import FlatParameters
+
 __all__ = ["FusedAdam"]
 
 
@@ -24,6 +26,17 @@ class _Moments(NamedTuple):
     """Views of `counts`, as the kernel wants them."""
     counts: Tensor
     """[P] steps so far, counted at once."""
+
+
+class _FlatMoments(NamedTuple):
+    """Adam's state of parameters that are views of one tensor [S]."""
+
+    means: Tensor
+    """[S]"""
+    squares: Tensor
+    """[S]"""
+    steps: Tensor
+    """[]"""
 
 
 class FusedAdam(torch.optim.Adam):
@@ -40,6 +53,7 @@ class FusedAdam(torch.optim.Adam):
         super().__init__(parameters, lr=lr, fused=True, capturable=on_gpu)
         self._state_seen: Any = None
         self._moments: _Moments | None = None
+        self._flat: _FlatMoments | None = None
 
     @torch.no_grad()
     def step(self, closure: Any = None) -> Any:
@@ -54,13 +68,40 @@ class FusedAdam(torch.optim.Adam):
             return super().step(closure)
         moments = self._ordered_moments()
         moments.counts.add_(1)
-        beta1, beta2 = group["betas"]
-        torch._fused_adam_(
-            parameters, gradients, moments.means, moments.squares, [], moments.steps,
-            lr=group["lr"], beta1=beta1, beta2=beta2, weight_decay=group["weight_decay"],
-            eps=group["eps"], amsgrad=group["amsgrad"], maximize=group["maximize"],
-        )  # fmt: skip
+        _adam(group, parameters, gradients, moments.means, moments.squares, moments.steps)
         return None
+
+    @torch.no_grad()
+    def step_flat(self, flat: FlatParameters) -> None:
+        """One step of all parameters at once, from the gradients of `flat`.
+
+        Args:
+            flat: this optimizer's parameters, in their order.
+        """
+        moments = self._flat_moments(flat)
+        moments.steps.add_(1)
+        _adam(
+            self.param_groups[0],
+            [flat.values], [flat.gradients], [moments.means], [moments.squares], [moments.steps],
+        )  # fmt: skip
+
+    def _flat_moments(self, flat: FlatParameters) -> _FlatMoments:
+        """The state as views of a few tensors: each parameter's part is where Adam has it."""
+        if self._flat is None or self._state_seen is not self.state:  # loaded meanwhile
+            moments = _FlatMoments(
+                torch.zeros_like(flat.values), torch.zeros_like(flat.values), torch.zeros(())
+            )
+            views = zip(flat.views(moments.means), flat.views(moments.squares), strict=True)
+            for parameter, (mean, square) in zip(flat.parameters, views, strict=True):
+                if old := self.state.get(parameter):
+                    mean.copy_(old["exp_avg"])
+                    square.copy_(old["exp_avg_sq"])
+                    moments.steps.copy_(old["step"])
+                self.state[parameter] = {
+                    "step": moments.steps, "exp_avg": mean, "exp_avg_sq": square
+                }  # fmt: skip
+            self._flat, self._state_seen = moments, self.state
+        return self._flat
 
     def _ordered_moments(self) -> _Moments:
         if self._moments is None or self._state_seen is not self.state:  # loaded meanwhile
@@ -82,3 +123,20 @@ class FusedAdam(torch.optim.Adam):
                 parameter.grad = None
         else:
             super().zero_grad(set_to_none=False)
+
+
+def _adam(
+    group: dict[str, Any],
+    parameters: list[Tensor],
+    gradients: list[Tensor],
+    means: list[Tensor],
+    squares: list[Tensor],
+    steps: list[Tensor],
+) -> None:
+    """Torch's kernel, with the settings of a parameter group."""
+    beta1, beta2 = group["betas"]
+    torch._fused_adam_(
+        parameters, gradients, means, squares, [], steps,
+        lr=group["lr"], beta1=beta1, beta2=beta2, weight_decay=group["weight_decay"],
+        eps=group["eps"], amsgrad=group["amsgrad"], maximize=group["maximize"],
+    )  # fmt: skip

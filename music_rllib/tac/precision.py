@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-__all__ = ["PrecisionError", "check_precision", "cpu_flags", "has_bf16"]
+__all__ = ["PrecisionError", "check_precision", "cpu_flags", "cpu_vendor", "has_bf16"]
 
 _CPU_FLAGS = frozenset({"amx_bf16", "avx512_bf16", "bf16"})
 """As Linux names them: Intel and AMD, and `bf16` on ARM."""
@@ -45,13 +45,23 @@ def has_bf16(device: str | torch.device = "cpu") -> bool:
     return bool(cpu_flags() & _CPU_FLAGS)
 
 
-@functools.cache
 def cpu_flags() -> frozenset[str]:
     """Instruction sets as /proc/cpuinfo has them; none where there is no such file."""
+    described = _cpu_description()
+    return frozenset((described.get("flags") or described.get("Features") or "").split())
+
+
+def cpu_vendor() -> str:
+    """As /proc/cpuinfo has it, `GenuineIntel` or `AuthenticAMD`; empty where it does not."""
+    return _cpu_description().get("vendor_id", "")
+
+
+@functools.cache
+def _cpu_description() -> dict[str, str]:
+    """Of the first CPU."""
     try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        first, _, _ = Path("/proc/cpuinfo").read_text().partition("\n\n")
     except OSError:
-        return frozenset()
-    described = (line.partition(":") for line in lines)
-    found = next((v for key, _, v in described if key.strip() in {"flags", "Features"}), "")
-    return frozenset(found.split())
+        return {}
+    lines = (line.partition(":") for line in first.splitlines())
+    return {key.strip(): value.strip() for key, _, value in lines}

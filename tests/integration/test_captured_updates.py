@@ -19,6 +19,7 @@ from torch.utils._pytree import tree_leaves
 
 from music_rllib.tac.algorithm import TAC
 from music_rllib.tac.graphs import CapturedUpdate, CudaRecorder, Replay
+from music_rllib.tac.learner import TACLearner
 from tests.integration.test_tac_algorithm import (
     DDPG,
     HER,
@@ -33,9 +34,9 @@ pytestmark = pytest.mark.usefixtures("local_ray")
 
 
 @pytest.fixture(autouse=True)
-def layer_by_layer(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As on a GPU: the fused perceptron is the CPU's own."""
-    monkeypatch.setattr("music_rllib.tac.fused._has_onednn", lambda: False)
+def with_autograd(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a GPU: the update without autograd is the CPU's own."""
+    monkeypatch.setattr(TACLearner, "_is_standard", False)
 
 
 Function = Callable[[], Mapping[Any, Tensor]]

@@ -24,7 +24,9 @@ def learner(**settings: Any) -> TACLearner:
         gym.spaces.Box(-1.0, 1.0, (ACTION,)),
     )
     config = TACConfig().debugging(seed=3)
-    config.training(hidden_sizes=(16, 16), batch_size=BATCH, random_steps=0, **settings)
+    config.training(
+        **{"hidden_sizes": (16, 16), "batch_size": BATCH, "random_steps": 0, **settings}
+    )
     config.environment(observation_space=spaces[0], action_space=spaces[1])
     built: TACLearner = config.build_learner(spaces={DEFAULT_MODULE_ID: spaces})
     built.module[DEFAULT_MODULE_ID].double()

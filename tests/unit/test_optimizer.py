@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from music_rllib.tac.kernels.flat import FlatParameters
 from music_rllib.tac.optimizer import FusedAdam
 
 SHAPES = [(7, 5), (5,), (2, 3, 4), ()]
@@ -119,3 +120,29 @@ def test_gradients_are_forgotten_or_made_zero() -> None:
     assert not any(parameter.grad.any() for parameter in training.ours)  # type: ignore[union-attr]
     training.fused.zero_grad()
     assert all(parameter.grad is None for parameter in training.ours)
+
+
+@pytest.mark.parametrize("behind", [0, 3])
+def test_a_flat_step_has_the_numbers_and_the_state_of_adam(behind: int) -> None:
+    training = Training()
+    for _ in range(behind):
+        training.step()
+    if behind:
+        training.fused.load_state_dict(saved(training.fused.state_dict()))
+    flat = FlatParameters(training.ours)
+    for step in range(STEPS):
+        if step == 2:  # a checkpoint in between is taken over
+            training.fused.load_state_dict(saved(training.fused.state_dict()))
+        training.adam.zero_grad()
+        for a, b in zip(training.theirs, training.ours, strict=True):
+            a.grad = torch.randn(a.shape, generator=training.generator)
+            flat.gradient(b).copy_(a.grad)
+        training.adam.step()
+        training.fused.step_flat(flat)
+        theirs, ours = training.adam.state_dict()["state"], training.fused.state_dict()["state"]
+        assert theirs.keys() == ours.keys()
+        for i, (a, b) in enumerate(zip(training.theirs, training.ours, strict=True)):
+            torch.testing.assert_close(b, a, rtol=1e-6, atol=1e-7)
+            assert list(theirs[i]) == list(ours[i])
+            for name, values in theirs[i].items():
+                torch.testing.assert_close(ours[i][name], values, rtol=1e-6, atol=1e-7)
