@@ -40,6 +40,7 @@ def test_gradients_in_float32_are_the_slope_on_both_sides_of_the_bound(q: float)
     log_x = torch.linspace(-8.0, 8.0, 2001, requires_grad=True)
     ln_q_of_log(log_x, q, max_exponent=MAX_EXPONENT).sum().backward()
     exponent = (q - 1.0) * log_x.detach().double()
+    assert log_x.grad is not None
     # The gradient of expm1 is its value + 1, which has the digits of 1.
     expected = exponent.clamp(max=MAX_EXPONENT).exp()
     torch.testing.assert_close(log_x.grad.double(), expected, rtol=2e-6, atol=2e-7)

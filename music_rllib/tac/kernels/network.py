@@ -57,18 +57,16 @@ class Network:
             self._kept[rows] = [inputs.new_empty(rows, len(bias)) for bias in self.biases[:-1]]
         return self._kept[rows]
 
-    def backward(
-        self, gradient: Tensor, *, learned: int, asked: int | None = None
-    ) -> Tensor | None:
+    def backward(self, gradient: Tensor, learned: int) -> Tensor:
         """Writes the parameters' gradients.
 
         Args:
             gradient: [R', O] of the outputs of the first R' rows of the last forward.
             learned: so many rows count for the parameters, the first ones.
-            asked: the first of the input columns whose gradient is wanted, of the rows that follow.
 
         Returns:
-            [R' - learned, I - asked], or None where nothing is asked.
+            [R', H] of the first layer's outputs, for `of_inputs`; valid until another network's
+            backward.
         """
         assert self._gradients is not None
         rows = len(gradient)
@@ -80,9 +78,11 @@ class Network:
             if layer > 0:
                 out = self._scratch.take(below)
                 gradient = self._products.through(gradient, self.weights[layer], below, out)
-        if asked is None:
-            return None
-        return gradient[learned:] @ self.weights[0][asked:].t()
+        return gradient
+
+    def of_inputs(self, gradient: Tensor, columns: slice) -> Tensor:
+        """[R, H] of the first layer's outputs -> of some columns of the inputs."""
+        return gradient @ self.weights[0][columns].t()
 
 
 class Scratch:

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from music_rllib.tac.precision import cpu_flags, cpu_vendor
 
-__all__ = ["Blas", "OneDnn", "Products", "products"]
+__all__ = ["Blas", "OneDnn", "Products", "has_onednn", "onednn_product", "products"]
 
 _pass_where_positive = torch.ops.aten.threshold_backward.grad_input
 
@@ -76,7 +76,7 @@ class OneDnn(Blas):
     def through(self, gradient: Tensor, weight: Tensor, below: Tensor, out: Tensor) -> Tensor:
         if _is_narrow(gradient, weight):
             return super().through(gradient, weight, below, out)
-        product = _product(gradient, weight)
+        product = onednn_product(gradient, weight)
         _pass_where_positive(product, below, 0, grad_input=product)
         return product
 
@@ -85,19 +85,19 @@ class OneDnn(Blas):
             super().of_weight(inputs, gradient, out)
         # oneDNN takes a copy of the first factor, which is transposed: cheaper of the narrower one.
         elif gradient.shape[1] < inputs.shape[1] // 2:
-            out.t().copy_(_product(_transposed(gradient), inputs.t()))
+            out.t().copy_(onednn_product(_transposed(gradient), inputs.t()))
         else:
-            out.copy_(_product(_transposed(inputs), gradient.t()))
+            out.copy_(onednn_product(_transposed(inputs), gradient.t()))
 
 
-def _product(left: Tensor, right: Tensor) -> Tensor:
-    """[M, K], [N, K] -> [M, N]."""
+def onednn_product(left: Tensor, right: Tensor) -> Tensor:
+    """[M, K], [N, K] -> [M, N], float32 by oneDNN."""
     product: Tensor = _linear_pointwise(left, right, None, "none", [], "")
     return product
 
 
 def _is_narrow(left: Tensor, right: Tensor) -> bool:
-    return min(*left.shape, *right.shape) < _NARROW
+    return any(size < _NARROW for size in (*left.shape, *right.shape))
 
 
 def _transposed(matrix: Tensor) -> Tensor:
@@ -112,9 +112,13 @@ def _transposed(matrix: Tensor) -> Tensor:
     return transposed
 
 
+def has_onednn() -> bool:
+    """Whether this build of PyTorch has what `OneDnn` calls."""
+    return torch.backends.mkldnn.is_available() and _linear_pointwise is not None
+
+
 @functools.cache
 def products() -> Products:
     """Those for this machine."""
-    has_onednn = torch.backends.mkldnn.is_available() and _linear_pointwise is not None
     wide_amd = cpu_vendor() == "AuthenticAMD" and "avx512f" in cpu_flags()
-    return OneDnn() if has_onednn and wide_amd else Blas()
+    return OneDnn() if wide_amd and has_onednn() else Blas()

@@ -8,6 +8,7 @@ Shape legend: B batch, I network inputs, A action dimensions, C critics.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 
 import torch
@@ -138,13 +139,12 @@ class DirectUpdate:
         of_learned = derivatives.of_critic_loss(forward.q_values, target, weights)
         counts = derivatives.of_policy_value(forward.q_of_policy, self._settings.policy_critic)
         of_values = torch.cat([of_learned, counts.div_(-len(target))], 1).unsqueeze(-1)
-        asked = self._module.input_size
-        of_action = None
-        for critic, of_value in zip(self._critics, of_values, strict=True):
-            found = critic.backward(of_value, learned=len(target), asked=asked)
-            of_action = found if of_action is None else of_action.add_(found)
-        assert of_action is not None
-        return of_action
+        rows, actions = len(target), slice(self._module.input_size, None)
+        of_actions = [
+            critic.of_inputs(critic.backward(of_value, learned=rows)[rows:], actions)
+            for critic, of_value in zip(self._critics, of_values, strict=True)
+        ]
+        return functools.reduce(torch.add, of_actions)
 
     def _through_distribution(
         self,
