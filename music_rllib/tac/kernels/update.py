@@ -75,7 +75,6 @@ class DirectUpdate:
         return TACForward(
             action=action,
             log_density=log_density,
-            mean=mean,
             log_std=log_std,
             q_values=q_values,
             q_of_policy=q_of_policy,
@@ -156,21 +155,20 @@ class DirectUpdate:
     ) -> Tensor:
         """[B, A or 2 A]: of the policy's loss by the outputs of its network."""
         settings, action = self._settings, forward.action
-        if forward.log_density is None or forward.log_std is None:
-            of_mean = derivatives.through_tanh(of_action, action)
-            gradients = [of_mean]
-        else:
-            slope = derivatives.of_ln_q(forward.log_density, q, settings.entropy_form)
-            of_log_density = slope * (alpha / len(action))
-            std_noise = forward.log_std.exp() * batch["noise"]
-            of_mean, of_log_std = derivatives.of_squashed_sample(
-                of_action, of_log_density, action, std_noise
-            )
-            raw = self._outputs[:, action.shape[1] :]
-            gradients = [of_mean, derivatives.through_clamp(of_log_std, raw, forward.log_std)]
         if settings.action_l2 > 0:
-            of_mean += derivatives.of_mean_square(forward.mean, settings.action_l2)
-        return torch.cat(gradients, 1)
+            of_action = of_action + derivatives.of_mean_square(action, settings.action_l2)
+        if forward.log_density is None or forward.log_std is None:
+            return derivatives.through_tanh(of_action, action)
+        slope = derivatives.of_ln_q(forward.log_density, q, settings.entropy_form)
+        of_mean, of_log_std = derivatives.of_squashed_sample(
+            of_action,
+            slope * (alpha / len(action)),
+            action,
+            forward.log_std.exp() * batch["noise"],
+        )
+        raw = self._outputs[:, action.shape[1] :]
+        of_raw = derivatives.through_clamp(of_log_std, raw, forward.log_std)
+        return torch.cat([of_mean, of_raw], 1)
 
 
 def _values(networks: list[Network], pairs: Tensor) -> Tensor:
