@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from typing import Any
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -12,14 +13,17 @@ from numpy.typing import NDArray
 
 from music_rllib._quiet import drop_farama_notice
 from music_rllib.envs.numbers import are_usable, bad_number
+from music_rllib.envs.registry import BUILT_IN_TASKS, Task
 from music_rllib.replay.buffer import GoalReward
 
 __all__ = [
     "Env",
+    "Known",
     "check_action_space",
     "episode_limit",
     "goal_reward_of",
     "is_gymnasium_id",
+    "known_environment",
     "make_env",
     "moved_distance_of",
     "name_of",
@@ -53,6 +57,35 @@ def make_env(env_id: str, **kwargs: Any) -> Env:
 
     speed_up(env)
     return env
+
+
+class Known(NamedTuple):
+    """An environment that may be made: the code and the arguments are not a file's choice."""
+
+    env_id: str
+    kwargs: Mapping[str, Any]
+
+
+def known_environment(task: Task, vouched: Iterable[Task] = ()) -> Known | None:
+    """The environment of a task that came in a file; None where it would choose what runs.
+
+    Known are those of the built-in tasks, what Gymnasium and Gymnasium-Robotics themselves have,
+    as it is without arguments (which may name files), and what the user vouches for.
+
+    Args:
+        task: From a file.
+        vouched: Tasks that the user declares or names.
+    """
+    for one in (*BUILT_IN_TASKS.values(), *vouched):
+        if (one.env_id, one.env_kwargs) == (task.env_id, task.env_kwargs):
+            return Known(one.env_id, one.env_kwargs)
+    _register_robotics()
+    # With a module in front it would be imported before anything else is looked at.
+    spec = None if ":" in task.env_id else gym.registry.get(task.env_id)
+    if spec is None or task.env_kwargs or not isinstance(spec.entry_point, str):
+        return None
+    package = spec.entry_point.partition(":")[0].partition(".")[0]
+    return Known(task.env_id, {}) if package in {"gymnasium", "gymnasium_robotics"} else None
 
 
 def is_gymnasium_id(env: object) -> bool:

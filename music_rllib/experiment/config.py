@@ -62,6 +62,7 @@ __all__ = [
     "Stage",
     "SweepConfig",
     "Variant",
+    "declared_tasks",
     "load_sweep",
 ]
 
@@ -98,6 +99,19 @@ def load_sweep(
     if config is None:
         raise ConfigError(_lines(findings.problems, file, document, options))
     return config
+
+
+def declared_tasks(path: str | Path) -> tuple[Task, ...]:
+    """The tasks that a sweep's YAML file declares under `environments`.
+
+    Raises:
+        ConfigError: It can't be read, or one of them is wrong.
+    """
+    file, findings = read_yaml(Path(path)), Findings()
+    registry = _registry(file.data, findings)
+    if findings.problems:
+        raise ConfigError(_lines(findings.problems, file, file.data, {}))
+    return tuple(task for name, task in registry.items() if name not in BUILT_IN_TASKS)
 
 
 def _seeds(text: str, given: Any) -> list[int]:

@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -24,13 +25,25 @@ from safetensors.numpy import save as save_safetensors
 from music_rllib.envs.registry import Task
 from music_rllib.experiment.files import canonical_json, write_atomically
 from music_rllib.experiment.settings import RunSettings, Source
+from music_rllib.limits import (
+    MOST_JSON_BYTES,
+    MOST_WEIGHTS_BYTES,
+    check_safetensors,
+    open_regular,
+    read_json,
+    read_regular,
+)
 from music_rllib.tac.version import ALGORITHM_VERSION
+
+if TYPE_CHECKING:
+    import gymnasium as gym
 
 __all__ = [
     "Architecture",
     "HandoffError",
     "HandoffInfo",
     "HandoffManifest",
+    "Spaces",
     "Weights",
     "open_handoff",
     "read_handoff",
@@ -80,6 +93,35 @@ class Architecture(_Strict):
         return [f"tac.{name}" for name in fields if getattr(self, name) != getattr(other, name)]
 
 
+class Spaces(_Strict):
+    """What a policy must know of its environment to act without it."""
+
+    observation_size: int = Field(gt=0)
+    goal_size: int = Field(ge=0)
+    """0 without goals."""
+    action_low: tuple[float, ...] = Field(min_length=1)
+    action_high: tuple[float, ...]
+    """The lowest and the highest action."""
+
+    @classmethod
+    def of(cls, observations: gym.Space[Any], actions: gym.Space[Any]) -> Spaces:
+        """Of an environment's spaces.
+
+        Raises:
+            ValueError: Nothing can be trained in them.
+        """
+        from music_rllib.envs.make import check_action_space, observation_sizes
+
+        observation_size, goal_size = observation_sizes(observations)
+        bounds = check_action_space(actions)
+        return cls(
+            observation_size=observation_size,
+            goal_size=goal_size,
+            action_low=tuple(bounds.low.tolist()),
+            action_high=tuple(bounds.high.tolist()),
+        )
+
+
 class HandoffInfo(_Strict):
     """Where a handoff comes from."""
 
@@ -92,9 +134,13 @@ class HandoffInfo(_Strict):
     node_key: str
     """Key of the source run; determines its settings and its own source."""
     algorithm_version: str = ALGORITHM_VERSION
+    spaces: Spaces | None = None
+    """None in handoffs of earlier versions."""
 
     @classmethod
-    def of(cls, run: RunSettings, node_key: str, env_steps: int) -> HandoffInfo:
+    def of(
+        cls, run: RunSettings, node_key: str, env_steps: int, spaces: Spaces | None = None
+    ) -> HandoffInfo:
         """The information about a handoff of `run` after `env_steps`."""
         return cls(
             task=run.task,
@@ -103,6 +149,7 @@ class HandoffInfo(_Strict):
             env_steps=env_steps,
             seed=run.seed,
             node_key=node_key,
+            spaces=spaces,
         )
 
 
@@ -185,16 +232,19 @@ def open_handoff(folder: Path) -> tuple[Path, HandoffManifest]:
         path = candidate / MANIFEST
         if path.is_file():
             try:
-                return candidate, HandoffManifest.model_validate_json(path.read_bytes())
-            except (ValidationError, OSError) as error:
+                content = read_json(read_regular(path, MOST_JSON_BYTES))
+                return candidate, HandoffManifest.model_validate(content)
+            except (ValueError, OSError) as error:
                 reason = _first_finding(error)
                 raise HandoffError(f"{path} must be a handoff manifest: {reason}") from None
     found = "the folder is there" if folder.is_dir() else "there is no such folder"
     raise HandoffError(f"{folder} must hold a handoff ({MANIFEST} and weights): {found}")
 
 
-def _first_finding(error: ValidationError | OSError) -> str:
+def _first_finding(error: ValueError | OSError) -> str:
     if isinstance(error, OSError):
+        return str(error.strerror)
+    if not isinstance(error, ValidationError):
         return str(error)
     finding = error.errors(include_url=False)[0]
     place = ".".join(str(part) for part in finding["loc"])
@@ -244,15 +294,22 @@ def _check_task(folder: Path, made_for: Task, wanted: Task) -> None:
 
 def _read_module(folder: Path, expected: _ModuleFile) -> dict[str, npt.NDArray[Any]]:
     path = folder / expected.file
+    if expected.bytes > MOST_WEIGHTS_BYTES:
+        raise HandoffError(
+            f"{path} must have at most {MOST_WEIGHTS_BYTES} bytes, {MANIFEST} says {expected.bytes}"
+        )
     try:
-        data = path.read_bytes()
+        with open_regular(path) as file:
+            size = os.fstat(file.fileno()).st_size
+            data = file.read(size) if size == expected.bytes else b""
     except OSError as error:
         raise HandoffError(f"{path} must be readable: {error.strerror}") from None
-    if len(data) != expected.bytes:
-        raise HandoffError(f"{path} must have {expected.bytes} bytes, it has {len(data)}")
+    if size != expected.bytes:
+        raise HandoffError(f"{path} must have {expected.bytes} bytes, it has {size}")
     if hashlib.sha256(data).hexdigest() != expected.sha256:
         raise HandoffError(f"{path} must have the hash in {MANIFEST}, its content has changed")
     try:
+        check_safetensors(data)
         arrays = load_safetensors(data)
     except (safetensors.SafetensorError, ValueError, KeyError, TypeError) as error:
         raise HandoffError(f"{path} must be a safetensors file: {error}") from None

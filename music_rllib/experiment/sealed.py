@@ -15,14 +15,15 @@ import os
 import shutil
 import tempfile
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Any, Literal
+from typing import IO, Annotated, Any, Literal
 
 import pyarrow.fs as pafs
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue, ValidationError
 
 from music_rllib.experiment.files import sync_folder, write_atomically
+from music_rllib.limits import MOST_JSON_BYTES, open_regular, read_json
 
 __all__ = ["DamagedError", "Manifest", "SealedFolders", "StorageError", "open_storage"]
 
@@ -41,7 +42,8 @@ class DamagedError(StorageError):
 
 def _inside(name: str) -> str:
     path = PurePosixPath(name)
-    if path.is_absolute() or ".." in path.parts or not path.parts or "\\" in name:
+    strange = "\\" in name or not name.isprintable()
+    if path.is_absolute() or ".." in path.parts or not path.parts or strange:
         raise ValueError(f"must be a path inside the folder, got {name!r}")
     return name
 
@@ -54,7 +56,7 @@ class FileRecord(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    bytes: int
+    bytes: Annotated[int, Field(ge=0)]
     sha256: str
 
 
@@ -128,13 +130,15 @@ class SealedFolders:
         """
         path = f"{self.path(name)}/{MANIFEST}"
         try:
-            with self._fs.open_input_stream(path) as stream:
-                manifest = Manifest.model_validate_json(stream.read())
+            with self._open(path) as stream:
+                manifest = Manifest.model_validate(read_json(stream.read(MOST_JSON_BYTES + 1)))
         except FileNotFoundError as error:
             raise DamagedError(f"{path} must exist, it does not") from error
         except ValidationError as error:
             reason = error.errors(include_url=False)[0]["msg"]
             raise DamagedError(f"{path} must be a manifest: {reason}") from error
+        except ValueError as error:
+            raise DamagedError(f"{path} must be a manifest: {error}") from error
         if manifest.name != name:
             raise DamagedError(f"{path} must be the manifest of {name}, got {manifest.name!r}")
         return manifest
@@ -221,31 +225,56 @@ class SealedFolders:
             raise DamagedError(f"{self.path(name)} must have {file}, it hasn't")
         source = self._source(name, manifest, file)
         try:
-            with self._fs.open_input_stream(source) as stream:
-                data: bytes = stream.read()
+            with self._open(source) as stream:
+                data: bytes = stream.read(manifest.files[file].bytes + 1)
         except FileNotFoundError as error:
             raise DamagedError(f"{source} must exist, its manifest lists it") from error
         _check(source, manifest.files[file], len(data), hashlib.sha256(data).hexdigest())
         return data
 
-    def fetch(self, name: str, folder: Path) -> Manifest:
-        """Copy all files into `folder` and verify them.
+    def fetch(
+        self, name: str, folder: Path, wanted: Callable[[str], bool] = lambda file: True
+    ) -> Manifest:
+        """Copy the files that are `wanted` by their names into `folder`, and verify them.
+
+        Of none more is copied than the manifest says that it has.
 
         Raises:
             DamagedError: One is missing or isn't what the manifest says.
         """
         manifest = self.manifest(name)
         for file, expected in manifest.files.items():
+            if not wanted(file):
+                continue
             source, target = self._source(name, manifest, file), folder / file
             target.parent.mkdir(parents=True, exist_ok=True)
             try:
-                with self._fs.open_input_stream(source) as stream, target.open("wb") as sink:
-                    shutil.copyfileobj(stream, sink, _CHUNK)
+                with self._open(source, expected.bytes) as stream, target.open("wb") as sink:
+                    size, digest = _copy(stream, sink, expected.bytes)
             except FileNotFoundError as error:
                 raise DamagedError(f"{source} must exist, its manifest lists it") from error
-            found = _record(target)
-            _check(source, expected, found.bytes, found.sha256)
+            _check(source, expected, size, digest)
         return manifest
+
+    def _open(self, path: str, size: int | None = None) -> contextlib.AbstractContextManager[Any]:
+        """A file for reading; on a disk only a regular one, and only of `size` bytes.
+
+        Raises:
+            DamagedError: It is something else.
+        """
+        if not self._local:
+            return self._fs.open_input_stream(path)  # type: ignore[no-any-return]
+        try:
+            file = open_regular(path)
+        except FileNotFoundError:
+            raise
+        except OSError as error:
+            raise DamagedError(f"{path} must be readable: {error.strerror}") from error
+        found = os.fstat(file.fileno()).st_size
+        if size is not None and found != size:
+            file.close()
+            raise DamagedError(f"{path} must have {size} bytes, it has {found}")
+        return file
 
     def _source(self, name: str, manifest: Manifest, file: str) -> str:
         return f"{self.path(name)}/{manifest.prefix}{file}"
@@ -287,6 +316,16 @@ def _record(path: Path, *, sync: bool = False) -> FileRecord:
         if sync:
             os.fsync(file.fileno())
     return FileRecord(bytes=path.stat().st_size, sha256=digest)
+
+
+def _copy(source: IO[bytes], target: IO[bytes], most: int) -> tuple[int, str]:
+    """Size and hash of what was copied: `most` bytes, and one more where there are more."""
+    size, digest = 0, hashlib.sha256()
+    while chunk := source.read(min(_CHUNK, most + 1 - size)):
+        target.write(chunk)
+        digest.update(chunk)
+        size += len(chunk)
+    return size, digest.hexdigest()
 
 
 def _check(path: str, expected: FileRecord, size: int, digest: str) -> None:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ray.rllib.core import DEFAULT_MODULE_ID
 from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, EPISODE_RETURN_MEAN, LEARNER_RESULTS
 
+from music_rllib.experiment.handoff import Spaces
 from music_rllib.experiment.plain_state import read_arrays, read_state, write_arrays, write_state
 from music_rllib.experiment.settings import RunSettings
 from music_rllib.experiment.store import Draft, Saved
@@ -170,6 +171,12 @@ class TrainingRun:
     def modules(self) -> dict[str, dict[str, NDArray[Any]]]:
         """Plain weights of every network, by module name, as a handoff carries them."""
         return self.algorithm.get_parts()
+
+    @property
+    def spaces(self) -> Spaces:
+        """What the environment observes and takes."""
+        pair = self.algorithm.env_runner.get_spaces()[DEFAULT_MODULE_ID]
+        return Spaces.of(*pair)
 
     def save(self, draft: Draft) -> None:
         """Writes everything that `restore` needs to continue exactly from here.

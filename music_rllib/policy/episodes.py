@@ -10,8 +10,8 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from music_rllib.envs.make import Env, make_env
-from music_rllib.policy.policy import Policy, PolicyError
+from music_rllib.envs.make import Env, check_action_space, make_env, observation_sizes
+from music_rllib.policy.policy import Policy, PolicyError, unknown_environment
 
 __all__ = ["EpisodeResult", "Moment", "open_task", "play"]
 
@@ -47,13 +47,38 @@ def open_task(policy: Policy, **options: Any) -> Env:
     """The policy's environment; `options` go to `gymnasium.make` over those of the task.
 
     Raises:
-        PolicyError: it can't be made.
+        PolicyError: nobody but the policy's file knows it, it can't be made, or the policy is
+            not for it.
     """
-    task = policy.task
+    known = policy.environment
+    if known is None:
+        raise PolicyError(unknown_environment(policy.task))
     try:
-        return make_env(task.env_id, **{**task.env_kwargs, **options})
+        env = make_env(known.env_id, **{**known.kwargs, **options})
     except (gym.error.Error, ImportError, TypeError) as error:
-        raise PolicyError(f"the environment {task.env_id} must be there: {error}") from error
+        raise PolicyError(f"the environment {known.env_id} must be there: {error}") from error
+    try:
+        _check_fit(policy, env)
+    except ValueError as error:
+        env.close()
+        raise PolicyError(f"{known.env_id} must fit the policy: {error}") from error
+    return env
+
+
+def _check_fit(policy: Policy, env: Env) -> None:
+    """Raise ValueError for an environment with other observations, goals or actions."""
+    theirs = (
+        *observation_sizes(env.observation_space),
+        *check_action_space(env.action_space).shape,
+    )
+    ours = (policy.observation_size, policy.goal_size, policy.action_size)
+    if theirs != ours:
+        raise ValueError(f"it has observations, goals and actions of {theirs}, the policy {ours}")
+    beyond = [one for one in policy.task.surrounding_indices if one >= policy.observation_size]
+    if beyond:
+        raise ValueError(
+            f"surrounding_indices must be < {policy.observation_size}, got {beyond[0]}"
+        )
 
 
 def play(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 import pyarrow.fs as pafs
 
 from music_rllib.experiment.sealed import SealedFolders, open_storage
+from music_rllib.limits import MOST_JSON_BYTES, read_json
 from music_rllib.policy.policy import PolicyError
 
 __all__ = ["find_policy"]
@@ -79,7 +79,7 @@ def _labels(filesystem: pafs.FileSystem, root: str) -> Iterator[tuple[str, str]]
             continue
         try:
             with filesystem.open_input_stream(plan) as stream:
-                nodes = json.loads(stream.read())["nodes"]
+                nodes = read_json(stream.read(MOST_JSON_BYTES + 1))["nodes"]
             labels = [(str(node["key"]), str(node["label"])) for node in nodes]
         except (ValueError, TypeError, KeyError) as error:
             warnings.warn(f"{plan} is damaged, its labels are not known: {error!r}", stacklevel=2)

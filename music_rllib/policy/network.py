@@ -25,6 +25,8 @@ from safetensors.numpy import save as save_safetensors
 __all__ = ["PolicyFileError", "PolicyNetwork"]
 
 FORMAT = "music_rllib policy 1"
+MOST_HEADER_BYTES = 1 << 20
+"""Of a policy's file, which may come from anywhere; a policy of ours has some thousand."""
 _HEADER = "music_rllib_policy"
 
 Floats = npt.NDArray[np.float32]
@@ -80,6 +82,8 @@ class PolicyNetwork:
         arrays = (*self.weights, *self.biases, self.mean, self.inverse_std, self.low, self.high)
         if not all(np.isfinite(array).all() for array in arrays):
             raise ValueError("a policy's arrays must be finite")
+        if not 0 < self.clip < np.inf:
+            raise ValueError(f"a policy's inputs must be cut to a positive range, got {self.clip}")
 
     @property
     def input_size(self) -> int:
@@ -168,11 +172,16 @@ class PolicyNetwork:
             PolicyFileError: the file isn't there or isn't a policy.
         """
         try:
+            _check_file(path)
             with safetensors.safe_open(path, framework="numpy") as file:
                 header = json.loads((file.metadata() or {}).get(_HEADER, "null"))
                 arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
             if not isinstance(header, dict) or header.get("format") != FORMAT:
                 raise ValueError(f"its header must say {FORMAT!r}")
+            if not isinstance(header["about"], dict):
+                raise ValueError("its header must say what it is about")
+            if {array.dtype for array in arrays.values()} != {np.dtype(np.float32)}:
+                raise ValueError("its arrays must be float32")
             count = sum(name.endswith(".bias") for name in arrays)
             return cls(
                 weights=tuple(arrays[f"layer.{i}.weight"] for i in range(count)),
@@ -187,8 +196,31 @@ class PolicyNetwork:
             )
         except KeyError as error:
             raise PolicyFileError(f"{path} must be a policy, it lacks {error}") from None
-        except (OSError, ValueError, TypeError, safetensors.SafetensorError) as error:
+        except RecursionError:
+            raise PolicyFileError(f"{path} must be a policy: its header is too deep") from None
+        except _UNREADABLE as error:
             raise PolicyFileError(f"{path} must be a policy: {error}") from None
+
+
+_UNREADABLE = (
+    *(OSError, ValueError, TypeError, IndexError, OverflowError),
+    safetensors.SafetensorError,
+)
+
+
+def _check_file(path: Path) -> None:
+    """Before anything parses it.
+
+    Raises:
+        ValueError: It is no regular file, or its header is too large.
+        OSError: It can't be read.
+    """
+    if not path.is_file():
+        raise ValueError("it is no regular file")
+    with path.open("rb") as file:
+        size = int.from_bytes(file.read(8), "little")
+    if size > MOST_HEADER_BYTES:
+        raise ValueError(f"its header must have at most {MOST_HEADER_BYTES} bytes, it says {size}")
 
 
 def _numbers(values: Any, name: str, size: int) -> Floats:

@@ -3,31 +3,43 @@
 from __future__ import annotations
 
 import contextlib
-import functools
-import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pyarrow.fs as pafs
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
-from music_rllib.envs.make import check_action_space, make_env, observation_sizes
+from music_rllib.envs.make import Known, known_environment, make_env
 from music_rllib.envs.registry import Task
 from music_rllib.experiment.handoff import MANIFEST as HANDOFF_FILE
-from music_rllib.experiment.handoff import HandoffError, HandoffInfo, open_handoff, read_handoff
+from music_rllib.experiment.handoff import (
+    HandoffError,
+    HandoffInfo,
+    Spaces,
+    open_handoff,
+    read_handoff,
+)
+from music_rllib.experiment.problems import shown
 from music_rllib.experiment.sealed import MANIFEST, SealedFolders, StorageError, open_storage
 from music_rllib.experiment.settings import RunSettings
+from music_rllib.limits import MOST_JSON_BYTES, MOST_WEIGHTS_BYTES, read_json, read_regular
 from music_rllib.policy.network import Floats, PolicyFileError, PolicyNetwork
 from music_rllib.tac.settings import TACSettings
 
-__all__ = ["RUN_FILE", "Policy", "PolicyError", "load_policy", "policy_from_folder"]
+__all__ = [
+    "RUN_FILE",
+    "Policy",
+    "PolicyError",
+    "load_policy",
+    "policy_from_folder",
+    "unknown_environment",
+]
 
 RUN_FILE = "run.json"
 """A run's settings, in its node and in its checkpoints."""
@@ -54,6 +66,9 @@ class Policy:
     """Environment steps that it was trained for."""
     max_episode_steps: int
     """Steps of its episodes."""
+    environment: Known | None
+    """What its episodes are played in. None where only the policy's file names it, and neither
+    this package nor the user knows it: then it acts, and nothing is imported for it."""
 
     @property
     def observation_size(self) -> int:
@@ -88,13 +103,18 @@ class Policy:
         return self.network.to_bytes()
 
 
-def load_policy(place: str | Path) -> Policy:
+def load_policy(place: str | Path, env: str | Sequence[Task] = ()) -> Policy:
     """Load the policy of a finished or unfinished run.
+
+    Nothing that stands in it is imported or executed.
 
     Args:
         place: a folder, or an `s3://` or `gs://` URI, of a finished node (`nodes/KEY`), of a
             checkpoint (`work/KEY/NUMBER`) or of a handoff; a policy's own file; or an MLflow URI
             (`models:/...`, `runs:/...`).
+        env: the environment that its episodes are played in, where it isn't one of the built-in
+            tasks or of Gymnasium: its id (`module:` in front is imported), or tasks that declare
+            it, as `experiment.config.declared_tasks` reads them from a sweep's YAML file.
 
     Raises:
         PolicyError: nothing there is a policy, or it is damaged; names the place.
@@ -102,17 +122,21 @@ def load_policy(place: str | Path) -> Policy:
     text = str(place)
     try:
         if text.startswith(("models:/", "runs:/")):
-            return _from_mlflow(text)
+            return _from_mlflow(text, env)
         if "://" not in text and Path(text).is_file():
-            return _from_file(Path(text))
+            return _from_file(Path(text), env)
         with _local_copy(text) as folder:
-            return policy_from_folder(folder)
+            return policy_from_folder(folder, env)
     except (HandoffError, StorageError, PolicyFileError, OSError) as error:
         raise PolicyError(f"{text} must hold a policy: {error}") from error
 
 
-def policy_from_folder(folder: Path) -> Policy:
+def policy_from_folder(folder: Path, env: str | Sequence[Task] = ()) -> Policy:
     """The policy in a local node, checkpoint or handoff, or in an MLflow model's folder.
+
+    Args:
+        folder: where.
+        env: as for `load_policy`.
 
     Raises:
         PolicyError: there are weights, but they don't belong to their task or settings, or there
@@ -121,7 +145,7 @@ def policy_from_folder(folder: Path) -> Policy:
     """
     for inside in (MLFLOW_FILE, f"artifacts/{MLFLOW_FILE}"):
         if (folder / inside).is_file():
-            return _from_file(folder / inside)
+            return _from_file(folder / inside, env)
     try:
         above, manifest = open_handoff(folder)
     except HandoffError as error:
@@ -132,10 +156,12 @@ def policy_from_folder(folder: Path) -> Policy:
     run = _run_settings(folder / RUN_FILE)
     tac = run.tac if run else TACSettings()
     try:
-        network = _network(parts, info, tac)
-    except ValueError as error:
-        raise PolicyError(f"{above} must fit the task {info.task.name}: {error}") from error
-    return _policy(network)
+        network = _network(parts, info, tac, _spaces(info, env))
+    except PolicyError:
+        raise
+    except (ValueError, LookupError) as error:
+        raise PolicyError(f"{above} must fit the task {info.task.name}: {error!r}") from error
+    return _policy(network, env)
 
 
 def _several(folder: Path) -> PolicyError | None:
@@ -159,17 +185,19 @@ def _several(folder: Path) -> PolicyError | None:
 
 
 def _network(
-    parts: Mapping[str, Mapping[str, NDArray[Any]]], info: HandoffInfo, tac: TACSettings
+    parts: Mapping[str, Mapping[str, NDArray[Any]]],
+    info: HandoffInfo,
+    tac: TACSettings,
+    spaces: Spaces,
 ) -> PolicyNetwork:
-    bounds = _bounds(info.task.model_dump_json())
     policy = parts["policy"]
     # torch's names: the layers are every other entry of a Sequential.
     layers = sorted(int(name.removesuffix(".weight")) for name in policy if "weight" in name)
     features = policy[f"{layers[0]}.weight"].shape[1]
-    if features != bounds.observation + bounds.goal:
+    if features != spaces.observation_size + spaces.goal_size:
         raise ValueError(
             f"the weights take {features} inputs, the environment's observations and goals have "
-            f"{bounds.observation} and {bounds.goal}"
+            f"{spaces.observation_size} and {spaces.goal_size}"
         )
     normaliser = parts.get("normaliser")
     limit = min(tac.max_episode_steps or info.task.horizon, info.task.horizon)
@@ -179,18 +207,20 @@ def _network(
         mean=_floats(normaliser["mean"] if normaliser else np.zeros(features)),
         inverse_std=_floats(normaliser["inverse_std"] if normaliser else np.ones(features)),
         clip=tac.observation_clip if normaliser else float(np.finfo(np.float32).max),
-        low=bounds.low,
-        high=bounds.high,
-        goal_size=bounds.goal,
-        about={**info.model_dump(mode="json"), "max_episode_steps": limit},
+        low=np.asarray(spaces.action_low, np.float32),
+        high=np.asarray(spaces.action_high, np.float32),
+        goal_size=spaces.goal_size,
+        about={**info.model_dump(mode="json", exclude={"spaces"}), "max_episode_steps": limit},
     )
 
 
-def _policy(network: PolicyNetwork) -> Policy:
+def _policy(network: PolicyNetwork, env: str | Sequence[Task]) -> Policy:
     about = network.about
+    task = Task.model_validate(about["task"])
     return Policy(
         network=network,
-        task=Task.model_validate(about["task"]),
+        task=task,
+        environment=_environment(task, env),
         variant=str(about["variant"]),
         seed=int(about["seed"]),
         node_key=str(about["node_key"]),
@@ -199,14 +229,28 @@ def _policy(network: PolicyNetwork) -> Policy:
     )
 
 
-def _from_file(path: Path) -> Policy:
+def _environment(task: Task, env: str | Sequence[Task]) -> Known | None:
+    if not isinstance(env, str):
+        return known_environment(task, env)
+    if task.env_kwargs:
+        raise PolicyError(
+            f"the environment of {task.name} takes arguments, {shown(task.env_kwargs)}: it must be "
+            f"declared in a sweep's YAML file to be used, got its id {env!r} alone"
+        )
+    return Known(env, {})
+
+
+def _from_file(path: Path, env: str | Sequence[Task]) -> Policy:
+    network = PolicyNetwork.from_file(path)
     try:
-        return _policy(PolicyNetwork.from_file(path))
-    except (KeyError, TypeError, ValidationError) as error:
+        return _policy(network, env)
+    except PolicyError:
+        raise
+    except (LookupError, TypeError, ValueError, OverflowError) as error:
         raise PolicyError(f"{path} must say what it was trained for: {error}") from error
 
 
-def _from_mlflow(uri: str) -> Policy:
+def _from_mlflow(uri: str, env: str | Sequence[Task]) -> Policy:
     os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
     import mlflow
     from mlflow.exceptions import MlflowException
@@ -214,7 +258,7 @@ def _from_mlflow(uri: str) -> Policy:
     try:
         with TemporaryDirectory() as folder:
             model = mlflow.artifacts.download_artifacts(uri, dst_path=folder)
-            return policy_from_folder(Path(model))
+            return policy_from_folder(Path(model), env)
     except MlflowException as error:
         raise PolicyError(
             f"{uri} must be a model at {mlflow.get_tracking_uri()} (MLFLOW_TRACKING_URI): {error}"
@@ -233,8 +277,18 @@ def _local_copy(place: str) -> Iterator[Path]:
             return
         raise PolicyError(f"{place} must be a finished node or a checkpoint: no {MANIFEST} there")
     with TemporaryDirectory() as folder:
-        sealed.fetch(name, Path(folder))
+        sizes = {file: one.bytes for file, one in sealed.manifest(name).files.items()}
+        needed = {file for file in sizes if file in _FILES or file.startswith("handoff/")}
+        total = sum(sizes[file] for file in needed)
+        if total > MOST_WEIGHTS_BYTES:
+            raise PolicyError(
+                f"{place} must have at most {MOST_WEIGHTS_BYTES} bytes of weights, it has {total}"
+            )
+        sealed.fetch(name, Path(folder), needed.__contains__)
         yield Path(folder)
+
+
+_FILES = {RUN_FILE, HANDOFF_FILE, MLFLOW_FILE, f"artifacts/{MLFLOW_FILE}"}
 
 
 def _run_settings(path: Path) -> RunSettings | None:
@@ -242,34 +296,40 @@ def _run_settings(path: Path) -> RunSettings | None:
     if not path.is_file():
         return None
     try:
-        return RunSettings.model_validate(json.loads(path.read_text()))
-    except ValueError as error:
-        raise PolicyError(f"{path} must hold a run's settings: {error}") from error
+        return RunSettings.model_validate(read_json(read_regular(path, MOST_JSON_BYTES)))
+    except (ValueError, OSError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise PolicyError(f"{path} must hold a run's settings: {reason}") from error
 
 
-class _Bounds(NamedTuple):
-    observation: int
-    goal: int
-    low: Floats
-    high: Floats
-
-
-@functools.cache
-def _bounds(task: str) -> _Bounds:
-    """Sizes and action bounds of a task (its JSON), asked of the environment once."""
-    described = Task.model_validate_json(task)
+def _spaces(info: HandoffInfo, env: str | Sequence[Task]) -> Spaces:
+    """Sizes and action bounds, asked of the environment where the handoff doesn't say them."""
+    if info.spaces is not None:
+        return info.spaces
+    known = _environment(info.task, env)
+    if known is None:
+        raise PolicyError(unknown_environment(info.task))
     try:
-        env = make_env(described.env_id, **described.env_kwargs)
-    except (gym.error.Error, ImportError) as error:
+        made = make_env(known.env_id, **known.kwargs)
+    except (gym.error.Error, ImportError, TypeError) as error:
         raise PolicyError(
-            f"{described.name}: the environment {described.env_id} must be there: {error}"
+            f"{info.task.name}: the environment {known.env_id} must be there: {error}"
         ) from error
     try:
-        actions = check_action_space(env.action_space)
-        sizes = observation_sizes(env.observation_space)
-        return _Bounds(*sizes, _floats(actions.low), _floats(actions.high))
+        return Spaces.of(made.observation_space, made.action_space)
     finally:
-        env.close()
+        made.close()
+
+
+def unknown_environment(task: Task) -> str:
+    """Why a task's environment is not made, and what to say to have it made."""
+    arguments = f" with {shown(task.env_kwargs)}" if task.env_kwargs else ""
+    return (
+        f"the environment of {task.name} must be a built-in task's, one of Gymnasium's, or named "
+        f"by you: the policy's file names {shown(task.env_id)}{arguments}, and a file doesn't "
+        "choose what is imported. If you trust it, give the sweep's YAML file that declares it, "
+        "or its id, as --env (load_policy: env=...)"
+    )
 
 
 def _floats(array: NDArray[Any]) -> Floats:

@@ -89,12 +89,12 @@ def _check_drawable(policy: Policy) -> None:
     modes = env.metadata.get("render_modes") or []
     env.close()
     if "rgb_array" not in modes:
-        raise VideoError(f"{policy.task.env_id} can't be drawn: it has no rgb_array rendering")
+        raise VideoError(f"{policy.task.name} can't be drawn: it has no rgb_array rendering")
 
 
 def _size(policy: Policy) -> dict[str, int]:
     """Options of MuJoCo's environments; others choose their own size."""
-    name = policy.task.env_id
+    name = "" if policy.environment is None else policy.environment.env_id
     mujoco = any(word in name for word in ("Fetch", "Hand", "Cheetah", "Hopper", "Walker", "Ant"))
     return {"width": SIZE, "height": SIZE} if mujoco else {}
 

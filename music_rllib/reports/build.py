@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from music_rllib.envs.registry import Task
 from music_rllib.reports.figures import METRICS
 from music_rllib.reports.films import make_films
 from music_rllib.reports.gallery import Drawing, drawing_of_stages, stage_drawings
@@ -45,6 +46,7 @@ def build_report(
     command: str = "",
     store: TrackingStore | None = None,
     video_seed: int | None = None,
+    environments: Sequence[Task] = (),
 ) -> Report:
     """Compute and arrange everything.
 
@@ -56,6 +58,7 @@ def build_report(
         command: that makes this report.
         store: where the sweep is logged, with its policies.
         video_seed: of the filmed episodes; None: no videos.
+        environments: of tasks that may be made for videos, beside the known ones.
     """
     analyses = analyse(sweep, rng)
     drawings = [d for analysis in analyses for d in stage_drawings(sweep, analysis, rng)]
@@ -72,7 +75,9 @@ def build_report(
         missing=missing(sweep, analyses, undelivered),
         difference=difference,
         command=command,
-        films=None if video_seed is None else make_films(sweep, analyses, store, video_seed),
+        films=None
+        if video_seed is None
+        else make_films(sweep, analyses, store, video_seed, environments),
     )
 
 

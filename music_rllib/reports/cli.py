@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from music_rllib.experiment.problems import ConfigError
 from music_rllib.results.data import ReportError
 from music_rllib.tracking import names
 from music_rllib.tracking.errors import TrackingError
@@ -86,6 +87,13 @@ def report(
     videos: Annotated[
         bool, typer.Option(help="Film an episode for each q, where this machine can draw.")
     ] = True,
+    env: Annotated[
+        Path | None,
+        typer.Option(
+            help="A sweep's YAML file: the environments that it declares are made for videos, "
+            "beside the built-in tasks' and Gymnasium's own.",
+        ),
+    ] = None,
     attach: Annotated[
         bool, typer.Option("--attach", help="Also keep the report with the sweep's run in MLflow.")
     ] = False,
@@ -114,9 +122,10 @@ def report(
                 difference,
                 seed,
                 videos=videos,
+                env=env,
                 attach=attach,
             )
-    except (ReportError, TrackingError) as error:
+    except (ConfigError, ReportError, TrackingError) as error:
         typer.echo(f"error: {redact(str(error))}", err=True)
         raise typer.Exit(BAD_INPUT) from error
 
@@ -157,10 +166,12 @@ def _report(
     seed: int,
     *,
     videos: bool,
+    env: Path | None,
     attach: bool,
 ) -> None:
     import numpy as np
 
+    from music_rllib.experiment.config import declared_tasks
     from music_rllib.reports.build import WANTED, build_report, write_report
     from music_rllib.reports.locate import find_sweep
     from music_rllib.results.verdict import verdict
@@ -173,6 +184,7 @@ def _report(
         undelivered=found.undelivered,
         store=found.store,
         video_seed=seed if videos else None,
+        environments=() if env is None else declared_tasks(env),
         command=redact(shlex.join(["python", "-m", "music_rllib.report", *sys.argv[1:]])),
     )
     page = write_report(made, output or found.folder / "report")

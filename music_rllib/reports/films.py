@@ -9,6 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
+from music_rllib.envs.registry import Task
 from music_rllib.reports.gallery import slug
 from music_rllib.reports.query import download_policy
 from music_rllib.reports.tables import last_success
@@ -59,9 +60,16 @@ class Films:
 
 
 def make_films(
-    sweep: Sweep, analyses: Sequence[StageAnalysis], store: TrackingStore | None, seed: int
+    sweep: Sweep,
+    analyses: Sequence[StageAnalysis],
+    store: TrackingStore | None,
+    seed: int,
+    environments: Sequence[Task] = (),
 ) -> Films:
-    """Film the last stage's policies. Never fails: what can't be is said."""
+    """Film the last stage's policies. Never fails: what can't be is said.
+
+    Played is in environments that are known, and in `environments`: those of the user.
+    """
     if store is None:
         return Films(why_not="an exported sweep has no policies; report on the sweep in MLflow")
     wanted = list(_wanted(sweep, analyses))
@@ -71,7 +79,9 @@ def make_films(
     reasons: list[str] = []
     for q, task, run in wanted:
         try:
-            films.append(_film(sweep, store, q, task, run, seed))
+            with TemporaryDirectory() as folder:
+                policy = _policy(sweep, store, run, Path(folder), environments)
+                films.append(_film(policy, sweep.runs[run].name, q, task, seed, Path(folder)))
         # An environment may raise anything, and no video is worth losing the report.
         except Exception as error:
             reasons.append(f"{sweep.runs[run].name}: {str(error).splitlines()[0]}")
@@ -100,31 +110,30 @@ def _wanted(sweep: Sweep, analyses: Sequence[StageAnalysis]) -> Iterator[tuple[s
                 yield q, task, sorted(rated)[len(rated) // 2][1]
 
 
-def _film(sweep: Sweep, store: TrackingStore, q: str, task: str, run: int, seed: int) -> Film:
+def _film(policy: Policy, run: str, q: str, task: str, seed: int, folder: Path) -> Film:
     from music_rllib.policy.video import film
 
-    record = sweep.runs[run]
-    with TemporaryDirectory() as folder:
-        policy = _policy(store, sweep.experiment_id, record.run_id, Path(folder))
-        frames, (result,) = film(policy, 1, seed, f"q = {q}  ·  {task}")
-        ending, data = _encoded(frames, Path(folder))
+    frames, (result,) = film(policy, 1, seed, f"q = {q}  ·  {task}")
+    ending, data = _encoded(frames, folder)
     return Film(
         entropic_index=q,
         task=task,
-        run=record.name,
+        run=run,
         success=result.success,
         ending=ending,
         data=data,
     )
 
 
-def _policy(store: TrackingStore, experiment_id: str, run_id: str, folder: Path) -> Policy:
+def _policy(
+    sweep: Sweep, store: TrackingStore, run: int, folder: Path, environments: Sequence[Task]
+) -> Policy:
     from music_rllib.policy.policy import load_policy
 
-    file = download_policy(store, experiment_id, run_id, folder)
+    file = download_policy(store, sweep.experiment_id, sweep.runs[run].run_id, folder)
     if file is None:
         raise ReportError("no policy is logged with it")
-    return load_policy(file)
+    return load_policy(file, environments)
 
 
 def _encoded(frames: Sequence[object], folder: Path) -> tuple[str, bytes]:

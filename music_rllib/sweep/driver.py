@@ -311,7 +311,8 @@ def _compute_and_report(console: Console, opened: Sweep, tracker: Tracker) -> in
     if undelivered := tracker.undelivered_message():
         console.print(Text(undelivered, style="yellow"), soft_wrap=True)
     if stopped_by is None:
-        report = report_at_end(opened.folder, opened.config.mlflow.tracking_uri)
+        config = opened.config
+        report = report_at_end(opened.folder, config.mlflow.tracking_uri, config.path)
         if report is not None:
             console.print(Text(report), soft_wrap=True)
     console.print(Text(f"Open MLflow's pages with: {tracker.ui_command()}"), soft_wrap=True)

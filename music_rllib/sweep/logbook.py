@@ -143,7 +143,8 @@ class Logbook(Listener):
                 if self._store is not None:
                     folder.mkdir()
                     self._store.fetch(node.key, folder)
-                    packed.write_bytes(policy_from_folder(folder).to_bytes())
+                    policy = policy_from_folder(folder, [node.run.task])
+                    packed.write_bytes(policy.to_bytes())
             except (OSError, ValueError, StorageError) as error:
                 self._complain(f"MLflow gets no policy of {node.label}: {error}")
             yield {names.ARTEFACT_POLICY: packed} if packed.exists() else {}

@@ -16,7 +16,7 @@ PATIENCE = 900.0
 """Seconds after which the sweep ends without a report."""
 
 
-def report_at_end(folder: Path, tracking_uri: str | None) -> str | None:
+def report_at_end(folder: Path, tracking_uri: str | None, config: Path) -> str | None:
     """Make the report of the sweep in `folder` and attach it to the sweep's run in MLflow.
 
     In a process of its own: it draws on all CPUs, and whatever happens in it, the sweep is over and
@@ -25,6 +25,7 @@ def report_at_end(folder: Path, tracking_uri: str | None) -> str | None:
     Args:
         folder: the sweep's.
         tracking_uri: of its MLflow, password included; None for the file in the storage.
+        config: the sweep's YAML file, whose environments are filmed.
 
     Returns:
         A line for the user; None where `MUSIC_RLLIB_REPORT=off` says that nobody wants one.
@@ -35,6 +36,8 @@ def report_at_end(folder: Path, tracking_uri: str | None) -> str | None:
     if tracking_uri is not None:
         environment[names.VARIABLE_TRACKING_URI] = tracking_uri
     command = [sys.executable, "-m", "music_rllib.report", str(folder)]
+    if config.is_file():
+        command += ["--env", str(config.absolute())]
     try:
         done = subprocess.run(  # noqa: S603
             [*command, "--attach"],

@@ -284,7 +284,7 @@ class RunTrainable(Trainable):
                 name: modules[name] for name in ("policy", "normaliser") if name in modules
             }
             with contextlib.suppress(ValueError):  # diverged: the end of the run will say so
-                self._write_outcome(draft.folder, acting, training.env_steps)
+                self._write_outcome(draft.folder, training, acting)
         self._saved = time.monotonic()
 
     def _pause(self, training: TrainingRun, store: NodeStore) -> None:
@@ -305,7 +305,7 @@ class RunTrainable(Trainable):
         store.tidy(self._job.key)
         with TemporaryDirectory() as temporary:
             folder = Path(temporary)
-            self._write_outcome(folder, training.modules(), training.env_steps)
+            self._write_outcome(folder, training, training.modules())
             result = RunResult(
                 label=self._job.label,
                 env_steps=last.env_steps,
@@ -323,7 +323,7 @@ class RunTrainable(Trainable):
         self._work(store).clear()
 
     def _write_outcome(
-        self, folder: Path, modules: Mapping[str, Mapping[str, Any]], env_steps: int
+        self, folder: Path, training: TrainingRun, modules: Mapping[str, Mapping[str, Any]]
     ) -> None:
         """What others may read: weights, history, settings. In nodes and in checkpoints.
 
@@ -332,7 +332,7 @@ class RunTrainable(Trainable):
         """
         (folder / HISTORY).write_bytes(to_json_lines(self._history))
         (folder / "run.json").write_text(self._job.run.model_dump_json(indent=1))
-        info = HandoffInfo.of(self._job.run, self._job.key, env_steps)
+        info = HandoffInfo.of(self._job.run, self._job.key, training.env_steps, training.spaces)
         write_handoff(folder / "handoff", modules, info)
 
     def _result(self, *, done: bool) -> dict[str, Any]:

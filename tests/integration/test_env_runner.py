@@ -6,7 +6,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch
 
 from music_rllib.envs.numbers import BadNumberError
 from music_rllib.tac.config import TACConfig

@@ -24,6 +24,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
         "_autoscaler",
         "_cluster",
         "_quiet",
+        "limits",
         "tsallis",
         "mutual_information",
         "schedules",

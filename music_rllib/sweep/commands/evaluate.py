@@ -24,6 +24,8 @@ examples:
       a finished node, or a checkpoint (results/work/KEY/NUMBER), by its folder
   python -m music_rllib.sweep evaluate 4f2a09 --storage s3://bucket/sweeps --video push.mp4
       and a film of the first three episodes
+  python -m music_rllib.sweep evaluate policy --env my.yaml
+      a policy for an environment of your own, as my.yaml declares it
   MLFLOW_TRACKING_URI=http://server:5000 python -m music_rllib.sweep evaluate models:/m-...
       a policy that was logged to MLflow
 """
@@ -49,6 +51,13 @@ def register(commands: Commands) -> None:
         default="results",
         metavar="PLACE",
         help="Where labels and keys are looked up (default: results).",
+    )
+    parser.add_argument(
+        "--env",
+        metavar="ENV",
+        help="The environment, where it is neither a built-in task's nor Gymnasium's own: a "
+        "sweep's YAML file that declares it, or its id. What a policy's file says is not enough: "
+        "making an environment runs its code.",
     )
     parser.add_argument(
         "--episodes", type=_positive, default=20, metavar="N", help="How many (default: 20)."
@@ -88,6 +97,7 @@ def _not_negative(text: str) -> int:
 
 
 def _execute(arguments: argparse.Namespace) -> int:
+    from music_rllib.experiment.config import declared_tasks
     from music_rllib.policy import PolicyError, find_policy, load_policy
     from music_rllib.policy.video import VideoError
 
@@ -95,9 +105,12 @@ def _execute(arguments: argparse.Namespace) -> int:
         raise BadInputError("--storage must not be empty, got ''")
     _check_video(arguments.video)
     console = console_for(arguments)
+    env = arguments.env or ()
+    if arguments.env and arguments.env.endswith((".yaml", ".yml")):
+        env = declared_tasks(arguments.env)
     try:
         place = find_policy(arguments.run, arguments.storage)
-        policy = load_policy(place)
+        policy = load_policy(place, env)
         results = _play(policy, arguments)
         if arguments.video:
             _film(policy, arguments)
@@ -156,7 +169,7 @@ def _document(
         "run": place,
         "node_key": policy.node_key,
         "task": policy.task.name,
-        "env_id": policy.task.env_id,
+        "env_id": policy.environment.env_id if policy.environment else None,
         "variant": policy.variant,
         "training_seed": policy.seed,
         "env_steps": policy.env_steps,

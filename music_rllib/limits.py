@@ -1,0 +1,162 @@
+"""How much of what comes from outside is read: files, JSON, safetensors headers.
+
+Policies, sealed folders, exported sweeps and YAML may come from strangers. What is beyond a limit
+below is refused before it costs time or memory. Each is far above anything that a sweep writes.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import re
+import stat
+from pathlib import Path
+from typing import Any, BinaryIO
+
+__all__ = [
+    "check_safetensors",
+    "nesting_of",
+    "open_regular",
+    "read_json",
+    "read_regular",
+]
+
+MOST_JSON_BYTES = 16 << 20
+"""Of a manifest, a handoff's description, an export's header, a search."""
+MOST_YAML_BYTES = 256 << 10
+"""Of a sweep's YAML file, or the configuration in an export."""
+MOST_WEIGHTS_BYTES = 1 << 30
+"""Of one module's weights, or a policy's file."""
+MOST_SAFETENSORS_HEADER_BYTES = 1 << 20
+MOST_NESTED = 64
+"""Levels of lists and mappings in each other."""
+MOST_CONTAINERS = 200_000
+"""Lists and mappings of a JSON document."""
+MOST_YAML_VALUES = 50_000
+"""Values of a YAML document, those of an alias counted wherever it stands."""
+MOST_DIGITS = 100
+"""Of a whole number in JSON: the state of a random generator has 39."""
+MOST_YAML_DIGITS = 19
+"""Of a whole number in YAML: 64 bits."""
+MOST_INDICES = 10_000
+"""Entries of an observation that a task may name."""
+MOST_SEEDS = 10_000
+MOST_GRID_POINTS = 10_000
+"""Of a stage's grid."""
+MOST_RUNS = 100_000
+"""Of a sweep."""
+MOST_TABLE_ROWS = 50_000_000
+"""Of an exported table."""
+MOST_ROWS_PER_BYTE = 100
+"""Of an exported table; one that is smaller is a bomb."""
+MOST_COLUMNS = 10_000
+"""Of an exported table."""
+
+# One that does not end is taken to the end: looking for it again at each quote would be quadratic.
+_TEXTS = re.compile(rb'"(?:[^"\\]++|\\.)*+"?', re.DOTALL)
+_LONG_NUMBER = re.compile(rb"\d{%d}" % (MOST_DIGITS + 1))
+_NO_BRACKETS = bytes(set(range(256)) - set(b"[]{}"))
+_KINDS = {
+    stat.S_IFIFO: "a FIFO",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFDIR: "a folder",
+    stat.S_IFLNK: "a link",
+}
+
+
+def open_regular(path: Path | str, *, follow: bool = False) -> BinaryIO:
+    """Open a regular file for reading; nothing else can be waited for or read without end.
+
+    Args:
+        path: Of the file.
+        follow: Whether `path` itself may be a link. For a place that a user names, not for the
+            files in a folder from elsewhere.
+
+    Raises:
+        OSError: It is a link, FIFO, device, socket or folder, or can't be read.
+    """
+    flags = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | (0 if follow else os.O_NOFOLLOW)
+    try:
+        handle = os.open(path, flags)
+    except OSError as error:
+        if error.errno in (errno.ELOOP, errno.ENXIO):  # a link; a FIFO or socket
+            what = "a link" if error.errno == errno.ELOOP else "a socket"
+            raise OSError(error.errno, f"it is {what}, no regular file", str(path)) from None
+        raise
+    kind = stat.S_IFMT(os.fstat(handle).st_mode)
+    if kind != stat.S_IFREG:
+        os.close(handle)
+        what = _KINDS.get(kind, "something else")
+        raise OSError(errno.EINVAL, f"it is {what}, no regular file", str(path))
+    return os.fdopen(handle, "rb")
+
+
+def read_regular(path: Path | str, most: int, *, follow: bool = False) -> bytes:
+    """The content of a regular file of at most `most` bytes.
+
+    Raises:
+        OSError: It is longer, or as for `open_regular`.
+    """
+    with open_regular(path, follow=follow) as file:
+        size = os.fstat(file.fileno()).st_size
+        # It may grow while it is read.
+        data = b"" if size > most else file.read(most + 1)
+        if max(size, len(data)) > most:
+            found = max(size, len(data))
+            raise OSError(errno.EFBIG, f"it has {found} bytes, more than {most}", str(path))
+    return data
+
+
+def read_json(data: bytes | str) -> Any:
+    """Parse JSON that may be hostile.
+
+    Raises:
+        ValueError: It is no JSON, or beyond a limit; says which.
+    """
+    raw = data.encode("utf-8", "surrogatepass") if isinstance(data, str) else data
+    if len(raw) > MOST_JSON_BYTES:
+        raise ValueError(f"must have at most {MOST_JSON_BYTES} bytes, it has {len(raw)}")
+    bare = _TEXTS.sub(b"", raw)
+    if found := _LONG_NUMBER.search(bare):
+        number = f"{found[0][:8].decode()}..."
+        raise ValueError(f"a number must have at most {MOST_DIGITS} digits, got {number}")
+    brackets = bare.translate(None, _NO_BRACKETS)
+    if len(brackets) > 2 * MOST_CONTAINERS:
+        raise ValueError(
+            f"must have at most {MOST_CONTAINERS} lists and mappings, it has {len(brackets) // 2}"
+        )
+    if nesting_of(brackets) > MOST_NESTED:
+        raise ValueError(f"must be nested at most {MOST_NESTED} levels deep, it is deeper")
+    try:
+        return json.loads(raw)
+    except RecursionError:
+        raise ValueError("must be nested less deeply") from None
+
+
+def nesting_of(brackets: bytes) -> int:
+    """Levels of nested pairs, `MOST_NESTED` + 1 for more; 0 for unbalanced ones: no JSON."""
+    for level in range(MOST_NESTED + 1):
+        inner = brackets.replace(b"[]", b"").replace(b"{}", b"")
+        if inner == brackets:
+            return level if not brackets else 0
+        brackets = inner
+    return MOST_NESTED + 1
+
+
+def check_safetensors(data: bytes) -> None:
+    """Check the size of a safetensors file's header before anything parses it.
+
+    Args:
+        data: The file's content, or its first 8 bytes.
+
+    Raises:
+        ValueError: It is too large.
+    """
+    size = int.from_bytes(data[:8], "little")
+    if size > MOST_SAFETENSORS_HEADER_BYTES:
+        raise ValueError(
+            f"its header must have at most {MOST_SAFETENSORS_HEADER_BYTES} bytes, it says {size}"
+        )
