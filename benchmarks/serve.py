@@ -2,7 +2,8 @@
 
 `python -m benchmarks.serve [POLICY]` starts the service as a user does, lets clients send
 observations one after the other without a pause, and compares every hundredth answer with the
-policy itself. Without POLICY the weights are random, which costs the same.
+policy itself. Without POLICY the weights are random, which costs the same. `--storm N` sends N
+requests at once instead, beside as many that are never sent to their end.
 `python -m benchmarks.serve --help`.
 """
 
@@ -11,12 +12,13 @@ from __future__ import annotations
 import argparse
 import asyncio
 import os
+import re
 import socket
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -25,6 +27,7 @@ from typing import Any
 
 import aiohttp
 import numpy as np
+import psutil
 from rich.console import Console
 from rich.table import Table
 
@@ -81,8 +84,8 @@ def random_policy(task: str = "FetchPush", hidden: int = 256) -> bytes:
 
 
 @contextmanager
-def service(policy: str, replicas: int) -> Iterator[str]:
-    """`python -m music_rllib.serve` on a free port of loopback; gives its URL."""
+def service(policy: str, replicas: int) -> Iterator[tuple[str, int]]:
+    """`python -m music_rllib.serve` on a free port of loopback; gives its URL and process id."""
     with socket.create_server(("127.0.0.1", 0)) as probe:
         port = probe.getsockname()[1]
     arguments = ["--port", str(port), "--replicas", str(replicas)]
@@ -96,7 +99,7 @@ def service(policy: str, replicas: int) -> Iterator[str]:
         assert process.stdout is not None
         if not process.stdout.readline().startswith("Serving"):
             raise SystemExit("the service did not start")
-        yield f"http://127.0.0.1:{port}"
+        yield f"http://127.0.0.1:{port}", process.pid
     finally:
         process.terminate()
         process.wait(timeout=START_SECONDS)
@@ -142,6 +145,107 @@ async def _client(
             load.wrong += not np.allclose(body["action"], expected, atol=1e-5)
 
 
+@dataclass
+class Storm:
+    """What many requests at once gave."""
+
+    answers: list[tuple[int, float]] = field(default_factory=list)
+    """Status and seconds of each request; 0 where the connection broke."""
+    healths: list[tuple[int, float]] = field(default_factory=list)
+    """The same of the questions for its health meanwhile, one after the other."""
+    without_retry: int = 0
+    """Answers 503 that don't say when to come again."""
+
+    def quantile(self, share: float, *statuses: int) -> float:
+        """Of the seconds of answers with these statuses."""
+        return float(np.quantile([t for status, t in self.answers if status in statuses], share))
+
+    def count(self, *statuses: int) -> int:
+        """Answers with these statuses."""
+        return sum(status in statuses for status, _ in self.answers)
+
+
+async def storm(url: str, policy: Policy, count: int, token: str | None = None) -> Storm:
+    """Send `count` requests in parallel, each on a connection of its own."""
+    seen = Storm()
+    body = {"observation": [0.5] * policy.observation_size}
+    if policy.goal_size:
+        body["desired_goal"] = [0.5] * policy.goal_size
+    headers = {"Authorization": f"Bearer {token}"} if token else {}
+    over = asyncio.Event()
+
+    async def ask(session: aiohttp.ClientSession) -> None:
+        began = time.perf_counter()
+        try:
+            async with session.post("/act", json=body, headers=headers) as answer:
+                await answer.read()
+                status, again = answer.status, answer.headers.get("Retry-After")
+        except aiohttp.ClientError:
+            status, again = 0, None
+        seen.answers.append((status, time.perf_counter() - began))
+        seen.without_retry += status == 503 and again is None
+
+    async def watch(session: aiohttp.ClientSession) -> None:
+        while not over.is_set():
+            began = time.perf_counter()
+            async with session.get("/health") as answer:
+                await answer.read()
+            seen.healths.append((answer.status, time.perf_counter() - began))
+            await asyncio.sleep(0.1)
+
+    connector = aiohttp.TCPConnector(limit=0)
+    async with aiohttp.ClientSession(url, connector=connector) as session:
+        watching = asyncio.create_task(watch(session))
+        await asyncio.gather(*(ask(session) for _ in range(count)))
+        over.set()
+        await watching
+    return seen
+
+
+@contextmanager
+def half_sent(url: str, count: int) -> Iterator[list[socket.socket]]:
+    """So many requests whose bodies never end."""
+    host, port = url.removeprefix("http://").split(":")
+    head = f"POST /act HTTP/1.1\r\nHost: {host}\r\nContent-Length: 60000\r\n\r\n"
+    with ExitStack() as stack:
+        opened = []
+        for _ in range(count):
+            client = stack.enter_context(socket.create_connection((host, int(port))))
+            client.sendall(head.encode() + b" " * 30000)
+            opened.append(client)
+        yield opened
+
+
+def memory(service: int) -> float:
+    """MB of the proxy and the replicas below the process `service`."""
+    workers = psutil.Process(service).children(recursive=True)
+    serving = [w for w in workers if re.match("ray::(Proxy|ServeReplica)", w.cmdline()[0])]
+    assert len(serving) >= 2
+    return float(sum(worker.memory_info().rss for worker in serving) / 1e6)
+
+
+def weather(url: str, policy: Policy, count: int, process: int) -> int:
+    """A storm, printed; 1 if anything but answers and polite refusals came of it."""
+    before = memory(process)
+    with half_sent(url, count):
+        seen = asyncio.run(storm(url, policy, count))
+        during = memory(process)
+        time.sleep(12)
+    after = memory(process)
+    again = asyncio.run(storm(url, policy, 1))
+    print(f"{count} requests at once beside {count} that are never sent to their end:")
+    for status in (200, 503):
+        if seen.count(status):
+            shown = [f"{seen.quantile(share, status):.2f}" for share in (0.5, 0.99, 1)]
+            print(f"  {status}: {seen.count(status)}, median, 99 % and slowest s {shown}")
+    worst = max(seconds for _, seconds in seen.healths)
+    print(f"  /health meanwhile: {len(seen.healths)} times, slowest {worst:.2f} s")
+    print(f"  proxy and replica: {before:.0f} MB before, {during:.0f} during, {after:.0f} after")
+    print(f"  load average {os.getloadavg()[0]:.1f}")
+    bad = len(seen.answers) - seen.count(200, 503) + seen.without_retry
+    return int(bad > 0 or again.count(200) != 1 or {s for s, _ in seen.healths} != {200})
+
+
 def table(loads: list[Load]) -> Table:
     """One row per combination."""
     shown = Table("clients", "rows", "requests/s", "actions/s", "median ms", "95 %", "99 %", "bad")
@@ -167,6 +271,7 @@ def main() -> int:
     parser.add_argument("--clients", type=int, nargs="+", default=[1, 8, 32])
     parser.add_argument("--rows", type=int, nargs="+", default=[1, 64], help="per request (1 64)")
     parser.add_argument("--replicas", type=int, default=1)
+    parser.add_argument("--storm", type=int, metavar="N", help="N requests at once instead")
     arguments = parser.parse_args()
     loads = [Load(clients, rows) for rows in arguments.rows for clients in arguments.clients]
     with TemporaryDirectory() as folder:
@@ -175,7 +280,9 @@ def main() -> int:
             place = str(Path(folder, "policy.safetensors"))
             Path(place).write_bytes(random_policy())
         policy = load_policy(place)
-        with service(place, arguments.replicas) as url:
+        with service(place, arguments.replicas) as (url, process):
+            if arguments.storm:
+                return weather(url, policy, arguments.storm, process)
             for load in loads:
                 asyncio.run(measure(url, policy, load, arguments.seconds))
     Console().print(table(loads))

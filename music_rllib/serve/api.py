@@ -75,9 +75,11 @@ def make_api(facts: PolicyFacts, act: Act, token_sha256: str | None = None) -> F
     protected = [Depends(_bearer(token_sha256))] if token_sha256 else []
     failures: Failures = {
         400: {"model": Failure, "description": "The body is not JSON"},
+        408: {"model": Failure, "description": "The request was not sent, or answered, in time"},
         413: {"model": Failure, "description": "The body is longer than any valid one"},
         422: {"model": Failure, "description": "The observation is not one of this task"},
     }
+    failures[503] = {"model": Failure, "description": "Busy; Retry-After says when to come again"}
     if token_sha256:
         failures[401] = {"model": Failure, "description": "The token is missing or wrong"}
 

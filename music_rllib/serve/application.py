@@ -7,20 +7,27 @@
 from __future__ import annotations
 
 import os
+from ipaddress import ip_address
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+import ray
 from pydantic import BaseModel, ConfigDict, Field
 from ray import serve
+from ray._common.tls_utils import add_port_to_grpc_server
 from ray.serve import Application
+from ray.serve._private import replica
+from ray.serve.config import BackpressureConfig
 
-from music_rllib.policy import PolicyNetwork, find_policy, load_policy
+from music_rllib._allocator import give_back_freed_memory
+from music_rllib.policy import Policy, PolicyNetwork, find_policy, load_policy
 from music_rllib.serve.api import make_api, token_hash
+from music_rllib.serve.limits import FOR_HEALTH, RETRY_SECONDS, Limits
 from music_rllib.serve.protocol import TOKEN_VARIABLE, Array, PolicyFacts, Rows, compute
 
-__all__ = ["ServeSettings", "app"]
+__all__ = ["ServeSettings", "app", "application"]
 
 TOGETHER = 64
 """Requests that are computed together at most."""
@@ -41,6 +48,8 @@ class ServeSettings(BaseModel):
     """Processes that compute actions."""
     cpus_per_replica: float = Field(1.0, gt=0)
     """CPUs reserved for each."""
+    max_requests: int = Field(Limits().max_requests, ge=1)
+    """Requests that wait for a replica at most, for each proxy; further ones get status 503."""
     token_required: bool = False
     """Refuse to start without a token in the environment; for services beyond loopback."""
 
@@ -52,25 +61,40 @@ def app(settings: ServeSettings) -> Application:
         PolicyError: There is no such policy.
         ValueError: A token is required and there is none.
     """
+    return application(load_policy(find_policy(settings.policy, settings.storage)), settings)
+
+
+def application(policy: Policy, settings: ServeSettings) -> Application:
+    """The same for a policy that is loaded.
+
+    Raises:
+        ValueError: A token is required and there is none.
+    """
     token = os.environ.get(TOKEN_VARIABLE)
     if settings.token_required and not token:
         raise ValueError(f"{TOKEN_VARIABLE} must be set in the environment for token_required")
-    policy = load_policy(find_policy(settings.policy, settings.storage))
     deployment: Any = PolicyServer
     # The token's hash: a deployment's arguments are kept by Ray and may be shown.
     return deployment.options(
         num_replicas=settings.replicas,
+        max_queued_requests=settings.max_requests + FOR_HEALTH,
         ray_actor_options={"num_cpus": settings.cpus_per_replica},
     ).bind(policy.to_bytes(), policy.task.name, token_hash(token) if token else None)
 
 
-@serve.deployment(name="policy", max_ongoing_requests=2 * TOGETHER)
+@serve.deployment(
+    name="policy",
+    max_ongoing_requests=2 * TOGETHER,
+    backpressure_config=BackpressureConfig(retry_after_s=RETRY_SECONDS),
+)
 @serve.ingress()
 class PolicyServer:
     """A replica."""
 
     def __init__(self, weights: bytes, task: str, token_sha256: str | None) -> None:
         """Take a policy's bytes (`Policy.to_bytes`) for the task of this name."""
+        give_back_freed_memory()
+        _stay_on_loopback()
         with TemporaryDirectory() as folder:
             file = Path(folder, "policy.safetensors")
             file.write_bytes(weights)
@@ -99,3 +123,15 @@ class PolicyServer:
     @serve.batch(max_batch_size=TOGETHER, batch_wait_timeout_s=WAIT_SECONDS)
     async def _act_together(self, waiting: list[Rows]) -> list[Array]:
         return compute(self._policy, waiting)
+
+
+def _stay_on_loopback() -> None:
+    """Where Ray's node listens on loopback only, have this replica do so, too.
+
+    Serve opens a port for calls between deployments on all addresses, and has no setting for it.
+    """
+    address = ray.util.get_node_ip_address()
+    if ip_address(address).is_loopback:
+        replica.add_port_to_grpc_server = lambda server, _: add_port_to_grpc_server(
+            server, f"{address}:0"
+        )

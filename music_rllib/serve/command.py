@@ -18,6 +18,7 @@ from music_rllib.serve.protocol import TOKEN_VARIABLE
 
 if TYPE_CHECKING:
     from music_rllib.serve.application import ServeSettings
+    from music_rllib.serve.limits import Limits
 
 __all__ = ["main"]
 
@@ -77,6 +78,21 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--port", type=_port, default=8000, help="Port to listen on (8000).")
     parser.add_argument(
         "--replicas", type=_positive, default=1, help="Processes that compute actions (1)."
+    )
+    parser.add_argument(
+        "--max-requests",
+        type=_positive,
+        metavar="N",
+        default=256,
+        help="Requests that are answered at a time (256); further ones get status 503 and are "
+        "asked to come again.",
+    )
+    parser.add_argument(
+        "--send-seconds",
+        type=_positive,
+        metavar="S",
+        default=10,
+        help="For a client to send a request, and to take the answer (10); then it is cut off.",
     )
     return parser
 
@@ -149,27 +165,37 @@ def _serve(arguments: argparse.Namespace) -> int:
             f"Ray Serve must be installed (pip install 'music_rllib[serve]'): {error}"
         ) from error
     from music_rllib.experiment.sealed import StorageError
-    from music_rllib.policy import PolicyError
-    from music_rllib.serve.application import ServeSettings, app
+    from music_rllib.policy import PolicyError, find_policy, load_policy
+    from music_rllib.serve.application import ServeSettings, application
+    from music_rllib.serve.limits import Limits
+    from music_rllib.serve.protocol import PolicyFacts, request_model
 
     settings = ServeSettings(
-        policy=arguments.policy, storage=arguments.storage, replicas=arguments.replicas
+        policy=arguments.policy,
+        storage=arguments.storage,
+        replicas=arguments.replicas,
+        max_requests=arguments.max_requests,
     )
     try:
-        application = app(settings)
+        policy = load_policy(find_policy(settings.policy, settings.storage))
     except (PolicyError, StorageError) as error:
         raise _BadInputError(str(error)) from error
     if cluster_address() is None:
         _check_room(settings, [len(os.sched_getaffinity(0))])
+    limits = Limits(
+        max_requests=arguments.max_requests,
+        max_body_bytes=request_model(PolicyFacts.of(policy.task.name, policy)).max_bytes,
+        send_seconds=arguments.send_seconds,
+    )
     stop = _stop_signal()
     _connect(settings)
     try:
-        _listen(arguments, serve)
+        _listen(arguments, limits, serve)
     except BaseException:
         _disconnect()
         raise
     try:
-        _run(application, arguments, serve)
+        _run(application(policy, settings), arguments, serve)
         stop.wait()
     finally:
         _shut_down(serve)
@@ -243,17 +269,26 @@ def _check_room(settings: ServeSettings, cpus_of_nodes: Sequence[float]) -> None
 
 QUIET = {"enable_access_log": False, "log_level": "WARNING"}
 APPLICATION = "policy"
+ANSWER_SECONDS = 60.0
+"""A request that a replica has had for so long is answered with status 408."""
 
 
-def _listen(arguments: argparse.Namespace, serve: Any) -> None:
+def _listen(arguments: argparse.Namespace, limits: Limits, serve: Any) -> None:
     """Start Serve's proxy; on a cluster where Serve runs already, see that we would not disturb."""
     from ray.serve.context import _get_global_client
+
+    from music_rllib.serve.limits import controller_environment
 
     logging.getLogger("ray.serve").setLevel(logging.ERROR)
     wanted = (arguments.host, arguments.port)
     serve.start(
         proxy_location="HeadOnly",
-        http_options=dict(zip(("host", "port"), wanted, strict=True)),
+        http_options={
+            "host": arguments.host,
+            "port": arguments.port,
+            "request_timeout_s": ANSWER_SECONDS,
+        },
+        controller_options={"runtime_env": {"env_vars": controller_environment(limits)}},
         logging_config=QUIET,
     )
     # Serve ignores new options where it runs already.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import socket
 import subprocess
@@ -16,7 +17,7 @@ import numpy as np
 import pytest
 import requests
 
-from benchmarks.serve import random_policy
+from benchmarks.serve import half_sent, memory, random_policy, storm
 from music_rllib.policy import Policy, load_policy
 from tests.integration.conftest import listening
 
@@ -50,7 +51,8 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     file.write_bytes(random_policy(hidden=32))
     with socket.create_server(("127.0.0.1", 0)) as probe:
         port = probe.getsockname()[1]
-    process = start(str(file), "--port", str(port), token=TOKEN)
+    limits = ("--max-requests", "32", "--send-seconds", "5")
+    process = start(str(file), "--port", str(port), *limits, token=TOKEN)
     assert process.stdout is not None
     assert process.stderr is not None
     try:
@@ -109,6 +111,24 @@ def test_the_token_is_needed_and_kept_out_of_sight(service: Service) -> None:
     assert len(notes) > 10
     for path in notes:
         assert TOKEN.encode() not in path.read_bytes(), path
+
+
+def test_a_storm_is_answered_or_asked_to_come_again(service: Service) -> None:
+    """And costs no more memory afterwards; those who never send their body take nobody's place."""
+    asyncio.run(storm(service.url, service.policy, 300, TOKEN))  # what a first load costs once
+    before = memory(service.process.pid)
+    with half_sent(service.url, 200) as clients:
+        seen = asyncio.run(storm(service.url, service.policy, 600, TOKEN))
+        for client in clients:
+            client.settimeout(60)
+            assert client.recv(65536).startswith(b"HTTP/1.1 408 ")
+    assert seen.count(200, 503) == 600
+    assert seen.count(200) >= 32
+    assert (seen.count(503) > 0, seen.without_retry) == (True, 0)
+    assert seen.quantile(0.99, 200, 503) < 30
+    assert {status for status, _ in seen.healths} == {200}
+    assert memory(service.process.pid) < before + 40
+    assert act(service, {"observation": [0.5] * 25, "desired_goal": [0.5] * 3}).status_code == 200
 
 
 def test_nothing_of_it_listens_beyond_loopback(service: Service) -> None:
