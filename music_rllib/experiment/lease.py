@@ -2,7 +2,8 @@
 
 A worker can outlive the driver that started it, and a second sweep may want the same run: whoever
 computes a run holds its lease. A lease that isn't renewed expires; one whose process is known to
-be dead, because it ran on this machine, needs no waiting.
+be dead, because it ran on this machine, needs no waiting. A process that was suspended (a laptop
+asleep) finds its lease lost when it goes on, and makes way.
 
 On a disk, taking and renewing happen under a file lock. An object store has none: there, who
 writes last has the lease, and everybody looks again after a moment.
@@ -16,7 +17,7 @@ import socket
 import threading
 import time
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import psutil
@@ -26,7 +27,15 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from music_rllib.experiment.sealed import StorageError
 
-__all__ = ["HeldLease", "Lease", "LeaseFile", "LeaseLostError", "runs_here", "this_machine"]
+__all__ = [
+    "HeldLease",
+    "Lease",
+    "LeaseFile",
+    "LeaseLostError",
+    "process_start",
+    "runs_here",
+    "this_machine",
+]
 
 EXPIRES_SECONDS = 60.0
 """How long a lease holds that isn't renewed; clocks of machines should agree better than that."""
@@ -55,6 +64,7 @@ class Lease(BaseModel):
     """Where `pid` has a meaning: a boot of a machine, and a container on it."""
     pid: int
     process_started: float
+    """As `process_start` gives it."""
     since: float
     """Seconds since the epoch, as is `expires`."""
     expires: float
@@ -69,7 +79,7 @@ class Lease(BaseModel):
             host=socket.gethostname(),
             machine=this_machine(),
             pid=os.getpid(),
-            process_started=psutil.Process().create_time(),
+            process_started=process_start(os.getpid()),
             since=now,
             expires=now + seconds,
         )
@@ -99,14 +109,28 @@ def this_machine() -> str:
         return f"{socket.gethostname()} {uuid.getnode()}"
 
 
+def process_start(pid: int) -> float:
+    """When a process of this machine began, in seconds, by a clock that nobody sets.
+
+    Raises:
+        psutil.NoSuchProcess: There is none.
+    """
+    try:
+        stat = Path(f"/proc/{pid}/stat").read_text()
+    except FileNotFoundError:
+        # Not Linux, or no such process; psutil adds the time of day of the boot.
+        return float(psutil.Process(pid).create_time())
+    # After the name, which may hold anything, come the third and further fields; this is the 22nd.
+    return int(stat.rpartition(")")[2].split()[19]) / os.sysconf("SC_CLK_TCK")
+
+
 def runs_here(pid: int, started: float) -> bool:
     """Whether this machine has that process, and it is the one that began then."""
     try:
-        process = psutil.Process(pid)
-        return bool(abs(process.create_time() - started) < 10 and process.status() != "zombie")
+        return abs(process_start(pid) - started) < 1 and psutil.Process(pid).status() != "zombie"
     except psutil.NoSuchProcess:
         return False
-    except psutil.Error:
+    except (OSError, psutil.Error):
         return True
 
 
@@ -118,6 +142,8 @@ class LeaseFile:
         self._fs = filesystem
         self.path = path
         self._local = isinstance(filesystem, pafs.LocalFileSystem)
+        self._seen: tuple[Lease | None, float] = (None, 0.0)
+        """Somebody's lease, and since when it is there, by a clock that nobody sets."""
 
     def read(self) -> Lease | None:
         """What is there; None if nothing is, or nothing that can be read."""
@@ -133,9 +159,12 @@ class LeaseFile:
         Raises:
             StorageError: The place can't be written.
         """
-        with self._exclusively():
-            holder = self.read()
-            if holder is not None and holder.owner != lease.owner and holder.holds():
+        # Who only waits must not touch a folder that its owner may be deleting.
+        with contextlib.suppress(OSError):  # said below, with the place
+            if (holder := self._holder_beside(lease)) is not None:
+                return holder
+        with self._exclusively(make_folder=True):
+            if (holder := self._holder_beside(lease)) is not None:
                 return holder
             self._write(lease)
         if self._local:
@@ -144,12 +173,24 @@ class LeaseFile:
         holder = self.read()
         return None if holder is None or holder.owner == lease.owner else holder
 
+    def _holder_beside(self, lease: Lease) -> Lease | None:
+        holder = self.read()
+        if holder is None or holder.owner == lease.owner or not holder.holds():
+            return None
+        if holder != self._seen[0]:
+            self._seen = (holder, time.monotonic())
+        # One that would hold longer was dated by another clock, or before this one was set back.
+        stale = time.monotonic() - self._seen[1] >= EXPIRES_SECONDS
+        return None if holder.seconds > EXPIRES_SECONDS and stale else holder
+
     def renew(self, lease: Lease) -> bool:
         """Write a later expiry; False, and nothing is written, where it is somebody else's.
 
         Raises:
             StorageError: The place can't be written.
         """
+        if not self.is_owned_by(lease.owner):
+            return False
         with self._exclusively():
             if not self.is_owned_by(lease.owner):
                 return False
@@ -163,20 +204,22 @@ class LeaseFile:
 
     def release(self, owner: str) -> None:
         """Remove it, if it is this owner's."""
-        with contextlib.suppress(OSError, StorageError), self._exclusively():
-            if self.is_owned_by(owner):
-                self._fs.delete_file(self.path)
+        with contextlib.suppress(OSError, StorageError):
+            if not self.is_owned_by(owner):
+                return  # and nothing is made where the new owner may have deleted all
+            with self._exclusively():
+                if self.is_owned_by(owner):
+                    self._fs.delete_file(self.path)
+                    if self._local:  # who waits for the lock notices, and makes another one
+                        self._lock_path.unlink()
 
     @contextlib.contextmanager
-    def _exclusively(self) -> Iterator[None]:
+    def _exclusively(self, *, make_folder: bool = False) -> Iterator[None]:
         if not self._local:
             yield
             return
-        folder = Path(self.path).parent
         try:
-            folder.mkdir(parents=True, exist_ok=True)
-            lock = FileLock(folder / f".{Path(self.path).name}.lock", timeout=LOCK_SECONDS)
-            lock.acquire()
+            lock = self._lock(make_folder=make_folder)
         except OSError as error:
             place = error.filename or self.path
             raise StorageError(f"{place} must be writable: {error.strerror or error}") from error
@@ -184,6 +227,25 @@ class LeaseFile:
             yield
         finally:
             lock.release()
+
+    def _lock(self, *, make_folder: bool, attempts: int = 10) -> FileLock:
+        lock = FileLock(self._lock_path, timeout=LOCK_SECONDS)
+        while True:
+            if make_folder:
+                self._lock_path.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                lock.acquire()
+            except FileNotFoundError:  # whoever had the run has just deleted its folder
+                attempts -= 1
+                if not make_folder or not attempts:
+                    raise
+            else:
+                return lock
+
+    @property
+    def _lock_path(self) -> Path:
+        path = Path(self.path)
+        return path.with_name(f".{path.name}.lock")
 
     def _write(self, lease: Lease) -> None:
         data = lease.model_dump_json().encode()
@@ -205,14 +267,27 @@ class LeaseFile:
 class HeldLease:
     """A lease that this process has acquired, renewed in the background until it is released."""
 
-    def __init__(self, file: LeaseFile, lease: Lease) -> None:
-        """Go on renewing `lease`, which `file` has just accepted."""
+    def __init__(
+        self, file: LeaseFile, lease: Lease, on_lost: Callable[[], None] = lambda: None
+    ) -> None:
+        """Go on renewing `lease`, which `file` has just accepted.
+
+        `on_lost` is called, in a thread, when a renewal finds that it is somebody else's.
+        """
         self._file, self._lease = file, lease
         self._duration = lease.expires - lease.since
         self._ended = threading.Event()
-        self._lost = False
+        self._on_lost = on_lost
+        self.lost = False
+        """Whether somebody else has it, as far as that is known without asking."""
         self._thread = threading.Thread(target=self._renew, name="lease", daemon=True)
         self._thread.start()
+
+    def is_lost(self) -> bool:
+        """Look again whether somebody else has it."""
+        with contextlib.suppress(OSError):  # a store that doesn't answer says nothing
+            self.lost = self.lost or not self._file.is_owned_by(self._lease.owner)
+        return self.lost
 
     def check(self) -> None:
         """Look again, before something is written that belongs to the owner.
@@ -220,12 +295,11 @@ class HeldLease:
         Raises:
             LeaseLostError: It is somebody else's by now.
         """
-        if self._lost or not self._file.is_owned_by(self._lease.owner):
-            self._lost = True
-            holder = self._file.read()
+        if self.is_lost():
             raise LeaseLostError(
                 f"{self._file.path} must name this process (owner {self._lease.owner}), it names "
-                f"{holder or 'nobody'}: this one was taken for dead, and writes nothing any more"
+                f"{self._file.read() or 'nobody'}: this one was taken for dead, and writes nothing "
+                "any more"
             )
 
     def release(self) -> None:
@@ -236,13 +310,27 @@ class HeldLease:
     def end(self) -> None:
         """Renew no more."""
         self._ended.set()
-        self._thread.join(timeout=5.0)
+        if threading.current_thread() is not self._thread:
+            self._thread.join(timeout=5.0)
 
     def _renew(self) -> None:
-        while not self._ended.wait(self._duration / RENEWALS):
+        while self._wait_until_due():
             later = self._lease.model_copy(update={"expires": time.time() + self._duration})
             # A full disk, or a store that doesn't answer: until it expires there is time.
             with contextlib.suppress(OSError, StorageError):
                 if not self._file.renew(later):
-                    self._lost = True
+                    self.lost = True
+                    self._on_lost()
                     return
+
+    def _wait_until_due(self) -> bool:
+        """Wait for the next renewal; False at the end.
+
+        It is due at once after the process or the machine slept, or the time of day was set.
+        """
+        pause = self._duration / RENEWALS
+        day, steady = time.time(), time.monotonic()
+        while not self._ended.wait(min(1.0, pause)):
+            if time.monotonic() - steady >= pause or abs(time.time() - day) >= pause:
+                return True
+        return False

@@ -136,6 +136,7 @@ class WorkFolder:
         self._checkpoints = SealedFolders(filesystem, root)
         self._parts = SealedFolders(filesystem, f"{root}/parts")
         self._keep = keep
+        self._local = isinstance(filesystem, pafs.LocalFileSystem)
 
     @contextlib.contextmanager
     def new_checkpoint(self, env_steps: int) -> Iterator[Draft]:
@@ -204,6 +205,12 @@ class WorkFolder:
     def names(self) -> list[str]:
         """The checkpoints there are, oldest first."""
         return self._checkpoints.names()
+
+    def remove_if_empty(self) -> None:
+        """Delete the folder, where it is on a disk and has nothing in it."""
+        if self._local:
+            with contextlib.suppress(OSError):
+                Path(self.root).rmdir()
 
     def clear(self) -> None:
         """Delete all checkpoints: the run is finished."""

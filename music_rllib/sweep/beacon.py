@@ -17,9 +17,7 @@ from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import Any, Self
 
-import psutil
-
-from music_rllib.experiment.lease import runs_here, this_machine
+from music_rllib.experiment.lease import process_start, runs_here, this_machine
 from music_rllib.experiment.model import Stage
 from music_rllib.experiment.plan import Node
 from music_rllib.experiment.result import Report, RunResult, last_values
@@ -71,7 +69,7 @@ class Beacon(Listener):
             "pid": os.getpid(),
             "host": socket.gethostname(),
             "machine": this_machine(),
-            "process_started": psutil.Process().create_time(),
+            "process_started": process_start(os.getpid()),
             "started": time.time(),
             "ended": None,
             "outcome": "running",

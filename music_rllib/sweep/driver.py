@@ -21,6 +21,7 @@ from music_rllib.sweep.beacon import Beacon
 from music_rllib.sweep.board import Status
 from music_rllib.sweep.changes import Changes, changes_since, check_begun, keep_settings
 from music_rllib.sweep.driving import driving
+from music_rllib.sweep.ending import try_for
 from music_rllib.sweep.frame import FAILED, BadInputError
 from music_rllib.sweep.listener import Listener
 from music_rllib.sweep.local import (
@@ -54,6 +55,8 @@ if TYPE_CHECKING:
 __all__ = ["DEFAULT_CONFIG", "resume_sweep", "run_sweep"]
 
 DEFAULT_CONFIG = Path(__file__).with_name("default.yaml")
+LAST_SECONDS = 20.0
+"""For what is left to say where Ray has died."""
 NAMED = 10
 """Reused runs that are listed by name."""
 
@@ -154,7 +157,7 @@ def _sweep(
     changes = changes_since(opened)
     if changes is not None and not accept_changes:
         raise BadInputError(str(changes))
-    with driving(opened), early:
+    with driving(opened, lambda text: console.print(Text(text), soft_wrap=True)), early:
         code = _drive(console, opened)
     answer(records.read(opened.storage, f"{config.name}/{records.STATE}") or {})
     return code
@@ -400,9 +403,11 @@ def _compute(
     def on_stop() -> None:
         display.say("stopping, this takes a few seconds; Ctrl-C again stops at once", "yellow")
 
-    def on_ray_gone() -> None:
-        display.say("Ray was told to stop as well, so no more can be saved now", "yellow")
-        beacon.end("stopped")
+    def on_ray_gone(cause: str | None) -> None:
+        told = "Ray was told to stop as well, so no more can be saved now"
+        display.say(cause or told, "red" if cause else "yellow")
+        outcome = "failed" if cause else "stopped"
+        try_for(LAST_SECONDS, lambda: beacon.end(outcome), lambda: logbook.end(killed=not cause))
         display.say(_how_to_continue())
 
     try:

@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from music_rllib.experiment.lease import HeldLease, Lease, LeaseFile
 from music_rllib.experiment.sealed import StorageError, open_storage
+from music_rllib.sweep.ending import end_process
+from music_rllib.sweep.frame import FAILED
 from music_rllib.sweep.session import Sweep
 
 __all__ = ["driving"]
 
 
 @contextlib.contextmanager
-def driving(sweep: Sweep) -> Iterator[None]:
+def driving(sweep: Sweep, say: Callable[[str], None] = print) -> Iterator[None]:
     """Be the one process that drives the sweep, on whatever machine, for this `with`.
+
+    A process that was suspended, and finds that another one drives the sweep by now, ends at once:
+    they would both write the sweep's files.
+
+    Args:
+        sweep: Which one.
+        say: Told why the process ends.
 
     Raises:
         StorageError: Another one does; or the storage can't be written.
@@ -28,7 +37,16 @@ def driving(sweep: Sweep) -> Iterator[None]:
             f"{root}/{sweep.plan.name} must be used by one process at a time, and another one has "
             f"it: {holder}. Wait for its end or stop it, or give this sweep another --name"
         )
-    held = HeldLease(file, lease)
+
+    def end() -> None:
+        say(
+            f"{root}/{sweep.plan.name} has been taken over while this process was suspended, by "
+            f"{file.read() or 'nobody that is there any more'}: this one ends. See how far the "
+            f"sweep is with: python -m music_rllib.sweep status {sweep.folder}"
+        )
+        end_process(FAILED)
+
+    held = HeldLease(file, lease, end)
     try:
         yield
     finally:

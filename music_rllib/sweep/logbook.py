@@ -164,6 +164,10 @@ class Logbook(Listener):
         self._try(lambda: self._tracker.finish(node.key, "KILLED"))
         self._open.discard(node.key)
 
+    def end(self, *, killed: bool) -> None:
+        """Close the sweep's run and those that are open, as far as that can be done in a moment."""
+        self._tracker.close("KILLED" if killed else "FAILED", timeout=10.0)
+
     def backlog(self) -> Backlog:
         """What MLflow does not have yet."""
         return self._tracker.backlog()

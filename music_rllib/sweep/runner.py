@@ -42,7 +42,7 @@ def compute(
     sweep: Sweep,
     listeners: Sequence[Listener],
     on_stop: Callable[[], None],
-    on_ray_gone: Callable[[], None],
+    on_ray_gone: Callable[[str | None], None],
     campaign: Campaign | None = None,
 ) -> Outcome:
     """Compute the waiting nodes, and those that searches ask for.
@@ -51,7 +51,8 @@ def compute(
         sweep: Its board says afterwards what became of each node.
         listeners: Are told what happens.
         on_stop: Called, in a signal handler, when the user asks to stop.
-        on_ray_gone: Called, in a thread, where that has also ended Ray, before the process ends.
+        on_ray_gone: Called, in a thread, before the process ends because Ray has: with the cause,
+            or None where the user's signal has ended that as well.
         campaign: The searches; None where there are none.
 
     Raises:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import signal
-import sys
 import threading
 import time
 import uuid
@@ -13,15 +11,21 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Any
 
-import psutil
 from ray import tune
 from ray.tune.experiment import Trial
 
+from music_rllib.sweep.ending import end_process
+from music_rllib.sweep.frame import FAILED
+from music_rllib.sweep.ray_watch import RayWatch
 from music_rllib.sweep.signals import SIGNALS, early
 from music_rllib.sweep.stop_flag import StopFlag
 from music_rllib.sweep.trainable import STOPPED
 
 __all__ = ["StopSignals"]
+
+WATCH_SECONDS = 0.3
+GROUP_SECONDS = 3.0
+"""After a local Ray has died, a signal that ended it may still be on its way to this process."""
 
 
 class StopSignals(tune.Callback):
@@ -30,6 +34,9 @@ class StopSignals(tune.Callback):
     That takes as long as a round of training, some seconds at most; after the grace time the loop
     ends in any case, and what has not been saved is computed again later. So it is where a local
     Ray gets the signal, too, as from `timeout` and Slurm, which signal a whole process group.
+
+    A Ray that has died ends the process as well, with exit code 1: the main thread may be waiting
+    for it, which Ray lets it do for a minute, or for good.
     """
 
     def __init__(
@@ -37,11 +44,12 @@ class StopSignals(tune.Callback):
         on_stop: Callable[[], None],
         grace_seconds: float = 30.0,
         now: Callable[[], float] = time.monotonic,
-        on_ray_gone: Callable[[], None] = lambda: None,
+        on_ray_gone: Callable[[str | None], None] = lambda cause: None,
     ) -> None:
         """Call `on_stop` at the first signal, and wait for runs so long at most.
 
-        `on_ray_gone` is called, in a thread, before the process ends because its Ray has ended.
+        `on_ray_gone` is called, in a thread, before the process ends because its Ray has ended:
+        with the cause, or None where that was told to stop as well.
         """
         self.received: int | None = None
         self.flag = StopFlag(f"stop-{uuid.uuid4().hex}")
@@ -54,8 +62,6 @@ class StopSignals(tune.Callback):
         self._before: dict[int, Any] = {}
         self._end_loop: Callable[[], None] | None = None
         self._on_ray_gone = on_ray_gone
-        self._daemons: list[psutil.Process] = []
-        """Of a local Ray, without which nothing can be saved."""
         self._left = threading.Event()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -67,8 +73,7 @@ class StopSignals(tune.Callback):
             early.install()
             early.check()
             self._before = {number: signal.getsignal(number) for number in SIGNALS}
-        children = psutil.Process().children()
-        self._daemons = [child for child in children if child.name() in {"gcs_server", "raylet"}]
+        threading.Thread(target=self._watch_ray, name="ray-watch", daemon=True).start()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -146,30 +151,23 @@ class StopSignals(tune.Callback):
             signal.signal(each, self._stop_at_once)
         # Not in here: the main thread may be in the middle of talking to Ray.
         threading.Thread(target=self._tell_workers, daemon=True).start()
-        threading.Thread(target=self._watch_ray, args=(number,), daemon=True).start()
         self._on_stop()
 
     def _tell_workers(self) -> None:
         with contextlib.suppress(Exception):
             self.flag.set()
 
-    def _watch_ray(self, number: int) -> None:
-        """Whoever waits for a Ray that is gone waits for a minute, and is then aborted by it."""
-        while self._daemons and not self._left.wait(0.2):
-            if not all(map(_is_alive, self._daemons)):
-                self._on_ray_gone()
-                self._stop_at_once(number, None)
+    def _watch_ray(self) -> None:
+        """Whoever waits for a Ray that is gone waits for good, or is aborted by it."""
+        watch = RayWatch()
+        while not self._left.wait(WATCH_SECONDS):
+            if (cause := watch.look()) is None:
+                continue
+            if self.received is None and self._left.wait(GROUP_SECONDS):
+                return
+            stopped_by = self.received
+            self._on_ray_gone(None if stopped_by is not None else cause)
+            end_process(FAILED if stopped_by is None else 128 + stopped_by)
 
     def _stop_at_once(self, number: int, frame: FrameType | None) -> None:
-        """As `kill -9` would, which a sweep survives; Ray's processes end with their driver."""
-        show_cursor = b"\x1b[?25h\n" if sys.stdout.isatty() else b""
-        with contextlib.suppress(OSError):
-            os.write(sys.stdout.fileno(), show_cursor)
-        os._exit(128 + number)
-
-
-def _is_alive(process: psutil.Process) -> bool:
-    try:
-        return bool(process.is_running() and process.status() != psutil.STATUS_ZOMBIE)
-    except psutil.NoSuchProcess:
-        return False
+        end_process(128 + number)

@@ -15,7 +15,7 @@ from ray.tune import PlacementGroupFactory, Trainable
 
 from music_rllib.envs.registry import Task
 from music_rllib.experiment.handoff import HandoffInfo, Weights, read_handoff, write_handoff
-from music_rllib.experiment.lease import HeldLease, Lease
+from music_rllib.experiment.lease import HeldLease, Lease, LeaseLostError
 from music_rllib.experiment.model import Checkpoints
 from music_rllib.experiment.plan import Node
 from music_rllib.experiment.result import (
@@ -148,11 +148,32 @@ class RunTrainable(Trainable):
     def step(self) -> dict[str, Any]:
         """Go on to the next report."""
         try:
-            return self._step(NodeStore(self._job.storage))
+            return self._step_or_make_way(NodeStore(self._job.storage))
         except Exception as error:
             text = traceback.format_exc()
             self._release()
             return self._result(done=True) | {CAUSE: cause_of(error, text), TRACEBACK: text}
+
+    def _step_or_make_way(self, store: NodeStore) -> dict[str, Any]:
+        try:
+            return self._step(store)
+        except (LeaseLostError, StorageError):
+            # Its new owner may have deleted what this one was about to write into.
+            if self._held is None or not self._held.is_lost():
+                raise
+            return self._make_way()
+
+    def _make_way(self) -> dict[str, Any]:
+        """Drop a run that another sweep took over; it is waited for, as one that is found held."""
+        assert self._held is not None
+        self._held.end()
+        if self._training is not None:
+            self._training.close()
+        self._held = self._training = None
+        self._history, self._unsent, self._seconds_before = [], 0, 0.0
+        self._waits = False
+        self._notes.append("was taken over while this process was suspended, and writes no more")
+        return self._result(done=False)
 
     def _step(self, store: NodeStore) -> dict[str, Any]:
         if self._stopped:
@@ -219,6 +240,7 @@ class RunTrainable(Trainable):
         if self._held is not None:
             self._held.release()
             self._held = None
+            self._work(NodeStore(self._job.storage)).remove_if_empty()
 
     def _begin(self, store: NodeStore) -> TrainingRun:
         from music_rllib.experiment.training import TrainingRun
@@ -250,9 +272,12 @@ class RunTrainable(Trainable):
         """Train to the next report; whether the run is over."""
         from music_rllib.experiment.training import Paused
 
+        held = self._held
+        assert held is not None
         try:
-            metrics = training.advance(pause=self._stop.asked)
+            metrics = training.advance(pause=lambda: held.lost or self._stop.asked())
         except Paused:
+            held.check()
             self._pause(training, store)
             return False
         self._history.append(
@@ -320,7 +345,10 @@ class RunTrainable(Trainable):
         assert self._held is not None
         self._held.end()  # a renewal would make the folder again
         self._held = None
-        self._work(store).clear()
+        try:
+            self._work(store).clear()
+        except OSError as error:  # the result is there
+            self._notes.append(f"its checkpoints could not be deleted: {error}")
 
     def _write_outcome(
         self, folder: Path, training: TrainingRun, modules: Mapping[str, Mapping[str, Any]]

@@ -205,7 +205,11 @@ def test_a_run_that_somebody_else_computes_is_waited_for(
     trial.stop()
 
 
-def test_a_worker_whose_lease_is_taken_over_writes_nothing_more(tmp_path: Path) -> None:
+def test_a_worker_whose_lease_is_taken_over_writes_nothing_more_and_reuses(
+    cut: tuple[Path, Path, NodeJob], tmp_path: Path
+) -> None:
+    """It was suspended; the other one finishes the run, and deletes the folder that it had."""
+    whole, _, _ = cut
     node = job(tmp_path, settings("tac"))
     trial = RunTrainable(config=node.to_tune())
     trial.train()
@@ -213,12 +217,42 @@ def test_a_worker_whose_lease_is_taken_over_writes_nothing_more(tmp_path: Path) 
     before = work.names()
     theirs = Lease.of_this_process("sweep 'other'")
     Path(work.lease.path).write_text(theirs.model_dump_json())
-    result = trial.train()
-    assert result["done"]
-    assert "LeaseLostError" in result[CAUSE]
-    trial.stop()
+    results = [trial.train(), trial.train()]
+    notes = [note for result in results for note in result[NOTES]]
+    assert "was taken over while this process was suspended" in notes[0]
+    assert "waits, as it is being computed by sweep 'other'" in notes[1]
+    assert not any(result["done"] for result in results)
     assert work.names() == before
     assert work.lease.is_owned_by(theirs.owner)
+    shutil.copytree(whole / "nodes", tmp_path / "nodes")
+    work.clear()
+    last = trial.train()
+    assert (last["done"], last.get(CAUSE)) == (True, None)
+    assert len(last["reports"].splitlines()) == 3
+    trial.stop()
+    assert not list((tmp_path / "work").iterdir())
+
+
+@pytest.mark.parametrize("theirs", ["released", "deleted"])
+def test_a_worker_whose_lease_is_lost_to_nobody_goes_on(
+    theirs: str, cut: tuple[Path, Path, NodeJob], tmp_path: Path
+) -> None:
+    """Whoever took the run over has stopped; or somebody deleted the folder below a checkpoint."""
+    whole, _, _ = cut
+    node = job(tmp_path, settings("tac"))
+    trial = RunTrainable(config=node.to_tune())
+    trial.train()
+    work = NodeStore(str(tmp_path)).work_folder(node.key)
+    if theirs == "released":
+        Path(work.lease.path).unlink()
+    else:
+        shutil.rmtree(work.root)
+    result: dict[str, Any] = {"done": False}
+    while not result["done"]:
+        result = trial.train()
+    trial.stop()
+    assert result.get(CAUSE) is None
+    assert numbers(tmp_path, node) == numbers(whole, node)
 
 
 def test_a_run_that_is_paused_between_reports_loses_nothing(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -129,3 +131,87 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     file = LeaseFile(pafs.LocalFileSystem(), str(tmp_path / "work" / "lease.json"))
     with pytest.raises(StorageError, match=r"work.* must be writable"):
         file.acquire(Lease.of_this_process("mine"))
+
+
+def test_a_clock_that_jumps_an_hour_takes_no_lease_from_a_living_owner(
+    place: LeaseFile, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Forwards and backwards: it is renewed at once, by the new time."""
+    mine, day, jump = Lease.of_this_process("mine"), time.time, [0.0]
+    place.acquire(mine)
+    monkeypatch.setattr(time, "time", lambda: day() + jump[0])
+    held = HeldLease(place, mine)
+    for hours in (1, -1):
+        jump[0] = 3600.0 * hours
+        deadline = time.monotonic() + 30
+        while (now := place.read()) is None or not 0 < now.seconds <= 60:
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        assert now.holds(), "the process is the same, whatever the time of day"
+    held.check()
+    held.release()
+
+
+def test_a_lease_from_a_time_that_is_yet_to_come_holds_while_it_is_renewed(
+    place: LeaseFile, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its owner's clock is ahead, or this one was set back after the owner died."""
+    theirs, mine = elsewhere(seconds=3700.0), Lease.of_this_process("mine")
+    steady, passed = time.monotonic, [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: steady() + passed[0])
+    assert place.acquire(theirs) is None
+    assert place.acquire(mine) == theirs
+    passed[0] = 50.0
+    assert place.acquire(mine) == theirs
+    later = theirs.model_copy(update={"expires": theirs.expires + 15})
+    assert place.renew(later)
+    passed[0] = 70.0
+    assert place.acquire(mine) == later, "it was renewed"
+    passed[0] = 140.0
+    assert place.acquire(mine) is None
+
+
+def test_who_lost_a_lease_is_told_and_leaves_no_folder(tmp_path: Path) -> None:
+    """Another sweep took the run over, finished it and deleted its folder."""
+    path = tmp_path / "work" / "key" / "lease.json"
+    file, mine = LeaseFile(pafs.LocalFileSystem(), str(path)), Lease.of_this_process("m", 0.4)
+    assert file.acquire(mine) is None
+    told = threading.Event()
+    held = HeldLease(file, mine, told.set)
+    shutil.rmtree(path.parent)
+    assert told.wait(30)
+    assert held.lost
+    with pytest.raises(LeaseLostError, match="it names nobody"):
+        held.check()
+    assert not file.renew(mine)
+    held.release()
+    assert not path.parent.exists()
+
+
+def test_waiting_for_a_lease_writes_nothing(place: LeaseFile, tmp_path: Path) -> None:
+    assert place.acquire(elsewhere()) is None
+    before = sorted(tmp_path.rglob("*"))
+    assert place.acquire(Lease.of_this_process("mine")) is not None
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_lease_is_acquired_while_its_folder_is_deleted_again_and_again(tmp_path: Path) -> None:
+    folder, over = tmp_path / "work", threading.Event()
+
+    def delete() -> None:
+        while not over.is_set():
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+
+    deleting = threading.Thread(target=delete)
+    deleting.start()
+    file = LeaseFile(pafs.LocalFileSystem(), str(folder / "lease.json"))
+    try:
+        for _ in range(50):
+            mine = Lease.of_this_process("mine")
+            assert file.acquire(mine) is None
+            assert file.is_owned_by(mine.owner)
+            file.release(mine.owner)
+    finally:
+        over.set()
+        deleting.join()

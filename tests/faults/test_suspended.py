@@ -1,0 +1,97 @@
+"""Sweeps that are suspended, as a laptop that sleeps does it, while another one takes over."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from tests.faults import comparison, sweeps
+from tests.integration.conftest import Program
+
+pytestmark = pytest.mark.thorough
+
+
+@pytest.fixture
+def other(tmp_path: Path) -> Iterator[sweeps.OwnProgram]:
+    """Another sweep, elsewhere, with the storage of `program` and an MLflow of its own."""
+    folder = tmp_path / "other"
+    folder.mkdir()
+    own = sweeps.program(folder)
+    own.write(
+        sweeps.document(
+            storage=str(tmp_path / "results"),
+            mlflow={"tracking_uri": f"sqlite:///{folder}/mlflow.db"},
+        )
+    )
+    yield own
+    own.end_all()
+
+
+def signal_all(process: subprocess.Popen[str], number: signal.Signals) -> None:
+    """The driver and all that it has started."""
+    for each in (driver := psutil.Process(process.pid), *driver.children(recursive=True)):
+        os.kill(each.pid, number)
+
+
+def let_expire(*leases: Path) -> None:
+    """As time would."""
+    for lease in leases:
+        content = json.loads(lease.read_text())
+        lease.write_text(json.dumps(content | {"expires": time.time() - 1}))
+
+
+def test_a_suspended_sweep_waits_for_the_one_that_took_its_runs_over(
+    program: Program, other: sweeps.OwnProgram, unbroken: Path, tmp_path: Path
+) -> None:
+    process = sweeps.start_until(program, "pretrain/Point/seed0: started")
+    (lease,) = wait_for_lease(tmp_path / "results")
+    signal_all(process, signal.SIGSTOP)
+    let_expire(lease)
+    second = other.start("--name", "second")
+    sweeps.read_until(second, "pretrain/Point/seed0: ")
+    signal_all(process, signal.SIGCONT)
+    output, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, output + errors
+    assert "pretrain/Point/seed0: was taken over while this process was suspended" in output
+    theirs, errors = second.communicate(timeout=300)
+    assert second.returncode == 0, theirs + errors
+    comparison.same(unbroken, tmp_path / "results")
+    theirs = comparison.logged(f"sqlite:///{other.folder}/mlflow.db", "second")
+    assert theirs == comparison.logged(f"sqlite:///{unbroken}/mlflow.db")
+
+
+def test_a_suspended_driver_whose_sweep_is_driven_by_another_one_ends(
+    program: Program, other: sweeps.OwnProgram, unbroken: Path, tmp_path: Path
+) -> None:
+    process = sweeps.start_until(program, "pretrain/Point/seed0: started")
+    (lease,) = wait_for_lease(tmp_path / "results")
+    signal_all(process, signal.SIGSTOP)
+    let_expire(lease, tmp_path / "results" / "points" / "driver.json")
+    second = other.start()
+    sweeps.read_until(second, "pretrain/Point/seed0: ")
+    signal_all(process, signal.SIGCONT)
+    output, errors = process.communicate(timeout=60)
+    assert process.returncode == 1, output + errors
+    told = "points has been taken over while this process was suspended, by sweep 'points' (process"
+    assert f"{told} {second.pid} on " in output
+    output, errors = second.communicate(timeout=300)
+    assert second.returncode == 0, output + errors
+    assert comparison.nodes(tmp_path / "results") == comparison.nodes(unbroken)
+    assert comparison.weights(tmp_path / "results") == comparison.weights(unbroken)
+
+
+def wait_for_lease(storage: Path) -> list[Path]:
+    """The run's, which its worker acquires in its first step."""
+    deadline = time.monotonic() + 60
+    while not (found := list((storage / "work").glob("*/lease.json"))):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    return found
