@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
-import tempfile
+import uuid
 from pathlib import Path
 from typing import Any
 
@@ -26,25 +27,30 @@ def content_key(value: Any) -> str:
     return hashlib.sha256(canonical_json(value).encode()).hexdigest()[:20]
 
 
-def write_atomically(path: Path, data: bytes) -> None:
-    """Replace `path` by `data`: beside it, flushed to the disk, then renamed.
+def write_atomically(path: Path, data: bytes, *, sync: bool = True) -> None:
+    """Replace `path` by `data`: beside it, flushed to the disk (`sync`), then renamed.
+
+    Who may read it is up to the umask, as for any other file.
 
     Raises:
         OSError: With the path in its message, also where the disk is full.
     """
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    beside = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}")
     try:
-        with os.fdopen(handle, "wb") as file:
+        with beside.open("xb") as file:
             file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        Path(name).replace(path)
+            if sync:
+                file.flush()
+                os.fsync(file.fileno())
+        beside.replace(path)
     except BaseException as error:
-        Path(name).unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            beside.unlink()
         if isinstance(error, OSError) and error.filename is None:
             raise OSError(error.errno, error.strerror, str(path)) from error
         raise
-    sync_folder(path.parent)
+    if sync:
+        sync_folder(path.parent)
 
 
 def sync_folder(folder: Path) -> None:

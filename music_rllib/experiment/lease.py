@@ -70,9 +70,10 @@ class Lease(BaseModel):
     expires: float
 
     @classmethod
-    def of_this_process(cls, what: str, seconds: float = EXPIRES_SECONDS) -> Lease:
+    def of_this_process(cls, what: str, seconds: float | None = None) -> Lease:
         """A new lease, from now on."""
         now = time.time()
+        seconds = EXPIRES_SECONDS if seconds is None else seconds
         return cls(
             owner=uuid.uuid4().hex,
             what=what,
@@ -228,14 +229,14 @@ class LeaseFile:
         finally:
             lock.release()
 
-    def _lock(self, *, make_folder: bool, attempts: int = 10) -> FileLock:
+    def _lock(self, *, make_folder: bool, attempts: int = 100) -> FileLock:
         lock = FileLock(self._lock_path, timeout=LOCK_SECONDS)
         while True:
-            if make_folder:
-                self._lock_path.parent.mkdir(parents=True, exist_ok=True)
             try:
+                if make_folder:
+                    self._lock_path.parent.mkdir(parents=True, exist_ok=True)
                 lock.acquire()
-            except FileNotFoundError:  # whoever had the run has just deleted its folder
+            except (FileNotFoundError, FileExistsError):  # somebody has just deleted the folder
                 attempts -= 1
                 if not make_folder or not attempts:
                     raise

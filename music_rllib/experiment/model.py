@@ -29,7 +29,9 @@ __all__ = [
     "SweepConfig",
 ]
 
-RESERVED_NAMES = frozenset({"nodes", "work", "mlartifacts", "mlflow.db", "mlflow.db.lock"})
+RESERVED_NAMES = frozenset(
+    {"nodes", "work", "verified.json", "mlartifacts", "mlflow.db", "mlflow.db.lock"}
+)
 """Entries of a storage folder that are no sweeps."""
 
 

@@ -232,6 +232,40 @@ class SealedFolders:
         _check(source, manifest.files[file], len(data), hashlib.sha256(data).hexdigest())
         return data
 
+    def check(self, name: str) -> None:
+        """Compare every file with the manifest: its size, and on a disk its hash.
+
+        An object store keeps hashes of its own; there, files are hashed where they are read.
+
+        Raises:
+            DamagedError: One is missing, can't be read or isn't what the manifest says.
+        """
+        manifest = self.manifest(name)
+        sources = {self._source(name, manifest, file): file for file in manifest.files}
+        for info in self._fs.get_file_info(list(sources)) if sources else ():
+            expected = manifest.files[sources[info.path]]
+            if info.type == pafs.FileType.NotFound:
+                raise DamagedError(f"{info.path} must exist, its manifest lists it")
+            if not info.is_file:
+                raise DamagedError(f"{info.path} must be a file, it is something else")
+            _check(info.path, expected, info.size, expected.sha256)
+            if self._local:
+                try:
+                    found = _record(Path(info.path))
+                except OSError as error:
+                    raise DamagedError(f"{info.path} must be readable: {error.strerror}") from error
+                _check(info.path, expected, found.bytes, found.sha256)
+
+    def files(self, name: str) -> list[str]:
+        """Where its files are, its manifest first.
+
+        Raises:
+            DamagedError: It can't be read.
+        """
+        manifest = self.manifest(name)
+        own = [self._source(name, manifest, file) for file in sorted(manifest.files)]
+        return [f"{self.path(name)}/{MANIFEST}", *own]
+
     def fetch(
         self, name: str, folder: Path, wanted: Callable[[str], bool] = lambda file: True
     ) -> Manifest:

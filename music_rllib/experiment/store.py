@@ -6,6 +6,7 @@ Below one storage folder or bucket, shared by all sweeps in it::
     work/<key>/<n>/   checkpoints of a run that isn't finished, each with its manifest
     work/<key>/parts/ what checkpoints share, such as old trajectories
     work/<key>/lease.json   who is computing the run, and until when that holds
+    verified.json     on a disk: finished runs that have been read through
 
 The store, not Tune's snapshot, says what is finished.
 """
@@ -16,7 +17,7 @@ import contextlib
 import shutil
 import uuid
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -24,15 +25,34 @@ from typing import Any, NamedTuple
 import pyarrow.fs as pafs
 
 from music_rllib.experiment.lease import LeaseFile
-from music_rllib.experiment.result import HISTORY, Report, RunResult, from_json_lines
+from music_rllib.experiment.result import (
+    HISTORY,
+    Report,
+    RunResult,
+    from_json_lines,
+    last_values,
+)
 from music_rllib.experiment.sealed import DamagedError, Manifest, SealedFolders, open_storage
+from music_rllib.experiment.verified import Verified, fingerprint
 
-__all__ = ["KEEP", "Draft", "NodeStore", "Saved", "WorkFolder"]
+__all__ = [
+    "KEEP",
+    "TRAIN_AGAIN",
+    "Draft",
+    "NodeStore",
+    "Saved",
+    "WorkFolder",
+    "damage_in_words",
+]
 
 FORMAT = "music_rllib checkpoint 2"
 KEEP = 2
 """Checkpoints of a run that are kept, unless a sweep says else."""
 LEASE = "lease.json"
+SHOWN = 10
+"""Damaged runs that are named."""
+VERIFIED = "verified.json"
+TRAIN_AGAIN = "'run' and 'resume' train what is damaged again with --retrain-damaged"
 
 
 class NodeStore:
@@ -47,6 +67,8 @@ class NodeStore:
         self.uri = uri
         self._fs, self._root = open_storage(uri)
         self._nodes = SealedFolders(self._fs, f"{self._root}/nodes")
+        self._local = isinstance(self._fs, pafs.LocalFileSystem)
+        self._verified = Verified(Path(self._root, VERIFIED))
 
     def path(self, key: str) -> str:
         """Where the node is or would be, for messages."""
@@ -87,7 +109,11 @@ class NodeStore:
             return
         meta = {"result": None if result is None else result.model_dump()}
         with self._nodes.sealing(key, meta) as staging:
-            shutil.copytree(folder, staging, dirs_exist_ok=True)
+            # Without the modes of a temporary folder, which only its owner may read.
+            for file in filter(Path.is_file, folder.rglob("*")):
+                target = staging / file.relative_to(folder)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(file, target)
 
     def tidy(self, key: str) -> None:
         """Delete what killed attempts at publishing `key` have left: for its lease's holder."""
@@ -102,24 +128,90 @@ class NodeStore:
         self._nodes.fetch(key, folder)
 
     def verify(self, key: str) -> None:
-        """Read a finished node through, so that damage shows before anything depends on it.
+        """Compare a finished node with its manifest, so that nothing depends on a damaged one.
 
         Raises:
             DamagedError: The node isn't what its manifest says; the message says what to do.
         """
-        with TemporaryDirectory() as folder, self._saying_what_to_do(key):
-            self.fetch(key, Path(folder))
+        with self._saying_what_to_do(key):
+            self._nodes.check(key)
+
+    def is_sound(self, key: str) -> bool:
+        """Whether the node has been published and is what its manifest says."""
+        return self.is_finished(key) and not self.damage([key])
+
+    def damage(self, keys: Iterable[str]) -> dict[str, DamagedError]:
+        """Which of these finished nodes aren't what their manifests say, and why.
+
+        On a disk a node that was sound before, and whose files have the same places, sizes and
+        times, isn't read again.
+        """
+        found = {}
+        for key in keys:
+            try:
+                mark = self._fingerprint(key)
+                if not self._verified.has(key, mark):
+                    self._check(key)
+                    self._verified.add(key, mark)
+            except DamagedError as error:
+                found[key] = error
+            except OSError as error:
+                place = error.filename or self.path(key)
+                found[key] = DamagedError(f"{place} must be readable: {error.strerror}")
+        self._verified.keep()
+        return found
+
+    def _fingerprint(self, key: str) -> str | None:
+        if not self._local:
+            return None
+        try:
+            return fingerprint(map(Path, self._nodes.files(key)))
+        except FileNotFoundError:
+            return None  # to be named
+
+    def _check(self, key: str) -> None:
+        self._nodes.check(key)
+        manifest = self._nodes.manifest(key)
+        result = manifest.meta.get("result")
+        # The manifest has no hash of its own; what it says of the result is in the history too.
+        if self._local and result is not None and HISTORY in manifest.files:
+            last = last_values(self.history(key))
+            if not _same(RunResult.model_validate(result).metrics, last):
+                raise DamagedError(
+                    f"{self.path(key)}/manifest.json must have the last values of {HISTORY}, it "
+                    "has others"
+                )
+
+    def remove(self, key: str) -> None:
+        """Delete a node, for it to be trained again."""
+        self._nodes.remove(key)
 
     @contextlib.contextmanager
     def _saying_what_to_do(self, key: str) -> Iterator[None]:
         try:
             yield
         except DamagedError as error:
-            raise DamagedError(f"{error}. Delete {self.path(key)} to train it again") from error
+            raise DamagedError(f"{error}. {TRAIN_AGAIN}") from error
 
     def work_folder(self, key: str, keep: int = KEEP) -> WorkFolder:
         """Where a run that isn't finished keeps its newest `keep` checkpoints."""
         return WorkFolder(self._fs, f"{self._root}/work/{key}", keep)
+
+
+def _same(one: Mapping[str, float], other: Mapping[str, float]) -> bool:
+    """Also where both have a NaN, which equals nothing."""
+    return {name: repr(value) for name, value in one.items()} == {
+        name: repr(value) for name, value in other.items()
+    }
+
+
+def damage_in_words(damage: Mapping[str, DamagedError]) -> str:
+    """Labels of runs, and what is wrong with each; with what to do."""
+    lines = [f"  {label}: {error}" for label, error in list(damage.items())[:SHOWN]]
+    if len(damage) > SHOWN:
+        lines.append(f"  ... and {len(damage) - SHOWN} more")
+    what = "1 finished run is" if len(damage) == 1 else f"{len(damage)} finished runs are"
+    return "\n".join((f"{what} damaged; {TRAIN_AGAIN}:", *lines))
 
 
 class WorkFolder:

@@ -43,6 +43,7 @@ def build_report(
     *,
     difference: float,
     undelivered: int = 0,
+    damaged: str | None = None,
     command: str = "",
     store: TrackingStore | None = None,
     video_seed: int | None = None,
@@ -55,6 +56,7 @@ def build_report(
         rng: for the bootstraps and the permutations.
         difference: in success rate, which the reader would want to be able to see.
         undelivered: runs of which MLflow does not have everything yet.
+        damaged: which finished runs are damaged in the storage, in words.
         command: that makes this report.
         store: where the sweep is logged, with its policies.
         video_seed: of the filmed episodes; None: no videos.
@@ -72,7 +74,7 @@ def build_report(
         together=analyse_stages(sweep, stages, rng),
         drawings=drawings,
         pictures=draw_all(drawings),
-        missing=missing(sweep, analyses, undelivered),
+        missing=missing(sweep, analyses, undelivered) + ([damaged] if damaged else []),
         difference=difference,
         command=command,
         films=None

@@ -23,7 +23,7 @@ __all__ = ["app"]
 
 app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
 
-BAD_INPUT = 2
+DAMAGED, BAD_INPUT = 1, 2
 EPILOG = """
 **Examples**
 
@@ -39,7 +39,8 @@ EPILOG = """
     python -m music_rllib.report results/smoke --export published/smoke --add
         the same, and what another machine has exported there stays
 
-**Exit codes**: 0 the report is written, whatever state the sweep is in; 2 there is no such sweep.
+**Exit codes**: 0 the report is written, whatever state the sweep is in; 1 it is, by what MLflow
+has, and finished runs in the sweep's storage are damaged; 2 there is no such sweep.
 """
 
 
@@ -182,6 +183,7 @@ def _report(
         np.random.default_rng(seed),
         difference=difference,
         undelivered=found.undelivered,
+        damaged=found.damaged,
         store=found.store,
         video_seed=seed if videos else None,
         environments=() if env is None else declared_tasks(env),
@@ -196,6 +198,9 @@ def _report(
     if attach:
         _attach(found, page.parent)
     typer.echo(f"Report: {page.absolute()}")
+    if found.damaged is not None:
+        typer.echo(f"error: {redact(found.damaged)}", err=True)
+        raise typer.Exit(DAMAGED)
 
 
 def _attach(found: Found, folder: Path) -> None:

@@ -6,6 +6,8 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
+from music_rllib.experiment.sealed import StorageError
+from music_rllib.experiment.store import NodeStore, damage_in_words
 from music_rllib.reports.archive import is_archive, read_archive
 from music_rllib.reports.query import read_mlflow
 from music_rllib.results.data import Sweep
@@ -26,6 +28,8 @@ class Found:
     """Where it is logged; None for an exported sweep."""
     undelivered: int = 0
     """Runs of which MLflow does not have everything yet."""
+    damaged: str | None = None
+    """Finished runs that are not any more in the storage what MLflow says of them, in words."""
 
 
 def find_sweep(
@@ -63,11 +67,26 @@ def find_sweep(
         name = Path(place).name
         sweep = read_mlflow(store, name, metrics=metrics)
         return Found(sweep=sweep, folder=folder, store=store)
-    store = resolve_store(
-        tracking_uri or record.tracking_uri, record.resolve_storage(folder.absolute())
-    )
+    place = record.resolve_storage(folder.absolute())
+    store = resolve_store(tracking_uri or record.tracking_uri, place)
     sweep = read_mlflow(store, record.sweep_name, sweep_id=record.sweep_id, metrics=metrics)
     spools = tracking_folder(folder)
     waiting = [spools / "parent", *(spools / "runs").glob("*")]
     undelivered = sum(map(has_undelivered, waiting))
-    return Found(sweep=sweep, folder=folder, store=store, undelivered=undelivered)
+    return Found(
+        sweep=sweep,
+        folder=folder,
+        store=store,
+        undelivered=undelivered,
+        damaged=_damaged(sweep, place),
+    )
+
+
+def _damaged(sweep: Sweep, storage: str) -> str | None:
+    try:
+        nodes = NodeStore(storage)
+        labels = {run.node_key: run.name for run in sweep.runs if nodes.is_finished(run.node_key)}
+        damage = nodes.damage(labels)
+    except (OSError, StorageError):  # a report needs MLflow only
+        return None
+    return damage_in_words({labels[key]: why for key, why in damage.items()}) if damage else None

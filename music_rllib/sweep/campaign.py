@@ -286,7 +286,8 @@ class Campaign(Listener):
 
     def _want_node(self, node: Node, until: int | None) -> None:
         new = not self._board.knows(node.key)
-        finished = new and self._store.is_finished(node.key)
+        # One that is damaged is handed out: the worker that finds it there says what is wrong.
+        finished = new and self._store.is_sound(node.key)
         self._board.want(node, until, finished=finished)
         if finished:
             self._reused(node)

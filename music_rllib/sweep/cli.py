@@ -43,8 +43,8 @@ Running a command again continues: finished runs are reused, others go on from t
 checkpoint.
 'COMMAND --help' has each command's options and examples.
 
-exit codes: 0 all is well, 1 a run failed, 2 bad input (nothing was started), 130 stopped by Ctrl-C,
-143 by SIGTERM (state kept).
+exit codes: 0 all is well, 1 a run failed or Ray died (state kept), 2 bad input or damaged results
+(nothing was started), 130 stopped by Ctrl-C, 143 by SIGTERM (state kept).
 """
 ORDER = ("run", "plan", "status", "stop", "resume", "compare", "best", "evaluate", "clean")
 """Of the commands in the help; others follow by name."""

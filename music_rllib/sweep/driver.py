@@ -19,7 +19,7 @@ from music_rllib.experiment.plan import Node, make_plan
 from music_rllib.sweep import records
 from music_rllib.sweep.beacon import Beacon
 from music_rllib.sweep.board import Status
-from music_rllib.sweep.changes import Changes, changes_since, check_begun, keep_settings
+from music_rllib.sweep.changes import changes_since, check_begun, keep_settings
 from music_rllib.sweep.driving import driving
 from music_rllib.sweep.ending import try_for
 from music_rllib.sweep.frame import FAILED, BadInputError
@@ -31,6 +31,7 @@ from music_rllib.sweep.local import (
     cluster_address,
 )
 from music_rllib.sweep.places import resolve_storage, sweep_folder
+from music_rllib.sweep.plan_answer import plan_answer
 from music_rllib.sweep.preflight import (
     check_environments,
     check_hardware,
@@ -39,9 +40,9 @@ from music_rllib.sweep.preflight import (
 )
 from music_rllib.sweep.records import SEARCH, as_json, keep
 from music_rllib.sweep.reporting import report_at_end
-from music_rllib.sweep.session import Sweep, keep_record, open_sweep, plan_document
+from music_rllib.sweep.session import Sweep, keep_record, open_sweep
 from music_rllib.sweep.signals import early
-from music_rllib.sweep.tables import plan_view, results_table, search_runs, search_views
+from music_rllib.sweep.tables import plan_view, results_table, search_views
 from music_rllib.tracking import names
 from music_rllib.tracking.redaction import redact
 
@@ -71,6 +72,7 @@ def run_sweep(
     name: str | None = None,
     seeds: str | None = None,
     accept_changes: bool = False,
+    retrain_damaged: bool = False,
     must_exist: bool = False,
     answer: Callable[[dict[str, Any]], None] = lambda document: None,
 ) -> int:
@@ -85,6 +87,7 @@ def run_sweep(
         name: Replaces the file's `name`.
         seeds: Replaces the file's `seeds`: how many, or a list with commas.
         accept_changes: Train runs anew whose settings are others than the last time.
+        retrain_damaged: Delete finished runs that are damaged, and train them again.
         must_exist: Refuse to begin a sweep; only go on with one.
         answer: Takes the plan of a dry run, or the sweep's last `state.json`, as plain data.
 
@@ -101,7 +104,13 @@ def run_sweep(
             check_begun(loaded)
         if dry_run:
             return _show(console, loaded, answer, measure=measure)
-        return _sweep(console, loaded, answer, accept_changes=accept_changes)
+        return _sweep(
+            console,
+            loaded,
+            answer,
+            accept_changes=accept_changes,
+            retrain_damaged=retrain_damaged,
+        )
     except (KeyboardInterrupt, SystemExit) as stopped:
         return _code_of(console, stopped)
 
@@ -124,6 +133,7 @@ def resume_sweep(
     *,
     seeds: str | None = None,
     accept_changes: bool = False,
+    retrain_damaged: bool = False,
     answer: Callable[[dict[str, Any]], None] = lambda document: None,
 ) -> int:
     """Go on with a sweep by the configuration in its storage; the exit code.
@@ -133,7 +143,13 @@ def resume_sweep(
     """
     try:
         loaded = found.config(seeds)
-        return _sweep(console, loaded, answer, accept_changes=accept_changes)
+        return _sweep(
+            console,
+            loaded,
+            answer,
+            accept_changes=accept_changes,
+            retrain_damaged=retrain_damaged,
+        )
     except (KeyboardInterrupt, SystemExit) as stopped:
         return _code_of(console, stopped)
 
@@ -144,6 +160,7 @@ def _sweep(
     answer: Callable[[dict[str, Any]], None],
     *,
     accept_changes: bool,
+    retrain_damaged: bool,
 ) -> int:
     """Run the whole program.
 
@@ -153,7 +170,7 @@ def _sweep(
     Raises:
         BadInputError: Nothing was started.
     """
-    opened = _open(console, config)
+    opened = _open(console, config, retrain_damaged=retrain_damaged)
     changes = changes_since(opened)
     if changes is not None and not accept_changes:
         raise BadInputError(str(changes))
@@ -187,39 +204,6 @@ def _show(
     console.print("Dry run: the configuration is sound, nothing was started.")
     answer(document)
     return 0
-
-
-def plan_answer(opened: Sweep, changes: Changes | None = None) -> dict[str, Any]:
-    """The plan as plain data."""
-    config = opened.config
-    searches = [
-        {
-            "stage": stage.name,
-            "mode": stage.search.mode,
-            "sampler": stage.search.sampler,
-            "studies": len(stage.search.arms()),
-            "trials": stage.search.count,
-            "runs_at_most": search_runs(stage, stage.search, len(config.seeds)),
-            "space": stage.search.model_dump(mode="json", by_alias=True)["space"],
-        }
-        for stage in config.stages
-        if stage.search is not None
-    ]
-    nodes = [
-        node | {"finished": node["key"] in opened.finished}
-        for node in plan_document(opened)["nodes"]
-    ]
-    return {
-        "sweep": config.name,
-        "storage": redact(opened.storage),
-        "seeds": list(config.seeds),
-        "runs": len(opened.plan.runs),
-        "env_steps": opened.plan.env_steps,
-        "env_steps_left": sum(node["env_steps"] for node in nodes if not node["finished"]),
-        "nodes": nodes,
-        "searches": searches,
-        "changes": None if changes is None else str(changes),
-    }
 
 
 def _drive(console: Console, opened: Sweep) -> int:
@@ -259,7 +243,7 @@ def _check_ray(console: Console, opened: Sweep) -> None:
     early.check()
 
 
-def _open(console: Console, config: SweepConfig) -> Sweep:
+def _open(console: Console, config: SweepConfig, *, retrain_damaged: bool = False) -> Sweep:
     """Check what can be checked without starting anything, and show the plan."""
     if config.path == DEFAULT_CONFIG:
         console.print(f"No CONFIG given: running the packaged sweep {DEFAULT_CONFIG}.")
@@ -270,7 +254,13 @@ def _open(console: Console, config: SweepConfig) -> Sweep:
     check_cpus(config.resources)
     check_memory_and_gpus(config.resources)
     storage, remark = resolve_storage(config.storage)
-    opened = open_sweep(config, plan, storage, sweep_folder(storage, config.name))
+    opened = open_sweep(
+        config,
+        plan,
+        storage,
+        sweep_folder(storage, config.name),
+        (lambda text: console.print(Text(text, style="yellow"))) if retrain_damaged else None,
+    )
     console.print(plan_view(config, plan, opened.finished))
     console.print(Text(f"Storage: {redact(storage)}"), soft_wrap=True)
     if remark:

@@ -38,16 +38,21 @@ def driving(sweep: Sweep, say: Callable[[str], None] = print) -> Iterator[None]:
             f"it: {holder}. Wait for its end or stop it, or give this sweep another --name"
         )
 
-    def end() -> None:
+    def lost() -> None:
+        again = Lease.of_this_process(f"sweep {sweep.plan.name!r}")
+        taken_by = file.acquire(again)
+        if taken_by is None:  # whoever had it has ended
+            held.append(HeldLease(file, again, lost))
+            return
         say(
             f"{root}/{sweep.plan.name} has been taken over while this process was suspended, by "
-            f"{file.read() or 'nobody that is there any more'}: this one ends. See how far the "
-            f"sweep is with: python -m music_rllib.sweep status {sweep.folder}"
+            f"{taken_by}: this one ends. See how far the sweep is with: python -m "
+            f"music_rllib.sweep status {sweep.folder}"
         )
         end_process(FAILED)
 
-    held = HeldLease(file, lease, end)
+    held = [HeldLease(file, lease, lost)]
     try:
         yield
     finally:
-        held.release()
+        held[-1].release()

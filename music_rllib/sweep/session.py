@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,9 +12,10 @@ from typing import Any
 from music_rllib.experiment.model import SweepConfig
 from music_rllib.experiment.plan import Plan
 from music_rllib.experiment.result import RunResult
-from music_rllib.experiment.store import NodeStore
+from music_rllib.experiment.sealed import DamagedError, StorageError
+from music_rllib.experiment.store import NodeStore, damage_in_words
 from music_rllib.sweep.board import Board, Status
-from music_rllib.sweep.records import CONFIG, PLAN, as_json, keep
+from music_rllib.sweep.records import CONFIG, PLAN, as_json, keep, read
 from music_rllib.tracking.redaction import redact, without_secrets
 
 __all__ = ["Sweep", "keep_record", "open_sweep", "plan_document"]
@@ -42,16 +45,35 @@ class Sweep:
         return {key: result for key, result in found.items() if result is not None}
 
 
-def open_sweep(config: SweepConfig, plan: Plan, storage: str, folder: Path) -> Sweep:
-    """Open the storage and see what is finished already.
+def open_sweep(
+    config: SweepConfig,
+    plan: Plan,
+    storage: str,
+    folder: Path,
+    remove_damaged: Callable[[str], None] | None = None,
+) -> Sweep:
+    """Open the storage, and see what is finished already and is what it was.
+
+    Args:
+        config: The sweep.
+        plan: Of the same.
+        storage: Absolute folder, or URI.
+        folder: The sweep's own files, on this machine.
+        remove_damaged: Delete finished runs that are damaged, and tell this about each.
 
     Raises:
-        StorageError: The storage can't be reached, or a finished node in it can't be read.
+        StorageError: The storage can't be reached, or finished runs in it are damaged.
     """
     store = NodeStore(storage)
+    labels = _labels(config, plan, storage)
+    damaged = store.damage(key for key in labels if store.is_finished(key))
+    if damaged and remove_damaged is None:
+        raise DamagedError(damage_in_words({labels[key]: why for key, why in damaged.items()}))
+    for key, why in damaged.items():
+        store.remove(key)
+        if remove_damaged is not None:
+            remove_damaged(f"{labels[key]}: damaged, is trained again: {why}")
     finished = {node.key for node in plan.nodes if store.is_finished(node.key)}
-    for key in finished:
-        store.result(key)
     return Sweep(
         config=config,
         plan=plan,
@@ -60,6 +82,21 @@ def open_sweep(config: SweepConfig, plan: Plan, storage: str, folder: Path) -> S
         folder=folder,
         board=Board(plan, finished),
     )
+
+
+def _labels(config: SweepConfig, plan: Plan, storage: str) -> dict[str, str]:
+    """Key to label of what the sweep may reuse: also what its searches have asked for before."""
+    labels = {
+        source.key: f"handoff {source.checkpoint.folder}"
+        for source in plan.imports
+        if source.checkpoint
+    }
+    labels |= {node.key: node.label for node in plan.nodes}
+    if plan.searched:
+        with contextlib.suppress(StorageError):  # the sweep writes it anew
+            known = read(storage, f"{config.name}/{PLAN}") or {"nodes": []}
+            labels = {node["key"]: node["label"] for node in known["nodes"]} | labels
+    return labels
 
 
 def plan_document(sweep: Sweep) -> dict[str, Any]:

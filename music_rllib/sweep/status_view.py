@@ -11,6 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from music_rllib.experiment.plan import short
+from music_rllib.experiment.store import TRAIN_AGAIN
 from music_rllib.sweep.judgement import best_in_words
 from music_rllib.sweep.words import clock, percent
 
@@ -43,6 +44,10 @@ def status_view(state: Mapping[str, Any]) -> RenderableType:
         )
         for one in state["running"]
     ]
+    for one in state["damaged"]:
+        parts.append(Text(f"DAMAGED {one['run']}: {one['cause']}", style="red"))
+    if state["damaged"]:
+        parts.append(Text(f"    {TRAIN_AGAIN}", style="dim"))
     for failure in state["failures"]:
         parts.append(Text(f"FAILED {failure['run']}: {failure['cause']}", style="red"))
         parts.append(Text(f"    {failure['log']}", style="dim"))

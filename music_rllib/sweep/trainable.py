@@ -211,6 +211,7 @@ class RunTrainable(Trainable):
 
     def _finished_elsewhere(self, store: NodeStore) -> dict[str, Any]:
         """Another sweep, or a worker that outlived its driver, was faster."""
+        store.verify(self._job.key)
         self._history = store.history(self._job.key)
         if self._held is not None:
             self._clear(store)

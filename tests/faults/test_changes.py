@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ import pyarrow.fs as pafs
 import pytest
 import yaml
 
+from music_rllib.experiment import lease as lease_module
 from music_rllib.experiment.config import load_sweep
 from music_rllib.experiment.lease import Lease, LeaseFile
 from music_rllib.experiment.model import SweepConfig
@@ -147,3 +150,38 @@ def test_a_second_driver_is_refused_and_a_dead_one_does_not_count(
     with driving(sweep):
         assert file.is_owned_by(str(getattr(file.read(), "owner", None)))
     assert file.read() is None
+
+
+def test_a_driver_that_was_suspended_ends_where_another_one_has_its_sweep(
+    tmp_path: Path, sweep_document: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And goes on where that one has ended since."""
+    monkeypatch.setattr(lease_module, "EXPIRES_SECONDS", 0.4)
+    sweep = opened(tmp_path, sweep_document)
+    file = LeaseFile(pafs.LocalFileSystem(), str(sweep.folder / "driver.json"))
+    ended: list[int] = []
+    said: list[str] = []
+    monkeypatch.setattr("music_rllib.sweep.driving.end_process", ended.append)
+    theirs = Lease.of_this_process("sweep 'points'", 60.0)
+    with driving(sweep, said.append):
+        mine = file.read()
+        assert mine is not None
+        file.release(mine.owner)
+        wait_until(lambda: file.read() is not None)
+        again = file.read()
+        assert again is not None
+        assert (again.owner != mine.owner, ended) == (True, [])
+        Path(file.path).write_text(theirs.model_dump_json())
+        wait_until(lambda: bool(ended))
+    assert ended == [1]
+    assert (
+        "points has been taken over while this process was suspended, by sweep 'points'" in said[0]
+    )
+    assert file.is_owned_by(theirs.owner)
+
+
+def wait_until(happened: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 30
+    while not happened():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)

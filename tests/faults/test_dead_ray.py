@@ -20,8 +20,8 @@ pytestmark = pytest.mark.thorough
 
 
 def daemon(of: int, name: str) -> int:
-    (found,) = [child.pid for child in psutil.Process(of).children() if child.name() == name]
-    return found
+    (found,) = [child for child in psutil.Process(of).children() if child.name() == name]
+    return int(found.pid)
 
 
 def check_end(program: Program, output: str) -> None:

@@ -199,7 +199,7 @@ def test_a_lease_is_acquired_while_its_folder_is_deleted_again_and_again(tmp_pat
     folder, over = tmp_path / "work", threading.Event()
 
     def delete() -> None:
-        while not over.is_set():
+        while not over.wait(0.0005):
             with contextlib.suppress(OSError):
                 folder.rmdir()
 

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import shutil
 import subprocess
 import sys
 import threading
@@ -12,7 +13,7 @@ import pyarrow.fs as pafs
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem  # type: ignore[import-untyped]
 
-from music_rllib.experiment import sealed
+from music_rllib.experiment import sealed, verified
 from music_rllib.experiment.files import canonical_json, write_atomically
 from music_rllib.experiment.result import (
     HISTORY,
@@ -35,6 +36,7 @@ def produced(tmp_path: Path) -> Path:
     (folder / "handoff").mkdir(parents=True)
     (folder / "handoff" / "w.bin").write_bytes(b"weights")
     reports = [Report(env_steps=5, seconds=1.0, timestamp_ms=7, metrics={"m": float("nan")})]
+    reports.append(Report(env_steps=10, seconds=1.5, timestamp_ms=9, metrics={"m": 0.5}))
     (folder / HISTORY).write_bytes(to_json_lines(reports))
     return folder
 
@@ -71,8 +73,8 @@ def test_a_published_node_comes_back_verified(
     store.publish(KEY, produced, RESULT)
     assert store.is_finished(KEY)
     assert store.result(KEY) == RESULT
-    (report,) = store.history(KEY)
-    assert report.env_steps == 5
+    report, last = store.history(KEY)
+    assert (report.env_steps, last.env_steps) == (5, 10)
     assert report.metrics["m"] != report.metrics["m"]
     store.verify(KEY)
     store.fetch(KEY, tmp_path / "fetched")
@@ -149,7 +151,103 @@ def test_damage_is_found_and_named(
     tamper(tmp_path / "storage" / "nodes" / KEY / "handoff" / "w.bin")
     with pytest.raises(DamagedError, match=message) as error:
         store.verify(KEY)
-    assert f"Delete {tmp_path}/storage/nodes/{KEY} to train it again" in str(error.value)
+    assert "again with --retrain-damaged" in str(error.value)
+    assert list(store.damage([KEY])) == [KEY]
+    assert not store.is_sound(KEY)
+    store.remove(KEY)
+    store.publish(KEY, produced, RESULT)
+    assert store.is_sound(KEY)
+
+
+def test_what_was_sound_is_not_read_again_and_damage_since_is_found(
+    tmp_path: Path, produced: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read: list[str] = []
+    check = SealedFolders.check
+
+    def counting(folders: SealedFolders, name: str) -> None:
+        read.append(name)
+        check(folders, name)
+
+    monkeypatch.setattr(SealedFolders, "check", counting)
+    # The times of the last change of a file's attributes can't be set: they count as old here.
+    monkeypatch.setattr(verified, "SETTLED_SECONDS", 0.0)
+    keys = [f"{number:020d}" for number in range(3)]
+    for key in keys:
+        local_store(tmp_path).publish(key, produced, RESULT)
+    for _ in range(3):
+        assert local_store(tmp_path).damage(keys) == {}
+    assert read == keys, "each once, by whatever process"
+
+    weights = tmp_path / "storage" / "nodes" / keys[1] / "handoff" / "w.bin"
+    times = weights.stat()
+    weights.write_bytes(b"weightz")
+    os.utime(weights, ns=(times.st_atime_ns, times.st_mtime_ns))
+    assert list(local_store(tmp_path).damage(keys)) == [keys[1]]
+    assert list(local_store(tmp_path).damage(keys)) == [keys[1]], "damage is not remembered"
+    weights.write_bytes(b"weights")
+    assert local_store(tmp_path).damage(keys) == {}
+
+
+@pytest.mark.parametrize("content", [b"", b"[]", b'{"a": 1', b"\xff", b'{"KEY": null}'])
+def test_a_damaged_list_of_what_is_sound_costs_a_second_reading(
+    tmp_path: Path, produced: Path, content: bytes
+) -> None:
+    local_store(tmp_path).publish(KEY, produced, RESULT)
+    listed = tmp_path / "storage" / "verified.json"
+    listed.write_bytes(content.replace(b"KEY", KEY.encode()))
+    assert local_store(tmp_path).damage([KEY]) == {}
+    (tmp_path / "storage" / "nodes" / KEY / HISTORY).unlink()
+    assert list(local_store(tmp_path).damage([KEY])) == [KEY]
+
+
+def test_a_file_that_was_written_just_now_is_read_again(tmp_path: Path, produced: Path) -> None:
+    """It may be written again at what the disk calls the same time."""
+    store = local_store(tmp_path)
+    store.publish(KEY, produced, RESULT)
+    assert store.damage([KEY]) == {}
+    assert not (tmp_path / "storage" / "verified.json").exists()
+
+
+def test_a_result_in_the_manifest_that_is_not_the_end_of_the_history(
+    tmp_path: Path, produced: Path
+) -> None:
+    store = local_store(tmp_path)
+    store.publish(KEY, produced, RESULT.model_copy(update={"metrics": {"m": 0.5}}))
+    assert store.damage([KEY]) == {}, "it is the last value"
+    path = tmp_path / "storage" / "nodes" / KEY / "manifest.json"
+    path.write_text(path.read_text().replace("0.5", "0.75"))
+    (error,) = store.damage([KEY]).values()
+    assert "manifest.json must have the last values of history.jsonl" in str(error)
+
+
+def test_sizes_tell_without_reading(store: NodeStore, produced: Path) -> None:
+    store.publish(KEY, produced, RESULT)
+    assert store.damage([KEY]) == {}
+    (weights,) = [file for file in store._nodes.files(KEY) if file.endswith("w.bin")]
+    with store._fs.open_output_stream(weights) as sink:
+        sink.write(b"weight")
+    (error,) = store.damage([KEY]).values()
+    assert "w.bin must have 7 bytes, it has 6" in str(error)
+    store._fs.delete_file(weights)
+    (error,) = store.damage([KEY]).values()
+    assert "w.bin must exist, its manifest lists it" in str(error)
+
+
+@pytest.mark.parametrize("mask", [0o022, 0o077, 0o007])
+def test_who_may_read_a_node_is_up_to_the_umask(tmp_path: Path, produced: Path, mask: int) -> None:
+    """Of a group that shares a storage all may read it; of a user who is alone nobody else."""
+    shutil.rmtree(tmp_path / "storage", ignore_errors=True)
+    before = os.umask(mask)
+    try:
+        local_store(tmp_path).publish(KEY, produced, RESULT)
+        write_atomically(tmp_path / "storage" / "state.json", b"{}")
+    finally:
+        os.umask(before)
+    manifest = tmp_path / "storage" / "nodes" / KEY / "manifest.json"
+    for path in (manifest, tmp_path / "storage" / "state.json"):
+        assert path.stat().st_mode & 0o777 == 0o666 & ~mask
+    assert manifest.parent.stat().st_mode & 0o777 == 0o777 & ~mask
 
 
 @pytest.mark.parametrize(

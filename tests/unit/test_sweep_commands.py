@@ -20,6 +20,7 @@ from music_rllib.experiment import sealed, store
 from music_rllib.experiment.config import load_sweep
 from music_rllib.experiment.plan import Node, make_plan
 from music_rllib.experiment.result import HISTORY, Report, RunResult, to_json_lines
+from music_rllib.experiment.sealed import DamagedError
 from music_rllib.sweep import cleaning, cli, records
 from music_rllib.sweep.beacon import Beacon, is_alive
 from music_rllib.sweep.places import sweep_folder
@@ -413,3 +414,58 @@ def test_plan_as_json_with_more_seeds(tmp_path: Path, program: Program) -> None:
     assert listed["seeds"] == [4, 9]
     bad = program("plan", "sweep.yaml", "--seeds", "many")
     assert (bad.code, "--seeds must be a number of seeds" in bad.errors) == (2, True)
+
+
+def test_a_damaged_run_is_named_by_every_command_and_trained_again_when_asked(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    sweep = played(storage, tmp_path)
+    good, bad = sweep.plan.nodes[0], sweep.plan.nodes[4]
+    history = next(file for file in sweep.store._nodes.files(bad.key) if file.endswith(HISTORY))
+    with sweep.store._fs.open_output_stream(history) as sink:
+        sink.write(b"")
+    place, file = f"{storage}/mine", str(tmp_path / "sweep.yaml")
+    for arguments in (
+        ("run", file, "--storage", storage),
+        ("run", file, "--storage", storage, "--dry-run"),
+        ("plan", file, "--storage", storage),
+        ("resume", place),
+        ("best", place),
+        ("compare", place),
+    ):
+        said = program(*arguments)
+        assert said.code == 2, arguments
+        assert "1 finished run is damaged" in said.errors
+        assert f"{bad.label}: {history} must have " in said.errors
+        assert "--retrain-damaged" in said.errors
+        assert good.label not in said.errors
+    said = program("status", place, "--json")
+    assert said.code == 1
+    (damaged,) = json.loads(said.output)["damaged"]
+    assert damaged["run"] == bad.label
+    said = program("status", place)
+    assert (said.code, f"DAMAGED {bad.label}: " in said.output) == (1, True)
+
+    removed: list[str] = []
+    again = open_sweep(sweep.config, sweep.plan, storage, sweep.folder, removed.append)
+    assert [line.split(":")[0] for line in removed] == [bad.label]
+    assert again.board.next_ready() == bad
+    assert len(again.finished) == 8
+    assert program("plan", file, "--storage", storage).code == 0
+    assert program("status", place).code == 0
+
+
+def test_what_a_search_has_asked_for_before_is_verified_too(tmp_path: Path) -> None:
+    """Its trials aren't part of the plan before the search begins."""
+    search = {"space": {"tac.lr": {"float": [1e-4, 1e-2]}}, "trials": 4}
+    stages = [{"name": "train", "variant": "tac", "search": search}]
+    storage = str(tmp_path / "results")
+    sweep = opened(storage, tmp_path, stages=stages, seeds=[0])
+    sweep.plan.add_trial("train", 0, {"tac.lr": 1e-3}, [0], "trial0")
+    keep_record(sweep)
+    (node,) = sweep.plan.nodes
+    with contextlib.suppress(KeyError):  # the board doesn't know it, which is enough here
+        finish(sweep, Beacon(sweep), node, 0.5, tmp_path / "made")
+    (tmp_path / "results/nodes" / node.key / "handoff/handoff.json").write_text("{ }")
+    with pytest.raises(DamagedError, match=rf"{node.label}: .*handoff\.json must have 2 bytes"):
+        opened(storage, tmp_path, stages=stages, seeds=[0])

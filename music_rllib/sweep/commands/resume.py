@@ -30,6 +30,7 @@ def register(commands: Commands) -> None:
     add_place(parser)
     parser.add_argument("--seeds", metavar="N", help="As of 'run'.")
     parser.add_argument("--accept-changes", action="store_true", help="As of 'run'.")
+    parser.add_argument("--retrain-damaged", action="store_true", help="As of 'run'.")
     add_json(parser)
     parser.set_defaults(execute=_execute)
 
@@ -43,5 +44,6 @@ def _execute(arguments: argparse.Namespace) -> int:
         find_sweep(arguments.sweep, arguments.storage),
         seeds=arguments.seeds,
         accept_changes=arguments.accept_changes,
+        retrain_damaged=arguments.retrain_damaged,
         answer=print_json if arguments.json else lambda document: None,
     )

@@ -37,6 +37,12 @@ def register(commands: Commands) -> None:
         "touch. Without it the command says what would be lost, and starts nothing.",
     )
     parser.add_argument(
+        "--retrain-damaged",
+        action="store_true",
+        help="Where finished runs are not what they were when they ended: delete them and train "
+        "them again. Without it the command names them, and starts nothing.",
+    )
+    parser.add_argument(
         "--resume",
         action="store_true",
         help="Start only where there is an earlier run of this sweep to go on with. Without it a "
@@ -83,5 +89,6 @@ def _execute(arguments: argparse.Namespace) -> int:
         seeds=arguments.seeds,
         answer=print_json if arguments.json else lambda document: None,
         accept_changes=arguments.accept_changes,
+        retrain_damaged=arguments.retrain_damaged,
         must_exist=arguments.resume,
     )

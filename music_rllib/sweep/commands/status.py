@@ -7,6 +7,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from music_rllib.sweep.frame import (
+    FAILED,
     BadInputError,
     Commands,
     add_json,
@@ -59,23 +60,28 @@ def _execute(arguments: argparse.Namespace) -> int:
     state = state_of(found)
     if arguments.json:
         print_json(state)
-        return 0
+        return _code(state)
     if not arguments.watch:
         console.print(status_view(state))
-        return 0
+        return _code(state)
     from rich.live import Live
 
     with Live(console=console, auto_refresh=False) as live:
         while True:
             live.update(status_view(state), refresh=True)
             if state["state"] != "running":
-                return 0
+                return _code(state)
             time.sleep(max(arguments.interval, 0.2))
             state = state_of(found)
 
 
+def _code(state: dict[str, Any]) -> int:
+    return FAILED if state.get("damaged") else 0
+
+
 def state_of(found: Found) -> dict[str, Any]:
-    """`state.json`, with what became of its driver."""
+    """`state.json`, with what became of its driver and of its finished runs."""
+    from music_rllib.experiment.store import NodeStore
     from music_rllib.sweep import records
     from music_rllib.sweep.beacon import is_alive
 
@@ -86,7 +92,12 @@ def state_of(found: Found) -> dict[str, Any]:
     if not is_alive(state):
         outcome = "interrupted" if outcome == "running" else outcome
         _nothing_runs(state)
-    return {"place": found.place, "state": outcome, **state}
+    store, nodes = NodeStore(found.storage), (found.read(records.PLAN) or {"nodes": []})["nodes"]
+    labels = {node["key"]: node["label"] for node in nodes if store.is_finished(node["key"])}
+    damaged = [
+        {"run": labels[key], "cause": str(error)} for key, error in store.damage(labels).items()
+    ]
+    return {"place": found.place, "state": outcome, **state, "damaged": damaged}
 
 
 def _nothing_runs(state: dict[str, Any]) -> None:
