@@ -59,6 +59,10 @@ class Resources(_Strict):
     """GiB of memory reserved for a run, so that fewer run side by side; null: memory is not
     counted."""
 
+    hang_minutes: float | None = Field(5.0, gt=0)
+    """A run whose environment takes longer for one call of `step()` or `reset()` has hung: it
+    fails, with the stack that it hangs in, and the others go on. null: it is waited for."""
+
     @property
     def bundle(self) -> dict[str, float]:
         """What is reserved for a run, by Ray's names; memory in bytes."""

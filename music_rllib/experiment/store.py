@@ -228,6 +228,7 @@ class WorkFolder:
         self._checkpoints = SealedFolders(filesystem, root)
         self._parts = SealedFolders(filesystem, f"{root}/parts")
         self._keep = keep
+        self._fs = filesystem
         self._local = isinstance(filesystem, pafs.LocalFileSystem)
 
     @contextlib.contextmanager
@@ -297,6 +298,19 @@ class WorkFolder:
     def names(self) -> list[str]:
         """The checkpoints there are, oldest first."""
         return self._checkpoints.names()
+
+    def read(self, name: str) -> str | None:
+        """A small text file in the folder; None where it isn't there."""
+        try:
+            with self._fs.open_input_stream(f"{self.root}/{name}") as stream:
+                return bytes(stream.read()).decode(errors="replace")
+        except FileNotFoundError:
+            return None
+
+    def remove_file(self, name: str) -> None:
+        """Delete such a file, if it is there."""
+        with contextlib.suppress(FileNotFoundError):
+            self._fs.delete_file(f"{self.root}/{name}")
 
     def remove_if_empty(self) -> None:
         """Delete the folder, where it is on a disk and has nothing in it."""

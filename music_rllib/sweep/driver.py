@@ -248,7 +248,7 @@ def _open(console: Console, config: SweepConfig, *, retrain_damaged: bool = Fals
     if config.path == DEFAULT_CONFIG:
         console.print(f"No CONFIG given: running the packaged sweep {DEFAULT_CONFIG}.")
     plan = make_plan(config)
-    check_environments(plan)
+    check_environments(plan, config.resources.hang_minutes)
     if cluster_address() is None:
         check_hardware(plan)
     check_cpus(config.resources)

@@ -14,6 +14,7 @@ from music_rllib.experiment.plan import Input, Plan
 from music_rllib.experiment.settings import RunSettings
 from music_rllib.experiment.store import NodeStore
 from music_rllib.sweep.board import Board, Status
+from music_rllib.sweep.in_time import in_time
 
 if TYPE_CHECKING:  # the environments are heavy, and most sweeps have none of their own
     from music_rllib.envs.make import Env
@@ -32,8 +33,12 @@ class TaskError(ValueError):
     """A task whose environment can't be made, or isn't as the task says."""
 
 
-def check_environments(plan: Plan) -> None:
+def check_environments(plan: Plan, hang_minutes: float | None = None) -> None:
     """Make each user's environment once, and look whether its task fits it.
+
+    Args:
+        plan: The sweep's.
+        hang_minutes: The program ends where one takes longer; None: it is waited for.
 
     Raises:
         TaskError: One doesn't; with one line per problem.
@@ -45,7 +50,9 @@ def check_environments(plan: Plan) -> None:
     problems = []
     for name, of_task in runs.items():
         hindsight = {run.replay.hindsight_episodes for run in of_task if run.replay.hindsight_k > 0}
-        misfits = _misfits(of_task[0].task, hindsight)
+        rule = f"environments.{name} must be made and played within resources.hang_minutes"
+        with in_time(hang_minutes and 60 * hang_minutes, f"{rule}, {hang_minutes}"):
+            misfits = _misfits(of_task[0].task, hindsight)
         problems += [f"environments.{name}: {line}" for line in misfits]
     if problems:
         raise TaskError("\n".join(problems))

@@ -19,9 +19,10 @@ from music_rllib.sweep.cluster import cluster
 from music_rllib.sweep.dag_searcher import DagSearcher
 from music_rllib.sweep.listener import Listener
 from music_rllib.sweep.local import cluster_address
+from music_rllib.sweep.node_job import NodeJob
 from music_rllib.sweep.session import Sweep
 from music_rllib.sweep.stopping import StopSignals
-from music_rllib.sweep.trainable import NodeJob, RunTrainable
+from music_rllib.sweep.trainable import RunTrainable
 from music_rllib.sweep.tune_events import RESTARTS, TuneEvents
 
 if TYPE_CHECKING:
@@ -74,6 +75,7 @@ def compute(
             checkpoints=sweep.config.checkpoints,
             sweep=sweep.plan.name,
             stop_key=stopping.flag.key,
+            hang_minutes=resources.hang_minutes,
         ).to_tune(),
         **({} if campaign is None else {"advance": campaign.advance}),
         stopped=lambda: stopping.received is not None,

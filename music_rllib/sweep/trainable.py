@@ -10,14 +10,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-from pydantic import BaseModel, ConfigDict
 from ray.tune import PlacementGroupFactory, Trainable
 
-from music_rllib.envs.registry import Task
 from music_rllib.experiment.handoff import HandoffInfo, Weights, read_handoff, write_handoff
 from music_rllib.experiment.lease import HeldLease, Lease, LeaseLostError
-from music_rllib.experiment.model import Checkpoints
-from music_rllib.experiment.plan import Node
 from music_rllib.experiment.result import (
     HISTORY,
     Report,
@@ -27,16 +23,18 @@ from music_rllib.experiment.result import (
     to_json_lines,
 )
 from music_rllib.experiment.sealed import StorageError
-from music_rllib.experiment.settings import RunSettings, handed_over
+from music_rllib.experiment.settings import handed_over
 from music_rllib.experiment.store import NodeStore, WorkFolder
 from music_rllib.sweep.causes import cause_of
+from music_rllib.sweep.hang_watch import RECORD, HangWatch, check_hung
+from music_rllib.sweep.node_job import NodeJob
 from music_rllib.sweep.stop_flag import StopWatch
 from music_rllib.tracking import names
 
 if TYPE_CHECKING:
     from music_rllib.experiment.training import TrainingRun
 
-__all__ = ["CAUSE", "NOTES", "PAUSED", "REPORTS", "STOPPED", "TRACEBACK", "NodeJob", "RunTrainable"]
+__all__ = ["CAUSE", "NOTES", "PAUSED", "REPORTS", "STOPPED", "TRACEBACK", "RunTrainable"]
 
 REPORTS, NOTES = "reports", "notes"
 """Keys of a Tune result: reports as JSON lines, and what a person should be told."""
@@ -50,71 +48,6 @@ SECONDS = "seconds"
 """File in a checkpoint: training time so far."""
 WAIT_SECONDS = 1.0
 """Between two looks at what somebody else is computing."""
-
-
-class NodeJob(BaseModel):
-    """All that a worker needs to compute a node."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    key: str
-    label: str
-    run: RunSettings
-    source_key: str | None
-    source_task: Task | None
-    storage: str
-    cpus: int
-    gpus: float = 0.0
-    memory: int = 0
-    """Bytes that are reserved; 0: memory is not counted."""
-    until: int | None = None
-    """Stop at the first evaluation from so many environment steps on, to be continued; None: go on
-    to the end."""
-    checkpoints: Checkpoints = Checkpoints()
-    sweep: str = ""
-    """Name of the sweep, for messages."""
-    stop_key: str | None = None
-    """Where to look whether to stop; None: nowhere."""
-
-    @classmethod
-    def of(
-        cls,
-        node: Node,
-        storage: str,
-        cpus: int,
-        *,
-        gpus: float = 0.0,
-        memory: int = 0,
-        until: int | None = None,
-        checkpoints: Checkpoints | None = None,
-        sweep: str = "",
-        stop_key: str | None = None,
-    ) -> NodeJob:
-        """The job that computes `node` in the storage at this URI on so many CPUs."""
-        return cls(
-            gpus=gpus,
-            memory=memory,
-            until=until,
-            checkpoints=checkpoints or Checkpoints(),
-            sweep=sweep,
-            stop_key=stop_key,
-            key=node.key,
-            label=node.label,
-            run=node.run,
-            source_key=node.input.key if node.input else None,
-            source_task=node.input.task if node.input else None,
-            storage=storage,
-            cpus=cpus,
-        )
-
-    def to_tune(self) -> dict[str, Any]:
-        """As a Tune config; text, so that Tune doesn't look for search spaces in it."""
-        return {"job": self.model_dump_json()}
-
-    @classmethod
-    def from_tune(cls, config: dict[str, Any]) -> NodeJob:
-        """Inverse of `to_tune`."""
-        return cls.model_validate_json(config["job"])
 
 
 class RunTrainable(Trainable):
@@ -138,6 +71,7 @@ class RunTrainable(Trainable):
         self._stop = StopWatch(self._job.stop_key)
         self._training: TrainingRun | None = None
         self._held: HeldLease | None = None
+        self._watch: HangWatch | None = None
         self._history: list[Report] = []
         self._notes: list[str] = []
         self._stopped = self._waits = False
@@ -166,6 +100,7 @@ class RunTrainable(Trainable):
     def _make_way(self) -> dict[str, Any]:
         """Drop a run that another sweep took over; it is waited for, as one that is found held."""
         assert self._held is not None
+        self._watch_no_more()
         self._held.end()
         if self._training is not None:
             self._training.close()
@@ -237,7 +172,13 @@ class RunTrainable(Trainable):
             )
         return False
 
+    def _watch_no_more(self) -> None:
+        if self._watch is not None:
+            self._watch.end()
+            self._watch = None
+
     def _release(self) -> None:
+        self._watch_no_more()
         if self._held is not None:
             self._held.release()
             self._held = None
@@ -246,6 +187,7 @@ class RunTrainable(Trainable):
     def _begin(self, store: NodeStore) -> TrainingRun:
         from music_rllib.experiment.training import TrainingRun
 
+        self._have_watched(store)
         training = TrainingRun(self._job.run, self._weights(store), self._job.gpus)
         with self._work(store).newest(self._notes.append) as saved:
             if saved is not None:
@@ -255,6 +197,19 @@ class RunTrainable(Trainable):
                 self._notes.append(f"continues at {training.env_steps:,} env steps")
         self._began = self._saved = time.monotonic()
         return training
+
+    def _have_watched(self, store: NodeStore) -> None:
+        """Be ended where the environment hangs; and say so, if the worker before this one was.
+
+        Raises:
+            HangError: It was.
+        """
+        work, attempt = self._work(store), self._job.stop_key or "alone"
+        record = work.read(RECORD)
+        work.remove_file(RECORD)
+        check_hung(record, attempt, self._job.run.task.env_id)
+        if (minutes := self._job.hang_minutes) is not None:
+            self._watch = HangWatch(60 * minutes, store.uri, self._job.key, attempt)
 
     def _weights(self, store: NodeStore) -> Weights | None:
         job = self._job
@@ -344,6 +299,7 @@ class RunTrainable(Trainable):
     def _clear(self, store: NodeStore) -> None:
         """Delete checkpoints and lease of a run that is finished. Only for the lease's holder."""
         assert self._held is not None
+        self._watch_no_more()
         self._held.end()  # a renewal would make the folder again
         self._held = None
         try:

@@ -18,14 +18,15 @@ from music_rllib.experiment.sealed import DamagedError
 from music_rllib.experiment.store import NodeStore
 from music_rllib.sweep.board import Board
 from music_rllib.sweep.causes import cause_of
+from music_rllib.sweep.hang_watch import RECORD
 from music_rllib.sweep.listener import Failure, Listener
+from music_rllib.sweep.node_job import NodeJob
 from music_rllib.sweep.trainable import (
     CAUSE,
     NOTES,
     PAUSED,
     REPORTS,
     TRACEBACK,
-    NodeJob,
 )
 
 __all__ = ["RESTARTS", "TuneEvents"]
@@ -125,12 +126,15 @@ class TuneEvents(Callback):
         """The trial's worker died, and another one goes on."""
         error = _error_of(trial)
         cause = cause_of(error, _COLOUR.sub("", _text_of(trial))).splitlines()[0]
+        text = (
+            f"{cause} Another worker goes on from the last checkpoint "
+            f"({trial.run_metadata.num_failures} of {RESTARTS} times)."
+        )
+        node = self._node(trial)
+        if self._store.work_folder(node.key).read(RECORD) is not None:
+            text = "its environment hangs, so its worker was ended; another one will say where"
         for listener in self._listeners:
-            listener.noted(
-                self._node(trial),
-                f"{cause} Another worker goes on from the last checkpoint "
-                f"({trial.run_metadata.num_failures} of {RESTARTS} times).",
-            )
+            listener.noted(node, text)
 
     def _fail(self, node: Node, cause: str, text: str) -> None:
         log = self._failures / f"{re.sub(r'[^A-Za-z0-9._=,-]+', '_', node.label)}-{node.key}.txt"

@@ -33,6 +33,7 @@ from ray.rllib.utils.metrics import (
 from ray.rllib.utils.typing import StateDict
 
 from music_rllib._quiet import quiet_third_parties
+from music_rllib.envs.calls import in_environment
 from music_rllib.envs.make import (
     Env,
     check_action_space,
@@ -194,7 +195,8 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
         entropy = np.random.SeedSequence((*self._entropy, self._episodes_started))
         self._episodes_started += 1
         seed = int(entropy.generate_state(1)[0])
-        observation, _ = self.envs[index].reset(seed=seed)
+        with in_environment:
+            observation, _ = self.envs[index].reset(seed=seed)
         worker = f" of worker {self.worker_index}" if self.worker_index else ""
         name = (
             f"{name_of(self.envs[index])}, sub-environment {index}{worker}, "
@@ -219,7 +221,8 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
 
     def _step(self, env: Env, recording: Recording, action: Floats, scaled: Floats) -> bool | None:
         """One step; at the episode's end whether it terminated, before that None."""
-        observation, reward, terminated, truncated, info = env.step(scaled)
+        with in_environment:
+            observation, reward, terminated, truncated, info = env.step(scaled)
         success = info.get(self._success_key) if self._success_key else None
         recording.step(action, float(reward), success, observation)
         if terminated or truncated or recording.steps == self.layout.horizon:

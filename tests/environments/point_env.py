@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import time
 from pathlib import Path
 from typing import Any
@@ -89,6 +90,28 @@ class Meeting(Point):
         raise RuntimeError("no run on another node has come")
 
 
+class Hanging(Point):
+    """Does not return from a step.
+
+    Args:
+        at: the environment's lifetime step.
+        locked: whether it holds Python's lock while it hangs, as a simulator in C may.
+    """
+
+    def __init__(self, at: int = 50, locked: bool = False) -> None:
+        super().__init__()
+        self._at, self._locked = at, locked
+
+    def step(self, action: Array) -> tuple[dict[str, Array], float, bool, bool, dict[str, Any]]:
+        if self._steps + 1 == self._at:
+            self.hang()
+        return super().step(action)
+
+    def hang(self) -> None:
+        sleep = ctypes.PyDLL(None).sleep if self._locked else time.sleep
+        sleep(3600)
+
+
 class Paced(Point):
     """Takes its time as long as there is no file at `fast`, so that it can be interrupted.
 
@@ -107,5 +130,6 @@ class Paced(Point):
 
 
 gym.register("Point-v0", "point_env:Point", max_episode_steps=20)
+gym.register("Hanging-v0", entry_point="point_env:Hanging", max_episode_steps=20)
 gym.register("Meeting-v0", entry_point="point_env:Meeting", max_episode_steps=20)
 gym.register("Paced-v0", entry_point="point_env:Paced", max_episode_steps=20)

@@ -21,7 +21,8 @@ from music_rllib.envs.registry import Task
 from music_rllib.experiment.lease import Lease
 from music_rllib.experiment.model import Checkpoints
 from music_rllib.experiment.store import NodeStore
-from music_rllib.sweep.trainable import CAUSE, NOTES, STOPPED, NodeJob, RunTrainable
+from music_rllib.sweep.node_job import NodeJob
+from music_rllib.sweep.trainable import CAUSE, NOTES, STOPPED, RunTrainable
 from tests.integration.test_sweep_trainable import (
     compute,
     job,

@@ -21,7 +21,8 @@ from music_rllib.experiment.settings import RunSettings, Variant, handed_over, p
 from music_rllib.experiment.store import NodeStore
 from music_rllib.experiment.training import TrainingRun
 from music_rllib.policy import find_policy, load_policy
-from music_rllib.sweep.trainable import CAUSE, NOTES, REPORTS, NodeJob, RunTrainable
+from music_rllib.sweep.node_job import NodeJob
+from music_rllib.sweep.trainable import CAUSE, NOTES, REPORTS, RunTrainable
 from music_rllib.tracking import names
 
 pytestmark = pytest.mark.integration

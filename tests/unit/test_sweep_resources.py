@@ -190,7 +190,8 @@ def test_a_trial_asks_ray_for_all_of_it() -> None:
     from music_rllib.experiment.config import load_sweep
     from music_rllib.experiment.plan import make_plan
     from music_rllib.sweep.driver import DEFAULT_CONFIG
-    from music_rllib.sweep.trainable import NodeJob, RunTrainable
+    from music_rllib.sweep.node_job import NodeJob
+    from music_rllib.sweep.trainable import RunTrainable
 
     node = make_plan(load_sweep(DEFAULT_CONFIG)).nodes[0]
     wanted = Resources(cpus_per_run=2, gpus_per_run=0.5, memory_per_run=1.5)

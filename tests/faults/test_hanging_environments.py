@@ -1,0 +1,157 @@
+"""Environments that do not return from a call: named, with their stack, and the others go on."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from music_rllib.sweep.hang_watch import RECORD, HangError, check_hung
+from tests.faults import sweeps
+from tests.integration.conftest import ENVIRONMENTS, REPOSITORY, Program
+
+WORKER = """
+import sys, time
+from music_rllib.envs.calls import in_environment
+from music_rllib.sweep.hang_watch import HangWatch
+from point_env import Hanging
+
+watch = HangWatch(1.0, sys.argv[1], "key", "attempt")
+print("watched", flush=True)
+if sys.argv[2] == "works":
+    for _ in range(30):
+        with in_environment:
+            time.sleep(0.05)
+    time.sleep(2.5)  # a long update, as far as the environment is concerned
+else:
+    with in_environment:
+        if sys.argv[2] == "stopped":
+            time.sleep(0.3)
+        else:
+            Hanging(locked=sys.argv[2] == "locked").hang()
+watch.end()
+"""
+
+
+def worker(storage: Path, what: str) -> subprocess.Popen[str]:
+    paths = os.pathsep.join(map(str, (REPOSITORY, ENVIRONMENTS)))
+    return subprocess.Popen(
+        [sys.executable, "-c", WORKER, str(storage), what],
+        env=os.environ | {"PYTHONPATH": paths},
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+
+
+@pytest.mark.parametrize("what", ["free", "locked"])
+def test_a_call_that_does_not_return_ends_the_worker_and_leaves_its_stack(
+    what: str, tmp_path: Path
+) -> None:
+    with worker(tmp_path, what) as process:
+        assert process.wait(timeout=60) == -signal.SIGKILL
+    record = (tmp_path / "work" / "key" / RECORD).read_text()
+    assert record.startswith("attempt\n1.0\n")
+    assert 'point_env.py", line ' in record
+    assert " in hang" in record
+    with pytest.raises(HangError, match=r"environment Hanging-v0 has not returned from .* for 1 s"):
+        check_hung(record, "attempt", "Hanging-v0")
+    check_hung(record, "another attempt", "Hanging-v0")
+    check_hung(None, "attempt", "Hanging-v0")
+
+
+@pytest.mark.parametrize("what", ["works", "stopped"])
+def test_what_takes_its_time_is_no_hang(what: str, tmp_path: Path) -> None:
+    """Many short calls, a long update, and a process that was stopped within a call."""
+    with worker(tmp_path, what) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "watched\n"
+        if what == "stopped":
+            process.send_signal(signal.SIGSTOP)
+            time.sleep(2.5)
+            process.send_signal(signal.SIGCONT)
+        assert process.wait(timeout=60) == 0
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("record", "call", "place"),
+    [
+        (
+            "a\n300.0\nCurrent thread 0x1 (most recent call first):\n"
+            '  File "/x/robot.py", line 7 in wait\n'
+            '  File "/x/tac/env_runner.py", line 9 in _step\n\n'
+            'Thread 0x2 (most recent call first):\n  File "/x/lease.py", line 1 in _renew\n',
+            "step",
+            'File "/x/robot.py", line 7 in wait',
+        ),
+        (
+            'a\n300.0\nThread 0x2 (most recent call first):\n  File "/x/lease.py", line 1 in w\n\n'
+            "Current thread 0x1 (most recent call first):\n"
+            '  File "/x/tac/env_runner.py", line 9 in _begin\n',
+            "reset",
+            'File "/x/tac/env_runner.py", line 9 in _begin',
+        ),
+        ("a\n300.0\n", "step() or reset", "a place that is not known"),
+    ],
+)
+def test_the_message_names_the_call_and_the_place(record: str, call: str, place: str) -> None:
+    with pytest.raises(HangError) as error:
+        check_hung(record, "a", "E")
+    first, second, *_ = str(error.value).splitlines()
+    assert first == (
+        f"environment E has not returned from {call}() for 300 s (resources.hang_minutes)"
+    )
+    assert second == f"it hangs at {place}"
+
+
+@pytest.mark.parametrize("locked", [False, pytest.param(True, marks=pytest.mark.thorough)])
+def test_one_that_hangs_while_it_is_checked_ends_the_program(
+    locked: bool, program: Program
+) -> None:
+    document = sweeps.document(tasks=["Hanging"])
+    document["environments"] = {
+        "Hanging": document["environments"]["Point"]
+        | {"env_id": "point_env:Hanging-v0", "env_kwargs": {"at": 1, "locked": locked}}
+    }
+    document["resources"] |= {"hang_minutes": 0.1}
+    program.write(document)
+    code, _, errors = program.run("--dry-run", timeout=120)
+    if locked:  # nothing else in the process can say more
+        assert (code, "Timeout (0:00:11" in errors) == (1, True), errors
+    else:
+        assert code == 2
+        assert "error: environments.Hanging must be made and played within resources" in errors
+    assert 'point_env.py", line ' in errors
+    assert not (program.folder / "results").exists()
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("locked", [False, True])
+def test_a_run_whose_environment_hangs_fails_and_the_others_finish(
+    locked: bool, program: Program
+) -> None:
+    document: dict[str, Any] = sweeps.document(tasks=["Point", "Hanging"])
+    document["environments"]["Hanging"] = document["environments"]["Point"] | {
+        "env_id": "point_env:Hanging-v0",
+        "env_kwargs": {"at": 300, "locked": locked},
+    }
+    document["resources"] |= {"hang_minutes": 0.1}
+    document["stages"] = document["stages"][:1]
+    program.write(document)
+    code, output, errors = program.run(timeout=300)
+    assert code == 1, output + errors
+    assert (
+        "pretrain/Hanging/seed0: FAILED: HangError: environment point_env:Hanging-v0 has not "
+        "returned from step() for 6 s (resources.hang_minutes)"
+    ) in output
+    assert f'it hangs at File "{ENVIRONMENTS}/point_env.py", line ' in output
+    assert "pretrain/Point/seed0: finished" in output
+    (log,) = (program.folder / "results" / "points" / "failures").glob("*Hanging*.txt")
+    assert "env_runner.py" in log.read_text()
+    assert "most recent call first" in log.read_text()
