@@ -241,20 +241,16 @@ class SealedFolders:
             DamagedError: One is missing, can't be read or isn't what the manifest says.
         """
         manifest = self.manifest(name)
-        sources = {self._source(name, manifest, file): file for file in manifest.files}
-        for info in self._fs.get_file_info(list(sources)) if sources else ():
-            expected = manifest.files[sources[info.path]]
+        for file, expected in manifest.files.items():
+            source = self._source(name, manifest, file)
+            info = self._fs.get_file_info(source)
             if info.type == pafs.FileType.NotFound:
-                raise DamagedError(f"{info.path} must exist, its manifest lists it")
-            if not info.is_file:
-                raise DamagedError(f"{info.path} must be a file, it is something else")
-            _check(info.path, expected, info.size, expected.sha256)
+                raise DamagedError(f"{source} must exist, its manifest lists it")
+            digest = expected.sha256
             if self._local:
-                try:
-                    found = _record(Path(info.path))
-                except OSError as error:
-                    raise DamagedError(f"{info.path} must be readable: {error.strerror}") from error
-                _check(info.path, expected, found.bytes, found.sha256)
+                with self._open(source, expected.bytes) as stream:
+                    digest = hashlib.file_digest(stream, "sha256").hexdigest()
+            _check(source, expected, info.size, digest)
 
     def files(self, name: str) -> list[str]:
         """Where its files are, its manifest first.

@@ -13,6 +13,7 @@ from music_rllib.sweep.frame import BAD_INPUT
 
 __all__ = ["in_time"]
 
+STDERR = 2
 SLACK = 5.0
 """Seconds after which the message is left out, as code that holds Python's lock leaves no room."""
 
@@ -30,14 +31,14 @@ def in_time(seconds: float | None, rule: str) -> Iterator[None]:
         return
 
     def end() -> None:
-        print(f"error: {rule}; it hangs at:", file=sys.__stderr__, flush=True)
-        faulthandler.dump_traceback(sys.__stderr__, all_threads=True)
+        print(f"error: {rule}; it hangs at:", file=sys.stderr, flush=True)
+        faulthandler.dump_traceback(STDERR, all_threads=True)
         end_process(BAD_INPUT)
 
     timer = threading.Timer(seconds, end)
     timer.daemon = True
     timer.start()
-    faulthandler.dump_traceback_later(seconds + SLACK, exit=True, file=sys.__stderr__)
+    faulthandler.dump_traceback_later(seconds + SLACK, exit=True, file=STDERR)
     try:
         yield
     finally:
