@@ -26,21 +26,22 @@ from music_rllib.experiment.config import load_sweep
 from music_rllib.experiment.plan import make_plan
 from music_rllib.reports.archive import is_archive, read_archive
 from music_rllib.reports.figures import files
-from music_rllib.reports.gallery import Drawing, drawing_of_stages, slug, stage_drawings
+from music_rllib.reports.gallery import Drawing, drawings_of_stages, slug, stage_drawings
 from music_rllib.reports.merge import of_plan
 from music_rllib.reports.searches import search_in_words, search_tables
 from music_rllib.results import statistics as st
-from music_rllib.results.analysis import Final, StageAnalysis, analyse
+from music_rllib.results.analysis import StageAnalysis, analyse
+from music_rllib.results.comparison import Final, each_seed, verdict
+from music_rllib.results.comparison import number as in_short
 from music_rllib.results.conditions import Condition, Stage, find_stages
 from music_rllib.results.data import Sweep
-from music_rllib.results.races import races
 from music_rllib.results.time_to_threshold import (
-    Waits,
     first_passage,
     median_wait,
     median_wait_interval,
+    races,
+    waits_of,
 )
-from music_rllib.results.verdict import verdict
 from music_rllib.tracking import names
 
 FOLDER = Path(__file__).parent
@@ -48,8 +49,6 @@ PAGE, TEMPLATE = FOLDER / "results.md", FOLDER / "results" / "page.md"
 DATA, FIGURES = FOLDER / "results" / "data", FOLDER / "results" / "figures"
 CONFIGS = FOLDER.parent / "tune_configs"
 THRESHOLD = 0.9
-DIFFERENCE = 0.1
-"""In success rate, which a reader would want to see: how many seeds would likely show it?"""
 NOTICE = (
     "<!-- Written by docs/generate_results.py from docs/results/page.md and docs/results/data. -->"
 )
@@ -171,49 +170,48 @@ def provenance(sweep: Sweep) -> str:
 
 def success(sweep: Sweep, figures: dict[str, bytes], stages: Sequence[str] = ()) -> Iterator[str]:
     """Per stage: final success and steps to the threshold, what may be said, and the curves."""
-    rng = np.random.default_rng(0)
-    for analysis in analyse(sweep, rng):
+    for analysis in analyse(sweep):
         if stages and analysis.stage.name not in stages:
             continue
-        yield from success_table(sweep, analysis, rng)
+        yield from success_table(sweep, analysis)
         yield ""
         for scope in analysis.scopes:
-            yield " ".join(verdict(scope, DIFFERENCE))
+            yield " ".join(verdict(scope))
             yield ""
-        yield from curves(sweep, analysis, rng, figures)
+        yield from curves(sweep, analysis, figures)
 
 
-def success_table(sweep: Sweep, analysis: StageAnalysis, rng: np.random.Generator) -> Iterator[str]:
+def success_table(sweep: Sweep, analysis: StageAnalysis) -> Iterator[str]:
     """One row per task and condition."""
     yield _row("task", f"{analysis.stage.variant}", *_OUTCOME)
     yield _rule(2 + len(_OUTCOME))
     for task in analysis.stage.tasks:
-        for condition, cells in outcomes(sweep, analysis, task, rng):
+        for condition, cells in outcomes(sweep, analysis, task):
             yield _row(task, condition.label, *cells)
 
 
 def stages_table(sweep: Sweep, *stages: str) -> Iterator[str]:
     """One row per task, stage and condition: stages side by side."""
-    rng = np.random.default_rng(0)
     yield _row("task", "stage", "condition", *_OUTCOME)
     yield _rule(3 + len(_OUTCOME))
-    for analysis in analyse(sweep, rng):
+    for analysis in analyse(sweep):
         if not stages or analysis.stage.name in stages:
             for task in analysis.stage.tasks:
-                for condition, cells in outcomes(sweep, analysis, task, rng):
+                for condition, cells in outcomes(sweep, analysis, task):
                     yield _row(task, analysis.stage.name, condition.label, *cells)
 
 
 _OUTCOME = (
     "finished",
-    "success, last evaluation: IQM [95 %]",
+    "success, last evaluation: mean [95 %]",
+    "each seed, %",
     f"steps to {100 * THRESHOLD:.0f} %: median [95 %]",
-    "got there",
+    "each run",
 )
 
 
 def outcomes(
-    sweep: Sweep, analysis: StageAnalysis, task: str, rng: np.random.Generator
+    sweep: Sweep, analysis: StageAnalysis, task: str
 ) -> Iterator[tuple[Condition, tuple[str, ...]]]:
     """Each condition with a run of the task, and what `_OUTCOME` names."""
     (scope,) = [scope for scope in analysis.scopes if scope.name == task]
@@ -226,36 +224,31 @@ def outcomes(
                 condition,
                 (
                     f"{done} of {len(runs)}",
-                    _interval(finals.get(condition)),
-                    *waits(sweep, runs, rng),
+                    *_interval(finals.get(condition)),
+                    *waits(sweep, task, runs),
                 ),
             )
 
 
-def waits(sweep: Sweep, runs: Sequence[int], rng: np.random.Generator) -> tuple[str, str]:
-    """Steps to the threshold, censored where it was not reached, and how many reached it."""
-    found = [sweep.series(i, names.EVAL_SUCCESS) for i in runs]
-    passages = [first_passage(steps.astype(float), v, THRESHOLD) for steps, v in found]
-    there = [passage for passage in passages if passage]
-    if not there:
+def waits(sweep: Sweep, task: str, runs: Sequence[int]) -> tuple[str, str]:
+    """Median of the steps to the threshold, censored where it was not reached, and each run's."""
+    told = waits_of(sweep, task, runs, THRESHOLD)
+    if told is None:
         return "", ""
-    told = Waits(
-        steps=np.array([steps for steps, _ in there]),
-        reached=np.array([reached for _, reached in there]),
+    each = ", ".join(
+        f"{'' if there else '> '}{steps:,.0f}"
+        for steps, there in sorted(zip(told.steps, told.reached, strict=True))
     )
-    low, high = median_wait_interval(told, rng)
+    if not told.reached.any():
+        return "not reached", each
+    low, high = median_wait_interval(told)
     spread = "" if np.isnan(low) else f" [{_steps_text(low)}, {_steps_text(high)}]"
-    return (
-        f"{_steps_text(median_wait(told))}{spread}",
-        f"{int(told.reached.sum())} of {len(there)}",
-    )
+    return f"{_steps_text(median_wait(told))}{spread}", each
 
 
-def curves(
-    sweep: Sweep, analysis: StageAnalysis, rng: np.random.Generator, figures: dict[str, bytes]
-) -> Iterator[str]:
+def curves(sweep: Sweep, analysis: StageAnalysis, figures: dict[str, bytes]) -> Iterator[str]:
     """The figure of success rates."""
-    for drawing in stage_drawings(sweep, analysis, rng):
+    for drawing in stage_drawings(sweep, analysis):
         if drawing.title == "Success rate":
             yield from figure(sweep, drawing, figures)
             yield ""
@@ -263,9 +256,8 @@ def curves(
 
 def stage_curves(sweep: Sweep, figures: dict[str, bytes], stages: Sequence[str]) -> Iterator[str]:
     """The figure of success rates of several stages."""
-    drawing = drawing_of_stages(sweep, _some(sweep, stages), np.random.default_rng(0))
-    assert drawing is not None, f"{sweep.name} must have two stages of {stages}"
-    yield from figure(sweep, drawing, figures)
+    for drawing in drawings_of_stages(sweep, _some(sweep, stages)):
+        yield from figure(sweep, drawing, figures)
 
 
 def figure(sweep: Sweep, drawing: Drawing, figures: dict[str, bytes]) -> Iterator[str]:
@@ -337,19 +329,18 @@ def _some(sweep: Sweep, stages: Sequence[str]) -> list[Stage]:
 
 def _races(sweep: Sweep, questions: Callable[[str], Iterable[Groups]]) -> Iterator[str]:
     """On each task, of each question all pairs of its groups, corrected for their number."""
-    rng = np.random.default_rng(0)
     yield _row("task", "sooner at", "than", "runs", "probability [95 %]", "p", "decided")
     yield _rule(7)
     for task in dict.fromkeys(run.task for run in sweep.runs):
         for groups in questions(task):
-            for race in races(sweep, task, groups, THRESHOLD, rng):
+            for race in races(sweep, task, groups, THRESHOLD):
                 yield _row(
                     race.task,
                     race.first,
                     race.second,
                     " / ".join(map(str, race.runs)),
-                    _spread(race.estimate),
-                    f"{race.p_value:.2g}",
+                    _spread(race.estimate) if race.reached else "not reached by either",
+                    f"{race.p_value:.2g}" if race.reached else "",
                     "yes" if race.decided else "no",
                 )
 
@@ -358,21 +349,23 @@ def _races(sweep: Sweep, questions: Callable[[str], Iterable[Groups]]) -> Iterat
 
 
 def metric_table(sweep: Sweep, *metrics: str) -> Iterator[str]:
-    """Last values of metrics, run by run, and their interquartile mean with its interval."""
-    rng = np.random.default_rng(0)
-    for position, analysis in enumerate(analyse(sweep, rng)):
+    """Last values of metrics, run by run, and their mean with its interval."""
+    for position, analysis in enumerate(analyse(sweep)):
         if position:
             yield ""
         seeds = analysis.stage.seeds
-        yield _row("task", "condition", "metric", *(f"seed {seed}" for seed in seeds), "IQM [95 %]")
+        yield _row(
+            "task", "condition", "metric", *(f"seed {seed}" for seed in seeds), "mean [95 %]"
+        )
         yield _rule(len(seeds) + 4)
         for task in analysis.stage.tasks:
             for condition in analysis.stage.conditions:
                 runs = {sweep.runs[i].seed: i for i in condition.runs if sweep.runs[i].task == task}
                 for metric in metrics:
                     last = [last_value(sweep, runs.get(seed), metric) for seed in seeds]
-                    told = st.estimate(np.array(last)[:, np.newaxis], rng)
-                    numbers = [_number(value) if np.isfinite(value) else "" for value in last]
+                    episodes = sweep.episodes(runs.values()) if metric in names.EVAL_RATES else None
+                    told = st.estimate(np.array(last)[:, np.newaxis], episodes)
+                    numbers = [in_short(value) if np.isfinite(value) else "" for value in last]
                     yield _row(task, condition.label, f"`{metric}`", *numbers, _spread(told))
 
 
@@ -380,8 +373,8 @@ def last_value(sweep: Sweep, run: int | None, metric: str) -> float:
     """Of a finished run; NaN otherwise."""
     if run is None or sweep.runs[run].status != "FINISHED":
         return float("nan")
-    _, values = sweep.series(run, metric)
-    return float(values[-1]) if len(values) else float("nan")
+    value = sweep.final(run, metric)
+    return float("nan") if value is None else value
 
 
 # -- searches ------------------------------------------------------------------------------------
@@ -389,19 +382,18 @@ def last_value(sweep: Sweep, run: int | None, metric: str) -> float:
 
 def search_text(sweep: Sweep, figures: dict[str, bytes]) -> Iterator[str]:
     """How it searched, its ranking on fresh seeds, importances, trials, and what may be said."""
-    rng = np.random.default_rng(0)
-    analyses = {found.stage.name: found for found in analyse(sweep, rng)}
+    analyses = {found.stage.name: found for found in analyse(sweep)}
     for search in sweep.searches:
         yield search_in_words(search)
         for scope in analyses[search["stage"]].scopes:
-            yield f"\n{' '.join(verdict(scope, DIFFERENCE))}"
+            yield f"\n{' '.join(verdict(scope))}"
         for found in search_tables(search):
             yield f"\n**{found.title}.** {found.note}\n"
             yield _row(*found.header)
             yield _rule(len(found.header))
             yield from (_row(*row) for row in found.rows)
         yield ""
-        for drawing in stage_drawings(sweep, analyses[search["stage"]], rng):
+        for drawing in stage_drawings(sweep, analyses[search["stage"]]):
             if drawing.title == "Importance of settings":
                 yield from figure(sweep, drawing, figures)
                 yield ""
@@ -419,26 +411,21 @@ def _rule(columns: int) -> str:
     return "|" + "---|" * columns
 
 
-def _interval(final: Final | None) -> str:
+def _interval(final: Final[Condition] | None) -> tuple[str, str]:
     if final is None:
-        return ""
+        return "", ""
     found = final.estimate
-    value = _percent(float(found.value))
+    value, each = _percent(final.value), ", ".join(f"{100 * x:.0f}" for x in each_seed(final))
     if not found.has_interval:
-        return f"{value} (one seed)"
-    return f"{value} [{_percent(float(found.lower))}, {_percent(float(found.upper))}]"
+        return f"{value} (one seed)", each
+    return f"{value} [{_percent(float(found.lower))}, {_percent(float(found.upper))}]", each
 
 
 def _spread(found: st.Estimate) -> str:
     if not np.isfinite(found.value):
         return ""
-    value, lower, upper = (_number(float(x)) for x in (found.value, found.lower, found.upper))
+    value, lower, upper = (in_short(float(x)) for x in (found.value, found.lower, found.upper))
     return f"{value} [{lower}, {upper}]" if found.has_interval else value
-
-
-def _number(value: float) -> str:
-    """Returns of hundreds need no fractions."""
-    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.2f}"
 
 
 def _percent(share: float) -> str:

@@ -32,6 +32,8 @@ from pydantic import (
     model_validator,
 )
 
+from music_rllib.tracking import names
+
 __all__ = [
     "BUILT_IN_TASKS",
     "Indices",
@@ -114,6 +116,11 @@ class Task(BaseModel):
     def _split_is_sound(self) -> Self:
         check_split(self.agent_indices, self.surrounding_indices)
         return self
+
+    @property
+    def primary_metric(self) -> str:
+        """What its runs are judged by: the success rate, or the return where it has no success."""
+        return names.primary_metric(self.success_key)
 
     @property
     def has_split(self) -> bool:

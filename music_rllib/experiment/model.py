@@ -13,6 +13,7 @@ from music_rllib.envs.registry import Task
 from music_rllib.experiment.handoff import HandoffManifest
 from music_rllib.experiment.settings import RunSettings, Variant
 from music_rllib.experiment.space import SearchSettings
+from music_rllib.tracking import names
 
 __all__ = [
     "RESERVED_NAMES",
@@ -196,6 +197,17 @@ class Stage:
     search: SearchSettings | None = None
     resolve: Resolve = field(compare=False, repr=False)
     """Makes a point of dotted settings laid over this stage's; raises ConfigError."""
+
+    @property
+    def primary_metric(self) -> str:
+        """What its runs are judged by: the return, unless each of its tasks has a success."""
+        found = {task.primary_metric for task in self.tasks}
+        return names.EVAL_SUCCESS if found == {names.EVAL_SUCCESS} else names.EVAL_RETURN
+
+    @property
+    def evaluation_episodes(self) -> int:
+        """Of an evaluation, in the run that has the fewest."""
+        return min(run.evaluation.episodes for point in self.points for run in point.runs.values())
 
 
 @dataclass(frozen=True, kw_only=True)

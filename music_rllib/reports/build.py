@@ -5,24 +5,23 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-import numpy as np
-
 from music_rllib.envs.registry import Task
 from music_rllib.reports.figures import METRICS
 from music_rllib.reports.films import make_films
-from music_rllib.reports.gallery import Drawing, drawing_of_stages, stage_drawings
+from music_rllib.reports.gallery import Drawing, drawings_of_stages, stage_drawings
 from music_rllib.reports.missing import missing
 from music_rllib.reports.page import Report, render
 from music_rllib.reports.pictures import draw_all
 from music_rllib.reports.tables import (
     Table,
+    finals_table,
     improvement_table,
     races_table,
     runs_table,
-    success_table,
     waits_table,
 )
 from music_rllib.results.analysis import analyse, analyse_stages
+from music_rllib.results.comparison import GAP
 from music_rllib.results.data import ReportError, Sweep
 from music_rllib.tracking import names
 from music_rllib.tracking.store import TrackingStore
@@ -30,18 +29,17 @@ from music_rllib.tracking.store import TrackingStore
 __all__ = ["PAGE", "WANTED", "build_report", "write_report"]
 
 PAGE = "report.html"
-WANTED = (*(metric.name for metric in METRICS), names.ENV_STEPS)
+WANTED = (*(metric.name for metric in METRICS), names.EVAL_EPISODES, names.ENV_STEPS)
 """Metrics that a report reads."""
 _CURVE_COLUMNS = (
-    *("stage", "task", "condition", "metric", "env_steps", "runs", "iqm", "lower", "upper"),
+    *("stage", "task", "condition", "metric", "env_steps", "runs", "mean", "lower", "upper"),
 )
 
 
 def build_report(
     sweep: Sweep,
-    rng: np.random.Generator,
     *,
-    difference: float,
+    difference: float = GAP,
     undelivered: int = 0,
     damaged: str | None = None,
     command: str = "",
@@ -53,7 +51,6 @@ def build_report(
 
     Args:
         sweep: with the metrics of `WANTED`.
-        rng: for the bootstraps and the permutations.
         difference: in success rate, which the reader would want to be able to see.
         undelivered: runs of which MLflow does not have everything yet.
         damaged: which finished runs are damaged in the storage, in words.
@@ -62,16 +59,14 @@ def build_report(
         video_seed: of the filmed episodes; None: no videos.
         environments: of tasks that may be made for videos, beside the known ones.
     """
-    analyses = analyse(sweep, rng)
-    drawings = [d for analysis in analyses for d in stage_drawings(sweep, analysis, rng)]
+    analyses = analyse(sweep)
+    drawings = [d for analysis in analyses for d in stage_drawings(sweep, analysis)]
     stages = [analysis.stage for analysis in analyses]
-    together = drawing_of_stages(sweep, stages, rng)
-    if together is not None:
-        drawings.append(together)
+    drawings += drawings_of_stages(sweep, stages)
     return Report(
         sweep=sweep,
         analyses=analyses,
-        together=analyse_stages(sweep, stages, rng),
+        together=analyse_stages(sweep, stages),
         drawings=drawings,
         pictures=draw_all(drawings),
         missing=missing(sweep, analyses, undelivered) + ([damaged] if damaged else []),
@@ -117,7 +112,7 @@ def write_report(report: Report, folder: Path) -> Path:
 
 def _tables(report: Report) -> Iterable[Table]:
     pairs = [*report.analyses, *([report.together] if report.together else [])]
-    yield success_table(report.analyses)
+    yield finals_table(report.analyses)
     yield waits_table(report.analyses)
     yield races_table(pairs)
     yield improvement_table(pairs)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from music_rllib.experiment.problems import ConfigError
+from music_rllib.results.comparison import GAP
 from music_rllib.results.data import ReportError
 from music_rllib.tracking import names
 from music_rllib.tracking.errors import TrackingError
@@ -83,8 +84,8 @@ def report(
             help="Difference in success rate that you would want to see: the report says how many "
             "seeds would likely show it.",
         ),
-    ] = 0.1,
-    seed: Annotated[int, typer.Option(min=0, help="Of the bootstrap and the permutations.")] = 0,
+    ] = GAP,
+    seed: Annotated[int, typer.Option(min=0, help="Of the filmed episodes.")] = 0,
     videos: Annotated[
         bool, typer.Option(help="Film an episode for each q, where this machine can draw.")
     ] = True,
@@ -170,17 +171,14 @@ def _report(
     env: Path | None,
     attach: bool,
 ) -> None:
-    import numpy as np
-
     from music_rllib.experiment.config import declared_tasks
     from music_rllib.reports.build import WANTED, build_report, write_report
     from music_rllib.reports.locate import find_sweep
-    from music_rllib.results.verdict import verdict
+    from music_rllib.results.comparison import verdict
 
     found = find_sweep(place, storage=storage, tracking_uri=tracking_uri, metrics=WANTED)
     made = build_report(
         found.sweep,
-        np.random.default_rng(seed),
         difference=difference,
         undelivered=found.undelivered,
         damaged=found.damaged,

@@ -24,7 +24,8 @@ from matplotlib.ticker import EngFormatter
 
 from music_rllib.reports.palette import Style, style_of
 from music_rllib.results import statistics as st
-from music_rllib.results.analysis import Curve, Final, Scope
+from music_rllib.results.analysis import Curve
+from music_rllib.results.comparison import SHOW_SEEDS_BELOW, Final, Scope
 from music_rllib.results.conditions import Condition
 from music_rllib.results.statistics import Array, Estimate
 from music_rllib.tracking import names
@@ -73,19 +74,21 @@ class Metric:
     target: float | None = None
 
 
+RATE_LIMITS = (-0.03, 1.03)
 METRICS = (
     Metric(
         name=names.EVAL_SUCCESS,
         title="Success rate",
         axis="success rate",
-        limits=(-0.03, 1.03),
+        limits=RATE_LIMITS,
         target=TARGET,
     ),
+    Metric(name=names.EVAL_RETURN, title="Return", axis="return of an episode"),
     Metric(
         name=names.EVAL_SUCCESS_ANY,
         title="Success at any step",
         axis="success at any step",
-        limits=(-0.03, 1.03),
+        limits=RATE_LIMITS,
     ),
     Metric(name=names.MI_BOUND, title="Mutual-information bound", axis="MI bound (nats)"),
     Metric(name=names.MI_REWARD, title="Mutual-information reward", axis="MI reward per step"),
@@ -133,13 +136,10 @@ def curve_panel(
     return Panel(title=task, draw=draw, **({"top": _TOP_WITH_EPOCHS} if epochs else {}))
 
 
-def profile_panel(scope: Scope, siblings: tuple[Condition, ...], rng: np.random.Generator) -> Panel:
+def profile_panel(scope: Scope[Condition], siblings: tuple[Condition, ...]) -> Panel:
     """Share of finished runs above each success rate."""
     thresholds = np.linspace(0.0, 1.0, 41)
-    profiles = [
-        (final, st.performance_profile(final.scores, thresholds, rng, resamples=1000))
-        for final in scope.finals
-    ]
+    profiles = [(final, st.performance_profile(final.scores, thresholds)) for final in scope.finals]
 
     def draw(axes: Axes) -> None:
         for final, profile in profiles:
@@ -156,16 +156,21 @@ def profile_panel(scope: Scope, siblings: tuple[Condition, ...], rng: np.random.
     return Panel(title=scope.name, draw=draw)
 
 
-def finals_panel(scope: Scope, siblings: tuple[Condition, ...]) -> Panel:
-    """Final success rates with their intervals, and every run as a point."""
+def finals_panel(scope: Scope[Condition], siblings: tuple[Condition, ...]) -> Panel:
+    """How conditions ended, with their intervals, and every run as a point."""
+    is_rate = scope.metric in names.EVAL_RATES
 
     def draw(axes: Axes) -> None:
+        scores = np.concatenate([final.scores.ravel() for final in scope.finals])
+        # Intervals of two or three returns may be many times as wide as what was seen.
+        room = 0.5 * (np.ptp(scores) or 1.0)
+        limits = RATE_LIMITS if is_rate else (scores.min() - room, scores.max() + room)
         for row, final in enumerate(scope.finals):
-            _draw_final(axes, row, final, siblings)
+            _draw_final(axes, row, final, siblings, limits[0])
         axes.set_yticks([])
         axes.set_ylim(len(scope.finals) - 0.5, -0.7)
-        axes.set_xlim(-0.03, 1.03)
-        axes.set_xlabel("final success rate")
+        axes.set_xlim(*limits)
+        axes.set_xlabel("final success rate" if is_rate else f"final {names.word_of(scope.metric)}")
 
     return Panel(title=scope.name, draw=draw)
 
@@ -261,7 +266,7 @@ def _drawn(panels: Sequence[Panel], legend: Legend, *, opaque: bool) -> Figure:
 
 
 def _draw_curve(axes: Axes, curve: Curve, style: Style) -> None:
-    """Thick where every run counts, thin from where the first one ended."""
+    """Thick where every run counts, thin from where the first one ended; few seeds each apart."""
     colour, marker, line = style
     value = curve.estimate.value
     every = max(1, len(curve.steps) // 8)
@@ -277,7 +282,12 @@ def _draw_curve(axes: Axes, curve: Curve, style: Style) -> None:
         markevery=every,
         markersize=5,
     )
+    if 1 < len(curve.values) < SHOW_SEEDS_BELOW:
+        axes.plot(curve.steps, curve.values.T, color=colour, linewidth=0.6, alpha=0.55)
+    limits = axes.get_ylim()  # of what was seen: a band of two seeds may be many times as wide
     _band(axes, curve.steps, curve.estimate, colour)
+    axes.set_ylim(*limits)
+    axes.set_autoscaley_on(True)
 
 
 def _band(
@@ -292,7 +302,9 @@ def _band(
     )
 
 
-def _draw_final(axes: Axes, row: int, final: Final, siblings: tuple[Condition, ...]) -> None:
+def _draw_final(
+    axes: Axes, row: int, final: Final[Condition], siblings: tuple[Condition, ...], left: float
+) -> None:
     colour, marker, _ = style_of(final.condition, siblings)
     scores = final.scores.ravel()
     axes.plot(scores, np.full(len(scores), row + 0.22), "|", color=colour, alpha=0.6, markersize=7)
@@ -302,7 +314,7 @@ def _draw_final(axes: Axes, row: int, final: Final, siblings: tuple[Condition, .
             [estimate.lower, estimate.upper], [row, row], color=colour, linewidth=5, alpha=0.35
         )
     axes.plot(estimate.value, row, marker, color=colour, markersize=7)
-    axes.text(0.0, row - 0.2, final.condition.label, va="bottom", fontsize=9)
+    axes.text(left, row - 0.2, f" {final.condition.label}", va="bottom", fontsize=9)
 
 
 def _add_epochs(axes: Axes) -> None:

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 from music_rllib.envs.registry import Task
 from music_rllib.reports.gallery import slug
 from music_rllib.reports.query import download_policy
-from music_rllib.reports.tables import last_success
 from music_rllib.results.analysis import StageAnalysis
 from music_rllib.results.data import ReportError, Sweep
 from music_rllib.tracking.store import TrackingStore
@@ -74,7 +73,7 @@ def make_films(
         return Films(why_not="an exported sweep has no policies; report on the sweep in MLflow")
     wanted = list(_wanted(sweep, analyses))
     if not wanted:
-        return Films(why_not="no run with a success rate has finished")
+        return Films(why_not="no run that was evaluated has finished")
     films: list[Film] = []
     reasons: list[str] = []
     for q, task, run in wanted:
@@ -104,7 +103,7 @@ def _wanted(sweep: Sweep, analyses: Sequence[StageAnalysis]) -> Iterator[tuple[s
                 for run in condition.runs
                 if sweep.runs[run].task == task
                 and sweep.runs[run].status == "FINISHED"
-                and (rate := last_success(sweep, run)) is not None
+                and (rate := sweep.final(run, sweep.primary_metric(task))) is not None
             ]
             if rated:
                 yield q, task, sorted(rated)[len(rated) // 2][1]

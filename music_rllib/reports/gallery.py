@@ -7,8 +7,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
-import numpy as np
-
 from music_rllib.reports.figures import (
     METRICS,
     Legend,
@@ -26,27 +24,30 @@ from music_rllib.reports.influence import (
     sensitivity_panels,
 )
 from music_rllib.reports.palette import BARS, Style, style_of, styles_by_stage, styles_of
-from music_rllib.reports.parallel import forked_map
-from music_rllib.results.analysis import Curve, Scope, StageAnalysis, curve
+from music_rllib.results.analysis import Curve, StageAnalysis, curve
+from music_rllib.results.comparison import SHOW_SEEDS_BELOW, Scope
 from music_rllib.results.conditions import Condition, Stage, side_by_side
 from music_rllib.results.data import Sweep
+from music_rllib.tracking import names
 
 __all__ = [
     "CURVES",
     "FINALS",
     "INFLUENCE",
+    "PRIMARY",
     "PROFILES",
     "Drawing",
-    "drawing_of_stages",
+    "drawings_of_stages",
     "slug",
     "stage_drawings",
 ]
 
-FINALS, PROFILES = "Final success rate", "Performance profile"
+FINALS = {names.EVAL_SUCCESS: "Final success rate", names.EVAL_RETURN: "Final return"}
+PROFILES = "Performance profile"
 INFLUENCE = ("Sensitivity", "Importance of settings", "Parallel coordinates")
-FEW_CURVES = 60
-"""Curves for which more processes would cost more than they save."""
 CURVES = tuple(metric.title for metric in METRICS)
+PRIMARY = CURVES[:2]
+"""Of what tasks are judged by: success, or the return."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +60,7 @@ class Drawing:
     panels: tuple[Panel, ...]
     legend: Legend
     values: tuple[tuple[object, ...], ...] = ()
-    """(stage, task, condition, metric, env_steps, runs, iqm, lower, upper) rows."""
+    """(stage, task, condition, metric, env_steps, runs, mean, lower, upper) rows."""
 
     @property
     def name(self) -> str:
@@ -72,20 +73,18 @@ def slug(text: str) -> str:
     return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")
 
 
-def stage_drawings(
-    sweep: Sweep, analysis: StageAnalysis, rng: np.random.Generator
-) -> Iterator[Drawing]:
+def stage_drawings(sweep: Sweep, analysis: StageAnalysis) -> Iterator[Drawing]:
     """The figures for which there is something to draw or to compare."""
     stage = _shown(sweep, analysis.stage)
-    found = _all_curves(sweep, stage, rng)
+    found = _all_curves(sweep, stage)
     for metric in METRICS:
         drawing = _curves(stage, metric, found, styles_of(stage.conditions))
         if drawing is not None:
             yield drawing
     of_shown = [replace(s, finals=s.compared) if s.compared else s for s in analysis.scopes]
     scopes = [scope for scope in of_shown if len(scope.finals) > 1]
-    if scopes:
-        yield from _finals(stage, scopes, rng)
+    for metric_name, title in FINALS.items():
+        yield from _finals(stage, title, [one for one in scopes if one.metric == metric_name])
     if any(len(scope.finals) > 1 for scope in analysis.scopes):
         yield from _influence(sweep, analysis)
 
@@ -102,40 +101,43 @@ def _shown(sweep: Sweep, stage: Stage) -> Stage:
     )
 
 
-def _finals(stage: Stage, scopes: Sequence[Scope], rng: np.random.Generator) -> Iterator[Drawing]:
+def _finals(stage: Stage, title: str, scopes: Sequence[Scope[Condition]]) -> Iterator[Drawing]:
+    if not scopes:
+        return
     legend = _legend(stage)
     yield Drawing(
         stage=stage.name,
-        title=FINALS,
-        caption="Large marks: interquartile mean; bars: 95 % intervals; small ticks: single runs.",
+        title=title,
+        caption="Large marks: mean; bars: 95 % intervals; small ticks: single runs.",
         panels=tuple(finals_panel(scope, stage.conditions) for scope in scopes),
         legend=legend,
     )
+    if scopes[0].metric not in names.EVAL_RATES:
+        return
     yield Drawing(
         stage=stage.name,
         title=PROFILES,
         caption="Share of finished runs that end above each success rate, with 95 % bands. A line "
         "that is above another everywhere is better at every standard.",
-        panels=tuple(profile_panel(scope, stage.conditions, rng) for scope in scopes),
+        panels=tuple(profile_panel(scope, stage.conditions) for scope in scopes),
         legend=legend,
     )
 
 
-def drawing_of_stages(
-    sweep: Sweep, stages: Sequence[Stage], rng: np.random.Generator
-) -> Drawing | None:
-    """Success rates of all stages that train for the task in one figure; None for a single one."""
+def drawings_of_stages(sweep: Sweep, stages: Sequence[Stage]) -> Iterator[Drawing]:
+    """What all stages that train for the task are judged by, together; none for a single one."""
     together = side_by_side(stages)
     if together is None:
-        return None
-    found = _all_curves(sweep, together, rng, METRICS[:1])
+        return
+    metrics = METRICS[: len(PRIMARY)]
+    found = _all_curves(sweep, together, metrics)
     styles = styles_by_stage(together.conditions)
-    drawing = _curves(together, METRICS[0], found, styles)
-    if drawing is None:
-        return None
-    legend = [(_named_by_stage(condition), style) for condition, style in styles.items()]
-    # Each stage's own drawing has the values.
-    return replace(drawing, legend=legend, values=())
+    for metric in metrics:
+        drawing = _curves(together, metric, found, styles)
+        if drawing is not None:
+            legend = [(_named_by_stage(condition), style) for condition, style in styles.items()]
+            # Each stage's own drawing has the values.
+            yield replace(drawing, legend=legend, values=())
 
 
 def _named_by_stage(condition: Condition) -> str:
@@ -145,20 +147,14 @@ def _named_by_stage(condition: Condition) -> str:
 
 
 def _all_curves(
-    sweep: Sweep, stage: Stage, rng: np.random.Generator, metrics: Sequence[Metric] = METRICS
+    sweep: Sweep, stage: Stage, metrics: Sequence[Metric] = METRICS
 ) -> dict[tuple[str, str], list[Curve]]:
-    """By metric and task."""
-    jobs = list(product(metrics, stage.tasks, stage.conditions))
-    # Each has its own randomness, so that it is the same in whatever process and order.
-    seeded = list(zip(jobs, rng.spawn(len(jobs)), strict=True))
-
-    def make(job: tuple[tuple[Metric, str, Condition], np.random.Generator]) -> Curve | None:
-        (metric, task, condition), own = job
-        return curve(sweep, condition, task, metric.name, own)
-
+    """By metric and task; the return of those tasks only that are judged by it."""
     curves: dict[tuple[str, str], list[Curve]] = {}
-    made = forked_map(make, seeded, few=FEW_CURVES)
-    for (metric, task, _), one in zip(jobs, made, strict=True):
+    for metric, task, condition in product(metrics, stage.tasks, stage.conditions):
+        if metric.name == names.EVAL_RETURN != sweep.primary_metric(task):
+            continue
+        one = curve(sweep, condition, task, metric.name)
         if one is not None:
             curves.setdefault((metric.name, task), []).append(one)
     return curves
@@ -202,7 +198,9 @@ def _caption(stage: Stage, metric: Metric) -> str:
     if seeds == 1:
         band = "A single seed: each line is one run, and there is no band."
     else:
-        band = f"Interquartile mean over up to {seeds} seeds with its 95 % bootstrap band."
+        band = f"Mean over up to {seeds} seeds with its 95 % band."
+        if seeds < SHOW_SEEDS_BELOW:
+            band += " The thinnest lines: single seeds."
     thin = "A line is thin where some of its runs had ended."
     target = "" if metric.target is None else f" Dotted: {metric.target * 100:.0f} %."
     return f"{band} {thin}{target}"
@@ -238,7 +236,7 @@ def _influence(sweep: Sweep, analysis: StageAnalysis) -> Iterator[Drawing]:
 
 
 _SENSITIVITY = (
-    "Interquartile mean of the final success rate over the entropy coefficient α and the weight of "
+    "Mean of what the runs ended at over the entropy coefficient α and the weight of "
     "the MI reward, linear between the settings that were tried (marks); nothing outside of them "
     "is known."
 )
@@ -246,6 +244,4 @@ _IMPORTANCE = (
     "Functional ANOVA (Hutter et al. 2014, as in Optuna) over the finished runs. A setting matters "
     "only as far as it explains more than the seed does."
 )
-_PARALLEL = (
-    "A line per condition through its settings to its final success rate; the fainter, the lower."
-)
+_PARALLEL = "A line per condition through its settings to what it ended at; the fainter, the lower."

@@ -1,4 +1,4 @@
-"""Which settings matter: what a stage varies, against the success rates at its end.
+"""Which settings matter: what a stage varies, against what its runs ended at.
 
 A *setting* is something numeric or categorical that varies between a stage's runs, q among them.
 """
@@ -12,9 +12,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import LogFormatter
 
-from music_rllib.reports.figures import Panel
+from music_rllib.reports.figures import RATE_LIMITS, Panel
 from music_rllib.reports.palette import BARS, colour_of, style_of
-from music_rllib.results.analysis import Final, Scope, StageAnalysis
+from music_rllib.results.analysis import StageAnalysis
+from music_rllib.results.comparison import Final, Scope
 from music_rllib.results.conditions import ENTROPIC_INDEX, SEEDS, Condition
 from music_rllib.results.data import Sweep
 from music_rllib.results.statistics import Array
@@ -47,7 +48,7 @@ MOST_PANELS = 12
 
 @dataclass(frozen=True, kw_only=True)
 class Importance:
-    """Share of the variance of final success rates that a setting explains."""
+    """Share of the variance of what runs ended at that a setting explains."""
 
     task: str
     setting: str
@@ -73,7 +74,7 @@ def varied(conditions: Sequence[Condition]) -> list[str]:
 
 
 def sensitivity_panels(analysis: StageAnalysis) -> list[Panel]:
-    """Final success over α and the MI reward's weight: one panel per task and q.
+    """What runs ended at over α and the MI reward's weight: one panel per task and q.
 
     Where both vary it is a contour, where one does a line with its intervals.
     """
@@ -94,8 +95,10 @@ def _position(condition: Condition, wanted: Sequence[str]) -> tuple[float, ...] 
     return None if None in numbers else tuple(n for n in numbers if n is not None)
 
 
-def _contours(scope: Scope, finals: Sequence[Final], wanted: Sequence[str]) -> Iterator[Panel]:
-    by_q: dict[str, list[Final]] = {}
+def _contours(
+    scope: Scope[Condition], finals: Sequence[Final[Condition]], wanted: Sequence[str]
+) -> Iterator[Panel]:
+    by_q: dict[str, list[Final[Condition]]] = {}
     for final in finals:
         by_q.setdefault(final.condition.entropic_index, []).append(final)
     for q, members in by_q.items():
@@ -108,13 +111,23 @@ def _contours(scope: Scope, finals: Sequence[Final], wanted: Sequence[str]) -> I
         if len(where) < FEWEST_POINTS or min(len(set(axis)) for axis in where.T) < 2:
             continue
         values = np.array([np.mean(found) for found in points.values()])
-        yield _contour(f"{scope.name}, q = {q}", where, values)
+        yield _contour(f"{scope.name}, q = {q}", where, values, _range(scope), scope.metric)
 
 
-def _contour(title: str, where: Array, values: Array) -> Panel:
+def _range(scope: Scope[Condition]) -> tuple[float, float]:
+    """Of a rate all that it can be, of a return what was seen."""
+    if scope.metric in names.EVAL_RATES:
+        return 0.0, 1.0
+    values = [final.value for final in scope.finals]
+    return min(values), max(values) if max(values) > min(values) else min(values) + 1.0
+
+
+def _contour(
+    title: str, where: Array, values: Array, ends: tuple[float, float], metric: str
+) -> Panel:
     def draw(axes: Axes) -> None:
         x, y = where.T
-        levels = np.linspace(0.0, 1.0, 11)
+        levels = np.linspace(*ends, 11)
         surface = axes.tricontourf(_scaled(x), _scaled(y), values, levels=levels, cmap="cividis")
         (marks,) = axes.plot(_scaled(x), _scaled(y), "o", color="#ffffff", mec="#1a1a1a", ms=5)
         marks.set(clip_on=False, zorder=5)
@@ -125,8 +138,8 @@ def _contour(title: str, where: Array, values: Array) -> Panel:
         axes.set_xlabel("α (entropy coefficient)")
         axes.set_ylabel("MI reward weight")
         axes.grid(visible=False)
-        bar = axes.figure.colorbar(surface, ax=axes, ticks=[0, 0.25, 0.5, 0.75, 1.0])
-        bar.ax.set_title("success", fontsize=8)
+        bar = axes.figure.colorbar(surface, ax=axes, ticks=np.linspace(*ends, 5))
+        bar.ax.set_title(names.word_of(metric), fontsize=8)
 
     return Panel(title=title, draw=draw)
 
@@ -139,13 +152,16 @@ def _scaled(values: Array, shown: Array | None = None) -> Array:
 
 
 def _lines(
-    scope: Scope, finals: Sequence[Final], name: str, siblings: tuple[Condition, ...]
+    scope: Scope[Condition],
+    finals: Sequence[Final[Condition]],
+    name: str,
+    siblings: tuple[Condition, ...],
 ) -> Panel:
-    by_q: dict[str, list[Final]] = {}
+    by_q: dict[str, list[Final[Condition]]] = {}
     for final in finals:
         by_q.setdefault(final.condition.entropic_index, []).append(final)
 
-    def at(final: Final) -> float:
+    def at(final: Final[Condition]) -> float:
         return float(settings_of(final.condition)[name])
 
     def draw(axes: Axes) -> None:
@@ -164,9 +180,10 @@ def _lines(
             # The scale's own labels are formulas, which nothing is read as.
             axes.xaxis.set_major_formatter(LogFormatter())
             axes.xaxis.set_minor_formatter(LogFormatter())
-        axes.set_ylim(-0.03, 1.03)
+        if scope.metric in names.EVAL_RATES:
+            axes.set_ylim(*RATE_LIMITS)
         axes.set_xlabel(f"{name} (log scale)" if axes.get_xscale() == "log" else name)
-        axes.set_ylabel("final success rate")
+        axes.set_ylabel(f"final {names.word_of(scope.metric)}")
 
     return Panel(title=scope.name, draw=draw)
 
@@ -198,11 +215,10 @@ def _rows(
         values = settings_of(condition)
         for run in condition.runs:
             record = sweep.runs[run]
-            last = sweep.series(run, names.EVAL_SUCCESS)[1][-1:]
-            if record.task == task and record.status == "FINISHED" and np.isfinite(last).all():
+            last = sweep.final(run, sweep.primary_metric(task))
+            if record.task == task and record.status == "FINISHED" and last is not None:
                 chosen = {name: values.get(name, "-") for name in wanted}
-                if len(last):
-                    yield {**chosen, CHANCE: record.seed}, float(last[0])
+                yield {**chosen, CHANCE: record.seed}, last
 
 
 def _fanova(rows: Sequence[tuple[Mapping[str, str], float]]) -> dict[str, float]:
@@ -257,7 +273,7 @@ def importance_panel(task: str, found: Sequence[Importance]) -> Panel:
         axes.set_yticks([])
         axes.set_ylim(len(ordered) - 0.5, -0.8)
         axes.set_xlim(0.0, 1.0)
-        axes.set_xlabel("share of the variance of final success")
+        axes.set_xlabel("share of the variance at the end")
 
     return Panel(title=task, draw=draw)
 
@@ -265,8 +281,8 @@ def importance_panel(task: str, found: Sequence[Importance]) -> Panel:
 # Parallel coordinates ---------------------------------------------------------------------------
 
 
-def parallel_panel(scope: Scope, conditions: Sequence[Condition]) -> Panel | None:
-    """A line per condition through its settings and its final success rate; coloured by q."""
+def parallel_panel(scope: Scope[Condition], conditions: Sequence[Condition]) -> Panel | None:
+    """A line per condition through its settings and what it ended at; coloured by q."""
     wanted = varied(conditions)
     if len(wanted) < 2 or len(scope.finals) < 2:
         return None
@@ -274,9 +290,10 @@ def parallel_panel(scope: Scope, conditions: Sequence[Condition]) -> Panel | Non
         _column([settings_of(f.condition).get(n, "-") for f in scope.finals]) for n in wanted
     ]
     heights = [column for column, _ in columns]
-    heights.append([float(final.estimate.value) for final in scope.finals])
+    low, high = _range(scope)
+    heights.append([(final.value - low) / (high - low) for final in scope.finals])
     ticks = [labels for _, labels in columns]
-    ticks.append([(tick, f"{tick:g}") for tick in (0.0, 0.5, 1.0)])
+    ticks.append([(tick, f"{low + tick * (high - low):.4g}") for tick in (0.0, 0.5, 1.0)])
 
     def draw(axes: Axes) -> None:
         for number, final in enumerate(scope.finals):
@@ -285,14 +302,17 @@ def parallel_panel(scope: Scope, conditions: Sequence[Condition]) -> Panel | Non
                 [column[number] for column in heights],
                 color=colour_of(final.condition.entropic_index),
                 linewidth=1.4,
-                alpha=0.35 + 0.6 * float(final.estimate.value),
+                alpha=0.35 + 0.6 * heights[-1][number],
             )
         for place, labels in enumerate(ticks):
             axes.axvline(place, color=axes.spines["left"].get_edgecolor(), linewidth=0.8)
             side = {"ha": "right", "x": place - 0.04} if place else {"ha": "left", "x": 0.04}
             for height, label in labels:
                 axes.text(side["x"], height, label, ha=side["ha"], va="center", fontsize=8)  # type: ignore[arg-type]
-        axes.set_xticks(range(len(heights)), [*(_short(n) for n in wanted), "final\nsuccess"])
+        axes.set_xticks(
+            range(len(heights)),
+            [*(_short(n) for n in wanted), f"final\n{names.word_of(scope.metric)}"],
+        )
         axes.set_yticks([])
         axes.set_ylim(-0.06, 1.06)
         axes.spines["left"].set_visible(False)

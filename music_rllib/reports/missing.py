@@ -68,8 +68,14 @@ def _missing_runs(sweep: Sweep) -> list[str]:
 
 def _missing_evidence(sweep: Sweep, analyses: Sequence[StageAnalysis]) -> list[str]:
     notes = []
-    if sweep.runs and names.EVAL_SUCCESS not in sweep.history:
-        notes.append("Nothing was evaluated yet, so there is no success rate.")
+    unevaluated = [
+        f"{task} ({names.word_of(metric)})"
+        for task in dict.fromkeys(run.task for run in sweep.runs)
+        if (metric := sweep.primary_metric(task))
+        and not any(len(sweep.series(i, metric)[0]) for i in sweep.on(task))
+    ]
+    if unevaluated:
+        notes.append(f"Nothing was evaluated yet on {_some(unevaluated)}.")
     for analysis in analyses:
         stage = analysis.stage
         if len(stage.conditions) == 1:

@@ -13,10 +13,10 @@ from music_rllib.tracking import names
 
 __all__ = [
     "Table",
+    "finals_table",
     "improvement_table",
     "races_table",
     "runs_table",
-    "success_table",
     "waits_table",
 ]
 
@@ -38,21 +38,26 @@ class Table:
         return buffer.getvalue()
 
 
-def success_table(analyses: Iterable[StageAnalysis]) -> Table:
-    """Final success rate of each condition."""
+def finals_table(analyses: Iterable[StageAnalysis]) -> Table:
+    """How each condition ended, and each of its seeds: means over the tasks."""
     return Table(
-        name="final_success",
-        columns=("stage", "tasks", "condition", "runs", "seeds", "iqm", "lower", "upper"),
+        name="final",
+        columns=(
+            *("stage", "tasks", "metric", "condition", "runs", "seeds", "mean", "lower", "upper"),
+            "each_seed",
+        ),
         rows=[
             (
                 analysis.stage.name,
                 scope.name,
+                scope.metric,
                 final.condition.label,
                 final.runs,
                 final.seeds,
-                float(final.estimate.value),
+                final.value,
                 float(final.estimate.lower),
                 float(final.estimate.upper),
+                " ".join(f"{score:g}" for score in final.scores.mean(axis=1)),
             )
             for analysis in analyses
             for scope in analysis.scopes
@@ -67,7 +72,7 @@ def improvement_table(analyses: Iterable[StageAnalysis]) -> Table:
         name="probability_of_improvement",
         columns=(
             *("stage", "tasks", "first", "second", "probability_first_higher", "lower", "upper"),
-            *("p_value_holm", "intervals_overlap", "decided"),
+            *("gap", "gap_lower", "gap_upper", "p_value_holm", "decided"),
         ),
         rows=[
             (
@@ -78,8 +83,8 @@ def improvement_table(analyses: Iterable[StageAnalysis]) -> Table:
                 float(pair.estimate.value),
                 float(pair.estimate.lower),
                 float(pair.estimate.upper),
+                *(float(end) for end in (pair.gap.value, pair.gap.lower, pair.gap.upper)),
                 pair.p_value,
-                pair.overlaps,
                 pair.decided,
             )
             for analysis in analyses
@@ -95,7 +100,7 @@ def waits_table(analyses: Iterable[StageAnalysis]) -> Table:
         name="steps_to_threshold",
         columns=(
             *("stage", "task", "condition", "threshold", "runs", "reached"),
-            *("median_env_steps", "lower", "upper"),
+            *("median_env_steps", "lower", "upper", "each_run"),
         ),
         rows=[
             (
@@ -108,6 +113,10 @@ def waits_table(analyses: Iterable[StageAnalysis]) -> Table:
                 wait.median,
                 wait.lower,
                 wait.upper,
+                " ".join(
+                    f"{steps:.0f}" if there else f">{steps:.0f}"
+                    for steps, there in zip(wait.waits.steps, wait.waits.reached, strict=True)
+                ),
             )
             for analysis in analyses
             for wait in analysis.waits
@@ -121,7 +130,7 @@ def races_table(analyses: Iterable[StageAnalysis]) -> Table:
         name="probability_sooner",
         columns=(
             *("stage", "task", "threshold", "first", "second", "probability_first_sooner"),
-            *("lower", "upper", "p_value_holm", "decided"),
+            *("lower", "upper", "p_value_holm", "decided", "reached"),
         ),
         rows=[
             (
@@ -135,6 +144,7 @@ def races_table(analyses: Iterable[StageAnalysis]) -> Table:
                 float(race.estimate.upper),
                 race.p_value,
                 race.decided,
+                race.reached,
             )
             for analysis in analyses
             for race in analysis.races
@@ -148,7 +158,7 @@ def runs_table(sweep: Sweep) -> Table:
         name="runs",
         columns=(
             *("run_id", "name", "stage", "task", "entropic_index", "seed", "status", "env_steps"),
-            *("budget", "seconds", "success_rate", "failure"),
+            *("budget", "seconds", "success_rate", "episode_return", "failure"),
         ),
         rows=[
             (
@@ -162,15 +172,10 @@ def runs_table(sweep: Sweep) -> Table:
                 sweep.last_step(position),
                 run.budget,
                 run.seconds,
-                last_success(sweep, position),
+                sweep.final(position, names.EVAL_SUCCESS),
+                sweep.final(position, names.EVAL_RETURN),
                 run.failure,
             )
             for position, run in enumerate(sweep.runs)
         ],
     )
-
-
-def last_success(sweep: Sweep, run: int) -> float | None:
-    """Success rate of a run's last evaluation."""
-    values = sweep.series(run, names.EVAL_SUCCESS)[1]
-    return float(values[-1]) if len(values) else None

@@ -179,6 +179,32 @@ class Sweep:
         begin, end = np.searchsorted(found.run, [run, run + 1])
         return found.step[begin:end], found.value[begin:end]
 
+    def finite(self, run: int, metric: str) -> tuple[Array, Array]:
+        """`series` without NaN and infinities, steps as numbers."""
+        steps, values = self.series(run, metric)
+        there = np.isfinite(values)
+        return steps[there].astype(float), values[there]
+
+    def final(self, run: int, metric: str) -> float | None:
+        """A run's last value of a metric; None where it has none, or NaN."""
+        values = self.series(run, metric)[1]
+        return float(values[-1]) if len(values) and not np.isnan(values[-1]) else None
+
+    def on(self, task: str) -> list[int]:
+        """Positions of the runs on a task."""
+        return [position for position, run in enumerate(self.runs) if run.task == task]
+
+    def primary_metric(self, task: str) -> str:
+        """What the runs of a task are judged by."""
+        keys = (run.params.get("task.success_key", "") for run in self.runs if run.task == task)
+        return names.primary_metric(next(keys, ""))
+
+    def episodes(self, runs: Iterable[int]) -> float:
+        """Of the last evaluation, mean of `runs`; infinite where it is not known."""
+        found = [self.final(run, names.EVAL_EPISODES) for run in runs]
+        known = [episodes for episodes in found if episodes is not None]
+        return float(np.mean(known)) if known else np.inf
+
     def last_step(self, run: int) -> int:
         """Environment steps that `runs[run]` is known to have done."""
         return max(

@@ -10,17 +10,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
 from music_rllib.experiment.result import Report
 from music_rllib.experiment.space import Objective, Pruning
-from music_rllib.results.statistics import Estimate, estimate, interquartile_mean
+from music_rllib.results import statistics as st
+from music_rllib.results.statistics import Array, Estimate
 from music_rllib.tracking import names
 
 __all__ = ["Verdict", "aggregate", "interval", "prune", "score"]
-
-Array = NDArray[np.float64]
 
 
 def score(objective: Objective, history: Sequence[Report], budget: int) -> float:
@@ -62,7 +60,7 @@ def aggregate(objective: Objective, scores: Array) -> float:
     """A trial's number from those of its runs, `[seeds, tasks]`."""
     match objective.aggregate:
         case "iqm":
-            return float(interquartile_mean(scores.reshape(-1)))
+            return float(stats.trim_mean(scores, 0.25, axis=None))
         case "mean":
             return float(np.mean(scores))
         case "median":
@@ -71,22 +69,27 @@ def aggregate(objective: Objective, scores: Array) -> float:
     return float(by_task.min() if objective.maximised else by_task.max())
 
 
-def interval(objective: Objective, scores: Array, seed: int = 0) -> Estimate:
-    """A trial's number with its 95 % stratified-bootstrap interval; NaN ends for a single run."""
+def interval(objective: Objective, scores: Array, episodes: int | None = None) -> Estimate:
+    """A trial's number with its 95 % interval; NaN ends for a single run.
 
-    def statistic(values: Array, axis: int) -> Array:
-        match objective.aggregate:
-            case "iqm":
-                return interquartile_mean(values, axis)
-            case "median":
-                return np.asarray(np.median(values, axis=axis))
-        return np.asarray(np.mean(values, axis=axis))
-
-    rng = np.random.default_rng(seed)
-    if objective.aggregate != "worst_task":
-        return estimate(scores, rng, statistic)
-    worst = scores.mean(axis=0).argmin() if objective.maximised else scores.mean(axis=0).argmax()
-    return estimate(scores[:, [int(worst)]], rng, statistic)
+    Args:
+        objective: What counts.
+        scores: Of the trial's runs, `[seeds, tasks]`.
+        episodes: Of an evaluation, where it is known.
+    """
+    is_rate = objective.metric in names.EVAL_RATES and objective.read != "steps_to"
+    if objective.aggregate == "worst_task":
+        by_task = scores.mean(axis=0)
+        scores = scores[:, [by_task.argmin() if objective.maximised else by_task.argmax()]]
+    freedom = scores.size - scores.shape[1]
+    squares = float(np.sum((scores - scores.mean(axis=0)) ** 2))
+    variance = squares / max(freedom, 1) / _runs_behind(objective, scores)
+    return st.interval(
+        aggregate(objective, scores),
+        variance,
+        freedom,
+        (math.inf if episodes is None else episodes) * scores.size if is_rate else None,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from music_rllib.experiment.plan import short
-from music_rllib.sweep.tables import with_interval
+from music_rllib.sweep.tables import seeds_in_words, with_interval
 from music_rllib.sweep.words import percent
 
 __all__ = ["compare_view"]
@@ -28,28 +28,27 @@ def compare_view(document: Mapping[str, Any]) -> RenderableType:
 
 def _table(document: Mapping[str, Any], group: Mapping[str, Any]) -> Table:
     rows = group["conditions"]
-    title = f"{document['metric']} of {document['stage']} {group['part']}".strip()
+    title = f"{group['metric']} of {document['stage']} on {group['tasks']} {group['part']}".strip()
     table = Table(title=title, title_justify="left")
     settings = dict.fromkeys(name for row in rows for name in row["values"])
-    tasks = dict.fromkeys(task for row in rows for task in row["tasks"])
-    for name in settings:
-        table.add_column(name, justify="right")
-    table.add_column("IQM, 95 %", justify="right")
-    for task in tasks if len(tasks) > 1 else ():
-        table.add_column(task, justify="right")
-    for name in ("runs", "P(first is better)", "p", ""):
+    for name in (
+        *settings,
+        "mean, 95 %",
+        "each seed",
+        "runs",
+        "gap, 95 %",
+        "P(first is better)",
+        "p",
+    ):
         table.add_column(name, justify="right")
     for row in rows:
         table.add_row(
             *(short(row["values"][name]) if name in row["values"] else "-" for name in settings),
             with_interval(row["value"], row["interval"]),
-            *(
-                f"{row['tasks'][task]:.3g}" if task in row["tasks"] else "-"
-                for task in (tasks if len(tasks) > 1 else ())
-            ),
+            seeds_in_words(row["seeds"]),
             f"{row['runs']} of {row['planned']}",
+            "" if row["gap"] is None else with_interval(row["gap"], row["gap_interval"]),
             percent(row["best_is_better_with"]),
             "" if row["p_value"] is None else f"{row['p_value']:.2g}",
-            "overlaps" if row["overlaps_best"] else "",
         )
     return table

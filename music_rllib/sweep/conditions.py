@@ -7,25 +7,18 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from music_rllib.experiment.plan import Plan, Run, short
 from music_rllib.experiment.result import RunResult
-from music_rllib.results.statistics import (
-    Estimate,
-    estimate,
-    holm,
-    improvement,
-    improvement_p_value,
-)
+from music_rllib.results import statistics as st
+from music_rllib.results.comparison import Scope, scopes_of
+from music_rllib.results.statistics import Array, Estimate
 from music_rllib.tracking import names
 
-__all__ = ["Condition", "compared", "conditions"]
-
-Array = NDArray[np.float64]
+__all__ = ["Condition", "conditions", "scopes"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Condition:
     """Runs that differ in their task and seed only."""
 
@@ -33,7 +26,8 @@ class Condition:
     values: Mapping[str, Any]
     part: str
     """`search` for runs that trials were chosen by, `final` for those on fresh seeds, or empty."""
-    tasks: tuple[str, ...]
+    metrics: Mapping[str, str]
+    """Task to the metric that its scores are last values of."""
     seeds: tuple[int, ...]
     runs: tuple[Run, ...]
     """Those with a result."""
@@ -42,6 +36,12 @@ class Condition:
     """Whether every planned run is finished, whatever it reported."""
     scores: Array
     """`[seeds, tasks]`, NaN where there is no result."""
+    episodes: float
+    """Of an evaluation, mean of the runs; infinite where it is not known."""
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        return tuple(self.metrics)
 
     @property
     def label(self) -> str:
@@ -50,28 +50,38 @@ class Condition:
         return ", ".join(pairs) or self.stage
 
     def estimate(self) -> Estimate:
-        """Interquartile mean with its 95 % interval."""
-        return estimate(self.scores, np.random.default_rng(0))
+        """Mean of what has a result, with its 95 % interval."""
+        is_rate = set(self.metrics.values()) <= names.EVAL_RATES
+        there = self.scores[:, ~np.isnan(self.scores).all(axis=0)]
+        return st.estimate(there, self.episodes if is_rate else None)
 
 
 def conditions(
-    plan: Plan, results: Mapping[str, RunResult], metric: str = names.EVAL_SUCCESS
+    plan: Plan, results: Mapping[str, RunResult], metric: str | None = None
 ) -> list[Condition]:
-    """Every condition of the plan, in its order; without those on which nothing is finished."""
+    """Every condition of the plan, in its order; without those on which nothing is finished.
+
+    Args:
+        plan: the sweep's.
+        results: node key to result.
+        metric: None for each task's primary one.
+    """
     groups: dict[tuple[str, str, str], list[Run]] = {}
     for run in plan.runs:
         values = ",".join(f"{name}={value!r}" for name, value in run.values.items())
         groups.setdefault((run.stage, _part(run), values), []).append(run)
     found = []
     for (stage, part, _), runs in groups.items():
-        tasks = tuple(dict.fromkeys(run.task for run in runs))
-        seeds = list(dict.fromkeys(run.seed for run in runs))
+        metrics = {r.task: metric or plan.node(r.key).run.task.primary_metric for r in runs}
+        seeds, tasks = list(dict.fromkeys(run.seed for run in runs)), list(metrics)
         scores = np.full((len(seeds), len(tasks)), np.nan)
-        done = []
+        done, episodes = [], []
         for run in runs:
             result = results.get(run.key)
-            if result is not None and metric in result.metrics:
-                scores[seeds.index(run.seed), tasks.index(run.task)] = result.metrics[metric]
+            if result is not None and metrics[run.task] in result.metrics:
+                score = result.metrics[metrics[run.task]]
+                scores[seeds.index(run.seed), tasks.index(run.task)] = score
+                episodes.append(result.metrics.get(names.EVAL_EPISODES, np.inf))
                 done.append(run)
         if done:
             found.append(
@@ -79,12 +89,13 @@ def conditions(
                     stage=stage,
                     values=runs[0].values,
                     part=part,
-                    tasks=tasks,
+                    metrics=metrics,
                     seeds=tuple(seeds),
                     runs=tuple(done),
                     planned=len({run.key for run in runs}),
                     complete=all(run.key in results for run in runs),
                     scores=scores,
+                    episodes=float(np.mean(episodes)),
                 )
             )
     return found
@@ -94,51 +105,22 @@ def _part(run: Run) -> str:
     return "final" if run.part.startswith("final") else "search" if run.part else ""
 
 
-def compared(found: Sequence[Condition], *, maximised: bool = True) -> list[dict[str, Any]]:
-    """Conditions side by side, the best first, each with its chance to be beaten by the first.
-
-    `p_value` is the permutation test's for that, adjusted for the number of conditions (Holm).
-    """
-    if not found:
-        return []
-    sign = 1.0 if maximised else -1.0
-    first, *others = sorted(found, key=lambda one: -sign * float(one.estimate().value))
-    rivals = [one for one in others if _comparable(first, one)]
-    rng = np.random.default_rng(0)
-    raw = [improvement_p_value(first.scores, one.scores, rng) for one in rivals]
-    p_values = {id(one): p for one, p in zip(rivals, holm(raw), strict=True)}
-    rows: list[dict[str, Any]] = []
-    for one in (first, *others):
-        ends = one.estimate()
-        better = None
-        if id(one) in p_values:
-            chance = improvement(first.scores, one.scores)
-            better = chance if maximised else 1 - chance
-        rows.append(
-            {
-                "stage": one.stage,
-                "values": dict(one.values),
-                "label": one.label,
-                "on_fresh_seeds": one.part == "final",
-                "value": float(ends.value),
-                "interval": [float(ends.lower), float(ends.upper)],
-                "tasks": {
-                    task: float(np.nanmean(one.scores[:, position]))
-                    for position, task in enumerate(one.tasks)
-                    if not np.isnan(one.scores[:, position]).all()
-                },
-                "runs": len(one.runs),
-                "planned": one.planned,
-                "best_is_better_with": better,
-                "p_value": p_values.get(id(one)),
-                "overlaps_best": one is not first and first.estimate().overlaps(ends),
-            }
+def scopes(found: Sequence[Condition]) -> tuple[Scope[Condition], ...]:
+    """Conditions of one stage side by side; of a search only those on fresh seeds are compared."""
+    metrics = {task: metric for one in found for task, metric in one.metrics.items()}
+    columns = [
+        (
+            one,
+            np.column_stack(
+                [
+                    one.scores[:, one.tasks.index(task)]
+                    if task in one.tasks
+                    else np.full(len(one.seeds), np.nan)
+                    for task in metrics
+                ]
+            ),
+            one.episodes,
         )
-    return rows
-
-
-def _comparable(one: Condition, other: Condition) -> bool:
-    """Whether both have a result on each of the same tasks."""
-    if one.tasks != other.tasks:
-        return False
-    return not any(np.isnan(scores).all(0).any() for scores in (one.scores, other.scores))
+        for one in found
+    ]
+    return scopes_of(metrics, columns, [one for one in found if one.part != "search"])

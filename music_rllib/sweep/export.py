@@ -12,6 +12,7 @@ import numpy as np
 import yaml
 
 from music_rllib.experiment.files import write_atomically
+from music_rllib.experiment.model import Stage
 from music_rllib.experiment.plan import Run
 from music_rllib.experiment.sealed import StorageError
 from music_rllib.experiment.space import Objective
@@ -56,7 +57,7 @@ def export_best(sweep: Sweep, stage: str | None, output: Path) -> dict[str, Any]
         "success_rate": _success(sweep, best),
         "on_fresh_seeds": best.part == "final",
         "why": f"{best.stage}: {best.label} is first by {by} {fresh}; {by} "
-        f"({'' if 'trial' in about else 'interquartile mean, '}95 %): {number} over "
+        f"({'' if 'trial' in about else 'mean, '}95 %): {number} over "
         f"{len(best.runs)} runs{rest}",
         "policies": [],
     }
@@ -90,7 +91,7 @@ def _best(sweep: Sweep, stage: str | None) -> tuple[Condition, dict[str, Any]]:
     of_stage = [one for one in of_stage if one.stage == wanted]
     settings = known[wanted].search
     if settings is not None:
-        return _best_trial(sweep, wanted, settings.objectives[0], of_stage)
+        return _best_trial(sweep, known[wanted], settings.objectives[0], of_stage)
     best = best_of(of_stage, measure)
     if best is None:
         raise BadInputError(
@@ -99,7 +100,7 @@ def _best(sweep: Sweep, stage: str | None) -> tuple[Condition, dict[str, Any]]:
         )
     ends = best.estimate()
     return best, {
-        "by": "success rate" if measure.metric == names.EVAL_SUCCESS else measure.metric,
+        "by": measure.word,
         "metric": measure.metric,
         "direction": "maximize",
         "value": float(ends.value),
@@ -108,23 +109,23 @@ def _best(sweep: Sweep, stage: str | None) -> tuple[Condition, dict[str, Any]]:
 
 
 def _best_trial(
-    sweep: Sweep, stage: str, objective: Objective, found: Sequence[Condition]
+    sweep: Sweep, stage: Stage, objective: Objective, found: Sequence[Condition]
 ) -> tuple[Condition, dict[str, Any]]:
     """What the stage's search itself holds to be the best."""
-    search = _search_of(sweep, stage)
+    search = _search_of(sweep, stage.name)
     first = None if search is None else leader(search)
     if first is None:
         raise BadInputError(
-            f"SWEEP must have a judged trial of stage {stage}, {sweep.config.name} has none"
+            f"SWEEP must have a judged trial of stage {stage.name}, {sweep.config.name} has none"
         )
     part = "final" if first.fresh else "search"
     best = [one for one in found if one.part == part and dict(one.values) == first.values]
     if not best:
         raise BadInputError(
-            f"SWEEP must have the runs of its best trial, {first.trial} of stage {stage}: "
+            f"SWEEP must have the runs of its best trial, {first.trial} of stage {stage.name}: "
             f"{redact(sweep.storage)} has none of them"
         )
-    ends = interval(objective, np.asarray(first.scores, float))
+    ends = interval(objective, np.asarray(first.scores, float), stage.evaluation_episodes)
     direction = "maximize" if objective.maximised else "minimize"
     return best[0], {
         "by": f"{objective.label} ({direction})",
@@ -148,7 +149,7 @@ def _search_of(sweep: Sweep, stage: str) -> Mapping[str, Any] | None:
 
 def _success(sweep: Sweep, best: Condition) -> float | None:
     """Its success rate, whatever it is the best by."""
-    for one in conditions(sweep.plan, sweep.results()):
+    for one in conditions(sweep.plan, sweep.results(), names.EVAL_SUCCESS):
         if (one.stage, one.part, one.values) == (best.stage, best.part, best.values):
             return float(one.estimate().value)
     return None

@@ -35,27 +35,23 @@ class Measure:
     @property
     def word(self) -> str:
         """For a line of text."""
-        return "success" if self.metric == names.EVAL_SUCCESS else self.metric
+        return names.word_of(self.metric)
 
 
 def measure_of(stage: Stage, plan: Plan, results: Mapping[str, RunResult]) -> Measure:
-    """What a stage is judged by where nobody says.
+    """What a stage is judged by where nobody says: its search's metric, else its tasks' own.
 
-    Its search's metric; else the success rate, or the return where its tasks have no success.
+    An objective may read what is no run's last value, as the budget is.
     """
-    done = [results[run.key] for run in plan.runs if run.stage == stage.name and run.key in results]
-    reported = {name for result in done for name in result.metrics}
     if stage.search is not None:
         objective = stage.search.objectives[0]
+        done = (results[r.key] for r in plan.runs if r.stage == stage.name and r.key in results)
+        reported = {name for result in done for name in result.metrics}
         if objective.metric in reported or not reported:
             # Fewer steps to a threshold is better, and so is more of what has the threshold.
             maximised = objective.maximised or objective.read == "steps_to"
             return Measure(metric=objective.metric, maximised=maximised)
-    if reported:
-        has_success = names.EVAL_SUCCESS in reported
-    else:
-        has_success = any(task.success_key is not None for task in stage.tasks)
-    return Measure(metric=names.EVAL_SUCCESS if has_success else names.EVAL_RETURN)
+    return Measure(metric=stage.primary_metric)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,7 +94,7 @@ def leader(search: Mapping[str, Any]) -> Leader | None:
 
 
 def best_of(found: Iterable[Condition], measure: Measure) -> Condition | None:
-    """The best by its interquartile mean, of those that have all their runs if there are any."""
+    """The best by its mean, of those that have all their runs if there are any."""
     numbers = [(float(one.estimate().value), one) for one in found]
     numbers = [(number, one) for number, one in numbers if math.isfinite(number)]
     numbers = [pair for pair in numbers if pair[1].complete] or numbers
@@ -161,7 +157,7 @@ def _best_trial(
     if first is None:
         return None
     objective = settings.objectives[0]
-    ends = interval(objective, np.asarray(first.scores, float))
+    ends = interval(objective, np.asarray(first.scores, float), stage.evaluation_episodes)
     direction = "maximize" if objective.maximised else "minimize"
     runs = int(np.size(first.scores))
     return {

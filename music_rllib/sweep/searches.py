@@ -14,7 +14,7 @@ from music_rllib.experiment.model import Stage
 from music_rllib.experiment.plan import node_key
 from music_rllib.experiment.searched import most_env_steps
 from music_rllib.experiment.space import Rung, SearchSettings, WarmStart
-from music_rllib.results.statistics import probability_of_improvement
+from music_rllib.results.statistics import improvement
 from music_rllib.search.database import (
     DATABASE_ERRORS,
     known_studies,
@@ -197,7 +197,7 @@ def _search(search: Search, thorough: bool) -> dict[str, Any]:
         ],
         "storage": None if settings.storage is None else redact(settings.storage),
         "arms": arms,
-        "ranking": _ranking(settings, finalists) if thorough else _order(settings, finalists),
+        "ranking": _ranking(search, finalists) if thorough else _order(settings, finalists),
         "complete": all(one.scores is not None or one.failure for one in finalists)
         and all(arm.finalists is not None for arm in search.arms),
     }
@@ -243,17 +243,17 @@ def _trial(search: Search, arm: Arm, trial: FrozenTrial, thorough: bool) -> dict
         "reason": trial.user_attrs.get(REASON),
     }
     if thorough and trial.state is TrialState.COMPLETE and last:
-        found["interval"] = _interval(search.settings, last)
+        found["interval"] = _interval(search, last)
     return found
 
 
-def _interval(settings: SearchSettings, scores: Sequence[Any]) -> list[list[float]]:
+def _interval(search: Search, scores: Sequence[Any]) -> list[list[float]]:
     """Ends of each objective's 95 % interval over seeds; NaN where a single run has none."""
     return [
         [float(found.lower), float(found.upper)]
         for found in (
-            interval(objective, np.asarray(of_objective))
-            for objective, of_objective in zip(settings.objectives, scores, strict=True)
+            interval(objective, np.asarray(of_objective), search.stage.evaluation_episodes)
+            for objective, of_objective in zip(search.settings.objectives, scores, strict=True)
         )
     ]
 
@@ -300,15 +300,16 @@ def _order(settings: SearchSettings, finalists: Sequence[Finalist]) -> list[dict
     return sorted(rows, key=lambda row: row["fresh"][0], reverse=settings.objectives[0].maximised)
 
 
-def _ranking(settings: SearchSettings, finalists: Sequence[Finalist]) -> list[dict[str, Any]]:
+def _ranking(search: Search, finalists: Sequence[Finalist]) -> list[dict[str, Any]]:
     """Finalists by their values on fresh seeds, the best first, each compared with the best."""
+    settings, episodes = search.settings, search.stage.evaluation_episodes
     done = [one for one in finalists if one.scores is not None]
     maximised = settings.objectives[0].maximised
     rows = []
     for finalist in done:
         assert finalist.scores is not None
         found = [
-            interval(objective, scores)
+            interval(objective, scores, episodes)
             for objective, scores in zip(settings.objectives, finalist.scores, strict=True)
         ]
         rows.append(
@@ -331,9 +332,8 @@ def _ranking(settings: SearchSettings, finalists: Sequence[Finalist]) -> list[di
         best = np.asarray(rows[0]["scores"][0])  # type: ignore[index]
         for row in rows[1:]:
             mine = np.asarray(row["scores"][0])  # type: ignore[index]
-            better = probability_of_improvement(best, mine, np.random.default_rng(0))
-            chance = float(better.value) if maximised else 1 - float(better.value)
-            row["best_is_better_with"] = chance
+            better = improvement(best, mine)
+            row["best_is_better_with"] = better if maximised else 1 - better
     rows.extend(
         {"trial": failed.number, "values": dict(failed.values), "failure": failed.failure}
         for failed in finalists

@@ -14,6 +14,7 @@ from music_rllib.experiment.plan import Node, Plan, short
 from music_rllib.experiment.result import RunResult
 from music_rllib.experiment.searched import most_env_steps
 from music_rllib.experiment.space import Choice, Dimension, SearchSettings
+from music_rllib.results.comparison import SHOW_SEEDS_BELOW
 from music_rllib.sweep.board import Status
 from music_rllib.sweep.words import clock, in_words, percent
 from music_rllib.tracking import names
@@ -25,6 +26,7 @@ __all__ = [
     "search_budget",
     "search_runs",
     "search_views",
+    "seeds_in_words",
     "with_interval",
 ]
 
@@ -294,6 +296,12 @@ def with_interval(value: float | None, ends: Sequence[float | None] | None) -> s
     if low is None or high is None or low != low or high != high:
         return f"{value:.3g}"
     return f"{value:.3g} [{low:.3g}, {high:.3g}]"
+
+
+def seeds_in_words(scores: Sequence[float]) -> str:
+    """`0.8 0.82 0.84`, the lowest first; nothing where there are too many to read."""
+    few = len(scores) < SHOW_SEEDS_BELOW
+    return " ".join(f"{score:.3g}" for score in sorted(scores)) if few else ""
 
 
 def _grid_columns(plan: Plan) -> list[str]:

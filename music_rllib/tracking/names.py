@@ -23,6 +23,23 @@ EVAL_TOUCHED = "evaluation/object_moved_share"
 """Share of episodes in which the object was moved."""
 EVAL_EPISODES = "evaluation/episodes"
 """Number of episodes behind the evaluation metrics of this step."""
+EVAL_RATES = frozenset({EVAL_SUCCESS, EVAL_SUCCESS_ANY, EVAL_TOUCHED})
+"""Those that are a share of the evaluation episodes."""
+
+
+def primary_metric(success_key: str | None) -> str:
+    """What runs on a task are judged by: its success rate, or the return where none is declared.
+
+    Args:
+        success_key: the task's; None, or `None` as MLflow keeps it, where it has no success.
+    """
+    return EVAL_RETURN if success_key in (None, "None") else EVAL_SUCCESS
+
+
+def word_of(metric: str) -> str:
+    """An evaluation metric in a line of text; other metrics are called by their name."""
+    return {EVAL_SUCCESS: "success", EVAL_RETURN: "return"}.get(metric, metric)
+
 
 # Training episodes (exploring policy) ---------------------------------------------------------
 TRAIN_SUCCESS = "training/success_rate"

@@ -22,10 +22,10 @@ from music_rllib.reports.missing import planned_runs
 from music_rllib.reports.page import Report, render
 from music_rllib.reports.palette import DARK, LIGHT, colour_of, marker_of
 from music_rllib.reports.pictures import draw_all
-from music_rllib.results.analysis import THRESHOLDS, Scope, analyse
-from music_rllib.results.conditions import SIDE_BY_SIDE, find_stages, stage_by_stage
+from music_rllib.results.analysis import THRESHOLDS, analyse
+from music_rllib.results.comparison import Scope, verdict
+from music_rllib.results.conditions import SIDE_BY_SIDE, Condition, find_stages, stage_by_stage
 from music_rllib.results.data import Points, RunRecord, Sweep, columns
-from music_rllib.results.verdict import verdict
 from music_rllib.tracking import names
 
 STEPS = range(20_000, 200_001, 20_000)
@@ -113,15 +113,15 @@ def compared(finals: Mapping[str, Sequence[float]], **changes: str) -> Sweep:
 
 
 def report_on(sweep: Sweep) -> Report:
-    return build_report(sweep, np.random.default_rng(0), difference=0.1)
+    return build_report(sweep)
 
 
-def first_scope(sweep: Sweep) -> Scope:
-    return analyse(sweep, np.random.default_rng(0))[0].scopes[0]
+def first_scope(sweep: Sweep) -> Scope[Condition]:
+    return analyse(sweep)[0].scopes[0]
 
 
 def said_about(sweep: Sweep) -> str:
-    return " ".join(verdict(first_scope(sweep), 0.1))
+    return " ".join(verdict(first_scope(sweep)))
 
 
 # What is said -----------------------------------------------------------------------------------
@@ -132,28 +132,70 @@ def test_a_clear_winner_is_named() -> None:
         compared({"1": [0.3, 0.32, 0.35, 0.31, 0.3], "1.5": [0.9, 0.92, 0.88, 0.95, 0.9]})
     )
     assert said.startswith(
-        "q = 1.5 is ahead on FetchPush: q = 1.5 with 0.91 (0.89 to 0.93, 5 seeds)"
+        "q = 1.5 is ahead on FetchPush: q = 1.5 with 0.91 (0.87 to 0.94, 5 seeds). "
+        "So large a gap comes by chance with p = 0.0079 at most"
     )
     assert "No winner" not in said
 
 
-def test_no_winner_where_intervals_overlap_and_how_many_seeds_would_tell() -> None:
+def test_no_winner_where_a_gap_may_be_chance_and_how_many_seeds_would_tell() -> None:
     said = said_about(
         compared({"1": [0.5, 0.9, 0.6, 0.8], "1.5": [0.6, 0.95, 0.7, 0.8], "2": [0.1, 0.2, 0.1, 0]})
     )
     assert "No winner on FetchPush: q = 1.5" in said
-    assert "the interval overlaps with that of q = 1." in said
-    # Squares .1 + .0675 (rounded) + .02 over 9 degrees of freedom: .146; 35 seeds by the t test.
+    # Four against four give 2 / 70 at best, three times for three comparisons.
+    assert "but from so few seeds the gap to q = 1 (0.06, " in said
+    assert "and q = 2 (0.66, " in said
+    # Squares .1 + .0675 + .02 over 9 degrees of freedom: .146; 34 seeds by the t test.
     assert re.search(r"differ by 0\.1[45] .* about 3\d seeds per condition .* 3\d more than", said)
 
 
 def test_two_seeds_far_apart_are_no_evidence() -> None:
-    """Their bootstrap intervals do not overlap; that alone would name a winner."""
     scope = first_scope(compared({"1": [0.1, 0.12], "1.5": [0.9, 0.95]}))
     (pair,) = scope.comparisons
-    assert not pair.overlaps
     assert not pair.decided
-    assert "may be chance (p = 0.3" in " ".join(verdict(scope, 0.1))
+    assert "may be chance" in " ".join(verdict(scope))
+    assert pair.p_value == pytest.approx(2 / 6)
+
+
+@pytest.mark.parametrize("rate", [0.0, 1.0])
+def test_where_all_are_equal_nobody_is_highest_and_nothing_is_asked_for(rate: float) -> None:
+    said = said_about(compared({"1": [rate] * 3, "1.5": [rate] * 3, "2": [rate] * 3}))
+    assert said == f"All conditions are equal on FetchPush: each of their runs ended at {rate:.2f}."
+
+
+def test_conditions_that_share_the_first_place_are_level() -> None:
+    said = said_about(compared({"1": [1.0] * 3, "1.5": [0.5, 0.6, 0.7], "2": [1.0] * 3}))
+    assert said.startswith(
+        "No winner on FetchPush: q = 1 and q = 2 are level at 1.00, but from so few seeds the gap "
+        "to q = 1.5 (0.40, "
+    )
+    assert "highest" not in said
+
+
+@pytest.mark.parametrize(
+    "finals, end",
+    [
+        ({"1": [1.0, 0.98, 1.0], "1.5": [0.96, 0.98, 1.0]}, "ceiling"),
+        ({"1": [0.0, 0.02, 0.0], "1.5": [0.04, 0.02, 0.0]}, "floor"),
+    ],
+)
+def test_the_spread_at_a_bound_promises_nothing(finals: dict[str, list[float]], end: str) -> None:
+    said = said_about(compared(finals))
+    assert f"All are within 0.1 of the {end}, where seeds differ less" in said
+    assert "standard deviation" not in said
+    # Of two conditions the one that is clear of the bound tells it.
+    clear = said_about(compared({**finals, "2": [0.4, 0.6, 0.5]}))
+    assert "Seeds of the same condition differ by 0.10" in clear
+
+
+def test_a_threshold_that_nobody_reaches_is_said_to_be_that() -> None:
+    sweep = compared({"1": [0.3, 0.4], "1.5": [0.6, 0.7]})
+    page = render(report_on(sweep))
+    assert row_of(page, "FetchPush", "q = 1.5 before q = 1", "85 %") == [
+        *("–", "not reached by either", "–", "no")
+    ]
+    assert row_of(page, "FetchPush", "q = 1.5 before q = 1", "50 %")[0] == "1.00"
 
 
 @pytest.mark.parametrize(
@@ -162,7 +204,7 @@ def test_two_seeds_far_apart_are_no_evidence() -> None:
         ({"1.5": [0.5, 0.6]}, "Only one condition has finished"),
         ({"1": [0.1], "1.5": [0.9]}, "every condition has a single seed, so there is no interval"),
         ({"1": [0.1], "1.5": [0.9], "2": [0.5, 0.6]}, "q = 1 and q = 1.5 have a single seed"),
-        ({"1": [0.1, 0.1], "1.5": [0.1, 0.1]}, "All seeds ended alike"),
+        ({"1": [0.3, 0.3], "1.5": [0.4, 0.4]}, "Seeds ended alike: their spread does not tell"),
     ],
 )
 def test_too_little_is_said_to_be_too_little(finals: dict[str, list[float]], expected: str) -> None:
@@ -181,7 +223,7 @@ TRIALS = [("1", 0, "trial0", 0.5), ("1.2", 0, "trial1", 1.0), ("1.4", 0, "trial2
 
 def test_trials_of_a_search_are_not_compared_on_the_seeds_that_chose_them() -> None:
     sweep = searched(*TRIALS)
-    (analysis,) = analyse(sweep, np.random.default_rng(0))
+    (analysis,) = analyse(sweep)
     assert (analysis.races, analysis.scopes[0].comparisons) == ((), ())
     assert len(analysis.scopes[0].finals) == 3, "they are in the table all the same"
     assert said_about(sweep).startswith("Nothing is ranked on FetchPush: no trial of the search")
@@ -211,7 +253,7 @@ def test_of_a_search_the_ranking_is_drawn_as_soon_as_there_is_one() -> None:
 def test_a_run_that_failed_has_no_final_rate_but_counts_as_waiting() -> None:
     failed = one_run("1", 1, status="FAILED")
     sweep = sweep_of([(one_run("1", 0), climbing(0.9)), (failed, climbing(0.9, upto=60_000))])
-    (analysis,) = analyse(sweep, np.random.default_rng(0))
+    (analysis,) = analyse(sweep)
     (final,) = analysis.scopes[0].finals
     assert final.seeds == 1
     assert float(final.estimate.value) == pytest.approx(0.9)
@@ -226,7 +268,7 @@ def test_over_all_tasks_only_seeds_that_finished_on_each_count() -> None:
         for task, finals in (("FetchPush", [0.9, 0.8]), ("FetchSlide", [0.3]))
         for seed, final in enumerate(finals)
     ]
-    over_all, push, _ = analyse(sweep_of(runs), np.random.default_rng(0))[0].scopes
+    over_all, push, _ = analyse(sweep_of(runs))[0].scopes
     assert float(over_all.finals[0].estimate.value) == pytest.approx(0.6)
     assert (over_all.finals[0].seeds, over_all.finals[0].runs) == (1, 2)
     assert push.finals[0].seeds == 2
@@ -309,6 +351,13 @@ class Page(HTMLParser):
 
     def handle_data(self, data: str) -> None:
         self.text += data
+
+
+def row_of(page: str, *begin: str) -> list[str]:
+    """What stands in the one table row that begins so."""
+    rows = [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in page.split("<tr>")]
+    (found,) = [row[len(begin) :] for row in rows if row[: len(begin)] == list(begin)]
+    return found
 
 
 def partial() -> Sweep:
@@ -439,6 +488,61 @@ def test_a_script_in_any_text_of_a_sweep_is_shown_as_text() -> None:
     for drawn in made.pictures.values():
         elements = ElementTree.fromstring(drawn.files["svg"]).iter()
         assert "script" not in {element.tag.rpartition("}")[2] for element in elements}
+
+
+def returning(finals: Mapping[str, Sequence[float]], task: str = "Reacher") -> Sweep:
+    """A task without success; each run's return climbs from -100 to its end."""
+    runs = []
+    for q, values in finals.items():
+        for seed, final in enumerate(values):
+            curve = [-100 + (final + 100) * step / STEPS[-1] for step in STEPS]
+            names_ = [names.EVAL_RETURN] * len(curve)
+            run = one_run(q, seed, task=task, params={"task.success_key": "None"})
+            runs.append((run, Points(names_, list(STEPS), list(STEPS), curve)))
+    return sweep_of(runs)
+
+
+def test_a_task_without_success_is_judged_by_its_return_everywhere() -> None:
+    sweep = returning({"1": [-9, -8, -7, -9.5, -8.5], "1.5": [-5, -4, -6, -4.5, -5.5]})
+    report = report_on(sweep)
+    shown = Page(render(report))
+    assert "Nothing was evaluated" not in shown.text
+    assert "q = 1.5 is ahead on Reacher: q = 1.5 with -5.00 (-5.98 to -4.02, 5 seeds)" in shown.text
+    drawn = {drawing.title: drawing for drawing in report.drawings}
+    assert list(drawn) == ["Return", "Final return"]
+    assert "return of an episode" in render(report)
+    assert {row[3] for row in drawn["Return"].values} == {names.EVAL_RETURN}
+    assert not report.analyses[0].waits, "there is no success rate to wait for"
+    assert row_of(render(report), "Reacher", "q = 1.5", "return") == [
+        *("-5.00", "-5.98 to -4.02", "-6.00 -5.50 -5.00 -4.50 -4.00", "5", "5")
+    ]
+    unsure = said_about(returning({"1": [-9, -8, -7], "1.5": [-8, -9, -6]}))
+    assert re.search(
+        r"With 3 seeds per condition a difference of \d\.\d\d is seen with 80 %", unsure
+    )
+
+
+def test_tasks_with_and_without_success_stand_side_by_side_and_are_not_averaged() -> None:
+    both = [
+        compared({"1": [0.5, 0.6], "1.5": [0.6, 0.7]}),
+        returning({"1": [-9, -8], "1.5": [-5, -4]}),
+    ]
+    runs = [run for sweep in both for run in sweep.runs]
+    points = []
+    for sweep in both:
+        metric = sweep.primary_metric(sweep.runs[0].task)
+        for position in range(len(sweep.runs)):
+            steps, values = sweep.series(position, metric)
+            points.append(Points([metric] * len(steps), list(steps), list(steps), list(values)))
+    report = report_on(sweep_of(list(zip(runs, points, strict=True))))
+    (analysis,) = report.analyses
+    assert [(scope.name, scope.metric) for scope in analysis.scopes] == [
+        ("FetchPush", names.EVAL_SUCCESS),
+        ("Reacher", names.EVAL_RETURN),
+    ]
+    titles = [drawing.title for drawing in report.drawings]
+    assert {"Success rate", "Return", "Final success rate", "Final return"} <= set(titles)
+    assert all(len(d.panels) == 1 for d in report.drawings), "each on its own tasks"
 
 
 STAGES = {"pretrain": "music-u", "plain": "tac", "with-a-rather-long-name": "music-r"}
@@ -588,10 +692,7 @@ def test_importance_with_many_seeds_is_found_in_seconds() -> None:
             for seed in range(30)
         ]
     )
-    shares = {
-        one.setting: one.share
-        for one in importances(sweep, analyse(sweep, np.random.default_rng(0))[0])
-    }
+    shares = {one.setting: one.share for one in importances(sweep, analyse(sweep)[0])}
     assert max(shares, key=lambda name: shares[name]) == "q"
     assert 0 < shares[CHANCE] < 0.2
 

@@ -21,11 +21,17 @@ from music_rllib.experiment.config import load_sweep
 from music_rllib.experiment.plan import Node, make_plan
 from music_rllib.experiment.result import HISTORY, Report, RunResult, to_json_lines
 from music_rllib.experiment.sealed import DamagedError
+from music_rllib.results.analysis import analyse
+from music_rllib.results.comparison import each_seed, verdict
+from music_rllib.results.data import Points, RunRecord, columns
+from music_rllib.results.data import Sweep as Logged
 from music_rllib.sweep import cleaning, cli, records
 from music_rllib.sweep.beacon import Beacon, is_alive
+from music_rllib.sweep.logbook import run_info
 from music_rllib.sweep.places import sweep_folder
 from music_rllib.sweep.session import Sweep, keep_record, open_sweep
 from music_rllib.tracking import names
+from music_rllib.tracking.redaction import flat_params
 
 SWEEP: dict[str, Any] = {
     "name": "mine",
@@ -100,7 +106,7 @@ def finish(
     metric: str = names.EVAL_SUCCESS,
 ) -> None:
     """As if the run had been trained."""
-    metrics = {metric: value}
+    metrics = {metric: value, names.EVAL_EPISODES: 20.0}
     report = Report(env_steps=4000, seconds=1.0, timestamp_ms=1, metrics=metrics)
     folder.mkdir(exist_ok=True)
     (folder / HISTORY).write_bytes(to_json_lines([report]))
@@ -143,9 +149,84 @@ def test_status_and_compare(storage: str, tmp_path: Path, program: Program) -> N
     assert first["values"] == {"tac.entropic_index": 1.5}
     assert first["value"] == pytest.approx(0.82)
     assert [row["best_is_better_with"] for row in others] == [1.0, 1.0]
-    assert "from so few seeds the gap may be chance" in group["verdict"]
+    assert "from so few seeds the gap to" in group["verdict"]
+    assert first["seeds"] == pytest.approx([0.8, 0.82, 0.84])
+    assert others[0]["gap"] == pytest.approx(0.5)
+    assert others[0]["gap_interval"][0] < 0.5 < others[0]["gap_interval"][1]
+    assert "0.8 0.82 0.84" in program("compare", place).output
     bad = program("compare", place, "--metric", "nonsense")
     assert (bad.code, "--metric must be one of" in bad.errors) == (2, True)
+
+
+def as_logged(sweep: Sweep) -> Logged:
+    """The sweep as its report reads it from MLflow, finished and unfinished runs."""
+    runs, points, results = [], [], sweep.results()
+    for node in sweep.plan.nodes:
+        info, result = run_info(node), results.get(node.key)
+        tags = {name: str(value) for name, value in info.tags.items() if value is not None}
+        runs.append(
+            RunRecord(
+                run_id=node.key,
+                name=info.name,
+                status="FINISHED" if result else "RUNNING",
+                started=0,
+                ended=None,
+                params=flat_params(info.config),
+                tags={**tags, names.TAG_NODE_KEY: node.key},
+            )
+        )
+        last = sorted((result.metrics if result else {names.EVAL_SUCCESS: 0.99}).items())
+        metrics = [metric for metric, _ in last]
+        points.append(Points(metrics, [4000] * len(last), [1] * len(last), [v for _, v in last]))
+    return Logged(
+        **dict.fromkeys(("name", "status", "run_id", "experiment_id", "source"), "mine"),  # type: ignore[arg-type]
+        started=0,
+        tags={},
+        config=None,
+        runs=runs,
+        history=columns(points),
+    )
+
+
+def test_compare_and_the_report_say_the_same_of_the_same_sweep(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    """Intervals, comparisons, corrections, unfinished seeds, words: there is one definition."""
+    tasks, seeds = ["FetchPush", "FetchSlide"], list(range(6))
+    sweep = opened(storage, tmp_path, tasks=tasks, seeds=seeds)
+    unfinished = {(1.5, "FetchSlide", 5), (1.5, "FetchPush", 2), (2.0, "FetchPush", 0)}
+    with Beacon(sweep) as beacon:
+        for node in sweep.plan.nodes:
+            q, task = float(node.run.tac.entropic_index), node.run.task.name  # type: ignore[arg-type]
+            if (q, task, node.run.seed) not in unfinished:
+                height = HEIGHTS[q] + 0.15 * (task == "FetchPush") + 0.01 * node.run.seed
+                finish(sweep, beacon, node, height, tmp_path / "made")
+        beacon.end("stopped")
+    groups = program("compare", f"{storage}/mine", "--json").document["groups"]
+    (analysis,) = analyse(as_logged(sweep))
+    assert [group["tasks"] for group in groups] == ["all tasks", *tasks]
+    for group, scope in zip(groups, analysis.scopes, strict=True):
+        assert group["metric"] == scope.metric
+        rows = {f"q = {row['values']['tac.entropic_index']:g}": row for row in group["conditions"]}
+        best = f"q = {group['conditions'][0]['values']['tac.entropic_index']:g}"
+        for final in scope.finals:
+            row = rows[final.condition.label]
+            assert (row["value"], row["runs"]) == (final.value, final.runs)
+            assert row["interval"] == [final.estimate.lower, final.estimate.upper]
+            assert sorted(row["seeds"]) == each_seed(final)
+        for pair in scope.comparisons:
+            labels = (pair.first.condition.label, pair.second.condition.label)
+            if best not in labels:
+                continue
+            (row,) = [rows[label] for label in labels if label != best]
+            chance = float(pair.estimate.value)
+            assert row["p_value"] == pair.p_value
+            assert row["best_is_better_with"] == (chance if labels[0] == best else 1 - chance)
+            assert abs(row["gap"]) == pytest.approx(abs(float(pair.gap.value)))
+        assert group["verdict"].replace("tac.entropic_index", "q") == " ".join(verdict(scope))
+    # Seeds that have finished on one of two tasks count there, and not over both.
+    assert [row["runs"] for row in groups[0]["conditions"]] == [8, 10, 12]
+    assert [row["runs"] for row in groups[1]["conditions"]] == [5, 5, 6]
 
 
 def test_compare_names_a_winner_on_evidence(storage: str, tmp_path: Path, program: Program) -> None:
@@ -154,9 +235,9 @@ def test_compare_names_a_winner_on_evidence(storage: str, tmp_path: Path, progra
     assert group["verdict"].startswith("tac.entropic_index = 1.5 is ahead")
     first, *others = group["conditions"]
     assert first["p_value"] is None
-    # All of 5 runs above all of 5: 2 of 252 relabellings, twice for two comparisons.
-    assert [row["p_value"] for row in others] == pytest.approx([0.016, 0.016], abs=0.005)
-    assert "0.01" in program("compare", f"{storage}/mine").output
+    # All of 5 runs above all of 5: 2 of 252 relabellings, three times for three comparisons.
+    assert [row["p_value"] for row in others] == pytest.approx([6 / 252] * 2)
+    assert "0.024" in program("compare", f"{storage}/mine").output
 
 
 def test_compare_names_no_winner_without_evidence(
@@ -164,7 +245,7 @@ def test_compare_names_no_winner_without_evidence(
 ) -> None:
     played(storage, tmp_path, runs=4)
     (group,) = program("compare", f"{storage}/mine", "--json").document["groups"]
-    assert "single run" in group["verdict"]
+    assert "has a single seed" in group["verdict"]
     assert sorted(row["runs"] for row in group["conditions"]) == [1, 3]
     text = program("compare", f"{storage}/mine").output
     assert "3 of 3" in text
@@ -186,7 +267,7 @@ def test_best_takes_the_middle_run_of_the_best_condition(
     assert json.loads((folder / "chosen.json").read_text())["node"] == policy["node"]
     assert policy["node"] in sweep.finished
     again = program("best", f"{storage}/mine", "--output", "out")
-    assert (again.code, "first by success rate" in again.output) == (0, True)
+    assert (again.code, "first by success" in again.output) == (0, True)
 
 
 def test_a_condition_with_all_its_runs_is_better_than_a_lucky_one(
@@ -224,7 +305,8 @@ def test_a_condition_with_all_its_runs_is_better_than_a_lucky_one(
 def test_tasks_without_success_are_judged_by_their_return(
     storage: str, tmp_path: Path, program: Program
 ) -> None:
-    sweep = opened(storage, tmp_path)
+    task = {"env_id": "Reacher-v5", "horizon": 50, "success_key": None}
+    sweep = opened(storage, tmp_path, environments={"Reacher": task}, tasks=["Reacher"])
     with Beacon(sweep) as beacon:
         for node in list(sweep.plan.nodes):
             height = -HEIGHTS[float(node.run.tac.entropic_index)]  # type: ignore[arg-type]
@@ -238,9 +320,9 @@ def test_tasks_without_success_are_judged_by_their_return(
     assert chosen["values"] == {"tac.entropic_index": 1.0}
     assert (chosen["metric"], chosen["value"]) == (names.EVAL_RETURN, pytest.approx(-0.2))
     assert chosen["success_rate"] is None
-    assert "first by evaluation/episode_return" in chosen["why"]
+    assert "first by return" in chosen["why"]
     shown = program("status", place).output
-    assert "Best so far: train tac.entropic_index = 1: evaluation/episode_return -0.2" in shown
+    assert "Best so far: train tac.entropic_index = 1: return -0.2" in shown
 
 
 def test_clean_lists_and_deletes_what_no_other_sweep_has(

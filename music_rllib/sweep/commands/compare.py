@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
 
 from music_rllib.sweep.frame import (
     BadInputError,
@@ -15,6 +15,10 @@ from music_rllib.sweep.frame import (
     print_json,
 )
 
+if TYPE_CHECKING:
+    from music_rllib.results.comparison import Final, Scope
+    from music_rllib.sweep.conditions import Condition
+
 __all__ = ["register"]
 
 EPILOG = """\
@@ -23,11 +27,15 @@ examples:
   python -m music_rllib.sweep compare results/smoke --metric evaluation/object_displacement
   python -m music_rllib.sweep compare results/search --stage finetune --json
 
-Each row is the interquartile mean over tasks and seeds with its 95 % stratified-bootstrap interval.
-Runs on the fresh seeds of a search's final ranking are never mixed with those its trials were
-chosen by. A condition is said to be ahead only where its interval overlaps with no other and a
-permutation test (Holm's correction) gives p < 0.05 against each: three seeds are never enough.
+Each row is the mean over the seeds that have finished on every task, with its 95 % interval
+(docs/reports.md). Runs on the fresh seeds of a search's final ranking are never mixed with those
+its trials were chosen by. A condition is said to be ahead only where an exact permutation test,
+with Holm's correction over all pairs, gives p < 0.05 against each other one: three seeds are never
+enough. The report says the same.
 """
+
+
+IN_THE_SEARCH = "Trials were chosen by these runs, so their order is biased: fresh seeds count."
 
 
 def register(commands: Commands) -> None:
@@ -43,7 +51,7 @@ def register(commands: Commands) -> None:
     parser.add_argument(
         "--metric",
         help="A run's last value of it. Without it: what a searched stage's objective reads, else "
-        "evaluation/success_rate, or evaluation/episode_return where tasks have no success.",
+        "each task's own, evaluation/success_rate, or evaluation/episode_return without success.",
     )
     parser.add_argument(
         "--minimize",
@@ -56,7 +64,7 @@ def register(commands: Commands) -> None:
 
 def _execute(arguments: argparse.Namespace) -> int:
     from music_rllib.sweep.compare_view import compare_view
-    from music_rllib.sweep.conditions import compared, conditions
+    from music_rllib.sweep.conditions import conditions, scopes
     from music_rllib.sweep.find import find_sweep
     from music_rllib.sweep.judgement import measure_of
 
@@ -68,25 +76,21 @@ def _execute(arguments: argparse.Namespace) -> int:
         raise BadInputError(f"--stage must be one of {', '.join(stages)}, got {stage!r}")
     results = sweep.results()
     measure = measure_of(stages[stage], sweep.plan, results)
-    metric = arguments.metric or measure.metric
+    # Without a word about it, each task is judged by its own.
+    metric = arguments.metric or (measure.metric if stages[stage].search else None)
     maximised = not arguments.minimize and (measure.maximised or metric != measure.metric)
-    everything = conditions(sweep.plan, results, metric)
-    of_stage = [one for one in everything if one.stage == stage]
-    if not of_stage and results and arguments.metric is not None:
+    found_ = [one for one in conditions(sweep.plan, results, metric) if one.stage == stage]
+    if not found_ and results and arguments.metric is not None:
         known = sorted({name for result in results.values() for name in result.metrics})
         if arguments.metric not in known:
             raise BadInputError(
                 f"--metric must be one of {', '.join(known)}, got {arguments.metric!r}"
             )
-    groups: list[dict[str, Any]] = []
-    for part, title in (("", ""), ("final", "on fresh seeds"), ("search", "in the search")):
-        rows = compared([one for one in of_stage if one.part == part], maximised=maximised)
-        if rows:
-            groups.append({"part": title, "conditions": rows, "verdict": verdict(rows, part)})
+    groups = [group for scope in scopes(found_) for group in _groups(scope, maximised)]
     document = {
         "sweep": found.name,
         "stage": stage,
-        "metric": metric,
+        "metric": metric or measure.metric,
         "direction": "maximize" if maximised else "minimize",
         "groups": groups,
     }
@@ -97,27 +101,60 @@ def _execute(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def verdict(rows: Sequence[dict[str, Any]], part: str) -> str:
-    """What intervals and permutation tests allow to be said."""
-    from music_rllib.results.statistics import SIGNIFICANCE
+def _groups(scope: Scope[Condition], maximised: bool) -> Iterator[dict[str, Any]]:
+    """What is compared on a task; apart from it the runs that a search's trials were chosen by."""
+    from music_rllib.results.comparison import verdict
 
-    if part == "search":
-        return "Trials were chosen by these runs, so their order is biased: fresh seeds count."
-    if len(rows) < 2:
-        return "There is nothing to compare it with."
-    if min(row["runs"] for row in rows) < 2:
-        return "A condition with a single run has no interval: nothing can be said yet."
-    if any(row["overlaps_best"] for row in rows[1:]):
-        return "Intervals overlap with that of the first: no winner. More seeds may tell."
-    p_values = [row["p_value"] for row in rows[1:]]
-    if any(p is None for p in p_values):
-        return "Not every condition has finished on the same tasks: no winner yet."
-    if max(p_values) >= SIGNIFICANCE:
-        return (
-            "No intervals overlap with that of the first, but from so few seeds the gap may be "
-            f"chance (p = {max(p_values):.2g}, permutation test): no winner. More seeds may tell."
-        )
-    return (
-        f"{rows[0]['label']} is ahead: its interval overlaps with no other, and so large a gap "
-        f"comes by chance with p = {max(p_values):.2g} at most (permutation test)."
+    fresh = any(final.condition.part == "final" for final in scope.compared)
+    chosen = [final for final in scope.finals if final not in scope.compared]
+    parts = (
+        (scope.compared, "on fresh seeds" if fresh else "", verdict(scope, maximised=maximised)),
+        (chosen, "in the search", [IN_THE_SEARCH]),
     )
+    for finals, part, said in parts:
+        if finals:
+            yield {
+                "part": part,
+                "tasks": scope.name,
+                "metric": scope.metric,
+                "conditions": list(_rows(scope, finals, maximised)),
+                "verdict": " ".join(said),
+            }
+
+
+def _rows(
+    scope: Scope[Condition], finals: Sequence[Final[Condition]], maximised: bool
+) -> Iterator[dict[str, Any]]:
+    """The best first, each with what tells it from the best."""
+    from music_rllib.results.statistics import difference
+
+    ordered = sorted(finals, key=lambda final: final.value, reverse=maximised)
+    best = ordered[0]
+    for final in ordered:
+        one, estimate = final.condition, final.estimate
+        row = {
+            "stage": one.stage,
+            "values": dict(one.values),
+            "label": one.label,
+            "on_fresh_seeds": one.part == "final",
+            "value": final.value,
+            "interval": [float(estimate.lower), float(estimate.upper)],
+            "seeds": final.scores.mean(axis=1).tolist(),
+            "runs": final.runs,
+            "planned": len(one.seeds) * scope.tasks,
+            "gap": None,
+            "gap_interval": None,
+            "best_is_better_with": None,
+            "p_value": None,
+        }
+        pair = next((p for p in scope.comparisons if {p.first, p.second} == {best, final}), None)
+        if pair is not None:
+            gap = difference(best.estimate, estimate)
+            higher = float(pair.estimate.value)
+            row |= {
+                "gap": float(gap.value),
+                "gap_interval": [float(gap.lower), float(gap.upper)],
+                "best_is_better_with": higher if (pair.first is best) == maximised else 1 - higher,
+                "p_value": pair.p_value,
+            }
+        yield row

@@ -191,12 +191,12 @@ def _mean(values: list[Any]) -> float | None:
 
 def _interval(successes: list[bool]) -> list[float] | None:
     """Clopper and Pearson's 95 % interval: of this policy, over starts and goals."""
-    from scipy.stats import binomtest
+    from music_rllib.results.statistics import clopper_pearson
 
     if not successes:
         return None
-    interval = binomtest(sum(successes), len(successes)).proportion_ci(0.95, method="exact")
-    return [float(interval.low), float(interval.high)]
+    lower, upper = clopper_pearson(sum(successes) / len(successes), len(successes))
+    return [float(lower), float(upper)]
 
 
 def _table(document: dict[str, Any]) -> Table:

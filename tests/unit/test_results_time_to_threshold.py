@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
 from music_rllib.results.data import Points, RunRecord, Sweep, columns
-from music_rllib.results.races import Race, races
+from music_rllib.results.time_to_threshold import Race, races
 from music_rllib.tracking import names
 
 BUDGET = 10
@@ -52,7 +51,7 @@ def sweep_of(runs: Runs) -> Sweep:
 
 def race(first: Runs, second: Runs) -> tuple[Race, ...]:
     groups = {"second": range(len(second)), "first": range(len(second), len(second + first))}
-    return races(sweep_of([*second, *first]), "Push", groups, 0.9, np.random.default_rng(0))
+    return races(sweep_of([*second, *first]), "Push", groups, 0.9)
 
 
 def finished(*at: int | None) -> Runs:
@@ -78,6 +77,18 @@ def test_five_clear_seeds_decide_and_three_cannot() -> None:
     assert not few.decided
 
 
+def test_where_nobody_gets_there_nothing_is_compared() -> None:
+    (found,) = race(finished(None, None), finished(None, None, None))
+    assert (found.reached, found.decided, found.p_value) == (False, False, 1.0)
+    (found,) = race(finished(None, None), finished(None, 3))
+    assert found.reached
+    # Five runs against five all apart, and a third group with no bearing on them: one comparison.
+    runs = [*finished(*[None] * 10), *finished(1, 1, 1, 1, 1)]
+    groups = {"a": range(5), "b": range(5, 10), "c": range(10, 15)}
+    by_pair = {(r.first, r.second): r.p_value for r in races(sweep_of(runs), "Push", groups, 0.9)}
+    assert by_pair == pytest.approx({("b", "a"): 1.0, ("c", "a"): 4 / 252, ("c", "b"): 4 / 252})
+
+
 def test_a_run_that_may_still_get_there_says_nothing() -> None:
     (found,) = race([*finished(3), ("RUNNING", None), ("FAILED", None)], finished(5))
     assert found.runs == (1, 1)
@@ -88,5 +99,4 @@ def test_a_run_that_may_still_get_there_says_nothing() -> None:
 
 def test_only_the_task_s_own_runs_race() -> None:
     sweep = sweep_of(finished(1, 2))
-    rng = np.random.default_rng(0)
-    assert races(sweep, "Slide", {"a": [0], "b": [1]}, 0.9, rng) == ()
+    assert races(sweep, "Slide", {"a": [0], "b": [1]}, 0.9) == ()

@@ -1,0 +1,166 @@
+"""How often 95 % intervals of few seeds hold the truth, by simulation.
+
+python -m benchmarks.coverage [REPEATS]
+
+Seeds are drawn from a population of known mean; a rate is that of 20 or 50 evaluation episodes, so
+that its noise is in it. `music_rllib.results` makes the intervals, those of the mean of all repeats
+at once: as points of a curve, which have nothing to do with each other.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from music_rllib.results import statistics as st
+from music_rllib.results.statistics import Array
+from music_rllib.results.time_to_threshold import Waits, median_wait_interval
+
+SEEDS = (2, 3, 4, 5, 10, 20)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Population:
+    """What seeds are drawn from."""
+
+    name: str
+    draw: Callable[[np.random.Generator, tuple[int, ...]], Array]
+    mean: float
+    episodes: int | None = None
+    """None: no rate."""
+
+
+def rates(a: float, b: float, episodes: int) -> Population:
+    """Success rates of seeds that are Beta(a, b), each seen through so many episodes."""
+    return Population(
+        name=f"rate, Beta({a:g}, {b:g}), {episodes} episodes",
+        draw=lambda rng, shape: rng.binomial(episodes, rng.beta(a, b, shape)) / episodes,
+        mean=a / (a + b),
+        episodes=episodes,
+    )
+
+
+POPULATIONS = (
+    Population(name="return, normal", draw=lambda rng, shape: rng.normal(size=shape), mean=0.0),
+    rates(5, 5, 50),
+    rates(3, 1, 50),
+    rates(9, 1, 50),
+    rates(9, 1, 20),
+    rates(20, 2, 50),
+    rates(50, 1, 50),
+    rates(200, 1, 50),
+    rates(1, 9, 50),
+)
+"""Normal, and bounded ones that are the more skewed, the nearer they are to a bound."""
+BEYOND = (
+    Population(name="return, uniform", draw=lambda rng, shape: rng.uniform(-1, 1, shape), mean=0.0),
+    Population(
+        name="return, exponential", draw=lambda rng, shape: -rng.exponential(size=shape), mean=-1.0
+    ),
+    rates(20, 0.5, 50),
+    rates(2, 0.2, 50),
+)
+"""Returns far from normal, and rates of which a few seeds are far below the rest: three seeds that
+are none of those can't know of them."""
+
+
+def coverage_of_the_mean(
+    populations: Sequence[Population], seeds: int, repeats: int, rng: np.random.Generator
+) -> tuple[float, float]:
+    """Share of intervals that hold the mean over the populations, and their median width.
+
+    Several populations are several tasks; all must be rates, or none.
+    """
+    scores = np.stack([one.draw(rng, (seeds, repeats)) for one in populations], axis=1)
+    found = st.estimate(scores, populations[0].episodes)
+    return _held(found, float(np.mean([one.mean for one in populations])))
+
+
+def coverage_of_the_gap(
+    x: Population, y: Population, seeds: int, repeats: int, rng: np.random.Generator
+) -> tuple[float, float]:
+    """The same of the difference between two conditions."""
+    a, b = (st.estimate(one.draw(rng, (seeds, 1, repeats)), one.episodes) for one in (x, y))
+    return _held(st.difference(a, b), x.mean - y.mean)
+
+
+def _held(found: st.Estimate, truth: float) -> tuple[float, float]:
+    held = (found.lower <= truth + 1e-12) & (truth - 1e-12 <= found.upper)
+    return float(np.mean(held)), float(np.median(found.upper - found.lower))
+
+
+def coverage_of_improvement(
+    x: Population, y: Population, seeds: int, repeats: int, rng: np.random.Generator
+) -> float:
+    """Share of intervals that hold the probability that a run of x ends above one of y."""
+    many = (one.draw(rng, (2000, 1)) for one in (x, y))
+    truth, held = st.improvement(*many), 0
+    for _ in range(repeats):
+        a, b = (one.draw(rng, (seeds, 1)) for one in (x, y))
+        found = st.probability_of_improvement(a, b)
+        held += bool(found.lower <= truth <= found.upper)
+    return held / repeats
+
+
+def coverage_of_the_median(seeds: int, repeats: int, rng: np.random.Generator) -> float:
+    """The same of the median of the steps to a threshold, lognormal, cut off at a budget."""
+    held, budget = 0, 1.5
+    for _ in range(repeats):
+        steps = rng.lognormal(size=seeds)
+        waits = Waits(steps=np.minimum(steps, budget), reached=steps <= budget)
+        lower, upper = median_wait_interval(waits)
+        held += bool(lower <= 1 <= upper)
+    return held / repeats
+
+
+def rows(repeats: int) -> Iterator[tuple[str, list[float]]]:
+    """What is measured, and its coverage for each number of `SEEDS`; NaN: no interval."""
+    rng = np.random.default_rng(0)
+    for one in (*POPULATIONS, *BEYOND):
+        yield (
+            f"mean: {one.name}",
+            [coverage_of_the_mean([one], seeds, repeats, rng)[0] for seeds in SEEDS],
+        )
+    tasks = [rates(9, 1, 50), rates(3, 3, 50), rates(50, 1, 50)]
+    yield (
+        "mean over three tasks: rates, Beta(9, 1), Beta(3, 3), Beta(50, 1)",
+        [coverage_of_the_mean(tasks, seeds, repeats, rng)[0] for seeds in SEEDS],
+    )
+    normal = POPULATIONS[0]
+    above = Population(
+        name="return, normal and higher",
+        draw=lambda rng, shape: rng.normal(1.0, 0.5, shape),
+        mean=1.0,
+    )
+    for x, y in ((above, normal), (rates(9, 1, 50), rates(5, 5, 50)), (rates(50, 1, 50),) * 2):
+        name = f"{x.name} against {y.name}"
+        yield f"gap: {name}", [coverage_of_the_gap(x, y, seeds, repeats, rng)[0] for seeds in SEEDS]
+        few = max(1, repeats // 20)
+        yield (
+            f"probability of improvement: {name}",
+            [coverage_of_improvement(x, y, seeds, few, rng) for seeds in SEEDS],
+        )
+    yield (
+        "median of steps to a threshold",
+        [
+            coverage_of_the_median(seeds, repeats // 4, rng) if seeds >= 5 else np.nan
+            for seeds in SEEDS
+        ],
+    )
+
+
+def main() -> None:
+    """Prints a Markdown table."""
+    repeats = int(sys.argv[1]) if len(sys.argv) > 1 else 20_000
+    print("| interval of | " + " | ".join(f"{seeds} seeds" for seeds in SEEDS) + " |")
+    print("|---|" + "---|" * len(SEEDS))
+    for name, found in rows(repeats):
+        cells = ["none" if np.isnan(share) else f"{share:.3f}" for share in found]
+        print(f"| {name} | {' | '.join(cells)} |")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,336 @@
+"""Conditions held against each other, in numbers and in words: the same ones whoever asks.
+
+`compare`, the report, its tables and the results page all go through :func:`scopes_of` and
+:func:`verdict`. A winner is named only where the evidence is there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations, count
+from math import comb
+from typing import Generic, Protocol, TypeVar
+
+import numpy as np
+
+from music_rllib.results import statistics as st
+from music_rllib.results.statistics import SIGNIFICANCE, Array, Estimate
+from music_rllib.tracking import names
+
+__all__ = ["ALL_TASKS", "GAP", "SHOW_SEEDS_BELOW", "Comparison", "Final", "Scope", "each_seed"]
+__all__ += ["interval_text", "number", "p_text", "scopes_of", "verdict"]
+
+ALL_TASKS = "all tasks"
+GAP = 0.1
+"""In a rate, which a reader would want to be able to see where nobody says another."""
+POWER = 0.8
+SHOW_SEEDS_BELOW = 10
+"""So few are shown one by one."""
+
+
+class Labelled(Protocol):
+    """What is compared."""
+
+    @property
+    def label(self) -> str: ...
+
+
+C = TypeVar("C", bound=Labelled)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Final(Generic[C]):
+    """How a condition ended."""
+
+    condition: C
+    scores: Array = field(repr=False)
+    """`[seeds, T]` of the seeds that have finished on every task of the scope."""
+    estimate: Estimate
+
+    @property
+    def value(self) -> float:
+        return float(self.estimate.value)
+
+    @property
+    def runs(self) -> int:
+        return int(self.scores.size)
+
+    @property
+    def seeds(self) -> int:
+        return len(self.scores)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Comparison(Generic[C]):
+    """Whether one condition's finished runs are better than another's."""
+
+    first: Final[C]
+    second: Final[C]
+    estimate: Estimate
+    """Probability that a run of `first` ends higher than one of `second`, ties half."""
+    p_value: float
+    """Of the exact permutation test, adjusted for the scope's other comparisons (Holm)."""
+
+    @property
+    def gap(self) -> Estimate:
+        """How much higher `first` is in the mean."""
+        return st.difference(self.first.estimate, self.second.estimate)
+
+    @property
+    def decided(self) -> bool:
+        """Evidence: relabelling the runs seldom makes such a gap."""
+        return self.p_value < SIGNIFICANCE
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scope(Generic[C]):
+    """Conditions on one task, or on all of them together."""
+
+    name: str
+    metric: str
+    """`names.*`, of which the last value counts."""
+    tasks: int
+    finals: tuple[Final[C], ...]
+    """Of the conditions with a seed that has finished on every task in the scope."""
+    compared: tuple[Final[C], ...]
+    """Those that may be held against each other: of a search the ones on fresh seeds."""
+    comparisons: tuple[Comparison[C], ...]
+    """Each pair of `compared` once, the later one against the earlier."""
+
+
+def scopes_of(
+    metrics: Mapping[str, str],
+    conditions: Sequence[tuple[C, Array, float]],
+    may_be_compared: Collection[C],
+) -> tuple[Scope[C], ...]:
+    """The numbers on each task, before them those over all tasks where these have a unit in common.
+
+    Args:
+        metrics: task to the metric that its T scores are last values of.
+        conditions: each with its scores `[seeds, T]`, NaN for what has not finished, and its
+            evaluation episodes, infinite where they are not known. Seeds that have not finished on
+            every task of a scope are left out of it: otherwise a task could weigh more in one
+            condition than in another.
+        may_be_compared: which of them.
+    """
+    columns = [(task, metric, [column]) for column, (task, metric) in enumerate(metrics.items())]
+    if len(columns) > 1 and len(set(metrics.values())) == 1 and columns[0][1] in names.EVAL_RATES:
+        columns.insert(0, (ALL_TASKS, columns[0][1], list(range(len(columns)))))
+    return tuple(
+        _scope(name, metric, [(c, x[:, chosen], n) for c, x, n in conditions], may_be_compared)
+        for name, metric, chosen in columns
+    )
+
+
+def _scope(
+    name: str,
+    metric: str,
+    conditions: Sequence[tuple[C, Array, float]],
+    may_be_compared: Collection[C],
+) -> Scope[C]:
+    is_rate = metric in names.EVAL_RATES
+    finals = [
+        Final(
+            condition=condition,
+            scores=complete,
+            estimate=st.estimate(complete, episodes if is_rate else None),
+        )
+        for condition, scores, episodes in conditions
+        if len(complete := scores[~np.isnan(scores).any(axis=1)])
+    ]
+    compared = tuple(final for final in finals if final.condition in may_be_compared)
+    pairs = [(second, first) for first, second in combinations(compared, 2)]
+    p_values = st.holm([st.improvement_p_value(a.scores, b.scores) for a, b in pairs])
+    return Scope(
+        name=name,
+        metric=metric,
+        tasks=conditions[0][1].shape[1] if conditions else 1,
+        finals=tuple(finals),
+        compared=compared,
+        comparisons=tuple(
+            Comparison(
+                first=a,
+                second=b,
+                estimate=st.probability_of_improvement(a.scores, b.scores),
+                p_value=p_value,
+            )
+            for (a, b), p_value in zip(pairs, p_values, strict=True)
+        ),
+    )
+
+
+# Words ------------------------------------------------------------------------------------------
+
+
+def verdict(scope: Scope[C], gap: float = GAP, *, maximised: bool = True) -> list[str]:
+    """Sentences about one scope: who is ahead, or why nobody is, and what would tell.
+
+    Args:
+        scope: with its comparisons.
+        gap: in a rate, which the reader would want to be able to see.
+        maximised: whether more of the metric is better.
+    """
+    where = "over all tasks together" if scope.name == ALL_TASKS else f"on {scope.name}"
+    if not scope.finals:
+        return [f"No condition has finished {where}: there is nothing to compare yet."]
+    if not scope.compared:
+        return [
+            f"Nothing is ranked {where}: no trial of the search has finished on fresh seeds. On "
+            "those that they are chosen by, trials are not compared: the best is so by luck, too."
+        ]
+    if len(scope.compared) == 1:
+        only = scope.compared[0]
+        return [f"Only one condition has finished {where}, so nothing is compared: {_said(only)}."]
+    lonely = [final for final in scope.compared if final.seeds < 2]
+    if lonely:
+        every = len(lonely) == len(scope.compared)
+        which = "every condition" if every else _names(lonely)
+        have = "have" if len(lonely) > 1 and not every else "has"
+        return [
+            f"No winner {where}: {which} {have} a single seed, so there is no interval and no "
+            f"evidence. {_direction(maximised).capitalize()} so far is "
+            f"{_said(_best(scope.compared, maximised)[0])}."
+        ]
+    if len({float(score) for final in scope.compared for score in final.scores.ravel()}) == 1:
+        return [
+            f"All conditions are equal {where}: each of their runs ended at "
+            f"{number(scope.compared[0].value)}."
+        ]
+    return [_ranking(scope, where, maximised), *_how_many_seeds(scope, gap)]
+
+
+def _best(finals: Sequence[Final[C]], maximised: bool) -> list[Final[C]]:
+    """Those with the best mean, which may be several."""
+    sign = 1.0 if maximised else -1.0
+    best = max(sign * final.value for final in finals)
+    return [final for final in finals if np.isclose(sign * final.value, best, atol=1e-9)]
+
+
+def _ranking(scope: Scope[C], where: str, maximised: bool) -> str:
+    best, *level = _best(scope.compared, maximised)
+    own = [
+        pair
+        for pair in scope.comparisons
+        if best in (pair.first, pair.second) and not {pair.first, pair.second} & set(level)
+    ]
+    # A mean may be better although most runs are worse: that is no evidence for it.
+    undecided = [pair for pair in own if not (pair.decided and _agrees(pair, best, maximised))]
+    if not undecided and not level:
+        worst = max(pair.p_value for pair in own)
+        return (
+            f"{best.condition.label} is ahead {where}: {_said(best)}. So large a gap comes by "
+            f"chance with {p_text(worst)} at most (permutation test, Holm's correction)."
+        )
+    gaps = []
+    for pair in undecided:
+        rival = pair.second if pair.first is best else pair.first
+        gap = st.difference(best.estimate, rival.estimate)
+        ends = interval_text(gap)
+        gaps.append(
+            f"{rival.condition.label} ({number(gap.value)}, {ends}; {p_text(pair.p_value)})"
+        )
+    lead = f"{_said(best)} is {_direction(maximised)}"
+    if level:
+        lead = f"{_names([best, *level])} are level at {number(best.value)}"
+    if not gaps:
+        return f"No winner {where}: {lead}."
+    most = sorted(final.seeds for final in scope.compared)[-2:]
+    few = "from so few seeds " if _least_p(scope, *most) >= SIGNIFICANCE else ""
+    return f"No winner {where}: {lead}, but {few}the gap to {_and(gaps)} may be chance."
+
+
+def _agrees(pair: Comparison[C], best: Final[C], maximised: bool) -> bool:
+    higher = pair.estimate.value > 0.5
+    return bool(higher == (pair.first is best) if maximised else higher == (pair.second is best))
+
+
+def _least_p(scope: Scope[C], first: int, second: int) -> float:
+    """The least that an adjusted p-value of so many seeds against so many can be."""
+    relabellings: int = comb(first + second, first) ** scope.tasks
+    return len(scope.comparisons) * 2 / relabellings
+
+
+def _how_many_seeds(scope: Scope[C], gap: float) -> list[str]:
+    """Where something is undecided: the seeds that would likely decide it."""
+    if all(pair.decided for pair in scope.comparisons):
+        return []
+    is_rate = scope.metric in names.EVAL_RATES
+    columns = [
+        column for final in scope.compared for column in np.split(final.scores, scope.tasks, 1)
+    ]
+    # Where a rate has no room for the gap, seeds differ less than they would elsewhere.
+    clear = [c for c in columns if not is_rate or gap <= c.mean() <= 1 - gap]
+    if not clear:
+        ends = sorted({"ceiling" if column.mean() > 0.5 else "floor" for column in columns})
+        return [
+            f"All are within {gap:g} of the {' or '.join(ends)}, where seeds differ less than "
+            "elsewhere: their spread does not tell how many would be needed."
+        ]
+    spread = st.pooled_spread(clear)
+    if not spread:
+        return ["Seeds ended alike: their spread does not tell how many would be needed."]
+    differ = f"Seeds of the same condition differ by {number(spread)} (standard deviation)"
+    seeds = min(final.seeds for final in scope.compared)
+    if not is_rate:
+        least = st.least_difference(seeds, spread, tasks=scope.tasks, power=POWER)
+        return [
+            f"{differ}. With {seeds} seeds per condition a difference of {number(least)} is seen "
+            f"with {POWER * 100:.0f} % chance (t test, one comparison)."
+        ]
+    needed = st.seeds_to_decide(gap, spread, tasks=scope.tasks, power=POWER)
+    # Below these no permutation test could decide anything.
+    fewest = next(n for n in count(2) if _least_p(scope, n, n) < SIGNIFICANCE)
+    if needed is None:
+        outcome = "more than 1000 seeds per condition would be needed"
+    elif (needed := max(needed, fewest)) <= seeds:
+        outcome = f"the {seeds} seeds per condition that there are would mostly show it"
+    else:
+        outcome = (
+            f"about {needed} seeds per condition would show it with {POWER * 100:.0f} % chance, "
+            f"{needed - seeds} more than now"
+        )
+    return [f"{differ}. For a difference of {gap:.2f}, {outcome} (t test, one comparison)."]
+
+
+def number(value: float | Array) -> str:
+    """Returns of hundreds need no fractions."""
+    value = float(value)
+    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.2f}"
+
+
+def interval_text(estimate: Estimate) -> str:
+    """`0.62 to 0.81`, or that there is none."""
+    if not estimate.has_interval:
+        return "no interval"
+    return f"{number(estimate.lower)} to {number(estimate.upper)}"
+
+
+def p_text(p_value: float) -> str:
+    """`p = 0.03`."""
+    return "p < 0.001" if p_value < 0.001 else f"p = {p_value:.2g}"
+
+
+def each_seed(final: Final[C]) -> list[float]:
+    """Every seed's score, mean over the tasks, the lowest first; empty where there are many."""
+    return sorted(final.scores.mean(axis=1).tolist()) if final.seeds < SHOW_SEEDS_BELOW else []
+
+
+def _direction(maximised: bool) -> str:
+    return "highest" if maximised else "lowest"
+
+
+def _said(final: Final[C]) -> str:
+    seeds = "1 seed" if final.seeds == 1 else f"{final.seeds} seeds"
+    return (
+        f"{final.condition.label} with {number(final.value)} "
+        f"({interval_text(final.estimate)}, {seeds})"
+    )
+
+
+def _names(finals: Iterable[Final[C]]) -> str:
+    return _and([final.condition.label for final in finals])
+
+
+def _and(words: Sequence[str]) -> str:
+    return " and ".join(filter(None, (", ".join(words[:-1]), words[-1])))
