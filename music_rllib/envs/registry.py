@@ -105,6 +105,9 @@ class Task(BaseModel):
     """Key of `info` that says whether the goal is reached now; null if there is none."""
     env_kwargs: dict[str, JsonValue] = Field(default_factory=dict)
     """Further arguments of `gymnasium.make`."""
+    reward_range: tuple[float, float] | None = None
+    """Smallest and largest reward of a step; null: not known. Changes no result: it tells where
+    `tac.target_bounds` cut off values that can be reached."""
     mi_reward_weight: float = Field(1.0, ge=0)
     """MUSIC-r's weight of the intrinsic reward where a sweep doesn't set it."""
     moved_distance: float | None = Field(None, gt=0)
@@ -115,6 +118,12 @@ class Task(BaseModel):
     @model_validator(mode="after")
     def _split_is_sound(self) -> Self:
         check_split(self.agent_indices, self.surrounding_indices)
+        return self
+
+    @model_validator(mode="after")
+    def _range_is_ordered(self) -> Self:
+        if self.reward_range is not None and self.reward_range[0] > self.reward_range[1]:
+            raise ValueError(f"reward_range must be [smallest, largest], got {self.reward_range}")
         return self
 
     @property
@@ -129,7 +138,12 @@ class Task(BaseModel):
 
     def identity(self) -> dict[str, Any]:
         """All that determines what the task is: neither its name nor how it is trained on."""
-        return self.model_dump(mode="json", exclude={"name", "mi_reward_weight", "moved_distance"})
+        left_out = {"name", "reward_range", "mi_reward_weight", "moved_distance"}
+        return self.model_dump(mode="json", exclude=left_out)
+
+
+_SPARSE = (-1.0, 0.0)
+"""Rewards of the built-in tasks: 0 at the goal, -1 elsewhere."""
 
 
 def _fetch(name: str, *, split: bool = True, mi_reward_weight: float = 1.0) -> Task:
@@ -139,6 +153,7 @@ def _fetch(name: str, *, split: bool = True, mi_reward_weight: float = 1.0) -> T
         horizon=50,
         agent_indices=(0, 1, 2) if split else (),
         surrounding_indices=(3, 4, 5) if split else (),
+        reward_range=_SPARSE,
         mi_reward_weight=mi_reward_weight,
     )
 
@@ -152,6 +167,7 @@ def _hand(name: str) -> Task:
         horizon=100,
         agent_indices=tuple(range(24)),
         surrounding_indices=(54, 55, 56),
+        reward_range=_SPARSE,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
@@ -99,7 +100,9 @@ class TrainingRun:
         config = algorithm_config(run)
         if gpus:
             config.learners(num_gpus_per_learner=gpus)
-        self.algorithm: TAC = config.build_algo()
+        with warnings.catch_warnings():  # of the settings: the sweep has given them, once
+            warnings.filterwarnings("ignore", "target_bounds ")
+            self.algorithm: TAC = config.build_algo()
         if handoff:
             if "normaliser" in handoff:
                 handoff = {**handoff, "normaliser": for_another_run(handoff["normaliser"])}

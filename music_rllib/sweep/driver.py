@@ -16,6 +16,7 @@ from music_rllib._allocator import give_back_freed_memory
 from music_rllib.experiment.config import load_sweep
 from music_rllib.experiment.model import SweepConfig
 from music_rllib.experiment.plan import Node, make_plan
+from music_rllib.experiment.remarks import remarks
 from music_rllib.sweep import records
 from music_rllib.sweep.beacon import Beacon
 from music_rllib.sweep.board import Status
@@ -263,8 +264,8 @@ def _open(console: Console, config: SweepConfig, *, retrain_damaged: bool = Fals
     )
     console.print(plan_view(config, plan, opened.finished))
     console.print(Text(f"Storage: {redact(storage)}"), soft_wrap=True)
-    if remark:
-        console.print(Text(remark, style="yellow"), soft_wrap=True)
+    for line in filter(None, (remark, *remarks(config))):
+        console.print(Text(line, style="yellow"), soft_wrap=True)
     return opened
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from music_rllib.experiment.remarks import remarks
 from music_rllib.sweep.changes import Changes
 from music_rllib.sweep.session import Sweep, plan_document
 from music_rllib.sweep.tables import search_runs
@@ -41,5 +42,6 @@ def plan_answer(opened: Sweep, changes: Changes | None = None) -> dict[str, Any]
         "env_steps_left": sum(node["env_steps"] for node in nodes if not node["finished"]),
         "nodes": nodes,
         "searches": searches,
+        "remarks": remarks(config),
         "changes": None if changes is None else str(changes),
     }

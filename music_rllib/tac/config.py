@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self, TypeVar
 
@@ -13,11 +14,12 @@ from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 from ray.tune.search.sample import Domain
 
 from music_rllib._quiet import quiet_third_parties
-from music_rllib.envs.registry import Indices, check_split
+from music_rllib.envs.registry import BUILT_IN_TASKS, Indices, check_split
 from music_rllib.estimator.settings import MusicSettings
 from music_rllib.replay.settings import ReplaySettings
 from music_rllib.schedules import Linear
 from music_rllib.tac.module import ESTIMATOR_MODULE, EstimatorModule, TACModule
+from music_rllib.tac.returns import Range, cut_off
 from music_rllib.tac.settings import TACSettings
 
 __all__ = ["TACConfig"]
@@ -55,6 +57,7 @@ class TACConfig(AlgorithmConfig):
         self.torch_threads = 1
         self.agent_indices: tuple[int, ...] = ()
         self.surrounding_indices: tuple[int, ...] = ()
+        self.reward_range: tuple[float, float] | None = None
         self.success_key: str | None = "is_success"
         self.moved_distance: float | None = None
         self.framework_str = "torch"
@@ -80,12 +83,15 @@ class TACConfig(AlgorithmConfig):
         *,
         total_env_steps: int | None = NotProvided,
         torch_threads: int = NotProvided,
+        reward_range: tuple[float, float] | None = NotProvided,
         **settings: Any,
     ) -> Self:
         """Sets TAC's hyper-parameters.
 
         Args:
             total_env_steps: budget of the run, which `linear` schedules are fractions of.
+            reward_range: smallest and largest reward of the environment, if they are known:
+                `validate()` then warns of `target_bounds` that cut off values within reach.
             torch_threads: threads of the Learner's process. More than one gains nothing on
                 networks of this size, and changes results in the last digits.
             **settings: fields of `TACSettings`, or arguments of `AlgorithmConfig.training`.
@@ -100,6 +106,8 @@ class TACConfig(AlgorithmConfig):
             self.total_env_steps = total_env_steps
         if torch_threads is not NotProvided:
             self.torch_threads = torch_threads
+        if reward_range is not NotProvided:
+            self.reward_range = reward_range
         return self
 
     def music(
@@ -227,6 +235,17 @@ class TACConfig(AlgorithmConfig):
                 "music(agent_indices=[...], surrounding_indices=[...])"
             )
         check_split(self.agent_indices, self.surrounding_indices)
+        task = self._rewards()
+        if task is not None and (remark := cut_off(tac, music, task)):
+            warnings.warn(str(remark), stacklevel=2)
+
+    def _rewards(self) -> Range | None:
+        """The task's, a step: as it was set, or a built-in environment's; None: not known."""
+        if self.reward_range is not None:
+            return Range(*self.reward_range)
+        known = (task.reward_range for task in BUILT_IN_TASKS.values() if task.env_id == self.env)
+        found = next(known, None) if not self.env_config else None
+        return None if found is None else Range(*found)
 
     # -- what RLlib builds from it --------------------------------------------------------
 

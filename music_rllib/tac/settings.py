@@ -93,7 +93,7 @@ class TACSettings(_Frozen):
     target_update_interval: int = Field(1, gt=0)
     """Gradient updates between two moves of the target networks."""
     target_bounds: tuple[float, float] | None = None
-    """Critic targets are clipped to this range (original MUSIC: -1/(1-gamma), 0)."""
+    """Critic targets are clipped to this range (original MUSIC: plus/minus 4/(1-gamma))."""
     batch_size: int = Field(256, gt=0)
     """Transitions per update."""
     replay_ratio: float = Field(1.0, gt=0)

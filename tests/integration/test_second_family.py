@@ -158,6 +158,7 @@ def test_episodes_last_the_horizon_and_say_whether_they_succeed(task: Task, env:
     assert task.success_key == "is_success"
     # Sparse rewards, 0 where the goal is reached and -1 elsewhere, say the same as the key.
     np.testing.assert_array_equal(trajectory.rewards, np.array(successes) - 1.0)
+    assert task.reward_range == (-1.0, 0.0)
 
 
 def test_same_seed_same_episode_whatever_was_played_before(task: Task, env: Env) -> None:

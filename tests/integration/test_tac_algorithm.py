@@ -116,7 +116,7 @@ DDPG: dict[str, Any] = {
     "bootstrap": "critics",
     "alpha": 0.0,
     "behaviour": {"kind": "gaussian_noise"},
-    "target_bounds": (-50.0, 0.0),
+    "target_bounds": (-100.0, 0.0),
 }
 ANNEALED = {"schedule": "linear", "start": 0.4, "end": 1.0}
 PER: dict[str, Any] = {"replay.priority": "td_error", "replay.importance_exponent": ANNEALED}
@@ -190,6 +190,7 @@ def test_every_setting_is_listed() -> None:
     assert fields == set(CHANGES)
 
 
+@pytest.mark.filterwarnings("ignore:target_bounds -1 to 0 cut off")
 @pytest.mark.parametrize("setting", CHANGES)
 def test_no_setting_is_dead(setting: str, bases: dict[str, dict[str, float]]) -> None:
     value, base = CHANGES[setting]
@@ -334,6 +335,26 @@ def test_a_bad_setting_is_refused_where_it_is_made(settings: dict[str, Any], mes
 def test_settings_that_contradict_each_other_are_refused(make: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make(TACConfig().environment("Pendulum-v1")).validate()
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda c: c.environment("FetchPush-v4"), "-100 to"),
+        (lambda c: c.environment("FetchPush-v4", env_config={"reward_type": "dense"}), None),
+        (lambda c: c.environment("Pendulum-v1"), None),
+        (lambda c: c.environment("Pendulum-v1").training(reward_range=(-17.0, 0.0)), "-1700 to"),
+        (lambda c: c.environment("FetchPush-v4").training(gamma=0.9), "-10 to"),
+        (lambda c: c.environment("FetchPush-v4").training(gamma=0.9, alpha=0.0), None),
+    ],
+)
+def test_bounds_that_cut_off_values_within_reach_are_warned_of(make: Any, said: str | None) -> None:
+    config = make(TACConfig().training(target_bounds=(-50.0, 0.0)))
+    if said is None:
+        config.validate()
+    else:
+        with pytest.warns(UserWarning, match=rf"target_bounds -50 to 0 cut off .*reached, {said}"):
+            config.validate()
 
 
 def test_tune_searches_tacs_settings_as_those_of_any_algorithm(tmp_path: Path) -> None:

@@ -3,9 +3,12 @@
 from pathlib import Path
 
 import pytest
+import torch
 
 from music_rllib.experiment.config import load_sweep
 from music_rllib.experiment.problems import ConfigError
+from music_rllib.experiment.remarks import remarks
+from music_rllib.tac.losses import critic_target
 
 SHIPPED = Path(__file__).parents[2] / "tune_configs" / "presets"
 SWEEP = """
@@ -78,3 +81,24 @@ SWEEPS = sorted(path for path in SHIPPED.parent.rglob("*.yaml") if path.parent !
 @pytest.mark.parametrize("path", SWEEPS, ids=lambda path: path.stem)
 def test_every_shipped_sweep_is_sound(path: Path) -> None:
     assert load_sweep(path).stages
+
+
+def test_music_2021_learns_from_the_intrinsic_reward_of_music_r(tmp_path: Path) -> None:
+    """Targets are iterated to where they end if every step pays -1, and if every step pays -2."""
+    (tmp_path / "presets").symlink_to(SHIPPED)
+    finetune = load_sweep(sweep(tmp_path, "music-2021")).stages[1].points[0].runs["FetchPush"].tac
+    values = torch.zeros(2, dtype=torch.float64)
+    for _ in range(3000):
+        values = critic_target(
+            torch.tensor([-1.0, -2.0]), torch.ones(2), values, 0.98, finetune.target_bounds
+        )
+    assert values.tolist() == pytest.approx([-50.0, -100.0], rel=1e-5)
+
+
+def test_no_shipped_bounds_cut_off_what_can_be_reached(tmp_path: Path) -> None:
+    (tmp_path / "presets").symlink_to(SHIPPED)
+    for preset in sorted(path.stem for path in SHIPPED.glob("*.yaml")):
+        config = load_sweep(sweep(tmp_path, preset))
+        assert remarks(config) == []
+    for path in SWEEPS:
+        assert remarks(load_sweep(path)) == []
