@@ -1,0 +1,56 @@
+"""How much one alpha weighs the Tsallis entropies of different q, and alphas that weigh them alike.
+
+S_q of different q have different scales: under one fixed alpha a policy of standard deviation .1
+feels 2.8 times the pressure at q = 2 that it feels at q = 1, and at .02 it is 14 times. A
+comparison of q at one alpha is then also one of the policies' widths.
+
+Plain numbers only. A: action dimensions; forms are those of `ln_q_of_policy`.
+"""
+
+from __future__ import annotations
+
+import math
+
+__all__ = ["entropy_pressure", "largest_entropy", "matched_alpha", "normalised_alpha"]
+
+_SHANNON = 1e-9
+"""|q - 1| below which S_q is Shannon's entropy."""
+
+
+def entropy_pressure(
+    q: float, width: float, actions: int = 1, form: str = "per_dimension"
+) -> float:
+    """dS_q / d ln sigma of one action dimension of a Gaussian policy, all as wide as `width`.
+
+    Per dimension it is G = q^(-1/2) (sqrt(2 pi) sigma)^(1-q), the integral of p^q. The joint
+    entropy (1 - G^A)/(q-1) has G^A. Shannon's has 1 at every width. Of the Gaussian before tanh,
+    which changes little at widths below .3.
+    """
+    log_integral = -0.5 * math.log(q) + (1.0 - q) * math.log(math.sqrt(2.0 * math.pi) * width)
+    return math.exp(log_integral * (actions if form == "joint" else 1))
+
+
+def matched_alpha(
+    alpha: float, q: float, width: float, actions: int = 1, form: str = "per_dimension"
+) -> float:
+    """The alpha at which q exerts the pressure at `width` that `alpha` does at q = 1."""
+    return alpha / entropy_pressure(q, width, actions, form)
+
+
+def largest_entropy(q: float, actions: int = 1, form: str = "per_dimension") -> float:
+    """S_q of the uniform density on [-1, 1]^A, which no policy there exceeds.
+
+    Per dimension A (1 - 2^(1-q))/(q-1), joint (1 - 2^(A (1-q)))/(q-1); A ln 2 at q = 1.
+    """
+    copies, dimensions = (1, actions) if form == "joint" else (actions, 1)
+    order, log_volume = q - 1.0, dimensions * math.log(2.0)
+    if abs(order) < _SHANNON:
+        return copies * log_volume
+    return -copies * math.expm1(-order * log_volume) / order
+
+
+def normalised_alpha(
+    alpha: float, q: float, actions: int = 1, form: str = "per_dimension"
+) -> float:
+    """The alpha that counts S_q as a share of its largest value, in units of that of q = 1."""
+    return alpha * largest_entropy(1.0, actions, form) / largest_entropy(q, actions, form)
