@@ -44,7 +44,13 @@ from music_rllib.experiment.space import (
 )
 from music_rllib.replay.settings import ReplaySettings
 from music_rllib.schedules import Linear, Piecewise
-from music_rllib.tac.settings import GaussianNoise, LearnedAlpha, TACSettings
+from music_rllib.tac.settings import (
+    GaussianNoise,
+    LearnedAlpha,
+    MatchedAlpha,
+    NormalisedAlpha,
+    TACSettings,
+)
 
 TARGET = Path(__file__).with_name("configuration.md")
 
@@ -168,6 +174,11 @@ def document() -> str:
         table(rows(TACSettings, "tac.")),
         "A learned `tac.alpha`:",
         table(rows(LearnedAlpha, "tac.alpha.")),
+        "A `tac.alpha` that is scaled for each q, for a comparison at equal pressure "
+        "([comparing q](comparing_q.md)); its keys can be searched (`tac.alpha.value`):",
+        table(rows(MatchedAlpha, "tac.alpha.")),
+        "or, by the entropy's largest value:",
+        table(rows(NormalisedAlpha, "tac.alpha.")),
         "A `tac.behaviour` with noise:",
         table(rows(GaussianNoise, "tac.behaviour.")),
         "### music",

@@ -19,7 +19,7 @@ from music_rllib.policy.policy import policy_from_folder
 from music_rllib.schedules import Linear, Piecewise, value_at
 from music_rllib.sweep.listener import Failure, Listener
 from music_rllib.sweep.words import in_words
-from music_rllib.tac.settings import LearnedAlpha
+from music_rllib.tac.settings import LearnedAlpha, MatchedAlpha, NormalisedAlpha
 from music_rllib.tac.version import ALGORITHM_VERSION
 from music_rllib.tracking import names
 from music_rllib.tracking.errors import TrackingError
@@ -29,8 +29,15 @@ from music_rllib.tracking.tracker import Point, RunInfo, Tracker
 __all__ = ["Logbook", "run_info"]
 
 
-def _at_start(value: float | Linear | Piecewise | LearnedAlpha, run: RunSettings) -> float:
-    return value.initial if isinstance(value, LearnedAlpha) else value_at(value, 0, run.env_steps)
+def _at_start(
+    value: float | Linear | Piecewise | LearnedAlpha | MatchedAlpha | NormalisedAlpha,
+    run: RunSettings,
+) -> float:
+    if isinstance(value, LearnedAlpha):
+        return value.initial
+    # As it was set: alpha at q = 1. What becomes of it at q is a metric of the run.
+    given = value.value if isinstance(value, MatchedAlpha | NormalisedAlpha) else value
+    return value_at(given, 0, run.env_steps)
 
 
 def run_info(node: Node) -> RunInfo:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from music_rllib.experiment.plan import short
 from music_rllib.schedules import Linear, Piecewise
-from music_rllib.tac.settings import LearnedAlpha
+from music_rllib.tac.settings import LearnedAlpha, MatchedAlpha, NormalisedAlpha
 
 __all__ = ["clock", "in_words", "percent"]
 
@@ -23,13 +23,23 @@ def clock(seconds: float | None) -> str:
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
-def in_words(value: float | Linear | Piecewise | LearnedAlpha) -> str:
-    """A constant, a schedule or a learned coefficient in a few characters: `1.5`, `1 to 2`."""
+def in_words(
+    value: float | Linear | Piecewise | LearnedAlpha | MatchedAlpha | NormalisedAlpha,
+) -> str:
+    """A constant, a schedule or a coefficient in a few characters: `1.5`, `1 to 2`, `learned`."""
     match value:
+        case MatchedAlpha():
+            return f"{in_words(value.value)} matched at {value.matched_width:g}"
+        case NormalisedAlpha():
+            return f"{in_words(value.value)} normalised"
         case Linear():
             return f"{value.start:g} to {value.end:g}"
         case Piecewise():
             return " to ".join(f"{point:g}" for _, point in value.points)
+        case LearnedAlpha(target_shannon=float(nats)):
+            return f"learned, {nats:g} nats"
+        case LearnedAlpha(target_width=float(width)):
+            return f"learned, width {width:g}"
         case LearnedAlpha():
             return "learned"
         case _:

@@ -221,7 +221,7 @@ class TACConfig(AlgorithmConfig):
             )
         schedules = (
             tac.entropic_index,
-            tac.alpha,
+            getattr(tac.alpha, "value", tac.alpha),
             music.mi_reward_weight,
             replay.importance_exponent,
         )

@@ -13,6 +13,7 @@ of every network and one of the estimator.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -41,7 +42,7 @@ from music_rllib.tac.module import ESTIMATOR_MODULE, EstimatorModule, TACModule,
 from music_rllib.tac.normaliser import RunningNormaliser
 from music_rllib.tac.optimizer import FusedAdam
 from music_rllib.tac.precision import check_precision
-from music_rllib.tac.settings import LearnedAlpha, TACSettings
+from music_rllib.tac.settings import LearnedAlpha, TACSettings, alpha_at
 from music_rllib.tracking import names
 from music_rllib.tsallis import ln_q_of_policy
 
@@ -75,7 +76,7 @@ class _Loss(NamedTuple):
     value_target: Tensor
     """[B] of the value network, where there is one."""
     excess_entropy: Tensor
-    """[] S_q of the policy less its target: the derivative by log alpha, where that is learned."""
+    """[] entropy of the policy less its target, the derivative by a learned log alpha."""
 
 
 class NonFiniteLossError(RuntimeError):
@@ -189,7 +190,9 @@ class TACLearner(TorchLearner):
         self._entropic_index = value_at(settings.entropic_index, env_steps, total)
         self._mi_reward_weight = value_at(self._music.mi_reward_weight, env_steps, total)
         if not isinstance(settings.alpha, LearnedAlpha):
-            self._alpha: float = value_at(settings.alpha, env_steps, total)
+            self._alpha: float = alpha_at(
+                settings, env_steps, total, self._policy_module.action_size
+            )
         else:
             self._target_entropy = self._resolve_target_entropy()
 
@@ -347,11 +350,23 @@ class TACLearner(TorchLearner):
             value = losses.value_loss(forward.value, value_target)
             total = total + value
             self._losses[names.VALUE_LOSS] = value.detach()
-        excess = -ln_q_pi.mean().detach() - self._target_entropy
+        excess = self._excess_entropy(forward, ln_q_pi)
         if isinstance(settings.alpha, LearnedAlpha):
             total = total + losses.alpha_loss(self._policy_module.log_alpha, excess)
         self._observe(forward, target, critic=critic, policy=policy)
         return _Loss(total, target, value_target, excess)
+
+    def _excess_entropy(self, forward: TACForward, ln_q_pi: Tensor) -> Tensor:
+        """[] how much too random the policy is for a learned alpha, in its target's own measure."""
+        alpha = self._settings.alpha
+        if not isinstance(alpha, LearnedAlpha) or forward.log_density is None:
+            return torch.zeros((), device=self._device)
+        if alpha.target_shannon is not None:
+            return -forward.log_density.detach().sum(-1).mean() - alpha.target_shannon
+        if alpha.target_width is not None:
+            assert forward.log_std is not None
+            return forward.log_std.detach().mean() - math.log(alpha.target_width)
+        return -ln_q_pi.mean().detach() - self._target_entropy
 
     def _update_directly(self, direct: DirectUpdate, minibatch: Minibatch) -> None:
         """RLlib's `_update` without its detours and, for the policy's module, without autograd."""

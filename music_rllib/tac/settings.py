@@ -2,17 +2,36 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Tag,
+    model_serializer,
+    model_validator,
+)
 
-from music_rllib.schedules import Schedule, bounded
+from music_rllib.entropy_scale import matched_alpha, normalised_alpha
+from music_rllib.schedules import Schedule, bounded, value_at
 
-__all__ = ["GaussianNoise", "LearnedAlpha", "TACSettings"]
+__all__ = [
+    "GaussianNoise",
+    "LearnedAlpha",
+    "MatchedAlpha",
+    "NormalisedAlpha",
+    "TACSettings",
+    "alpha_at",
+]
 
 
 class _Frozen(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+PositiveSchedule = Annotated[Schedule, bounded(">= 0", lambda alpha: alpha >= 0)]
 
 
 class LearnedAlpha(_Frozen):
@@ -25,8 +44,58 @@ class LearnedAlpha(_Frozen):
     target_entropy: float | Literal["auto"] = "auto"
     """Target for S_q of the policy. `auto`: the S_q of a density of e per action dimension, which
     is SAC's usual minus-the-number-of-dimensions at q = 1."""
+    target_shannon: float | None = None
+    """In place of `target_entropy`: target for the policy's Shannon entropy in nats, over all
+    action dimensions. The same at every q, so that policies of different q are equally random."""
+    target_width: float | None = Field(None, gt=0)
+    """In place of `target_entropy`: target for the geometric mean of the policy's standard
+    deviations, before tanh. The same at every q."""
     lr: float = Field(3e-4, gt=0)
     """Adam's step size for log alpha."""
+
+    @model_validator(mode="after")
+    def _one_target(self) -> Self:
+        given = [
+            name
+            for name in ("target_entropy", "target_shannon", "target_width")
+            if getattr(self, name) != type(self).model_fields[name].default
+        ]
+        if len(given) > 1:
+            raise ValueError(f"only one target can be given, got {' and '.join(given)}")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _without_what_is_not_given(self, dump: Any) -> dict[str, Any]:
+        """Keys of runs that use no such target are those of before there were any."""
+        return {name: value for name, value in dump(self).items() if value is not None}
+
+
+class MatchedAlpha(_Frozen):
+    """Entropy coefficient that weighs the entropy of every q alike at a reference width."""
+
+    value: PositiveSchedule = 0.2
+    """Alpha at q = 1."""
+    matched_width: float = Field(gt=0)
+    """Standard deviation of the policy, before tanh, at which every q exerts the pressure
+    `alpha dS_q / d ln sigma` of q = 1 (docs/comparing_q.md)."""
+
+    def scaled(self, alpha: float, q: float, actions: int, form: str) -> float:
+        """Alpha at q, for so many action dimensions."""
+        return matched_alpha(alpha, q, self.matched_width, actions, form)
+
+
+class NormalisedAlpha(_Frozen):
+    """Entropy coefficient of S_q as a share of the largest that it can be."""
+
+    value: PositiveSchedule = 0.2
+    """Alpha at q = 1."""
+    normalised: Literal[True]
+    """Divides S_q by that of the uniform policy, relative to q = 1. It raises alpha for q > 1, and
+    so makes the pressures on narrow policies more unequal than one alpha does."""
+
+    def scaled(self, alpha: float, q: float, actions: int, form: str) -> float:
+        """Alpha at q, for so many action dimensions."""
+        return normalised_alpha(alpha, q, actions, form)
 
 
 class GaussianNoise(_Frozen):
@@ -40,17 +109,45 @@ class GaussianNoise(_Frozen):
     """Share of actions drawn uniformly instead."""
 
 
+_KINDS_OF_ALPHA = {
+    "learned": LearnedAlpha,
+    "matched_width": MatchedAlpha,
+    "normalised": NormalisedAlpha,
+}
+"""By the key that only they have."""
+
+
 def _alpha_kind(value: object) -> str:
-    learned = isinstance(value, LearnedAlpha) or (isinstance(value, dict) and "learned" in value)
-    return "learned" if learned else "scheduled"
+    for key, kind in _KINDS_OF_ALPHA.items():
+        if isinstance(value, kind) or (isinstance(value, dict) and key in value):
+            return key
+    return "scheduled"
 
 
 Alpha = Annotated[
-    Annotated[Schedule, bounded(">= 0", lambda alpha: alpha >= 0), Tag("scheduled")]
-    | Annotated[LearnedAlpha, Tag("learned")],
+    Annotated[PositiveSchedule, Tag("scheduled")]
+    | Annotated[LearnedAlpha, Tag("learned")]
+    | Annotated[MatchedAlpha, Tag("matched_width")]
+    | Annotated[NormalisedAlpha, Tag("normalised")],
     Discriminator(_alpha_kind),
 ]
-"""Entropy coefficient: a constant, a schedule, or learned."""
+"""Entropy coefficient: a constant or a schedule, as it is or scaled for each q, or learned."""
+
+
+def alpha_at(settings: TACSettings, env_steps: int, total_env_steps: int, actions: int) -> float:
+    """The entropy coefficient after `env_steps`, at the q of that time; a learned one's first.
+
+    Args:
+        actions: action dimensions of the task; they count for `entropy_form: joint` only.
+    """
+    alpha = settings.alpha
+    if isinstance(alpha, LearnedAlpha):
+        return alpha.initial
+    if not isinstance(alpha, MatchedAlpha | NormalisedAlpha):
+        return value_at(alpha, env_steps, total_env_steps)
+    value = value_at(alpha.value, env_steps, total_env_steps)
+    q = value_at(settings.entropic_index, env_steps, total_env_steps)
+    return alpha.scaled(value, q, actions, settings.entropy_form)
 
 
 def _behaviour_kind(value: object) -> str:
@@ -70,7 +167,8 @@ class TACSettings(_Frozen):
     entropic_index: Annotated[Schedule, bounded("> 0", lambda q: q > 0)] = 1.0
     """q of ln_q. 1 is SAC, 2 the sparse Tsallis entropy."""
     alpha: Alpha = 0.2
-    """Entropy coefficient: a constant, a schedule, or `{learned: true, ...}`."""
+    """Entropy coefficient: a constant, a schedule, `{learned: true, ...}`, or, to compare q at
+    equal pressure, `{value: ..., matched_width: ...}` (docs/comparing_q.md)."""
     entropy_form: Literal["per_dimension", "joint"] = "per_dimension"
     """ln_q summed over action dimensions (the TAC authors), or of the joint density (the paper)."""
     policy: Literal["stochastic", "deterministic"] = "stochastic"
