@@ -122,6 +122,14 @@ def test_a_schedule_replaces_the_one_below_it_whole(load: Callable[..., SweepCon
     assert run_of(config, point=1).tac.entropic_index == Linear(start=1.0, end=3.0, begin=0.2)
 
 
+def test_a_target_that_is_not_given_leaves_the_keys_of_learned_alphas_alone(
+    load: Callable[..., SweepConfig],
+) -> None:
+    stages = [{"name": "a", "variant": "tac", "tac": {"alpha": {"learned": True}}}]
+    alpha = run_of(load(changed(stages=stages))).identity()["tac"]["alpha"]
+    assert alpha == {"learned": True, "initial": 0.2, "target_entropy": "auto", "lr": 3e-4}
+
+
 def test_the_grid_is_a_product_with_the_last_key_fastest(
     load: Callable[..., SweepConfig],
 ) -> None:
@@ -236,6 +244,20 @@ BAD: list[tuple[Document, str]] = [
     (
         with_stage(0, tac={"alpha": {"learned": True, "initial": -1.0}}),
         "stages.pretrain.tac.alpha.initial must be > 0, got -1.0",
+    ),
+    (
+        with_stage(
+            0, tac={"alpha": {"learned": True, "target_shannon": -4.0, "target_width": 0.1}}
+        ),
+        "only one target can be given, got target_shannon and target_width",
+    ),
+    (
+        with_stage(0, tac={"alpha": {"value": 0.1, "matched_width": 0.0}}),
+        "stages.pretrain.tac.alpha.matched_width must be > 0, got 0",
+    ),
+    (
+        with_stage(0, tac={"alpha": {"value": 0.1, "normalised": False}}),
+        "stages.pretrain.tac.alpha.normalised must be",
     ),
     (with_stage(0, tac={"hiden_sizes": [1]}), "(did you mean 'hidden_sizes'?)"),
     (

@@ -1,6 +1,7 @@
 """What a person sees: the plan, progress on a terminal and without one, the results."""
 
 import io
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from music_rllib.experiment.model import SweepConfig
 from music_rllib.experiment.plan import Plan, make_plan
 from music_rllib.experiment.result import Report, RunResult
 from music_rllib.schedules import Linear, Piecewise
+from music_rllib.sweep.alpha_view import alpha_rows, alpha_table
 from music_rllib.sweep.board import Board
 from music_rllib.sweep.display import Display
 from music_rllib.sweep.listener import Failure
@@ -85,6 +87,40 @@ def test_the_plan_counts_runs_budgets_and_what_is_finished(config: SweepConfig, 
     assert "6 runs, 24,000 env steps in all, 1 finished earlier and reused, 22,000 env steps" in (
         text.getvalue()
     )
+
+
+def test_the_plan_shows_what_a_control_makes_of_alpha_at_each_q(tmp_path: Path) -> None:
+    alpha = {"value": 0.05, "matched_width": 0.1}
+    ramp = {"schedule": "linear", "start": 1.0, "end": 2.0}
+    stages = [
+        {
+            "name": "fixed",
+            "variant": "tac",
+            "tac": {"alpha": alpha},
+            "grid": {"tac.entropic_index": [2.0, 1.0]},
+        },
+        {
+            "name": "joint",
+            "variant": "tac",
+            "tac": {"alpha": alpha, "entropic_index": ramp, "entropy_form": "joint"},
+        },
+        {"name": "plain", "variant": "tac", "grid": {"tac.alpha": [0.05, 0.1]}},
+    ]
+    path = tmp_path / "s.yaml"
+    path.write_text(yaml.safe_dump(DOCUMENT | {"stages": stages}, sort_keys=False))
+    rows = alpha_rows(make_plan(load_sweep(path)))
+    # G = q^(-1/2) (sqrt(2 pi) sigma)^(1-q) at q = 2, and of four dimensions its fourth power.
+    pressure = 2**-0.5 / ((2 * math.pi) ** 0.5 * 0.1)
+    assert [(row["stage"], row["q"]) for row in rows] == [
+        ("fixed", "1"),
+        ("fixed", "2"),
+        ("joint", "1 to 2"),
+    ]
+    assert [row["at_start"] for row in rows] == pytest.approx([0.05, 0.05 / pressure, 0.05])
+    assert rows[2]["at_end"] == pytest.approx(0.05 / pressure**4)
+    console, text = screen()
+    console.print(alpha_table(rows))
+    assert "0.05 matched at 0.1" in text.getvalue()
 
 
 def test_results_have_a_row_per_run_whatever_became_of_it(plan: Plan) -> None:
