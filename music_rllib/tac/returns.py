@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from music_rllib.estimator.settings import MusicSettings
 from music_rllib.schedules import extremes
-from music_rllib.tac.settings import LearnedAlpha, TACSettings
+from music_rllib.tac.settings import Alpha, LearnedAlpha, MatchedAlpha, NormalisedAlpha, TACSettings
 from music_rllib.tsallis import uniform_entropy
 
 __all__ = ["CutOff", "Range", "cut_off", "reward_a_step"]
@@ -84,5 +84,13 @@ def _entropy_bonus(tac: TACSettings) -> float:
     """
     if tac.policy == "deterministic":
         return 0.0
-    alpha = tac.alpha.initial if isinstance(tac.alpha, LearnedAlpha) else extremes(tac.alpha)[1]
-    return alpha * max(0.0, *(uniform_entropy(q) for q in extremes(tac.entropic_index)))
+    qs = extremes(tac.entropic_index)
+    return max(0.0, *(_largest_alpha(tac.alpha, q) * uniform_entropy(q) for q in qs))
+
+
+def _largest_alpha(alpha: Alpha, q: float) -> float:
+    if isinstance(alpha, LearnedAlpha):
+        return alpha.initial
+    if isinstance(alpha, MatchedAlpha | NormalisedAlpha):
+        return alpha.scaled(extremes(alpha.value)[1], q, 1, "per_dimension")
+    return extremes(alpha)[1]

@@ -18,6 +18,7 @@ from music_rllib.entropy_scale import matched_alpha, normalised_alpha
 from music_rllib.schedules import Schedule, bounded, value_at
 
 __all__ = [
+    "Alpha",
     "GaussianNoise",
     "LearnedAlpha",
     "MatchedAlpha",
@@ -109,7 +110,7 @@ class GaussianNoise(_Frozen):
     """Share of actions drawn uniformly instead."""
 
 
-_KINDS_OF_ALPHA = {
+_KINDS_OF_ALPHA: dict[str, type[BaseModel]] = {
     "learned": LearnedAlpha,
     "matched_width": MatchedAlpha,
     "normalised": NormalisedAlpha,
@@ -119,7 +120,7 @@ _KINDS_OF_ALPHA = {
 
 def _alpha_kind(value: object) -> str:
     for key, kind in _KINDS_OF_ALPHA.items():
-        if isinstance(value, kind) or (isinstance(value, dict) and key in value):
+        if (isinstance(value, dict) and key in value) or type(value) is kind:
             return key
     return "scheduled"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
@@ -72,7 +73,7 @@ def test_a_learned_alpha_reaches_a_width() -> None:
 @pytest.mark.parametrize("form", ["per_dimension", "joint"])
 def test_alpha_follows_q_where_it_is_scaled_for_it(form: str) -> None:
     shared = {"entropic_index": RAMP, "entropy_form": form, "total_env_steps": 1_000}
-    controls = {
+    controls: dict[str, tuple[Any, Callable[[float], float]]] = {
         "matched_width": (0.1, lambda q: matched_alpha(0.3, q, 0.1, ACTIONS, form)),
         "normalised": (True, lambda q: normalised_alpha(0.3, q, ACTIONS, form)),
     }
