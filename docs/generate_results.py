@@ -120,7 +120,9 @@ def exports() -> list[Sweep]:
 
 def runs_table(sweep: Sweep) -> Iterator[str]:
     """Each run, failures too: how far, how well, how long, under which code."""
-    yield _row("run", "state", "env steps", "success", f"first >= {_percent(THRESHOLD)} at", "time")
+    yield _row(
+        "run", "state", "env steps", "last evaluation", f"first >= {_percent(THRESHOLD)} at", "time"
+    )
     yield _rule(6)
     for position in sorted(range(len(sweep.runs)), key=lambda i: _natural(sweep.runs[i].name)):
         run = sweep.runs[position]
@@ -130,12 +132,21 @@ def runs_table(sweep: Sweep) -> Iterator[str]:
             f"`{run.name}`",
             run.status.lower(),
             f"{sweep.last_step(position):,}",
-            _percent(values[-1]) if len(values) else "",
+            _last(sweep, position),
             _first(passage),
             _clock(run.seconds),
         )
     yield ""
     yield provenance(sweep)
+
+
+def _last(sweep: Sweep, run: int) -> str:
+    """What its task is judged by, at the end; empty before the first evaluation."""
+    metric = sweep.primary_metric(sweep.runs[run].task)
+    value = sweep.final(run, metric)
+    if value is None:
+        return ""
+    return _percent(value) if metric == names.EVAL_SUCCESS else in_short(value)
 
 
 def _first(passage: tuple[float, bool] | None) -> str:

@@ -28,7 +28,6 @@ from music_rllib.sweep.board import Status
 from music_rllib.sweep.judgement import best_in_words, best_so_far
 from music_rllib.sweep.listener import Failure, Listener
 from music_rllib.sweep.session import Sweep, plan_document
-from music_rllib.tracking import names
 
 __all__ = ["Beacon", "is_alive"]
 
@@ -182,13 +181,14 @@ class Beacon(Listener):
             if status in (Status.WAITING, Status.STARTED, Status.PAUSED):
                 steps_left += node.run.env_steps - steps
             if status is Status.STARTED:
-                success = self._metrics.get(node.key, {}).get(names.EVAL_SUCCESS)
+                metric = node.run.task.primary_metric
                 running.append(
                     {
                         "run": node.label,
                         "env_steps": steps,
                         "budget": node.run.env_steps,
-                        "success": success,
+                        "metric": metric,
+                        "value": self._metrics.get(node.key, {}).get(metric),
                     }
                 )
         stages = [

@@ -18,7 +18,7 @@ from music_rllib.experiment.result import Report, RunResult
 from music_rllib.sweep.board import Board, Status
 from music_rllib.sweep.listener import Failure, Listener
 from music_rllib.sweep.pace import Pace
-from music_rllib.sweep.words import clock, percent
+from music_rllib.sweep.words import clock, evaluated_in_words
 from music_rllib.tracking import names
 
 __all__ = ["Display"]
@@ -89,7 +89,7 @@ class Display(Listener):
         quiet = self._now() - self._said.get(node.key, self._began) >= QUIET_SECONDS
         if self._live is None and (evaluated or quiet) and not self._is_over(node, pace):
             self._said[node.key] = self._now()
-            self.say(f"{node.label}: {self._progress_in_words(pace)}")
+            self.say(f"{node.label}: {self._progress_in_words(node, pace)}")
 
     @staticmethod
     def _is_over(node: Node, pace: Pace) -> bool:
@@ -104,7 +104,7 @@ class Display(Listener):
     def finished(self, node: Node, result: RunResult) -> None:
         self._running.pop(node.key, None)
         self.say(
-            f"{node.label}: finished, {_success(result.metrics)}, "
+            f"{node.label}: finished, {evaluated_in_words(node.run.task, result.metrics)}, "
             f"{result.env_steps:,} env steps in {clock(result.seconds)}",
             "green",
         )
@@ -140,7 +140,7 @@ class Display(Listener):
         table = Table(box=None, pad_edge=False)
         table.add_column("running")
         table.add_column("", width=16)
-        for name in ("env steps", "steps/s", "left", "success"):
+        for name in ("env steps", "steps/s", "left", "last evaluation"):
             table.add_column(name, justify="right")
         for node, pace in self._running.values():
             rate = pace.steps_per_second
@@ -150,7 +150,9 @@ class Display(Listener):
                 f"{pace.env_steps:,} / {pace.budget:,}" if pace.env_steps else "preparing",
                 "-" if rate is None else f"{rate:.0f}",
                 clock(pace.seconds_left(self._now())),
-                percent(pace.metrics.get(names.EVAL_SUCCESS)),
+                evaluated_in_words(node.run.task, pace.metrics)
+                if node.run.task.primary_metric in pace.metrics
+                else "-",
             )
         lines, best = self.headline()
         texts = [Text(line, style="dim") for line in [*lines, self._summary()]]
@@ -179,16 +181,11 @@ class Display(Listener):
         steps = sum(node.run.env_steps for node in to_do) - sum(pace.env_steps for pace in paces)
         return max(steps / sum(rates), *(pace.seconds_left(self._now()) or 0.0 for pace in paces))
 
-    def _progress_in_words(self, pace: Pace) -> str:
+    def _progress_in_words(self, node: Node, pace: Pace) -> str:
         parts = [f"{pace.env_steps:,} of {pace.budget:,} env steps"]
         rate, left = pace.steps_per_second, pace.seconds_left(self._now())
         if rate is not None:
             parts += [f"{rate:.0f} steps/s", f"{clock(left)} left"]
-        if names.EVAL_SUCCESS in pace.metrics:
-            parts.append(_success(pace.metrics))
+        if node.run.task.primary_metric in pace.metrics:
+            parts.append(evaluated_in_words(node.run.task, pace.metrics))
         return ", ".join(parts)
-
-
-def _success(metrics: dict[str, float]) -> str:
-    last, some = metrics.get(names.EVAL_SUCCESS), metrics.get(names.EVAL_SUCCESS_ANY)
-    return f"success {percent(last)} (any step {percent(some)})"

@@ -38,6 +38,7 @@ SWEEP_TAGS = ("sweep",)
 _METRICS = {
     "music_success_rate": names.EVAL_SUCCESS,
     "music_success_rate_any_step": names.EVAL_SUCCESS_ANY,
+    "music_episode_return": names.EVAL_RETURN,
     "music_mutual_information_bound_nats": names.MI_BOUND,
     "music_env_steps": names.ENV_STEPS,
     "music_grad_updates": names.GRAD_UPDATES,
@@ -49,6 +50,7 @@ _RATES = {
 GAUGES = {
     "music_success_rate": "Success at the last step of evaluation episodes, of a run.",
     "music_success_rate_any_step": "Success at any step of evaluation episodes, of a run.",
+    "music_episode_return": "Return of evaluation episodes, of a run.",
     "music_mutual_information_bound_nats": "Bound on the mutual information, of a run.",
     "music_env_steps": "Environment steps that a run has done.",
     "music_grad_updates": "Gradient updates that a run has done.",

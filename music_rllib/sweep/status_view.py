@@ -13,7 +13,8 @@ from rich.text import Text
 from music_rllib.experiment.plan import short
 from music_rllib.experiment.store import TRAIN_AGAIN
 from music_rllib.sweep.judgement import best_in_words
-from music_rllib.sweep.words import clock, percent
+from music_rllib.sweep.words import clock, measured
+from music_rllib.tracking import names
 
 __all__ = ["status_view"]
 
@@ -40,7 +41,7 @@ def status_view(state: Mapping[str, Any]) -> RenderableType:
     parts += [
         Text(
             f"running: {one['run']}  {one['env_steps']:,} / {one['budget']:,} env steps, "
-            f"success {percent(one['success'])}"
+            f"{names.word_of(one['metric'])} {measured(one['metric'], one['value'])}"
         )
         for one in state["running"]
     ]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from music_rllib.envs.registry import Task
 from music_rllib.experiment.model import Source, Stage, SweepConfig
 from music_rllib.experiment.plan import Node, Plan, short
 from music_rllib.experiment.result import RunResult
@@ -16,7 +17,7 @@ from music_rllib.experiment.searched import most_env_steps
 from music_rllib.experiment.space import Choice, Dimension, SearchSettings
 from music_rllib.results.comparison import SHOW_SEEDS_BELOW
 from music_rllib.sweep.board import Status
-from music_rllib.sweep.words import clock, in_words, percent
+from music_rllib.sweep.words import clock, in_words, measured, percent
 from music_rllib.tracking import names
 
 __all__ = [
@@ -67,7 +68,7 @@ def _stage_row(
     runs = [run for run in plan.runs if run.stage == stage.name]
     if not runs:  # its settings are searched for: it runs as trials want it
         budget = next(iter(stage.points[0].runs.values())).env_steps
-        tasks = ", ".join(task.name for task in stage.tasks)
+        tasks = ", ".join(map(_judged, stage.tasks))
         counts = ["as needed", str(seeds), "-", f"{budget:,}", "-", "-"]
         return [stage.name, stage.variant, _source(stage.source), tasks, "-", *counts]
     budgets = sorted({nodes[run.key].run.env_steps for run in runs})
@@ -75,7 +76,7 @@ def _stage_row(
         stage.name,
         stage.variant,
         _source(stage.source),
-        ", ".join(task.name for task in stage.tasks),
+        ", ".join(map(_judged, stage.tasks)),
         "\n".join(_axes(stage)) or "-",
         str(len({run.trial for run in runs})),
         str(seeds),
@@ -84,6 +85,12 @@ def _stage_row(
         f"{sum(nodes[run.key].run.env_steps for run in runs):,}",
         str(sum(run.key in finished for run in runs)),
     ]
+
+
+def _judged(task: Task) -> str:
+    """The task's name, with what it is judged by where that is not its success."""
+    metric = task.primary_metric
+    return task.name if metric == names.EVAL_SUCCESS else f"{task.name} ({names.word_of(metric)})"
 
 
 def _search_row(stage: Stage, search: SearchSettings, plan: Plan, seeds: int) -> list[str]:
@@ -100,7 +107,7 @@ def _search_row(stage: Stage, search: SearchSettings, plan: Plan, seeds: int) ->
         stage.name,
         stage.variant,
         _source(stage.source),
-        ", ".join(task.name for task in stage.tasks),
+        ", ".join(map(_judged, stage.tasks)),
         "\n".join(axes),
         f"{studies} x {search.count}\n{search.sampler}"
         if studies > 1
@@ -185,11 +192,12 @@ def results_table(
     table = Table(title=f"Results of {plan.name}", title_justify="left")
     for name in ("stage", "task", "seed", "q", *grid):
         table.add_column(name, justify="right" if name in {"seed", "q"} else "left")
-    for name in ("success,\nlast step", "success,\nany step", "MI reward", "env steps", "time"):
+    nodes = {node.key: node for node in plan.nodes}
+    metrics = _columns(node.run.task.primary_metric for node in nodes.values())
+    for name in (*metrics.values(), "MI reward", "env steps", "time"):
         table.add_column(name, justify="right")
     table.add_column("MLflow run", no_wrap=True)
     table.add_column("state", no_wrap=True)
-    nodes = {node.key: node for node in plan.nodes}
     for run in plan.runs:
         if run.part:
             continue  # one of many: its trial has a row in another table
@@ -200,7 +208,7 @@ def results_table(
             str(run.seed),
             in_words(nodes[run.key].run.tac.entropic_index),
             *(short(run.values[name]) if name in run.values else "-" for name in grid),
-            *_reached(results.get(run.key)),
+            *_reached(results.get(run.key), metrics),
             (mlflow_run(run.key) or "-")[:8],
             _STATE.get(state, str(state)),
             style=_COLOURS.get(state),
@@ -310,13 +318,27 @@ def _grid_columns(plan: Plan) -> list[str]:
     return [name for name in found if name != "tac.entropic_index"]
 
 
-def _reached(result: RunResult | None) -> list[str]:
+def _columns(primary: Iterable[str]) -> dict[str, str]:
+    """What runs are judged by to the heads of their columns."""
+    found = set(primary)
+    heads = {
+        names.EVAL_SUCCESS: "success,\nlast step",
+        names.EVAL_SUCCESS_ANY: "success,\nany step",
+        names.EVAL_RETURN: "return",
+    }
+    if names.EVAL_RETURN not in found:
+        del heads[names.EVAL_RETURN]
+    if found == {names.EVAL_RETURN}:
+        heads = {names.EVAL_RETURN: heads[names.EVAL_RETURN]}
+    return heads
+
+
+def _reached(result: RunResult | None, metrics: Iterable[str]) -> list[str]:
     if result is None:
-        return ["-"] * 5
+        return ["-"] * (len(list(metrics)) + 3)
     reward = result.metrics.get(names.MI_REWARD)
     return [
-        percent(result.metrics.get(names.EVAL_SUCCESS)),
-        percent(result.metrics.get(names.EVAL_SUCCESS_ANY)),
+        *(measured(metric, result.metrics.get(metric)) for metric in metrics),
         "-" if reward is None else f"{reward:.3f}",
         f"{result.env_steps:,}",
         clock(result.seconds),

@@ -2,16 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+from music_rllib.envs.registry import Task
 from music_rllib.experiment.plan import short
 from music_rllib.schedules import Linear, Piecewise
 from music_rllib.tac.settings import LearnedAlpha, MatchedAlpha, NormalisedAlpha
+from music_rllib.tracking import names
 
-__all__ = ["clock", "in_words", "percent"]
+__all__ = ["clock", "evaluated_in_words", "in_words", "measured", "percent"]
 
 
 def percent(value: float | None) -> str:
     """`35 %`, or `-` for None."""
     return "-" if value is None else f"{100 * value:.0f} %"
+
+
+def measured(metric: str, value: float | None) -> str:
+    """`35 %` of a rate, `-5.2` of another metric, or `-` for None."""
+    return percent(value) if value is None or metric in names.EVAL_RATES else f"{value:.4g}"
+
+
+def evaluated_in_words(task: Task, metrics: Mapping[str, float]) -> str:
+    """A run's last evaluation by its task's own metric: `success 35 % (any step 40 %)`."""
+    metric = task.primary_metric
+    text = f"{names.word_of(metric)} {measured(metric, metrics.get(metric))}"
+    if metric != names.EVAL_SUCCESS:
+        return text
+    return f"{text} (any step {percent(metrics.get(names.EVAL_SUCCESS_ANY))})"
 
 
 def clock(seconds: float | None) -> str:

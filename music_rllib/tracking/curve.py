@@ -1,4 +1,4 @@
-"""The learning-curve picture of one run: success above, mutual information below."""
+"""The learning-curve picture of one run: success or return above, mutual information below."""
 
 from __future__ import annotations
 
@@ -52,6 +52,10 @@ PANELS = (
         ),
     ),
     Panel(
+        ylabel="return of an episode",
+        lines=(_line(names.EVAL_RETURN, "return", BLUE, "-", "o"),),
+    ),
+    Panel(
         ylabel="MI bound (nats)",
         lines=(_line(names.MI_BOUND, "MI bound", GREEN, "-", "o"),),
     ),
@@ -63,12 +67,15 @@ PANELS = (
 
 
 def learning_curve(history: Sequence[Metrics], *, title: str) -> Figure:
-    """Success rate, MI bound and MI reward against environment steps.
+    """Success rate (or return), MI bound and MI reward against environment steps.
 
-    Panels without a value are left out; a history with none of the metrics says so. Draws on its
-    own figure, never through pyplot, so that it is safe in a thread and needs no display.
+    The return of a task that has a success says the same in other units, and has no panel. Panels
+    without a value are left out; a history with none of the metrics says so. Draws on its own
+    figure, never through pyplot, so that it is safe in a thread and needs no display.
     """
     panels = [panel for panel in PANELS if any(_points(history, line) for line in panel.lines)]
+    if PANELS[0] in panels:
+        panels = [panel for panel in panels if panel.lines[0].metric != names.EVAL_RETURN]
     figure = Figure(figsize=(6.4, 1.2 + 2.1 * max(1, len(panels))), layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(title, fontsize=11)
@@ -77,7 +84,7 @@ def learning_curve(history: Sequence[Metrics], *, title: str) -> Figure:
         _draw(axes, panel, history)
     if not panels:
         rows[0].text(0.5, 0.5, "nothing was evaluated", ha="center", transform=rows[0].transAxes)
-        rows[0].set_ylabel("success rate")
+        rows[0].set_ylabel("evaluation")
     rows[-1].set_xlabel("environment steps")
     rows[-1].xaxis.set_major_formatter(EngFormatter(sep=""))
     return figure

@@ -3,6 +3,8 @@
 import json
 import re
 import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from ipaddress import ip_address
 from pathlib import Path
@@ -100,6 +102,44 @@ def check_mlflow(runs: dict[str, Any], folder: Path, found: list[list[str]]) -> 
         assert metric_steps(folder, run, names.EVAL_SUCCESS) == [400, 800, 1200]
     ids = [run.info.run_id[:8] for name, run in sorted(runs.items()) if name != "points"]
     assert sorted(ids) == sorted(row[-2] for row in found)
+
+
+def test_a_task_without_success_shows_its_return_from_the_first_line_to_the_report(
+    sweep_program: Any, sweep_document: Document, mlflow_runs: Runs, tmp_path: Path
+) -> None:
+    sweep_document["environments"]["Point"]["success_key"] = None
+    sweep_document["defaults"] |= {"env_steps": 800}
+    stage = {"name": "train", "variant": "tac", "grid": {"tac.entropic_index": [1.0, 2.0]}}
+    sweep_document["stages"] = [stage]
+    sweep_program.environment[names.VARIABLE_REPORT] = "on"
+    sweep_program.write(sweep_document)
+    code, output, errors = sweep_program.run()
+    assert (code, errors) == (0, "")
+    assert re.search(r"400 of 800 env steps.*, return -\d", output)
+    assert re.search(r"finished, return -\d", output)
+    assert "success" not in output.replace(str(tmp_path), "")
+    assert all(float(row[4]) < 0 for row in rows(output))
+    for run in mlflow_runs().values():
+        assert names.EVAL_SUCCESS not in run.data.metrics
+    page = (tmp_path / "results/points/report/report.html").read_text()
+    assert "Nothing was evaluated" not in page
+    assert 'id="train-return"' in page
+    assert (tmp_path / "results/points/report/figures/train-final-return.svg").is_file()
+    table = (tmp_path / "results/points/report/tables/final.csv").read_text()
+    assert table.count(f"train,Point,{names.EVAL_RETURN},q = ") == 2
+    for command, words in (
+        ("status", "Best so far: train tac.entropic_index = "),
+        ("compare", f"{names.EVAL_RETURN} of train on Point"),
+    ):
+        said = subprocess.run(
+            [sys.executable, "-m", "music_rllib.sweep", command, "points", "--storage", "results"],
+            cwd=tmp_path,
+            env=sweep_program.environment,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        assert words in said.stdout
 
 
 def test_a_failure_is_explained_and_the_others_finish(

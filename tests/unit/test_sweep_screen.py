@@ -237,6 +237,45 @@ def test_a_terminal_shows_a_live_table(plan: Plan) -> None:
     assert "about 1:50 left" in shown
 
 
+def test_tasks_without_success_are_shown_by_their_return(tmp_path: Path) -> None:
+    path = tmp_path / "s.yaml"
+    task = {"env_id": "Reacher-v5", "horizon": 50, "success_key": None}
+    stage = {"name": "train", "variant": "tac"}
+    both = {"environments": {"Reacher": task}, "tasks": ["Reacher", "FetchReach"]}
+    path.write_text(yaml.safe_dump(DOCUMENT | both | {"stages": [stage], "seeds": [0]}))
+    config = load_sweep(path)
+    plan = make_plan(config)
+    metrics = {names.EVAL_RETURN: -5.25, names.EVAL_EPISODES: 5.0}
+    success = {names.EVAL_SUCCESS: 0.5, names.EVAL_RETURN: -20.0}
+    for terminal in (False, True):
+        console, text = screen(terminal=terminal)
+        with Display(console, plan, Board(plan, finished=()), time := Clock()) as display:
+            display.started(plan.nodes[0])
+            time.now += 10
+            display.reported(plan.nodes[0], [report(1000, 10.0, **metrics)])
+            display.tick()
+        assert "return -5.25" in text.getvalue()
+        assert "success" not in text.getvalue()
+    console, text = screen()
+    with Display(console, plan, Board(plan, finished=())) as display:
+        result = RunResult(label="x", env_steps=2000, seconds=20, metrics=metrics)
+        display.finished(plan.nodes[0], result)
+    assert "finished, return -5.25, 2,000 env steps" in text.getvalue()
+    console, text = screen()
+    console.print(plan_view(config, plan, set()))
+    assert "Reacher (return), FetchReach" in text.getvalue()
+    results = {
+        node.key: RunResult(label="x", env_steps=2000, seconds=20, metrics=found)
+        for node, found in zip(plan.nodes, (metrics, success), strict=True)
+    }
+    console, text = screen()
+    finished = Board(plan, finished=list(results))
+    console.print(results_table(plan, finished.__getitem__, results, lambda _: None))
+    lines = [line for line in text.getvalue().splitlines() if line.startswith("│")]
+    cells = [[cell.strip() for cell in line.split("│")[4:8]] for line in lines]
+    assert cells == [["1", "-", "-", "-5.25"], ["1", "50 %", "-", "-20"]]
+
+
 def test_pace_is_that_of_the_last_reports() -> None:
     pace = Pace(10_000, warm_up=0, now=0.0)
     assert pace.steps_per_second is None

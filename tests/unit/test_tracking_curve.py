@@ -46,6 +46,16 @@ def test_a_run_without_mutual_information_has_no_empty_panel() -> None:
     assert len(learning_curve(history, title="tac").axes) == 1
 
 
+def test_a_task_without_success_has_its_return() -> None:
+    without = [Metrics(time=1, step=1, values={names.EVAL_RETURN: -7.5})]
+    (axes,) = learning_curve(without, title="reacher").axes
+    assert axes.get_ylabel() == "return of an episode"
+    np.testing.assert_array_equal(axes.lines[0].get_ydata(), [-7.5])
+    both = [Metrics(time=1, step=1, values={names.EVAL_RETURN: -7.5, names.EVAL_SUCCESS: 0.5})]
+    (axes,) = learning_curve(both, title="push").axes
+    assert axes.get_ylabel() == "success rate"
+
+
 def test_a_run_without_evaluation_says_so() -> None:
     history = [Metrics(time=1, step=1, values={names.TRAIN_RETURN: 0.5})]
     texts = [text.get_text() for text in learning_curve(history, title="cut").axes[0].texts]
