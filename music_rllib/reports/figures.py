@@ -170,6 +170,7 @@ def finals_panel(scope: Scope[Condition], siblings: tuple[Condition, ...]) -> Pa
         axes.set_yticks([])
         axes.set_ylim(len(scope.finals) - 0.5, -0.7)
         axes.set_xlim(*limits)
+        axes.locator_params(axis="x", nbins=6)
         axes.set_xlabel("final success rate" if is_rate else f"final {names.word_of(scope.metric)}")
 
     return Panel(title=scope.name, draw=draw)

@@ -245,7 +245,7 @@ def test_a_report_needs_neither_ray_nor_mlflow_for_an_exported_sweep(
     command = [sys.executable, "-c", code, str(exported)]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == 0, done.stderr
-    for name in ("final_success", "runs", "curves"):
+    for name in ("final", "runs", "curves"):
         tables = (page.parent, exported / "report")
         one, other = ((folder / "tables" / f"{name}.csv").read_text() for folder in tables)
         assert one == other
