@@ -380,7 +380,7 @@ class Study:
     def sign(self, now: float | None = None) -> None:
         """Say, from time to time, that this driver is alive, and put back what dead ones hold."""
         now = time.time() if now is None else now
-        if now - self._signed >= SIGN_SECONDS:
+        if abs(now - self._signed) >= SIGN_SECONDS:  # the clock may be set back
             self._signed = now
             self._storage.set_study_user_attr(self._id, f"{DRIVER}{self._me}", now)
             if not self._alone:

@@ -208,8 +208,12 @@ class RunTrainable(Trainable):
         record = work.read(RECORD)
         work.remove_file(RECORD)
         check_hung(record, attempt, self._job.run.task.env_id)
-        if (minutes := self._job.hang_minutes) is not None:
+        if (minutes := self._job.hang_minutes) is None:
+            return
+        try:
             self._watch = HangWatch(60 * minutes, store.uri, self._job.key, attempt)
+        except OSError as error:  # a full disk for temporary files, or no process to spare
+            self._notes.append(f"is not watched for an environment that hangs: {error}")
 
     def _weights(self, store: NodeStore) -> Weights | None:
         job = self._job

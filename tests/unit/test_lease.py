@@ -12,12 +12,13 @@ import threading
 import time
 from pathlib import Path
 
+import psutil
 import pyarrow.fs as pafs
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem  # type: ignore[import-untyped]
 
 from music_rllib.experiment import lease as lease_module
-from music_rllib.experiment.lease import HeldLease, Lease, LeaseFile, LeaseLostError
+from music_rllib.experiment.lease import HeldLease, Lease, LeaseFile, LeaseLostError, runs_here
 from music_rllib.experiment.sealed import StorageError
 
 pytestmark = pytest.mark.faults
@@ -215,3 +216,16 @@ def test_a_lease_is_acquired_while_its_folder_is_deleted_again_and_again(tmp_pat
     finally:
         over.set()
         deleting.join()
+
+
+def test_a_process_is_the_same_after_the_time_of_day_was_set(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The boot, by which psutil dates processes, is an hour earlier or later then."""
+    mine = Lease.of_this_process("mine")
+    boot = psutil.boot_time()
+    for hours in (1, -1):
+        monkeypatch.setattr(psutil._psplatform, "boot_time", lambda h=hours: boot + 3600 * h)
+        assert mine.holds()
+        assert runs_here(mine.pid, mine.process_started)
+    assert not runs_here(mine.pid, mine.process_started + 5), "another one with its number"

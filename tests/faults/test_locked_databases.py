@@ -1,0 +1,68 @@
+"""A sqlite file that another program is writing into, for longer than anybody waits for it."""
+
+from __future__ import annotations
+
+import contextlib
+import sqlite3
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from music_rllib.search import database
+from tests.faults import comparison, sweeps
+from tests.integration.conftest import Program
+from tests.integration.test_search_played import Driver, document, searched
+
+
+@contextlib.contextmanager
+def locked(file: Path) -> Iterator[None]:
+    """Be its only writer for this `with`."""
+    assert file.is_file()
+    connection = sqlite3.connect(file, isolation_level=None, timeout=30)
+    connection.execute("BEGIN IMMEDIATE")
+    yield
+    connection.execute("ROLLBACK")
+    connection.close()
+
+
+def test_a_locked_study_is_said_and_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = database._engine_options
+
+    def impatient(url: Any) -> dict[str, Any]:
+        return options(url) | {"connect_args": {"timeout": 0.1}}
+
+    monkeypatch.setattr(database, "_engine_options", impatient)
+    for folder in ("whole", "locked"):
+        (tmp_path / folder).mkdir()
+    whole = searched(tmp_path / "whole")
+    driver = Driver(tmp_path / "locked", document({}))
+    said: list[str] = []
+    driver.campaign._say = said.append
+    driver.play(stop_after=3)
+    (file,) = driver.sweep.folder.glob("*.db")
+    with locked(file), pytest.raises(AssertionError, match="wait for ever"):
+        driver.play()
+    assert sum("does not answer, trying again: " in line for line in said) == 1
+    assert any("database is locked" in line for line in said)
+    driver.play()
+    assert driver.trials() == whole.trials()
+
+
+@pytest.mark.thorough
+def test_a_locked_mlflow_holds_no_run_up_and_has_each_step_once(
+    program: Program, unbroken: Path
+) -> None:
+    results = program.folder / "results"
+    process = sweeps.start_until(program, "pretrain/Point/seed0: started")
+    with locked(results / "mlflow.db"):
+        sweeps.read_until(process, "pretrain/Point/seed0: finished")
+        time.sleep(10.0)
+    output, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, output + errors
+    assert "did not reach MLflow" not in output
+    comparison.same(unbroken, results)
