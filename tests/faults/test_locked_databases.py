@@ -14,7 +14,7 @@ import pytest
 from music_rllib.search import database
 from tests.faults import comparison, sweeps
 from tests.integration.conftest import Program
-from tests.integration.test_search_played import Driver, document, searched
+from tests.played_search import Driver, document, searched
 
 
 @contextlib.contextmanager
