@@ -32,6 +32,7 @@ from pydantic import (
     model_validator,
 )
 
+from music_rllib.limits import MOST_INDICES
 from music_rllib.tracking import names
 
 __all__ = [
@@ -49,13 +50,17 @@ _RANGE = re.compile(r"(\d+):(\d+)")
 
 def _expand_range(value: Any) -> Any:
     """`"3:6"` becomes (3, 4, 5); whatever else is left for the validators."""
-    if isinstance(value, list):
+    if isinstance(value, list | tuple):
+        if len(value) > MOST_INDICES:
+            raise ValueError(f"must have at most {MOST_INDICES} entries, got {len(value)}")
         return tuple(value)
     if not isinstance(value, str):
         return value
     bounds = _RANGE.fullmatch(value.strip())
     if bounds is None:
         raise ValueError(f"must be a list of indices or a range such as 0:3, got {value!r}")
+    if max(map(len, bounds.groups())) > 9 or int(bounds[2]) - int(bounds[1]) > MOST_INDICES:
+        raise ValueError(f"must have at most {MOST_INDICES} entries, got {value[:40]!r}")
     return tuple(range(int(bounds[1]), int(bounds[2])))
 
 

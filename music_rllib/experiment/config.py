@@ -49,6 +49,7 @@ from music_rllib.experiment.settings import Evaluation, RunSettings, Variant
 from music_rllib.experiment.space import FINAL_SEED
 from music_rllib.experiment.stages import resolve_stage
 from music_rllib.experiment.yaml_file import YamlFile, read_yaml
+from music_rllib.limits import MOST_RUNS, MOST_SEEDS
 
 __all__ = [
     "Checkpoint",
@@ -116,7 +117,10 @@ def declared_tasks(path: str | Path) -> tuple[Task, ...]:
 
 def _seeds(text: str, given: Any) -> list[int]:
     """`10`, or `0,1,7`."""
-    if not re.fullmatch(r"\d+(,\d+)*,?", text) or text in {"0", ""}:
+    digits = re.fullmatch(r"\d{1,9}(,\d{1,9})*,?", text)
+    if digits and "," not in text and int(text) > MOST_SEEDS:
+        raise ConfigError([f"--seeds must be at most {MOST_SEEDS:,} seeds, got {text}"])
+    if not digits or text in {"0", ""}:
         raise ConfigError([f"--seeds must be a number of seeds or a list like 0,1,7, got {text!r}"])
     if "," in text:
         return [int(seed) for seed in text.split(",") if seed]
@@ -154,6 +158,8 @@ def _resolve(file: YamlFile, document: dict[str, Any], findings: Findings) -> Sw
             findings=findings,
         )
         stages[stage.name if stage else str(raw.get("name"))] = stage
+    if header:
+        _count_runs(stages, len(header.seeds), findings)
     if header and any(stage and stage.search for stage in stages.values()):
         for position, one in enumerate(header.seeds):
             if one >= FINAL_SEED:
@@ -173,6 +179,22 @@ def _resolve(file: YamlFile, document: dict[str, Any], findings: Findings) -> Sw
         checkpoints=header.checkpoints,
         stages=tuple(stage for stage in stages.values() if stage is not None),
     )
+
+
+def _count_runs(stages: Mapping[str, Stage | None], seeds: int, findings: Findings) -> None:
+    """Runs multiply from stage to stage; refuse more than can be planned."""
+    trials: dict[str, int] = {}
+    total = 0
+    for index, (name, stage) in enumerate(stages.items()):
+        if stage is None or stage.search is not None:
+            continue
+        above = stage.source.stage if stage.source else None
+        trials[name] = len(stage.points) * trials.get(str(above), 1)
+        total += trials[name] * len(stage.tasks) * seeds
+        if total > MOST_RUNS:
+            rule = f"must not make the sweep larger than {MOST_RUNS:,} runs, got {total:,}"
+            findings.add(("stages", index), rule)
+            return
 
 
 def _registry(document: dict[str, Any], findings: Findings) -> TaskRegistry:
@@ -202,6 +224,9 @@ def _header(document: dict[str, Any], findings: Findings) -> Header | None:
         findings.add(("name",), f"must not be {header.name!r}, which the storage uses itself")
     for key in ("tasks", "seeds"):
         findings.forbid_repeats(values.get(key), (key,))
+    if header and len(header.seeds) > MOST_SEEDS:
+        rule = f"must have at most {MOST_SEEDS:,} entries, got {len(header.seeds):,}"
+        findings.add(("seeds",), rule)
     return header
 
 

@@ -246,8 +246,15 @@ class Findings:
 
     def forbid_repeats(self, values: Any, path: Path) -> None:
         """Note entries of the list `values` that are there twice; 1 and 1.0 are the same."""
-        seen: list[Any] = []
+        seen: set[tuple[bool, Any]] = set()
+        others: list[Any] = []
         for position, value in enumerate(values if isinstance(values, list | tuple) else ()):
-            if any(same(value, other) for other in seen):
+            if isinstance(value, str | int | float | None):
+                # Equal numbers have equal hashes, whatever their type; 1 and true too.
+                again = (isinstance(value, bool), value) in seen
+                seen.add((isinstance(value, bool), value))
+            else:
+                again = any(same(value, other) for other in others)
+                others.append(value)
+            if again:
                 self.add((*path, position), f"must not repeat, got {shown(value)} again")
-            seen.append(value)

@@ -104,7 +104,7 @@ class FloatRange(_Dimension):
     def size(self) -> int | None:
         """Number of values; None where they can't be counted."""
         low, high = self.bounds
-        return None if self.step is None else int((high - low) / self.step + 1e-9) + 1
+        return None if self.step is None else int(min((high - low) / self.step, 1e18) + 1e-9) + 1
 
     def _at(self, position: int) -> float:
         return float(f"{self.bounds[0] + position * (self.step or 0.0):.12g}")

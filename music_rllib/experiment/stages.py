@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,7 @@ from music_rllib.experiment.problems import (
 from music_rllib.experiment.problems import Path as KeyPath
 from music_rllib.experiment.searched import check_search
 from music_rllib.experiment.settings import VARIANTS, RunSettings, Variant, handed_over
+from music_rllib.limits import MOST_GRID_POINTS
 
 __all__ = ["resolve_stage"]
 
@@ -82,6 +84,11 @@ def resolve_stage(
     def resolve_at(point: Mapping[str, tuple[KeyPath, Any]], found: Findings) -> Point:
         return _resolve_point(header.variant, point, tasks, defaults, settings, seed, path, found)
 
+    size = math.prod(map(len, header.grid.values()))
+    if size > MOST_GRID_POINTS:  # counted before any of them is made
+        rule = f"must have at most {MOST_GRID_POINTS:,} points, got {size:,}"
+        findings.add((*path, "grid"), rule)
+        return None
     points = tuple(resolve_at(point, findings) for point in _grid_points(header.grid))
     if len(findings.problems) == problems_before:
         _forbid_equal_points(points, path, findings)
@@ -200,12 +207,15 @@ def _resolve_point(
 
 def _forbid_equal_points(points: tuple[Point, ...], path: KeyPath, findings: Findings) -> None:
     """Two spellings of one schedule, say: the same trial twice."""
-    for one, other in itertools.combinations(points, 2):
-        if other.runs and one.runs == other.runs:
+    seen = set()
+    for point in points:
+        runs = tuple(run.model_dump_json() for run in point.runs.values())
+        if runs and runs in seen:
             findings.add(
                 (*path, "grid"),
-                f"must not have two equal points, got {shown(other.values)} again",
+                f"must not have two equal points, got {shown(point.values)} again",
             )
+        seen.add(runs)
 
 
 def _source(

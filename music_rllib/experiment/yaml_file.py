@@ -15,6 +15,13 @@ from typing import Any, NamedTuple
 import yaml
 
 from music_rllib.experiment.problems import ConfigError, Path
+from music_rllib.limits import (
+    MOST_DIGITS,
+    MOST_NESTED,
+    MOST_YAML_BYTES,
+    MOST_YAML_VALUES,
+    read_regular,
+)
 
 __all__ = ["YamlFile", "read_yaml"]
 
@@ -46,7 +53,7 @@ def read_yaml(path: FilePath) -> YamlFile:
         ConfigError: The file is missing, unreadable or not a sound YAML mapping.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_regular(path, MOST_YAML_BYTES, follow=True).decode("utf-8")
     except FileNotFoundError:
         raise ConfigError([f"{path}: must be an existing file"]) from None
     except (OSError, UnicodeDecodeError) as error:
@@ -56,7 +63,9 @@ def read_yaml(path: FilePath) -> YamlFile:
         loader = _StrictLoader(text)
         root = loader.get_single_node()
         lines: dict[Path, int] = {}
-        _note_lines(root, (), lines, frozenset())
+        if root is not None:
+            _count(root, {})
+        _note_lines(root, (), lines)
         data = loader.construct_document(root) if root is not None else None
     except yaml.YAMLError as error:
         raise ConfigError([f"{path.name}{_mark(error)}: {_complaint(error)}"]) from None
@@ -79,6 +88,31 @@ class _StrictLoader(yaml.SafeLoader):
     """PyYAML's safe loader with the scalars of YAML 1.2 and without repeated keys."""
 
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012
+
+    _depth = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """Refuse a value that is nested too deeply before Python does."""
+        self._depth += 1
+        if self._depth > MOST_NESTED:
+            raise yaml.composer.ComposerError(
+                *(None, None, f"must be nested at most {MOST_NESTED} levels deep"),
+                self.peek_event().start_mark,  # type: ignore[no-untyped-call]
+            )
+        try:
+            return super().compose_node(parent, index)
+        finally:
+            self._depth -= 1
+
+    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
+        """As usual; what a tag promises and the text isn't (`!!int x`) is an error of the file."""
+        try:
+            return super().construct_object(node, deep=deep)
+        except (ValueError, TypeError, LookupError, AttributeError) as error:
+            tag = node.tag.rpartition(":")[2]
+            raise yaml.constructor.ConstructorError(
+                None, None, f"must be of its type, {tag}: {error}", node.start_mark
+            ) from None
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
         seen = set()
@@ -122,23 +156,43 @@ for _tag in ("binary", "omap", "pairs", "set", "timestamp"):
     _StrictLoader.add_constructor(f"tag:yaml.org,2002:{_tag}", _StrictLoader.reject)
 
 
-def _note_lines(
-    node: yaml.Node | None, path: Path, lines: dict[Path, int], above: frozenset[int]
-) -> None:
-    """Record where each value begins; refuse a value that contains itself through an alias."""
-    if node is None:
-        return
-    if id(node) in above:
-        raise yaml.constructor.ConstructorError(
-            None, None, "an alias must not contain itself", node.start_mark
-        )
-    above |= {id(node)}
+def _count(node: yaml.Node, counts: dict[int, int | None]) -> int:
+    """Values in `node`, those of an alias counted wherever it stands; refuse more than allowed.
+
+    Each is looked at once: with nine aliases in a row the document would have a thousand million.
+    """
+    if id(node) in counts:
+        found = counts[id(node)]
+        if found is None:
+            raise _refusal("an alias must not contain itself", node)
+        return found
+    counts[id(node)] = None
+    total = 1
+    if isinstance(node, yaml.MappingNode):
+        total += sum(_count(key, counts) + _count(value, counts) for key, value in node.value)
+    elif isinstance(node, yaml.SequenceNode):
+        total += sum(_count(value, counts) for value in node.value)
+    elif node.tag.endswith(":int") and len(node.value) > MOST_DIGITS + 1:
+        shown = f"{node.value[:8]}..."
+        raise _refusal(f"a number must have at most {MOST_DIGITS} digits, got {shown}", node)
+    if total > MOST_YAML_VALUES:
+        raise _refusal(f"must have at most {MOST_YAML_VALUES} values, aliases included", node)
+    counts[id(node)] = total
+    return total
+
+
+def _refusal(rule: str, node: yaml.Node) -> yaml.YAMLError:
+    return yaml.constructor.ConstructorError(None, None, rule, node.start_mark)
+
+
+def _note_lines(node: yaml.Node | None, path: Path, lines: dict[Path, int]) -> None:
+    """Record where each value begins."""
     if isinstance(node, yaml.MappingNode):
         for key_node, value_node in node.value:
             inner = (*path, str(key_node.value))
             lines[inner] = key_node.start_mark.line + 1
-            _note_lines(value_node, inner, lines, above)
+            _note_lines(value_node, inner, lines)
     elif isinstance(node, yaml.SequenceNode):
         for index, value_node in enumerate(node.value):
             lines[*path, index] = value_node.start_mark.line + 1
-            _note_lines(value_node, (*path, index), lines, above)
+            _note_lines(value_node, (*path, index), lines)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,7 +10,6 @@ from pathlib import Path
 import pyarrow.fs as pafs
 
 from music_rllib.experiment.sealed import SealedFolders, open_storage
-from music_rllib.limits import MOST_JSON_BYTES, read_json
 from music_rllib.policy.policy import PolicyError
 
 __all__ = ["find_policy"]
@@ -79,9 +79,9 @@ def _labels(filesystem: pafs.FileSystem, root: str) -> Iterator[tuple[str, str]]
             continue
         try:
             with filesystem.open_input_stream(plan) as stream:
-                nodes = read_json(stream.read(MOST_JSON_BYTES + 1))["nodes"]
+                nodes = json.loads(stream.read())["nodes"]
             labels = [(str(node["key"]), str(node["label"])) for node in nodes]
-        except (ValueError, TypeError, KeyError) as error:
+        except (ValueError, TypeError, LookupError, RecursionError) as error:
             warnings.warn(f"{plan} is damaged, its labels are not known: {error!r}", stacklevel=2)
             continue
         yield from labels

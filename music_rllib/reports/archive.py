@@ -20,8 +20,12 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 import pyarrow as pa
-from pyarrow import csv, parquet
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from music_rllib.experiment.problems import shown
+from music_rllib.limits import MOST_JSON_BYTES, MOST_YAML_BYTES, read_json, read_regular
+from music_rllib.reports.archive_tables import read_table, write_table
+from music_rllib.reports.searches import checked_searches
 from music_rllib.results.data import Column, ReportError, RunRecord, Sweep
 
 __all__ = ["Format", "is_archive", "read_archive", "write_archive"]
@@ -31,6 +35,12 @@ VERSION = 1
 _HEADER, _SEARCHES = "sweep.json", "search.json"
 _OWN_FIELDS = ("name", "status", "run_id", "experiment_id", "started", "source", "tags", "config")
 _RUN_FIELDS = ("run_id", "name", "status", "started", "ended")
+_RUNS = {
+    "run": pa.int64(),
+    **dict.fromkeys(("run_id", "name", "status"), pa.string()),
+    **dict.fromkeys(("started", "ended"), pa.int64()),
+}
+"""What a run must have; every other column is text."""
 _METRICS = {
     "run": pa.int64(),
     "metric": pa.string(),
@@ -78,8 +88,8 @@ def write_archive(sweep: Sweep, folder: Path, file_format: Format = "parquet") -
         for stale in get_args(Format):
             for table in ("runs", "metrics"):
                 (folder / f"{table}.{stale}").unlink(missing_ok=True)
-        _write(_runs_table(sweep.runs), folder / f"runs.{file_format}")
-        _write(_metrics_table(sweep), folder / f"metrics.{file_format}")
+        write_table(_runs_table(sweep.runs), folder / f"runs.{file_format}")
+        write_table(_metrics_table(sweep), folder / f"metrics.{file_format}")
         (folder / _SEARCHES).unlink(missing_ok=True)
         if sweep.searches:
             _write_json([_without_place(found) for found in sweep.searches], folder / _SEARCHES)
@@ -94,22 +104,56 @@ def read_archive(folder: Path) -> Sweep:
     Raises:
         ReportError: where something is missing or is not what was written.
     """
+    file = folder / _HEADER
     try:
-        header = json.loads((folder / _HEADER).read_text("utf-8"))
-        if header["version"] != VERSION:
-            raise ValueError(f"version must be {VERSION}, got {header['version']!r}")
-        own = {name: header[name] for name in _OWN_FIELDS}
-        runs = _read(folder / f"runs.{header['format']}")
-        metrics = _read(folder / f"metrics.{header['format']}", _METRICS)
-        searches = folder / _SEARCHES
-        return Sweep(
-            **own,
-            runs=_records(runs),
-            history=_history(metrics, runs.num_rows),
-            searches=json.loads(searches.read_text("utf-8")) if searches.exists() else (),
-        )
-    except (OSError, KeyError, TypeError, ValueError, pa.ArrowException) as error:
-        raise ReportError(f"{folder} must hold an exported sweep: {error}") from error
+        header = _Header.model_validate(_read_json(file))
+        file = folder / f"runs.{header.format}"
+        runs = read_table(file, _RUNS)
+        records = _records(runs)
+        file = folder / f"metrics.{header.format}"
+        metrics = read_table(file, _METRICS)
+        history = _history(metrics, runs.num_rows)
+        file = folder / _SEARCHES
+        found = checked_searches(_read_json(file)) if file.exists() else ()
+    except (OSError, KeyError, TypeError, ValueError, OverflowError, pa.ArrowException) as error:
+        raise ReportError(
+            f"{folder} must hold an exported sweep: {file.name}: {_reason(error)}"
+        ) from error
+    own = {name: getattr(header, name) for name in _OWN_FIELDS}
+    return Sweep(**own, runs=records, history=history, searches=found)
+
+
+class _Header(BaseModel):
+    """Content of `sweep.json`."""
+
+    model_config = ConfigDict(strict=True)
+
+    version: Literal[1]
+    format: Format
+    name: str
+    status: str
+    run_id: str
+    experiment_id: str
+    started: int | None = Field(ge=0, lt=2**47)  # until the year 6429
+    source: str
+    tags: dict[str, str]
+    config: str | None = Field(max_length=MOST_YAML_BYTES)
+
+
+def _read_json(file: Path) -> Any:
+    return read_json(read_regular(file, MOST_JSON_BYTES))
+
+
+def _reason(error: Exception) -> str:
+    """In one line: of several findings the first."""
+    if isinstance(error, ValidationError):
+        finding = error.errors(include_url=False)[0]
+        place = ".".join(str(part) for part in finding["loc"])
+        rule = finding["msg"].replace("Input should", "must")
+        return f"{place} {rule}, got {shown(finding['input'])}"
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return f"must have {error}" if isinstance(error, KeyError) else str(error).splitlines()[0]
 
 
 def _without_place(search: Mapping[str, Any]) -> dict[str, Any]:
@@ -154,31 +198,6 @@ def _concatenated(parts: Sequence[Any], dtype: type) -> Any:
     return np.concatenate(parts) if parts else np.empty(0, dtype=dtype)
 
 
-def _write(table: pa.Table, file: Path) -> None:
-    if file.suffix == ".csv":
-        csv.write_csv(table, file)
-    else:
-        parquet.write_table(table, file, compression="zstd")
-
-
-def _read(file: Path, kinds: Mapping[str, Any] | None = None) -> pa.Table:
-    if file.suffix != ".csv":
-        return parquet.read_table(file)
-    known = {"run": pa.int64(), "started": pa.int64(), "ended": pa.int64()}
-    names = csv.open_csv(file).schema.names
-    convert = csv.ConvertOptions(
-        column_types=kinds or {name: known.get(name, pa.string()) for name in names},
-        # An empty field is nothing, an empty text in quotes is a text, and nan is a number.
-        null_values=[""],
-        strings_can_be_null=True,
-        quoted_strings_can_be_null=False,
-    )
-    # A failure's text has line breaks.
-    return csv.read_csv(
-        file, convert_options=convert, parse_options=csv.ParseOptions(newlines_in_values=True)
-    )
-
-
 def _records(table: pa.Table) -> list[RunRecord]:
     return [
         RunRecord(
@@ -206,11 +225,13 @@ def _history(table: pa.Table, runs: int) -> dict[str, Column]:
     )
     if len(run) and not 0 <= run.min() <= run.max() < runs:
         raise ValueError(f"a metric's run must be one of {runs}, got {run.min()} to {run.max()}")
+    order = np.lexsort((step, run, codes))
+    names_of = metrics.dictionary.to_pylist()
+    ends = np.searchsorted(codes[order], np.arange(len(names_of) + 1))
     history = {}
-    for code, name in enumerate(metrics.dictionary.to_pylist()):
-        chosen = np.flatnonzero(codes == code)
-        order = chosen[np.lexsort((step[chosen], run[chosen]))]
+    for code, name in enumerate(names_of):
+        chosen = order[ends[code] : ends[code + 1]]
         history[name] = Column(
-            run=run[order], step=step[order], value=value[order], time=time[order]
+            run=run[chosen], step=step[chosen], value=value[chosen], time=time[chosen]
         )
     return history

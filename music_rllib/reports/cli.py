@@ -15,7 +15,7 @@ from music_rllib.results.comparison import GAP
 from music_rllib.results.data import ReportError
 from music_rllib.tracking import names
 from music_rllib.tracking.errors import TrackingError
-from music_rllib.tracking.redaction import redact
+from music_rllib.tracking.redaction import for_people, redact
 
 if TYPE_CHECKING:
     from music_rllib.reports.locate import Found
@@ -128,7 +128,7 @@ def report(
                 attach=attach,
             )
     except (ConfigError, ReportError, TrackingError) as error:
-        typer.echo(f"error: {redact(str(error))}", err=True)
+        typer.echo(f"error: {for_people(error)}", err=True)
         raise typer.Exit(BAD_INPUT) from error
 
 
@@ -189,10 +189,10 @@ def _report(
     )
     page = write_report(made, output or found.folder / "report")
     for note in made.missing:
-        typer.echo(f"missing: {note}")
+        typer.echo(f"missing: {for_people(note)}")
     for analysis in made.analyses:
         for line in verdict(analysis.scopes[0], difference):
-            typer.echo(f"{analysis.stage.name}: {line}")
+            typer.echo(for_people(f"{analysis.stage.name}: {line}"))
     if attach:
         _attach(found, page.parent)
     typer.echo(f"Report: {page.absolute()}")
@@ -208,4 +208,4 @@ def _attach(found: Found, folder: Path) -> None:
         raise ReportError("--attach needs a sweep that is read from MLflow, got an exported one")
     attach(found.store, found.sweep.run_id, folder, "report")
     where = found.sweep.url(found.sweep.run_id) or f"run {found.sweep.run_id}"
-    typer.echo(f"Attached to the sweep's run in MLflow: {where}")
+    typer.echo(for_people(f"Attached to the sweep's run in MLflow: {where}"))

@@ -7,7 +7,6 @@ large sweep. Where the store is a database, the values are read from its `metric
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import tempfile
@@ -18,6 +17,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from music_rllib.limits import MOST_JSON_BYTES, read_json, read_regular
+from music_rllib.reports.searches import checked_searches
 from music_rllib.results.data import Column, Points, ReportError, RunRecord, Sweep, columns
 from music_rllib.tracking import names
 from music_rllib.tracking.redaction import redact
@@ -75,7 +76,9 @@ def read_mlflow(
             config=_artefact(client, run_id, names.ARTEFACT_SWEEP_CONFIG),
             runs=runs,
             history=_history(client, store, children, metrics),
-            searches=json.loads(_artefact(client, run_id, names.ARTEFACT_SEARCH) or "[]"),
+            searches=checked_searches(
+                read_json(_artefact(client, run_id, names.ARTEFACT_SEARCH) or "[]")
+            ),
         )
     except ReportError:
         raise
@@ -206,7 +209,8 @@ def _artefact(client: MlflowClient, run_id: str, name: str) -> str | None:
 
     with tempfile.TemporaryDirectory() as folder:
         try:
-            return Path(client.download_artifacts(run_id, name, folder)).read_text("utf-8")
+            file = client.download_artifacts(run_id, name, folder)
+            return read_regular(file, MOST_JSON_BYTES).decode("utf-8")
         except (MlflowException, OSError):
             return None
 

@@ -141,7 +141,7 @@ class RunRecord:
     def budget(self) -> int | None:
         """Environment steps that it is to train for."""
         text = self.params.get("env_steps", "")
-        return int(text) if text.isdigit() else None
+        return int(text) if text.isdecimal() and len(text) < 19 else None
 
     @property
     def seconds(self) -> float | None:

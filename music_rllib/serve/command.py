@@ -55,7 +55,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         _check_cluster()
         return _serve(arguments)
     except _BadInputError as error:
-        print(f"error: {error}", file=sys.stderr)
+        from music_rllib.tracking.redaction import for_people
+
+        print(f"error: {for_people(error)}", file=sys.stderr)
         return BAD_INPUT
 
 

@@ -11,7 +11,7 @@ import signal
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, TracebackType
 
 from music_rllib.sweep import commands as package
 from music_rllib.sweep.frame import BAD_INPUT, BadInputError, Formatter
@@ -64,6 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return BAD_INPUT
         given.insert(0, "run")
     parsed = _parser(modules).parse_args(given)
+    sys.excepthook = _show_unexpected
     try:
         return int(parsed.execute(parsed))
     except KeyboardInterrupt:
@@ -75,10 +76,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception as error:
         if not isinstance(error, _bad_input()):
             raise
-        from music_rllib.tracking.redaction import redact
+        from music_rllib.tracking.redaction import for_people
 
-        print(f"error: {redact(str(error))}", file=sys.stderr)
+        print(f"error: {for_people(error)}", file=sys.stderr)
         return BAD_INPUT
+
+
+def _show_unexpected(
+    kind: type[BaseException], error: BaseException, trace: TracebackType | None
+) -> None:
+    """A defect's traceback, without the passwords that an environment put into its message."""
+    import traceback
+
+    from music_rllib.tracking.redaction import for_people
+
+    print(for_people("".join(traceback.format_exception(kind, error, trace))), file=sys.stderr)
 
 
 def _meant(word: str, commands: Iterable[str]) -> str | None:

@@ -8,7 +8,7 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rich.console import Console
+    from rich.console import Console, RenderHook
 
 __all__ = [
     "BAD_INPUT",
@@ -63,12 +63,47 @@ def console_for(arguments: argparse.Namespace) -> Console:
 
     stderr = bool(getattr(arguments, "json", False))
     terminal = (sys.stderr if stderr else sys.stdout).isatty()
-    return Console(highlight=False, stderr=stderr, width=None if terminal else WIDTH)
+    console = Console(
+        # No [red] in a name is a colour.
+        markup=False,
+        emoji=False,
+        highlight=False,
+        stderr=stderr,
+        width=None if terminal else WIDTH,
+    )
+    console.push_render_hook(_printable_hook())
+    return console
+
+
+def _printable_hook() -> RenderHook:
+    """Escapes control characters in whatever a console prints."""
+    from rich.console import ConsoleOptions, ConsoleRenderable, RenderHook, RenderResult
+    from rich.segment import Segment
+
+    from music_rllib.tracking.redaction import printable
+
+    class Printable:
+        def __init__(self, inner: ConsoleRenderable) -> None:
+            self._inner = inner
+
+        def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+            for text, style, control in console.render(self._inner, options):
+                yield Segment(text if control else printable(text), style, control)
+
+    class Hook(RenderHook):
+        def process_renderables(
+            self, renderables: list[ConsoleRenderable]
+        ) -> list[ConsoleRenderable]:
+            return [Printable(renderable) for renderable in renderables]
+
+    return Hook()
 
 
 def print_json(document: Any) -> None:
     """One JSON document on standard output; NaN and infinities, which JSON lacks, are null."""
-    print(json.dumps(_plain(document), indent=2, ensure_ascii=False, default=str))
+    from music_rllib.tracking.redaction import printable
+
+    print(printable(json.dumps(_plain(document), indent=2, ensure_ascii=False, default=str)))
 
 
 def _plain(value: Any) -> Any:

@@ -30,6 +30,7 @@ from music_rllib.sweep.hang_watch import RECORD, HangWatch, check_hung
 from music_rllib.sweep.node_job import NodeJob
 from music_rllib.sweep.stop_flag import StopWatch
 from music_rllib.tracking import names
+from music_rllib.tracking.redaction import redact
 
 if TYPE_CHECKING:
     from music_rllib.experiment.training import TrainingRun
@@ -84,9 +85,9 @@ class RunTrainable(Trainable):
         try:
             return self._step_or_make_way(NodeStore(self._job.storage))
         except Exception as error:
-            text = traceback.format_exc()
+            text = redact(traceback.format_exc())
             self._release()
-            return self._result(done=True) | {CAUSE: cause_of(error, text), TRACEBACK: text}
+            return self._result(done=True) | {CAUSE: redact(cause_of(error, text)), TRACEBACK: text}
 
     def _step_or_make_way(self, store: NodeStore) -> dict[str, Any]:
         try:

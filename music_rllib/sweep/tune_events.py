@@ -28,6 +28,7 @@ from music_rllib.sweep.trainable import (
     REPORTS,
     TRACEBACK,
 )
+from music_rllib.tracking.redaction import redact
 
 __all__ = ["RESTARTS", "TuneEvents"]
 
@@ -78,7 +79,7 @@ class TuneEvents(Callback):
         reports = from_json_lines(result[REPORTS].encode())
         for listener in self._listeners:
             for note in result[NOTES]:
-                listener.noted(node, note)
+                listener.noted(node, redact(note))
             if reports:
                 listener.reported(node, reports)
 
@@ -125,7 +126,7 @@ class TuneEvents(Callback):
     ) -> None:
         """The trial's worker died, and another one goes on."""
         error = _error_of(trial)
-        cause = cause_of(error, _COLOUR.sub("", _text_of(trial))).splitlines()[0]
+        cause = redact(cause_of(error, _COLOUR.sub("", _text_of(trial)))).splitlines()[0]
         text = (
             f"{cause} Another worker goes on from the last checkpoint "
             f"({trial.run_metadata.num_failures} of {RESTARTS} times)."
@@ -137,6 +138,8 @@ class TuneEvents(Callback):
             listener.noted(node, text)
 
     def _fail(self, node: Node, cause: str, text: str) -> None:
+        # An environment may say anything, its database's password too.
+        cause, text = redact(cause), redact(text)
         log = self._failures / f"{re.sub(r'[^A-Za-z0-9._=,-]+', '_', node.label)}-{node.key}.txt"
         try:
             log.parent.mkdir(parents=True, exist_ok=True)

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from music_rllib.tracking.errors import TrackingError
-from music_rllib.tracking.redaction import redact
+from music_rllib.tracking.redaction import for_people
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
 
@@ -43,12 +43,12 @@ def deliver(
     try:
         left = deliver_sweep(sweep_folder, tracking_uri, timeout)
     except TrackingError as error:
-        typer.echo(f"error: {error}", err=True)
+        typer.echo(f"error: {for_people(error)}", err=True)
         raise typer.Exit(2) from error
     if left:
         reason = left.error or f"not done within {timeout:.0f} s"
         typer.echo(
-            f"{left.records} records and {left.artefacts} artefacts are left: {redact(reason)}",
+            f"{left.records} records and {left.artefacts} artefacts are left: {for_people(reason)}",
             err=True,
         )
         raise typer.Exit(1)

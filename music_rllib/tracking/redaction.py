@@ -1,4 +1,8 @@
-"""What may be written down: settings as flat params, and text without passwords."""
+"""What may leave the process: settings as flat params, and text without passwords.
+
+Every text that comes from elsewhere (an environment's exception, a file, a server) and goes to a
+file, the terminal or MLflow goes through `redact`, and to the terminal through `printable` as well.
+"""
 
 from __future__ import annotations
 
@@ -13,14 +17,52 @@ _USER_INFO = re.compile(r"(?P<scheme>[A-Za-z][A-Za-z0-9+.\-]*://)[^/?#\s'\"]*@")
 _QUERY_SECRET = re.compile(
     r"(?P<name>[?&](?:password|passwd|pwd|sslpassword|token|secret|access_key)=)[^&\s'\"]*", re.I
 )
+_ASSIGNED_SECRET = re.compile(
+    r"""(?P<name>[\w-]*(?:password|passwd|pwd|secret|token|api_?key|access_?key|credential)[\w-]*
+        \\?["']?\s*)
+    (?:(?P<equals>=\s*)|(?P<colon>:\s*))
+    (?:\\?(?P<quote>["']).*?(?P=quote)|(?:Bearer\s+)?[^\s,;&)}\]'"]+)""",
+    re.IGNORECASE | re.VERBOSE,
+)
+_BEARER = re.compile(r"(?P<name>\bBearer\s+)[\w.~+/=-]+")
+# C0 and C1 controls but line breaks and tabs, marks that change the direction of writing or hide,
+# and halves of characters, which no terminal can be given.
+_UNPRINTABLE = re.compile(
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u2069\ufeff\ud800-\udfff]"
+)
 _SECRET_KEY = re.compile(r"password|passwd|secret|token|api_?key|credential", re.I)
 _NOT_IN_A_NAME = re.compile(r"[^\w./\- ]")
 
 
 def redact(text: str) -> str:
-    """``text`` without the ``user:password@`` and ``?password=`` parts of the URIs in it."""
+    """``text`` without passwords.
+
+    Left out are ``user:password@`` in URIs, and what is assigned to a name that contains
+    ``password``, ``token``, ``secret``, ``api_key``, ``access_key`` or ``credential``: by ``=``,
+    ``:`` or in a URI's query.
+    """
     text = _USER_INFO.sub(lambda match: match["scheme"], text)
-    return _QUERY_SECRET.sub(lambda match: match["name"] + "***", text)
+    text = _QUERY_SECRET.sub(lambda match: match["name"] + "***", text)
+    text = _BEARER.sub(lambda match: match["name"] + "***", text)
+    return _ASSIGNED_SECRET.sub(_hidden, text)
+
+
+def _hidden(found: re.Match[str]) -> str:
+    """In quotes after a colon, to stay YAML and JSON."""
+    if found["equals"] is not None:
+        return f"{found['name']}{found['equals']}***"
+    quote = found["quote"] or '"'
+    return f"{found['name']}{found['colon']}{quote}***{quote}"
+
+
+def printable(text: str) -> str:
+    """``text`` with control characters as JSON's escapes: a file can't command a terminal."""
+    return _UNPRINTABLE.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+
+
+def for_people(text: object) -> str:
+    """An error or a remark as it may be shown: without passwords and control characters."""
+    return printable(redact(str(text)))
 
 
 def without_secrets(settings: Mapping[str, object]) -> dict[str, object]:

@@ -2,9 +2,25 @@
 
 from __future__ import annotations
 
-import pytest
+import argparse
+import unicodedata
+from pathlib import Path
 
-from music_rllib.tracking.redaction import MAX_PARAM_LENGTH, flat_params, redact, without_secrets
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.table import Table
+from rich.text import Text
+
+from music_rllib.sweep.cli import main as sweep_main
+from music_rllib.sweep.frame import console_for
+from music_rllib.tracking.redaction import (
+    MAX_PARAM_LENGTH,
+    flat_params,
+    printable,
+    redact,
+    without_secrets,
+)
 
 
 @pytest.mark.parametrize(
@@ -20,6 +36,14 @@ from music_rllib.tracking.redaction import MAX_PARAM_LENGTH, flat_params, redact
         ("cannot reach 'http://u:p@h:1/a' now", "cannot reach 'http://h:1/a' now"),
         ("someone@example.org wrote http://h/a@b", "someone@example.org wrote http://h/a@b"),
         ("sqlite:////home/me/mlflow.db", "sqlite:////home/me/mlflow.db"),
+        ("connect(host='h', password='p w', a=1)", "connect(host='h', password=***, a=1)"),
+        ("no login with password=hunter2, user=me", "no login with password=***, user=me"),
+        ("DB_PASSWORD: hunter2", 'DB_PASSWORD: "***"'),
+        ("{'api_key': 'k', \"token\": \"t\"}", "{'api_key': '***', \"token\": \"***\"}"),
+        ("PGPASSWORD=hunter2 psql", "PGPASSWORD=*** psql"),
+        ("Authorization: Bearer abc.def-g", "Authorization: Bearer ***"),
+        ("the password must be given", "the password must be given"),
+        ("5 tokens = 3 words", "5 tokens = *** words"),
     ],
 )
 def test_uris_lose_their_passwords_and_nothing_else(text: str, expected: str) -> None:
@@ -62,3 +86,47 @@ def test_params_are_flat_text() -> None:
 def test_params_that_mlflow_would_refuse_for_their_length_are_left_out() -> None:
     params = flat_params({"fits": "x" * MAX_PARAM_LENGTH, "long": "x" * (MAX_PARAM_LENGTH + 1)})
     assert list(params) == ["fits"]
+
+
+@given(st.text(), st.sampled_from(["password=", "https://me:", "token: ", "'secret': '"]))
+def test_what_is_redacted_stays_so(text: str, name: str) -> None:
+    once = redact(f"{text}{name}hunter2@host'{text}")
+    assert redact(once) == once
+
+
+CONTROLS = "\x1b[31m\x07\x9b2J\r\u202e\ud800\x00"
+
+
+@given(st.text(alphabet=st.characters()))
+def test_what_is_printed_commands_no_terminal(text: str) -> None:
+    shown = printable(text + CONTROLS)
+    shown.encode()
+    assert not any(unicodedata.category(one) in {"Cc", "Cs"} for one in shown if one not in "\n\t")
+    assert printable(text) == text or any(not one.isprintable() for one in text)
+
+
+def test_a_console_shows_markup_and_escapes_as_text(capsys: pytest.CaptureFixture[str]) -> None:
+    console = console_for(argparse.Namespace())
+    table = Table(title=f"[red]{CONTROLS[:-2]}")
+    table.add_column("[blink]")
+    table.add_row("[bold]x :smile:")
+    console.print(f"[red]{CONTROLS}")
+    console.print(Text(f"[link=x]{CONTROLS}"))
+    console.print(table)
+    shown = capsys.readouterr().out
+    for word in ("[red]\\u001b[31m", "[link=x]", "[blink]", "[bold]x :smile:"):
+        assert word in shown
+    assert not any(unicodedata.category(one) == "Cc" for one in shown if one != "\n")
+
+
+def test_an_error_shows_control_characters_as_text(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A file's name and its values are somebody's text."""
+    file = tmp_path / "a\x1b[2Jb.yaml"
+    file.write_text('name: "\\e[31m[red]\\u202e"\n"k\\e": 1\n')
+    assert sweep_main(["plan", str(file)]) == 2
+    shown = capsys.readouterr().err
+    assert "\x1b" not in shown
+    assert "\u202e" not in shown
+    assert r"\u001b[2Jb.yaml" in shown

@@ -1,0 +1,124 @@
+"""Tables of an exported sweep as files, CSV or Parquet, which may come from strangers."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import pyarrow as pa
+from pyarrow import compute, csv, parquet
+
+from music_rllib.limits import (
+    MOST_COLUMNS,
+    MOST_ROWS_PER_BYTE,
+    MOST_TABLE_ROWS,
+    MOST_TABLE_TEXT,
+    open_regular,
+)
+
+__all__ = ["read_table", "write_table"]
+
+_FREE_ROWS = 100_000
+"""Rows that a file of any size may have."""
+_FIRST_BYTES = 1 << 20
+"""In which a CSV file's first line ends."""
+_MAY_BE_EMPTY = ("started", "ended")
+
+
+def write_table(table: pa.Table, file: Path) -> None:
+    """Write it, as its ending says."""
+    if file.suffix == ".csv":
+        csv.write_csv(table, file)
+    else:
+        parquet.write_table(table, file, compression="zstd")
+
+
+def read_table(file: Path, kinds: Mapping[str, pa.DataType]) -> pa.Table:
+    """Read a table and check it against a schema, before it takes memory where that can be.
+
+    Args:
+        file: `.csv`, or Parquet.
+        kinds: The columns that there must be, by name; others are text.
+
+    Raises:
+        OSError: It can't be read.
+        ValueError: It is another table, or a larger one than its file can hold.
+        pyarrow.ArrowException: It is damaged.
+    """
+    with open_regular(file) as source:
+        table = _from_csv(source, kinds) if file.suffix == ".csv" else _from_parquet(source)
+    missing = [name for name in kinds if name not in table.column_names]
+    if missing:
+        raise ValueError(f"must have the column {missing[0]}, it has {table.column_names[:9]}")
+    if len(set(table.column_names)) < table.num_columns:
+        raise ValueError("its columns must have different names")
+    _check_texts(table)
+    names = table.column_names
+    schema = pa.schema([(name, kinds.get(name, pa.string())) for name in names])
+    table = table.cast(schema)
+    for name in kinds:
+        if table[name].null_count and name not in _MAY_BE_EMPTY:
+            raise ValueError(f"{name} must be given in each row, it is not")
+    return table
+
+
+def _check_size(rows: int, columns: int, size: int) -> None:
+    most = min(MOST_TABLE_ROWS, _FREE_ROWS + MOST_ROWS_PER_BYTE * size)
+    if rows > most:
+        raise ValueError(f"must have at most {most} rows in {size} bytes, it says {rows}")
+    if columns > MOST_COLUMNS:
+        raise ValueError(f"must have at most {MOST_COLUMNS} columns, it has {columns}")
+
+
+def _check_texts(table: pa.Table) -> None:
+    """Long texts that a dictionary repeats would be as many copies."""
+    total = 0
+    for column in table.columns:
+        for chunk in column.chunks:
+            if isinstance(chunk, pa.DictionaryArray):
+                lengths = compute.binary_length(chunk.dictionary).take(chunk.indices)
+                total += compute.sum(lengths).as_py() or 0
+    if total > MOST_TABLE_TEXT:
+        raise ValueError(f"must have at most {MOST_TABLE_TEXT} characters of text, it has {total}")
+
+
+def _from_parquet(source: BinaryIO) -> pa.Table:
+    size = os.fstat(source.fileno()).st_size
+    limits: dict[str, Any] = {
+        "thrift_string_size_limit": 16 << 20,
+        "thrift_container_size_limit": 1_000_000,
+    }
+    footer = parquet.ParquetFile(source, **limits)
+    _check_size(footer.metadata.num_rows, footer.metadata.num_columns, size)
+    schema = footer.schema_arrow
+    for field in schema:
+        plain = pa.types.is_string(field.type) or pa.types.is_large_string(field.type)
+        if not (plain or pa.types.is_primitive(field.type) or pa.types.is_null(field.type)):
+            raise ValueError(f"{field.name} must be text or numbers, it is {field.type}")
+    # As dictionaries, so that a text that stands in each row is read once.
+    texts = [field.name for field in schema if pa.types.is_string(field.type)]
+    source.seek(0)
+    return parquet.ParquetFile(source, read_dictionary=texts, **limits).read()
+
+
+def _from_csv(source: BinaryIO, kinds: Mapping[str, pa.DataType]) -> pa.Table:
+    head = source.read(_FIRST_BYTES).partition(b"\n")[0]
+    _check_size(0, head.count(b",") + 1, 0)
+    source.seek(0)
+    names = csv.open_csv(pa.PythonFile(source)).schema.names
+    source.seek(0)
+    convert = csv.ConvertOptions(
+        column_types={name: kinds.get(name, pa.string()) for name in names},
+        # An empty field is nothing, an empty text in quotes is a text, and nan is a number.
+        null_values=[""],
+        strings_can_be_null=True,
+        quoted_strings_can_be_null=False,
+    )
+    # A failure's text has line breaks.
+    return csv.read_csv(
+        pa.PythonFile(source),
+        convert_options=convert,
+        parse_options=csv.ParseOptions(newlines_in_values=True),
+    )
