@@ -33,7 +33,7 @@ MOST_NESTED = 64
 """Levels of lists and mappings in each other."""
 MOST_CONTAINERS = 200_000
 """Lists and mappings of a JSON document."""
-MOST_YAML_VALUES = 50_000
+MOST_YAML_VALUES = 12_000
 """Values of a YAML document, those of an alias counted wherever it stands."""
 MOST_DIGITS = 100
 """Of a whole number: the state of a random generator has 39."""

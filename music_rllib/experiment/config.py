@@ -121,7 +121,9 @@ def _seeds(text: str, given: Any) -> list[int]:
     if digits and "," not in text and int(text) > MOST_SEEDS:
         raise ConfigError([f"--seeds must be at most {MOST_SEEDS:,} seeds, got {text}"])
     if not digits or text in {"0", ""}:
-        raise ConfigError([f"--seeds must be a number of seeds or a list like 0,1,7, got {text!r}"])
+        raise ConfigError(
+            [f"--seeds must be a number of seeds or a list like 0,1,7, got {shown(text)}"]
+        )
     if "," in text:
         return [int(seed) for seed in text.split(",") if seed]
     known = [seed for seed in given if isinstance(seed, int)] if isinstance(given, list) else [0]

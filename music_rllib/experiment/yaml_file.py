@@ -89,16 +89,18 @@ class _StrictLoader(yaml.SafeLoader):
 
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012
 
-    _depth = 0
+    _depth = _composed = 0
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        """Refuse a value that is nested too deeply before Python does."""
+        """Refuse what is nested too deeply, before Python does, and what is too much, in time."""
         self._depth += 1
-        if self._depth > MOST_NESTED:
-            raise yaml.composer.ComposerError(
-                *(None, None, f"must be nested at most {MOST_NESTED} levels deep"),
-                self.peek_event().start_mark,  # type: ignore[no-untyped-call]
-            )
+        self._composed += 1
+        rule = f"must be nested at most {MOST_NESTED} levels deep"
+        if self._composed > MOST_YAML_VALUES:
+            rule = f"must have at most {MOST_YAML_VALUES} values"
+        if self._depth > MOST_NESTED or self._composed > MOST_YAML_VALUES:
+            mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]
+            raise yaml.composer.ComposerError(None, None, rule, mark)
         try:
             return super().compose_node(parent, index)
         finally:

@@ -13,6 +13,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -65,7 +66,7 @@ def _without_folders(place: str) -> str:
 
 def is_archive(folder: Path) -> bool:
     """Whether `folder` holds an exported sweep."""
-    return (folder / _HEADER).is_file()
+    return os.path.lexists(folder / _HEADER)
 
 
 def write_archive(sweep: Sweep, folder: Path, file_format: Format = "parquet") -> None:

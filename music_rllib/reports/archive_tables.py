@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import pyarrow as pa
 from pyarrow import compute, csv, parquet
@@ -48,7 +48,13 @@ def read_table(file: Path, kinds: Mapping[str, pa.DataType]) -> pa.Table:
         pyarrow.ArrowException: It is damaged.
     """
     with open_regular(file) as source:
-        table = _from_csv(source, kinds) if file.suffix == ".csv" else _from_parquet(source)
+        head, size = source.read(_FIRST_BYTES), os.fstat(source.fileno()).st_size
+    # By Arrow's own threads, which can't wait for Python's at the end of a process.
+    with pa.OSFile(str(file)) as native:
+        if file.suffix == ".csv":
+            table = _from_csv(native, head, kinds)
+        else:
+            table = _from_parquet(native, size)
     missing = [name for name in kinds if name not in table.column_names]
     if missing:
         raise ValueError(f"must have the column {missing[0]}, it has {table.column_names[:9]}")
@@ -84,8 +90,7 @@ def _check_texts(table: pa.Table) -> None:
         raise ValueError(f"must have at most {MOST_TABLE_TEXT} characters of text, it has {total}")
 
 
-def _from_parquet(source: BinaryIO) -> pa.Table:
-    size = os.fstat(source.fileno()).st_size
+def _from_parquet(source: pa.NativeFile, size: int) -> pa.Table:
     limits: dict[str, Any] = {
         "thrift_string_size_limit": 16 << 20,
         "thrift_container_size_limit": 1_000_000,
@@ -103,12 +108,10 @@ def _from_parquet(source: BinaryIO) -> pa.Table:
     return parquet.ParquetFile(source, read_dictionary=texts, **limits).read()
 
 
-def _from_csv(source: BinaryIO, kinds: Mapping[str, pa.DataType]) -> pa.Table:
-    head = source.read(_FIRST_BYTES).partition(b"\n")[0]
-    _check_size(0, head.count(b",") + 1, 0)
-    source.seek(0)
-    names = csv.open_csv(pa.PythonFile(source)).schema.names
-    source.seek(0)
+def _from_csv(source: pa.NativeFile, head: bytes, kinds: Mapping[str, pa.DataType]) -> pa.Table:
+    first, _, _ = head.partition(b"\n")
+    _check_size(0, first.count(b",") + 1, 0)
+    names = csv.read_csv(pa.BufferReader(first + b"\n")).column_names
     convert = csv.ConvertOptions(
         column_types={name: kinds.get(name, pa.string()) for name in names},
         # An empty field is nothing, an empty text in quotes is a text, and nan is a number.
@@ -118,7 +121,7 @@ def _from_csv(source: BinaryIO, kinds: Mapping[str, pa.DataType]) -> pa.Table:
     )
     # A failure's text has line breaks.
     return csv.read_csv(
-        pa.PythonFile(source),
+        source,
         convert_options=convert,
         parse_options=csv.ParseOptions(newlines_in_values=True),
     )

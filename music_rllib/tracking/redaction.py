@@ -13,15 +13,16 @@ from collections.abc import Iterator, Mapping
 MAX_PARAM_LENGTH = 6000
 """MLflow's limit for the value of a param, in characters."""
 
-_USER_INFO = re.compile(r"(?P<scheme>[A-Za-z][A-Za-z0-9+.\-]*://)[^/?#\s'\"]*@")
+_USER_INFO = re.compile(r"(?P<scheme>[A-Za-z][A-Za-z0-9+.\-]{0,40}://)[^/?#\s'\"]*@")
 _QUERY_SECRET = re.compile(
     r"(?P<name>[?&](?:password|passwd|pwd|sslpassword|token|secret|access_key)=)[^&\s'\"]*", re.I
 )
 _ASSIGNED_SECRET = re.compile(
-    r"""(?P<name>[\w-]*(?:password|passwd|pwd|secret|token|api_?key|access_?key|credential)[\w-]*
-        \\?["']?\s*)
-    (?:(?P<equals>=\s*)|(?P<colon>:\s*))
-    (?:\\?(?P<quote>["']).*?(?P=quote)|(?:Bearer\s+)?[^\s,;&)}\]'"]+)""",
+    # Bounded repetitions: a long text must not take time quadratic in its length.
+    r"""(?P<name>(?:password|passwd|pwd|secret|token|api_?key|access_?key|credential)[\w-]{0,40}
+        \\?["']?\s{0,9})
+    (?:(?P<equals>=\s{0,9})|(?P<colon>:\s{0,9}))
+    (?:\\?(?P<quote>["']).{0,9999}?(?P=quote)|(?:Bearer\s+)?[^\s,;&)}\]'"]+)""",
     re.IGNORECASE | re.VERBOSE,
 )
 _BEARER = re.compile(r"(?P<name>\bBearer\s+)[\w.~+/=-]+")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import time
 from pathlib import Path
 from typing import Any
@@ -52,7 +53,8 @@ class Point(gym.Env[dict[str, Array], Array]):
     def step(self, action: Array) -> tuple[dict[str, Array], float, bool, bool, dict[str, Any]]:
         self._steps += 1
         if self._steps == self._fail_at:
-            raise RuntimeError("the gripper fell off\nlook at the second screw")
+            said = os.environ.get("POINT_SAYS", "look at the second screw")
+            raise RuntimeError(f"the gripper fell off\n{said}")
         moved = self._state + np.concatenate([0.1 * action, 0.05 * action])
         self._state = np.clip(moved, -2, 2).astype(np.float32)
         if self._steps == self._nan_at:

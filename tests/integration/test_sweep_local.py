@@ -150,10 +150,14 @@ def test_a_failure_is_explained_and_the_others_finish(
     sweep_document["tasks"] = ["Broken", "Point"]
     sweep_document["stages"][1].pop("grid")
     sweep_program.write(sweep_document)
+    sweep_program.environment["POINT_SAYS"] = (
+        "look at postgresql://me:planted-1@db/screws "
+        "(password=planted-2, 'token': 'planted-3') \x1b[2J"
+    )
     code, output, errors = sweep_program.run()
     assert (code, errors) == (1, "")
     assert "pretrain/Broken/seed0: FAILED: RuntimeError: the gripper fell off" in output
-    assert "look at the second screw" in output
+    assert "look at postgresql://db/screws (password=***, 'token': '***') \\u001b[2J" in output
     assert "finetune/Broken/seed0: skipped, it starts from pretrain/Broken/seed0" in output
     assert [(row[1], row[-1]) for row in rows(output)] == [
         ("Broken", "failed"),
@@ -163,12 +167,16 @@ def test_a_failure_is_explained_and_the_others_finish(
     ]
     log = Path(re.findall(r"whole traceback: (.*)", output)[0])
     text = log.read_text()
-    assert 'raise RuntimeError("the gripper fell off' in text
+    assert 'raise RuntimeError(f"the gripper fell off' in text
     assert "point_env.py" in text
     failed = mlflow_runs()["pretrain/Broken/seed0"]
     assert failed.info.status == "FAILED"
     assert failed.data.tags[names.TAG_FAILURE].startswith("RuntimeError: the gripper fell off")
     assert "finetune/Broken/seed0" not in mlflow_runs()
+    # What the environment said holds passwords: they are in no byte of what is kept and shown.
+    files = [file for file in tmp_path.rglob("*") if file.is_file()]
+    assert [file for file in files if b"planted-" in file.read_bytes()] == []
+    assert "planted-" not in output
 
 
 def test_stopped_killed_and_continued(

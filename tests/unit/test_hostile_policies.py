@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import socket
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,46 +12,13 @@ import pytest
 from music_rllib.envs.make import known_environment
 from music_rllib.envs.registry import BUILT_IN_TASKS, Task
 from music_rllib.experiment.config import declared_tasks
-from music_rllib.experiment.handoff import HandoffError, HandoffInfo, Spaces, write_handoff
+from music_rllib.experiment.handoff import HandoffError
 from music_rllib.experiment.handoff import read_handoff as read_handoff_of
 from music_rllib.experiment.sealed import DamagedError, SealedFolders, open_storage
-from music_rllib.experiment.settings import RunSettings
 from music_rllib.policy import Policy, PolicyError, load_policy
 from music_rllib.policy.episodes import open_task
 from music_rllib.sweep.cli import main as sweep_main
-
-INPUTS = 3
-SPACES = Spaces(observation_size=INPUTS, goal_size=0, action_low=(-2.0,), action_high=(2.0,))
-PENDULUM = Task(name="Pendulum", env_id="Pendulum-v1", horizon=20, success_key=None)
-
-
-def write_policy(folder: Path, task: Task, spaces: Spaces | None = SPACES) -> Path:
-    """A handoff with weights for the spaces of Pendulum, whatever its task is."""
-    run = RunSettings.model_validate(
-        {"task": task, "variant": "tac", "seed": 0, "tac": {"hidden_sizes": [2]}}
-    )
-    rng = np.random.default_rng(0)
-    policy = {
-        "0.weight": rng.normal(size=(2, INPUTS)),
-        "0.bias": np.zeros(2),
-        "2.weight": rng.normal(size=(2, 2)),
-        "2.bias": np.zeros(2),
-    }
-    modules = {
-        "policy": {name: array.astype(np.float32) for name, array in policy.items()},
-        "normaliser": {
-            "mean": np.zeros(INPUTS, np.float32),
-            "inverse_std": np.ones(INPUTS, np.float32),
-        },
-    }
-    write_handoff(folder / "handoff", modules, HandoffInfo.of(run, "0" * 20, 1, spaces))
-    return folder
-
-
-def seal_policy(storage: Path, task: Task) -> Path:
-    with SealedFolders(*open_storage(str(storage))).sealing("node", {}) as folder:
-        write_policy(folder, task)
-    return storage / "node"
+from tests.hostile_files import INPUTS, PENDULUM, STRANGE, seal_policy, write_policy
 
 
 @pytest.fixture
@@ -147,26 +112,6 @@ def test_which_environments_a_file_may_name(
 
 
 # Files that are none ------------------------------------------------------------------------------
-
-
-def _device(path: Path) -> None:
-    path.symlink_to("/dev/zero")
-
-
-def _socket(path: Path) -> None:
-    with socket.socket(socket.AF_UNIX) as listening:
-        here = Path.cwd()
-        os.chdir(path.parent)  # a socket's path must be short
-        listening.bind(path.name)
-        os.chdir(here)
-
-
-def _sparse(path: Path) -> None:
-    with path.open("wb") as file:
-        file.truncate(1 << 40)
-
-
-STRANGE = {"device": _device, "FIFO": os.mkfifo, "socket": _socket, "sparse": _sparse}
 
 
 @pytest.mark.parametrize("kind", STRANGE)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import time
 import unicodedata
 from pathlib import Path
 
@@ -130,3 +131,11 @@ def test_an_error_shows_control_characters_as_text(
     assert "\x1b" not in shown
     assert "\u202e" not in shown
     assert r"\u001b[2Jb.yaml" in shown
+
+
+@pytest.mark.parametrize("text", ["1" * 100_000, "token" * 20_000, "a://" * 20_000, "secret='" * 9])
+def test_redaction_takes_time_in_proportion_to_a_text(text: str) -> None:
+    """Quadratic, the first would take minutes."""
+    began = time.process_time()
+    redact(text)
+    assert time.process_time() - began < 1

@@ -1,0 +1,44 @@
+"""Files from strangers: each is refused in time, in few bytes, and in words."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.hostile_files import CORPUS, MEGABYTES, SECONDS
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]]:
+    """What the programs made of each file of the corpus, one after the other."""
+    folder = tmp_path_factory.mktemp("corpus")
+    done = subprocess.run(
+        [sys.executable, "-m", "tests.hostile_files", str(folder)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=280,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    results = [json.loads(line) for line in done.stdout.splitlines()]
+    return {result["name"]: result for result in results}
+
+
+@pytest.mark.parametrize("name", CORPUS)
+def test_a_hostile_file_is_refused(found: dict[str, dict[str, Any]], name: str) -> None:
+    """With exit code 2 and a message, before it has cost a second or 300 MB."""
+    result = found[name]
+    assert CORPUS[name].said in result["said"]
+    assert "Traceback" not in result["said"]
+    assert result["code"] == 2
+    assert result["seconds"] < SECONDS
+    assert result["megabytes"] < MEGABYTES
+    assert not result["written"]
