@@ -72,6 +72,10 @@ class Architecture(_Strict):
     bootstrap: str
     normalise_observations: bool
     estimator_hidden_size: int
+    log_std_form: str = "clamp"
+    """What the policy's outputs mean; handoffs from before there was a choice do not say."""
+    log_std_bounds: tuple[float, float] | None = None
+    """Of `tanh`, which scales to them; others only cut off there."""
 
     @classmethod
     def of(cls, run: RunSettings) -> Architecture:
@@ -82,6 +86,8 @@ class Architecture(_Strict):
             bootstrap=run.tac.bootstrap,
             normalise_observations=run.tac.normalise_observations,
             estimator_hidden_size=run.music.hidden_size,
+            log_std_form=run.tac.log_std_form,
+            log_std_bounds=run.tac.log_std_bounds if run.tac.log_std_form == "tanh" else None,
         )
 
     def differences(self, other: Architecture, starts_from: Source) -> list[str]:
@@ -89,7 +95,9 @@ class Architecture(_Strict):
         if starts_from == "estimator":
             fits = self.estimator_hidden_size == other.estimator_hidden_size
             return [] if fits else ["music.hidden_size"]
-        fields = ("hidden_sizes", "policy", "bootstrap", "normalise_observations")
+        fields = ["hidden_sizes", "policy", "bootstrap", "normalise_observations", "log_std_form"]
+        if self.log_std_form == other.log_std_form:
+            fields.append("log_std_bounds")
         return [f"tac.{name}" for name in fields if getattr(self, name) != getattr(other, name)]
 
 

@@ -109,7 +109,7 @@ def contradiction(variant: Variant, fixed: Any, got: Any) -> str:
     return f"must be {json.dumps(fixed)} for {variant}, got {json.dumps(got)}"
 
 
-YOUNGER: tuple[tuple[str, str], ...] = ()
+YOUNGER: tuple[tuple[str, str], ...] = (("tac", "log_std_form"),)
 """Section and name of settings that came after keys of finished runs had been written down."""
 
 

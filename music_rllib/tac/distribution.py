@@ -12,7 +12,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-__all__ = ["PolicySample", "deterministic_action", "sample_squashed", "squashed_action"]
+__all__ = [
+    "PolicySample",
+    "bounded_log_std",
+    "deterministic_action",
+    "sample_squashed",
+    "squashed_action",
+]
 
 _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 _LOG_2 = math.log(2.0)
@@ -25,6 +31,18 @@ class PolicySample(NamedTuple):
     """[B, A] in (-1, 1)."""
     log_density: Tensor
     """[B, A] log pi of each dimension, in nats, the tanh Jacobian included."""
+
+
+def bounded_log_std(raw: Tensor, bounds: tuple[float, float], form: str) -> Tensor:
+    """Log standard deviation [B, A] of the network's outputs [B, A], within `bounds`.
+
+    At an output of 0, where a fresh network is, `clamp` has sigma = 1 and `tanh` the middle of the
+    bounds: 1.2e-4 of [-20, 2].
+    """
+    low, high = bounds
+    if form == "clamp":
+        return raw.clamp(low, high)
+    return low + 0.5 * (high - low) * (torch.tanh(raw) + 1.0)
 
 
 def sample_squashed(mean: Tensor, log_std: Tensor, noise: Tensor) -> PolicySample:

@@ -14,7 +14,12 @@ from torch import Tensor, nn
 
 from music_rllib.envs.make import observation_sizes
 from music_rllib.estimator.network import MutualInformationEstimator, intrinsic_reward
-from music_rllib.tac.distribution import deterministic_action, sample_squashed, squashed_action
+from music_rllib.tac.distribution import (
+    bounded_log_std,
+    deterministic_action,
+    sample_squashed,
+    squashed_action,
+)
 from music_rllib.tac.forward import Bootstrap, TACForward
 from music_rllib.tac.networks import Critics, Perceptron
 from music_rllib.tac.normaliser import RunningNormaliser
@@ -76,8 +81,9 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
         """What the outputs of the policy's network stand for: mean and log standard deviation."""
         if self.deterministic:
             return outputs, None
-        mean, log_std = outputs.chunk(2, dim=-1)
-        return mean, log_std.clamp(*self.settings.log_std_bounds)
+        mean, raw = outputs.chunk(2, dim=-1)
+        settings = self.settings
+        return mean, bounded_log_std(raw, settings.log_std_bounds, settings.log_std_form)
 
     @torch.no_grad()
     def act(self, inputs: Tensor, noise: Tensor | None = None) -> Tensor:

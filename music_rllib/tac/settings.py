@@ -182,7 +182,10 @@ class TACSettings(_Frozen):
     hidden_sizes: tuple[Annotated[int, Field(gt=0)], ...] = Field((256, 256, 256), min_length=1)
     """Hidden layers (ReLU) of policy, value and critics."""
     log_std_bounds: tuple[float, float] = (-20.0, 2.0)
-    """The policy's log standard deviation is clamped to this range."""
+    """Range of the policy's log standard deviation."""
+    log_std_form: Literal["clamp", "tanh"] = "clamp"
+    """How it gets there: cut off at the bounds, so that it begins near 0; or tanh, scaled to them,
+    so that it begins in their middle (TAC-2020: [-20, 2], original MUSIC's SAC: [-5, 2])."""
     lr: float = Field(1e-3, gt=0)
     """Adam's step size for policy, value and critics."""
     gamma: float = Field(0.99, ge=0, lt=1)

@@ -116,6 +116,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "alpha learned": {"alpha": {"learned": True}, "bootstrap": "critics"},
     "ddpg": {**DDPG, "target_update_interval": 2, "action_l2": 1.0},
     "per": PER,
+    "widths between bounds": {"log_std_form": "tanh", "log_std_bounds": (-5.0, 2.0)},
 }
 
 

@@ -98,6 +98,7 @@ def test_gradients_are_autograds_at_every_q(q: float, form: str, backbone: str) 
         {"action_l2": 0.7},
         {"target_bounds": (-0.5, 0.5)},
         {"normalise_observations": False},
+        {"log_std_form": "tanh", "log_std_bounds": (-2.0, 1.0)},
     ],
     ids=str,
 )

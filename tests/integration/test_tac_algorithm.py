@@ -131,6 +131,7 @@ CHANGES: dict[str, tuple[Any, dict[str, Any]]] = {
     "policy_critic": ("first", {}),
     "hidden_sizes": ((32, 16), {}),
     "log_std_bounds": ((-1.0, -0.5), {}),
+    "log_std_form": ("tanh", {}),
     "lr": (3e-4, {}),
     "gamma": (0.9, {}),
     "tau": (0.5, {}),

@@ -352,6 +352,22 @@ def test_policies_need_the_same_networks_on_both_sides(
         "tac.hidden_sizes in stage f as in stage u",
         "tac.normalise_observations in stage f as in stage u",
     ]
+    # The same numbers would be other widths.
+    for theirs, ours, wrong in (
+        ({}, {"log_std_form": "tanh"}, ["log_std_form"]),
+        ({"log_std_form": "tanh"}, {}, ["log_std_form"]),
+        (
+            {"log_std_form": "tanh"},
+            {"log_std_form": "tanh", "log_std_bounds": [-5.0, 2.0]},
+            ["log_std_bounds"],
+        ),
+    ):
+        stages[0]["tac"], stages[1]["tac"] = theirs, ours
+        lines = problems(changed(stages=stages))
+        named = [line.split("needs the same tac.")[1].split(" in stage")[0] for line in lines]
+        assert named == wrong
+    stages[0]["tac"], stages[1]["tac"] = {}, {"log_std_bounds": [-5.0, 2.0]}
+    load(changed(stages=stages))
 
 
 def test_an_estimator_must_come_from_a_stage_that_has_one(

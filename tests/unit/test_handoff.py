@@ -79,6 +79,16 @@ def test_a_task_may_have_another_name_but_nothing_else(handoff: Path) -> None:
         read_handoff(handoff, ["normaliser"], other_split)
 
 
+def test_a_handoff_from_before_there_was_a_choice_has_clamped_widths(handoff: Path) -> None:
+    path = handoff / "handoff.json"
+    manifest = json.loads(path.read_text())
+    for name in ("log_std_form", "log_std_bounds"):
+        del manifest["info"]["architecture"][name]
+    path.write_text(json.dumps(manifest))
+    architecture = open_handoff(handoff)[1].info.architecture
+    assert (architecture.log_std_form, architecture.log_std_bounds) == ("clamp", None)
+
+
 def test_a_node_folder_holds_its_handoff_below(handoff: Path) -> None:
     folder, manifest = open_handoff(handoff.parent)
     assert folder == handoff

@@ -126,6 +126,7 @@ def settings(**changes: Any) -> RunSettings:
         {"num_envs": 5},
         {"evaluation": {"episodes": 21}},
         {"tac": {"lr": 0.0011}},
+        {"tac": {"log_std_form": "tanh"}},
         {"replay": {"hindsight_k": 1.0}},
         {"music": preset("music-u", BUILT_IN_TASKS["FetchPush"]) | {"lr": 0.0011}},
         {"task": BUILT_IN_TASKS["FetchPush"].model_copy(update={"horizon": 49})},

@@ -72,8 +72,13 @@ def observations() -> np.ndarray[Any, Any]:
 
 @pytest.mark.parametrize(
     "tac",
-    [{}, {"normalise_observations": False}, {"policy": "deterministic", "bootstrap": "critics"}],
-    ids=["usual", "without normaliser", "deterministic"],
+    [
+        {},
+        {"normalise_observations": False},
+        {"policy": "deterministic", "bootstrap": "critics"},
+        {"log_std_form": "tanh", "log_std_bounds": [-5.0, 2.0]},
+    ],
+    ids=["usual", "without normaliser", "deterministic", "scaled widths"],
 )
 def test_acts_like_the_networks(
     tmp_path: Path, observations: np.ndarray[Any, Any], tac: dict[str, Any]

@@ -1,12 +1,19 @@
 """Distribution and networks of TAC, each against an independent computation."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
 from scipy import integrate
 from torch import nn
 
-from music_rllib.tac.distribution import deterministic_action, sample_squashed
+from music_rllib.tac.distribution import (
+    bounded_log_std,
+    deterministic_action,
+    sample_squashed,
+)
+from music_rllib.tac.kernels.derivatives import through_scaled_tanh
 from music_rllib.tac.networks import Critics, Perceptron
 
 
@@ -77,3 +84,27 @@ def test_frozen_critics_pass_gradients_to_their_inputs_only() -> None:
     assert inputs.grad is not None
     assert inputs.grad.abs().sum() > 0
     assert all(parameter.grad is None for parameter in critics.parameters())
+
+
+@pytest.mark.parametrize(
+    ("bounds", "first_std"), [((-20.0, 2.0), 1.234e-4), ((-5.0, 2.0), 0.2231)], ids=str
+)
+def test_log_std_is_cut_off_at_its_bounds_or_scaled_between_them(
+    bounds: tuple[float, float], first_std: float
+) -> None:
+    """TAC-2020 writes -20 + 11 (tanh(x) + 1), the original MUSIC's SAC -5 + 3.5 (tanh(x) + 1)."""
+    low, high = bounds
+    raw = torch.tensor([-30.0, -1.0, 0.0, 1.0, 30.0], dtype=torch.float64)
+    scaled = bounded_log_std(raw, bounds, "tanh")
+    half = {-20.0: 11.0, -5.0: 3.5}[low]
+    expected = [low + half * (math.tanh(x) + 1) for x in raw.tolist()]
+    assert scaled.tolist() == pytest.approx(expected)
+    assert math.exp(scaled[2]) == pytest.approx(first_std, rel=1e-3)
+    clamped = [max(low, -30.0), -1.0, 0.0, 1.0, high]
+    assert bounded_log_std(raw, bounds, "clamp").tolist() == clamped
+    # In closed form as in autograd.
+    raw.requires_grad_()
+    output = bounded_log_std(raw, bounds, "tanh")
+    (slope,) = torch.autograd.grad(output.sum(), raw)
+    found = through_scaled_tanh(torch.ones_like(output), output.detach(), bounds)
+    torch.testing.assert_close(found, slope)

@@ -21,6 +21,7 @@ __all__ = [
     "of_squashed_sample",
     "of_value_loss",
     "through_clamp",
+    "through_scaled_tanh",
     "through_tanh",
 ]
 
@@ -85,6 +86,15 @@ def through_tanh(of_action: Tensor, action: Tensor) -> Tensor:
 def through_clamp(gradient: Tensor, raw: Tensor, clamped: Tensor) -> Tensor:
     """[B, A]: what lies within the bounds, or on them, has it all, what lies outside nothing."""
     return torch.where(raw == clamped, gradient, 0.0)
+
+
+def through_scaled_tanh(gradient: Tensor, output: Tensor, bounds: tuple[float, float]) -> Tensor:
+    """[B, A]: through `low + (high - low) / 2 (tanh + 1)`, given its output.
+
+    Its slope is (high - low) / 2 (1 - tanh^2), of which both factors are read off the output.
+    """
+    low, high = bounds
+    return gradient * (output - low) * (high - output) * (2.0 / (high - low))
 
 
 def of_mean_square(values: Tensor, weight: float) -> Tensor:

@@ -166,9 +166,16 @@ class DirectUpdate:
             action,
             forward.log_std.exp() * batch["noise"],
         )
-        raw = self._outputs[:, action.shape[1] :]
-        of_raw = derivatives.through_clamp(of_log_std, raw, forward.log_std)
+        of_raw = self._through_bounds(of_log_std, forward.log_std)
         return torch.cat([of_mean, of_raw], 1)
+
+    def _through_bounds(self, of_log_std: Tensor, log_std: Tensor) -> Tensor:
+        """[B, A]: by the network's outputs, given that by the ln sigma made of them."""
+        settings = self._settings
+        if settings.log_std_form == "tanh":
+            return derivatives.through_scaled_tanh(of_log_std, log_std, settings.log_std_bounds)
+        raw = self._outputs[:, log_std.shape[1] :]
+        return derivatives.through_clamp(of_log_std, raw, log_std)
 
 
 def _values(networks: list[Network], pairs: Tensor) -> Tensor:
