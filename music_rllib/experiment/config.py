@@ -87,6 +87,9 @@ def load_sweep(
     Raises:
         ConfigError: With one line per problem.
     """
+    for key, value in (("name", name), ("storage", storage)):
+        if value is not None and not _is_utf8(value):
+            raise ConfigError([f"--{key} must be UTF-8 text, got {value!a}"])
     file = read_yaml(Path(path))
     options: dict[str, Any] = {
         key: value for key, value in (("name", name), ("storage", storage)) if value is not None
@@ -113,6 +116,15 @@ def declared_tasks(path: str | Path) -> tuple[Task, ...]:
     if findings.problems:
         raise ConfigError(_lines(findings.problems, file, file.data, {}))
     return tuple(task for name, task in registry.items() if name not in BUILT_IN_TASKS)
+
+
+def _is_utf8(argument: str) -> bool:
+    """Other bytes of a command line are kept as what no encoding has."""
+    try:
+        argument.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def _seeds(text: str, given: Any) -> list[int]:

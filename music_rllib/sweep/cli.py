@@ -143,6 +143,7 @@ def _bad_input() -> tuple[type[Exception], ...]:
     from music_rllib.experiment.config import ConfigError
     from music_rllib.experiment.handoff import HandoffError
     from music_rllib.experiment.sealed import StorageError
+    from music_rllib.sweep.demand import DemandError
     from music_rllib.sweep.local import ClusterError
     from music_rllib.sweep.preflight import HardwareError, TaskError
     from music_rllib.tracking.errors import TrackingError
@@ -151,6 +152,7 @@ def _bad_input() -> tuple[type[Exception], ...]:
         BadInputError,
         ClusterError,
         ConfigError,
+        DemandError,
         HandoffError,
         HardwareError,
         StorageError,

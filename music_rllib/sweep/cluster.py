@@ -34,6 +34,8 @@ class Room:
     """Runs that fit at once into the nodes that there are; 0 only where it grows."""
     grows: bool = False
     """Whether nodes may be added for what waits."""
+    memory: int = 0
+    """Bytes of the largest node."""
 
     @property
     def at_once(self) -> int:
@@ -110,15 +112,17 @@ def check_fits(resources: Resources) -> str | None:
 
 def _room(resources: Resources) -> Room:
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    kinds = ("memory", "object_store_memory")
+    memory = int(max(sum(node.get(kind, 0) for kind in kinds) for node in nodes))
     if cluster_address() is None:
-        return Room(now=slots(resources, nodes, local=True))
+        return Room(now=slots(resources, nodes, local=True), memory=memory)
     try:
         now = slots(resources, nodes, local=False)
     except ClusterError:
         if not _autoscaler.adds_nodes(resources.bundle):
             raise
-        return Room(now=0, grows=True)
-    return Room(now=now, grows=_autoscaler.is_there())
+        return Room(now=0, grows=True, memory=memory)
+    return Room(now=now, grows=_autoscaler.is_there(), memory=memory)
 
 
 def slots(resources: Resources, nodes: Sequence[Mapping[str, float]], *, local: bool) -> int:

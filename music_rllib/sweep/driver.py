@@ -22,6 +22,7 @@ from music_rllib.sweep.alpha_view import alpha_rows, alpha_table
 from music_rllib.sweep.beacon import Beacon
 from music_rllib.sweep.board import Status
 from music_rllib.sweep.changes import changes_since, check_begun, keep_settings
+from music_rllib.sweep.demand import check_demand
 from music_rllib.sweep.driving import driving
 from music_rllib.sweep.ending import try_for
 from music_rllib.sweep.frame import FAILED, BadInputError
@@ -32,7 +33,7 @@ from music_rllib.sweep.local import (
     check_reachable,
     cluster_address,
 )
-from music_rllib.sweep.places import resolve_storage, sweep_folder
+from music_rllib.sweep.places import check_storage, resolve_storage, sweep_folder
 from music_rllib.sweep.plan_answer import plan_answer
 from music_rllib.sweep.preflight import (
     check_environments,
@@ -256,6 +257,7 @@ def _open(console: Console, config: SweepConfig, *, retrain_damaged: bool = Fals
     check_cpus(config.resources)
     check_memory_and_gpus(config.resources)
     storage, remark = resolve_storage(config.storage)
+    check_storage(storage, config.name)
     opened = open_sweep(
         config,
         plan,
@@ -267,7 +269,7 @@ def _open(console: Console, config: SweepConfig, *, retrain_damaged: bool = Fals
     if rows := alpha_rows(plan):
         console.print(alpha_table(rows))
     console.print(Text(f"Storage: {redact(storage)}"), soft_wrap=True)
-    for line in filter(None, (remark, *remarks(config))):
+    for line in filter(None, (remark, *remarks(config), *check_demand(opened))):
         console.print(Text(line, style="yellow"), soft_wrap=True)
     return opened
 

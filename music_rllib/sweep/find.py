@@ -12,7 +12,7 @@ from music_rllib.experiment.model import SweepConfig
 from music_rllib.experiment.plan import make_plan
 from music_rllib.sweep import records
 from music_rllib.sweep.frame import BadInputError
-from music_rllib.sweep.places import resolve_storage, sweep_folder
+from music_rllib.sweep.places import check_answers, resolve_storage, sweep_folder
 from music_rllib.sweep.session import Sweep, open_sweep
 from music_rllib.tracking.redaction import redact
 
@@ -70,6 +70,7 @@ def find_sweep(place: str, storage: str | None) -> Found:
         BadInputError: There is none.
     """
     found = _found(place, storage)
+    check_answers(found.storage)
     if found.read(records.CONFIG) is None:
         others = ", ".join(_others(found.storage)) or "none"
         raise BadInputError(

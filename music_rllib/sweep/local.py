@@ -16,7 +16,9 @@ __all__ = [
     "check_cpus",
     "check_memory_and_gpus",
     "check_reachable",
+    "claimable",
     "cluster_address",
+    "memory",
 ]
 
 
@@ -50,11 +52,11 @@ def check_memory_and_gpus(resources: Resources) -> None:
     """
     if cluster_address() is not None:
         return
-    memory, gpus = resources.memory_per_run, resources.gpus_per_run
-    if memory is not None and memory > (here := _memory() / 2**30):
+    reserved, gpus = resources.memory_per_run, resources.gpus_per_run
+    if reserved is not None and reserved > (here := memory() / 2**30):
         raise ClusterError(
             f"resources.memory_per_run must be <= {math.floor(here * 10) / 10:g}, the GiB of "
-            f"memory of this machine, got {memory:g}"
+            f"memory of this machine, got {reserved:g}"
         )
     if gpus and gpus > (count := _gpus()):
         raise ClusterError(
@@ -63,7 +65,7 @@ def check_memory_and_gpus(resources: Resources) -> None:
         )
 
 
-def _memory() -> int:
+def memory() -> int:
     """Bytes of this machine's memory, or of this container's."""
     found = [int(psutil.virtual_memory().total)]
     for place in MEMORY_LIMITS:
@@ -74,6 +76,11 @@ def _memory() -> int:
         if text.isdecimal():  # or "max"
             found.append(int(text))
     return min(found)
+
+
+def claimable() -> int:
+    """Bytes that Linux grants a process at once by default, used or not: all memory and swap."""
+    return int(psutil.virtual_memory().total + psutil.swap_memory().total)
 
 
 def _gpus() -> int:
