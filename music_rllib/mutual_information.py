@@ -14,34 +14,50 @@ from torch import Tensor
 __all__ = ["donsker_varadhan", "shuffle_time", "time_permutations"]
 
 
-def donsker_varadhan(joint: Tensor, marginals: Tensor) -> Tensor:
+def donsker_varadhan(joint: Tensor, marginals: Tensor, inside: Tensor | None = None) -> Tensor:
     """mean_t T(x, y) - log mean_t exp T(x, y'), a lower bound on I(X; Y) in nats.
 
     Args:
         joint: [N, T] statistics of pairs that occurred together.
         marginals: [N, T] statistics of pairs from the product of marginals.
+        inside: [N, T] False for padding behind a trajectory that ends early; None: all are whole.
 
     Returns:
         [N] bounds; unchanged when a constant is added to the statistic. The mean over few
         frames of exp T makes a single bound noisy and, in expectation, slightly too high.
     """
-    log_mean_exp = torch.logsumexp(marginals, dim=-1) - math.log(marginals.shape[-1])
-    return joint.mean(dim=-1) - log_mean_exp
+    if inside is None:
+        log_mean_exp = torch.logsumexp(marginals, dim=-1) - math.log(marginals.shape[-1])
+        return joint.mean(dim=-1) - log_mean_exp
+    frames, padding = inside.sum(dim=-1), ~inside
+    log_sum_exp = torch.logsumexp(marginals.masked_fill(padding, -math.inf), dim=-1)
+    mean = joint.masked_fill(padding, 0.0).sum(dim=-1) / frames
+    return mean - (log_sum_exp - frames.to(mean).log())
 
 
 def time_permutations(
-    trajectories: int, frames: int, generator: torch.Generator, *, shared: bool = False
+    trajectories: int,
+    frames: int,
+    generator: torch.Generator,
+    *,
+    sharing: int = 1,
+    inside: Tensor | None = None,
 ) -> Tensor:
     """Random permutations of time, [N, T] integers.
 
     Args:
         generator: source of randomness; its device is the result's.
-        shared: one permutation for all trajectories, as in the original, which draws it once
+        sharing: neighbours that have one permutation, as in the original, which draws it once
             per minibatch (on two frames it is the identity half the time).
+        inside: [N, T] False for padding, which then stays behind: each trajectory's own frames
+            change places among themselves. None: all are whole.
     """
-    rows = 1 if shared else trajectories
+    rows = trajectories // sharing
     keys = torch.rand(rows, frames, generator=generator, device=generator.device)
-    return keys.argsort(dim=-1).expand(trajectories, frames)
+    if inside is None:
+        return keys.argsort(dim=-1).repeat_interleave(sharing, dim=0)
+    keys = keys.repeat_interleave(sharing, dim=0)
+    return keys.masked_fill(~inside, 1.0).argsort(dim=-1)
 
 
 def shuffle_time(values: Tensor, permutations: Tensor) -> Tensor:

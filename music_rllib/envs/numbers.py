@@ -13,8 +13,6 @@ __all__ = ["LARGEST", "BadNumberError", "are_usable", "bad_number"]
 LARGEST = 1e15
 """Beyond it, squared errors of returns a hundred times as large, summed over a minibatch, leave
 float32's range."""
-_SCALE = np.float32(1e-24)
-"""Squares of what is scaled by it stay within float32's range."""
 _RULE = f"every number must be finite and within +-{LARGEST:g}"
 
 
@@ -23,13 +21,15 @@ class BadNumberError(RuntimeError):
 
 
 def are_usable(values: NDArray[np.float32]) -> bool:
-    """Whether the numbers, [N], are surely finite and within `LARGEST`, in a microsecond or two.
+    """Whether the numbers, [N], are surely finite and within `LARGEST`, in half a microsecond.
 
     Where they are not, `bad_number` finds out: the vector's length is what is looked at.
     """
-    scaled = values * _SCALE
-    # NaN is not less than anything.
-    return bool(scaled.dot(scaled) < (LARGEST * _SCALE) ** 2)
+    try:
+        # NaN is not less than anything.
+        return bool(values.dot(values) < LARGEST**2)
+    except RuntimeWarning:  # of an overflow, where warnings are errors
+        return False
 
 
 def bad_number(named: Iterable[tuple[str, Any]], where: str) -> BadNumberError | None:

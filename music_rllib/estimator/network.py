@@ -1,7 +1,7 @@
 """MUSIC's statistics network and what is computed from it (paper III-A, Fig. 1-2).
 
 Shape legend: N trajectories, T frames, B transitions, X / Y features of the agent's and the
-surrounding state. States are raw observations: the original does not normalise them either.
+surrounding state. States are raw observations, as in the original, unless they lie far from 0.
 """
 
 from __future__ import annotations
@@ -18,44 +18,84 @@ from music_rllib.mutual_information import donsker_varadhan, shuffle_time
 __all__ = ["MutualInformationEstimator", "intrinsic_reward"]
 
 
+FAR = 10.0
+"""Mean or standard deviation of an input beyond which a fresh network's tanh is at its end: there
+every statistic is 1 or every one -1, and the bound is 0 for ever. Fetch's are below 2."""
+
+
 class MutualInformationEstimator(nn.Module):
     """T(x, y) = tanh(w . relu(Wx x + Wy y + b) + c).
 
-    tanh keeps T in [-1, 1] and thereby the bound below 2 nats.
+    tanh keeps T in [-1, 1] and thereby the bound below 2 nats. Inputs that lie far from 0 are
+    shifted and scaled first (`adapt_to`), which leaves the information between them as it is.
     """
+
+    offset: Tensor
+    """[X + Y] taken from the inputs; 0 for what is used raw."""
+    scale: Tensor
+    """[X + Y] multiplies what is left; 1 for what is used raw."""
 
     def __init__(self, agent_size: int, surrounding_size: int, hidden_size: int = 128) -> None:
         super().__init__()
         self.agent = nn.Linear(agent_size, hidden_size)
         self.surrounding = nn.Linear(surrounding_size, hidden_size, bias=False)
         self.output = nn.Linear(hidden_size, 1)
+        self.register_buffer("offset", torch.zeros(agent_size + surrounding_size))
+        self.register_buffer("scale", torch.ones(agent_size + surrounding_size))
+        self._raw = True
+        hook = MutualInformationEstimator._see_whether_raw
+        self.register_load_state_dict_post_hook(hook)  # type: ignore[no-untyped-call]
+
+    def _see_whether_raw(self, *_: object) -> None:
+        """Looked up in every update, where a device would have to be waited for."""
+        self._raw = not bool(self.offset.any() or (self.scale != 1.0).any())
+
+    @torch.no_grad()
+    def adapt_to(self, agent: Tensor, surrounding: Tensor) -> None:
+        """Before the first training: [..., X], [..., Y] states like those it is to learn from."""
+        inputs = torch.cat([agent, surrounding], -1).flatten(0, -2).double()
+        mean, std = inputs.mean(0), inputs.std(0, correction=0)
+        self.offset.copy_(torch.where(mean.abs() > FAR, mean, 0.0))
+        self.scale.copy_(torch.where(std > FAR, 1.0 / std, 1.0))
+        self._see_whether_raw()
 
     def forward(self, agent: Tensor, surrounding: Tensor) -> Tensor:
         """[..., X], [..., Y] -> [...] statistics."""
         pairs = torch.cat([agent, surrounding], -1)
+        if not self._raw:
+            pairs = (pairs - self.offset) * self.scale
         weight = torch.cat([self.agent.weight, self.surrounding.weight], 1)
         statistics: Tensor = _Statistic.apply(  # type: ignore[no-untyped-call]
             pairs.flatten(0, -2), weight, self.agent.bias, self.output.weight, self.output.bias
         )
         return statistics.view(pairs.shape[:-1])
 
-    def bound(self, agent: Tensor, surrounding: Tensor, permutations: Tensor) -> Tensor:
+    def bound(
+        self,
+        agent: Tensor,
+        surrounding: Tensor,
+        permutations: Tensor,
+        inside: Tensor | None = None,
+    ) -> Tensor:
         """Bound on I(surrounding; agent) of each trajectory, in nats.
 
         Args:
             agent: [N, T, X]; surrounding: [N, T, Y]
             permutations: [N, T] of time, for the product of the marginals.
+            inside: [N, T] False for padding behind shorter trajectories; None: there is none.
 
         Returns:
             [N]
         """
-        return self._bound(agent, surrounding, shuffle_time(surrounding, permutations))
+        return self._bound(agent, surrounding, shuffle_time(surrounding, permutations), inside)
 
-    def _bound(self, agent: Tensor, surrounding: Tensor, shuffled: Tensor) -> Tensor:
+    def _bound(
+        self, agent: Tensor, surrounding: Tensor, shuffled: Tensor, inside: Tensor | None = None
+    ) -> Tensor:
         """[N, T, X], [N, T, Y] twice -> [N]."""
         both = torch.stack([surrounding, shuffled])
         joint, marginals = self(agent.expand(2, *agent.shape), both)
-        return donsker_varadhan(joint, marginals)
+        return donsker_varadhan(joint, marginals, inside)
 
     def transition_bound(
         self, agent: Tensor, surrounding: Tensor, *, swapped: bool = True

@@ -21,6 +21,7 @@ from music_rllib.replay.segments import Segment, load_segments, new_segments
 from music_rllib.tac.algorithm import TAC
 from music_rllib.tac.config import TACConfig
 from music_rllib.tac.env_runner import DISPLACEMENT, MOVED, SUCCESS_ANY, SUCCESS_LAST
+from music_rllib.tac.learner import HELD_OUT_STEPS
 from music_rllib.tac.normaliser import for_another_run
 from music_rllib.tracking import names
 
@@ -147,7 +148,7 @@ class TrainingRun:
                 raise Paused
             for name, value in _training_metrics(self.algorithm.train()):
                 self._rounds[name].append(value)
-        metrics = {name: float(np.mean(values)) for name, values in self._rounds.items()}
+        metrics = _means(self._rounds)
         self._rounds.clear()
         if self.env_steps >= evaluation_at or self.finished:
             metrics |= self.evaluate()
@@ -229,6 +230,15 @@ class TrainingRun:
         self.algorithm.stop()
 
 
+def _means(rounds: Mapping[str, list[float]]) -> dict[str, float]:
+    """Of what was measured in some rounds; the bound on fresh trajectories by their steps."""
+    metrics = {name: float(np.mean(values)) for name, values in rounds.items()}
+    if (steps := metrics.pop(HELD_OUT_STEPS, None)) is not None:
+        weights = np.array(rounds[HELD_OUT_STEPS]) / steps
+        metrics[names.HELD_OUT_BOUND] = float(np.mean(weights * rounds[names.HELD_OUT_BOUND]))
+    return metrics
+
+
 def _next_multiple(steps: int, interval: int) -> int:
     return (steps // interval + 1) * interval
 
@@ -241,5 +251,5 @@ def _training_metrics(result: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
             yield name, float(episodes[key])
     learner = result.get(LEARNER_RESULTS, {}).get(DEFAULT_MODULE_ID, {})
     for key, value in learner.items():
-        if key in names.LEARNER or key.startswith(names.PER_DIMENSION):
+        if key in names.LEARNER or key == HELD_OUT_STEPS or key.startswith(names.PER_DIMENSION):
             yield key, float(value)

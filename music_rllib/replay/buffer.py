@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from music_rllib.replay.places import Places
 from music_rllib.replay.priorities import TDPriorities, WeightedDraws, ranges, rank_weights
+from music_rllib.replay.whole import WholeTrajectories, long_enough
 
 __all__ = ["ReplayLayout", "Trajectory", "TrajectoryReplay", "Transitions"]
 
@@ -141,6 +142,7 @@ class TrajectoryReplay:
         self._moved_distance = moved_distance
         self._moved = np.zeros(0, np.bool_)
         self._places: tuple[Places, Places] | None = None
+        self._whole: Places | None = None
         ring = capacity // layout.horizon * (layout.horizon + 1)
         # Untouched pages of zeros cost nothing: the system hands them out as they are written.
         self._steps = np.zeros((ring, layout.frame + layout.action + 2), np.float32)
@@ -164,11 +166,6 @@ class TrajectoryReplay:
     def trajectories(self) -> int:
         """Trajectories held."""
         return len(self._lengths)
-
-    @property
-    def longest(self) -> int:
-        """Steps of the longest trajectory held; 0 if there is none."""
-        return self._all_and_moved()[0].longest
 
     @property
     def nbytes(self) -> int:
@@ -216,7 +213,7 @@ class TrajectoryReplay:
         self._write = end + 1
         self._used = max(self._used, self._write)
         self.trajectories_added += 1
-        self._places = None
+        self._places = self._whole = None
 
     def _make_room(self, frames: int) -> int:
         """Start of `frames` free consecutive frames; the oldest trajectories there are dropped."""
@@ -255,7 +252,7 @@ class TrajectoryReplay:
             places = zip(self._starts.tolist(), self._lengths.tolist(), strict=True)
             moved = [self._has_moved(start, steps) for start, steps in places]
             self._moved = np.array(moved, np.bool_)
-        self._places = None
+        self._places = self._whole = None
 
     def _all_and_moved(self) -> tuple[Places, Places]:
         """Kept between minibatches: to find them anew takes time that grows with the replay."""
@@ -326,9 +323,7 @@ class TrajectoryReplay:
 
     def _draw(self, count: int) -> tuple[Rows, Rows, Rows]:
         """First frame, step and length of their trajectory, of `count` transitions; [B] each."""
-        total = len(self)
-        if total == 0:
-            raise ValueError("cannot sample from an empty replay: collect an episode first")
+        self._check_filled()
         if self._td is not None:
             return self._td.draw(self.rng.random(count))
         if self._by_rank is not None:
@@ -337,29 +332,43 @@ class TrajectoryReplay:
             return self._starts[which], (self.rng.random(count) * length).astype(np.int64), length
         return self._all_and_moved()[0].draw(self.rng, count)
 
+    def _check_filled(self) -> None:
+        if not self.trajectories:
+            raise ValueError("cannot sample from an empty replay: collect an episode first")
+
     def _later_step(self, step: NDArray[np.int64], length: NDArray[np.int64]) -> NDArray[np.int64]:
         """Uniform over the states that follow: step + 1 to the episode's last one."""
         return step + 1 + (self.rng.random(len(step)) * (length - step)).astype(np.int64)
 
     # -- the view of MUSIC: trajectories --------------------------------------------------
 
-    def sample_trajectories(self, count: int, steps: int) -> Floats:
-        """Observations of `count` trajectories of `steps` steps, [N, steps + 1, D].
+    def sample_trajectories(self, count: int) -> WholeTrajectories:
+        """Observations of `count` whole trajectories, drawn with replacement.
 
-        Uniform over the trajectories of at least that length, with replacement; of a longer one,
-        a random stretch.
+        Each in proportion to its steps, so that every state counts the same, as for the policy.
+        Those of a single step only where there are no others. T is the longest one held.
 
         Raises:
-            ValueError: no trajectory is that long.
+            ValueError: the replay is empty.
         """
-        long_enough = np.flatnonzero(self._lengths >= steps)
-        if len(long_enough) == 0:
-            raise ValueError(f"no trajectory of {steps} steps is in the replay")
-        which = long_enough[self.rng.integers(0, len(long_enough), count)]
-        slack = self._lengths[which] - steps + 1
-        offset = (self.rng.random(count) * slack).astype(np.int64)
-        rows = (self._starts[which] + offset)[:, None] + np.arange(steps + 1)
-        return self._read(rows, 0, self.layout.observation)
+        places = self._long_enough()
+        start, _, length = places.draw(self.rng, count)
+        time = np.arange(places.longest + 1)
+        if places.equal:
+            return WholeTrajectories(
+                self._read(start[:, None] + time, 0, self.layout.observation), None
+            )
+        rows = start[:, None] + np.minimum(time, length[:, None])
+        observations = self._read(rows, 0, self.layout.observation)
+        return WholeTrajectories(observations, time <= length[:, None])
+
+    def _long_enough(self) -> Places:
+        """Kept between minibatches, as `_all_and_moved`."""
+        if self._whole is None:
+            self._check_filled()
+            chosen = long_enough(self._lengths)
+            self._whole = Places.of(self._starts[chosen], self._lengths[chosen])
+        return self._whole
 
     # -- checkpoints ----------------------------------------------------------------------
 

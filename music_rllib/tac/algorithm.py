@@ -267,10 +267,11 @@ class TAC(Algorithm):
             columns["weights"] = drawn.weights
         batches = {DEFAULT_MODULE_ID: SampleBatch(columns)}
         if self._music.estimator == "trained":
-            trajectories = self.replay.sample_trajectories(
-                updates * self._music.batch_trajectories, self.replay.longest
-            )
-            batches[ESTIMATOR_MODULE] = SampleBatch({Columns.OBS: trajectories})
+            whole = self.replay.sample_trajectories(updates * self._music.batch_trajectories)
+            of_estimator: dict[str, NDArray[Any]] = {Columns.OBS: whole.observations}
+            if whole.inside is not None:
+                of_estimator["inside"] = whole.inside
+            batches[ESTIMATOR_MODULE] = SampleBatch(of_estimator)
         return MultiAgentBatch(batches, env_steps=len(drawn.rewards))
 
     # -- plain weights --------------------------------------------------------------------
@@ -299,6 +300,11 @@ class TAC(Algorithm):
         own = self.get_parts()
         if "normaliser" in parts:
             parts = {**parts, "normaliser": in_this_form(parts["normaliser"])}
+        if ESTIMATOR_MODULE in parts and ESTIMATOR_MODULE in own:
+            # Those of before version 3 use all inputs raw.
+            raw = {"offset": np.zeros_like, "scale": np.ones_like}
+            defaults = {name: like(own[ESTIMATOR_MODULE][name]) for name, like in raw.items()}
+            parts = {**parts, ESTIMATOR_MODULE: {**defaults, **parts[ESTIMATOR_MODULE]}}
         for part, arrays in parts.items():
             _check_same_tensors(part, own.get(part), arrays)
         modules: dict[str, dict[str, NDArray[Any]]] = {}

@@ -37,6 +37,7 @@ from music_rllib.schedules import value_at
 from music_rllib.tac import diagnostics, losses
 from music_rllib.tac.forward import Bootstrap, TACForward
 from music_rllib.tac.graphs import CapturedUpdate, CudaRecorder
+from music_rllib.tac.held_out import HeldOutBound
 from music_rllib.tac.kernels.update import DirectUpdate
 from music_rllib.tac.module import ESTIMATOR_MODULE, EstimatorModule, TACModule, choose_action
 from music_rllib.tac.normaliser import RunningNormaliser
@@ -46,12 +47,14 @@ from music_rllib.tac.settings import LearnedAlpha, TACSettings, alpha_at
 from music_rllib.tracking import names
 from music_rllib.tsallis import ln_q_of_policy
 
-__all__ = ["GRAD_UPDATES", "NonFiniteLossError", "TACLearner"]
+__all__ = ["GRAD_UPDATES", "HELD_OUT_STEPS", "NonFiniteLossError", "TACLearner"]
 
 GRAD_UPDATES = "grad_updates"
 PRIORITY_CLIP = 2e-4
 """MUSIC-p: largest bound (nats) of one step that counts for its trajectory's priority."""
 LOSSES = "losses"
+HELD_OUT_STEPS = "held_out_steps"
+"""Metric: steps behind the bound on fresh trajectories, which it is averaged by."""
 Minibatch = dict[ModuleID, dict[str, Tensor]]
 FlatMinibatch = Mapping[tuple[ModuleID, str], Tensor]
 
@@ -65,6 +68,8 @@ class _Constants(NamedTuple):
     """None: learned, and a tensor."""
     swapped: bool
     """Whether the two frames of a transition are swapped for the intrinsic reward."""
+    trajectories: tuple[int, bool] | None
+    """Frames of the estimator's trajectories, and whether some are shorter."""
 
 
 class _Loss(NamedTuple):
@@ -102,6 +107,7 @@ class TACLearner(TorchLearner):
         seed = self.config.seed if self.config.seed is not None else torch.seed()
         self._generator = torch.Generator(device=self._device).manual_seed(seed + 7919)
         self._grad_updates = 0
+        self._held_out = HeldOutBound()
         self._losses: dict[str, Tensor] = {}
         self._observed: dict[str, Tensor] = {}
         self._names_of_losses: list[str] = []
@@ -272,18 +278,24 @@ class TACLearner(TorchLearner):
         if ESTIMATOR_MODULE in columns:
             rows[ESTIMATOR_MODULE] = self._music.batch_trajectories
             trajectories = columns[ESTIMATOR_MODULE]
-            trajectories["permutations"] = self._permutations(trajectories[Columns.OBS], updates)
+            if self._grad_updates == 0 and (estimator := self._estimator) is not None:
+                estimator.adapt_to(trajectories[Columns.OBS])
+            trajectories["permutations"] = self._permutations(trajectories, updates)
         for k in range(updates):
             minibatch = {
                 (mid, name): values[k * n : (k + 1) * n]
                 for mid, n in rows.items()
                 for name, values in columns[mid].items()
             }
-            yield minibatch, self._constants(swapped=swapped[k])
+            yield minibatch, self._constants(minibatch, swapped=swapped[k])
 
-    def _constants(self, *, swapped: bool) -> _Constants:
+    def _constants(self, minibatch: FlatMinibatch, *, swapped: bool) -> _Constants:
         alpha = self._alpha if not isinstance(self._settings.alpha, LearnedAlpha) else None
-        return _Constants(self._entropic_index, self._mi_reward_weight, alpha, swapped)
+        shape = None
+        if (ESTIMATOR_MODULE, Columns.OBS) in minibatch:
+            frames = minibatch[ESTIMATOR_MODULE, Columns.OBS].shape[1]
+            shape = (frames, (ESTIMATOR_MODULE, "inside") in minibatch)
+        return _Constants(self._entropic_index, self._mi_reward_weight, alpha, swapped, shape)
 
     def _policy_noise(self, actions: Tensor) -> dict[str, Tensor]:
         """Standard normal numbers for the policy's actions, and the next ones where needed."""
@@ -300,12 +312,11 @@ class TACLearner(TorchLearner):
         drawn = torch.rand(updates, generator=self._generator, device=self._device) < 0.5
         return drawn.tolist()
 
-    def _permutations(self, trajectories: Tensor, updates: int) -> Tensor:
-        rows, frames = trajectories.shape[:2]
-        if self._music.shuffle == "independent":
-            return time_permutations(rows, frames, self._generator)
-        per_minibatch = time_permutations(updates, frames, self._generator)
-        return per_minibatch.repeat_interleave(rows // updates, dim=0)
+    def _permutations(self, trajectories: Mapping[str, Tensor], updates: int) -> Tensor:
+        rows, frames = trajectories[Columns.OBS].shape[:2]
+        sharing = 1 if self._music.shuffle == "independent" else rows // updates
+        inside = trajectories.get("inside")
+        return time_permutations(rows, frames, self._generator, sharing=sharing, inside=inside)
 
     def _priced(self, minibatch: Minibatch, *, swapped: bool) -> Minibatch:
         """The minibatch with the reward that is learned from: task and intrinsic, weighted."""
@@ -446,6 +457,9 @@ class TACLearner(TorchLearner):
         log = self.metrics.log_value
         for key, mean in zip(keys, table.mean(0).tolist(), strict=True):
             log((DEFAULT_MODULE_ID, key), mean, window=1)
+        if (held_out := self._held_out.take()) is not None:
+            for key, value in zip((names.HELD_OUT_BOUND, HELD_OUT_STEPS), held_out, strict=True):
+                log((DEFAULT_MODULE_ID, key), value, window=1)
         log((DEFAULT_MODULE_ID, names.ENTROPIC_INDEX), self._entropic_index, window=1)
         log((DEFAULT_MODULE_ID, names.MI_REWARD_WEIGHT), self._mi_reward_weight, window=1)
         log((DEFAULT_MODULE_ID, names.ALPHA), float(self._current_alpha()), window=1)
@@ -504,7 +518,7 @@ class TACLearner(TorchLearner):
         last = np.cumsum(lengths) - 1
         if (estimator := self._estimator) is not None:
             rewards = self._total_reward(rewards, estimator.reward(states, followers))
-            self._log_held_out_bound(episodes, estimator)
+            self._held_out.add(episodes, estimator.bound, self._generator)
         noise = self._policy_noise(actions)
         mean, log_std = module.policy_parameters(module.normaliser(states))
         entropy = -self._ln_q(choose_action(mean, log_std, noise.get("noise"))[1]).expand(
@@ -524,17 +538,6 @@ class TACLearner(TorchLearner):
         predicted = module.critics(asked).amin(0).cpu().numpy()
         bias = float((predicted - realised).mean())
         self.metrics.log_value((DEFAULT_MODULE_ID, names.Q_BIAS), bias, window=1)
-
-    def _log_held_out_bound(
-        self, episodes: Sequence[Trajectory], estimator: EstimatorModule
-    ) -> None:
-        longest = max(len(episode) for episode in episodes)
-        whole = [e.frames[:, : self._input_size] for e in episodes if len(e) == longest]
-        trajectories = torch.as_tensor(np.stack(whole), device=self._device)
-        count, frames = trajectories.shape[:2]
-        permutations = time_permutations(count, frames, self._generator)
-        bound = float(estimator.bound(trajectories, permutations).mean())
-        self.metrics.log_value((DEFAULT_MODULE_ID, names.HELD_OUT_BOUND), bound, window=1)
 
     @torch.no_grad()
     def trajectory_priorities(self, episodes: Sequence[Trajectory]) -> NDArray[np.float64]:
@@ -568,6 +571,7 @@ class TACLearner(TorchLearner):
         state["tac"] = {
             "generator": self._generator.get_state().numpy(),
             GRAD_UPDATES: self._grad_updates,
+            "held_out": self._held_out.state(),
         }
         return state
 
@@ -583,3 +587,4 @@ class TACLearner(TorchLearner):
         if "tac" in state:
             self._generator.set_state(torch.from_numpy(state["tac"]["generator"].copy()))
             self._grad_updates = int(state["tac"][GRAD_UPDATES])
+            self._held_out.load_state(state["tac"]["held_out"])

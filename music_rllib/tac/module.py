@@ -210,9 +210,15 @@ class EstimatorModule(TorchRLModule, SelfSupervisedLossAPI):
             observations.index_select(-1, self.surrounding),
         )
 
-    def bound(self, observations: Tensor, permutations: Tensor) -> Tensor:
-        """[N, T, D] trajectories and [N, T] permutations -> [N] bounds in nats."""
-        return self.estimator.bound(*self.split(observations), permutations)
+    def adapt_to(self, observations: Tensor) -> None:
+        """Before its first training: [..., D] observations such as those it is to learn from."""
+        self.estimator.adapt_to(*self.split(observations))
+
+    def bound(
+        self, observations: Tensor, permutations: Tensor, inside: Tensor | None = None
+    ) -> Tensor:
+        """[N, T, D] trajectories, [N, T] permutations and padding -> [N] bounds in nats."""
+        return self.estimator.bound(*self.split(observations), permutations, inside)
 
     def transition_bounds(self, observations: Tensor, *, swapped: bool = True) -> Tensor:
         """[T, D] states of one trajectory -> [T-1] bounds of its transitions, in nats."""
@@ -227,7 +233,7 @@ class EstimatorModule(TorchRLModule, SelfSupervisedLossAPI):
         return intrinsic_reward(bound, self.reward_scale)
 
     def _forward_train(self, batch: dict[str, Any], **kwargs: Any) -> dict[str, Any]:
-        return {"bound": self.bound(batch[Columns.OBS], batch["permutations"])}
+        return {"bound": self.bound(batch[Columns.OBS], batch["permutations"], batch.get("inside"))}
 
     def compute_self_supervised_loss(
         self, *, learner: Any, module_id: str, config: Any, batch: Any, fwd_out: dict[str, Tensor]

@@ -19,10 +19,11 @@ from music_rllib.experiment.plan import node_key
 from music_rllib.experiment.result import from_json_lines
 from music_rllib.experiment.settings import RunSettings, Variant, handed_over, preset
 from music_rllib.experiment.store import NodeStore
-from music_rllib.experiment.training import TrainingRun
+from music_rllib.experiment.training import TrainingRun, _means
 from music_rllib.policy import find_policy, load_policy
 from music_rllib.sweep.node_job import NodeJob
 from music_rllib.sweep.trainable import CAUSE, NOTES, REPORTS, RunTrainable
+from music_rllib.tac.learner import HELD_OUT_STEPS
 from music_rllib.tracking import names
 
 pytestmark = pytest.mark.integration
@@ -184,6 +185,12 @@ def test_a_cut_run_ends_with_the_numbers_of_an_unbroken_one(
     assert told == [200, 400, 600, 800], "the driver may not have heard of the first ones"
     assert numbers(tmp_path / "b", cut) == numbers(tmp_path / "a", unbroken)
     assert NodeStore(str(tmp_path / "b")).work_folder(cut.key).names() == []
+
+
+def test_the_bound_on_fresh_episodes_is_averaged_by_their_steps_over_a_report() -> None:
+    rounds = {"a": [1.0, 3.0], names.HELD_OUT_BOUND: [0.1, 0.4], HELD_OUT_STEPS: [30.0, 10.0]}
+    assert _means(rounds) == pytest.approx({"a": 2.0, names.HELD_OUT_BOUND: 0.175})
+    assert _means({"a": [1.0]}) == {"a": 1.0}
 
 
 @pytest.mark.usefixtures("local_ray")

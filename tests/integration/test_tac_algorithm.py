@@ -1,5 +1,6 @@
 """TAC as an RLlib algorithm: same seed, same numbers; exact resume; no dead settings."""
 
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from music_rllib import TACConfig
 from music_rllib.envs.make import make_env
 from music_rllib.envs.numbers import BadNumberError
 from music_rllib.estimator.settings import MusicSettings
+from music_rllib.replay.buffer import Trajectory
 from music_rllib.replay.settings import ReplaySettings
 from music_rllib.tac.algorithm import TAC
 from music_rllib.tac.precision import PrecisionError, has_bf16
@@ -268,6 +270,53 @@ def test_remote_runners_and_learner_learn_and_resume_like_local_ones(
     assert algo.evaluate()["env_runners"]["episode_return_mean"] <= 0
     for one in (algo, resumed):
         one.stop()
+
+
+def register_uneven() -> None:
+    """`Uneven`: FetchReach with episodes of 1 to 50 steps, as their seeds say."""
+
+    def uneven(context: Any) -> gym.Env[Any, Any]:
+        class Uneven(gym.Wrapper[Any, Any, Any, Any]):
+            left = 0
+
+            def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+                self.left = int(np.random.default_rng(seed).integers(1, 51))
+                return self.env.reset(seed=seed, options=options)
+
+            def step(self, action: Any) -> Any:
+                observation, reward, _, truncated, info = self.env.step(action)
+                self.left -= 1
+                return observation, reward, self.left == 0, truncated, info
+
+        return Uneven(make_env("FetchReach-v4"))
+
+    tune.register_env("Uneven", uneven)
+
+
+def test_the_bound_on_fresh_episodes_is_taken_over_all_of_them(tmp_path: Path) -> None:
+    register_uneven()
+    algo, resumed = (build("Uneven", music=MUSIC_U) for _ in range(2))
+    while algo.env_steps < 200:
+        last = algo.train()
+    steps = [int(n) for n in algo.replay.packed(0)["lengths"]]
+    found = last["learners"]["default_policy"]
+    assert found["held_out_steps"] == sum(n for n in steps[-2:] if n > 1)
+    assert len(set(steps)) > 3
+    assert abs(found["mutual_information/held_out_bound"]) < 0.5
+    # What has been measured and not yet reported is part of the state.
+    learner = algo.learner_group._learner
+    assert learner._held_out.take() is None
+    held = algo.replay.packed(0)
+    ends = np.cumsum([0, *steps])
+    for i, (begin, end) in enumerate(itertools.pairwise(ends)):
+        columns = (held["actions"][begin:end], held["rewards"][begin:end], held["terminated"][i])
+        learner.diagnose([Trajectory(held["frames"][begin + i : end + i + 1], *columns)])
+    algo.save_to_path(tmp_path / "checkpoint")
+    resumed.restore_from_path(tmp_path / "checkpoint")
+    taken = learner._held_out.take()
+    assert taken[1] == sum(n for n in steps if n > 1)
+    assert resumed.learner_group._learner._held_out.take() == taken
+    assert fingerprint(resumed, 1) == fingerprint(algo, 1)
 
 
 @pytest.mark.parametrize("runners", [0, 1])

@@ -93,13 +93,99 @@ def test_reward_is_the_clipped_scaled_bound() -> None:
     torch.testing.assert_close(intrinsic_reward(bound, 5000.0), expected)
 
 
+def correlated(rows: int) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    x, noise = torch.randn(2, 8, rows, 2, generator=generator)
+    return x, 0.9 * x + (1 - 0.9**2) ** 0.5 * noise
+
+
+@pytest.mark.parametrize(("offset", "spread"), [(1e6, 0.5), (-3e3, 1.0), (0.0, 1e4), (5e5, 3e4)])
+def test_inputs_far_from_0_are_learned_from_like_others(offset: float, spread: float) -> None:
+    def bound(x: Tensor, y: Tensor, *, adapts: bool) -> float:
+        torch.manual_seed(0)
+        estimator = MutualInformationEstimator(2, 2, hidden_size=32)
+        if adapts:
+            estimator.adapt_to(x, y)
+        adam = torch.optim.Adam(estimator.parameters(), 1e-2)
+        generator = torch.Generator().manual_seed(1)
+        for _ in range(100):
+            value = estimator.bound(x, y, time_permutations(8, 200, generator)).mean()
+            adam.zero_grad()
+            (-value).backward()
+            adam.step()
+        return float(value.detach())
+
+    x, y = correlated(200)
+    usual = bound(x, y, adapts=True)
+    assert usual > 0.5
+    far = (offset + spread * x, y - offset)
+    assert bound(*far, adapts=True) == pytest.approx(usual, rel=0.15)
+    if offset:
+        assert bound(*far, adapts=False) == 0.0, "what this is for"
+
+
+def test_inputs_near_0_are_used_raw_and_the_state_says_what_is_not() -> None:
+    x, y = correlated(20)
+    estimator, copy = MutualInformationEstimator(2, 2), MutualInformationEstimator(2, 2)
+    before = estimator(x + 1.3, y)
+    estimator.adapt_to(x + 1.3, y)
+    assert torch.equal(estimator(x + 1.3, y), before)
+    estimator.adapt_to(x + 1e6, y)
+    copy.load_state_dict(estimator.state_dict())
+    assert torch.equal(copy(x + 1e6, y), estimator(x + 1e6, y))
+    assert not torch.equal(copy(x + 1e6, y), before)
+
+
 def test_every_trajectory_has_its_own_permutation_unless_shared() -> None:
     generator = torch.Generator().manual_seed(0)
     own = time_permutations(6, 20, generator)
     assert (own.sort(-1).values == torch.arange(20)).all()
     assert not (own == own[0]).all()
-    shared = time_permutations(6, 20, generator, shared=True)
+    shared = time_permutations(6, 20, generator, sharing=6)
     assert (shared == shared[0]).all()
+
+
+COUNTS = torch.tensor([11, 2, 7, 3])
+INSIDE = torch.arange(11) < COUNTS.unsqueeze(1)
+
+
+@pytest.mark.parametrize("sharing", [1, 4])
+def test_of_unequal_trajectories_each_is_shuffled_by_itself(sharing: int) -> None:
+    generator = torch.Generator().manual_seed(0)
+    times = [
+        time_permutations(4, 11, generator, sharing=sharing, inside=INSIDE) for _ in range(500)
+    ]
+    for drawn in times:
+        assert (drawn.sort(-1).values == torch.arange(11)).all()
+        for row, count in zip(drawn, COUNTS.tolist(), strict=True):
+            assert (row[:count] < count).all()
+    # Every frame of its own is as likely as any other: 71 of 500 expected, deviation 8.
+    first = torch.stack(times)[:, 2, 0].bincount(minlength=7)
+    assert ((first - 500 / 7).abs() < 5 * 8).all()
+
+
+def test_bound_of_unequal_trajectories_is_that_of_each_by_itself() -> None:
+    generator = torch.Generator().manual_seed(2)
+    estimator = MutualInformationEstimator(3, 2, hidden_size=20).double()
+    x, y = (torch.randn(4, 11, n, generator=generator).double() for n in (3, 2))
+    permutations = time_permutations(4, 11, generator, inside=INSIDE)
+    together = estimator.bound(x, y, permutations, INSIDE)
+    alone = torch.stack(
+        [
+            estimator.bound(x[i : i + 1, :n], y[i : i + 1, :n], permutations[i : i + 1, :n])[0]
+            for i, n in enumerate(COUNTS.tolist())
+        ]
+    )
+    torch.testing.assert_close(together, alone)
+    parameters = list(estimator.parameters())
+    ours = torch.autograd.grad(together.sum(), parameters)
+    for one, other in zip(ours, torch.autograd.grad(alone.sum(), parameters), strict=True):
+        torch.testing.assert_close(one, other)
+    everything = torch.ones(4, 11, dtype=torch.bool)
+    whole = time_permutations(4, 11, generator)
+    torch.testing.assert_close(
+        estimator.bound(x, y, whole, everything), estimator.bound(x, y, whole)
+    )
 
 
 def test_shuffle_moves_whole_frames() -> None:

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from music_rllib.replay.buffer import ReplayLayout, Trajectory, TrajectoryReplay
 from music_rllib.replay.priorities import SumTree, WeightedDraws, rank_weights
+from music_rllib.replay.whole import WholeTrajectories
 
 LAYOUT = ReplayLayout(observation=3, action=2, goal=1, horizon=5)
 
@@ -192,16 +193,54 @@ def test_where_a_distance_is_given_jitter_is_no_move_even_with_dense_rewards(jit
     assert batch.inputs[batch.inputs[:, 3] >= 0, 0].min() == 50
 
 
-def test_trajectories_come_whole_and_in_order() -> None:
+def test_trajectories_of_one_length_come_whole_and_in_order() -> None:
     buffer = replay(100)
-    buffer.extend([episode(0, 5), episode(1, 2), episode(2, 5)])
-    stretches = buffer.sample_trajectories(50, 5)
-    assert stretches.shape == (50, 6, 3)
-    assert set(stretches[:, 0, 0]) == {0.0, 2.0}
-    assert (stretches[:, :, 1] == np.arange(6)).all()
-    shorter = buffer.sample_trajectories(300, 2)
-    assert set(shorter[:, 0, 1]) == {0.0, 1.0, 2.0, 3.0}
-    assert (np.diff(shorter[:, :, 1], axis=1) == 1).all()
+    buffer.extend([episode(n, 5) for n in range(3)])
+    whole = buffer.sample_trajectories(6_000)
+    assert whole.inside is None
+    assert whole.observations.shape == (6_000, 6, 3)
+    assert (whole.observations[:, :, 1] == np.arange(6)).all()
+    counts = np.bincount(whole.observations[:, 0, 0].astype(int))
+    np.testing.assert_allclose(counts, 2_000, atol=5 * 37)
+
+
+def test_trajectories_of_any_length_come_whole_each_by_its_steps() -> None:
+    buffer = replay(1_000)
+    # Mostly short ones, some of a single step, and the longest right at the ring's end.
+    lengths = [2] * 40 + [1] * 7 + [4] * 5 + [5]
+    buffer.extend([episode(n, steps) for n, steps in enumerate(lengths)])
+    whole = buffer.sample_trajectories(10_500)
+    assert whole.inside is not None
+    number = whole.observations[:, 0, 0].astype(int)
+    steps = np.array(lengths)[number]
+    assert (whole.observations[:, :, 0] == number[:, None]).all()
+    np.testing.assert_array_equal(whole.inside, np.arange(6) <= steps[:, None])
+    expected = np.minimum(np.arange(6), steps[:, None])
+    np.testing.assert_array_equal(whole.observations[:, :, 1], expected)
+    counts = np.bincount(number, minlength=len(lengths))
+    # 105 transitions of trajectories with two steps or more, a hundred draws for each.
+    np.testing.assert_allclose(counts, np.where(np.array(lengths) > 1, lengths, 0) * 100, atol=100)
+    assert counts[40:47].max() == 0
+
+
+def test_single_steps_are_whole_trajectories_where_there_is_nothing_else() -> None:
+    buffer = replay(100)
+    buffer.extend([episode(n, 1) for n in range(3)])
+    assert buffer.sample_trajectories(9).observations.shape == (9, 2, 3)
+    buffer.extend([episode(3, 3)])
+    assert set(buffer.sample_trajectories(9).observations[:, 0, 0]) == {3.0}
+
+
+@given(st.lists(st.integers(1, 6), min_size=1, max_size=6))
+def test_trajectories_are_put_side_by_side_as_they_are_read(counts: list[int]) -> None:
+    rng = np.random.default_rng(0)
+    frames = [rng.normal(size=(count, 2)).astype(np.float32) for count in counts]
+    whole = WholeTrajectories.of(frames)
+    inside = np.ones((len(counts), counts[0]), bool) if whole.inside is None else whole.inside
+    assert (whole.inside is None) == (len(set(counts)) == 1)
+    for one, row, held in zip(frames, whole.observations, inside, strict=True):
+        np.testing.assert_array_equal(row[held], one)
+        assert (row[~held] == one[-1]).all()
 
 
 @given(
@@ -236,7 +275,7 @@ def test_memory_is_what_the_documentation_says() -> None:
     [
         (lambda: replay(4), "capacity must hold an episode of 5 steps, got 4"),
         (lambda: replay(10).sample_transitions(1), "empty replay"),
-        (lambda: replay(10).sample_trajectories(1, 5), "no trajectory of 5 steps"),
+        (lambda: replay(10).sample_trajectories(1), "empty replay"),
         (lambda: replay(10).extend([episode(0, 6)]), "1 to 5 steps, got 6"),
         (
             lambda: TrajectoryReplay(LAYOUT, 10, np.random.default_rng(0), hindsight_k=4),
