@@ -30,11 +30,21 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "TAC, HER, 1,000,000 transitions": {"hindsight_k": 4.0, "transitions": 10**6},
     "TAC, HER, frozen estimator": {"hindsight_k": 4.0, "estimator": "frozen"},
     "TAC, HER, trained estimator": {"hindsight_k": 4.0, "estimator": "trained"},
+    "TAC, HER, by autograd": {"hindsight_k": 4.0, "direct": False},
+    "TAC, HER, 3 x 128": {"hindsight_k": 4.0, "hidden_sizes": (128,) * 3},
+    "TAC, HER, 3 x 128, by autograd": {
+        "hindsight_k": 4.0,
+        "hidden_sizes": (128,) * 3,
+        "direct": False,
+    },
 }
 
-PEERS = {
+PEERS: dict[str, tuple[str, str, float | None]] = {
     "TAC, HER, 1,000,000 transitions": ("10,000 transitions", "TAC, HER", 1.05),
     "TAC, HER, trained estimator": ("TAC, HER", "TAC, HER", 1.35),
+    "TAC, HER, by autograd": ("TAC, HER", "TAC, HER", None),
+    "TAC, HER, 3 x 128": ("by autograd", "TAC, HER, 3 x 128, by autograd", 0.8),
+    "TAC, HER, 3 x 128, by autograd": ("raw torch with 3 x 256", "raw", None),
 }
 """What a variant is compared with in place of raw torch, what that is called, and the target."""
 
@@ -45,6 +55,7 @@ def algorithm(
     transitions: int = 10_000,
     gpus: int = 0,
     graphs: bool = True,
+    direct: bool = True,
     **training: Any,
 ) -> TAC:
     """TAC on FetchPush, 10,000 transitions of random actions in its replay, or more, made up."""
@@ -62,6 +73,8 @@ def algorithm(
     algo: TAC = config.build_algo()
     if not graphs:
         algo.learner_group._learner._captured = None
+    if not direct:
+        algo.learner_group._learner._direct = None
     while len(algo.replay) < 10_000:
         algo.training_step()
     fill(algo.replay, transitions)
