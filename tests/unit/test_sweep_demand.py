@@ -49,7 +49,7 @@ def run(tmp_path: Any, **defaults: Any) -> RunSettings:
         ({"music": {"hidden_size": 10**9}}, "music.hidden_size"),
         ({"music": {"batch_trajectories": 10**7}}, "music.batch_trajectories"),
         ({"num_envs": 10**7, "replay": {"capacity": 10**9}}, "num_envs"),
-        ({"tac": {"hidden_sizes": [10**400]}}, "tac.hidden_sizes"),
+        ({"tac": {"hidden_sizes": [10**99]}}, "tac.hidden_sizes"),
     ],
 )
 def test_what_cannot_be_held_is_refused(
