@@ -15,7 +15,7 @@ from pydantic import (
 )
 
 from music_rllib.entropy_scale import matched_alpha, normalised_alpha
-from music_rllib.schedules import Schedule, bounded, value_at
+from music_rllib.schedules import Schedule, bounded, extremes, value_at
 
 __all__ = [
     "Alpha",
@@ -225,6 +225,19 @@ class TACSettings(_Frozen):
             raise ValueError(f"log_std_bounds must be increasing, got {low:g}, {high:g}")
         if self.target_bounds is not None and self.target_bounds[0] >= self.target_bounds[1]:
             raise ValueError(f"target_bounds must be increasing, got {list(self.target_bounds)}")
+        return self
+
+    @model_validator(mode="after")
+    def _target_fits_every_q(self) -> Self:
+        if not isinstance(self.alpha, LearnedAlpha) or self.alpha.target_entropy == "auto":
+            return self
+        low, high = extremes(self.entropic_index)
+        if low != high:
+            raise ValueError(
+                "alpha.target_entropy must be auto where entropic_index is a schedule (a value of "
+                f"S_q means another width at each q), got {self.alpha.target_entropy:g}; "
+                "target_shannon and target_width hold for every q"
+            )
         return self
 
     @model_validator(mode="after")

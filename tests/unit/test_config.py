@@ -261,6 +261,18 @@ BAD: list[tuple[Document, str]] = [
     ),
     (with_stage(0, tac={"hiden_sizes": [1]}), "(did you mean 'hidden_sizes'?)"),
     (
+        with_stage(
+            0,
+            tac={
+                "alpha": {"learned": True, "target_entropy": -3.0},
+                "entropic_index": {"schedule": "linear", "start": 1.0, "end": 2.0},
+            },
+        ),
+        "stages.pretrain.tac.alpha.target_entropy must be auto where entropic_index is a schedule "
+        "(a value of S_q means another width at each q), got -3; "
+        "target_shannon and target_width hold for every q",
+    ),
+    (
         with_stage(0, tac={"log_std_bounds": [1.0, 0.0]}),
         "stages.pretrain.tac.log_std_bounds must be increasing, got 1, 0",
     ),

@@ -1,6 +1,7 @@
 """Presets: laid below everything that a sweep says itself, and every shipped one is sound."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -8,7 +9,9 @@ import torch
 from music_rllib.experiment.config import load_sweep
 from music_rllib.experiment.problems import ConfigError
 from music_rllib.experiment.remarks import remarks
+from music_rllib.experiment.yaml_file import read_yaml
 from music_rllib.tac.losses import critic_target
+from music_rllib.tsallis import gaussian_entropy, joint_entropy
 
 SHIPPED = Path(__file__).parents[2] / "tune_configs" / "presets"
 SWEEP = """
@@ -102,3 +105,104 @@ def test_no_shipped_bounds_cut_off_what_can_be_reached(tmp_path: Path) -> None:
         assert remarks(config) == []
     for path in SWEEPS:
         assert remarks(load_sweep(path)) == []
+
+
+CLAIMED: dict[str, dict[str, Any]] = {
+    "music-2021": {
+        "env_steps": 16 * 2 * 50 * 50 * 50,
+        "num_envs": 16,
+        "evaluation": {"interval": 16 * 2 * 50 * 50, "episodes": 10 * 2 * 16},
+        "tac": {
+            "policy": "deterministic",
+            "bootstrap": "critics",
+            "alpha": 0.0,
+            "action_l2": 1.0,
+            "target_bounds": [-200.0, 200.0],
+            "hidden_sizes": [256, 256, 256],
+            "lr": 1e-3,
+            "gamma": 0.98,
+            "tau": 0.05,
+            "target_update_interval": 40,
+            "batch_size": 16 * 256,
+            "replay_ratio": 40 / (16 * 2 * 50),
+            "random_steps": 0,
+            "behaviour": {"kind": "gaussian_noise", "std": 0.2, "random_share": 0.3},
+            "normaliser_epsilon": 0.01,
+            "observation_clip": 5.0,
+        },
+        "music": {
+            "shuffle": "random",
+            "reward_scale": 5000.0,
+            "hidden_size": 128,
+            "lr": 1e-3,
+            "batch_trajectories": 16 * 256,
+        },
+        "replay": {"capacity": 4_000_000, "hindsight_k": 0},
+    },
+    "paper": {
+        "env_steps": 4_000_000,
+        "num_envs": 16,
+        "evaluation": {"interval": 80_000, "episodes": 320},
+        "tac": {
+            "alpha": 0.2,
+            "entropy_form": "joint",
+            "policy_critic": "min",
+            "hidden_sizes": [256, 256, 256],
+            "lr": 1e-3,
+            "gamma": 0.98,
+            "tau": 0.05,
+            "target_update_interval": 40,
+            "batch_size": 16 * 256,
+            "replay_ratio": 100_000 / 4_000_000,
+            "random_steps": 10_000,
+            "behaviour": "policy",
+        },
+        "music": {"batch_trajectories": 16 * 256},
+        "replay": {"capacity": 4_000_000, "hindsight_k": 0},
+    },
+    "tac-2020": {
+        "env_steps": 200 * 5000,
+        "num_envs": 1,
+        "evaluation": {"interval": 5000, "episodes": 10},
+        "tac": {
+            "alpha": 0.2,
+            "entropy_form": "per_dimension",
+            "policy_critic": "first",
+            "hidden_sizes": [400, 300],
+            "lr": 1e-3,
+            "gamma": 0.99,
+            "tau": 1 - 0.995,
+            "batch_size": 100,
+            "replay_ratio": 1.0,
+            "random_steps": 10_000,
+            "log_std_form": "tanh",
+            "log_std_bounds": [-20.0, 2.0],
+            "normalise_observations": False,
+            "behaviour": "policy",
+        },
+        "replay": {"capacity": 1_000_000, "hindsight_k": 0},
+    },
+}
+"""The originals' numbers, as their code has them; nothing else may stand in a preset of them."""
+
+
+@pytest.mark.parametrize("preset", CLAIMED)
+def test_presets_have_the_originals_numbers(preset: str) -> None:
+    def flat(values: dict[str, Any]) -> dict[str, Any]:
+        inner = {k: v for k, v in values.items() if not isinstance(v, dict)}
+        for key in values.keys() - inner.keys():
+            inner |= {f"{key}.{name}": value for name, value in flat(values[key]).items()}
+        return inner
+
+    found, expected = flat(read_yaml(SHIPPED / f"{preset}.yaml").data), flat(CLAIMED[preset])
+    assert found.keys() == expected.keys()
+    for name, value in expected.items():
+        close = pytest.approx(value) if isinstance(value, float) else value
+        assert found[name] == close, name
+
+
+def test_what_papers_preset_says_its_entropy_weighs() -> None:
+    text = (SHIPPED / "paper.yaml").read_text()
+    widths = torch.full((4,), 0.1, dtype=torch.float64)
+    terms = [0.2 * float(joint_entropy(gaussian_entropy(widths, q), q)) for q in (1.0, 1.5, 2.0)]
+    assert ", ".join(f"{term:.1f}" for term in terms[:2]) + f" and {terms[2]:.1f}" in text
