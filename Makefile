@@ -6,6 +6,8 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 CONFIG ?= tune_configs/smoke.yaml
 PYTEST_ARGS ?=
+SECONDS ?= 600
+SEED    ?= 0
 # The tests of a file stay together and share what they set up.
 JOBS   ?= 2
 PYTEST := $(BIN)/python -m pytest -n $(JOBS) --dist loadscope
@@ -13,7 +15,7 @@ PYTEST := $(BIN)/python -m pytest -n $(JOBS) --dist loadscope
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help venv sweep test test-unit test-faults lint type bench profile results clean
+.PHONY: help venv sweep test test-unit test-faults fuzz lint type bench profile results clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -54,6 +56,9 @@ test-unit: venv  ## run the quick tests (little more than a minute)
 
 test-faults: venv  ## kill, fill, cut and corrupt, and compare with unbroken runs (a quarter of an hour)
 	@$(PYTEST) -m 'faults or thorough' $(PYTEST_ARGS)
+
+fuzz: venv  ## change policies, exports and YAML at random and read them (SECONDS=600 SEED=0)
+	@$(BIN)/python -m tests.fuzz --seconds $(SECONDS) --seed $(SEED)
 
 lint: venv  ## ruff: rules and formatting
 	@$(BIN)/ruff check .

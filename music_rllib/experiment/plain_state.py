@@ -17,6 +17,8 @@ import safetensors
 from safetensors.numpy import load as load_safetensors
 from safetensors.numpy import save as save_safetensors
 
+from music_rllib.limits import check_safetensors, open_regular
+
 __all__ = ["StateError", "read_arrays", "read_state", "write_arrays", "write_state"]
 
 TREE, ARRAYS = "state.json", "state.safetensors"
@@ -52,8 +54,9 @@ def read_state(folder: Path) -> Any:
     """
     arrays = read_arrays(folder / ARRAYS)
     try:
-        return _decode(json.loads((folder / TREE).read_text(encoding="utf-8")), arrays)
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        with open_regular(folder / TREE) as file:
+            return _decode(json.loads(file.read()), arrays)
+    except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
         raise StateError(f"{folder / TREE} must be a saved state: {error}") from error
 
 
@@ -74,7 +77,10 @@ def read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
         StateError: There is no such file, or it is no safetensors file.
     """
     try:
-        return load_safetensors(path.read_bytes())
+        with open_regular(path) as file:
+            data = file.read()
+        check_safetensors(data)
+        return load_safetensors(data)
     except (OSError, safetensors.SafetensorError, ValueError, KeyError, TypeError) as error:
         raise StateError(f"{path} must be a safetensors file: {error}") from error
 

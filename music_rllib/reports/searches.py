@@ -78,8 +78,8 @@ def checked_searches(document: Any) -> list[dict[str, Any]]:
             for name in ("objective", "interval", "fresh"):
                 if row.get(name) and len(row[name]) != aims:
                     raise ValueError(f"{name} must have {aims} entries, it has {len(row[name])}")
-            if "failure" not in row and not row.get("scores", [[]]):
-                raise ValueError("scores must be given")
+        if any("failure" not in row and not row.get("scores") for row in search["ranking"] or []):
+            raise ValueError("ranking must have scores where it has no failure")
     return searches
 
 

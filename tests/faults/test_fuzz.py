@@ -1,0 +1,32 @@
+"""Files changed at random, for as long as a suite can wait; `make fuzz` goes on for longer."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+SECONDS = float(os.environ.get("FUZZ_SECONDS", "45"))
+SEED = os.environ.get("FUZZ_SEED", "0")
+
+
+def test_no_changed_file_does_what_it_should_not() -> None:
+    """See `tests/fuzz.py`; it says which case of which seed, and where its files are."""
+    done = subprocess.run(
+        [sys.executable, "-m", "tests.fuzz", "--seconds", str(SECONDS), "--seed", SEED],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=SECONDS + 200,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout.splitlines()[-1])
+    # Some files of each kind are still sound after their change, and others are not.
+    for kind in ("sealed_policy", "packed_policy", "export", "sweep_file", "state"):
+        outcomes = {name for name in found if name.startswith(f"{kind}:")}
+        assert f"{kind}: read" in outcomes
+        assert len(outcomes) > 1
