@@ -21,7 +21,6 @@ from music_rllib.limits import MOST_JSON_BYTES, read_json, read_regular
 from music_rllib.reports.searches import checked_searches
 from music_rllib.results.data import Column, Points, ReportError, RunRecord, Sweep, columns
 from music_rllib.tracking import names
-from music_rllib.tracking.redaction import redact
 from music_rllib.tracking.store import TrackingStore, check_reachable
 
 if TYPE_CHECKING:
@@ -144,7 +143,9 @@ def _open(store: TrackingStore) -> MlflowClient:
 
 
 def _first_line(error: Exception) -> str:
-    return redact((str(error).strip() or type(error).__name__).splitlines()[0])
+    from music_rllib.tracking.mlflow_client import first_line  # with MLflow, which is loaded by now
+
+    return first_line(error)
 
 
 def _sqlite_file(store: TrackingStore) -> Path | None:

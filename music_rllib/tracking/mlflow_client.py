@@ -57,9 +57,12 @@ _LASTING_ERRORS = frozenset(
 _Item = TypeVar("_Item")
 
 
-_CREDENTIALS_HINT = (
-    " Set MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD in the environment of the sweep."
-)
+_HINTS = {
+    r"error code 40[13]\b": "Set MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD in the "
+    "environment.",
+    r"\b5\d\d error responses|error code 5\d\d\b": "The server's own log says why.",
+}
+"""What an answer looks like, and what to do then."""
 
 
 def is_lasting(error: Exception) -> bool:
@@ -85,11 +88,9 @@ class Experiment:
         except TrackingError:
             raise
         except Exception as error:
-            answer = first_line(error)
-            hint = _CREDENTIALS_HINT if re.search(r"\b40[13]\b", answer) else ""
             raise TrackingError(
                 f"MLflow at {store.public_uri} must accept the experiment {name!r}, "
-                f"it answered: {answer}{hint}"
+                f"it answered: {first_line(error)}"
             ) from error
 
     def find_run(self, tags: Mapping[str, str]) -> str | None:
@@ -227,13 +228,15 @@ class Experiment:
 
 
 def first_line(error: Exception) -> str:
-    """The first line of an error that says something, without passwords."""
+    """The first line of an error that says something, without passwords, and what to do."""
     lines = [
         line
         for line in str(error).strip().splitlines()
         if line.strip() and not line.startswith("(raised as a result of Query-invoked autoflush")
     ] or [type(error).__name__]
-    return redact(lines[0])
+    line = redact(lines[0])
+    hint = next((hint for sign, hint in _HINTS.items() if re.search(sign, line)), "")
+    return f"{line} {hint}".rstrip()
 
 
 def _configure_mlflow() -> None:

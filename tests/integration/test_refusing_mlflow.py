@@ -1,0 +1,100 @@
+"""An MLflow server that refuses every question: wrong credentials, or a fault of its own."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from music_rllib.sweep import cli
+from music_rllib.tracking.__main__ import app as tracking
+from music_rllib.tracking.session import SweepRecord, tracking_folder
+from tests.integration.conftest import SWEEP
+
+TODO = {
+    401: "Set MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD in the environment",
+    403: "Set MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD in the environment",
+    500: "The server's own log says why",
+}
+
+
+@pytest.fixture(params=sorted(TODO))
+def status(request: pytest.FixtureRequest) -> int:
+    return int(request.param)
+
+
+@pytest.fixture
+def uri(status: int) -> Iterator[str]:
+    """Of a server that is in health, and refuses everything else."""
+
+    class Refusing(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.rfile.read(int(self.headers.get("Content-Length") or 0))
+            self.send_response(200 if self.path == "/health" else status)
+            self.send_header("Content-Length", "2")
+            self.end_headers()
+            self.wfile.write(b"no")
+
+        do_POST = do_PATCH = do_GET  # noqa: N815
+
+        def log_message(self, *_: Any) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Refusing) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://user:planted-password@127.0.0.1:{server.server_address[1]}"
+        server.shutdown()
+
+
+def check(code: int, message: str, status: int) -> None:
+    assert code == 2
+    assert message.startswith("error: MLflow at http://127.0.0.1:")
+    assert message.count("\n") == 1
+    assert TODO[status] in message
+    assert "planted" not in message
+
+
+def test_a_sweep_says_so_and_starts_nothing(
+    uri: str,
+    status: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    document = {key: value for key, value in SWEEP.items() if key != "environments"}
+    document |= {"tasks": ["FetchPush"], "mlflow": {"tracking_uri": uri}}
+    Path("sweep.yaml").write_text(yaml.safe_dump(document))
+    code = cli.main(["run", "sweep.yaml"])
+    check(code, capsys.readouterr().err, status)
+    assert not Path("results", "nodes").exists()
+    kept = [path for path in Path("results").rglob("*") if path.is_file()]
+    assert not any(b"planted" in path.read_bytes() for path in kept)
+
+
+def test_what_waits_stays_and_is_told(uri: str, status: int, tmp_path: Path) -> None:
+    tracking_folder(tmp_path).mkdir()
+    record = SweepRecord(sweep_name="s", sweep_id="0", tracking_uri=uri, storage="..")
+    record.write(tmp_path)
+    waiting = tracking_folder(tmp_path) / "runs" / "a"
+    waiting.mkdir(parents=True)
+    (waiting / "records.jsonl").write_text("")
+    done = CliRunner().invoke(tracking, ["deliver", str(tmp_path), "--timeout", "1"])
+    check(done.exit_code, done.stderr, status)
+    assert (waiting / "records.jsonl").exists()
+
+
+def test_a_report_says_so(
+    uri: str, status: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from music_rllib.reports.cli import app
+
+    monkeypatch.chdir(tmp_path)
+    done = CliRunner().invoke(app, ["s", "--tracking-uri", uri])
+    check(done.exit_code, done.stderr, status)
