@@ -14,7 +14,7 @@ from music_rllib.tac.kernels import products
 from music_rllib.tac.kernels.products import Blas, OneDnn, Products
 from music_rllib.tac.kernels.update import DirectUpdate
 from music_rllib.tac.learner import TACLearner
-from tests.integration.test_captured_updates import VARIANTS
+from tests.integration.test_captured_updates import VARIANTS, register_uneven
 from tests.integration.test_tac_algorithm import build, fingerprint
 from tests.integration.test_tac_losses import ACTION, BATCH, OBSERVATION, learner, minibatch
 
@@ -147,6 +147,7 @@ def test_in_float32_gradients_differ_by_rounding_whatever_multiplies(
 def test_a_training_has_autograds_numbers_to_rounding(
     settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    register_uneven()
     found = fingerprint(build(**settings), 2)
     monkeypatch.setattr(TACLearner, "_is_standard", False)
     expected = fingerprint(build(**settings), 2)

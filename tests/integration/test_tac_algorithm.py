@@ -118,7 +118,7 @@ DDPG: dict[str, Any] = {
     "bootstrap": "critics",
     "alpha": 0.0,
     "behaviour": {"kind": "gaussian_noise"},
-    "target_bounds": (-100.0, 0.0),
+    "target_bounds": (-200.0, 0.0),
 }
 ANNEALED = {"schedule": "linear", "start": 0.4, "end": 1.0}
 PER: dict[str, Any] = {"replay.priority": "td_error", "replay.importance_exponent": ANNEALED}
