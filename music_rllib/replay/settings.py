@@ -23,8 +23,8 @@ class ReplaySettings(BaseModel):
     hindsight_episodes: Literal["all", "moved"] = "all"
     """HER: relabelled transitions come from all episodes, or only from those that achieve something
     that their first state does not (`environments.<name>.moved_distance`). Where an object rests,
-    hindsight has nothing to tell. None of them makes up more than a tenth of a minibatch on
-    average."""
+    hindsight has nothing to tell. None of them makes up more than two fifths of a minibatch
+    on average."""
     priority: Literal["uniform", "td_error"] = "uniform"
     """Transitions drawn uniformly, or by their TD error (PER, Schaul et al. 2016, proportional)."""
     priority_exponent: float = Field(0.6, gt=0)

@@ -138,16 +138,16 @@ def test_hindsight_of_moved_episodes_leaves_out_those_that_reach_every_goal_at_o
 @pytest.mark.parametrize(
     ("moved", "others", "share"),
     [
-        # A tenth each and what they get as some of all, in place of .8 over their number.
-        ([5], 200, 0.1),
-        ([5, 5, 5], 100, 0.1),
-        # Of unequal ones the longest gets a tenth, each transition as much as any other.
-        ([5, 1, 1], 200, 0.1),
-        # From eight on it does not bind.
+        # And what it gets as one of all, in place of .8.
+        ([5], 200, 0.4),
+        # Of unequal ones the longest gets as much, each transition as any other.
+        ([5, 1, 1], 200, 0.4),
+        # From two of one length on it does not bind.
+        ([5, 5, 5], 100, 0.8 / 3),
         ([5] * 10, 100, 0.08),
     ],
 )
-def test_no_moved_episode_fills_more_than_a_tenth_of_a_minibatch(
+def test_no_moved_episode_fills_more_than_two_fifths_of_a_minibatch(
     moved: list[int], others: int, share: float
 ) -> None:
     buffer, again = moving_replay(), moving_replay()
