@@ -14,8 +14,8 @@ from music_rllib.tac.kernels import products
 from music_rllib.tac.kernels.products import Blas, OneDnn, Products
 from music_rllib.tac.kernels.update import DirectUpdate
 from music_rllib.tac.learner import TACLearner
-from tests.integration.test_captured_updates import VARIANTS, register_uneven
-from tests.integration.test_tac_algorithm import build, fingerprint
+from tests.integration.test_captured_updates import VARIANTS
+from tests.integration.test_tac_algorithm import build, fingerprint, register_uneven
 from tests.integration.test_tac_losses import ACTION, BATCH, OBSERVATION, learner, minibatch
 
 DDPG = {
