@@ -81,8 +81,10 @@ def test_each_run_has_its_policy_and_evaluate_finds_it_by_label(finished: Finish
     models = finished.client.search_logged_models([finished.experiment_id])
     assert {model.source_run_id for model in models} == {run.info.run_id for run in runs.values()}
     label = next(name for name in runs if name.startswith("finetune"))
+    # The policy's file names a module, which only the user may have imported.
+    options = ["--episodes", "2", "--json", "--env", "point_env:Point-v0"]
     done = subprocess.run(
-        [sys.executable, "-m", "music_rllib.sweep", "evaluate", label, "--episodes", "2", "--json"],
+        [sys.executable, "-m", "music_rllib.sweep", "evaluate", label, *options],
         cwd=finished.folder,
         env=os.environ | {"PYTHONPATH": _python_path()},
         capture_output=True,
