@@ -148,9 +148,11 @@ def test_a_training_has_autograds_numbers_to_rounding(
     settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     register_uneven()
-    found = fingerprint(build(**settings), 3)
+    # Few updates: what is counted jumps where rounding has grown. Short episodes need a third round.
+    rounds = 3 if "task" in settings else 2
+    found = fingerprint(build(**settings), rounds)
     monkeypatch.setattr(TACLearner, "_is_standard", False)
-    expected = fingerprint(build(**settings), 3)
+    expected = fingerprint(build(**settings), rounds)
     assert found != expected, "they round differently: else both took the same way"
     for row, same in zip(found, expected, strict=True):
         assert row == pytest.approx(same, rel=1e-3, abs=1e-4)
