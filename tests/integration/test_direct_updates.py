@@ -148,7 +148,7 @@ def test_a_training_has_autograds_numbers_to_rounding(
     settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     register_uneven()
-    # Few updates: what is counted jumps where rounding has grown. Short episodes need a third round.
+    # Few updates: what is counted jumps where rounding has grown. Short episodes need a round more.
     rounds = 3 if "task" in settings else 2
     found = fingerprint(build(**settings), rounds)
     monkeypatch.setattr(TACLearner, "_is_standard", False)
