@@ -1,0 +1,218 @@
+"""Comparisons decide as often as they say, by simulation, and agree with scipy's exact tests."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as st_numpy
+from scipy import stats
+
+from music_rllib.results.claims import contrasts as c
+from music_rllib.results.claims.area import area_under_curve
+from music_rllib.results.claims.contrasts import Verdict
+from music_rllib.results.statistics import Array, Estimate
+
+DRAWS = 4000
+SPREAD, MARGIN = 0.06, 0.05
+NOISE = 3 * np.sqrt(0.05 * 0.95 / DRAWS)
+"""Three standard errors of a rate of 5 %."""
+
+Study = tuple[Array, Array]
+
+
+def study(effect: float, seeds: int, rng: np.random.Generator, *, paired: bool) -> Study:
+    """Mean success over the budget of two conditions, `[seeds, draws]`; a seed's share is common.
+
+    Each is a mean of 20 evaluations of 50 episodes, around curves that differ in height.
+    """
+    common = rng.normal(0.55, 0.05, (seeds, DRAWS))
+    own = rng.normal(0, SPREAD / np.sqrt(2), (2, seeds, DRAWS))
+    other = common if paired else rng.normal(0.55, 0.05, (seeds, DRAWS))
+    rates = np.clip(np.stack([common + own[0] + effect, other + own[1]]), 0, 1)
+    x, y = rng.binomial(1000, rates) / 1000
+    return x, y
+
+
+def verdicts(found: c.Contrast) -> dict[Verdict, float]:
+    """How often each comes, of single comparisons."""
+    assert found.p_equivalent is not None
+    triples = zip(found.difference.value, found.p_value, found.p_equivalent, strict=True)
+    decided = [c.verdict_of(*map(float, triple)) for triple in triples]
+    return {verdict: decided.count(verdict) / len(decided) for verdict in Verdict}
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+@pytest.mark.parametrize("paired", [True, False])
+@pytest.mark.parametrize("seeds", [3, 5, 10])
+def test_rates_of_error_and_coverage_are_nominal(
+    seeds: int, paired: bool, rng: np.random.Generator
+) -> None:
+    none = c.contrast(*study(0.0, seeds, rng, paired=paired), paired=paired, margin=MARGIN)
+    covers = (none.difference.lower <= 0) & (none.difference.upper >= 0)
+    assert abs(np.mean(none.p_value < 0.05) - 0.05) < NOISE + 0.01
+    assert abs(np.mean(covers) - 0.95) < NOISE + 0.01
+    # A difference as large as the margin is called equivalent in one of twenty studies.
+    edge = c.contrast(*study(MARGIN, seeds, rng, paired=paired), paired=paired, margin=MARGIN)
+    assert edge.p_equivalent is not None
+    assert np.mean(edge.p_equivalent < 0.05) < 0.05 + NOISE
+
+
+def test_a_planted_effect_is_decided_rightly(rng: np.random.Generator) -> None:
+    """With the seeds that the power statement asks for, each true answer comes in 80 %."""
+    spread = float(np.hypot(SPREAD, np.sqrt(2 * 0.25 / 1000)))  # and that of the evaluations
+    seeds = c.seeds_for_difference(0.1, spread, paired=True)
+    assert seeds is not None
+    better = c.contrast(*study(0.1, seeds, rng, paired=True), paired=True, margin=MARGIN)
+    assert verdicts(better)[Verdict.SUPERIOR] == pytest.approx(0.84, abs=0.05)
+    assert verdicts(better)[Verdict.WORSE] + verdicts(better)[Verdict.EQUIVALENT] < 0.002
+    worse = c.contrast(*study(-0.1, seeds, rng, paired=True), paired=True, margin=MARGIN)
+    assert verdicts(worse)[Verdict.WORSE] == pytest.approx(0.84, abs=0.05)
+    seeds = c.seeds_for_equivalence(MARGIN, spread, paired=True)
+    assert seeds is not None
+    same = c.contrast(*study(0.0, seeds, rng, paired=True), paired=True, margin=MARGIN)
+    assert verdicts(same)[Verdict.EQUIVALENT] == pytest.approx(0.82, abs=0.04)
+    few = c.contrast(*study(0.0, 3, rng, paired=True), paired=True, margin=MARGIN)
+    assert verdicts(few)[Verdict.UNDECIDED] > 0.85
+
+
+def test_pairs_see_what_groups_do_not(rng: np.random.Generator) -> None:
+    x, y = study(0.08, 5, rng, paired=True)
+    shares = [np.mean(c.contrast(x, y, paired=paired).p_value < 0.05) for paired in (True, False)]
+    assert shares[0] > shares[1] + 0.1
+
+
+def test_of_several_comparisons_one_in_twenty_studies_has_a_wrong_one(
+    rng: np.random.Generator,
+) -> None:
+    wrong = 0
+    for _ in range(400):
+        scores = rng.normal(size=(4, 8))
+        pairs = [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
+        found = [c.contrast(scores[a], scores[b], paired=True) for a, b in pairs]
+        wrong += any(verdict != Verdict.UNDECIDED for _, _, verdict in c.decide(found))
+    assert wrong / 400 < 0.05 + 3 * np.sqrt(0.05 * 0.95 / 400)
+
+
+@pytest.mark.parametrize("gap", [0.0, 0.02, 0.1, -0.1])
+@pytest.mark.parametrize("m, n, paired", [(5, 5, True), (3, 3, True), (4, 5, False), (3, 3, False)])
+def test_where_all_seeds_tie_it_is_the_exact_permutation_test(
+    m: int, n: int, paired: bool, gap: float
+) -> None:
+    x, y = np.full(m, 0.5 + gap), np.full(n, 0.5)
+    found = c.contrast(x, y, paired=paired, margin=MARGIN)
+
+    def exact(shift: float, alternative: str) -> float:
+        # scipy counts the observed labelling among finitely many, as it should.
+        done = stats.permutation_test(
+            (x + shift, y),
+            lambda a, b, axis: np.mean(a, axis=axis) - np.mean(b, axis=axis),
+            permutation_type="samples" if paired else "independent",
+            alternative=alternative,
+            n_resamples=np.inf,
+            vectorized=True,
+        )
+        return float(done.pvalue)
+
+    assert found.p_equivalent is not None
+    assert float(found.p_value) == pytest.approx(min(1.0, exact(0.0, "two-sided")))
+    both = max(exact(MARGIN, "greater"), exact(-MARGIN, "less"))
+    assert float(found.p_equivalent) == pytest.approx(both if abs(gap) < MARGIN else 1.0)
+
+
+def test_seeds_that_tie_are_not_equivalent_beyond_what_their_episodes_show() -> None:
+    ones, few = (
+        np.ones(6),
+        Estimate(value=np.array(0.0), lower=np.array(-0.07), upper=np.array(0.07)),
+    )
+    assert float(c.contrast(ones, ones, paired=True, margin=MARGIN).p_equivalent) < 0.05  # type: ignore[arg-type]
+    held = c.contrast(ones, ones, paired=True, margin=MARGIN, apart=few)
+    assert float(held.p_equivalent) == 1.0  # type: ignore[arg-type]
+    assert (float(held.difference.lower), float(held.difference.upper)) == (-0.07, 0.07)
+
+
+@pytest.mark.parametrize("m, n, paired", [(5, 5, True), (5, 3, False), (2, 2, False)])
+def test_otherwise_it_is_scipy_s_test(
+    m: int, n: int, paired: bool, rng: np.random.Generator
+) -> None:
+    x, y = rng.normal(0.7, 0.2, (m, 50)), rng.normal(0.6, 0.1, (n, 50))
+    found = c.contrast(x, y, paired=paired, margin=0.2)
+    run = stats.ttest_rel if paired else partial(stats.ttest_ind, equal_var=False)
+    np.testing.assert_allclose(found.p_value, run(x, y).pvalue)
+    ends = run(x, y).confidence_interval(0.95)
+    np.testing.assert_allclose([found.difference.lower, found.difference.upper], ends)
+    sides = run(x + 0.2, y, alternative="greater"), run(x - 0.2, y, alternative="less")
+    np.testing.assert_allclose(found.p_equivalent, np.max([s.pvalue for s in sides], axis=0))  # type: ignore[arg-type]
+
+
+def test_one_seed_decides_nothing() -> None:
+    found = c.contrast(np.array([0.9]), np.array([0.1]), paired=True, margin=MARGIN)
+    assert c.decide([found]) == [(1.0, 1.0, Verdict.UNDECIDED)]
+    assert not found.difference.has_interval
+
+
+pairs = st_numpy.arrays(
+    float, st.tuples(st.just(2), st.integers(2, 9)), elements=st.integers(0, 100)
+).map(lambda counts: counts / 100)
+
+
+@given(pairs, st.booleans(), st.floats(0.01, 0.5))
+def test_turned_round_it_says_the_opposite(scores: Array, paired: bool, margin: float) -> None:
+    x, y = scores
+    one, other = (c.contrast(*s, paired=paired, margin=margin) for s in ((x, y), (y, x)))
+    np.testing.assert_allclose(one.difference.value, -other.difference.value)
+    np.testing.assert_allclose(one.difference.lower, -other.difference.upper, atol=1e-9)
+    np.testing.assert_allclose(one.p_value, other.p_value, rtol=1e-6)
+    assert one.p_equivalent is not None
+    assert other.p_equivalent is not None
+    np.testing.assert_allclose(one.p_equivalent, other.p_equivalent, rtol=1e-6)
+
+
+@given(pairs, st.booleans(), st.floats(0.01, 0.4))
+def test_a_wider_margin_is_never_harder_to_stay_within(
+    scores: Array, paired: bool, margin: float
+) -> None:
+    narrow, wide = (
+        c.contrast(*scores, paired=paired, margin=m).p_equivalent for m in (margin, margin + 0.1)
+    )
+    assert narrow is not None
+    assert wide is not None
+    assert wide <= narrow + 1e-9
+
+
+# Area under the curve -----------------------------------------------------------------------------
+
+
+def test_area_by_hand() -> None:
+    steps, values = np.array([100.0, 200.0, 300.0]), np.array([0.0, 0.5, 1.0])
+    assert area_under_curve(steps, values, 300) == pytest.approx((0 + 25 + 75) / 300)
+    # Cut between two evaluations: at 250 the line is at .75.
+    assert area_under_curve(steps, values, 250) == pytest.approx((25 + 50 * 0.625) / 250)
+    # An evaluation before the first step counts from there.
+    assert area_under_curve(np.array([0.0, 10.0]), np.array([1.0, 0.0]), 10) == pytest.approx(0.5)
+    assert np.isnan(area_under_curve(steps, values, 301))
+    assert np.isnan(area_under_curve(steps[:0], values[:0], 1))
+
+
+curves = st.lists(
+    st.tuples(st.integers(0, 1000), st.floats(0, 1)), min_size=1, unique_by=lambda p: p[0]
+)
+
+
+@given(curves, st.floats(-2, 2), st.integers(1, 1000))
+def test_area_is_a_mean(points: list[tuple[int, float]], shift: float, horizon: int) -> None:
+    steps, values = (np.array(part, float) for part in zip(*sorted(points), strict=True))
+    found = area_under_curve(steps, values, horizon)
+    if steps[-1] < horizon:
+        assert np.isnan(found)
+        return
+    assert values.min() - 1e-9 <= found <= values.max() + 1e-9
+    assert area_under_curve(steps, values + shift, horizon) == pytest.approx(found + shift)
+    assert area_under_curve(steps * 7, values, horizon * 7) == pytest.approx(found)
