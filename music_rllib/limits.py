@@ -50,6 +50,14 @@ MOST_ROWS_PER_BYTE = 4
 """Of an exported table beyond its first 100,000: those of real runs have 0.1 to 0.3."""
 MOST_TABLE_TEXT = 64 << 20
 """Characters of all cells of an exported table."""
+MOST_PAGES = 30_000
+"""Of an exported Parquet table."""
+MOST_PAGE_BYTES = 16 << 20
+"""Of one of its pages, unpacked: Arrow writes pages of 1 MiB."""
+MOST_UNPACKED_BYTES = 32 << 20
+"""Of all its pages, and on top of that"""
+MOST_UNPACKED_PER_BYTE = 16
+"""for each byte of the file. Those of real sweeps have 1.5 to 1.8."""
 MOST_COLUMNS = 10_000
 """Of an exported table."""
 

@@ -345,6 +345,27 @@ def _long_texts(file: Path) -> None:
     parquet.write_table(pa.table(table), file, store_schema=False)
 
 
+def _unpacking(cells: int, **options: Any) -> Callable[[Path], None]:
+    """Texts of a megabyte each, which take next to nothing in the file."""
+
+    def apply(file: Path) -> None:
+        numbers = pa.array(np.zeros(cells, np.int64))
+        table = {"run": numbers, "metric": pa.repeat("x" * (1 << 20), cells)}
+        table |= {"env_steps": numbers, "value": numbers.cast(pa.float64()), "time_ms": numbers}
+        written: dict[str, Any] = {"use_dictionary": False, "compression": "zstd"}
+        parquet.write_table(pa.table(table), file, store_schema=False, **written | options)
+
+    return apply
+
+
+def _fewer_rows_said(file: Path) -> None:
+    """The footer says 5 rows, and its one row group two million."""
+    _nulls(2_000_000, 2_000_000)(file)
+    data, rows = file.read_bytes(), bytes((0x16, 0x80, 0x92, 0xF4, 0x01))
+    assert data.count(rows) > 1, "Thrift's number of rows of the file, and of the group"
+    file.write_bytes(data.replace(rows, bytes((0x16, 0x8A, 0x80, 0x80, 0x00)), 1))
+
+
 def _columns(file: Path) -> None:
     names_of = ",".join(f"c{i}" for i in range(100_000))
     file.write_text(f"{names_of}\n{',' * 99_999}\n")
@@ -519,6 +540,22 @@ CORPUS: dict[str, Hostile] = {
     ),
     "export: long texts": Hostile(
         _export("metrics.parquet", _long_texts), "characters of text, it has 1000000000"
+    ),
+    "export: a large page": Hostile(
+        _export("metrics.parquet", _unpacking(100, data_page_size=1 << 30)), "bytes each"
+    ),
+    "export: much to unpack": Hostile(
+        _export("metrics.parquet", _unpacking(100, write_batch_size=1)), "together when unpacked"
+    ),
+    "export: texts in each other": Hostile(
+        _export(
+            "metrics.parquet",
+            _unpacking(100, use_dictionary=["run"], column_encoding={"metric": "DELTA_BYTE_ARRAY"}),
+        ),
+        "must be encoded as one of",
+    ),
+    "export: more rows than it says": Hostile(
+        _export("metrics.parquet", _fewer_rows_said), "as many rows as it says, 5, it has 2000000"
     ),
     "export: many columns": Hostile(
         _export("runs.csv", _columns, "csv"), "must have at most 10000 columns"

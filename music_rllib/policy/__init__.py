@@ -10,11 +10,18 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from music_rllib.policy.locate import find_policy
+    from music_rllib.policy.locate import find_policy, named_environment
     from music_rllib.policy.network import PolicyNetwork
     from music_rllib.policy.policy import Policy, PolicyError, load_policy
 
-__all__ = ["Policy", "PolicyError", "PolicyNetwork", "find_policy", "load_policy"]
+__all__ = [
+    "Policy",
+    "PolicyError",
+    "PolicyNetwork",
+    "find_policy",
+    "load_policy",
+    "named_environment",
+]
 
 _HOMES = {
     "Policy": "policy",
@@ -22,6 +29,7 @@ _HOMES = {
     "PolicyNetwork": "network",
     "find_policy": "locate",
     "load_policy": "policy",
+    "named_environment": "locate",
 }
 
 

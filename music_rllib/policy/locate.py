@@ -1,4 +1,4 @@
-"""Finding a run's policy by what a person knows of the run: a key, a label, or a place."""
+"""What a person names: a run's policy (by key, label or place), and an environment."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from pathlib import Path
 
 import pyarrow.fs as pafs
 
+from music_rllib.envs.registry import Task
+from music_rllib.experiment.config import declared_tasks
 from music_rllib.experiment.sealed import SealedFolders, open_storage
 from music_rllib.policy.policy import PolicyError
 
-__all__ = ["find_policy"]
+__all__ = ["find_policy", "named_environment"]
 
 _SHORTEST_KEY = 4
 _NAMED = 8
@@ -59,6 +61,20 @@ def find_policy(wanted: str, storage: str) -> str:
     if not checkpoints:
         raise PolicyError(f"{wanted!r} must have a checkpoint, it has none in {storage} yet")
     return f"{prefix}/work/{keys[0]}/{checkpoints[-1]}"
+
+
+def named_environment(env: str | None) -> str | tuple[Task, ...]:
+    """What `--env` names, for `load_policy`.
+
+    Args:
+        env: an environment's id, or a sweep's YAML file that declares environments.
+
+    Raises:
+        ConfigError: that file can't be read, or is wrong.
+    """
+    if env is None:
+        return ()
+    return declared_tasks(env) if env.endswith((".yaml", ".yml")) else env
 
 
 def _matching(wanted: str, keys: list[str], labels: dict[str, list[str]]) -> list[str]:

@@ -17,6 +17,7 @@ from music_rllib.limits import (
     MOST_TABLE_TEXT,
     open_regular,
 )
+from music_rllib.results.parquet_pages import check_pages
 
 __all__ = ["read_table", "write_table"]
 
@@ -54,7 +55,7 @@ def read_table(file: Path, kinds: Mapping[str, pa.DataType]) -> pa.Table:
         if file.suffix == ".csv":
             table = _from_csv(native, head, kinds)
         else:
-            table = _from_parquet(native, size)
+            table = _from_parquet(native, size, file)
     missing = [name for name in kinds if name not in table.column_names]
     if missing:
         raise ValueError(f"must have the column {missing[0]}, it has {table.column_names[:9]}")
@@ -90,13 +91,15 @@ def _check_texts(table: pa.Table) -> None:
         raise ValueError(f"must have at most {MOST_TABLE_TEXT} characters of text, it has {total}")
 
 
-def _from_parquet(source: pa.NativeFile, size: int) -> pa.Table:
+def _from_parquet(source: pa.NativeFile, size: int, file: Path) -> pa.Table:
     limits: dict[str, Any] = {
         "thrift_string_size_limit": 16 << 20,
         "thrift_container_size_limit": 1_000_000,
     }
     footer = parquet.ParquetFile(source, **limits)
     _check_size(footer.metadata.num_rows, footer.metadata.num_columns, size)
+    with pa.memory_map(str(file)) as mapped:
+        check_pages(memoryview(mapped.read_buffer()).cast("B"), footer.metadata)
     schema = footer.schema_arrow
     for field in schema:
         plain = pa.types.is_string(field.type) or pa.types.is_large_string(field.type)

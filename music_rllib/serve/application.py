@@ -22,12 +22,12 @@ from ray.serve._private import replica
 from ray.serve.config import BackpressureConfig
 
 from music_rllib._allocator import give_back_freed_memory
-from music_rllib.policy import Policy, PolicyNetwork, find_policy, load_policy
+from music_rllib.policy import Policy, PolicyNetwork, find_policy, load_policy, named_environment
 from music_rllib.serve.api import make_api, token_hash
 from music_rllib.serve.limits import FOR_HEALTH, RETRY_SECONDS, Limits
 from music_rllib.serve.protocol import TOKEN_VARIABLE, Array, PolicyFacts, Rows, compute
 
-__all__ = ["ServeSettings", "app", "application"]
+__all__ = ["ServeSettings", "app", "application", "policy_of"]
 
 TOGETHER = 64
 """Requests that are computed together at most."""
@@ -44,6 +44,9 @@ class ServeSettings(BaseModel):
     """Folder or URI of a finished node, an exported policy, or a run's key or label."""
     storage: str = "results"
     """Where keys and labels are looked up."""
+    env: str | None = None
+    """The environment, where the policy doesn't say what it takes and gives: a sweep's YAML file
+    that declares it, or its id."""
     replicas: int = Field(1, ge=1)
     """Processes that compute actions."""
     cpus_per_replica: float = Field(1.0, gt=0)
@@ -59,9 +62,16 @@ def app(settings: ServeSettings) -> Application:
 
     Raises:
         PolicyError: There is no such policy.
+        ConfigError: The file that declares its environment is wrong.
         ValueError: A token is required and there is none.
     """
-    return application(load_policy(find_policy(settings.policy, settings.storage)), settings)
+    return application(policy_of(settings), settings)
+
+
+def policy_of(settings: ServeSettings) -> Policy:
+    """The policy that is to be served; raises as `app` does."""
+    place = find_policy(settings.policy, settings.storage)
+    return load_policy(place, named_environment(settings.env))
 
 
 def application(policy: Policy, settings: ServeSettings) -> Application:

@@ -76,6 +76,12 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--storage", default="results", help="Where keys and labels are looked up (results)."
     )
+    parser.add_argument(
+        "--env",
+        metavar="ENV",
+        help="The environment, where neither this package nor the policy's own file says what it "
+        "takes and gives: a sweep's YAML file that declares it, or its id.",
+    )
     parser.add_argument("--host", default="127.0.0.1", help="Address to listen on (127.0.0.1).")
     parser.add_argument("--port", type=_port, default=8000, help="Port to listen on (8000).")
     parser.add_argument(
@@ -166,21 +172,23 @@ def _serve(arguments: argparse.Namespace) -> int:
         raise _BadInputError(
             f"Ray Serve must be installed (pip install 'music_rllib[serve]'): {error}"
         ) from error
+    from music_rllib.experiment.config import ConfigError
     from music_rllib.experiment.sealed import StorageError
-    from music_rllib.policy import PolicyError, find_policy, load_policy
-    from music_rllib.serve.application import ServeSettings, application
+    from music_rllib.policy import PolicyError
+    from music_rllib.serve.application import ServeSettings, application, policy_of
     from music_rllib.serve.limits import Limits
     from music_rllib.serve.protocol import PolicyFacts, request_model
 
     settings = ServeSettings(
         policy=arguments.policy,
         storage=arguments.storage,
+        env=arguments.env,
         replicas=arguments.replicas,
         max_requests=arguments.max_requests,
     )
     try:
-        policy = load_policy(find_policy(settings.policy, settings.storage))
-    except (PolicyError, StorageError) as error:
+        policy = policy_of(settings)
+    except (ConfigError, PolicyError, StorageError) as error:
         raise _BadInputError(str(error)) from error
     if cluster_address() is None:
         _check_room(settings, [len(os.sched_getaffinity(0))])

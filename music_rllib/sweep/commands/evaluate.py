@@ -97,20 +97,16 @@ def _not_negative(text: str) -> int:
 
 
 def _execute(arguments: argparse.Namespace) -> int:
-    from music_rllib.experiment.config import declared_tasks
-    from music_rllib.policy import PolicyError, find_policy, load_policy
+    from music_rllib.policy import PolicyError, find_policy, load_policy, named_environment
     from music_rllib.policy.video import VideoError
 
     if not arguments.storage:
         raise BadInputError("--storage must not be empty, got ''")
     _check_video(arguments.video)
     console = console_for(arguments)
-    env = arguments.env or ()
-    if arguments.env and arguments.env.endswith((".yaml", ".yml")):
-        env = declared_tasks(arguments.env)
     try:
         place = find_policy(arguments.run, arguments.storage)
-        policy = load_policy(place, env)
+        policy = load_policy(place, named_environment(arguments.env))
         results = _play(policy, arguments)
         if arguments.video:
             _film(policy, arguments)
