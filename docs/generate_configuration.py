@@ -43,7 +43,7 @@ from music_rllib.experiment.space import (
     WarmStart,
 )
 from music_rllib.replay.settings import ReplaySettings
-from music_rllib.schedules import Linear, Piecewise
+from music_rllib.schedules import Linear, Measured, Piecewise
 from music_rllib.tac.settings import (
     GaussianNoise,
     LearnedAlpha,
@@ -121,6 +121,15 @@ value: `{schedule: linear, start: 1.0, end: 2.0}`,
 `{schedule: piecewise, points: [[0, 1.0], [50000, 0.0]], interpolation: hold}`.
 """
 
+MEASURED_TEXT = """\
+### Measured schedules
+
+Where it says *or measured*, a mapping with `follows` makes the value a function of what the run
+measures: `{follows: success_rate, points: [[0.2, 2.0], [0.9, 1.0]], monotone: true}`. Success is
+measured at evaluations (`evaluation.interval`), the entropy in the updates after each round of
+episodes. [comparing_q.md](comparing_q.md) has an example.
+"""
+
 # --- the document ------------------------------------------------------------------------------
 
 
@@ -188,6 +197,8 @@ def document() -> str:
         SCHEDULES_TEXT,
         table(rows(Linear, "")),
         table(rows(Piecewise, "")),
+        MEASURED_TEXT,
+        table(rows(Measured, "")),
         "## Environments",
         "`environments` maps a task's name to its definition:",
         table(rows(Task, "", skip=("name",))),
@@ -331,11 +342,16 @@ def _flat(metadata: tuple[Any, ...]) -> Iterator[Any]:
 
 def _union(members: tuple[Any, ...]) -> str:
     bare = {_bare(member) for member in members}
-    words = [type_of(member) for member in members if _bare(member) not in (Linear, Piecewise)]
+    words = [type_of(member) for member in members if _bare(member) not in _SCHEDULES]
     if Linear in bare:
         words.append("[schedule](#schedules)")
+    if Measured in bare:
+        words.append("[measured](#measured-schedules)")
     separator = ", or " if any(", >" in word for word in words) else " or "
     return separator.join(dict.fromkeys(words))
+
+
+_SCHEDULES = (Linear, Piecewise, Measured)
 
 
 def _bare(annotation: Any) -> Any:

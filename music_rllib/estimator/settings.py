@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from music_rllib.schedules import Schedule, bounded
+from music_rllib.schedules import AdaptiveSchedule, bounded
 
 __all__ = ["MusicSettings"]
 
@@ -18,7 +18,7 @@ class MusicSettings(BaseModel):
 
     estimator: Literal["none", "trained", "frozen"] = "none"
     """No mutual information; an estimator trained along; or one that was handed over, unchanged."""
-    mi_reward_weight: Annotated[Schedule, bounded(">= 0", lambda w: w >= 0)] = 0.0
+    mi_reward_weight: Annotated[AdaptiveSchedule, bounded(">= 0", lambda w: w >= 0)] = 0.0
     """Weight of the intrinsic reward in the reward of a minibatch."""
     task_reward: bool = True
     """Whether the environment's reward counts."""

@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from music_rllib.envs.registry import Task
 from music_rllib.estimator.settings import MusicSettings
 from music_rllib.replay.settings import ReplaySettings
+from music_rllib.schedules import check_measurable
 from music_rllib.tac.settings import TACSettings
 
 __all__ = [
@@ -171,6 +172,16 @@ class RunSettings(_Frozen):
                 f"task must have agent_indices and surrounding_indices for {self.variant}, "
                 f"got {self.task.name!r}, which has none"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _followed_is_measured(self) -> Self:
+        adaptive = {
+            "tac.entropic_index": self.tac.entropic_index,
+            "music.mi_reward_weight": self.music.mi_reward_weight,
+        }
+        success, entropy = self.task.success_key is not None, self.tac.policy == "stochastic"
+        check_measurable(adaptive, success=success, entropy=entropy)
         return self
 
     @model_validator(mode="after")

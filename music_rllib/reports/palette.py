@@ -105,7 +105,7 @@ def styles_by_stage(conditions: tuple[Condition, ...]) -> dict[Condition, Style]
 
 def _number(entropic_index: str) -> float | None:
     try:
-        return float(entropic_index.split(" (")[0].rpartition(" ")[2])
+        return float(entropic_index.split(" (")[0].split(" by ")[0].rpartition(" ")[2])
     except ValueError:
         return None
 

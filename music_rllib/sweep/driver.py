@@ -18,7 +18,7 @@ from music_rllib.experiment.model import SweepConfig
 from music_rllib.experiment.plan import Node, make_plan
 from music_rllib.experiment.remarks import remarks
 from music_rllib.sweep import records
-from music_rllib.sweep.alpha_view import alpha_rows, alpha_table
+from music_rllib.sweep.alpha_view import adaptive_rows, adaptive_text, alpha_rows, alpha_table
 from music_rllib.sweep.beacon import Beacon
 from music_rllib.sweep.board import Status
 from music_rllib.sweep.changes import changes_since, check_begun, keep_settings
@@ -268,6 +268,8 @@ def _open(console: Console, config: SweepConfig, *, retrain_damaged: bool = Fals
     console.print(plan_view(config, plan, opened.finished))
     if rows := alpha_rows(plan):
         console.print(alpha_table(rows))
+    for row in adaptive_rows(plan):
+        console.print(Text(adaptive_text(row)), soft_wrap=True)
     console.print(Text(f"Storage: {redact(storage)}"), soft_wrap=True)
     for line in filter(None, (remark, *remarks(config), *check_demand(opened))):
         console.print(Text(line, style="yellow"), soft_wrap=True)

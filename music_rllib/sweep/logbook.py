@@ -16,7 +16,7 @@ from music_rllib.experiment.sealed import DamagedError, StorageError
 from music_rllib.experiment.settings import RunSettings
 from music_rllib.experiment.store import NodeStore
 from music_rllib.policy.policy import policy_from_folder
-from music_rllib.schedules import Linear, Piecewise, value_at
+from music_rllib.schedules import Linear, Measured, Piecewise, value_at
 from music_rllib.sweep.listener import Failure, Listener
 from music_rllib.sweep.words import in_words
 from music_rllib.tac.settings import LearnedAlpha, MatchedAlpha, NormalisedAlpha
@@ -30,7 +30,7 @@ __all__ = ["Logbook", "run_info"]
 
 
 def _at_start(
-    value: float | Linear | Piecewise | LearnedAlpha | MatchedAlpha | NormalisedAlpha,
+    value: float | Linear | Piecewise | Measured | LearnedAlpha | MatchedAlpha | NormalisedAlpha,
     run: RunSettings,
 ) -> float:
     if isinstance(value, LearnedAlpha):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from music_rllib.experiment.remarks import remarks
-from music_rllib.sweep.alpha_view import alpha_rows
+from music_rllib.sweep.alpha_view import adaptive_rows, alpha_rows
 from music_rllib.sweep.changes import Changes
 from music_rllib.sweep.session import Sweep, plan_document
 from music_rllib.sweep.tables import search_runs
@@ -45,5 +45,6 @@ def plan_answer(opened: Sweep, changes: Changes | None = None) -> dict[str, Any]
         "searches": searches,
         "remarks": remarks(config),
         "alpha": alpha_rows(opened.plan),
+        "adaptive": adaptive_rows(opened.plan),
         "changes": None if changes is None else str(changes),
     }

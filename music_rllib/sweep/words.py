@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from music_rllib.envs.registry import Task
 from music_rllib.experiment.plan import short
-from music_rllib.schedules import Linear, Piecewise
+from music_rllib.schedules import Linear, Measured, Piecewise
 from music_rllib.tac.settings import LearnedAlpha, MatchedAlpha, NormalisedAlpha
 from music_rllib.tracking import names
 
@@ -42,7 +42,7 @@ def clock(seconds: float | None) -> str:
 
 
 def in_words(
-    value: float | Linear | Piecewise | LearnedAlpha | MatchedAlpha | NormalisedAlpha,
+    value: float | Linear | Piecewise | Measured | LearnedAlpha | MatchedAlpha | NormalisedAlpha,
 ) -> str:
     """A constant, a schedule or a coefficient in a few characters: `1.5`, `1 to 2`, `learned`."""
     match value:
@@ -52,6 +52,9 @@ def in_words(
             return f"{in_words(value.value)} normalised"
         case Linear():
             return f"{value.start:g} to {value.end:g}"
+        case Measured():
+            quantity = value.follows.replace("_", " ")
+            return f"{' to '.join(f'{point:g}' for _, point in value.points)} by {quantity}"
         case Piecewise():
             return " to ".join(f"{point:g}" for _, point in value.points)
         case LearnedAlpha(target_shannon=float(nats)):

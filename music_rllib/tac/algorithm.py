@@ -38,7 +38,7 @@ from music_rllib.envs.numbers import BadNumberError
 from music_rllib.replay.buffer import TrajectoryReplay, Transitions
 from music_rllib.schedules import value_at
 from music_rllib.tac.config import TACConfig
-from music_rllib.tac.env_runner import Episode, TrajectoryEnvRunner, seed_or_entropy
+from music_rllib.tac.env_runner import SUCCESS_LAST, Episode, TrajectoryEnvRunner, seed_or_entropy
 from music_rllib.tac.module import ESTIMATOR_MODULE
 from music_rllib.tac.normaliser import in_this_form
 
@@ -141,6 +141,17 @@ class TAC(Algorithm):
             self.env_runner_group.sync_weights(
                 from_worker_or_learner_group=self.learner_group, inference_only=True
             )
+
+    def evaluate(self, *args: Any, **kwargs: Any) -> Any:
+        """As RLlib's; what follows the success rate takes it from here."""
+        results = super().evaluate(*args, **kwargs)
+        success = results.get(ENV_RUNNER_RESULTS, {}).get(SUCCESS_LAST)
+        if success is not None:
+            rate, env_steps = float(success), self.env_steps
+            self.learner_group.foreach_learner(
+                lambda learner: learner.observe_measured("success_rate", rate, env_steps)
+            )
+        return results
 
     def _collect(self, *, random_actions: bool) -> list[Episode]:
         """One episode in every sub-environment."""

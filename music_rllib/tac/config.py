@@ -17,7 +17,7 @@ from music_rllib._quiet import quiet_third_parties
 from music_rllib.envs.registry import BUILT_IN_TASKS, Indices, check_split
 from music_rllib.estimator.settings import MusicSettings
 from music_rllib.replay.settings import ReplaySettings
-from music_rllib.schedules import Linear
+from music_rllib.schedules import Linear, Measured, check_measurable
 from music_rllib.tac.module import ESTIMATOR_MODULE, EstimatorModule, TACModule
 from music_rllib.tac.returns import Range, cut_off
 from music_rllib.tac.settings import TACSettings
@@ -229,6 +229,7 @@ class TACConfig(AlgorithmConfig):
             self._value_error(
                 "a linear schedule needs the budget: set training(total_env_steps=...)"
             )
+        self._check_adaptive(tac, music)
         if music.estimator != "none" and not (self.agent_indices and self.surrounding_indices):
             self._value_error(
                 "MUSIC needs to know the agent's and the surrounding state: set "
@@ -238,6 +239,21 @@ class TACConfig(AlgorithmConfig):
         task = self._rewards()
         if task is not None and (remark := cut_off(tac, music, task)):
             warnings.warn(str(remark), stacklevel=2)
+
+    def _check_adaptive(self, tac: TACSettings, music: MusicSettings) -> None:
+        adaptive = {
+            "entropic_index": tac.entropic_index,
+            "music_mi_reward_weight": music.mi_reward_weight,
+        }
+        success, entropy = self.success_key is not None, tac.policy == "stochastic"
+        check_measurable(adaptive, success=success, entropy=entropy)
+        for name, value in adaptive.items():
+            followed = isinstance(value, Measured) and value.follows == "success_rate"
+            if followed and not self.evaluation_interval:
+                self._value_error(
+                    f"{name}.follows: success_rate needs evaluations: set "
+                    "evaluation(evaluation_interval=...)"
+                )
 
     def _rewards(self) -> Range | None:
         """The task's, a step: as it was set, or a built-in environment's; None: not known."""
@@ -294,7 +310,10 @@ _CHECKS: dict[str, TypeAdapter[Any]] = {
 } | {name: TypeAdapter(Indices) for name in ("agent_indices", "surrounding_indices")}
 """The rule of each field by itself; rules between fields are checked by `validate()`."""
 _KINDS = frozenset(
-    {"constant", "linear", "piecewise", "scheduled", "learned", "policy", "gaussian_noise"}
+    {
+        *("constant", "linear", "piecewise", "measured", "scheduled", "learned"),
+        *("policy", "gaussian_noise"),
+    }
 )
 """Members of unions, which pydantic puts into an error's place."""
 _T = TypeVar("_T")

@@ -33,7 +33,7 @@ from music_rllib._allocator import keep_freed_memory
 from music_rllib._quiet import quiet_third_parties
 from music_rllib.mutual_information import time_permutations
 from music_rllib.replay.buffer import Trajectory
-from music_rllib.schedules import value_at
+from music_rllib.schedules import Quantity
 from music_rllib.tac import diagnostics, losses
 from music_rllib.tac.forward import Bootstrap, TACForward
 from music_rllib.tac.graphs import CapturedUpdate, CudaRecorder
@@ -43,7 +43,8 @@ from music_rllib.tac.module import ESTIMATOR_MODULE, EstimatorModule, TACModule,
 from music_rllib.tac.normaliser import RunningNormaliser
 from music_rllib.tac.optimizer import FusedAdam
 from music_rllib.tac.precision import check_precision
-from music_rllib.tac.settings import LearnedAlpha, TACSettings, alpha_at
+from music_rllib.tac.scheduled import ScheduledSettings
+from music_rllib.tac.settings import LearnedAlpha, TACSettings
 from music_rllib.tracking import names
 from music_rllib.tsallis import ln_q_of_policy
 
@@ -112,7 +113,12 @@ class TACLearner(TorchLearner):
         self._observed: dict[str, Tensor] = {}
         self._names_of_losses: list[str] = []
         self._td_errors: Tensor | None = None
-        self._set_schedules(0)
+        self._now = ScheduledSettings(
+            self._settings,
+            self._music,
+            self.config.total_env_steps or 0,
+            self._policy_module.action_size,
+        )
         self._target_entropy = self._resolve_target_entropy()
         pairs = self._policy_module.get_target_network_pairs()
         self._online: list[Tensor] = [p for online, _ in pairs for p in online.parameters()]
@@ -181,26 +187,19 @@ class TACLearner(TorchLearner):
             return float(getattr(alpha, "target_entropy", 0.0))
         # S_q of a density of e per dimension: -1 nat each at q = 1, as SAC has it.
         ones = torch.ones(1, self._policy_module.action_size)
-        q, form = self._entropic_index, self._settings.entropy_form
+        q, form = self._now.entropic_index, self._settings.entropy_form
         return -float(ln_q_of_policy(ones, q, form))
 
     # -- the update loop ------------------------------------------------------------------
 
     def before_gradient_based_update(self, *, timesteps: dict[str, Any]) -> None:
         super().before_gradient_based_update(timesteps=timesteps)
-        self._set_schedules(int(timesteps.get(NUM_ENV_STEPS_SAMPLED_LIFETIME, 0)))
+        self._now.advance(int(timesteps.get(NUM_ENV_STEPS_SAMPLED_LIFETIME, 0)))
+        self._target_entropy = self._resolve_target_entropy()
 
-    def _set_schedules(self, env_steps: int) -> None:
-        total = self.config.total_env_steps or 0
-        settings = self._settings
-        self._entropic_index = value_at(settings.entropic_index, env_steps, total)
-        self._mi_reward_weight = value_at(self._music.mi_reward_weight, env_steps, total)
-        if not isinstance(settings.alpha, LearnedAlpha):
-            self._alpha: float = alpha_at(
-                settings, env_steps, total, self._policy_module.action_size
-            )
-        else:
-            self._target_entropy = self._resolve_target_entropy()
+    def observe_measured(self, quantity: Quantity, measured: float, env_steps: int) -> None:
+        """Takes what was measured after `env_steps`; settings follow it from the next update on."""
+        self._now.observe(quantity, measured, env_steps)
 
     def update(
         self,
@@ -290,12 +289,13 @@ class TACLearner(TorchLearner):
             yield minibatch, self._constants(minibatch, swapped=swapped[k])
 
     def _constants(self, minibatch: FlatMinibatch, *, swapped: bool) -> _Constants:
-        alpha = self._alpha if not isinstance(self._settings.alpha, LearnedAlpha) else None
+        alpha = None if isinstance(self._settings.alpha, LearnedAlpha) else self._now.alpha
         shape = None
         if (ESTIMATOR_MODULE, Columns.OBS) in minibatch:
             frames = minibatch[ESTIMATOR_MODULE, Columns.OBS].shape[1]
             shape = (frames, (ESTIMATOR_MODULE, "inside") in minibatch)
-        return _Constants(self._entropic_index, self._mi_reward_weight, alpha, swapped, shape)
+        now = self._now
+        return _Constants(now.entropic_index, now.mi_reward_weight, alpha, swapped, shape)
 
     def _policy_noise(self, actions: Tensor) -> dict[str, Tensor]:
         """Standard normal numbers for the policy's actions, and the next ones where needed."""
@@ -330,7 +330,7 @@ class TACLearner(TorchLearner):
         return {**minibatch, DEFAULT_MODULE_ID: {**policy, Columns.REWARDS: reward}}
 
     def _total_reward(self, task: Tensor, intrinsic: Tensor) -> Tensor:
-        weighted = self._mi_reward_weight * intrinsic
+        weighted = self._now.mi_reward_weight * intrinsic
         return task + weighted if self._music.task_reward else weighted
 
     # -- losses ---------------------------------------------------------------------------
@@ -390,7 +390,7 @@ class TACLearner(TorchLearner):
             batch,
             target=loss.target,
             value_target=loss.value_target,
-            entropic_index=self._entropic_index,
+            entropic_index=self._now.entropic_index,
             alpha=self._current_alpha(),
         )
         self._adam["networks"].step_flat(direct.flat)
@@ -416,7 +416,7 @@ class TACLearner(TorchLearner):
         """[B, A] -> [B] ln_q of the policy's density; 0 for a deterministic policy."""
         if log_density is None:
             return torch.zeros((), device=self._device)
-        return ln_q_of_policy(log_density, self._entropic_index, self._settings.entropy_form)
+        return ln_q_of_policy(log_density, self._now.entropic_index, self._settings.entropy_form)
 
     def _soft_value(self, bootstrap: Bootstrap) -> Tensor:
         """[B] value of the states, the policy's entropy there included."""
@@ -427,7 +427,7 @@ class TACLearner(TorchLearner):
     def _current_alpha(self) -> Tensor | float:
         if isinstance(self._settings.alpha, LearnedAlpha):
             return self._policy_module.log_alpha.detach().exp()
-        return self._alpha
+        return self._now.alpha
 
     # -- metrics --------------------------------------------------------------------------
 
@@ -455,15 +455,16 @@ class TACLearner(TorchLearner):
         keys, table = list(metrics), torch.stack([m.float() for m in metrics.values()], dim=1)
         self._check_finite(keys, table)
         log = self.metrics.log_value
-        for key, mean in zip(keys, table.mean(0).tolist(), strict=True):
+        means = dict(zip(keys, table.mean(0).tolist(), strict=True))
+        for key, mean in {**means, **self._now.metrics()}.items():
             log((DEFAULT_MODULE_ID, key), mean, window=1)
         if (held_out := self._held_out.take()) is not None:
             for key, value in zip((names.HELD_OUT_BOUND, HELD_OUT_STEPS), held_out, strict=True):
                 log((DEFAULT_MODULE_ID, key), value, window=1)
-        log((DEFAULT_MODULE_ID, names.ENTROPIC_INDEX), self._entropic_index, window=1)
-        log((DEFAULT_MODULE_ID, names.MI_REWARD_WEIGHT), self._mi_reward_weight, window=1)
         log((DEFAULT_MODULE_ID, names.ALPHA), float(self._current_alpha()), window=1)
         log((ALL_MODULES, GRAD_UPDATES), self._grad_updates, window=1)
+        if names.SHANNON_ENTROPY in means:
+            self._now.observe("shannon_entropy", means[names.SHANNON_ENTROPY])
 
     def _diagnosed(self, observed: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Metrics of K updates, [K] each, from what was observed of them, [K, ...] each."""
@@ -475,7 +476,7 @@ class TACLearner(TorchLearner):
             metrics |= diagnostics.of_policy(
                 observed["log_density"],
                 observed["log_std"],
-                self._entropic_index,
+                self._now.entropic_index,
                 settings.entropy_form,
                 settings.log_std_bounds,
             )
@@ -493,9 +494,10 @@ class TACLearner(TorchLearner):
         step = int(bad.any(1).nonzero()[0])
         culprits = [key for key, is_bad in zip(keys, bad[step].tolist(), strict=True) if is_bad]
         update = self._grad_updates - len(table) + step + 1
+        q, alpha = self._now.entropic_index, float(self._current_alpha())
         raise NonFiniteLossError(
             f"{', '.join(culprits)} not finite at gradient update {update} "
-            f"(entropic_index {self._entropic_index:g}, alpha {float(self._current_alpha()):g}). "
+            f"(entropic_index {q:g}, alpha {alpha:g}). "
             "The run stops here; its last checkpoint is good. Try a smaller tac.lr or tac.alpha, "
             "or an entropic_index nearer to 1."
         )
@@ -572,6 +574,7 @@ class TACLearner(TorchLearner):
             "generator": self._generator.get_state().numpy(),
             GRAD_UPDATES: self._grad_updates,
             "held_out": self._held_out.state(),
+            "scheduled": self._now.state(),
         }
         return state
 
@@ -588,3 +591,5 @@ class TACLearner(TorchLearner):
             self._generator.set_state(torch.from_numpy(state["tac"]["generator"].copy()))
             self._grad_updates = int(state["tac"][GRAD_UPDATES])
             self._held_out.load_state(state["tac"]["held_out"])
+            if "scheduled" in state["tac"]:  # older states have none
+                self._now.load_state(state["tac"]["scheduled"])

@@ -15,7 +15,7 @@ from pydantic import (
 )
 
 from music_rllib.entropy_scale import matched_alpha, normalised_alpha
-from music_rllib.schedules import Schedule, bounded, extremes, value_at
+from music_rllib.schedules import AdaptiveSchedule, Schedule, bounded, extremes, value_at
 
 __all__ = [
     "Alpha",
@@ -135,10 +135,13 @@ Alpha = Annotated[
 """Entropy coefficient: a constant or a schedule, as it is or scaled for each q, or learned."""
 
 
-def alpha_at(settings: TACSettings, env_steps: int, total_env_steps: int, actions: int) -> float:
-    """The entropy coefficient after `env_steps`, at the q of that time; a learned one's first.
+def alpha_at(
+    settings: TACSettings, q: float, env_steps: int, total_env_steps: int, actions: int
+) -> float:
+    """The entropy coefficient after `env_steps`; a learned one's first.
 
     Args:
+        q: entropic index at that time.
         actions: action dimensions of the task; they count for `entropy_form: joint` only.
     """
     alpha = settings.alpha
@@ -147,7 +150,6 @@ def alpha_at(settings: TACSettings, env_steps: int, total_env_steps: int, action
     if not isinstance(alpha, MatchedAlpha | NormalisedAlpha):
         return value_at(alpha, env_steps, total_env_steps)
     value = value_at(alpha.value, env_steps, total_env_steps)
-    q = value_at(settings.entropic_index, env_steps, total_env_steps)
     return alpha.scaled(value, q, actions, settings.entropy_form)
 
 
@@ -165,7 +167,7 @@ Behaviour = Annotated[
 class TACSettings(_Frozen):
     """Settings of the Tsallis actor-critic (paper III-B, Fig. 3)."""
 
-    entropic_index: Annotated[Schedule, bounded("> 0", lambda q: q > 0)] = 1.0
+    entropic_index: Annotated[AdaptiveSchedule, bounded("> 0", lambda q: q > 0)] = 1.0
     """q of ln_q. 1 is SAC, 2 the sparse Tsallis entropy."""
     alpha: Alpha = 0.2
     """Entropy coefficient: a constant, a schedule, `{learned: true, ...}`, or, to compare q at

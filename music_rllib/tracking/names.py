@@ -70,6 +70,14 @@ LOG_STD_AT_BOUND = "bounds/log_std_share"
 ENTROPIC_INDEX = "schedule/entropic_index"
 ALPHA = "schedule/alpha"
 MI_REWARD_WEIGHT = "schedule/mi_reward_weight"
+ENTROPIC_INDEX_FOLLOWS = "schedule/entropic_index_follows"
+MI_REWARD_WEIGHT_FOLLOWS = "schedule/mi_reward_weight_follows"
+FOLLOWED = {
+    ENTROPIC_INDEX: ENTROPIC_INDEX_FOLLOWS,
+    MI_REWARD_WEIGHT: MI_REWARD_WEIGHT_FOLLOWS,
+}
+"""Setting to the success rate, or entropy in nats, that it is a function of: smoothed, and monotone
+where asked."""
 
 
 CLIPPED_TARGETS = "bounds/target_share"
@@ -108,6 +116,8 @@ LEARNER = frozenset(
         ENTROPIC_INDEX,
         ALPHA,
         MI_REWARD_WEIGHT,
+        ENTROPIC_INDEX_FOLLOWS,
+        MI_REWARD_WEIGHT_FOLLOWS,
     }
 )
 """What the Learner logs, beside the entropies of single dimensions."""

@@ -48,7 +48,7 @@ def both_gradients(
         batch,
         target=loss.target,
         value_target=loss.value_target,
-        entropic_index=built._entropic_index,
+        entropic_index=built._now.entropic_index,
         alpha=built._current_alpha(),
     )
     ours = {name: direct.flat.gradient(parameter) for name, parameter in trained.items()}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -173,9 +174,17 @@ def test_a_task_says_from_which_distance_on_something_has_moved() -> None:
 def test_a_cut_run_ends_with_the_numbers_of_an_unbroken_one(
     tmp_path: Path, variant: Variant
 ) -> None:
-    unbroken = job(tmp_path / "a", settings(variant, env_steps=800))
+    """Also where q follows the entropy, and the weight of MUSIC's reward the success rate."""
+    run = settings(variant, env_steps=800)
+    q = {"follows": "shannon_entropy", "points": [[0.0, 1.0], [1.5, 2.0]], "smoothing": 100.0}
+    follows = {"tac": {**run.tac.model_dump(), "entropic_index": q}}
+    if variant == "music-u":
+        weight = {"follows": "success_rate", "points": [[0.0, 1.0], [1.0, 0.0]]}
+        follows["music"] = {**run.music.model_dump(), "mi_reward_weight": weight}
+    run = RunSettings.model_validate({**run.model_dump(), **follows})
+    unbroken = job(tmp_path / "a", run)
     compute(unbroken)
-    cut = job(tmp_path / "b", settings(variant, env_steps=800))
+    cut = job(tmp_path / "b", run)
     assert cut.key == unbroken.key
     assert [result["done"] for result in compute(cut, steps=2)] == [False, False]
     # What it did after its last checkpoint is lost, as after a kill.
@@ -185,6 +194,12 @@ def test_a_cut_run_ends_with_the_numbers_of_an_unbroken_one(
     assert told == [200, 400, 600, 800], "the driver may not have heard of the first ones"
     assert numbers(tmp_path / "b", cut) == numbers(tmp_path / "a", unbroken)
     assert NodeStore(str(tmp_path / "b")).work_folder(cut.key).names() == []
+    rows = [row for row in numbers(tmp_path / "a", unbroken) if names.ENTROPIC_INDEX_FOLLOWS in row]
+    assert len({row[names.ENTROPIC_INDEX] for row in rows}) == len(rows) >= 3
+    for before, row in pairwise(numbers(tmp_path / "a", unbroken)):
+        if variant == "music-u" and names.MI_REWARD_WEIGHT_FOLLOWS in row:
+            assert row[names.MI_REWARD_WEIGHT_FOLLOWS] == before[names.EVAL_SUCCESS]
+            assert row[names.MI_REWARD_WEIGHT] == 1.0 - before[names.EVAL_SUCCESS]
 
 
 def test_the_bound_on_fresh_episodes_is_averaged_by_their_steps_over_a_report() -> None:

@@ -99,13 +99,22 @@ def test_same_seed_gives_bit_identical_metrics_and_weights(music: dict[str, Any]
     assert first[-3]["loss/critics"] > 0
 
 
-@pytest.mark.parametrize("alpha", [0.1, {"learned": True}])
-def test_a_restored_checkpoint_continues_with_the_same_numbers(alpha: Any, tmp_path: Path) -> None:
-    unbroken = build(music=MUSIC_U, alpha=alpha)
+RAMP = {"schedule": "linear", "start": 1.0, "end": 2.0, "begin": 0.0}
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"alpha": 0.1, "entropic_index": RAMP}, {"alpha": {"learned": True}}],
+    ids=["q scheduled", "alpha learned"],
+)
+def test_a_restored_checkpoint_continues_with_the_same_numbers(
+    settings: dict[str, Any], tmp_path: Path
+) -> None:
+    unbroken = build(music=MUSIC_U, **settings)
     fingerprint(unbroken, 2)
     unbroken.save_to_path(tmp_path / "checkpoint")
     expected = fingerprint(unbroken, 2)
-    resumed = build(music=MUSIC_U, alpha=alpha)
+    resumed = build(music=MUSIC_U, **settings)
     resumed.restore_from_path(tmp_path / "checkpoint")
     assert fingerprint(resumed, 2) == expected
     # Also in the process that has gone on since: RLlib's own runners would keep newer weights.
@@ -379,6 +388,12 @@ def test_a_bad_setting_is_refused_where_it_is_made(settings: dict[str, Any], mes
         (
             lambda c: c.training(entropic_index={"schedule": "linear", "start": 1.0, "end": 2.0}),
             "a linear schedule needs the budget",
+        ),
+        (
+            lambda c: c.training(
+                entropic_index={"follows": "success_rate", "points": [[0, 1], [1, 2]]}
+            ),
+            "entropic_index.follows: success_rate needs evaluations",
         ),
     ],
 )

@@ -276,6 +276,25 @@ BAD: list[tuple[Document, str]] = [
         with_stage(0, tac={"log_std_bounds": [1.0, 0.0]}),
         "stages.pretrain.tac.log_std_bounds must be increasing, got 1, 0",
     ),
+    (
+        with_stage(
+            0, tac={"entropic_index": {"follows": "success_rate", "points": [[0, 0], [1, 1]]}}
+        ),
+        "stages.pretrain.tac.entropic_index must be > 0, got 0",
+    ),
+    (
+        with_stage(
+            0,
+            tac={
+                "policy": "deterministic",
+                "alpha": 0.0,
+                "bootstrap": "critics",
+                "behaviour": {"kind": "gaussian_noise"},
+                "entropic_index": {"follows": "shannon_entropy", "points": [[0, 1], [1, 2]]},
+            },
+        ),
+        "stages.pretrain.tac.entropic_index.follows must not be shannon_entropy for policy: determ",
+    ),
     (with_stage(0, music={"goals": "environment"}), 'music.goals must be "zero" for music-u'),
     (with_stage(0, init_from="finetune"), "init_from has no effect with variant music-u"),
     (

@@ -1,15 +1,28 @@
 """Schedules: their values, how they end, and what they refuse."""
 
-from typing import Annotated
+import math
+from typing import Annotated, Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import TypeAdapter, ValidationError
 
-from music_rllib.schedules import Linear, Piecewise, Schedule, bounded, extremes, value_at
+from music_rllib.schedules import (
+    AdaptiveSchedule,
+    Follower,
+    Linear,
+    Measured,
+    Piecewise,
+    Quantity,
+    Schedule,
+    bounded,
+    extremes,
+    value_at,
+)
 
 schedule = TypeAdapter(Schedule)
+adaptive = TypeAdapter(AdaptiveSchedule)
 positive = TypeAdapter(Annotated[Schedule, bounded("> 0", lambda value: value > 0)])
 
 
@@ -39,6 +52,67 @@ def test_a_schedule_stays_between_its_extremes(start: float, end: float, step: i
     assert low - 1e-9 <= value_at(ramp, step, 1000) <= high + 1e-9
 
 
+def follower(follows: Quantity = "success_rate", **settings: object) -> tuple[Measured, Follower]:
+    points = [[0.2, 2.0], [0.6, 1.0], [0.8, 1.5]]
+    made: Any = adaptive.validate_python({"follows": follows, "points": points, **settings})
+    return made, Follower(made)
+
+
+def test_a_measured_value_lies_on_lines_between_its_points() -> None:
+    made, _ = follower()
+    at = [value_at(made, 10**6, 0, rate) for rate in (None, 0.0, 0.2, 0.4, 0.6, 0.7, 1.0)]
+    assert at == pytest.approx([2.0, 2.0, 2.0, 1.5, 1.0, 1.25, 1.5])
+    assert extremes(made) == (1.0, 2.0)
+    of_entropy, _ = follower("shannon_entropy")
+    assert of_entropy.value(None) == 1.5, "before the first update a policy is as random as ever"
+
+
+def test_what_is_measured_is_averaged_by_its_age() -> None:
+    made, one = follower(smoothing=1000.0)
+    one.observe("success_rate", 0.4, 5000)
+    one.observe("shannon_entropy", -9.0, 5500)
+    one.observe("success_rate", 1.0, 6000)
+    kept = math.exp(-1.0)
+    assert one.measured == pytest.approx(0.4 * kept + 1.0 * (1 - kept))
+    resumed = Follower(made)
+    resumed.load_state(one.state())
+    for each in (one, resumed):
+        each.observe("success_rate", 0.1, 7000)
+    assert resumed.measured == one.measured
+
+
+@pytest.mark.parametrize(("follows", "best"), [("success_rate", max), ("shannon_entropy", min)])
+@given(seen=st.lists(st.floats(-3, 3), min_size=1))
+def test_a_monotone_one_never_goes_back(follows: Quantity, best: Any, seen: list[float]) -> None:
+    _, one = follower(follows, monotone=True)
+    for step, measured in enumerate(seen):
+        one.observe(follows, measured, step)
+        one.observe(follows, math.nan, step)
+        assert one.measured == best(seen[: step + 1])
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ({"follows": "return", "points": [[0, 1], [1, 2]]}, "'success_rate' or 'shannon_entropy'"),
+        ({"follows": "success_rate", "points": [[0, 1]]}, "at least 2 items"),
+        (
+            {"follows": "success_rate", "points": [[0.5, 1], [0.5, 2]]},
+            r"must rise strictly in what is measured, got \[0.5, 0.5\]",
+        ),
+        (
+            {"follows": "success_rate", "points": [[20, 2], [90, 1]]},
+            r"points of a success rate must lie in \[0, 1\], got \[20.0, 90.0\]",
+        ),
+        ({"start": 1}, "'schedule: linear', 'schedule: piecewise' or 'follows'"),
+    ],
+)
+def test_bad_measured_ones_give_exactly_one_error(value: object, message: str) -> None:
+    with pytest.raises(ValidationError, match=message) as caught:
+        adaptive.validate_python(value)
+    assert caught.value.error_count() == 1
+
+
 @pytest.mark.parametrize(
     ("value", "message"),
     [
@@ -49,6 +123,10 @@ def test_a_schedule_stays_between_its_extremes(start: float, end: float, step: i
         (
             {"schedule": "linear", "start": 1, "end": 2, "begin": 0.9, "finish": 0.1},
             "begin must be",
+        ),
+        (
+            {"follows": "success_rate", "points": [[0, 1], [1, 2]]},
+            "must be a number, or have 'schedule: linear'",
         ),
         ({"schedule": "piecewise", "points": [[5, 1.0]]}, "must begin at env step 0, got 5"),
         ({"schedule": "piecewise", "points": [[0, 1.0], [0, 2.0]]}, "strictly increasing"),

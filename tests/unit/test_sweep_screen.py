@@ -14,8 +14,9 @@ from music_rllib.experiment.config import load_sweep
 from music_rllib.experiment.model import SweepConfig
 from music_rllib.experiment.plan import Plan, make_plan
 from music_rllib.experiment.result import Report, RunResult
+from music_rllib.reports.palette import colour_of
 from music_rllib.schedules import Linear, Piecewise
-from music_rllib.sweep.alpha_view import alpha_rows, alpha_table
+from music_rllib.sweep.alpha_view import adaptive_rows, adaptive_text, alpha_rows, alpha_table
 from music_rllib.sweep.board import Board
 from music_rllib.sweep.display import Display
 from music_rllib.sweep.listener import Failure
@@ -121,6 +122,22 @@ def test_the_plan_shows_what_a_control_makes_of_alpha_at_each_q(tmp_path: Path) 
     console, text = screen()
     console.print(alpha_table(rows))
     assert "0.05 matched at 0.1" in text.getvalue()
+
+
+def test_the_plan_says_what_follows_what_is_measured(tmp_path: Path) -> None:
+    q = {"follows": "success_rate", "points": [[0.2, 2.0], [0.9, 1.0]], "monotone": True}
+    alpha = {"value": 0.05, "matched_width": 0.1}
+    stage = {"name": "her", "variant": "tac", "grid": {"tac.entropic_index": [q, 1.0]}}
+    path = tmp_path / "s.yaml"
+    document = DOCUMENT | {"stages": [stage | {"tac": {"alpha": alpha}}]}
+    path.write_text(yaml.safe_dump(document, sort_keys=False))
+    plan = make_plan(load_sweep(path))
+    assert [adaptive_text(row) for row in adaptive_rows(plan)] == [
+        "her: tac.entropic_index follows the success rate: 2 at 0.2, 1 at 0.9; never goes back"
+    ]
+    row = alpha_rows(plan)[1]
+    assert (row["q"], row["q_at_start"], row["at_end"]) == ("2 to 1 by success rate", 2.0, 0.05)
+    assert colour_of(row["q"]) == colour_of("1"), "it has that of its last value"
 
 
 def test_results_have_a_row_per_run_whatever_became_of_it(plan: Plan) -> None:

@@ -1,0 +1,87 @@
+"""What q, alpha and the weight of the intrinsic reward are now."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from music_rllib.estimator.settings import MusicSettings
+from music_rllib.schedules import Follower, Linear, Measured, Piecewise, Quantity, value_at
+from music_rllib.tac.settings import TACSettings, alpha_at
+from music_rllib.tracking import names
+
+__all__ = ["ScheduledSettings"]
+
+
+class ScheduledSettings:
+    """Settings that change over a run, as of the last `advance`.
+
+    Args:
+        tac: has q and alpha.
+        music: has the weight.
+        total_env_steps: the run's budget, 0 where it is not known.
+        actions: action dimensions.
+    """
+
+    entropic_index: float
+    mi_reward_weight: float
+    alpha: float
+    """At this q; without effect where it is learned."""
+
+    def __init__(
+        self, tac: TACSettings, music: MusicSettings, total_env_steps: int, actions: int
+    ) -> None:
+        self._tac, self._total, self._actions = tac, total_env_steps, actions
+        self._adaptive: dict[str, float | Linear | Piecewise | Measured] = {
+            names.ENTROPIC_INDEX: tac.entropic_index,
+            names.MI_REWARD_WEIGHT: music.mi_reward_weight,
+        }
+        self._followers = {
+            name: Follower(schedule)
+            for name, schedule in self._adaptive.items()
+            if isinstance(schedule, Measured)
+        }
+        self._set(0, {})
+
+    def advance(self, env_steps: int) -> None:
+        """To the values after `env_steps`, of what has been measured so far."""
+        self._set(env_steps, {name: one.measured for name, one in self._followers.items()})
+
+    def _set(self, env_steps: int, followed: dict[str, float | None]) -> None:
+        self._env_steps, self._followed = env_steps, followed
+        self.entropic_index, self.mi_reward_weight = (
+            value_at(schedule, env_steps, self._total, followed.get(name))
+            for name, schedule in self._adaptive.items()
+        )
+        self.alpha = alpha_at(self._tac, self.entropic_index, env_steps, self._total, self._actions)
+
+    def observe(self, quantity: Quantity, measured: float, env_steps: int | None = None) -> None:
+        """Takes what was measured after `env_steps`, or at the last `advance`."""
+        at = self._env_steps if env_steps is None else env_steps
+        for follower in self._followers.values():
+            follower.observe(quantity, measured, at)
+
+    def metrics(self) -> dict[str, float]:
+        """The values, and what they follow, by their public names; alpha is the Learner's."""
+        values = (self.entropic_index, self.mi_reward_weight)
+        followed = {
+            names.FOLLOWED[name]: measured
+            for name, measured in self._followed.items()
+            if measured is not None
+        }
+        return dict(zip(self._adaptive, values, strict=True)) | followed
+
+    def state(self) -> dict[str, Any]:
+        """For a checkpoint: fresh episodes are diagnosed by the values of the last update."""
+        followers = {name: follower.state() for name, follower in self._followers.items()}
+        return {
+            "env_steps": self._env_steps,
+            "followed": dict(self._followed),
+            "followers": followers,
+        }
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """Goes on from `state`."""
+        self._set(state["env_steps"], dict(state["followed"]))
+        for name, follower in self._followers.items():
+            follower.load_state(state["followers"][name])
