@@ -26,7 +26,13 @@ from music_rllib.experiment.config import load_sweep
 from music_rllib.experiment.plan import make_plan
 from music_rllib.reports.archive import is_archive, read_archive
 from music_rllib.reports.figures import files
-from music_rllib.reports.gallery import Drawing, drawings_of_stages, slug, stage_drawings
+from music_rllib.reports.gallery import (
+    PRIMARY,
+    Drawing,
+    drawings_of_stages,
+    slug,
+    stage_drawings,
+)
 from music_rllib.reports.merge import of_plan
 from music_rllib.reports.searches import search_in_words, search_tables
 from music_rllib.results import statistics as st
@@ -268,7 +274,8 @@ def curves(sweep: Sweep, analysis: StageAnalysis, figures: dict[str, bytes]) -> 
 def stage_curves(sweep: Sweep, figures: dict[str, bytes], stages: Sequence[str]) -> Iterator[str]:
     """The figure of success rates of several stages."""
     for drawing in drawings_of_stages(sweep, _some(sweep, stages)):
-        yield from figure(sweep, drawing, figures)
+        if drawing.title in PRIMARY:
+            yield from figure(sweep, drawing, figures)
 
 
 def figure(sweep: Sweep, drawing: Drawing, figures: dict[str, bytes]) -> Iterator[str]:

@@ -90,6 +90,11 @@ METRICS = (
         axis="success at any step",
         limits=RATE_LIMITS,
     ),
+    Metric(
+        name=names.EVAL_DISPLACEMENT,
+        title="Object displacement",
+        axis="object displacement (m)",
+    ),
     Metric(name=names.MI_BOUND, title="Mutual-information bound", axis="MI bound (nats)"),
     Metric(name=names.MI_REWARD, title="Mutual-information reward", axis="MI reward per step"),
     Metric(name=names.ENTROPY, title="Tsallis entropy of the policy", axis="Tsallis entropy"),

@@ -48,6 +48,8 @@ INFLUENCE = ("Sensitivity", "Importance of settings", "Parallel coordinates")
 CURVES = tuple(metric.title for metric in METRICS)
 PRIMARY = CURVES[:2]
 """Of what tasks are judged by: success, or the return."""
+OF_ALL_STAGES = (*METRICS[:2], *(one for one in METRICS if one.name == names.EVAL_DISPLACEMENT))
+"""What is drawn of all stages together: it shows an effect before the first success, too."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,14 +127,13 @@ def _finals(stage: Stage, title: str, scopes: Sequence[Scope[Condition]]) -> Ite
 
 
 def drawings_of_stages(sweep: Sweep, stages: Sequence[Stage]) -> Iterator[Drawing]:
-    """What all stages that train for the task are judged by, together; none for a single one."""
+    """What all stages that train for the task come to, together; none for a single one."""
     together = side_by_side(stages)
     if together is None:
         return
-    metrics = METRICS[: len(PRIMARY)]
-    found = _all_curves(sweep, together, metrics)
+    found = _all_curves(sweep, together, OF_ALL_STAGES)
     styles = styles_by_stage(together.conditions)
-    for metric in metrics:
+    for metric in OF_ALL_STAGES:
         drawing = _curves(together, metric, found, styles)
         if drawing is not None:
             legend = [(_named_by_stage(condition), style) for condition, style in styles.items()]
