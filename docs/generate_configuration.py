@@ -85,16 +85,29 @@ Settings are laid over each other, later ones winning: what the variant brings a
 `defaults`, the stage, what its `per_task` has for the task, the point of its `grid`. The groups
 `evaluation`, `tac`, `music` and `replay` are merged field by field. Whatever is wrong is reported
 before anything starts, all of it at once, each with file, line, key, rule and value. YAML is read
-by the rules of YAML 1.2 (`1e-3` is a number, `no` is text), keys may not repeat, and unknown keys
-are errors.
+by the rules of YAML 1.2 (`1e-3` is a number, `no` is text), `1e6` is a whole number where one is
+asked for, keys may not repeat, and unknown keys are errors.
 
-[tune_configs/presets](../tune_configs/presets) has `small` (for two cores), `paper`, `music-2021`
-and `tac-2020`; each file says where its numbers come from.
+`preset: small` (for two cores), `paper`, `music-2021` or `tac-2020` takes over the settings of a
+file of [music_rllib/presets](../music_rllib/presets), which says where its numbers come from;
+`music-rllib presets` lists them.
+
+Behind the file, `KEY=VALUE` replaces what it says, with values in YAML:
+
+```sh
+music-rllib run my_sweep.yaml tac.alpha=0.1 seeds=5 env_steps=1e6
+music-rllib plan my_sweep.yaml stages.finetune.grid.tac.entropic_index='[1, 1.25]'
+```
+
+A setting (`tac.alpha`, `env_steps`) then holds in every stage, whatever the file says of it in
+`defaults`, in stages and under `per_task`; `stages.NAME.KEY` changes one stage, and a key of the
+file's top replaces that. What a `grid` or `search` varies can only be replaced there. The sweep's
+folder keeps the configuration with it (`config.json`), so that `resume` needs no repetition.
 """
 
 PRESET_MEANING = (
-    "Settings that lie below `defaults`: a file of `presets/` beside the sweep's, without `.yaml`, "
-    "or any YAML file by its path from there."
+    "Settings that lie below `defaults`, by name: a file of `presets/` beside the sweep's, or one "
+    "of the package's (`music-rllib presets`). Or any YAML file by its path from the sweep's."
 )
 
 SEARCH_TEXT = """\

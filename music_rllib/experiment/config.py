@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from pydantic import ValidationError
@@ -20,9 +22,14 @@ from music_rllib.envs.registry import (
     Task,
     TaskRegistry,
     UnknownTaskError,
-    closest,
 )
-from music_rllib.experiment.layers import LAYER_KEYS, SECTIONS, known_settings
+from music_rllib.experiment.layers import (
+    LAYER_KEYS,
+    SECTIONS,
+    all_settings,
+    for_a_grid,
+    known_settings,
+)
 from music_rllib.experiment.model import (
     RESERVED_NAMES,
     Checkpoint,
@@ -34,6 +41,7 @@ from music_rllib.experiment.model import (
     Stage,
     SweepConfig,
 )
+from music_rllib.experiment.overrides import Override, lay_overrides, parse_overrides
 from music_rllib.experiment.presets import with_preset
 from music_rllib.experiment.problems import (
     ConfigError,
@@ -43,6 +51,7 @@ from music_rllib.experiment.problems import (
     in_words,
     lookup,
     shown,
+    unknown,
 )
 from music_rllib.experiment.problems import Path as KeyPath
 from music_rllib.experiment.settings import Evaluation, RunSettings, Variant
@@ -74,6 +83,7 @@ def load_sweep(
     name: str | None = None,
     storage: str | None = None,
     seeds: str | None = None,
+    overrides: Sequence[str] = (),
 ) -> SweepConfig:
     """Read and validate a sweep.
 
@@ -83,6 +93,7 @@ def load_sweep(
         storage: Replaces the file's `storage`.
         seeds: Replaces the file's `seeds`: how many (the file's first, then the smallest that it
             hasn't), or a list with commas.
+        overrides: `KEY=VALUE` each, laid over the file.
 
     Raises:
         ConfigError: With one line per problem.
@@ -94,15 +105,38 @@ def load_sweep(
     options: dict[str, Any] = {
         key: value for key, value in (("name", name), ("storage", storage)) if value is not None
     }
+    given = parse_overrides(overrides)
+    file, origins = _with_preset_of(file, given)
     document = with_preset(file, _preset_mistakes)
+    document, places = lay_overrides(document, [one for one in given if one.key != "preset"])
+    origins |= places
+    if "seeds" in document:
+        document["seeds"] = _spelt_out(document["seeds"])
     if seeds is not None:
         options["seeds"] = _seeds(seeds, document.get("seeds"))
     document |= options
     findings = Findings()
     config = _resolve(file, document, findings)
     if config is None:
-        raise ConfigError(_lines(findings.problems, file, document, options))
-    return config
+        raise ConfigError(_lines(findings.problems, file, document, options, origins))
+    return replace(config, arguments=tuple(overrides))
+
+
+def _with_preset_of(
+    file: YamlFile, overrides: Iterable[Override]
+) -> tuple[YamlFile, dict[KeyPath, str]]:
+    """The file with the preset of the command line, which others of its arguments lie above."""
+    for one in overrides:
+        if one.key == "preset":
+            return file._replace(data=file.data | {"preset": one.value}), {("preset",): one.key}
+    return file, {}
+
+
+def _spelt_out(seeds: Any) -> Any:
+    """`5` is short for the first five seeds."""
+    if isinstance(seeds, bool) or not isinstance(seeds, int | float):
+        return seeds
+    return list(range(int(seeds))) if 1 <= seeds <= MOST_SEEDS and seeds == int(seeds) else seeds
 
 
 def declared_tasks(path: str | Path) -> tuple[Task, ...]:
@@ -230,9 +264,13 @@ def _registry(document: dict[str, Any], findings: Findings) -> TaskRegistry:
 
 def _header(document: dict[str, Any], findings: Findings) -> Header | None:
     known = {*Header.model_fields, "preset", "environments", "defaults", "stages"}
+    below = {f"defaults.{name}" for name in all_settings()}
     for key in document.keys() - known:
-        findings.add((key,), f"is not a known setting{closest(key, known)}")
+        findings.add((key,), unknown(key, (*known, *sorted(below))))
     values = {key: value for key, value in document.items() if key in Header.model_fields}
+    if isinstance(values.get("seeds"), int | float):  # else it was spelt out
+        rule = f"must be a list like [0, 1], or how many (1 to {MOST_SEEDS:,})"
+        findings.add(("seeds",), f"{rule}, got {shown(values.pop('seeds'))}")
     header = findings.validate(Header, values, ())
     if header and header.name in RESERVED_NAMES:
         findings.add(("name",), f"must not be {header.name!r}, which the storage uses itself")
@@ -252,7 +290,7 @@ def _defaults(document: dict[str, Any], findings: Findings) -> dict[str, Any]:
         return {}
     for key, value in defaults.items():
         if key not in LAYER_KEYS:
-            findings.add(("defaults", key), f"is not a known setting{closest(key, LAYER_KEYS)}")
+            findings.add(("defaults", key), unknown(key, all_settings()))
         elif not (key in SECTIONS and value is None):
             _check_fields(key, value, findings)
     return defaults
@@ -266,7 +304,8 @@ def _check_fields(key: str, value: Any, findings: Findings) -> None:
     except ValidationError as error:
         for found in in_words(error, value, lambda at: known_settings((key, *at))):
             if found.path or not isinstance(value, dict):
-                findings.add(("defaults", key, *found.path), found.rule)
+                rule = for_a_grid(found.rule, (key, *found.path), {key: value})
+                findings.add(("defaults", key, *found.path), rule)
 
 
 def _tasks(
@@ -300,19 +339,54 @@ def _raw_stages(document: dict[str, Any], findings: Findings) -> list[tuple[int,
 
 
 def _lines(
-    problems: Iterable[Problem], file: YamlFile, document: Any, options: Mapping[str, Any]
+    problems: Iterable[Problem],
+    file: YamlFile,
+    document: Any,
+    options: Mapping[str, Any],
+    origins: Mapping[KeyPath, str] = MappingProxyType({}),
 ) -> list[str]:
-    """One line per different problem, in the order of the file."""
+    """One line per different mistake, in the order of the file, those of the command line first."""
 
     def line(problem: Problem) -> str:
         if problem.path and problem.path[0] in options:
             return f"--{problem.path[0]} {problem.rule}"
-        key = _dotted(problem.path, document)
+        place, key = file.place(problem.path), _dotted(problem.path, document)
+        for length in range(len(problem.path), 0, -1):
+            if problem.path[:length] in origins:
+                place, key = "command line", origins[problem.path[:length]]
+                key += "".join(
+                    f"[{part}]" if isinstance(part, int) else f".{part}"
+                    for part in problem.path[length:]
+                )
+                break
+        else:
+            inside = (path[: len(problem.path)] for path in origins)
+            if problem.path not in file.lines and problem.path in inside:
+                place = "command line"
         separator = " " if problem.rule.startswith(("must ", "is ", "has ", "needs ")) else ": "
-        return f"{file.place(problem.path)}: {key}{separator if key else ''}{problem.rule}"
+        return f"{place}: {key}{separator if key else ''}{problem.rule}"
 
-    in_order = sorted(problems, key=lambda problem: file.line(problem.path) or 0)
+    in_order = sorted(_merged(problems), key=lambda problem: file.line(problem.path) or 0)
     return list(dict.fromkeys(line(problem) for problem in in_order))
+
+
+def _merged(problems: Iterable[Problem]) -> list[Problem]:
+    """The values of one list in a grid that break the same rule are one mistake."""
+    groups: dict[tuple[KeyPath, str], list[Problem]] = {}
+    for problem in dict.fromkeys(problems):
+        path, rule = problem.path, problem.rule
+        if len(path) > 3 and path[2] == "grid" and isinstance(path[-1], int):
+            path, rule = path[:-1], rule.partition(", got ")[0]
+        groups.setdefault((path, rule), []).append(problem)
+    return [
+        group[0] if len(group) == 1 else Problem(path, rule + _got(group))
+        for (path, rule), group in groups.items()
+    ]
+
+
+def _got(group: Iterable[Problem]) -> str:
+    values = ", ".join(problem.rule.partition(", got ")[2] for problem in group)
+    return f", got {values}" if values.strip(", ") else ""
 
 
 def _dotted(path: KeyPath, document: Any) -> str:

@@ -10,11 +10,19 @@ import copy
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from music_rllib.envs.registry import Task, closest
-from music_rllib.experiment.problems import Path, Problem, known_fields, lookup, shown
+from music_rllib.envs.registry import Task
+from music_rllib.experiment.problems import Path, Problem, known_fields, lookup, shown, unknown
 from music_rllib.experiment.settings import VARIANTS, RunSettings, Variant, contradiction, preset
 
-__all__ = ["LAYER_KEYS", "SECTIONS", "Layers", "known_settings", "merge"]
+__all__ = [
+    "LAYER_KEYS",
+    "SECTIONS",
+    "Layers",
+    "all_settings",
+    "for_a_grid",
+    "known_settings",
+    "merge",
+]
 
 SECTIONS = ("evaluation", "tac", "music", "replay")
 """Groups of settings; layers replace their fields one by one."""
@@ -25,6 +33,19 @@ LAYER_KEYS = ("env_steps", "num_envs", *SECTIONS)
 def known_settings(path: Path) -> Iterable[str]:
     """Names of the settings below `path` of a run, for suggestions."""
     return known_fields(RunSettings, path) if path else LAYER_KEYS
+
+
+def for_a_grid(rule: str, path: Path, settings: Any) -> str:
+    """`rule`, with where to put several values if that is what `settings` have at `path`."""
+    try:
+        value = lookup(settings, path)
+    except LookupError:
+        return rule
+    lists = rule.startswith(("must be a list", "must have", "must not"))
+    if not isinstance(value, list) or len(path) > 2 or lists:
+        return rule
+    key = ".".join(map(str, path))
+    return f"{rule}; values to compare belong in a stage's grid: {{{key}: {shown(value)}}}"
 
 
 class Layers:
@@ -50,7 +71,8 @@ class Layers:
             if path[0] in {"seed", "seeds", "task", "tasks"}:
                 hint = f"; list them under '{path[0].removesuffix('s')}s'"
                 return Problem(origin, f"{path[0]} is never a grid dimension{hint}")
-            return Problem(origin, f"is not a known setting{closest(dotted, _all_settings())}")
+            key = origin[:-1] if isinstance(origin[-1], int) else origin  # not for each value
+            return Problem(key, unknown(dotted, all_settings()))
         try:
             above = lookup(self.data, path[:-1])
         except LookupError:
@@ -78,7 +100,8 @@ class Layers:
         return otherwise + path
 
 
-def _all_settings() -> list[str]:
+def all_settings() -> list[str]:
+    """Every setting of a run, those of sections with dots."""
     fields = [f"{section}.{name}" for section in SECTIONS for name in known_settings((section,))]
     return [*LAYER_KEYS, *fields]
 

@@ -106,7 +106,7 @@ class Header(_Strict):
     tasks: tuple[str, ...] = Field(min_length=1)
     """Built-in tasks or those of `environments`; every trial is run on each."""
     seeds: tuple[Seed, ...] = Field((0,), min_length=1)
-    """Every trial is run with each."""
+    """Every trial is run with each. `5` is short for `[0, 1, 2, 3, 4]`."""
     storage: str = Field("results", min_length=1)
     """Folder or bucket (`s3://`, `gs://`); the sweep's own folder is `<storage>/<name>`."""
     mlflow: MlflowSettings = MlflowSettings()
@@ -217,6 +217,8 @@ class SweepConfig:
     path: Path
     text: str = field(repr=False)
     """The file as it was written."""
+    arguments: tuple[str, ...] = ()
+    """`KEY=VALUE` of the command line, which `document` has and `text` has not."""
     document: Mapping[str, Any] = field(repr=False)
     """Its content as plain data, with the options of the command line."""
     name: str

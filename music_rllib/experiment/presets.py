@@ -3,17 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
+import music_rllib
 from music_rllib.envs.registry import closest
 from music_rllib.experiment.layers import SECTIONS
 from music_rllib.experiment.problems import ConfigError, shown
 from music_rllib.experiment.yaml_file import YamlFile, read_yaml
 
-__all__ = ["FOLDER", "with_preset"]
+__all__ = ["SHIPPED", "shipped_presets", "with_preset"]
 
 FOLDER = "presets"
-"""Beside the sweep's file; `preset: small` is `presets/small.yaml` there."""
+"""Beside the sweep's file: `presets/small.yaml` there comes before the package's `small`."""
+SHIPPED = Path(music_rllib.__file__).with_name(FOLDER)
+"""The package's own presets, one file each."""
+
+
+def shipped_presets() -> dict[str, str]:
+    """Names of the package's presets, and the line that each begins with."""
+    found = {}
+    for path in sorted(SHIPPED.glob("*.yaml")):
+        line = path.read_text(encoding="utf-8").partition("\n")[0]
+        found[path.stem] = line.removeprefix(f"# {path.stem}: ")
+    return found
 
 
 def with_preset(file: YamlFile, check: Callable[[YamlFile], Iterable[str]]) -> dict[str, Any]:
@@ -44,13 +57,15 @@ def _read(file: YamlFile, name: Any) -> YamlFile:
         raise ConfigError([f"{place}: preset must be a preset's name or a file, got {shown(name)}"])
     if name.endswith((".yaml", ".yml")):
         return read_yaml(folder / name)
-    path = folder / FOLDER / f"{name}.yaml"
-    if not path.is_file():
-        known = sorted(found.stem for found in (folder / FOLDER).glob("*.yaml"))
-        choice = f"one of {', '.join(known)}" if known else f"a file in {folder / FOLDER}"
-        hint = closest(name, known)
-        raise ConfigError([f"{place}: preset must be {choice}, got {shown(name)}{hint}"])
-    return read_yaml(path)
+    known = {
+        path.stem: path for place in (SHIPPED, folder / FOLDER) for path in place.glob("*.yaml")
+    }
+    if name not in known:
+        choice = ", ".join(sorted(known))
+        raise ConfigError(
+            [f"{place}: preset must be one of {choice}, got {shown(name)}{closest(name, known)}"]
+        )
+    return read_yaml(known[name])
 
 
 def _laid(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:

@@ -27,6 +27,7 @@ __all__ = [
     "lookup",
     "same",
     "shown",
+    "unknown",
 ]
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -88,6 +89,25 @@ def lookup(document: Any, path: Iterable[str | int]) -> Any:
         else:
             raise LookupError(part)
     return document
+
+
+SYMBOLS = {"q": "entropic_index", "weight": "mi_reward_weight"}
+"""What papers, tables and labels call a setting to its name."""
+
+
+def unknown(key: str, known: Iterable[str]) -> str:
+    """The rule that an unknown key breaks, with what was probably meant.
+
+    Args:
+        key: What was written, with dots or without.
+        known: What could have been, with dots for what lies deeper.
+    """
+    names = list(known)
+    field = key.rpartition(".")[2]
+    field = SYMBOLS.get(field, field)
+    meant = next((name for name in names if field in (name, name.rpartition(".")[2])), None)
+    hint = closest(key, names) if meant is None else f" (did you mean {meant!r}?)"
+    return f"is not a known setting{hint}"
 
 
 def known_fields(model: type[BaseModel], path: Path) -> Iterable[str]:
@@ -183,7 +203,7 @@ _COMPARISONS = {
 def _rule(details: ErrorDetails, path: Path, known: Callable[[Path], Iterable[str]]) -> str:
     kind, context, value = details["type"], details.get("ctx", {}), details["input"]
     if kind == "extra_forbidden":
-        return f"is not a known setting{closest(str(path[-1]), known(path[:-1]))}"
+        return unknown(str(path[-1]), known(path[:-1]))
     if kind == "missing":
         return _FIXED_RULES[kind]
     if kind in _FIXED_RULES:
@@ -222,7 +242,37 @@ def from_json(kind: Any, value: Any) -> Any:
         pydantic.ValidationError: It isn't one.
     """
     # Through JSON, because strict mode takes lists for tuples only from there.
-    return TypeAdapter(kind).validate_json(json.dumps(value), strict=True)
+    adapter = TypeAdapter(kind)
+    try:
+        return adapter.validate_json(json.dumps(value), strict=True)
+    except ValidationError as error:
+        whole = _with_whole_numbers(value, error)
+        if whole is None:
+            raise
+        return adapter.validate_json(json.dumps(whole), strict=True)
+
+
+def _with_whole_numbers(value: Any, error: ValidationError) -> Any:
+    """`value` with integers where it has `1e6` and an integer is asked for; None: it has none."""
+    places = [
+        _without_tags(details["loc"], value, missing=False)
+        for details in error.errors(include_url=False)
+        if details["type"] in {"int_type", "int_from_float"}
+        and isinstance(details["input"], float)
+        and details["input"].is_integer()
+    ]
+    for place in places:
+        value = _replaced(value, place)
+    return value if places else None
+
+
+def _replaced(value: Any, path: Path) -> Any:
+    """A copy of `value` with an integer in place of the number at `path`."""
+    if not path:
+        return int(value)
+    copy: Any = dict(value) if isinstance(value, Mapping) else list(value)
+    copy[path[0]] = _replaced(copy[path[0]], path[1:])
+    return copy
 
 
 class Findings:

@@ -102,7 +102,7 @@ def most_env_steps(search: SearchSettings, points: Sequence[Point]) -> int:
     if "env_steps" in search.space:
         return int(max(search.space["env_steps"].ends()))
     if "env_steps" in search.compare:
-        return max(int(str(value)) for value in search.compare["env_steps"])
+        return max(int(float(str(value))) for value in search.compare["env_steps"])
     return max((run.env_steps for point in points for run in point.runs.values()), default=0)
 
 

@@ -12,7 +12,13 @@ from pydantic import ValidationError
 
 from music_rllib.envs.registry import BUILT_IN_TASKS, Task, closest
 from music_rllib.experiment.handoff import Architecture, HandoffError, open_handoff, read_handoff
-from music_rllib.experiment.layers import LAYER_KEYS, known_settings, merge
+from music_rllib.experiment.layers import (
+    LAYER_KEYS,
+    all_settings,
+    for_a_grid,
+    known_settings,
+    merge,
+)
 from music_rllib.experiment.model import (
     Checkpoint,
     InitFrom,
@@ -27,6 +33,7 @@ from music_rllib.experiment.problems import (
     from_json,
     in_words,
     shown,
+    unknown,
 )
 from music_rllib.experiment.problems import Path as KeyPath
 from music_rllib.experiment.searched import check_search
@@ -128,7 +135,7 @@ def _resolver(
 def _header(raw: dict[str, Any], path: KeyPath, findings: Findings) -> StageHeader | None:
     known = {*StageHeader.model_fields, *LAYER_KEYS}
     for key in raw.keys() - known:
-        findings.add((*path, key), f"is not a known setting{closest(key, known)}")
+        findings.add((*path, key), unknown(key, (*known, *all_settings())))
     values = {key: value for key, value in raw.items() if key in StageHeader.model_fields}
     if isinstance(values.get("init_from"), str):
         values["init_from"] = {"stage": values["init_from"]}
@@ -166,7 +173,7 @@ def _per_task(
         if name not in known:
             findings.add(place, f"is not a task of this stage ({', '.join(known)})")
         for key in settings.keys() - set(LAYER_KEYS):
-            findings.add((*place, key), f"is not a known setting{closest(key, LAYER_KEYS)}")
+            findings.add((*place, key), unknown(key, all_settings()))
     return header.per_task
 
 
@@ -201,7 +208,8 @@ def _resolve_point(
             for found in in_words(error, data, known_settings):
                 # Settings that contradict their variant can't be consistent among themselves.
                 if not (problems and found.path == ("music",)):
-                    findings.add(layers.origin(found.path, path), found.rule)
+                    rule = for_a_grid(found.rule, found.path, data)
+                    findings.add(layers.origin(found.path, path), rule)
     return Point(values={key: value for key, (_, value) in point.items()}, runs=runs)
 
 

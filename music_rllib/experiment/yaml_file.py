@@ -23,7 +23,7 @@ from music_rllib.limits import (
     read_regular,
 )
 
-__all__ = ["YamlFile", "read_yaml"]
+__all__ = ["YamlFile", "read_value", "read_yaml"]
 
 
 class YamlFile(NamedTuple):
@@ -72,6 +72,23 @@ def read_yaml(path: FilePath) -> YamlFile:
     if not isinstance(data, dict):
         raise ConfigError([f"{path.name}: must be a mapping of keys to values at its top"])
     return YamlFile(path, text, data, MappingProxyType(lines))
+
+
+def read_value(text: str) -> Any:
+    """One value by the same rules, as it stands behind a key.
+
+    Raises:
+        ValueError: It is none; says what it must be.
+    """
+    try:
+        loader = _StrictLoader(text[:MOST_YAML_BYTES])
+        root = loader.get_single_node()
+        if root is None:
+            return None
+        _count(root, {})
+        return loader.construct_document(root)
+    except yaml.YAMLError as error:
+        raise ValueError(_complaint(error)) from None
 
 
 def _mark(error: yaml.YAMLError) -> str:

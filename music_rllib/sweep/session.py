@@ -119,7 +119,8 @@ def keep_record(sweep: Sweep) -> None:
     Raises:
         StorageError: The folder can't be written.
     """
-    keep(sweep, "sweep.yaml", redact(sweep.config.text))
+    given = [f"# {argument}  (command line)\n" for argument in sweep.config.arguments]
+    keep(sweep, "sweep.yaml", redact("".join(given) + sweep.config.text))
     keep(sweep, CONFIG, as_json(_configuration(sweep.config)))
     keep(sweep, PLAN, as_json(plan_document(sweep)))
 

@@ -212,7 +212,7 @@ BAD: list[tuple[Document, str]] = [
     (changed(seeds=[0, 0]), "seeds[1] must not repeat, got 0 again"),
     (changed(seeds=[-1]), "seeds[0] must be >= 0, got -1"),
     (changed(seeds=[True]), "seeds[0] must be a whole number, got true"),
-    (changed(seeds=3), "seeds must be a list, got 3"),
+    (changed(seeds="3"), 'seeds must be a list, got "3"'),
     (changed(resources={"num_cpus": 0}), "resources.num_cpus must be > 0, got 0"),
     (
         changed(resources={"num_cpus": 2, "cpus_per_run": 3}),
@@ -221,7 +221,7 @@ BAD: list[tuple[Document, str]] = [
     (changed(mlflow={"tracking_url": "x"}), "(did you mean 'tracking_uri'?)"),
     (changed(environments={"FetchPush": {}}), "environments.FetchPush is a built-in task"),
     (changed(environments={"A": {"env_id": "A-v0"}}), "environments.A.horizon must be given"),
-    (changed(defaults={"env_steps": 6e3}), "env_steps must be a whole number, got 6000.0"),
+    (changed(defaults={"env_steps": 6.5e-1}), "env_steps must be a whole number, got 0.65"),
     (changed(defaults={"seed": 1}), "defaults.seed is not a known setting"),
     (changed(defaults={"tac": 5}), "defaults.tac must be a mapping of keys to values, got 5"),
     (changed(defaults={"tac": {"lr": "fast"}}), 'defaults.tac.lr must be a number, got "fast"'),

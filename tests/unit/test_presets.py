@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from music_rllib.experiment.config import load_sweep
+from music_rllib.experiment.presets import SHIPPED, shipped_presets
 from music_rllib.experiment.problems import ConfigError
 from music_rllib.experiment.remarks import remarks
 from music_rllib.experiment.yaml_file import read_yaml
 from music_rllib.tac.losses import critic_target
 from music_rllib.tsallis import gaussian_entropy, joint_entropy
 
-SHIPPED = Path(__file__).parents[2] / "tune_configs" / "presets"
 SWEEP = """
 name: one
 tasks: [FetchPush]
@@ -56,7 +56,6 @@ def test_hindsight_of_a_preset_does_not_reach_music_u(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("preset", sorted(path.stem for path in SHIPPED.glob("*.yaml")))
 def test_every_shipped_preset_makes_a_sound_sweep(preset: str, tmp_path: Path) -> None:
-    (tmp_path / "presets").symlink_to(SHIPPED)
     config = load_sweep(sweep(tmp_path, preset))
     assert all(point.runs for stage in config.stages for point in stage.points)
 
@@ -64,7 +63,11 @@ def test_every_shipped_preset_makes_a_sound_sweep(preset: str, tmp_path: Path) -
 @pytest.mark.parametrize(
     ("preset", "content", "message"),
     [
-        ("mime", "env_steps: 1000", r"sweep.yaml:4: preset must be one of mine, got .mime."),
+        (
+            "mime",
+            "env_steps: 1000",
+            r"sweep.yaml:4: preset must be one of mine, music-2021, .*did you mean .mine",
+        ),
         ("3", "env_steps: 1000", r"sweep.yaml:4: preset must be a preset's name or a file, got 3"),
         ("other.yaml", None, r"other.yaml: must be an existing file"),
         ("mine", "tac: {entropic_index: -1}", r"mine.yaml:1: tac.entropic_index must be > 0, got"),
@@ -78,7 +81,20 @@ def test_mistakes_are_named_where_they_are(
         load_sweep(sweep(tmp_path, preset, content))
 
 
-SWEEPS = sorted(path for path in SHIPPED.parent.rglob("*.yaml") if path.parent != SHIPPED)
+def test_presets_are_listed_with_what_they_are() -> None:
+    assert shipped_presets()["small"] == "what learned soonest on a 2-core machine."
+    assert all(line.endswith(".") for line in shipped_presets().values())
+
+
+def test_a_preset_of_ones_own_comes_before_the_packages(tmp_path: Path) -> None:
+    path = sweep(tmp_path, "small")
+    assert load_sweep(path).stages[0].points[0].runs["FetchPush"].num_envs == 4
+    (tmp_path / "presets").mkdir()
+    (tmp_path / "presets" / "small.yaml").write_text("num_envs: 7")
+    assert load_sweep(path).stages[0].points[0].runs["FetchPush"].num_envs == 7
+
+
+SWEEPS = sorted((Path(__file__).parents[2] / "tune_configs").rglob("*.yaml"))
 
 
 @pytest.mark.parametrize("path", SWEEPS, ids=lambda path: path.stem)
@@ -88,7 +104,6 @@ def test_every_shipped_sweep_is_sound(path: Path) -> None:
 
 def test_music_2021_learns_from_the_intrinsic_reward_of_music_r(tmp_path: Path) -> None:
     """Targets are iterated to where they end if every step pays -1, and if every step pays -2."""
-    (tmp_path / "presets").symlink_to(SHIPPED)
     finetune = load_sweep(sweep(tmp_path, "music-2021")).stages[1].points[0].runs["FetchPush"].tac
     values = torch.zeros(2, dtype=torch.float64)
     for _ in range(3000):
@@ -99,7 +114,6 @@ def test_music_2021_learns_from_the_intrinsic_reward_of_music_r(tmp_path: Path) 
 
 
 def test_no_shipped_bounds_cut_off_what_can_be_reached(tmp_path: Path) -> None:
-    (tmp_path / "presets").symlink_to(SHIPPED)
     for preset in sorted(path.stem for path in SHIPPED.glob("*.yaml")):
         config = load_sweep(sweep(tmp_path, preset))
         assert remarks(config) == []
