@@ -33,11 +33,12 @@ GROUPS = {
 }
 EXAMPLES = """\
 examples:
-  python -m benchmarks                       the whole table, three quarters of an hour
+  python -m benchmarks                       the whole table, more than an hour
   python -m benchmarks step environment      two groups of it
   python -m benchmarks --repeats 9 step      more turns
 
-Stable-Baselines3 is compared with where it is installed: pip install -e '.[bench]'.
+Stable-Baselines3, SBX and a JAX jit are compared with where they are installed:
+pip install -e '.[bench]'. Targets count by wall and by CPU time; the latter is of all threads.
 """
 
 
@@ -137,22 +138,30 @@ def _described(machine: dict[str, Any]) -> str:
     return ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in machine.items())
 
 
-COLUMNS = ("group", "what", "value", "against", "ratio", "range", "target", "met")
+COLUMNS = (
+    "group", "what", "value", "by CPU", "against", "ratio", "range", "by CPU time", "range of it",
+    "target", "met",
+)  # fmt: skip
 
 
 def cells(row: Row) -> tuple[str, ...]:
     """A row as text, in the order of `COLUMNS`."""
-    spread = "" if row.low is None or row.high is None else f"{row.low:.2f} - {row.high:.2f}"
     return (
         row.group,
         row.what,
         f"{row.value:,.4g} {row.unit}",
+        "" if row.cpu is None else f"{row.cpu:,.4g}",
         row.against,
-        "" if row.ratio is None else f"{row.ratio:.2f}",
-        spread,
+        *_ratio(row.ratio, row.low, row.high),
+        *_ratio(row.cpu_ratio, row.cpu_low, row.cpu_high),
         row.target,
         {True: "yes", False: "NO", None: ""}[row.met],
     )
+
+
+def _ratio(median: float | None, low: float | None, high: float | None) -> tuple[str, str]:
+    spread = "" if low is None or high is None else f"{low:.2f} - {high:.2f}"
+    return "" if median is None else f"{median:.2f}", spread
 
 
 def as_table(rows: list[Row]) -> Table:
@@ -161,7 +170,7 @@ def as_table(rows: list[Row]) -> Table:
 
     table = Table(title="medians over interleaved turns, one thread each")
     for column in COLUMNS:
-        right = column in ("value", "ratio", "range", "target")
+        right = column not in ("group", "what", "against", "met")
         table.add_column(column, justify="right" if right else "left", overflow="fold")
     for row in rows:
         table.add_row(*cells(row))

@@ -12,7 +12,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from benchmarks.measure import Row, seconds
+from benchmarks.measure import Row, taken_by
 from benchmarks.runs import fill, settings
 from benchmarks.sampling import random_trajectory
 from music_rllib.experiment.store import NodeStore, WorkFolder
@@ -52,7 +52,7 @@ def turn(transitions: int) -> tuple[float, ...]:
         later = save(training, work, Path(folder), 2)
         with closing(TrainingRun(settings())) as other, work.newest() as saved:
             assert saved is not None
-            restoring = seconds(partial(other.restore, saved))
+            restoring = taken_by(partial(other.restore, saved)).wall
     return *first, *later, restoring
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import statistics
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -12,7 +11,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 
-from benchmarks.measure import Row, interleaved, ratio_row
+from benchmarks.measure import Row, compared, interleaved, middle, ratio_row
 from music_rllib import TACConfig
 from music_rllib.envs.make import make_env
 from music_rllib.tac.env_runner import TrajectoryEnvRunner
@@ -75,18 +74,15 @@ def rows(repeats: int) -> Iterator[Row]:
         played = runner(count)
         taken = interleaved({"ours": played.sample, "stock": stock}, repeats)
         steps = count * HORIZON
-        rate = steps / statistics.median(taken["ours"])
+        rate, cpu_rate = (steps / seconds for seconds in middle(taken["ours"]))
         what = f"{count} sub-environment" + ("s" if count > 1 else "")
-        faster = [
-            (steps / ours) / (HORIZON / theirs)
-            for ours, theirs in zip(taken["ours"], taken["stock"], strict=True)
-        ]
         yield ratio_row(
-            GROUP, what, rate, "steps/s", against="gymnasium loop (speed)", ratios=faster
-        )
+            GROUP, what, rate, "steps/s", cpu=cpu_rate, against="gymnasium loop (speed)",
+            **compared(taken["stock"], taken["ours"], factor=steps / HORIZON),
+        )  # fmt: skip
         shares = [share_of_physics(played) for _ in range(repeats)]
         yield ratio_row(
-            GROUP, what, rate, "steps/s", against="mj_step alone (speed)", ratios=shares,
-            at_least=0.85 if count == 8 else None,
+            GROUP, what, rate, "steps/s", cpu=cpu_rate, against="mj_step alone (speed)",
+            ratios=shares, at_least=0.85 if count == 8 else None,
         )  # fmt: skip
         played.stop()

@@ -2,16 +2,36 @@
 
 from __future__ import annotations
 
+import resource
 import statistics
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
-__all__ = ["Row", "interleaved", "ratio_row", "seconds", "start_ray", "told_turns"]
+__all__ = [
+    "Row",
+    "Taken",
+    "compared",
+    "interleaved",
+    "middle",
+    "ratio_row",
+    "start_ray",
+    "taken_by",
+    "told_turns",
+]
 
-Turns = dict[str, list[float]]
+
+class Taken(NamedTuple):
+    """Seconds of a turn."""
+
+    wall: float
+    cpu: float
+    """Of the process and of those that it waited for: two threads of a second take two."""
+
+
+Turns = dict[str, list[Taken]]
 
 
 @dataclass(frozen=True)
@@ -30,9 +50,14 @@ class Row:
     low: float | None = None
     high: float | None = None
     """The smallest and the largest ratio of a turn."""
+    cpu: float | None = None
+    """`value` by CPU time, where that was measured: on a shared machine wall time misleads."""
+    cpu_ratio: float | None = None
+    cpu_low: float | None = None
+    cpu_high: float | None = None
     target: str = ""
     met: bool | None = None
-    """Whether the target is met; None where there is none."""
+    """Whether the target is met, by wall and by CPU time; None where there is none."""
 
 
 def start_ray(cpus: int, address: str = "local") -> None:
@@ -45,21 +70,26 @@ def start_ray(cpus: int, address: str = "local") -> None:
     ray.init(address, **quiet)
 
 
-def seconds(turn: Callable[[], object]) -> float:
-    """Wall time of a turn."""
-    begin = time.perf_counter()
+def taken_by(turn: Callable[[], object]) -> Taken:
+    """Seconds of a turn of this process."""
+    wall, cpu = time.perf_counter(), _cpu_seconds()
     turn()
-    return time.perf_counter() - begin
+    return Taken(time.perf_counter() - wall, _cpu_seconds() - cpu)
+
+
+def _cpu_seconds() -> float:
+    used = map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return sum(usage.ru_utime + usage.ru_stime for usage in used)
 
 
 def interleaved(turns: Mapping[str, Callable[[], object]], repeats: int) -> Turns:
-    """Wall times of all turns, in rounds: what disturbs the machine disturbs each alike."""
+    """Times of all turns, in rounds: what disturbs the machine disturbs each alike."""
     for turn in turns.values():
         turn()  # the first one allocates
     taken: Turns = {name: [] for name in turns}
     for _ in range(repeats):
         for name, turn in turns.items():
-            taken[name].append(seconds(turn))
+            taken[name].append(taken_by(turn))
     return taken
 
 
@@ -70,6 +100,20 @@ def told_turns(repeats: int) -> Iterator[int]:
         yield turn
 
 
+def middle(taken: Sequence[Taken]) -> Taken:
+    """Medians of wall and of CPU time."""
+    return Taken(*map(statistics.median, zip(*taken, strict=True)))
+
+
+def compared(over: Sequence[Taken], under: Sequence[Taken], factor: float = 1.0) -> dict[str, Any]:
+    """The ratios of two programs' turns, by wall and CPU time, as `ratio_row` takes them."""
+    pairs = list(zip(over, under, strict=True))
+    return {
+        "ratios": [factor * a.wall / b.wall for a, b in pairs],
+        "cpu_ratios": [factor * a.cpu / b.cpu for a, b in pairs],
+    }
+
+
 def ratio_row(
     group: str,
     what: str,
@@ -78,14 +122,25 @@ def ratio_row(
     *,
     against: str,
     ratios: Sequence[float],
+    cpu: float | None = None,
+    cpu_ratios: Sequence[float] = (),
     at_most: float | None = None,
     at_least: float | None = None,
 ) -> Row:
-    """A row of ratios, one a turn, and a target for their median."""
-    middle = statistics.median(ratios)
+    """A row of ratios, one a turn, and a target for their median, by wall and by CPU time."""
+    medians = [statistics.median(measured) for measured in (ratios, cpu_ratios) if measured]
     target, met = "", None
     if at_most is not None:
-        target, met = f"<= {at_most:g}", middle <= at_most
+        target, met = f"<= {at_most:g}", max(medians) <= at_most
     elif at_least is not None:
-        target, met = f">= {at_least:g}", middle >= at_least
-    return Row(group, what, value, unit, against, middle, min(ratios), max(ratios), target, met)
+        target, met = f">= {at_least:g}", min(medians) >= at_least
+    return Row(
+        group, what, value, unit, against, *_spread(ratios), cpu, *_spread(cpu_ratios), target, met
+    )
+
+
+def _spread(ratios: Sequence[float]) -> tuple[float | None, float | None, float | None]:
+    """Median, smallest and largest."""
+    if not ratios:
+        return None, None, None
+    return statistics.median(ratios), min(ratios), max(ratios)

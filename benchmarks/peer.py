@@ -1,11 +1,13 @@
-"""One training program in a process of its own: `python -m benchmarks.peer NAME`.
+"""One training program in a process of its own: `python -m benchmarks.peer NAME WIDTH RATIO`.
 
-Reads seconds from its input, a line each; trains for at least so long, and answers with a line of
-JSON: the environment steps and the seconds they took.
+WIDTH is that of its three hidden layers, RATIO its updates per environment step, 1 or 0.4. Reads
+seconds from its input, a line each; trains for at least so long, and answers with a line of JSON:
+the environment steps and the seconds they took.
 """
 
 from __future__ import annotations
 
+import functools
 import json
 import sys
 import time
@@ -18,17 +20,19 @@ __all__ = ["PEERS"]
 
 ENV_ID = "FetchPush-v4"
 WARM_UP = 1_000
-HIDDEN = [256, 256, 256]
 BATCH = 256
+ENVIRONMENTS = 4
+"""Sub-environments of the programs that gain by several."""
 
 
-def ours(replay_ratio: float, precision: str = "float32") -> Callable[[], int]:
-    """TAC with HER at q = 1 (SAC), four sub-environments."""
+def ours(width: int, ratio: float, precision: str = "float32") -> Callable[[], int]:
+    """TAC with HER at q = 1 (SAC)."""
     from music_rllib import TACConfig
 
-    config = TACConfig().environment(ENV_ID).env_runners(num_envs_per_env_runner=4)
+    config = TACConfig().environment(ENV_ID)
+    config.env_runners(num_envs_per_env_runner=ENVIRONMENTS)
     config.training(
-        random_steps=WARM_UP, hidden_sizes=HIDDEN, batch_size=BATCH, replay_ratio=replay_ratio,
+        random_steps=WARM_UP, hidden_sizes=[width] * 3, batch_size=BATCH, replay_ratio=ratio,
         precision=precision,
     )  # fmt: skip
     config.replay(hindsight_k=4.0).reporting(min_sample_timesteps_per_iteration=1)
@@ -42,8 +46,8 @@ def ours(replay_ratio: float, precision: str = "float32") -> Callable[[], int]:
     return some_more
 
 
-def rllib_sac(env_steps: int, updates: int, *, plain: bool) -> Callable[[], int]:
-    """RLlib's SAC with so many updates after so many steps, without hindsight (it has none)."""
+def rllib_sac(width: int, ratio: float, *, plain: bool = True) -> Callable[[], int]:
+    """RLlib's SAC, without hindsight (it has none); not `plain`: with its default networks."""
     import gymnasium as gym
     from ray.rllib.algorithms.sac import SACConfig
     from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
@@ -59,6 +63,7 @@ def rllib_sac(env_steps: int, updates: int, *, plain: bool) -> Callable[[], int]
         return gym.wrappers.FlattenObservation(kept)
 
     register_env("flat-push", flat)
+    env_steps, updates = OFTEN[ratio]
     config = SACConfig().environment("flat-push")
     config.env_runners(num_env_runners=0, rollout_fragment_length=env_steps)
     config.training(
@@ -69,7 +74,7 @@ def rllib_sac(env_steps: int, updates: int, *, plain: bool) -> Callable[[], int]
     )
     if plain:
         model = DefaultModelConfig(
-            fcnet_hiddens=HIDDEN, fcnet_activation="relu", head_fcnet_hiddens=[]
+            fcnet_hiddens=[width] * 3, fcnet_activation="relu", head_fcnet_hiddens=[]
         )
         config.rl_module(model_config=model)
     config.reporting(min_sample_timesteps_per_iteration=20, min_time_s_per_iteration=0)
@@ -83,7 +88,7 @@ def rllib_sac(env_steps: int, updates: int, *, plain: bool) -> Callable[[], int]
     return some_more
 
 
-def sb3_sac(train_freq: int, gradient_steps: int) -> Callable[[], int]:
+def sb3_sac(width: int, ratio: float) -> Callable[[], int]:
     """Stable-Baselines3's SAC with its HerReplayBuffer."""
     import gymnasium as gym
     from stable_baselines3 import SAC, HerReplayBuffer
@@ -91,6 +96,7 @@ def sb3_sac(train_freq: int, gradient_steps: int) -> Callable[[], int]:
     from music_rllib.envs.make import make_env
 
     make_env(ENV_ID).close()  # registers the robotics tasks
+    train_freq, gradient_steps = OFTEN[ratio]
     model = SAC(
         "MultiInputPolicy",
         gym.make(ENV_ID),
@@ -101,7 +107,7 @@ def sb3_sac(train_freq: int, gradient_steps: int) -> Callable[[], int]:
         train_freq=train_freq,
         gradient_steps=gradient_steps,
         ent_coef=0.05,
-        policy_kwargs={"net_arch": HIDDEN},
+        policy_kwargs={"net_arch": [width] * 3},
         seed=0,
         device="cpu",
     )
@@ -113,16 +119,51 @@ def sb3_sac(train_freq: int, gradient_steps: int) -> Callable[[], int]:
     return some_more
 
 
-PEERS: dict[str, Callable[[], Callable[[], int]]] = {
-    "ours": lambda: ours(1.0),
-    "ours, ratio 0.4": lambda: ours(0.4),
-    "ours, bf16": lambda: ours(1.0, "bf16"),
-    "RLlib SAC": lambda: rllib_sac(1, 1, plain=False),
-    "RLlib SAC, same networks": lambda: rllib_sac(1, 1, plain=True),
-    "RLlib SAC, ratio 0.4": lambda: rllib_sac(5, 2, plain=False),
-    "RLlib SAC, same networks, ratio 0.4": lambda: rllib_sac(5, 2, plain=True),
-    "SB3 SAC+HER": lambda: sb3_sac(1, 1),
-    "SB3 SAC+HER, ratio 0.4": lambda: sb3_sac(5, 2),
+def sbx_sac(width: int, ratio: float) -> Callable[[], int]:
+    """SBX, which is Stable-Baselines3 in JAX: SAC, with the HerReplayBuffer.
+
+    It compiles all updates of a call into one, so that it gets those of four episodes at once, as
+    ours does.
+    """
+    import gymnasium as gym
+    from sbx import SAC
+    from stable_baselines3 import HerReplayBuffer
+    from stable_baselines3.common.vec_env import DummyVecEnv
+
+    from music_rllib.envs.make import make_env
+
+    make_env(ENV_ID).close()  # registers the robotics tasks
+    steps = ENVIRONMENTS * 50
+    model = SAC(
+        "MultiInputPolicy",
+        DummyVecEnv([functools.partial(gym.make, ENV_ID)] * ENVIRONMENTS),
+        replay_buffer_class=HerReplayBuffer,
+        replay_buffer_kwargs={"n_sampled_goal": 4, "goal_selection_strategy": "future"},
+        batch_size=BATCH,
+        learning_starts=WARM_UP,
+        train_freq=(50, "step"),
+        gradient_steps=round(steps * ratio),
+        ent_coef=0.05,
+        policy_kwargs={"net_arch": [width] * 3},
+        seed=0,
+    )
+
+    def some_more() -> int:
+        model.learn(steps, reset_num_timesteps=False)
+        return int(model.num_timesteps)
+
+    return some_more
+
+
+OFTEN = {1.0: (1, 1), 0.4: (5, 2)}
+"""By replay ratio: updates after so many environment steps, where an update is a call."""
+PEERS: dict[str, Callable[[int, float], Callable[[], int]]] = {
+    "ours": ours,
+    "ours, bf16": functools.partial(ours, precision="bf16"),
+    "RLlib SAC": functools.partial(rllib_sac, plain=False),
+    "RLlib SAC, same networks": rllib_sac,
+    "SB3 SAC+HER": sb3_sac,
+    "SBX SAC+HER": sbx_sac,
 }
 
 
@@ -133,12 +174,13 @@ def main() -> None:
     import torch
 
     torch.set_num_threads(1)
-    if not sys.argv[1].startswith("SB3"):
+    name, width, ratio = sys.argv[1], int(sys.argv[2]), float(sys.argv[3])
+    if not name.startswith("SB"):
         from benchmarks.measure import start_ray
 
         start_ray(1)
     quiet_third_parties()
-    train = PEERS[sys.argv[1]]()
+    train = PEERS[name](width, ratio)
     while (steps := train()) < WARM_UP + 50:
         pass
     print(json.dumps({"ready": steps}), file=answers, flush=True)

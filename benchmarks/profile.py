@@ -17,7 +17,7 @@ examples:
 
 
 def main() -> int:
-    """Samples `benchmarks.peer`, which trains TAC with HER on FetchPush."""
+    """Samples `benchmarks.peer`, which trains TAC with HER on FetchPush, 3 x 128."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.profile",
         description=__doc__,
@@ -42,7 +42,7 @@ def record(py_spy: str, arguments: argparse.Namespace) -> int:
     options = ["--output", str(arguments.output), "--format", arguments.format]
     if arguments.native:
         options.append("--native")
-    training = [sys.executable, "-m", "benchmarks.peer", "ours"]
+    training = [sys.executable, "-m", "benchmarks.peer", "ours", "128", "0.4"]
     finished = subprocess.run(
         [py_spy, "record", *options, "--", *training],
         input=f"{arguments.seconds}\n",

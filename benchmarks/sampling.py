@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.measure import Row, interleaved, ratio_row
+from benchmarks.measure import Row, compared, interleaved, middle, ratio_row
 from music_rllib.replay.buffer import ReplayLayout, Trajectory, TrajectoryReplay
 
 __all__ = ["filled_replay", "random_trajectory", "rows"]
@@ -66,20 +65,19 @@ def rows(repeats: int) -> Iterator[Row]:
     taken = interleaved({f"{kind} {n}": turn for (kind, n), turn in turns.items()}, repeats)
     for kind, n in turns:
         times = taken[f"{kind} {n}"]
-        value = statistics.median(times) / (CALLS * PER_CALL) * 1e3
+        value, cpu = (seconds / (CALLS * PER_CALL) * 1e3 for seconds in middle(times))
         what = f"{kind}, {n:,} trajectories"
         if kind != "MUSIC-p" and n == min(sizes):  # what the others are compared with
-            yield Row(GROUP, what, value, "ms/minibatch")
+            yield Row(GROUP, what, value, "ms/minibatch", cpu=cpu)
             continue
         if kind == "MUSIC-p":
             against, peer, limit = "uniform", taken[f"uniform {n}"], 2.0
         else:
             against, peer, limit = "1,000 trajectories", taken[f"{kind} 1000"], FLAT
-        ratios = [a / b for a, b in zip(times, peer, strict=True)]
         if kind == "HER" and n == max(sizes):
-            yield Row(GROUP, f"{what}: a minibatch", value, "ms", target="<= 0.25",
-                      met=value <= 0.25)  # fmt: skip
+            yield Row(GROUP, f"{what}: a minibatch", value, "ms", cpu=cpu,
+                      target="<= 0.25", met=value <= 0.25)  # fmt: skip
         yield ratio_row(
-            GROUP, what, value, "ms/minibatch", against=f"{against} (time)", ratios=ratios,
-            at_most=limit,
+            GROUP, what, value, "ms/minibatch", cpu=cpu, against=f"{against} (time)",
+            **compared(times, peer), at_most=limit,
         )  # fmt: skip

@@ -1,16 +1,16 @@
-"""One training step (sampling, relabelling, update) against bare torch and the matrix products."""
+"""One training step (sampling, relabelling, update) against its products, bare torch and JAX."""
 
 from __future__ import annotations
 
-import statistics
+import importlib.util
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from typing import Any
 
 import torch
 
-from benchmarks.measure import Row, interleaved, ratio_row
-from benchmarks.raw_torch import HIDDEN, RawUpdate
+from benchmarks.measure import Row, Taken, compared, interleaved, middle, ratio_row
+from benchmarks.raw_torch import RawUpdate
 from benchmarks.runs import fill
 from music_rllib import TACConfig
 from music_rllib.tac.algorithm import TAC
@@ -24,29 +24,32 @@ UPDATES = 50
 ROUNDS = 3
 """Of `repeats`: a turn takes a third of a second, and the machine's memory has slower minutes."""
 BATCH, INPUTS, ACTIONS = 256, 28, 4
+HER: dict[str, Any] = {"hindsight_k": 4.0}
+SMALL: dict[str, Any] = HER | {"hidden_sizes": (128,) * 3}
 VARIANTS: dict[str, dict[str, Any]] = {
     "TAC": {},
-    "TAC, HER": {"hindsight_k": 4.0},
-    "TAC, HER, 1,000,000 transitions": {"hindsight_k": 4.0, "transitions": 10**6},
-    "TAC, HER, frozen estimator": {"hindsight_k": 4.0, "estimator": "frozen"},
-    "TAC, HER, trained estimator": {"hindsight_k": 4.0, "estimator": "trained"},
-    "TAC, HER, by autograd": {"hindsight_k": 4.0, "direct": False},
-    "TAC, HER, 3 x 128": {"hindsight_k": 4.0, "hidden_sizes": (128,) * 3},
-    "TAC, HER, 3 x 128, by autograd": {
-        "hindsight_k": 4.0,
-        "hidden_sizes": (128,) * 3,
-        "direct": False,
-    },
+    "TAC, HER": HER,
+    "TAC, HER, 1,000,000 transitions": HER | {"transitions": 10**6},
+    "TAC, HER, by autograd": HER | {"direct": False},
+    "TAC, HER, 3 x 128": SMALL,
+    "TAC, HER, 3 x 128, by autograd": SMALL | {"direct": False},
+    "TAC, HER, 3 x 128, frozen estimator": SMALL | {"estimator": "frozen"},
+    "TAC, HER, 3 x 128, trained estimator": SMALL | {"estimator": "trained"},
 }
-
-PEERS: dict[str, tuple[str, str, float | None]] = {
-    "TAC, HER, 1,000,000 transitions": ("10,000 transitions", "TAC, HER", 1.05),
-    "TAC, HER, trained estimator": ("TAC, HER", "TAC, HER", 1.35),
-    "TAC, HER, by autograd": ("TAC, HER", "TAC, HER", None),
-    "TAC, HER, 3 x 128": ("by autograd", "TAC, HER, 3 x 128, by autograd", 0.8),
-    "TAC, HER, 3 x 128, by autograd": ("raw torch with 3 x 256", "raw", None),
+PEERS: dict[str, tuple[str, float | None]] = {
+    "TAC": ("raw torch", 1.0),
+    "TAC, HER": ("raw torch", 1.0),
+    "TAC, HER, 1,000,000 transitions": ("TAC, HER", 1.05),
+    "TAC, HER, by autograd": ("TAC, HER", None),
+    "TAC, HER, 3 x 128, by autograd": ("TAC, HER, 3 x 128", None),
+    "TAC, HER, 3 x 128, frozen estimator": ("TAC, HER, 3 x 128", 1.03),
+    "TAC, HER, 3 x 128, trained estimator": ("TAC, HER, 3 x 128", 1.15),
 }
-"""What a variant is compared with in place of raw torch, what that is called, and the target."""
+"""What a variant's time is compared with, and the target."""
+SIZES = {"TAC, HER": 256, "TAC, HER, 3 x 128": 128}
+"""Variants that are held against JAX and against their products, and the width of their layers."""
+OF_PRODUCTS = {128: 1.5, 256: 1.35}
+"""The target for their time as a multiple of their products', by width."""
 
 
 def algorithm(
@@ -104,15 +107,31 @@ def raw_updates(*, bf16: bool = False) -> Callable[[], None]:
 Turn = Callable[[], None]
 
 
-def products(multiply: Callable[[torch.Tensor, torch.Tensor], torch.Tensor]) -> Turn:
-    """A turn of matrix products with the FLOPs of `UPDATES` updates, at the networks' size."""
-    width = HIDDEN[0]
-    left, right = torch.randn(BATCH, width), torch.randn(width, width)
-    count = round(UPDATES * flops(INPUTS, ACTIONS, HIDDEN, BATCH) / (2 * BATCH * width * width))
+def floors(width: int) -> dict[str, Turn]:
+    """Turns of matrix products with the FLOPs of `UPDATES` updates, by library and rows."""
+    libraries: dict[str, Callable[[torch.Tensor, torch.Tensor, torch.Tensor], Any]] = {
+        "torch.mm": lambda left, right, out: torch.mm(left, right, out=out)
+    }
+    if has_onednn():
+        libraries["oneDNN"] = lambda left, right, out: onednn_product(left, right.t())
+    whole = UPDATES * flops(INPUTS, ACTIONS, (width,) * 3, BATCH)
+    return {
+        f"{name}, {rows} x {width} x {width}": _products(multiply, rows, width, whole)
+        for name, multiply in libraries.items()
+        for rows in (BATCH, 2 * BATCH)
+    }
+
+
+def _products(multiply: Callable[..., Any], rows: int, width: int, whole: int) -> Turn:
+    left, right, out = (
+        torch.randn(rows, width),
+        torch.randn(width, width),
+        torch.empty(rows, width),
+    )
 
     def turn() -> None:
-        for _ in range(count):
-            multiply(left, right)
+        for _ in range(round(whole / (2 * rows * width * width))):
+            multiply(left, right, out)
 
     return turn
 
@@ -137,47 +156,63 @@ def flops(inputs: int, actions: int, hidden: Sequence[int], batch: int) -> int:
 
 
 def rows(repeats: int) -> Iterator[Row]:
-    """Against bare torch in the same run, and both against the matrix products.
-
-    Those are at the best rate there is here, `torch.matmul`'s or oneDNN's.
-    """
-    ours = {name: updates(algorithm(**settings)) for name, settings in VARIANTS.items()}
-    floors = {"torch.matmul": products(torch.matmul)}
-    if has_onednn():
-        floors["oneDNN"] = products(onednn_product)
-    turns = {"raw": raw_updates(), **floors, **ours}
+    """Against bare torch, a JAX jit and the products at the best rate found, all in one run."""
+    turns = {name: updates(algorithm(**settings)) for name, settings in VARIANTS.items()}
+    turns["raw torch"] = raw_updates()
+    for width in SIZES.values():
+        turns |= floors(width)
+        if importlib.util.find_spec("jax") is not None:
+            turns[f"JAX {width}"] = _by_jax(width)
     if has_bf16():
-        turns["raw, bf16"] = raw_updates(bf16=True)
+        turns["raw torch, bf16"] = raw_updates(bf16=True)
         turns["TAC, HER, bf16"] = updates(algorithm(hindsight_k=4.0, precision="bf16"))
     taken = interleaved(turns, ROUNDS * repeats)
-    floor = min(floors, key=lambda name: statistics.median(taken[name]))
-    for name in ("raw", "TAC, HER"):
-        ratios = [a / b for a, b in zip(taken[name], taken[floor], strict=True)]
+    for name in SIZES:
+        yield from _against_the_best(name, taken)
+    for name, (peer, limit) in PEERS.items():
+        yield _row(name, taken, peer, f"{peer} (time)", at_most=limit)
+    for name in ("raw torch", "TAC, HER") if has_bf16() else ():
+        wanted = 1.5 if "amx_bf16" in cpu_flags() else None
+        faster = compared(taken[name], taken[f"{name}, bf16"])
+        rate, cpu = _rates(taken[f"{name}, bf16"])
         yield ratio_row(
-            GROUP, name, UPDATES / statistics.median(taken[name]), "updates/s",
-            against=f"its products by {floor} (time)", ratios=ratios, at_most=1.5,
-        )  # fmt: skip
-    for name, times in taken.items():
-        if name == "raw" or name in floors:
-            continue
-        rate = UPDATES / statistics.median(times)
-        if "bf16" in name:
-            name = name.replace(", bf16", "") + ", bf16"
-            without = name.removesuffix(", bf16")
-            ratios = [a / b for a, b in zip(taken[without], times, strict=True)]
-            yield ratio_row(
-                GROUP, name, rate, "updates/s", against="float32 (speed)", ratios=ratios,
-                at_least=1.5 if "amx_bf16" in cpu_flags() else None,
-            )  # fmt: skip
-            continue
-        against, peer, limit = PEERS.get(name, ("raw torch", "raw", 1.12))
-        ratios = [a / b for a, b in zip(times, taken[peer], strict=True)]
-        yield ratio_row(
-            GROUP, name, rate, "updates/s", against=f"{against} (time)", ratios=ratios,
-            at_most=limit,
+            GROUP, f"{name}, bf16", rate, "updates/s", cpu=cpu, against="float32 (speed)",
+            at_least=wanted, **faster,
         )  # fmt: skip
     if torch.cuda.is_available():
         yield from on_gpu(repeats)
+
+
+def _against_the_best(name: str, taken: dict[str, list[Taken]]) -> Iterator[Row]:
+    width = SIZES[name]
+    if f"JAX {width}" in taken:
+        yield _row(name, taken, f"JAX {width}", "a JAX jit of the update alone (time)", at_most=1.1)
+    floors_of_it = [one for one in taken if one.endswith(f"{width} x {width}")]
+    floor = min(floors_of_it, key=lambda one: middle(taken[one]).cpu)
+    limit = OF_PRODUCTS[width]
+    yield _row(name, taken, floor, f"its products at their best, {floor} (time)", at_most=limit)
+
+
+def _row(
+    name: str, taken: dict[str, list[Taken]], peer: str, against: str, *, at_most: float | None
+) -> Row:
+    rate, cpu = _rates(taken[name])
+    return ratio_row(
+        GROUP, name, rate, "updates/s", cpu=cpu,
+        against=against, at_most=at_most, **compared(taken[name], taken[peer]),
+    )  # fmt: skip
+
+
+def _rates(taken: list[Taken]) -> tuple[float, float]:
+    """Updates a second, and a CPU-second."""
+    wall, cpu = middle(taken)
+    return UPDATES / wall, UPDATES / cpu
+
+
+def _by_jax(width: int) -> Turn:
+    from benchmarks.jax_update import jax_updates
+
+    return jax_updates(INPUTS, ACTIONS, (width,) * 3, BATCH, UPDATES, q=1.5, alpha=0.05)
 
 
 def on_gpu(repeats: int) -> Iterator[Row]:
@@ -188,13 +223,15 @@ def on_gpu(repeats: int) -> Iterator[Row]:
             "launched": updates(algorithm(hindsight_k=4.0, batch_size=batch, gpus=1, graphs=False)),
         }
         taken = interleaved({name: _waited_for(turn) for name, turn in turns.items()}, repeats)
-        ratios = [a / b for a, b in zip(taken["launched"], taken["captured"], strict=True)]
-        rate = UPDATES / statistics.median(taken["captured"])
-        yield ratio_row(
-            GROUP, f"TAC, HER, GPU, batch {batch}", rate, "updates/s",
-            against="launched from Python (speed)", ratios=ratios,
+        faster = compared(taken["launched"], taken["captured"])
+        rate, cpu = _rates(taken["captured"])
+        row = ratio_row(
+            GROUP, f"TAC, HER, GPU, batch {batch}", rate, "updates/s", cpu=cpu,
+            against="launched from Python (speed)", **faster,
         )  # fmt: skip
-        share = 100 * (1 - 1 / statistics.median(ratios))
+        yield row
+        assert row.ratio is not None
+        share = 100 * (1 - 1 / row.ratio)
         yield Row(GROUP, f"time that launching takes, batch {batch}", share, "%")
 
 

@@ -2,40 +2,49 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import json
 import os
-import statistics
 import subprocess
 import sys
 from collections.abc import Iterator
 from typing import Any
 
-from benchmarks.measure import Row, ratio_row, told_turns
+import psutil
+
+from benchmarks.measure import Row, Taken, compared, middle, ratio_row, told_turns
 from music_rllib.tac.precision import has_bf16
 
 __all__ = ["rows"]
 
 GROUP = "whole training"
-SECONDS = 12.0
-"""Of a turn. The slowest peer does some 70 environment steps in it."""
-COMPARED = (
-    ("ours", "RLlib SAC", None),
-    ("ours", "RLlib SAC, same networks", 5.0),
-    ("ours", "SB3 SAC+HER", 1.5),
-    ("ours, ratio 0.4", "RLlib SAC, ratio 0.4", None),
-    ("ours, ratio 0.4", "RLlib SAC, same networks, ratio 0.4", None),
-    ("ours, ratio 0.4", "SB3 SAC+HER, ratio 0.4", None),
-    ("ours, bf16", "ours", None),
-)
+SECONDS = 10.0
+"""Of a turn. The slowest peer does some 60 environment steps in it."""
+OTHERS: dict[str, str] = {
+    "RLlib SAC": "ray",
+    "RLlib SAC, same networks": "ray",
+    "SB3 SAC+HER": "stable_baselines3",
+    "SBX SAC+HER": "sbx",
+}
+"""What ours is compared with, and the package that it takes."""
+SETTINGS: dict[tuple[int, float], dict[str, float]] = {
+    (128, 0.4): {"RLlib SAC, same networks": 10.0, "SB3 SAC+HER": 3.0, "SBX SAC+HER": 1.3},
+    (128, 1.0): {"SB3 SAC+HER": 3.0, "SBX SAC+HER": 1.3},
+    (256, 0.4): {"RLlib SAC, same networks": 5.0, "SB3 SAC+HER": 1.7, "SBX SAC+HER": 1.0},
+    (256, 1.0): {
+        "RLlib SAC": 5.0, "RLlib SAC, same networks": 5.0, "SB3 SAC+HER": 1.7, "SBX SAC+HER": 1.0,
+    },
+}  # fmt: skip
+"""Width of the three layers and replay ratio (`small`'s first), and the targets of the ratios."""
 
 
 class Peer:
     """A process that trains when it is asked to, and waits otherwise."""
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, width: int, ratio: float) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "benchmarks.peer", name],
+            [sys.executable, "-m", "benchmarks.peer", name, str(width), str(ratio)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
@@ -47,13 +56,23 @@ class Peer:
         """Until its warm-up is over."""
         self._answer()
 
-    def turn(self) -> float:
-        """Environment steps a second."""
+    def turn(self) -> Taken:
+        """Seconds per environment step, by CPU time those of Ray's processes included."""
         assert self._process.stdin is not None
+        before = self._cpu_seconds()
         self._process.stdin.write(f"{SECONDS}\n")
         self._process.stdin.flush()
         answer = self._answer()
-        return float(answer["steps"] / answer["seconds"])
+        used = self._cpu_seconds() - before
+        return Taken(answer["seconds"] / answer["steps"], used / answer["steps"])
+
+    def _cpu_seconds(self) -> float:
+        own = psutil.Process(self._process.pid)
+        used = 0.0
+        for process in (own, *own.children(recursive=True)):
+            with contextlib.suppress(psutil.NoSuchProcess):
+                used += sum(process.cpu_times()[:2])
+        return used
 
     def _answer(self) -> dict[str, Any]:
         assert self._process.stdout is not None
@@ -72,33 +91,44 @@ class Peer:
 
 
 def rows(repeats: int) -> Iterator[Row]:
-    """Speeds at equal networks, batch and replay ratio."""
-    pairs = [pair for pair in COMPARED if _available(pair[0]) and _available(pair[1])]
+    """Speeds at equal networks, batch and replay ratio; programs of a setting take turns."""
+    for (width, ratio), targets in SETTINGS.items():
+        names = ["ours", *(name for name in targets if _is_installed(OTHERS[name]))]
+        what = f"3 x {width}, replay ratio {ratio:g}"
+        print(f"  {what}: {', '.join(names)}", file=sys.stderr, flush=True)
+        taken = _in_turns(names, width, ratio, repeats)
+        for name in names[1:]:
+            yield _row(what, taken["ours"], taken[name], f"{name} (speed)", targets[name])
+    if has_bf16():
+        taken = _in_turns(["ours", "ours, bf16"], 256, 1.0, repeats)
+        yield _row("3 x 256, bf16", taken["ours, bf16"], taken["ours"], "float32 (speed)", None)
+
+
+def _in_turns(names: list[str], width: int, ratio: float, repeats: int) -> dict[str, list[Taken]]:
     peers: dict[str, Peer] = {}
     try:
-        for name in dict.fromkeys(name for ours, theirs, _ in pairs for name in (ours, theirs)):
-            peers[name] = Peer(name)
+        for name in names:
+            peers[name] = Peer(name, width, ratio)
             peers[name].wait()  # one after the other, on a machine of few cores
-        speeds: dict[str, list[float]] = {name: [] for name in peers}
+        taken: dict[str, list[Taken]] = {name: [] for name in names}
         for _ in told_turns(repeats):
             for name, peer in peers.items():
-                speeds[name].append(peer.turn())
+                taken[name].append(peer.turn())
     finally:
         for peer in peers.values():
             peer.stop()
-    for ours, theirs, target in pairs:
-        yield ratio_row(
-            GROUP,
-            ours,
-            statistics.median(speeds[ours]),
-            "env steps/s",
-            against=f"{theirs} (speed)",
-            ratios=[a / b for a, b in zip(speeds[ours], speeds[theirs], strict=True)],
-            at_least=target,
-        )
+    return taken
 
 
-def _available(name: str) -> bool:
-    if name.startswith("SB3"):
-        return importlib.util.find_spec("stable_baselines3") is not None
-    return "bf16" not in name or has_bf16()
+def _row(
+    what: str, ours: list[Taken], theirs: list[Taken], against: str, target: float | None
+) -> Row:
+    wall, cpu = middle(ours)
+    return ratio_row(
+        GROUP, what, 1.0 / wall, "env steps/s", cpu=1.0 / cpu, against=against, at_least=target,
+        **compared(theirs, ours),
+    )  # fmt: skip
+
+
+def _is_installed(package: str) -> bool:
+    return importlib.util.find_spec(package) is not None

@@ -7,7 +7,14 @@ from pathlib import Path
 
 import torch
 
-__all__ = ["PrecisionError", "check_precision", "cpu_flags", "cpu_vendor", "has_bf16"]
+__all__ = [
+    "PrecisionError",
+    "check_precision",
+    "cpu_family",
+    "cpu_flags",
+    "cpu_vendor",
+    "has_bf16",
+]
 
 _CPU_FLAGS = frozenset({"amx_bf16", "avx512_bf16", "bf16"})
 """As Linux names them: Intel and AMD, and `bf16` on ARM."""
@@ -54,6 +61,11 @@ def cpu_flags() -> frozenset[str]:
 def cpu_vendor() -> str:
     """As /proc/cpuinfo has it, `GenuineIntel` or `AuthenticAMD`; empty where it does not."""
     return _cpu_description().get("vendor_id", "")
+
+
+def cpu_family() -> int:
+    """As /proc/cpuinfo has it, 25 of AMD's Zen 3 and 4, 26 of Zen 5; 0 where it does not."""
+    return int(_cpu_description().get("cpu family", 0))
 
 
 @functools.cache

@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -53,10 +54,12 @@ def test_bad_input_is_refused_before_anything_is_measured(tmp_path: Path) -> Non
         ({"at_most": 1.0}, "<= 1", False),
         ({"at_least": 1.0}, ">= 1", True),
         ({"at_least": 1.1}, ">= 1.1", False),
+        ({"at_most": 1.1, "cpu_ratios": [1.2]}, "<= 1.1", False),
+        ({"at_least": 1.0, "cpu_ratios": [1.2]}, ">= 1", True),
         ({}, "", None),
     ],
 )
-def test_a_target_is_for_the_median(limits: dict[str, float], target: str, met: bool) -> None:
+def test_a_target_is_for_the_median(limits: dict[str, Any], target: str, met: bool) -> None:
     row = ratio_row("group", "what", 1.0, "s", against="that", ratios=[1.05, 9.0, 0.1], **limits)
     assert (row.ratio, row.low, row.high) == (1.05, 0.1, 9.0)
     assert (row.target, row.met) == (target, met)

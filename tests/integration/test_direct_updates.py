@@ -189,18 +189,20 @@ def test_a_converted_module_is_taken_over_anew() -> None:
 
 
 @pytest.mark.parametrize(
-    ("vendor", "flags", "expected"),
+    ("vendor", "family", "flags", "expected"),
     [
-        ("AuthenticAMD", {"avx2", "avx512f"}, OneDnn),
-        ("AuthenticAMD", {"avx2"}, Blas),
-        ("GenuineIntel", {"avx2", "avx512f"}, Blas),
-        ("", set(), Blas),
+        ("AuthenticAMD", 26, {"avx2", "avx512f"}, OneDnn),
+        ("AuthenticAMD", 26, {"avx2"}, Blas),
+        ("AuthenticAMD", 25, {"avx2", "avx512f"}, Blas),
+        ("GenuineIntel", 6, {"avx2", "avx512f"}, Blas),
+        ("", 0, set(), Blas),
     ],
 )
 def test_the_library_follows_from_the_machines_description(
-    vendor: str, flags: set[str], expected: type, monkeypatch: pytest.MonkeyPatch
+    vendor: str, family: int, flags: set[str], expected: type, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(products, "cpu_vendor", lambda: vendor)
+    monkeypatch.setattr(products, "cpu_family", lambda: family)
     monkeypatch.setattr(products, "cpu_flags", lambda: frozenset(flags))
     products.products.cache_clear()
     try:

@@ -176,7 +176,7 @@ def _requirements_of(name: str, extras: set[str]) -> Iterator[Requirement]:
 
 
 # Of the `bench` extra, which is installed with `make bench`: its own needs cannot be looked up.
-ONLY_COMPARED_WITH = {"stable-baselines3"}
+ONLY_COMPARED_WITH = {"sbx-rl", "stable-baselines3"}
 
 
 def test_constraints_pin_everything_that_is_pulled_in() -> None:

@@ -1,9 +1,10 @@
 """The matrix products of a perceptron, by the library that is faster on this CPU.
 
-PyTorch leaves float32 products to MKL, which is the faster one on Intel's CPUs and, by AVX2, on
-AMD's. AMD's CPUs with AVX-512 gain by oneDNN, which PyTorch has too: MKL uses AVX-512 on Intel's
-only (docs/performance.md has a table). The choice follows from the machine's description and not
-from a measurement: a seed has to give the same numbers.
+PyTorch leaves float32 products to MKL, which uses AVX-512 on Intel's CPUs only; it has oneDNN too,
+which uses it everywhere. AMD's Zen 5 computes 512 bits at once, so that there oneDNN has twice
+MKL's rate; Zen 4 takes them in two halves, as fast as AVX2 (docs/performance.md has a table). The
+choice follows from the machine's description and not from a measurement: a seed has to give the
+same numbers.
 
 Shape legend: R rows, I inputs, O outputs of a layer. Results are written to `out` where the library
 can, and returned.
@@ -17,7 +18,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from music_rllib.tac.precision import cpu_flags, cpu_vendor
+from music_rllib.tac.precision import cpu_family, cpu_flags, cpu_vendor
 
 __all__ = ["Blas", "OneDnn", "Products", "has_onednn", "onednn_product", "products"]
 
@@ -120,5 +121,5 @@ def has_onednn() -> bool:
 @functools.cache
 def products() -> Products:
     """Those for this machine."""
-    wide_amd = cpu_vendor() == "AuthenticAMD" and "avx512f" in cpu_flags()
-    return OneDnn() if wide_amd and has_onednn() else Blas()
+    zen_5 = cpu_vendor() == "AuthenticAMD" and cpu_family() >= 26 and "avx512f" in cpu_flags()
+    return OneDnn() if zen_5 and has_onednn() else Blas()
