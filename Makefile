@@ -60,9 +60,10 @@ test-faults: venv  ## kill, fill, cut and corrupt, and compare with unbroken run
 fuzz: venv  ## change policies, exports and YAML at random and read them (SECONDS=600 SEED=0)
 	@$(BIN)/python -m tests.fuzz --seconds $(SECONDS) --seed $(SEED)
 
-lint: venv  ## ruff: rules and formatting
+lint: venv  ## ruff: rules and formatting; import-linter: which room imports which
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
+	@$(BIN)/lint-imports
 
 type: venv  ## mypy --strict
 	@$(BIN)/mypy

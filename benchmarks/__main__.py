@@ -13,7 +13,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from music_rllib._quiet import prepare_environment, quiet_third_parties
+from music_rllib.runtime.quiet import prepare_environment, quiet_third_parties
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -92,7 +92,7 @@ def measure(name: str, repeats: int) -> Iterator[Row]:
     import torch
 
     from benchmarks.measure import start_ray
-    from music_rllib._allocator import keep_freed_memory
+    from music_rllib.runtime.allocator import keep_freed_memory
 
     quiet_third_parties()
     torch.set_num_threads(1)

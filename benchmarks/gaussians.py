@@ -14,8 +14,8 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from music_rllib.estimator.network import MutualInformationEstimator
-from music_rllib.mutual_information import time_permutations
+from music_rllib.functional.mutual_information import time_permutations
+from music_rllib.intrinsic.estimator import MutualInformationEstimator
 
 HELD_OUT = (8, 20_000)
 """Trajectories and frames that a trained estimator is judged on."""

@@ -45,9 +45,9 @@ def main() -> None:
 
     from benchmarks.checkpoint import save
     from benchmarks.runs import fill, settings
-    from music_rllib._quiet import quiet_third_parties
-    from music_rllib.experiment.store import NodeStore
-    from music_rllib.experiment.training import TrainingRun
+    from music_rllib.runtime.quiet import quiet_third_parties
+    from music_rllib.store.node_store import NodeStore
+    from music_rllib.training.run import TrainingRun
 
     quiet_third_parties()
     start_ray(1)

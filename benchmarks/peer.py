@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from music_rllib._quiet import prepare_environment, quiet_third_parties
+from music_rllib.runtime.quiet import prepare_environment, quiet_third_parties
 
 __all__ = ["PEERS"]
 

@@ -9,12 +9,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from music_rllib.tac import losses
-from music_rllib.tac.distribution import sample_squashed
+from music_rllib.functional import actor_critic
+from music_rllib.functional.squashed_gaussian import sample_squashed
+from music_rllib.functional.tsallis import ln_q_of_policy
+from music_rllib.tac.kernels.adam import FusedAdam
 from music_rllib.tac.networks import Critics, Perceptron
 from music_rllib.tac.normaliser import RunningNormaliser
-from music_rllib.tac.optimizer import FusedAdam
-from music_rllib.tsallis import ln_q_of_policy
 
 HIDDEN = (256, 256, 256)
 
@@ -53,11 +53,13 @@ class RawUpdate:
         q_data = self.critics(torch.cat([obs, self.actions], -1))
         q_policy = self.critics(torch.cat([obs, sample.action], -1), frozen=True)
         value = self.value(obs).squeeze(-1)
-        target = losses.critic_target(self.reward, self.discount, next_value, 0.98)
+        target = actor_critic.critic_target(self.reward, self.discount, next_value, 0.98)
         loss = (
-            losses.critic_loss(q_data, target)
-            + losses.value_loss(value, losses.value_target(q_policy, ln_q_pi, self.alpha))
-            + losses.policy_loss(q_policy.amin(0), ln_q_pi, self.alpha)
+            actor_critic.critic_loss(q_data, target)
+            + actor_critic.value_loss(
+                value, actor_critic.value_target(q_policy, ln_q_pi, self.alpha)
+            )
+            + actor_critic.policy_loss(q_policy.amin(0), ln_q_pi, self.alpha)
         )
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()

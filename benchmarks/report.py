@@ -14,11 +14,12 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from benchmarks.measure import Row, middle, taken_by
-from music_rllib.experiment.config import load_sweep
-from music_rllib.experiment.model import SweepConfig
+from music_rllib import names
+from music_rllib.config.load import load_sweep
+from music_rllib.config.schema import SweepConfig
 from music_rllib.experiment.plan import make_plan
-from music_rllib.sweep.logbook import run_info
-from music_rllib.tracking import Tracker, names
+from music_rllib.sweep.listeners.mlflow import run_info
+from music_rllib.tracking import Tracker
 
 __all__ = ["rows"]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.sampling import LAYOUT, random_trajectory
-from music_rllib.envs.registry import BUILT_IN_TASKS
-from music_rllib.experiment.settings import RunSettings
+from music_rllib.config.run_settings import RunSettings
+from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.replay.buffer import TrajectoryReplay
 
 __all__ = ["fill", "settings"]

@@ -31,7 +31,7 @@ import psutil
 from rich.console import Console
 from rich.table import Table
 
-from music_rllib.envs.registry import BUILT_IN_TASKS
+from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.policy import Policy, PolicyNetwork, load_policy
 
 START_SECONDS = 120

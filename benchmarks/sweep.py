@@ -100,7 +100,7 @@ class Starter:
     """What a trial's process does until its first episode has been played."""
 
     def first_step(self) -> int:
-        from music_rllib.experiment.training import TrainingRun
+        from music_rllib.training.run import TrainingRun
 
         training = TrainingRun(settings())
         training.algorithm.env_runner.sample(num_episodes=1)
@@ -124,8 +124,8 @@ def start_up(repeats: int) -> Iterator[Row]:
 
 def train(seed: int, address: str = "local") -> None:
     """One run without a sweep around it, with the Ray at `address` or its own."""
-    from music_rllib._quiet import quiet_third_parties
-    from music_rllib.experiment.training import TrainingRun
+    from music_rllib.runtime.quiet import quiet_third_parties
+    from music_rllib.training.run import TrainingRun
 
     quiet_third_parties()
     start_ray(1, address)

@@ -14,8 +14,8 @@ from benchmarks.raw_torch import RawUpdate
 from benchmarks.runs import fill
 from music_rllib import TACConfig
 from music_rllib.tac.algorithm import TAC
+from music_rllib.tac.kernels.precision import cpu_flags, has_bf16
 from music_rllib.tac.kernels.products import has_onednn, onednn_product
-from music_rllib.tac.precision import cpu_flags, has_bf16
 
 __all__ = ["rows"]
 

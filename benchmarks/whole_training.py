@@ -14,7 +14,7 @@ from typing import Any
 import psutil
 
 from benchmarks.measure import Row, Taken, compared, middle, ratio_row, told_turns
-from music_rllib.tac.precision import has_bf16
+from music_rllib.tac.kernels.precision import has_bf16
 
 __all__ = ["rows"]
 

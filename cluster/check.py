@@ -413,8 +413,8 @@ def _unknown(given: Any, known: Any, place: str = "") -> Problems:
 
 def check_sweep(_: dict[str, Any], path: Path) -> Problems:
     """As `python -m music_rllib.sweep` does."""
-    from music_rllib.experiment.config import load_sweep
-    from music_rllib.experiment.problems import ConfigError
+    from music_rllib.config.load import load_sweep
+    from music_rllib.config.problems import ConfigError
 
     try:
         load_sweep(path)

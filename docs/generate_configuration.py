@@ -20,9 +20,8 @@ import annotated_types
 from pydantic import AfterValidator, BaseModel, BeforeValidator
 from pydantic.fields import FieldInfo
 
-from music_rllib.envs.registry import Task
-from music_rllib.estimator.settings import MusicSettings
-from music_rllib.experiment.model import (
+from music_rllib.config.run_settings import VARIANTS, Evaluation, RunSettings
+from music_rllib.config.schema import (
     Checkpoints,
     Header,
     InitFrom,
@@ -30,8 +29,7 @@ from music_rllib.experiment.model import (
     Resources,
     StageHeader,
 )
-from music_rllib.experiment.settings import VARIANTS, Evaluation, RunSettings
-from music_rllib.experiment.space import (
+from music_rllib.config.search.space import (
     Choice,
     Final,
     FloatRange,
@@ -42,15 +40,17 @@ from music_rllib.experiment.space import (
     SearchSettings,
     WarmStart,
 )
-from music_rllib.replay.settings import ReplaySettings
-from music_rllib.schedules import Linear, Measured, Piecewise
-from music_rllib.tac.settings import (
+from music_rllib.config.tac_settings import (
     GaussianNoise,
     LearnedAlpha,
     MatchedAlpha,
     NormalisedAlpha,
     TACSettings,
 )
+from music_rllib.envs.tasks import Task
+from music_rllib.intrinsic.settings import MusicSettings
+from music_rllib.replay.settings import ReplaySettings
+from music_rllib.schedules import Linear, Measured, Piecewise
 
 TARGET = Path(__file__).with_name("configuration.md")
 

@@ -22,21 +22,22 @@ from pathlib import Path
 
 import numpy as np
 
-from music_rllib.experiment.config import load_sweep
+from music_rllib import names
+from music_rllib.config.load import load_sweep
 from music_rllib.experiment.plan import make_plan
-from music_rllib.reports.archive import is_archive, read_archive
-from music_rllib.reports.figures import files
-from music_rllib.reports.gallery import (
+from music_rllib.report.figures.choice import (
     PRIMARY,
     Drawing,
     drawings_of_stages,
     slug,
     stage_drawings,
 )
-from music_rllib.reports.merge import of_plan
-from music_rllib.reports.searches import search_in_words, search_tables
+from music_rllib.report.figures.plots import files
+from music_rllib.report.search_tables import search_in_words, search_tables
 from music_rllib.results import statistics as st
 from music_rllib.results.analysis import StageAnalysis, analyse
+from music_rllib.results.archive.folder import is_archive, read_archive
+from music_rllib.results.archive.merge import of_plan
 from music_rllib.results.comparison import Final, each_seed, verdict
 from music_rllib.results.comparison import number as in_short
 from music_rllib.results.conditions import Condition, Stage, find_stages
@@ -48,7 +49,6 @@ from music_rllib.results.time_to_threshold import (
     races,
     waits_of,
 )
-from music_rllib.tracking import names
 
 FOLDER = Path(__file__).parent
 PAGE, TEMPLATE = FOLDER / "results.md", FOLDER / "results" / "page.md"

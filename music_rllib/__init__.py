@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from music_rllib.tac.algorithm import TAC
     from music_rllib.tac.config import TACConfig
     from music_rllib.tac.learner import TACLearner
-    from music_rllib.tac.module import TACModule
+    from music_rllib.tac.rl_module import TACModule
 
 __version__ = "0.1.0"
 
@@ -23,7 +23,7 @@ _HOMES = {
     "TAC": "music_rllib.tac.algorithm",
     "TACConfig": "music_rllib.tac.config",
     "TACLearner": "music_rllib.tac.learner",
-    "TACModule": "music_rllib.tac.module",
+    "TACModule": "music_rllib.tac.rl_module",
 }
 
 

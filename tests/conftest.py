@@ -27,7 +27,7 @@ for _name in ("FORCE_COLOR", "RAY_ADDRESS", "MLFLOW_TRACKING_URI", "MLFLOW_RUN_I
 import hypothesis
 import pytest
 
-from music_rllib._quiet import (
+from music_rllib.runtime.quiet import (
     LOCAL_RAY_BEYOND_LOOPBACK,
     prepare_environment,
     quiet_third_parties,

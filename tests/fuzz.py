@@ -29,19 +29,19 @@ from typing import Any
 
 import numpy as np
 
-from music_rllib.experiment.config import ConfigError, load_sweep
-from music_rllib.experiment.handoff import HandoffError
-from music_rllib.experiment.plain_state import StateError, read_state, write_state
+from music_rllib.config.load import ConfigError, load_sweep
 from music_rllib.experiment.plan import make_plan
-from music_rllib.experiment.sealed import SealedFolders, StorageError, open_storage
 from music_rllib.policy import PolicyError, load_policy
-from music_rllib.policy.episodes import open_task
-from music_rllib.reports.archive import read_archive
-from music_rllib.reports.missing import missing
-from music_rllib.reports.searches import search_in_words, search_tables
-from music_rllib.reports.tables import runs_table
+from music_rllib.policy.rollout import open_task
+from music_rllib.report.limitations import missing
+from music_rllib.report.search_tables import search_in_words, search_tables
+from music_rllib.report.tables import runs_table
+from music_rllib.results.archive.folder import read_archive
 from music_rllib.results.conditions import find_stages
 from music_rllib.results.data import ReportError
+from music_rllib.store.handoff import HandoffError
+from music_rllib.store.object_folder import SealedFolders, StorageError, open_storage
+from music_rllib.store.state_io import StateError, read_state, write_state
 from tests.hostile_files import PENDULUM, seal_policy, write_export, write_sweep
 
 OWN_ERRORS = (ConfigError, HandoffError, PolicyError, ReportError, StateError, StorageError)
@@ -265,7 +265,7 @@ def _seal_again(folder: Path) -> None:
     node = folder / "node"
     handoff = node / "handoff" / "handoff.json"
     try:
-        from music_rllib.experiment.sealed import _record
+        from music_rllib.store.object_folder import _record
 
         content = json.loads(handoff.read_bytes())
         for module in content["modules"].values():

@@ -26,14 +26,14 @@ import pyarrow as pa
 import yaml
 from pyarrow import parquet
 
-from music_rllib.envs.registry import Task
-from music_rllib.experiment.handoff import HandoffInfo, Spaces, write_handoff
-from music_rllib.experiment.sealed import SealedFolders, open_storage
-from music_rllib.experiment.settings import RunSettings
+from music_rllib import names
+from music_rllib.config.run_settings import RunSettings
+from music_rllib.envs.tasks import Task
 from music_rllib.policy import load_policy
-from music_rllib.reports.archive import Format, write_archive
+from music_rllib.results.archive.folder import Format, write_archive
 from music_rllib.results.data import Points, RunRecord, Sweep, columns
-from music_rllib.tracking import names
+from music_rllib.store.handoff import Spaces, write_handoff
+from music_rllib.store.object_folder import SealedFolders, open_storage
 
 INPUTS = 3
 SPACES = Spaces(observation_size=INPUTS, goal_size=0, action_low=(-2.0,), action_high=(2.0,))
@@ -59,7 +59,7 @@ def write_policy(folder: Path, task: Task, spaces: Spaces | None = SPACES) -> Pa
             "inverse_std": np.ones(INPUTS, np.float32),
         },
     }
-    write_handoff(folder / "handoff", modules, HandoffInfo.of(run, "0" * 20, 1, spaces))
+    write_handoff(folder / "handoff", modules, run.handoff_info("0" * 20, 1, spaces))
     return folder
 
 
@@ -582,7 +582,7 @@ def run(arguments: list[str]) -> tuple[object, str]:
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
         try:
             if arguments[0] == "report":
-                from music_rllib.reports.cli import app
+                from music_rllib.report.cli import app
 
                 return app(arguments[1:], standalone_mode=False), said.getvalue()
             from music_rllib.sweep.cli import main

@@ -13,16 +13,16 @@ from typing import Any
 import yaml
 from ray.tune.search import Searcher
 
-from music_rllib.experiment.config import load_sweep
+from music_rllib import names
+from music_rllib.config.load import load_sweep
+from music_rllib.config.run_settings import RunSettings
 from music_rllib.experiment.plan import Node, make_plan
-from music_rllib.experiment.result import HISTORY, Report, RunResult, last_values, to_json_lines
-from music_rllib.experiment.settings import RunSettings
-from music_rllib.sweep.campaign import Campaign
-from music_rllib.sweep.dag_searcher import DagSearcher
-from music_rllib.sweep.places import sweep_folder
-from music_rllib.sweep.searches import open_searches, outcome
-from music_rllib.sweep.session import Sweep, open_sweep
-from music_rllib.tracking import names
+from music_rllib.experiment.session import Sweep, open_sweep
+from music_rllib.search.controller import Campaign
+from music_rllib.search.summary import open_searches, outcome
+from music_rllib.store.paths import sweep_folder
+from music_rllib.store.run_record import HISTORY, Report, RunResult, last_values, to_json_lines
+from music_rllib.sweep.tune.dag_searcher import DagSearcher
 
 Document = dict[str, Any]
 Formula = Callable[[RunSettings, float], float]

@@ -11,9 +11,9 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from music_rllib._quiet import drop_farama_notice
+from music_rllib.envs.farama_notice import drop_farama_notice
 from music_rllib.envs.numbers import are_usable, bad_number
-from music_rllib.envs.registry import BUILT_IN_TASKS, Task
+from music_rllib.envs.tasks import BUILT_IN_TASKS, Task
 from music_rllib.replay.buffer import GoalReward
 
 __all__ = [

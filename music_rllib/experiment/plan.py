@@ -11,12 +11,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from music_rllib.envs.registry import Task
-from music_rllib.experiment.files import content_key
-from music_rllib.experiment.model import Checkpoint, Point, Source, Stage, SweepConfig
-from music_rllib.experiment.searched import of_stage, stages_in
-from music_rllib.experiment.settings import RunSettings
-from music_rllib.tac.version import ALGORITHM_VERSION
+from music_rllib.config.run_settings import RunSettings
+from music_rllib.config.schema import Checkpoint, Point, Source, Stage, SweepConfig
+from music_rllib.config.search.check import of_stage, stages_in
+from music_rllib.envs.tasks import Task
+from music_rllib.store.files import content_key
+from music_rllib.version import ALGORITHM_VERSION
 
 __all__ = ["Input", "Node", "Plan", "Run", "make_plan", "node_key"]
 

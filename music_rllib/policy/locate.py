@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pyarrow.fs as pafs
 
-from music_rllib.envs.registry import Task
-from music_rllib.experiment.config import declared_tasks
-from music_rllib.experiment.sealed import SealedFolders, open_storage
+from music_rllib.config.load import declared_tasks
+from music_rllib.envs.tasks import Task
 from music_rllib.policy.policy import PolicyError
+from music_rllib.store.object_folder import SealedFolders, open_storage
 
 __all__ = ["find_policy", "named_environment"]
 

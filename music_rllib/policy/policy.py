@@ -15,22 +15,22 @@ import numpy as np
 import pyarrow.fs as pafs
 from numpy.typing import NDArray
 
+from music_rllib.config.problems import shown
+from music_rllib.config.run_settings import RunSettings
+from music_rllib.config.tac_settings import TACSettings
 from music_rllib.envs.make import Known, known_environment, make_env
-from music_rllib.envs.registry import Task
-from music_rllib.experiment.handoff import MANIFEST as HANDOFF_FILE
-from music_rllib.experiment.handoff import (
+from music_rllib.envs.tasks import Task
+from music_rllib.limits import MOST_JSON_BYTES, MOST_WEIGHTS_BYTES, read_json, read_regular
+from music_rllib.policy.network import Floats, PolicyFileError, PolicyNetwork
+from music_rllib.store.handoff import MANIFEST as HANDOFF_FILE
+from music_rllib.store.handoff import (
     HandoffError,
     HandoffInfo,
     Spaces,
     open_handoff,
     read_handoff,
 )
-from music_rllib.experiment.problems import shown
-from music_rllib.experiment.sealed import MANIFEST, SealedFolders, StorageError, open_storage
-from music_rllib.experiment.settings import RunSettings
-from music_rllib.limits import MOST_JSON_BYTES, MOST_WEIGHTS_BYTES, read_json, read_regular
-from music_rllib.policy.network import Floats, PolicyFileError, PolicyNetwork
-from music_rllib.tac.settings import TACSettings
+from music_rllib.store.object_folder import MANIFEST, SealedFolders, StorageError, open_storage
 
 __all__ = [
     "RUN_FILE",

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from music_rllib.envs.make import Env
-from music_rllib.policy.episodes import EpisodeResult, Moment, open_task, play
 from music_rllib.policy.policy import Policy
+from music_rllib.policy.rollout import EpisodeResult, Moment, open_task, play
 
 __all__ = ["FORMATS", "VideoError", "film", "find_renderer", "write_video"]
 

@@ -22,9 +22,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from music_rllib.replay.places import Places
 from music_rllib.replay.priorities import TDPriorities, WeightedDraws, ranges, rank_weights
-from music_rllib.replay.whole import WholeTrajectories, long_enough
+from music_rllib.replay.sampling import Places
+from music_rllib.replay.trajectories import WholeTrajectories, long_enough
 
 __all__ = ["ReplayLayout", "Trajectory", "TrajectoryReplay", "Transitions"]
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from music_rllib import names
 from music_rllib.results import statistics as st
 from music_rllib.results.comparison import Scope, scopes_of
 from music_rllib.results.conditions import Condition, Stage, find_stages, stage_by_stage
@@ -26,7 +27,6 @@ from music_rllib.results.time_to_threshold import (
     races,
     waits_of,
 )
-from music_rllib.tracking import names
 
 __all__ = ["Curve", "StageAnalysis", "Wait", "analyse", "analyse_stages", "curve"]
 

@@ -14,9 +14,9 @@ from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
+from music_rllib import names
 from music_rllib.results import statistics as st
 from music_rllib.results.statistics import SIGNIFICANCE, Array, Estimate
-from music_rllib.tracking import names
 
 __all__ = ["ALL_TASKS", "GAP", "SHOW_SEEDS_BELOW", "Comparison", "Final", "Scope", "each_seed"]
 __all__ += ["interval_text", "number", "p_text", "scopes_of", "verdict"]
@@ -297,6 +297,16 @@ def number(value: float | Array) -> str:
     """Returns of hundreds need no fractions."""
     value = float(value)
     return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.2f}"
+
+
+def with_interval(value: float | None, ends: Sequence[float | None] | None) -> str:
+    """`0.45 [0.3, 0.6]`; without the ends where a single run has none."""
+    if value is None:
+        return "-"
+    low, high = ends or (None, None)
+    if low is None or high is None or low != low or high != high:
+        return f"{value:.3g}"
+    return f"{value:.3g} [{low:.3g}, {high:.3g}]"
 
 
 def interval_text(estimate: Estimate) -> str:

@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from music_rllib import names
 from music_rllib.results.data import RunRecord, Sweep
-from music_rllib.tracking import names
 
 __all__ = ["SIDE_BY_SIDE", "Condition", "Stage", "find_stages", "side_by_side", "stage_by_stage"]
 

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from music_rllib import names
 from music_rllib.results.statistics import Array
-from music_rllib.tracking import names
 
 __all__ = [
     "Column",

@@ -8,7 +8,7 @@ The estimate is the mean: over each task's runs, then over the tasks. The interq
 Agarwal et al. 2021 (https://arxiv.org/abs/2108.13264) show is another quantity with each number of
 seeds below ten (of three it trims nothing, of four half) and leaves out the seed that failed. Their
 percentile bootstrap covers 74 % with three seeds where it says 95 %; coverage of the intervals here
-is held by `tests/unit/test_results_coverage.py` and listed in docs/reports.md.
+is held by `tests/unit/results/test_coverage.py` and listed in docs/reports.md.
 """
 
 from __future__ import annotations

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from music_rllib import names
 from music_rllib.results import statistics as st
 from music_rllib.results.data import Sweep
 from music_rllib.results.statistics import SIGNIFICANCE, Array, Estimate
-from music_rllib.tracking import names
 
 __all__ = [
     "FEWEST_FOR_INTERVAL",

@@ -1,6 +1,6 @@
 """`python -m music_rllib.serve`."""
 
-from music_rllib._quiet import prepare_environment, quiet_third_parties
+from music_rllib.runtime.quiet import prepare_environment, quiet_third_parties
 
 # Ray reads its environment while it is imported.
 prepare_environment()

@@ -17,7 +17,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 import music_rllib
 from music_rllib.serve.docs_page import docs_page
-from music_rllib.serve.protocol import (
+from music_rllib.serve.schema import (
     Answer,
     Array,
     Failure,

@@ -13,12 +13,12 @@ from collections.abc import Sequence
 from ipaddress import ip_address
 from typing import TYPE_CHECKING, Any
 
-from music_rllib._cluster import ClusterError, check_reachable, cluster_address
-from music_rllib.serve.protocol import TOKEN_VARIABLE
+from music_rllib.runtime.ray_address import ClusterError, check_reachable, cluster_address
+from music_rllib.serve.schema import TOKEN_VARIABLE
 
 if TYPE_CHECKING:
     from music_rllib.serve.application import ServeSettings
-    from music_rllib.serve.limits import Limits
+    from music_rllib.serve.load_limits import Limits
 
 __all__ = ["main"]
 
@@ -55,7 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         _check_cluster()
         return _serve(arguments)
     except _BadInputError as error:
-        from music_rllib.tracking.redaction import for_people
+        from music_rllib.redaction import for_people
 
         print(f"error: {for_people(error)}", file=sys.stderr)
         return BAD_INPUT
@@ -172,12 +172,12 @@ def _serve(arguments: argparse.Namespace) -> int:
         raise _BadInputError(
             f"Ray Serve must be installed (pip install 'music_rllib[serve]'): {error}"
         ) from error
-    from music_rllib.experiment.config import ConfigError
-    from music_rllib.experiment.sealed import StorageError
+    from music_rllib.config.load import ConfigError
     from music_rllib.policy import PolicyError
     from music_rllib.serve.application import ServeSettings, application, policy_of
-    from music_rllib.serve.limits import Limits
-    from music_rllib.serve.protocol import PolicyFacts, request_model
+    from music_rllib.serve.load_limits import Limits
+    from music_rllib.serve.schema import PolicyFacts, request_model
+    from music_rllib.store.object_folder import StorageError
 
     settings = ServeSettings(
         policy=arguments.policy,
@@ -224,7 +224,7 @@ def _connect(settings: ServeSettings) -> None:
     """A local Ray, or the cluster of the environment; refuses replicas that can never start."""
     import ray
 
-    from music_rllib._quiet import quiet_third_parties
+    from music_rllib.runtime.quiet import quiet_third_parties
 
     options: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.WARNING}
     address = cluster_address()
@@ -256,9 +256,9 @@ def _connect(settings: ServeSettings) -> None:
 
 def _waits_for_nodes(settings: ServeSettings) -> bool:
     """Whether an autoscaler adds the nodes that replicas have no place on yet; says so."""
-    from music_rllib import _autoscaler
+    from music_rllib.runtime import autoscaler
 
-    if not _autoscaler.adds_nodes({"CPU": settings.cpus_per_replica}, settings.replicas):
+    if not autoscaler.adds_nodes({"CPU": settings.cpus_per_replica}, settings.replicas):
         return False
     print(
         f"The cluster has no room for {settings.replicas} replicas yet; its autoscaler is asked "
@@ -287,7 +287,7 @@ def _listen(arguments: argparse.Namespace, limits: Limits, serve: Any) -> None:
     """Start Serve's proxy; on a cluster where Serve runs already, see that we would not disturb."""
     from ray.serve.context import _get_global_client
 
-    from music_rllib.serve.limits import controller_environment
+    from music_rllib.serve.load_limits import controller_environment
 
     logging.getLogger("ray.serve").setLevel(logging.ERROR)
     wanted = (arguments.host, arguments.port)

@@ -1,6 +1,6 @@
 """`python -m music_rllib.sweep`."""
 
-from music_rllib._quiet import prepare_environment, quiet_third_parties
+from music_rllib.runtime.quiet import prepare_environment, quiet_third_parties
 
 # Ray and MLflow read their environment while they are imported.
 prepare_environment()

@@ -13,8 +13,9 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import ModuleType, TracebackType
 
+from music_rllib.errors import BAD_INPUT, BadInputError
 from music_rllib.sweep import commands as package
-from music_rllib.sweep.frame import BAD_INPUT, BadInputError, Formatter
+from music_rllib.sweep.cli_helpers import Formatter
 
 __all__ = ["main"]
 
@@ -76,7 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception as error:
         if not isinstance(error, _bad_input()):
             raise
-        from music_rllib.tracking.redaction import for_people
+        from music_rllib.redaction import for_people
 
         print(f"error: {for_people(error)}", file=sys.stderr)
         return BAD_INPUT
@@ -88,7 +89,7 @@ def _show_unexpected(
     """A defect's traceback, without the passwords that an environment put into its message."""
     import traceback
 
-    from music_rllib.tracking.redaction import for_people
+    from music_rllib.redaction import for_people
 
     print(for_people("".join(traceback.format_exception(kind, error, trace))), file=sys.stderr)
 
@@ -140,13 +141,13 @@ class _Parser(argparse.ArgumentParser):
 def _bad_input() -> tuple[type[Exception], ...]:
     """Errors whose message tells the user what to change."""
     # Only here: they would load what the quick answers of the program don't need.
-    from music_rllib.experiment.config import ConfigError
-    from music_rllib.experiment.handoff import HandoffError
-    from music_rllib.experiment.sealed import StorageError
-    from music_rllib.sweep.demand import DemandError
-    from music_rllib.sweep.local import ClusterError
+    from music_rllib.config.load import ConfigError
+    from music_rllib.errors import TrackingError
+    from music_rllib.experiment.demand import DemandError
+    from music_rllib.runtime.machine import ClusterError
+    from music_rllib.store.handoff import HandoffError
+    from music_rllib.store.object_folder import StorageError
     from music_rllib.sweep.preflight import HardwareError, TaskError
-    from music_rllib.tracking.errors import TrackingError
 
     return (
         BadInputError,

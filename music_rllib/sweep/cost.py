@@ -12,13 +12,13 @@ from typing import Any
 
 from rich.table import Table
 
-from music_rllib.experiment.model import SweepConfig
+from music_rllib.config.run_settings import RunSettings
+from music_rllib.config.schema import SweepConfig
 from music_rllib.experiment.plan import Plan
-from music_rllib.experiment.settings import RunSettings
-from music_rllib.experiment.training import TrainingRun
-from music_rllib.sweep.cluster import cluster
-from music_rllib.sweep.tables import search_budget, search_runs
-from music_rllib.sweep.words import clock
+from music_rllib.runtime.ray_cluster import cluster
+from music_rllib.sweep.views.tables import search_budget, search_runs
+from music_rllib.sweep.views.text import clock
+from music_rllib.training.run import TrainingRun
 
 __all__ = ["Kind", "cost_document", "cost_table", "kinds", "measure"]
 

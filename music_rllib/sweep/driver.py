@@ -12,48 +12,48 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.text import Text
 
-from music_rllib._allocator import give_back_freed_memory
-from music_rllib.experiment.config import load_sweep
-from music_rllib.experiment.model import SweepConfig
+from music_rllib import names
+from music_rllib.config.load import load_sweep
+from music_rllib.config.remarks import remarks
+from music_rllib.config.schema import SweepConfig
+from music_rllib.errors import FAILED, BadInputError
+from music_rllib.experiment import sweep_files
+from music_rllib.experiment.changes import changes_since, check_begun, keep_settings
+from music_rllib.experiment.demand import check_demand
+from music_rllib.experiment.listener import Listener
 from music_rllib.experiment.plan import Node, make_plan
-from music_rllib.experiment.remarks import remarks
-from music_rllib.sweep import records
-from music_rllib.sweep.alpha_view import adaptive_rows, adaptive_text, alpha_rows, alpha_table
-from music_rllib.sweep.beacon import Beacon
-from music_rllib.sweep.board import Status
-from music_rllib.sweep.changes import changes_since, check_begun, keep_settings
-from music_rllib.sweep.demand import check_demand
-from music_rllib.sweep.driving import driving
-from music_rllib.sweep.ending import try_for
-from music_rllib.sweep.frame import FAILED, BadInputError
-from music_rllib.sweep.listener import Listener
-from music_rllib.sweep.local import (
+from music_rllib.experiment.scheduler import Status
+from music_rllib.experiment.session import Sweep, keep_record, open_sweep
+from music_rllib.experiment.sweep_files import SEARCH, as_json, keep
+from music_rllib.redaction import redact
+from music_rllib.runtime.allocator import give_back_freed_memory
+from music_rllib.runtime.ending import try_for
+from music_rllib.runtime.machine import (
     check_cpus,
     check_memory_and_gpus,
     check_reachable,
     cluster_address,
 )
-from music_rllib.sweep.places import check_storage, resolve_storage, sweep_folder
-from music_rllib.sweep.plan_answer import plan_answer
+from music_rllib.runtime.signals import early
+from music_rllib.store.paths import check_storage, resolve_storage, sweep_folder
+from music_rllib.sweep.driver_lock import driving
+from music_rllib.sweep.listeners.state_file import Beacon
 from music_rllib.sweep.preflight import (
     check_environments,
     check_hardware,
     import_checkpoints,
     verify_inputs,
 )
-from music_rllib.sweep.records import SEARCH, as_json, keep
-from music_rllib.sweep.reporting import report_at_end
-from music_rllib.sweep.session import Sweep, keep_record, open_sweep
-from music_rllib.sweep.signals import early
-from music_rllib.sweep.tables import plan_view, results_table, search_views
-from music_rllib.tracking import names
-from music_rllib.tracking.redaction import redact
+from music_rllib.sweep.report_at_end import report_at_end
+from music_rllib.sweep.views.alpha import adaptive_rows, adaptive_text, alpha_rows, alpha_table
+from music_rllib.sweep.views.plan_json import plan_answer
+from music_rllib.sweep.views.tables import plan_view, results_table, search_views
 
 if TYPE_CHECKING:
-    from music_rllib.sweep.campaign import Campaign
-    from music_rllib.sweep.display import Display
-    from music_rllib.sweep.find import Found
-    from music_rllib.sweep.logbook import Logbook
+    from music_rllib.experiment.location import Found
+    from music_rllib.search.controller import Campaign
+    from music_rllib.sweep.listeners.mlflow import Logbook
+    from music_rllib.sweep.listeners.screen import Display
     from music_rllib.tracking.tracker import Tracker
 
 __all__ = ["DEFAULT_CONFIG", "resume_sweep", "run_sweep"]
@@ -179,7 +179,7 @@ def _sweep(
         raise BadInputError(str(changes))
     with driving(opened, lambda text: console.print(Text(text), soft_wrap=True)), early:
         code = _drive(console, opened)
-    answer(records.read(opened.storage, f"{config.name}/{records.STATE}") or {})
+    answer(sweep_files.read(opened.storage, f"{config.name}/{sweep_files.STATE}") or {})
     return code
 
 
@@ -226,19 +226,19 @@ def _drive(console: Console, opened: Sweep) -> int:
 
 def _check_searches(opened: Sweep) -> None:
     if opened.plan.searched:
-        from music_rllib.sweep.searches import check_studies
+        from music_rllib.search.summary import check_studies
 
         check_studies(opened)
 
 
 def _check_ray(console: Console, opened: Sweep) -> None:
     """Look whether Ray is there and can hold a run, unless nothing is left to compute."""
-    begun = (opened.folder / records.CONFIG).is_file()
+    begun = (opened.folder / sweep_files.CONFIG).is_file()
     if opened.board.complete and (begun or not opened.plan.searched):
         return
     if (address := cluster_address()) is not None:
         check_reachable(address)
-    from music_rllib.sweep.cluster import check_fits
+    from music_rllib.runtime.ray_cluster import check_fits
 
     if remark := check_fits(opened.config.resources):
         console.print(Text(remark, style="yellow"), soft_wrap=True)
@@ -289,8 +289,8 @@ def _open_tracker(opened: Sweep) -> Tracker:
 
 
 def _compute_and_report(console: Console, opened: Sweep, tracker: Tracker) -> int:
-    from music_rllib.sweep.display import Display
-    from music_rllib.sweep.logbook import Logbook
+    from music_rllib.sweep.listeners.mlflow import Logbook
+    from music_rllib.sweep.listeners.screen import Display
 
     with Display(console, opened.plan, opened.board) as display, Beacon(opened) as beacon:
         logbook = Logbook(tracker, lambda text: display.say(text, "yellow"), opened.store)
@@ -340,8 +340,8 @@ def _open_campaign(
     """The sweep's searches, if it has any, as far as earlier results lead."""
     if not opened.plan.searched:
         return None
-    from music_rllib.sweep.campaign import Campaign
-    from music_rllib.sweep.searches import learnings, open_searches, outcome
+    from music_rllib.search.controller import Campaign
+    from music_rllib.search.summary import learnings, open_searches, outcome
 
     def reused(node: Node) -> None:
         logbook.reused(node, opened.store)
@@ -365,7 +365,7 @@ def _open_campaign(
 
 def _close_campaign(opened: Sweep, campaign: Campaign, tracker: Tracker) -> list[dict[str, Any]]:
     """Keep what came of the searches, in the sweep's folder and in MLflow."""
-    from music_rllib.sweep.searches import outcome
+    from music_rllib.search.summary import outcome
 
     campaign.stop()
     found = outcome(campaign)
@@ -387,8 +387,8 @@ def _compute(
     """Compute what is left, if anything; the signal that stopped it."""
     if opened.board.complete and (campaign is None or campaign.over):
         return None
-    from music_rllib.sweep.gauges import Gauges
-    from music_rllib.sweep.runner import compute
+    from music_rllib.sweep.listeners.prometheus import Gauges
+    from music_rllib.sweep.tune.runner import compute
 
     address = cluster_address()
     display.say("starting a local Ray" if address is None else f"connecting to Ray at {address}")

@@ -11,20 +11,20 @@ from typing import Any
 import numpy as np
 import yaml
 
-from music_rllib.experiment.files import write_atomically
-from music_rllib.experiment.model import Stage
+from music_rllib import names
+from music_rllib.config.schema import Stage
+from music_rllib.config.search.space import Objective
+from music_rllib.errors import BadInputError
+from music_rllib.experiment import sweep_files
 from music_rllib.experiment.plan import Run
-from music_rllib.experiment.sealed import StorageError
-from music_rllib.experiment.space import Objective
-from music_rllib.search.judge import interval
-from music_rllib.sweep import records
-from music_rllib.sweep.conditions import Condition, conditions
-from music_rllib.sweep.frame import BadInputError
-from music_rllib.sweep.judgement import best_of, leader, measure_of
-from music_rllib.sweep.session import Sweep
-from music_rllib.sweep.tables import with_interval
-from music_rllib.tracking import names
-from music_rllib.tracking.redaction import redact
+from music_rllib.experiment.session import Sweep
+from music_rllib.redaction import redact
+from music_rllib.results.comparison import with_interval
+from music_rllib.results.from_store import Condition, conditions
+from music_rllib.search.objective import interval
+from music_rllib.search.ranking import best_of, leader, measure_of
+from music_rllib.store.files import write_atomically
+from music_rllib.store.object_folder import StorageError
 
 __all__ = ["export_best"]
 
@@ -139,8 +139,8 @@ def _best_trial(
 
 def _search_of(sweep: Sweep, stage: str) -> Mapping[str, Any] | None:
     """What came of a search: with its ranking once it is over, and as far as it is before."""
-    state = records.read(sweep.storage, f"{sweep.config.name}/{records.STATE}") or {}
-    ended = records.read(sweep.storage, f"{sweep.config.name}/{records.SEARCH}") or ()
+    state = sweep_files.read(sweep.storage, f"{sweep.config.name}/{sweep_files.STATE}") or {}
+    ended = sweep_files.read(sweep.storage, f"{sweep.config.name}/{sweep_files.SEARCH}") or ()
     now = [search for search in state.get("searches", ()) if search["stage"] == stage]
     then = [search for search in ended if search["stage"] == stage]
     # That of the end is older than a search that goes on, as one that has been extended does.
@@ -177,7 +177,7 @@ def _export(sweep: Sweep, run: Run, folder: Path, chosen: dict[str, Any]) -> Non
                     shutil.rmtree(target)
                 part.replace(target)
         settings = sweep.plan.node(run.key).run.model_dump(mode="json")
-        write_atomically(folder / CHOSEN, records.as_json(chosen).encode())
+        write_atomically(folder / CHOSEN, sweep_files.as_json(chosen).encode())
         write_atomically(folder / "run.yaml", yaml.safe_dump(settings, sort_keys=False).encode())
     except OSError as error:
         raise StorageError(f"{error.filename or folder} must be writable: {error.strerror}") from (

@@ -8,13 +8,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-from music_rllib.envs.registry import BUILT_IN_TASKS, Task, closest
-from music_rllib.experiment.handoff import open_handoff, read_handoff
+from music_rllib.config.run_settings import RunSettings
+from music_rllib.envs.tasks import BUILT_IN_TASKS, Task, closest
 from music_rllib.experiment.plan import Input, Plan
-from music_rllib.experiment.settings import RunSettings
-from music_rllib.experiment.store import NodeStore
-from music_rllib.sweep.board import Board, Status
-from music_rllib.sweep.in_time import in_time
+from music_rllib.experiment.scheduler import Board, Status
+from music_rllib.runtime.in_time import in_time
+from music_rllib.store.handoff import open_handoff, read_handoff
+from music_rllib.store.node_store import NodeStore
 
 if TYPE_CHECKING:  # the environments are heavy, and most sweeps have none of their own
     from music_rllib.envs.make import Env
@@ -70,7 +70,7 @@ def check_hardware(plan: Plan) -> None:
     """
     if all(node.run.tac.precision == "float32" for node in plan.nodes):
         return
-    from music_rllib.tac.precision import PrecisionError, check_precision
+    from music_rllib.tac.kernels.precision import PrecisionError, check_precision
 
     try:
         check_precision("bf16")

@@ -39,8 +39,8 @@ from music_rllib.replay.buffer import TrajectoryReplay, Transitions
 from music_rllib.schedules import value_at
 from music_rllib.tac.config import TACConfig
 from music_rllib.tac.env_runner import SUCCESS_LAST, Episode, TrajectoryEnvRunner, seed_or_entropy
-from music_rllib.tac.module import ESTIMATOR_MODULE
 from music_rllib.tac.normaliser import in_this_form
+from music_rllib.tac.rl_module import ESTIMATOR_MODULE
 
 __all__ = ["TAC"]
 

@@ -13,14 +13,14 @@ from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 from ray.tune.search.sample import Domain
 
-from music_rllib._quiet import quiet_third_parties
-from music_rllib.envs.registry import BUILT_IN_TASKS, Indices, check_split
-from music_rllib.estimator.settings import MusicSettings
+from music_rllib.config.returns import Range, cut_off
+from music_rllib.config.tac_settings import TACSettings
+from music_rllib.envs.tasks import BUILT_IN_TASKS, Indices, check_split
+from music_rllib.intrinsic.settings import MusicSettings
 from music_rllib.replay.settings import ReplaySettings
+from music_rllib.runtime.quiet import quiet_third_parties
 from music_rllib.schedules import Linear, Measured, check_measurable
-from music_rllib.tac.module import ESTIMATOR_MODULE, EstimatorModule, TACModule
-from music_rllib.tac.returns import Range, cut_off
-from music_rllib.tac.settings import TACSettings
+from music_rllib.tac.rl_module import ESTIMATOR_MODULE, EstimatorModule, TACModule
 
 __all__ = ["TACConfig"]
 

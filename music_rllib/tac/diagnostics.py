@@ -15,8 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from music_rllib.tracking import names
-from music_rllib.tsallis import MAX_EXPONENT, bound_active, ln_q_of_log, ln_q_of_policy
+from music_rllib import names
+from music_rllib.functional.tsallis import MAX_EXPONENT, bound_active, ln_q_of_log, ln_q_of_policy
 
 __all__ = ["discounted_returns", "of_intrinsic_reward", "of_policy", "of_targets"]
 

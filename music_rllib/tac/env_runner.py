@@ -32,7 +32,7 @@ from ray.rllib.utils.metrics import (
 )
 from ray.rllib.utils.typing import StateDict
 
-from music_rllib._quiet import quiet_third_parties
+from music_rllib.config.tac_settings import GaussianNoise, TACSettings
 from music_rllib.envs.calls import in_environment
 from music_rllib.envs.make import (
     Env,
@@ -45,9 +45,9 @@ from music_rllib.envs.make import (
 )
 from music_rllib.envs.numbers import BadNumberError
 from music_rllib.replay.buffer import ReplayLayout
-from music_rllib.tac.module import TACModule
+from music_rllib.runtime.quiet import quiet_third_parties
 from music_rllib.tac.recording import Episode, Recording
-from music_rllib.tac.settings import GaussianNoise, TACSettings
+from music_rllib.tac.rl_module import TACModule
 
 __all__ = [
     "DISPLACEMENT",

@@ -29,24 +29,25 @@ from ray.rllib.utils.metrics import NUM_ENV_STEPS_SAMPLED_LIFETIME
 from ray.rllib.utils.typing import ModuleID, ParamDict, ResultDict, StateDict
 from torch import Tensor
 
-from music_rllib._allocator import keep_freed_memory
-from music_rllib._quiet import quiet_third_parties
-from music_rllib.mutual_information import time_permutations
+from music_rllib import names
+from music_rllib.config.tac_settings import LearnedAlpha, TACSettings
+from music_rllib.functional import actor_critic
+from music_rllib.functional.mutual_information import time_permutations
+from music_rllib.functional.tsallis import ln_q_of_policy
+from music_rllib.intrinsic.held_out import HeldOutBound
 from music_rllib.replay.buffer import Trajectory
+from music_rllib.runtime.allocator import keep_freed_memory
+from music_rllib.runtime.quiet import quiet_third_parties
 from music_rllib.schedules import Quantity
-from music_rllib.tac import diagnostics, losses
-from music_rllib.tac.forward import Bootstrap, TACForward
-from music_rllib.tac.graphs import CapturedUpdate, CudaRecorder
-from music_rllib.tac.held_out import HeldOutBound
+from music_rllib.tac import diagnostics
+from music_rllib.tac.kernels.adam import FusedAdam
+from music_rllib.tac.kernels.cuda_graphs import CapturedUpdate, CudaRecorder
+from music_rllib.tac.kernels.forward import Bootstrap, TACForward
+from music_rllib.tac.kernels.precision import check_precision
 from music_rllib.tac.kernels.update import DirectUpdate
-from music_rllib.tac.module import ESTIMATOR_MODULE, EstimatorModule, TACModule, choose_action
 from music_rllib.tac.normaliser import RunningNormaliser
-from music_rllib.tac.optimizer import FusedAdam
-from music_rllib.tac.precision import check_precision
+from music_rllib.tac.rl_module import ESTIMATOR_MODULE, EstimatorModule, TACModule, choose_action
 from music_rllib.tac.scheduled import ScheduledSettings
-from music_rllib.tac.settings import LearnedAlpha, TACSettings
-from music_rllib.tracking import names
-from music_rllib.tsallis import ln_q_of_policy
 
 __all__ = ["GRAD_UPDATES", "HELD_OUT_STEPS", "NonFiniteLossError", "TACLearner"]
 
@@ -342,7 +343,7 @@ class TACLearner(TorchLearner):
 
     def _loss(self, forward: TACForward, batch: Mapping[str, Tensor]) -> _Loss:
         settings, alpha = self._settings, self._current_alpha()
-        target = losses.critic_target(
+        target = actor_critic.critic_target(
             batch[Columns.REWARDS],
             batch["discounts"],
             self._soft_value(forward.next),
@@ -350,20 +351,20 @@ class TACLearner(TorchLearner):
             settings.target_bounds,
         )
         ln_q_pi = self._ln_q(forward.log_density)
-        critic = losses.critic_loss(forward.q_values, target, batch.get("weights"))
-        improved = losses.policy_value(forward.q_of_policy, settings.policy_critic)
-        policy = losses.policy_loss(improved, ln_q_pi, alpha)
+        critic = actor_critic.critic_loss(forward.q_values, target, batch.get("weights"))
+        improved = actor_critic.policy_value(forward.q_of_policy, settings.policy_critic)
+        policy = actor_critic.policy_loss(improved, ln_q_pi, alpha)
         if settings.action_l2 > 0:
             policy = policy + settings.action_l2 * forward.action.square().mean()
         total = critic + policy
-        value_target = losses.value_target(forward.q_of_policy, ln_q_pi, alpha)
+        value_target = actor_critic.value_target(forward.q_of_policy, ln_q_pi, alpha)
         if forward.value is not None:
-            value = losses.value_loss(forward.value, value_target)
+            value = actor_critic.value_loss(forward.value, value_target)
             total = total + value
             self._losses[names.VALUE_LOSS] = value.detach()
         excess = self._excess_entropy(forward, ln_q_pi)
         if isinstance(settings.alpha, LearnedAlpha):
-            total = total + losses.alpha_loss(self._policy_module.log_alpha, excess)
+            total = total + actor_critic.alpha_loss(self._policy_module.log_alpha, excess)
         self._observe(forward, target, critic=critic, policy=policy)
         return _Loss(total, target, value_target, excess)
 

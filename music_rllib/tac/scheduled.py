@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from music_rllib.estimator.settings import MusicSettings
+from music_rllib import names
+from music_rllib.config.tac_settings import TACSettings, alpha_at
+from music_rllib.intrinsic.settings import MusicSettings
 from music_rllib.schedules import Follower, Linear, Measured, Piecewise, Quantity, value_at
-from music_rllib.tac.settings import TACSettings, alpha_at
-from music_rllib.tracking import names
 
 __all__ = ["ScheduledSettings"]
 

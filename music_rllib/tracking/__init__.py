@@ -1,7 +1,6 @@
-"""Metric names and MLflow. Knows neither Ray nor the environments.
+"""MLflow. Knows neither Ray nor the environments.
 
-The names below are loaded on first use: :mod:`music_rllib.tracking.names` is read by every layer
-and must not cost them the import of MLflow.
+The names below are loaded on first use, as MLflow takes a second to import.
 """
 
 from __future__ import annotations
@@ -10,7 +9,6 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from music_rllib.tracking.errors import TrackingError
     from music_rllib.tracking.sender import Backlog
     from music_rllib.tracking.session import deliver
     from music_rllib.tracking.store import check_reachable, resolve_store
@@ -21,7 +19,6 @@ __all__ = [
     "Point",
     "RunInfo",
     "Tracker",
-    "TrackingError",
     "check_reachable",
     "deliver",
     "resolve_store",
@@ -32,7 +29,6 @@ _HOMES = {
     "Point": "tracker",
     "RunInfo": "tracker",
     "Tracker": "tracker",
-    "TrackingError": "errors",
     "check_reachable": "store",
     "deliver": "session",
     "resolve_store": "store",

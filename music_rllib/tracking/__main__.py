@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from music_rllib.tracking.errors import TrackingError
-from music_rllib.tracking.redaction import for_people
+from music_rllib.errors import TrackingError
+from music_rllib.redaction import for_people
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
 

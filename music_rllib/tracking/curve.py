@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from music_rllib.tracking import names
+from music_rllib import names
 from music_rllib.tracking.spool import Metrics
 
 # Okabe and Ito's colours, told apart by colour-blind readers; line styles tell them apart in grey.

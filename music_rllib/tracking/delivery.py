@@ -12,9 +12,9 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 
-from music_rllib.tracking import names
+from music_rllib import names
+from music_rllib.errors import TrackingError
 from music_rllib.tracking.curve import learning_curve_png
-from music_rllib.tracking.errors import TrackingError
 from music_rllib.tracking.mlflow_client import MAX_METRICS, Experiment
 from music_rllib.tracking.spool import Delivered, Finish, Metrics, Record, Spool, Start
 

@@ -28,10 +28,10 @@ from mlflow.entities import (
 from mlflow.exceptions import MlflowException
 from mlflow.tracking._tracking_service import utils
 
-from music_rllib.tracking import names
-from music_rllib.tracking.errors import TrackingError
+from music_rllib import names
+from music_rllib.errors import TrackingError
+from music_rllib.redaction import redact
 from music_rllib.tracking.policy_model import MODEL_NAME, write_model
-from music_rllib.tracking.redaction import redact
 from music_rllib.tracking.spool import Metrics, Status
 from music_rllib.tracking.store import TrackingStore
 

@@ -8,7 +8,7 @@ from importlib import metadata
 from pathlib import Path
 
 import music_rllib
-from music_rllib.tracking import names
+from music_rllib import names
 
 PACKAGES = (
     "music-rllib",

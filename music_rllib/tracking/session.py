@@ -20,9 +20,9 @@ from typing import Self
 
 from filelock import FileLock, Timeout
 
-from music_rllib.tracking import names
+from music_rllib import names
+from music_rllib.errors import TrackingError
 from music_rllib.tracking.delivery import Delivery
-from music_rllib.tracking.errors import TrackingError
 from music_rllib.tracking.mlflow_client import Experiment, first_line
 from music_rllib.tracking.sender import Backlog, Sender
 from music_rllib.tracking.spool import Spool, Start, has_undelivered

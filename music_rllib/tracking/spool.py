@@ -24,7 +24,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
-from music_rllib.tracking.errors import TrackingError
+from music_rllib.errors import TrackingError
 
 logger = logging.getLogger(__name__)
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from music_rllib.tracking.errors import TrackingError
-from music_rllib.tracking.redaction import redact
+from music_rllib.errors import TrackingError
+from music_rllib.redaction import redact
 
 CONNECT_SECONDS = 3.0
 ANSWER_SECONDS = 5.0

@@ -18,10 +18,10 @@ from typing import Self
 
 import yaml
 
-from music_rllib.tracking import names
-from music_rllib.tracking.errors import TrackingError
+from music_rllib import names
+from music_rllib.errors import TrackingError
+from music_rllib.redaction import flat_params, redact, without_secrets
 from music_rllib.tracking.provenance import provenance_tags
-from music_rllib.tracking.redaction import flat_params, redact, without_secrets
 from music_rllib.tracking.sender import Backlog
 from music_rllib.tracking.session import Session, SweepRecord, new_sweep_id, relative_storage
 from music_rllib.tracking.spool import Finish, Metrics, Record, Spool, Start, Status

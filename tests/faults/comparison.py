@@ -8,8 +8,8 @@ from typing import Any
 
 from mlflow import MlflowClient
 
-from music_rllib.experiment.store import NodeStore
-from music_rllib.tracking import names
+from music_rllib import names
+from music_rllib.store.node_store import NodeStore
 
 Numbers = dict[str, list[tuple[int, dict[str, float]]]]
 

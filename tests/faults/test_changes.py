@@ -13,17 +13,17 @@ import pyarrow.fs as pafs
 import pytest
 import yaml
 
-from music_rllib.experiment import lease as lease_module
-from music_rllib.experiment.config import load_sweep
-from music_rllib.experiment.lease import Lease, LeaseFile
-from music_rllib.experiment.model import SweepConfig
+from music_rllib.config.load import load_sweep
+from music_rllib.config.schema import SweepConfig
+from music_rllib.experiment import changes as changes_module
+from music_rllib.experiment.changes import changes_since, keep_settings
 from music_rllib.experiment.plan import make_plan
-from music_rllib.experiment.result import RunResult
-from music_rllib.experiment.sealed import StorageError
-from music_rllib.sweep import changes as changes_module
-from music_rllib.sweep.changes import changes_since, keep_settings
-from music_rllib.sweep.driving import driving
-from music_rllib.sweep.session import Sweep, open_sweep
+from music_rllib.experiment.session import Sweep, open_sweep
+from music_rllib.store import lease as lease_module
+from music_rllib.store.lease import Lease, LeaseFile
+from music_rllib.store.object_folder import StorageError
+from music_rllib.store.run_record import RunResult
+from music_rllib.sweep.driver_lock import driving
 
 RESULT = RunResult(label="l", env_steps=1200, seconds=1.0, metrics={})
 
@@ -161,7 +161,7 @@ def test_a_driver_that_was_suspended_ends_where_another_one_has_its_sweep(
     file = LeaseFile(pafs.LocalFileSystem(), str(sweep.folder / "driver.json"))
     ended: list[int] = []
     said: list[str] = []
-    monkeypatch.setattr("music_rllib.sweep.driving.end_process", ended.append)
+    monkeypatch.setattr("music_rllib.sweep.driver_lock.end_process", ended.append)
     theirs = Lease.of_this_process("sweep 'points'", 60.0)
     with driving(sweep, said.append):
         mine = file.read()

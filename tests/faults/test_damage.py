@@ -17,12 +17,12 @@ from typing import Any
 
 import pytest
 
-from music_rllib.envs.registry import Task
-from music_rllib.experiment.lease import Lease
-from music_rllib.experiment.model import Checkpoints
-from music_rllib.experiment.store import NodeStore
-from music_rllib.sweep.node_job import NodeJob
-from music_rllib.sweep.trainable import CAUSE, NOTES, STOPPED, RunTrainable
+from music_rllib.config.schema import Checkpoints
+from music_rllib.envs.tasks import Task
+from music_rllib.store.lease import Lease
+from music_rllib.store.node_store import NodeStore
+from music_rllib.training.job import NodeJob
+from music_rllib.training.worker import CAUSE, NOTES, STOPPED, RunTrainable
 from tests.integration.test_sweep_trainable import (
     compute,
     job,
@@ -289,7 +289,7 @@ def test_a_run_that_is_paused_between_reports_loses_nothing(
 KILLED_WHILE_SAVING = """
 import os, sys
 from pathlib import Path
-from music_rllib.experiment.store import NodeStore
+from music_rllib.store.node_store import NodeStore
 
 storage, crash_at = sys.argv[1], int(sys.argv[2])
 work = NodeStore(storage).work_folder("a" * 20)

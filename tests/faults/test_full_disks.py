@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from music_rllib.experiment.sealed import StorageError
-from music_rllib.experiment.store import NodeStore
+from music_rllib.store.node_store import NodeStore
+from music_rllib.store.object_folder import StorageError
 from tests.faults import comparison, sweeps
 from tests.integration.conftest import Program
 

@@ -12,14 +12,14 @@ from typing import Any
 
 import pytest
 
-from music_rllib.sweep.hang_watch import RECORD, HangError, check_hung
+from music_rllib.training.hang_watch import RECORD, HangError, check_hung
 from tests.faults import sweeps
 from tests.integration.conftest import ENVIRONMENTS, REPOSITORY, Program
 
 WORKER = """
 import sys, time
 from music_rllib.envs.calls import in_environment
-from music_rllib.sweep.hang_watch import HangWatch
+from music_rllib.training.hang_watch import HangWatch
 from point_env import Hanging
 
 watch = HangWatch(1.0, sys.argv[1], "key", "attempt")

@@ -11,10 +11,10 @@ import pytest
 from ray.rllib.core import DEFAULT_MODULE_ID
 from ray.rllib.policy.sample_batch import MultiAgentBatch, SampleBatch
 
-from music_rllib.entropy_scale import matched_alpha, normalised_alpha
+from music_rllib import names
+from music_rllib.functional.entropy_scale import matched_alpha, normalised_alpha
 from music_rllib.tac.config import TACConfig
 from music_rllib.tac.learner import TACLearner
-from music_rllib.tracking import names
 
 ACTIONS, BATCH, UPDATES = 2, 32, 100
 RAMP = {"schedule": "linear", "start": 1.0, "end": 3.0, "begin": 0.0, "finish": 1.0}

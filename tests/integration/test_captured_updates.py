@@ -18,7 +18,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from music_rllib.tac.algorithm import TAC
-from music_rllib.tac.graphs import CapturedUpdate, CudaRecorder, Replay
+from music_rllib.tac.kernels.cuda_graphs import CapturedUpdate, CudaRecorder, Replay
 from music_rllib.tac.learner import TACLearner
 from tests.integration.test_tac_algorithm import (
     DDPG,

@@ -17,7 +17,7 @@ from urllib.request import urlopen
 import pytest
 import yaml
 
-from music_rllib.sweep.gauges import GAUGES, TARGETS
+from music_rllib.sweep.listeners.prometheus import GAUGES, TARGETS
 
 DASHBOARDS = Path(__file__).parents[2] / "dashboards"
 PATIENCE = 240.0

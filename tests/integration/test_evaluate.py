@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from music_rllib.envs.registry import BUILT_IN_TASKS, Task
+from music_rllib.envs.tasks import BUILT_IN_TASKS, Task
 from music_rllib.policy import Policy, PolicyNetwork
-from music_rllib.policy.episodes import open_task, play
+from music_rllib.policy.rollout import open_task, play
 from music_rllib.policy.video import FORMATS, VideoError, film, find_renderer, write_video
 from music_rllib.sweep.cli import main
 

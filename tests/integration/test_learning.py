@@ -5,12 +5,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from music_rllib import TACConfig
-from music_rllib.envs.registry import BUILT_IN_TASKS
-from music_rllib.experiment.settings import RunSettings, preset
-from music_rllib.experiment.training import TrainingRun
+from music_rllib import TACConfig, names
+from music_rllib.config.run_settings import RunSettings, preset
+from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.tac.algorithm import TAC
-from music_rllib.tracking import names
+from music_rllib.training.run import TrainingRun
 
 pytestmark = [pytest.mark.learning, pytest.mark.usefixtures("local_ray")]
 

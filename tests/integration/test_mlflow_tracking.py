@@ -27,8 +27,10 @@ from mlflow.models import Model
 from mlflow.tracking._tracking_service import utils as tracking_utils
 from typer.testing import CliRunner
 
+from music_rllib import names
+from music_rllib.errors import TrackingError
 from music_rllib.policy import PolicyNetwork
-from music_rllib.tracking import Point, RunInfo, Tracker, TrackingError, deliver, names
+from music_rllib.tracking import Point, RunInfo, Tracker, deliver
 from music_rllib.tracking.__main__ import app
 from music_rllib.tracking.policy_model import write_model
 

@@ -20,8 +20,8 @@ import pytest
 import yaml
 from mlflow import MlflowClient
 
-from music_rllib.reports.build import PAGE
-from music_rllib.tracking import names
+from music_rllib import names
+from music_rllib.report.build import PAGE
 from tests.integration.conftest import ENVIRONMENTS, REPOSITORY, SWEEP
 from tests.integration.devtools import Page
 

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import yaml
 
-from music_rllib.experiment.config import load_sweep
+from music_rllib.config.load import load_sweep
 from music_rllib.experiment.plan import make_plan
 from music_rllib.sweep.preflight import TaskError, check_environments
 

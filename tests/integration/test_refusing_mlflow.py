@@ -93,7 +93,7 @@ def test_what_waits_stays_and_is_told(uri: str, status: int, tmp_path: Path) -> 
 def test_a_report_says_so(
     uri: str, status: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from music_rllib.reports.cli import app
+    from music_rllib.report.cli import app
 
     monkeypatch.chdir(tmp_path)
     done = CliRunner().invoke(app, ["s", "--tracking-uri", uri])

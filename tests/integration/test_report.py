@@ -22,16 +22,17 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from music_rllib.experiment.config import load_sweep
+from music_rllib import names
+from music_rllib.config.load import load_sweep
 from music_rllib.experiment.plan import Node, make_plan
-from music_rllib.reports.archive import Format, read_archive
-from music_rllib.reports.build import PAGE
-from music_rllib.reports.cli import app
-from music_rllib.reports.locate import find_sweep
-from music_rllib.reports.query import read_mlflow
+from music_rllib.report.build import PAGE
+from music_rllib.report.cli import app
+from music_rllib.report.location import find_sweep
+from music_rllib.results.archive.folder import Format, read_archive
 from music_rllib.results.data import Sweep
-from music_rllib.sweep.logbook import run_info
-from music_rllib.tracking import Tracker, names, resolve_store
+from music_rllib.results.from_mlflow import read_mlflow
+from music_rllib.sweep.listeners.mlflow import run_info
+from music_rllib.tracking import Tracker, resolve_store
 
 STEPS = range(20_000, 100_001, 20_000)
 CONFIG = """
@@ -240,7 +241,7 @@ def test_a_report_needs_neither_ray_nor_mlflow_for_an_exported_sweep(
     run(sweep_folder, "--export", exported)
     code = (
         "import sys; sys.modules['ray'] = sys.modules['mlflow'] = None\n"
-        "from music_rllib.reports.cli import app; app(sys.argv[1:], standalone_mode=False)"
+        "from music_rllib.report.cli import app; app(sys.argv[1:], standalone_mode=False)"
     )
     command = [sys.executable, "-c", code, str(exported)]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 PROGRAM = """
-from music_rllib._quiet import prepare_environment, quiet_third_parties
+from music_rllib.runtime.quiet import prepare_environment, quiet_third_parties
 prepare_environment()
 quiet_third_parties()
 

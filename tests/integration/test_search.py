@@ -17,8 +17,8 @@ from typing import Any
 
 import pytest
 
-from music_rllib.search.database import known_studies
-from music_rllib.tracking import names
+from music_rllib import names
+from music_rllib.search.storage import known_studies
 from tests.faults import comparison
 
 pytestmark = pytest.mark.integration

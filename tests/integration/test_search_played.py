@@ -24,16 +24,17 @@ import psutil
 import pytest
 from optuna.exceptions import StorageInternalError
 
-from music_rllib.experiment.sealed import StorageError
-from music_rllib.experiment.settings import RunSettings
-from music_rllib.experiment.space import FINAL_SEED
-from music_rllib.sweep import cli, records
-from music_rllib.sweep.beacon import Beacon
-from music_rllib.sweep.board import Status
-from music_rllib.sweep.searches import learnings, outcome
-from music_rllib.sweep.session import keep_record
-from music_rllib.tac.settings import LearnedAlpha
-from music_rllib.tracking import names
+from music_rllib import names
+from music_rllib.config.run_settings import RunSettings
+from music_rllib.config.search.space import FINAL_SEED
+from music_rllib.config.tac_settings import LearnedAlpha
+from music_rllib.experiment import sweep_files
+from music_rllib.experiment.scheduler import Status
+from music_rllib.experiment.session import keep_record
+from music_rllib.search.summary import learnings, outcome
+from music_rllib.store.object_folder import StorageError
+from music_rllib.sweep import cli
+from music_rllib.sweep.listeners.state_file import Beacon
 from tests.played_search import SPACE, Document, Driver, document, points, searched, success
 
 
@@ -295,7 +296,9 @@ def recorded(folder: Path, content: Document) -> Driver:
         beacon.searches = lambda: outcome(driver.campaign, thorough=False)
         beacon.end("stopped")
     if driver.campaign.over:
-        records.keep(driver.sweep, records.SEARCH, records.as_json(outcome(driver.campaign)))
+        sweep_files.keep(
+            driver.sweep, sweep_files.SEARCH, sweep_files.as_json(outcome(driver.campaign))
+        )
     return driver
 
 

@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from music_rllib import names
+from music_rllib.config.load import load_sweep
+from music_rllib.config.run_settings import Evaluation, RunSettings, Variant, preset
 from music_rllib.envs.make import goal_reward_of, make_env
-from music_rllib.envs.registry import BUILT_IN_TASKS, Task
-from music_rllib.experiment.config import load_sweep
+from music_rllib.envs.tasks import BUILT_IN_TASKS, Task
 from music_rllib.experiment.plan import make_plan
-from music_rllib.experiment.settings import Evaluation, RunSettings, Variant, preset
 from music_rllib.replay.buffer import ReplayLayout, Trajectory, TrajectoryReplay
 from music_rllib.sweep.preflight import check_environments
-from music_rllib.tracking import names
 
 Floats = NDArray[np.float64]
 Env = gym.Env[Any, Any]
@@ -267,7 +267,7 @@ def run_settings(variant: Variant, *, hindsight_k: float = 0.0) -> RunSettings:
 @pytest.mark.usefixtures("local_ray")
 @pytest.mark.parametrize("variant, hindsight_k", [("music-u", 0.0), ("tac", 4.0)])
 def test_the_hand_is_trained_to_the_end_of_its_budget(variant: Variant, hindsight_k: float) -> None:
-    from music_rllib.experiment.training import TrainingRun
+    from music_rllib.training.run import TrainingRun
 
     training = TrainingRun(run_settings(variant, hindsight_k=hindsight_k))
     metrics: dict[str, float] = {}

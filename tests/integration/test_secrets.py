@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 import requests
 
-from music_rllib.tracking.redaction import redact
+from music_rllib.redaction import redact
 
 ROOT = Path(__file__).parents[2]
 USER, PASSWORD = "music", "planted-mlflow-password"
@@ -134,9 +134,9 @@ def test_a_password_in_the_tracking_uri_is_not_kept(
     sweep_program: Any, sweep_document: dict[str, Any], tmp_path: Path
 ) -> None:
     """It should be in the environment; where it is not, the copy of the file leaves it out."""
-    from music_rllib.experiment.config import load_sweep
+    from music_rllib.config.load import load_sweep
     from music_rllib.experiment.plan import make_plan
-    from music_rllib.sweep.session import keep_record, open_sweep
+    from music_rllib.experiment.session import keep_record, open_sweep
 
     document = sweep_document
     document["mlflow"] = {"tracking_uri": "http://music:planted-in-a-uri@localhost:1"}

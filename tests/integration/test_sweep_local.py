@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from mlflow import MlflowClient
 
-from music_rllib.tracking import names
+from music_rllib import names
 from tests.integration.conftest import listening
 
 pytestmark = pytest.mark.integration

@@ -14,18 +14,18 @@ import pytest
 import torch
 from ray.tune.trainable import trainable
 
-from music_rllib.envs.registry import Task
-from music_rllib.experiment.handoff import read_handoff
+from music_rllib import names
+from music_rllib.config.run_settings import RunSettings, Variant, handed_over, preset
+from music_rllib.envs.tasks import Task
 from music_rllib.experiment.plan import node_key
-from music_rllib.experiment.result import from_json_lines
-from music_rllib.experiment.settings import RunSettings, Variant, handed_over, preset
-from music_rllib.experiment.store import NodeStore
-from music_rllib.experiment.training import TrainingRun, _means
 from music_rllib.policy import find_policy, load_policy
-from music_rllib.sweep.node_job import NodeJob
-from music_rllib.sweep.trainable import CAUSE, NOTES, REPORTS, RunTrainable
+from music_rllib.store.handoff import read_handoff
+from music_rllib.store.node_store import NodeStore
+from music_rllib.store.run_record import from_json_lines
 from music_rllib.tac.learner import HELD_OUT_STEPS
-from music_rllib.tracking import names
+from music_rllib.training.job import NodeJob
+from music_rllib.training.run import TrainingRun, _means
+from music_rllib.training.worker import CAUSE, NOTES, REPORTS, RunTrainable
 
 pytestmark = pytest.mark.integration
 

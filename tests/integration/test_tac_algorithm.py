@@ -9,16 +9,15 @@ import numpy as np
 import pytest
 from ray import tune
 
-from music_rllib import TACConfig
+from music_rllib import TACConfig, names
+from music_rllib.config.tac_settings import TACSettings
 from music_rllib.envs.make import make_env
 from music_rllib.envs.numbers import BadNumberError
-from music_rllib.estimator.settings import MusicSettings
+from music_rllib.intrinsic.settings import MusicSettings
 from music_rllib.replay.buffer import Trajectory
 from music_rllib.replay.settings import ReplaySettings
 from music_rllib.tac.algorithm import TAC
-from music_rllib.tac.precision import PrecisionError, has_bf16
-from music_rllib.tac.settings import TACSettings
-from music_rllib.tracking import names
+from music_rllib.tac.kernels.precision import PrecisionError, has_bf16
 
 pytestmark = pytest.mark.usefixtures("local_ray")
 

@@ -11,9 +11,9 @@ import torch.nn.functional as F
 from ray.rllib.core import DEFAULT_MODULE_ID
 from torch import Tensor
 
+from music_rllib import names
 from music_rllib.tac.config import TACConfig
 from music_rllib.tac.learner import NonFiniteLossError, TACLearner
-from music_rllib.tracking import names
 
 OBSERVATION, ACTION, BATCH = 6, 3, 32
 

@@ -28,7 +28,7 @@ from cluster.check import (
     read_crds,
     strings,
 )
-from music_rllib.experiment.config import load_sweep
+from music_rllib.config.load import load_sweep
 
 ROOT = Path(__file__).parents[2]
 CLUSTER = ROOT / "cluster"

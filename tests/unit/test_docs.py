@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from music_rllib.envs.registry import BUILT_IN_TASKS
-from music_rllib.experiment.config import load_sweep
-from music_rllib.tracking import names
+from music_rllib import names
+from music_rllib.config.load import load_sweep
+from music_rllib.envs.tasks import BUILT_IN_TASKS
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"

@@ -1,66 +1,28 @@
-"""The layers import downwards only, and the lower ones load no Ray.
-
-Modules are found by walking the package: a new one is held to its layer's rule from its first
-day, and one in a new place must be given a layer here.
-"""
+"""Rooms import downwards only, and most modules load no Ray, not even by what they import."""
 
 from __future__ import annotations
 
-import ast
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-
-import pytest
 
 PACKAGE = Path(__file__).parents[2] / "music_rllib"
 
-# From the bottom up. A module may import its own part of the package and what stands lower.
-LAYERS: tuple[tuple[str, ...], ...] = (
-    (
-        "_allocator",
-        "_autoscaler",
-        "_cluster",
-        "_quiet",
-        "entropy_scale",
-        "limits",
-        "tsallis",
-        "mutual_information",
-        "schedules",
-        "tracking.names",
-        "policy.network",
-    ),
-    ("estimator", "replay", "tracking"),
-    ("results",),
-    ("envs",),
-    ("tac",),
-    ("experiment",),
-    ("search",),
-    ("policy",),
-    ("sweep", "reports", "serve"),
-    ("report",),
-)
-
 # Only these may load Ray; everything else is usable, and tested, without it.
 MAY_LOAD_RAY = (
-    "_autoscaler",
-    "tac.algorithm",
-    "tac.config",
-    "tac.env_runner",
-    "tac.kernels.network",
-    "tac.kernels.update",
-    "tac.learner",
-    "tac.module",
-    "experiment.training",
+    "runtime.autoscaler",
+    "runtime.ray_cluster",
+    "runtime.ray_watch",
+    "tac",
+    "training",
     "serve.application",
     "sweep",
 )
 # torch and numpy only: no environments, no tracking.
-PURE = ("_allocator", "tsallis", "mutual_information", "schedules", "estimator", "replay")
+PURE = ("functional", "intrinsic", "replay", "runtime.allocator", "schedules")
 # Read by the command line before anything heavy is needed.
-LIGHT = ("", "_quiet", "tracking.names")
+LIGHT = ("", "errors", "names", "runtime.quiet")
 
 
 def _modules() -> list[str]:
@@ -81,63 +43,13 @@ def _is_in(module: str, part: str) -> bool:
     return module == part or module.startswith(f"{part}.")
 
 
-def _layer(module: str) -> tuple[int, str]:
-    """Height and part of a module; the most exact entry counts (``tracking.names``)."""
-    matches = [
-        (len(part), height, part)
-        for height, parts in enumerate(LAYERS)
-        for part in parts
-        if _is_in(module, part)
-    ]
-    assert matches, f"music_rllib.{module} has no layer: give it one in {Path(__file__).name}"
-    _, height, part = max(matches)
-    return height, part
-
-
-def _is_type_checking(node: ast.AST) -> bool:
-    return isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING")
-
-
-def _import_nodes(tree: ast.AST) -> Iterator[ast.Import | ast.ImportFrom]:
-    """Every import that can run, those inside functions too."""
-    for node in ast.iter_child_nodes(tree):
-        if isinstance(node, ast.Import | ast.ImportFrom):
-            yield node
-        elif not _is_type_checking(node):
-            yield from _import_nodes(node)
-
-
-def _own_imports(module: str) -> set[str]:
-    """The modules below ``music_rllib`` that ``module`` imports."""
-    path = PACKAGE.joinpath(*module.split("."))
-    source = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
-    imported: set[str] = set()
-    for node in _import_nodes(ast.parse(source.read_text())):
-        if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
-        else:
-            assert node.level == 0, f"{source}: imports are absolute here"
-            # `from music_rllib.tracking import names` imports a module, or a name in one.
-            names = [f"{node.module}.{alias.name}" for alias in node.names]
-        for name in names:
-            if not name.startswith("music_rllib."):
-                continue
-            below = name.removeprefix("music_rllib.")
-            while below not in MODULES and "." in below:
-                below = below.rpartition(".")[0]
-            if below in MODULES:
-                imported.add(below)
-    return imported
-
-
-@pytest.mark.parametrize("module", [name for name in MODULES if name])
-def test_imports_point_downwards(module: str) -> None:
-    height, part = _layer(module)
-    for imported in sorted(_own_imports(module)):
-        below, other = _layer(imported)
-        assert part == other or below < height, (
-            f"music_rllib.{module} (layer {height}) imports music_rllib.{imported} (layer {below})"
-        )
+def test_imports_point_downwards() -> None:
+    """The contracts of pyproject.toml."""
+    program = Path(sys.executable).with_name("lint-imports")
+    done = subprocess.run(
+        [program], cwd=PACKAGE.parent, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout
 
 
 def _forbidden(module: str) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from music_rllib.sweep.frame import Commands, add_json, add_place, console_for, print_json
+from music_rllib.sweep.cli_helpers import Commands, add_json, add_place, console_for, print_json
 
 __all__ = ["register"]
 
@@ -43,8 +43,8 @@ def register(commands: Commands) -> None:
 
 
 def _execute(arguments: argparse.Namespace) -> int:
+    from music_rllib.experiment.location import find_sweep
     from music_rllib.sweep.export import export_best
-    from music_rllib.sweep.find import find_sweep
 
     found = find_sweep(arguments.sweep, arguments.storage)
     sweep = found.open()

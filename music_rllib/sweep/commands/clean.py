@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from music_rllib.sweep.frame import Commands, add_json, add_place, console_for, print_json
+from music_rllib.sweep.cli_helpers import Commands, add_json, add_place, console_for, print_json
 
 __all__ = ["register"]
 
@@ -46,8 +46,8 @@ def register(commands: Commands) -> None:
 
 
 def _execute(arguments: argparse.Namespace) -> int:
-    from music_rllib.sweep.cleaning import delete, what_can_go
-    from music_rllib.sweep.find import find_sweep
+    from music_rllib.experiment.location import find_sweep
+    from music_rllib.sweep.clean import delete, what_can_go
 
     found = find_sweep(arguments.sweep, arguments.storage)
     cleaning = what_can_go(

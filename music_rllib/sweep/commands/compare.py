@@ -6,18 +6,12 @@ import argparse
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
-from music_rllib.sweep.frame import (
-    BadInputError,
-    Commands,
-    add_json,
-    add_place,
-    console_for,
-    print_json,
-)
+from music_rllib.errors import BadInputError
+from music_rllib.sweep.cli_helpers import Commands, add_json, add_place, console_for, print_json
 
 if TYPE_CHECKING:
     from music_rllib.results.comparison import Final, Scope
-    from music_rllib.sweep.conditions import Condition
+    from music_rllib.results.from_store import Condition
 
 __all__ = ["register"]
 
@@ -63,10 +57,10 @@ def register(commands: Commands) -> None:
 
 
 def _execute(arguments: argparse.Namespace) -> int:
-    from music_rllib.sweep.compare_view import compare_view
-    from music_rllib.sweep.conditions import conditions, scopes
-    from music_rllib.sweep.find import find_sweep
-    from music_rllib.sweep.judgement import measure_of
+    from music_rllib.experiment.location import find_sweep
+    from music_rllib.results.from_store import conditions, scopes
+    from music_rllib.search.ranking import measure_of
+    from music_rllib.sweep.views.compare import compare_view
 
     found = find_sweep(arguments.sweep, arguments.storage)
     sweep = found.open()

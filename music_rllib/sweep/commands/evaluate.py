@@ -6,13 +6,14 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from music_rllib.sweep.frame import BadInputError, Commands, add_json, console_for, print_json
+from music_rllib.errors import BadInputError
+from music_rllib.sweep.cli_helpers import Commands, add_json, console_for, print_json
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from music_rllib.policy.episodes import EpisodeResult
     from music_rllib.policy.policy import Policy
+    from music_rllib.policy.rollout import EpisodeResult
 
 __all__ = ["register"]
 
@@ -135,7 +136,7 @@ def _check_video(path: Path | None) -> None:
 
 
 def _play(policy: Policy, arguments: argparse.Namespace) -> list[EpisodeResult]:
-    from music_rllib.policy.episodes import open_task, play
+    from music_rllib.policy.rollout import open_task, play
 
     env = open_task(policy)
     try:

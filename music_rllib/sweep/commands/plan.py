@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 
+from music_rllib.sweep.cli_helpers import Commands, add_json, console_for, print_json
 from music_rllib.sweep.commands.run import add_sweep_options
-from music_rllib.sweep.frame import Commands, add_json, console_for, print_json
 
 __all__ = ["register"]
 

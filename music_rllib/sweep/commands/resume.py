@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from music_rllib.sweep.frame import Commands, add_json, add_place, console_for, print_json
+from music_rllib.sweep.cli_helpers import Commands, add_json, add_place, console_for, print_json
 
 __all__ = ["register"]
 
@@ -36,8 +36,8 @@ def register(commands: Commands) -> None:
 
 
 def _execute(arguments: argparse.Namespace) -> int:
+    from music_rllib.experiment.location import find_sweep
     from music_rllib.sweep.driver import resume_sweep
-    from music_rllib.sweep.find import find_sweep
 
     return resume_sweep(
         console_for(arguments),

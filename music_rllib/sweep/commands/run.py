@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from music_rllib.sweep.frame import Commands, add_json, console_for
+from music_rllib.sweep.cli_helpers import Commands, add_json, console_for
 
 __all__ = ["add_sweep_options", "register"]
 
@@ -77,8 +77,8 @@ def add_sweep_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _execute(arguments: argparse.Namespace) -> int:
+    from music_rllib.sweep.cli_helpers import print_json
     from music_rllib.sweep.driver import run_sweep
-    from music_rllib.sweep.frame import print_json
 
     return run_sweep(
         console_for(arguments),

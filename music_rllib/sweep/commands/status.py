@@ -6,18 +6,11 @@ import argparse
 import time
 from typing import TYPE_CHECKING, Any
 
-from music_rllib.sweep.frame import (
-    FAILED,
-    BadInputError,
-    Commands,
-    add_json,
-    add_place,
-    console_for,
-    print_json,
-)
+from music_rllib.errors import FAILED, BadInputError
+from music_rllib.sweep.cli_helpers import Commands, add_json, add_place, console_for, print_json
 
 if TYPE_CHECKING:
-    from music_rllib.sweep.find import Found
+    from music_rllib.experiment.location import Found
 
 __all__ = ["register", "state_of"]
 
@@ -50,8 +43,8 @@ def register(commands: Commands) -> None:
 
 
 def _execute(arguments: argparse.Namespace) -> int:
-    from music_rllib.sweep.find import find_sweep
-    from music_rllib.sweep.status_view import status_view
+    from music_rllib.experiment.location import find_sweep
+    from music_rllib.sweep.views.status import status_view
 
     found = find_sweep(arguments.sweep, arguments.storage)
     if arguments.json and arguments.watch:
@@ -81,18 +74,21 @@ def _code(state: dict[str, Any]) -> int:
 
 def state_of(found: Found) -> dict[str, Any]:
     """`state.json`, with what became of its driver and of its finished runs."""
-    from music_rllib.experiment.store import NodeStore
-    from music_rllib.sweep import records
-    from music_rllib.sweep.beacon import is_alive
+    from music_rllib.experiment import sweep_files
+    from music_rllib.store.node_store import NodeStore
+    from music_rllib.sweep.listeners.state_file import is_alive
 
-    state = found.read(records.STATE)
+    state = found.read(sweep_files.STATE)
     if state is None:
         return {"sweep": found.name, "place": found.place, "state": "not started"}
     outcome = state["driver"]["outcome"]
     if not is_alive(state):
         outcome = "interrupted" if outcome == "running" else outcome
         _nothing_runs(state)
-    store, nodes = NodeStore(found.storage), (found.read(records.PLAN) or {"nodes": []})["nodes"]
+    store, nodes = (
+        NodeStore(found.storage),
+        (found.read(sweep_files.PLAN) or {"nodes": []})["nodes"],
+    )
     labels = {node["key"]: node["label"] for node in nodes if store.is_finished(node["key"])}
     damaged = [
         {"run": labels[key], "cause": str(error)} for key, error in store.damage(labels).items()

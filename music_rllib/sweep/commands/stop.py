@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 import time
 
-from music_rllib.sweep.frame import FAILED, Commands, add_json, add_place, console_for, print_json
+from music_rllib.errors import FAILED
+from music_rllib.sweep.cli_helpers import Commands, add_json, add_place, console_for, print_json
 
 __all__ = ["register"]
 
@@ -39,16 +40,16 @@ def register(commands: Commands) -> None:
 
 
 def _execute(arguments: argparse.Namespace) -> int:
-    from music_rllib.sweep import records
+    from music_rllib.experiment import sweep_files
+    from music_rllib.experiment.location import find_sweep
     from music_rllib.sweep.commands.status import state_of
-    from music_rllib.sweep.find import find_sweep
 
     found = find_sweep(arguments.sweep, arguments.storage)
     console = console_for(arguments)
     state = state_of(found)["state"]
     asked = state == "running"
     if asked:
-        records.write(found.storage, f"{found.name}/{records.STOP}", '{"stop": true}')
+        sweep_files.write(found.storage, f"{found.name}/{sweep_files.STOP}", '{"stop": true}')
         deadline = time.monotonic() + arguments.wait
         while state == "running" and time.monotonic() < deadline:
             time.sleep(0.5)

@@ -1,4 +1,4 @@
-"""Derivatives of TAC's losses in closed form; the losses are `music_rllib.tac.losses`.
+"""Derivatives of TAC's losses in closed form; the losses are `music_rllib.functional.actor_critic`.
 
 Each is the gradient of a loss that is a mean over the minibatch, hence the factors 1/B.
 
@@ -11,7 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from music_rllib.tsallis import ln_q_slope
+from music_rllib.functional.tsallis import ln_q_slope
 
 __all__ = [
     "of_critic_loss",

@@ -18,7 +18,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from music_rllib.tac.precision import cpu_family, cpu_flags, cpu_vendor
+from music_rllib.tac.kernels.precision import cpu_family, cpu_flags, cpu_vendor
 
 __all__ = ["Blas", "OneDnn", "Products", "has_onednn", "onednn_product", "products"]
 

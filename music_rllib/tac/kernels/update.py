@@ -15,13 +15,13 @@ import torch
 from ray.rllib.core.columns import Columns
 from torch import Tensor
 
-from music_rllib.tac.distribution import deterministic_action
-from music_rllib.tac.forward import Bootstrap, TACForward
+from music_rllib.functional.squashed_gaussian import deterministic_action
 from music_rllib.tac.kernels import derivatives
 from music_rllib.tac.kernels.flat import FlatParameters
-from music_rllib.tac.kernels.network import Network, Scratch, critics, perceptron
+from music_rllib.tac.kernels.forward import Bootstrap, TACForward
+from music_rllib.tac.kernels.mlp import Network, Scratch, critics, perceptron
 from music_rllib.tac.kernels.products import Products, products
-from music_rllib.tac.module import TACModule, choose_action
+from music_rllib.tac.rl_module import TACModule, choose_action
 
 __all__ = ["DirectUpdate"]
 

@@ -1,0 +1,405 @@
+"""A sweep's YAML file, read and validated as a whole before anything starts.
+
+:func:`load_sweep` reports all problems at once, each as ``file:line: key rule, got value``. What it
+returns is resolved: every stage has, for every point of its grid and every task, the complete
+settings of a run.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from pydantic import ValidationError
+
+from music_rllib.config.layers import (
+    LAYER_KEYS,
+    SECTIONS,
+    all_settings,
+    for_a_grid,
+    known_settings,
+)
+from music_rllib.config.overrides import Override, lay_overrides, parse_overrides
+from music_rllib.config.presets import with_preset
+from music_rllib.config.problems import (
+    ConfigError,
+    Findings,
+    Problem,
+    from_json,
+    in_words,
+    lookup,
+    shown,
+    unknown,
+)
+from music_rllib.config.problems import Path as KeyPath
+from music_rllib.config.resolve import resolve_stage
+from music_rllib.config.run_settings import Evaluation, RunSettings, Variant
+from music_rllib.config.schema import (
+    RESERVED_NAMES,
+    Checkpoint,
+    Header,
+    MlflowSettings,
+    Point,
+    Resources,
+    Source,
+    Stage,
+    SweepConfig,
+)
+from music_rllib.config.search.space import FINAL_SEED
+from music_rllib.config.yaml_file import YamlFile, read_yaml
+from music_rllib.envs.tasks import (
+    BUILT_IN_TASKS,
+    Task,
+    TaskRegistry,
+    UnknownTaskError,
+)
+from music_rllib.limits import MOST_RUNS, MOST_SEEDS
+
+__all__ = [
+    "Checkpoint",
+    "ConfigError",
+    "Evaluation",
+    "MlflowSettings",
+    "Point",
+    "Resources",
+    "RunSettings",
+    "Source",
+    "Stage",
+    "SweepConfig",
+    "Variant",
+    "declared_tasks",
+    "load_sweep",
+]
+
+
+def load_sweep(
+    path: str | Path,
+    *,
+    name: str | None = None,
+    storage: str | None = None,
+    seeds: str | None = None,
+    overrides: Sequence[str] = (),
+) -> SweepConfig:
+    """Read and validate a sweep.
+
+    Args:
+        path: The YAML file.
+        name: Replaces the file's `name`.
+        storage: Replaces the file's `storage`.
+        seeds: Replaces the file's `seeds`: how many (the file's first, then the smallest that it
+            hasn't), or a list with commas.
+        overrides: `KEY=VALUE` each, laid over the file.
+
+    Raises:
+        ConfigError: With one line per problem.
+    """
+    for key, value in (("name", name), ("storage", storage)):
+        if value is not None and not _is_utf8(value):
+            raise ConfigError([f"--{key} must be UTF-8 text, got {value!a}"])
+    file = read_yaml(Path(path))
+    options: dict[str, Any] = {
+        key: value for key, value in (("name", name), ("storage", storage)) if value is not None
+    }
+    given = parse_overrides(overrides)
+    file, origins = _with_preset_of(file, given)
+    document = with_preset(file, _preset_mistakes)
+    document, places = lay_overrides(document, [one for one in given if one.key != "preset"])
+    origins |= places
+    if "seeds" in document:
+        document["seeds"] = _spelt_out(document["seeds"])
+    if seeds is not None:
+        options["seeds"] = _seeds(seeds, document.get("seeds"))
+    document |= options
+    findings = Findings()
+    config = _resolve(file, document, findings)
+    if config is None:
+        raise ConfigError(_lines(findings.problems, file, document, options, origins))
+    return replace(config, arguments=tuple(overrides))
+
+
+def _with_preset_of(
+    file: YamlFile, overrides: Iterable[Override]
+) -> tuple[YamlFile, dict[KeyPath, str]]:
+    """The file with the preset of the command line, which others of its arguments lie above."""
+    for one in overrides:
+        if one.key == "preset":
+            return file._replace(data=file.data | {"preset": one.value}), {("preset",): one.key}
+    return file, {}
+
+
+def _spelt_out(seeds: Any) -> Any:
+    """`5` is short for the first five seeds."""
+    if isinstance(seeds, bool) or not isinstance(seeds, int | float):
+        return seeds
+    return list(range(int(seeds))) if 1 <= seeds <= MOST_SEEDS and seeds == int(seeds) else seeds
+
+
+def declared_tasks(path: str | Path) -> tuple[Task, ...]:
+    """The tasks that a sweep's YAML file declares under `environments`.
+
+    Raises:
+        ConfigError: It can't be read, or one of them is wrong.
+    """
+    file, findings = read_yaml(Path(path)), Findings()
+    registry = _registry(file.data, findings)
+    if findings.problems:
+        raise ConfigError(_lines(findings.problems, file, file.data, {}))
+    return tuple(task for name, task in registry.items() if name not in BUILT_IN_TASKS)
+
+
+def _is_utf8(argument: str) -> bool:
+    """Other bytes of a command line are kept as what no encoding has."""
+    try:
+        argument.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def _seeds(text: str, given: Any) -> list[int]:
+    """`10`, or `0,1,7`."""
+    digits = re.fullmatch(r"\d{1,9}(,\d{1,9})*,?", text)
+    if digits and "," not in text and int(text) > MOST_SEEDS:
+        raise ConfigError([f"--seeds must be at most {MOST_SEEDS:,} seeds, got {text}"])
+    if not digits or text in {"0", ""}:
+        raise ConfigError(
+            [f"--seeds must be a number of seeds or a list like 0,1,7, got {shown(text)}"]
+        )
+    if "," in text:
+        return [int(seed) for seed in text.split(",") if seed]
+    known = [seed for seed in given if isinstance(seed, int)] if isinstance(given, list) else [0]
+    others = (seed for seed in itertools.count() if seed not in known)
+    return [*known, *itertools.islice(others, max(int(text) - len(known), 0))][: int(text)]
+
+
+def _preset_mistakes(preset: YamlFile) -> list[str]:
+    """What is wrong with a preset by itself, in its own lines."""
+    findings = Findings()
+    _defaults({"defaults": preset.data}, findings)
+    problems = [Problem(problem.path[1:], problem.rule) for problem in findings.problems]
+    return _lines(problems, preset, preset.data, {})
+
+
+def _resolve(file: YamlFile, document: dict[str, Any], findings: Findings) -> SweepConfig | None:
+    """The sweep; None, with the problems in `findings`, if there are any."""
+    registry = _registry(document, findings)
+    header = _header(document, findings)
+    defaults = _defaults(document, findings)
+    names = document.get("tasks")
+    names = [name for name in names if isinstance(name, str)] if isinstance(names, list) else []
+    known_tasks = _tasks(names, ("tasks",), registry, document, findings)
+    stages: dict[str, Stage | None] = {}
+    for index, raw in _raw_stages(document, findings):
+        stage = resolve_stage(
+            raw,
+            ("stages", index),
+            defaults=defaults,
+            seeds=header.seeds if header else (),
+            sweep_tasks=known_tasks,
+            find_tasks=lambda names, path: _tasks(names, path, registry, document, findings),
+            earlier=stages,
+            findings=findings,
+        )
+        stages[stage.name if stage else str(raw.get("name"))] = stage
+    if header:
+        _count_runs(stages, len(header.seeds), findings)
+    if header and any(stage and stage.search for stage in stages.values()):
+        for position, one in enumerate(header.seeds):
+            if one >= FINAL_SEED:
+                rule = f"must be < {FINAL_SEED}, where a search's fresh seeds begin, got {one}"
+                findings.add(("seeds", position), rule)
+    if findings.problems or header is None:
+        return None
+    return SweepConfig(
+        path=file.path,
+        text=file.text,
+        document=document,
+        name=header.name,
+        seeds=header.seeds,
+        storage=header.storage,
+        mlflow=header.mlflow,
+        resources=header.resources,
+        checkpoints=header.checkpoints,
+        stages=tuple(stage for stage in stages.values() if stage is not None),
+    )
+
+
+def _count_runs(stages: Mapping[str, Stage | None], seeds: int, findings: Findings) -> None:
+    """Runs multiply from stage to stage; refuse more than can be planned."""
+    trials: dict[str, int] = {}
+    total = 0
+    for index, (name, stage) in enumerate(stages.items()):
+        if stage is None or stage.search is not None:
+            continue
+        above = stage.source.stage if stage.source else None
+        trials[name] = len(stage.points) * trials.get(str(above), 1)
+        total += trials[name] * len(stage.tasks) * seeds
+        if total > MOST_RUNS:
+            rule = f"must not make the sweep larger than {MOST_RUNS:,} runs, got {total:,}"
+            findings.add(("stages", index), rule)
+            return
+
+
+def _registry(document: dict[str, Any], findings: Findings) -> TaskRegistry:
+    tasks = []
+    environments = document.get("environments") or {}
+    if not isinstance(environments, dict):
+        findings.add(("environments",), f"must be a mapping, got {shown(environments)}")
+        environments = {}
+    for name, raw in environments.items():
+        path = ("environments", name)
+        if name in BUILT_IN_TASKS:
+            findings.add(path, "is a built-in task; choose another name")
+        elif not isinstance(raw, dict) or "name" in raw:
+            findings.add(path, f"must be a mapping without a name of its own, got {shown(raw)}")
+        elif task := findings.validate(Task, raw | {"name": name}, path):
+            tasks.append(task)
+    return TaskRegistry(tasks)
+
+
+def _header(document: dict[str, Any], findings: Findings) -> Header | None:
+    known = {*Header.model_fields, "preset", "environments", "defaults", "stages"}
+    below = {f"defaults.{name}" for name in all_settings()}
+    for key in document.keys() - known:
+        findings.add((key,), unknown(key, (*known, *sorted(below))))
+    values = {key: value for key, value in document.items() if key in Header.model_fields}
+    if isinstance(values.get("seeds"), int | float):  # else it was spelt out
+        rule = f"must be a list like [0, 1], or how many (1 to {MOST_SEEDS:,})"
+        findings.add(("seeds",), f"{rule}, got {shown(values.pop('seeds'))}")
+    header = findings.validate(Header, values, ())
+    if header and header.name in RESERVED_NAMES:
+        findings.add(("name",), f"must not be {header.name!r}, which the storage uses itself")
+    for key in ("tasks", "seeds"):
+        findings.forbid_repeats(values.get(key), (key,))
+    if header and len(header.seeds) > MOST_SEEDS:
+        rule = f"must have at most {MOST_SEEDS:,} entries, got {len(header.seeds):,}"
+        findings.add(("seeds",), rule)
+    return header
+
+
+def _defaults(document: dict[str, Any], findings: Findings) -> dict[str, Any]:
+    """`defaults`, with what can be said of them alone; the rest shows where they are merged."""
+    defaults = document.get("defaults") or {}
+    if not isinstance(defaults, dict):
+        findings.add(("defaults",), f"must be a mapping, got {shown(defaults)}")
+        return {}
+    for key, value in defaults.items():
+        if key not in LAYER_KEYS:
+            findings.add(("defaults", key), unknown(key, all_settings()))
+        elif not (key in SECTIONS and value is None):
+            _check_fields(key, value, findings)
+    return defaults
+
+
+def _check_fields(key: str, value: Any, findings: Findings) -> None:
+    """Validate fields one by one: rules between them depend on the variant."""
+    field = RunSettings.model_fields[key]
+    try:
+        from_json(field.rebuild_annotation(), value)
+    except ValidationError as error:
+        for found in in_words(error, value, lambda at: known_settings((key, *at))):
+            if found.path or not isinstance(value, dict):
+                rule = for_a_grid(found.rule, (key, *found.path), {key: value})
+                findings.add(("defaults", key, *found.path), rule)
+
+
+def _tasks(
+    names: Iterable[str],
+    path: KeyPath,
+    registry: TaskRegistry,
+    document: dict[str, Any],
+    findings: Findings,
+) -> tuple[Task, ...]:
+    tasks = []
+    declared = document.get("environments") or {}
+    for position, name in enumerate(names):
+        try:
+            tasks.append(registry[name])
+        except UnknownTaskError as error:
+            # One that was declared with a mistake isn't unknown, and the mistake is reported.
+            if not isinstance(declared, dict) or name not in declared:
+                findings.add((*path, position), str(error))
+    return tuple(tasks)
+
+
+def _raw_stages(document: dict[str, Any], findings: Findings) -> list[tuple[int, dict[str, Any]]]:
+    raw = document.get("stages")
+    if not isinstance(raw, list) or not raw:
+        findings.add(("stages",), f"must be a list of at least one stage, got {shown(raw)}")
+        return []
+    for index, stage in enumerate(raw):
+        if not isinstance(stage, dict):
+            findings.add(("stages", index), f"must be a mapping, got {shown(stage)}")
+    return [(index, stage) for index, stage in enumerate(raw) if isinstance(stage, dict)]
+
+
+def _lines(
+    problems: Iterable[Problem],
+    file: YamlFile,
+    document: Any,
+    options: Mapping[str, Any],
+    origins: Mapping[KeyPath, str] = MappingProxyType({}),
+) -> list[str]:
+    """One line per different mistake, in the order of the file, those of the command line first."""
+
+    def line(problem: Problem) -> str:
+        if problem.path and problem.path[0] in options:
+            return f"--{problem.path[0]} {problem.rule}"
+        place, key = file.place(problem.path), _dotted(problem.path, document)
+        for length in range(len(problem.path), 0, -1):
+            if problem.path[:length] in origins:
+                place, key = "command line", origins[problem.path[:length]]
+                key += "".join(
+                    f"[{part}]" if isinstance(part, int) else f".{part}"
+                    for part in problem.path[length:]
+                )
+                break
+        else:
+            inside = (path[: len(problem.path)] for path in origins)
+            if problem.path not in file.lines and problem.path in inside:
+                place = "command line"
+        separator = " " if problem.rule.startswith(("must ", "is ", "has ", "needs ")) else ": "
+        return f"{place}: {key}{separator if key else ''}{problem.rule}"
+
+    in_order = sorted(_merged(problems), key=lambda problem: file.line(problem.path) or 0)
+    return list(dict.fromkeys(line(problem) for problem in in_order))
+
+
+def _merged(problems: Iterable[Problem]) -> list[Problem]:
+    """The values of one list in a grid that break the same rule are one mistake."""
+    groups: dict[tuple[KeyPath, str], list[Problem]] = {}
+    for problem in dict.fromkeys(problems):
+        path, rule = problem.path, problem.rule
+        if len(path) > 3 and path[2] == "grid" and isinstance(path[-1], int):
+            path, rule = path[:-1], rule.partition(", got ")[0]
+        groups.setdefault((path, rule), []).append(problem)
+    return [
+        group[0] if len(group) == 1 else Problem(path, rule + _got(group))
+        for (path, rule), group in groups.items()
+    ]
+
+
+def _got(group: Iterable[Problem]) -> str:
+    values = ", ".join(problem.rule.partition(", got ")[2] for problem in group)
+    return f", got {values}" if values.strip(", ") else ""
+
+
+def _dotted(path: KeyPath, document: Any) -> str:
+    """`stages.finetune.tac.lr`: stages by name, positions in other lists in brackets."""
+    text = ""
+    for position, part in enumerate(path):
+        if isinstance(part, str):
+            text += f".{part}" if text else part
+            continue
+        try:
+            name = lookup(document, (*path[: position + 1], "name"))
+        except LookupError:
+            name = None
+        by_name = path[0] == "stages" and position == 1 and isinstance(name, str)
+        text += f".{name}" if by_name else f"[{part}]"
+    return text

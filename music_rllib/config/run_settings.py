@@ -1,0 +1,244 @@
+"""Settings of one run, and the variants that fix part of them (MUSIC, paper III-A and its code).
+
+A *run* is one trial on one task with one seed. `RunSettings` holds everything that determines its
+numbers, apart from the weights it may start from, and nothing else.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, Literal, NamedTuple, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from music_rllib.config.tac_settings import TACSettings
+from music_rllib.envs.tasks import Task
+from music_rllib.intrinsic.settings import MusicSettings
+from music_rllib.replay.settings import ReplaySettings
+from music_rllib.schedules import check_measurable
+from music_rllib.store.handoff import Architecture, HandoffInfo, Spaces
+
+__all__ = [
+    "VARIANTS",
+    "Evaluation",
+    "RunSettings",
+    "Variant",
+    "VariantRules",
+    "contradiction",
+    "handed_over",
+    "preset",
+]
+
+Variant = Literal["tac", "music-u", "music-r", "music-f", "music-p"]
+Source = Literal["scratch", "estimator", "agent"]
+"""What a variant's runs start from: nothing, a trained estimator, or a whole trained agent."""
+
+
+class VariantRules(NamedTuple):
+    """What a variant fixes, and what it needs from the run that it starts from."""
+
+    fixed: Mapping[str, Any]
+    """Fields of `MusicSettings` that no other layer of the configuration may contradict."""
+    without_effect: frozenset[str]
+    """Dotted settings that change nothing here: ignored in `defaults`, refused in a stage."""
+    starts_from: Source = "scratch"
+    """What comes from the source of `init_from`."""
+
+    @property
+    def uses_mi(self) -> bool:
+        """Whether mutual information plays a part, so that the task must have a split."""
+        return bool(self.fixed["estimator"] != "none")
+
+
+_MUSIC_FIELDS = frozenset(MusicSettings.model_fields)
+_FIXED = ("estimator", "task_reward", "goals")
+_MUSIC_REST = frozenset(f"music.{name}" for name in _MUSIC_FIELDS.difference(_FIXED))
+_TRAINING_OF_ESTIMATOR = frozenset({"music.lr", "music.batch_trajectories"})
+
+
+def _fixed(estimator: str, *, task_reward: bool, goals: str = "environment") -> dict[str, Any]:
+    return dict(zip(_FIXED, (estimator, task_reward, goals), strict=True))
+
+
+VARIANTS: Mapping[Variant, VariantRules] = MappingProxyType(
+    {
+        "tac": VariantRules(
+            fixed=_fixed("none", task_reward=True),
+            without_effect=_MUSIC_REST,
+        ),
+        "music-u": VariantRules(
+            fixed=_fixed("trained", task_reward=False, goals="zero"),
+            # Hindsight would put achieved goals in place of the zeros.
+            without_effect=frozenset({"replay.hindsight_k", "replay.hindsight_episodes"}),
+        ),
+        "music-r": VariantRules(
+            fixed=_fixed("frozen", task_reward=True),
+            without_effect=_TRAINING_OF_ESTIMATOR,
+            starts_from="estimator",
+        ),
+        "music-f": VariantRules(
+            fixed=_fixed("none", task_reward=True),
+            without_effect=_MUSIC_REST,
+            starts_from="agent",
+        ),
+        "music-p": VariantRules(
+            fixed=_fixed("frozen", task_reward=True)
+            | {"mi_reward_weight": 0.0, "prioritise_replay": True},
+            without_effect=_TRAINING_OF_ESTIMATOR
+            | {"music.mi_reward_weight", "music.reward_scale"}
+            # The ranks of the trajectories decide what is replayed.
+            | {"replay.hindsight_episodes"},
+            starts_from="estimator",
+        ),
+    }
+)
+
+
+def preset(variant: Variant, task: Task) -> dict[str, Any]:
+    """Fields of `MusicSettings` that the variant sets on this task before any other layer."""
+    music = dict(VARIANTS[variant].fixed)
+    if variant == "music-u":
+        music["mi_reward_weight"] = 1.0
+    elif variant == "music-r":
+        music["mi_reward_weight"] = task.mi_reward_weight
+    return music
+
+
+def contradiction(variant: Variant, fixed: Any, got: Any) -> str:
+    """The rule that is broken where a setting contradicts its variant."""
+    return f"must be {json.dumps(fixed)} for {variant}, got {json.dumps(got)}"
+
+
+YOUNGER: tuple[tuple[str, str], ...] = (("tac", "log_std_form"),)
+"""Section and name of settings that came after keys of finished runs had been written down."""
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Evaluation(_Frozen):
+    """Deterministic evaluation episodes during a run."""
+
+    interval: int = Field(5_000, gt=0)
+    """Environment steps between two evaluations; the end of a run is always evaluated."""
+    episodes: int = Field(20, gt=0)
+    """Episodes per evaluation."""
+
+
+class RunSettings(_Frozen):
+    """Everything that determines the numbers of one run, given the weights it starts from."""
+
+    task: Task
+    variant: Variant
+    seed: int = Field(ge=0, lt=2**31)
+    env_steps: int = Field(200_000, gt=0)
+    """Budget: environment steps of training, over all sub-environments."""
+    num_envs: int = Field(4, gt=0)
+    """Sub-environments stepped together."""
+    evaluation: Evaluation = Evaluation()
+    tac: TACSettings = TACSettings()
+    music: MusicSettings = MusicSettings()
+    replay: ReplaySettings = ReplaySettings()
+
+    @property
+    def architecture(self) -> Architecture:
+        """The settings that shape the arrays of its networks."""
+        return Architecture(
+            hidden_sizes=self.tac.hidden_sizes,
+            policy=self.tac.policy,
+            bootstrap=self.tac.bootstrap,
+            normalise_observations=self.tac.normalise_observations,
+            estimator_hidden_size=self.music.hidden_size,
+            log_std_form=self.tac.log_std_form,
+            log_std_bounds=self.tac.log_std_bounds if self.tac.log_std_form == "tanh" else None,
+        )
+
+    def handoff_info(
+        self, node_key: str, env_steps: int, spaces: Spaces | None = None
+    ) -> HandoffInfo:
+        """What a handoff of this run says of itself after `env_steps`."""
+        return HandoffInfo(
+            task=self.task,
+            variant=self.variant,
+            architecture=self.architecture,
+            env_steps=env_steps,
+            seed=self.seed,
+            node_key=node_key,
+            spaces=spaces,
+        )
+
+    def identity(self) -> dict[str, Any]:
+        """All that determines the numbers, as plain data; the task without what does not.
+
+        A setting of `YOUNGER` is left out where it has its default: runs that do not use it keep
+        the identity that they had before there was one.
+        """
+        settings = self.model_dump(mode="json") | {"task": self.task.identity()}
+        if self.replay.hindsight_episodes == "moved" and self.task.moved_distance is not None:
+            settings["task"]["moved_distance"] = self.task.moved_distance
+        for section, name in YOUNGER:
+            part: BaseModel = getattr(self, section)
+            default = type(part).model_fields[name].get_default(call_default_factory=True)
+            if getattr(part, name) == default:
+                del settings[section][name]
+        return settings
+
+    @model_validator(mode="after")
+    def _variant_holds(self) -> Self:
+        rules = VARIANTS[self.variant]
+        for field, value in rules.fixed.items():
+            if getattr(self.music, field) != value:
+                raise ValueError(
+                    f"music.{field} "
+                    + contradiction(self.variant, value, getattr(self.music, field))
+                )
+        if rules.uses_mi and not self.task.has_split:
+            raise ValueError(
+                f"task must have agent_indices and surrounding_indices for {self.variant}, "
+                f"got {self.task.name!r}, which has none"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _followed_is_measured(self) -> Self:
+        adaptive = {
+            "tac.entropic_index": self.tac.entropic_index,
+            "music.mi_reward_weight": self.music.mi_reward_weight,
+        }
+        success, entropy = self.task.success_key is not None, self.tac.policy == "stochastic"
+        check_measurable(adaptive, success=success, entropy=entropy)
+        return self
+
+    @model_validator(mode="after")
+    def _budget_fits(self) -> Self:
+        if self.tac.random_steps >= self.env_steps:
+            raise ValueError(
+                f"env_steps must be > tac.random_steps ({self.tac.random_steps}), "
+                f"or nothing is learned, got {self.env_steps}"
+            )
+        trajectories = self.num_envs * self.task.horizon
+        if self.replay.capacity < trajectories:
+            raise ValueError(
+                "replay.capacity must hold one episode of every sub-environment "
+                f"({self.num_envs} x {self.task.horizon} steps), got {self.replay.capacity}"
+            )
+        return self
+
+
+def handed_over(run: RunSettings) -> tuple[str, ...]:
+    """Names of the modules that `run` gets from its source, as `TrainingRun` calls them."""
+    match VARIANTS[run.variant].starts_from:
+        case "scratch":
+            return ()
+        case "estimator":
+            return ("mi_estimator",)
+    modules = ["policy", "critics"]
+    modules += ["value", "value_target"] if run.tac.bootstrap == "value" else ["critics_target"]
+    if run.tac.policy == "deterministic":
+        modules.append("policy_target")
+    if run.tac.normalise_observations:
+        modules.append("normaliser")
+    return tuple(modules)

@@ -1,0 +1,236 @@
+"""Tasks: an environment, its horizon, and its split into agent and surrounding state.
+
+MUSIC (paper III-A) needs to know which observation entries belong to the agent (x, for Fetch the
+gripper's position) and which to its surroundings (y, the object's position). That split is part
+of a task's definition. Four Fetch tasks are built in; a user declares others in a sweep's YAML
+under ``environments:``::
+
+    environments:
+      MyPush:
+        env_id: my_package.envs:MyPush-v0   # a Gymnasium id; `module:` in front is imported first
+        horizon: 100
+        agent_indices: 0:3                  # or a list, [0, 1, 2]
+        surrounding_indices: [3, 4, 5]
+
+Nothing here imports an environment: :mod:`music_rllib.envs.make` builds them.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from types import MappingProxyType
+from typing import Annotated, Any, Self
+
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    JsonValue,
+    model_validator,
+)
+
+from music_rllib import names
+from music_rllib.limits import MOST_INDICES
+
+__all__ = [
+    "BUILT_IN_TASKS",
+    "Indices",
+    "Task",
+    "TaskRegistry",
+    "UnknownTaskError",
+    "check_split",
+    "closest",
+]
+
+_RANGE = re.compile(r"(\d+):(\d+)")
+
+
+def _expand_range(value: Any) -> Any:
+    """`"3:6"` becomes (3, 4, 5); whatever else is left for the validators."""
+    if isinstance(value, list | tuple):
+        if len(value) > MOST_INDICES:
+            raise ValueError(f"must have at most {MOST_INDICES} entries, got {len(value)}")
+        return tuple(value)
+    if not isinstance(value, str):
+        return value
+    bounds = _RANGE.fullmatch(value.strip())
+    if bounds is None:
+        raise ValueError(f"must be a list of indices or a range such as 0:3, got {value!r}")
+    if max(map(len, bounds.groups())) > 9 or int(bounds[2]) - int(bounds[1]) > MOST_INDICES:
+        raise ValueError(f"must have at most {MOST_INDICES} entries, got {value[:40]!r}")
+    return tuple(range(int(bounds[1]), int(bounds[2])))
+
+
+Indices = Annotated[
+    tuple[Annotated[int, Field(ge=0)], ...],
+    BeforeValidator(_expand_range, json_schema_input_type=tuple[int, ...] | str),
+]
+"""Positions in the observation vector: a list, or a half-open range `a:b` as in Python."""
+
+
+def check_split(agent_indices: Sequence[int], surrounding_indices: Sequence[int]) -> None:
+    """Whether these can be agent and surrounding state; both empty: there is no split.
+
+    Raises:
+        ValueError: one is missing, or an index is there twice, in one of them or in both.
+    """
+    if bool(agent_indices) != bool(surrounding_indices):
+        missing = "surrounding_indices" if agent_indices else "agent_indices"
+        raise ValueError(f"{missing} must be given too: a split needs both parts")
+    parts = (("agent_indices", agent_indices), ("surrounding_indices", surrounding_indices))
+    for name, indices in parts:
+        if len(set(indices)) < len(indices):
+            raise ValueError(f"{name} must not repeat an index, got {list(indices)}")
+    shared = sorted(set(agent_indices) & set(surrounding_indices))
+    if shared:
+        raise ValueError(f"agent and surrounding indices must not overlap, both have {shared}")
+
+
+class Task(BaseModel):
+    """One environment as experiments see it."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=80)
+    """What sweeps, labels and reports call it. Does not influence results."""
+    env_id: str = Field(min_length=1)
+    """Gymnasium id, with `module:` in front if that module registers it."""
+    horizon: int = Field(gt=0)
+    """Steps per episode; the environment is truncated there."""
+    agent_indices: Indices = ()
+    """Entries of the observation (of `observation["observation"]` if it is a goal dict) that are
+    the agent state x: a list of positions, or a range such as `0:3`."""
+    surrounding_indices: Indices = ()
+    """Entries that are the surrounding state y. Both empty: the task has no split and can't be
+    used with MUSIC."""
+    success_key: str | None = "is_success"
+    """Key of `info` that says whether the goal is reached now; null if there is none."""
+    env_kwargs: dict[str, JsonValue] = Field(default_factory=dict)
+    """Further arguments of `gymnasium.make`."""
+    reward_range: tuple[float, float] | None = None
+    """Smallest and largest reward of a step; null: not known. Changes no result: it tells where
+    `tac.target_bounds` cut off values that can be reached."""
+    mi_reward_weight: float = Field(1.0, ge=0)
+    """MUSIC-r's weight of the intrinsic reward where a sweep doesn't set it."""
+    moved_distance: float | None = Field(None, gt=0)
+    """Distance, in the goal's units, from which on what is achieved has moved, for
+    `replay.hindsight_episodes: moved`. null: where the task's reward no longer takes it for the
+    same; with dense rewards a fifth of the environment's `distance_threshold`."""
+
+    @model_validator(mode="after")
+    def _split_is_sound(self) -> Self:
+        check_split(self.agent_indices, self.surrounding_indices)
+        return self
+
+    @model_validator(mode="after")
+    def _range_is_ordered(self) -> Self:
+        if self.reward_range is not None and self.reward_range[0] > self.reward_range[1]:
+            raise ValueError(f"reward_range must be [smallest, largest], got {self.reward_range}")
+        return self
+
+    @property
+    def primary_metric(self) -> str:
+        """What its runs are judged by: the success rate, or the return where it has no success."""
+        return names.primary_metric(self.success_key)
+
+    @property
+    def has_split(self) -> bool:
+        """Whether MUSIC can be used on this task."""
+        return bool(self.surrounding_indices)
+
+    def identity(self) -> dict[str, Any]:
+        """All that determines what the task is: neither its name nor how it is trained on."""
+        left_out = {"name", "reward_range", "mi_reward_weight", "moved_distance"}
+        return self.model_dump(mode="json", exclude=left_out)
+
+
+_SPARSE = (-1.0, 0.0)
+"""Rewards of the built-in tasks: 0 at the goal, -1 elsewhere."""
+
+
+def _fetch(name: str, *, split: bool = True, mi_reward_weight: float = 1.0) -> Task:
+    return Task(
+        name=name,
+        env_id=f"{name}-v4",
+        horizon=50,
+        agent_indices=(0, 1, 2) if split else (),
+        surrounding_indices=(3, 4, 5) if split else (),
+        reward_range=_SPARSE,
+        mi_reward_weight=mi_reward_weight,
+    )
+
+
+def _hand(name: str) -> Task:
+    # observation: 24 joint angles, their 24 velocities, the object's 6 velocities and its pose. Of
+    # the pose only the position, so that distances between surrounding states are metres.
+    return Task(
+        name=name,
+        env_id=f"{name}-v1",
+        horizon=100,
+        agent_indices=tuple(range(24)),
+        surrounding_indices=(54, 55, 56),
+        reward_range=_SPARSE,
+    )
+
+
+BUILT_IN_TASKS: Mapping[str, Task] = MappingProxyType(
+    {
+        task.name: task
+        for task in (
+            # Reach has no object: observation[3:6] are fingers and velocity, not surroundings.
+            _fetch("FetchReach", split=False),
+            _fetch("FetchPush"),
+            _fetch("FetchPickAndPlace"),
+            # The original MUSIC halves the weight on Slide.
+            _fetch("FetchSlide", mi_reward_weight=0.5),
+            _hand("HandManipulateBlock"),
+        )
+    }
+)
+"""Tasks of Gymnasium-Robotics, each of them held against its live environment by tests."""
+
+
+class UnknownTaskError(LookupError):
+    """A task name that is neither built in nor declared; the message suggests close ones."""
+
+
+class TaskRegistry(Mapping[str, Task]):
+    """The built-in tasks and those of a user."""
+
+    def __init__(self, user_tasks: Iterable[Task] = ()) -> None:
+        """Add `user_tasks`.
+
+        Raises:
+            ValueError: A name is taken already.
+        """
+        self._tasks = dict(BUILT_IN_TASKS)
+        for task in user_tasks:
+            if task.name in self._tasks:
+                kind = "a built-in task" if task.name in BUILT_IN_TASKS else "declared twice"
+                raise ValueError(f"{task.name} is {kind}; choose another name")
+            self._tasks[task.name] = task
+
+    def __getitem__(self, name: str) -> Task:
+        try:
+            return self._tasks[name]
+        except KeyError:
+            known = ", ".join(self._tasks)
+            raise UnknownTaskError(
+                f"must be a known task ({known}), got {name!r}{closest(name, self._tasks)}"
+            ) from None
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._tasks)
+
+    def __len__(self) -> int:
+        return len(self._tasks)
+
+
+def closest(name: str, known: Iterable[str]) -> str:
+    """`" (did you mean 'FetchPush'?)"`, or nothing where no known name is close."""
+    by_folded = {candidate.casefold(): candidate for candidate in known}
+    matches = difflib.get_close_matches(name.casefold(), by_folded, n=1, cutoff=0.6)
+    return f" (did you mean {by_folded[matches[0]]!r}?)" if matches else ""

@@ -1,0 +1,16 @@
+"""Errors that a user sees, and the exit codes of every command."""
+
+__all__ = ["BAD_INPUT", "FAILED", "BadInputError", "TrackingError"]
+
+FAILED, BAD_INPUT = 1, 2
+
+
+class BadInputError(Exception):
+    """Something that the user must change; nothing has been started."""
+
+
+class TrackingError(RuntimeError):
+    """Tracking cannot be set up, or a spool cannot be read or written.
+
+    The message names the place (URI or path), the rule and what to do; it holds no password.
+    """

@@ -1,0 +1,139 @@
+"""What has changed in a sweep since it was last run, and which results that leaves behind."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from music_rllib.config.schema import SweepConfig
+from music_rllib.experiment.plan import Node
+from music_rllib.experiment.session import Sweep
+from music_rllib.store.files import write_atomically
+from music_rllib.store.node_store import NodeStore
+from music_rllib.store.object_folder import StorageError
+from music_rllib.store.paths import resolve_storage, sweep_folder
+from music_rllib.version import ALGORITHM_VERSION
+
+__all__ = ["Changes", "changes_since", "check_begun", "keep_settings"]
+
+FILE = "settings.json"
+SHOWN = 10
+"""Lines of each list that are shown."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Changes:
+    """How a sweep differs from the last one of its name."""
+
+    name: str
+    what: tuple[str, ...]
+    """`tac.lr: 0.001 -> 0.0003 (4 runs)`, one line each."""
+    lost: tuple[str, ...]
+    """Runs that have something which the changed sweep has no use for, and what."""
+
+    def __str__(self) -> str:
+        return "\n".join(
+            (
+                f"the configuration of sweep {self.name!r} has changed since it was last run:",
+                *_indented(self.what),
+                f"{len(self.lost)} runs would be trained anew, and not use what they have:",
+                *_indented(self.lost),
+                "Choose: --accept-changes trains them anew (the old results stay in the storage), "
+                "--name NEW keeps both sweeps, the old configuration uses what is there.",
+            )
+        )
+
+
+def _indented(lines: tuple[str, ...]) -> list[str]:
+    more = [f"  ... and {len(lines) - SHOWN} more"] if len(lines) > SHOWN else []
+    return [f"  {line}" for line in lines[:SHOWN]] + more
+
+
+def keep_settings(sweep: Sweep) -> None:
+    """Remember what `changes_since` compares with.
+
+    Raises:
+        StorageError: The sweep's folder can't be written.
+    """
+    runs = {node.label: {"key": node.key, **_settings(node)} for node in sweep.plan.nodes}
+    path = sweep.folder / FILE
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(
+            path, json.dumps({"algorithm": ALGORITHM_VERSION, "runs": runs}, indent=1).encode()
+        )
+    except OSError as error:
+        place = error.filename or path
+        raise StorageError(f"{place} must be writable: {error.strerror}") from error
+
+
+def check_begun(config: SweepConfig) -> None:
+    """Whether there is a sweep to go on with.
+
+    Raises:
+        StorageError: There is none of this name.
+    """
+    folder = sweep_folder(resolve_storage(config.storage)[0], config.name)
+    if not (folder / FILE).is_file():
+        raise StorageError(
+            f"--resume must find an earlier run of sweep {config.name!r}, there is none in {folder}"
+        )
+
+
+def _settings(node: Node) -> dict[str, Any]:
+    return {
+        "settings": node.run.model_dump(mode="json"),
+        "source": node.input.key if node.input else None,
+    }
+
+
+def changes_since(sweep: Sweep) -> Changes | None:
+    """What the last run of this sweep has made and this one has no use for; None: nothing.
+
+    Runs that are new, or that aren't asked for any more, are no such change.
+    """
+    try:
+        before = json.loads((sweep.folder / FILE).read_bytes())
+        runs: Mapping[str, Any] = before["runs"]
+        algorithm = before["algorithm"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None  # the first time, or nothing that tells
+    keys = {node.key for node in sweep.plan.nodes}
+    what: Counter[str] = Counter()
+    lost = []
+    for node in sweep.plan.nodes:
+        was = runs.get(node.label)
+        if was is None or was["key"] == node.key or was["key"] in keys:
+            continue
+        what.update(_differences(was["settings"], node.run.model_dump(mode="json")))
+        if (has := _what_there_is(sweep.store, was["key"])) is not None:
+            lost.append(f"{node.label}: {has}")
+    if not lost:
+        return None
+    lines = [f"{line} ({count} run{'s' * (count > 1)})" for line, count in what.items()]
+    if algorithm != ALGORITHM_VERSION:
+        lines.append(f"version of the algorithm: {algorithm} -> {ALGORITHM_VERSION}")
+    return Changes(
+        name=sweep.plan.name, what=tuple(lines or ["what it starts from"]), lost=tuple(lost)
+    )
+
+
+def _what_there_is(store: NodeStore, key: str) -> str | None:
+    if store.is_finished(key):
+        return "is finished"
+    checkpoints = store.work_folder(key).names()
+    if not checkpoints:
+        return None
+    return f"is at {int(checkpoints[-1].split('-')[0]):,} env steps"
+
+
+def _differences(before: Any, after: Any, place: str = "") -> Iterator[str]:
+    if isinstance(before, dict) and isinstance(after, dict):
+        for key in before | after:
+            inner = f"{place}.{key}" if place else str(key)
+            yield from _differences(before.get(key), after.get(key), inner)
+    elif before != after:
+        yield f"{place}: {json.dumps(before)} -> {json.dumps(after)}"

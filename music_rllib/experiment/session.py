@@ -1,0 +1,135 @@
+"""A planned sweep with its storage open: what is done, and what it leaves about itself."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from music_rllib.config.schema import SweepConfig
+from music_rllib.experiment.plan import Plan
+from music_rllib.experiment.scheduler import Board, Status
+from music_rllib.experiment.sweep_files import CONFIG, PLAN, as_json, keep, read
+from music_rllib.redaction import redact, without_secrets
+from music_rllib.store.node_store import NodeStore, damage_in_words
+from music_rllib.store.object_folder import DamagedError, StorageError
+from music_rllib.store.run_record import RunResult
+
+__all__ = ["Sweep", "keep_record", "open_sweep", "plan_document"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sweep:
+    """A planned sweep, its storage open."""
+
+    config: SweepConfig
+    plan: Plan
+    storage: str
+    """Absolute folder, or URI."""
+    store: NodeStore
+    folder: Path
+    """The sweep's own files, on this machine."""
+    board: Board
+
+    @property
+    def finished(self) -> set[str]:
+        """Keys of the nodes that have a result."""
+        return {node.key for node in self.board.having(Status.FINISHED, Status.REUSED)}
+
+    def results(self) -> dict[str, RunResult]:
+        """Node key to result, for the finished ones."""
+        found = {key: self.store.result(key) for key in self.finished}
+        return {key: result for key, result in found.items() if result is not None}
+
+
+def open_sweep(
+    config: SweepConfig,
+    plan: Plan,
+    storage: str,
+    folder: Path,
+    remove_damaged: Callable[[str], None] | None = None,
+) -> Sweep:
+    """Open the storage, and see what is finished already and is what it was.
+
+    Args:
+        config: The sweep.
+        plan: Of the same.
+        storage: Absolute folder, or URI.
+        folder: The sweep's own files, on this machine.
+        remove_damaged: Delete finished runs that are damaged, and tell this about each.
+
+    Raises:
+        StorageError: The storage can't be reached, or finished runs in it are damaged.
+    """
+    store = NodeStore(storage)
+    labels = _labels(config, plan, storage)
+    damaged = store.damage(key for key in labels if store.is_finished(key))
+    if damaged and remove_damaged is None:
+        raise DamagedError(damage_in_words({labels[key]: why for key, why in damaged.items()}))
+    for key, why in damaged.items():
+        store.remove(key)
+        if remove_damaged is not None:
+            remove_damaged(f"{labels[key]}: damaged, is trained again: {why}")
+    finished = {node.key for node in plan.nodes if store.is_finished(node.key)}
+    return Sweep(
+        config=config,
+        plan=plan,
+        storage=storage,
+        store=store,
+        folder=folder,
+        board=Board(plan, finished),
+    )
+
+
+def _labels(config: SweepConfig, plan: Plan, storage: str) -> dict[str, str]:
+    """Key to label of what the sweep may reuse: also what its searches have asked for before."""
+    labels = {
+        source.key: f"handoff {source.checkpoint.folder}"
+        for source in plan.imports
+        if source.checkpoint
+    }
+    labels |= {node.key: node.label for node in plan.nodes}
+    if plan.searched:
+        with contextlib.suppress(StorageError):  # the sweep writes it anew
+            known = read(storage, f"{config.name}/{PLAN}") or {"nodes": []}
+            labels = {node["key"]: node["label"] for node in known["nodes"]} | labels
+    return labels
+
+
+def plan_document(sweep: Sweep) -> dict[str, Any]:
+    """The runs, those of searches as far as they are chosen."""
+    nodes = [
+        {
+            "key": node.key,
+            "label": node.label,
+            "input": node.input.key if node.input else None,
+            "env_steps": node.run.env_steps,
+        }
+        for node in sweep.plan.nodes
+    ]
+    return {"storage": redact(sweep.storage), "nodes": nodes, "trials": sweep.plan.trials}
+
+
+def keep_record(sweep: Sweep) -> None:
+    """Write the configuration and the plan into the sweep's folder.
+
+    Raises:
+        StorageError: The folder can't be written.
+    """
+    given = [f"# {argument}  (command line)\n" for argument in sweep.config.arguments]
+    keep(sweep, "sweep.yaml", redact("".join(given) + sweep.config.text))
+    keep(sweep, CONFIG, as_json(_configuration(sweep.config)))
+    keep(sweep, PLAN, as_json(plan_document(sweep)))
+
+
+def _configuration(config: SweepConfig) -> dict[str, Any]:
+    """All of it, without secrets, and with paths that mean the same from anywhere."""
+    document: dict[str, Any] = json.loads(as_json(without_secrets(config.document)))
+    for stage in document["stages"]:
+        source = stage.get("init_from")
+        if isinstance(source, dict) and source.get("checkpoint"):
+            source["checkpoint"] = str(Path(source["checkpoint"]).expanduser().absolute())
+    return document

@@ -1,0 +1,1 @@
+"""Pure maths: Tsallis entropies, the policy's density, TAC's losses, MUSIC's bound."""

@@ -1,0 +1,211 @@
+"""The command line of reports."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from music_rllib import names
+from music_rllib.config.problems import ConfigError
+from music_rllib.errors import TrackingError
+from music_rllib.redaction import for_people, redact
+from music_rllib.results.comparison import GAP
+from music_rllib.results.data import ReportError
+
+if TYPE_CHECKING:
+    from music_rllib.report.location import Found
+
+__all__ = ["app"]
+
+app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
+
+DAMAGED, BAD_INPUT = 1, 2
+EPILOG = """
+**Examples**
+
+    python -m music_rllib.report results/smoke
+        report on the sweep in that folder, while it runs or afterwards
+
+    python -m music_rllib.report smoke --tracking-uri http://mlflow:5000 --output reports/smoke
+        a sweep that was logged to a server, from any machine
+
+    python -m music_rllib.report results/smoke --export published/smoke --format csv
+        its runs and metrics as plain tables; `report published/smoke` reads them again
+
+    python -m music_rllib.report results/smoke --export published/smoke --add
+        the same, and what another machine has exported there stays
+
+**Exit codes**: 0 the report is written, whatever state the sweep is in; 1 it is, by what MLflow
+has, and finished runs in the sweep's storage are damaged; 2 there is no such sweep.
+"""
+
+
+class TableFormat(StrEnum):
+    """Of exported tables."""
+
+    csv = "csv"
+    parquet = "parquet"
+
+
+@app.command(epilog=EPILOG)
+def report(
+    sweep: Annotated[
+        str,
+        typer.Argument(
+            help="A sweep's folder, an exported one, or a sweep's name.", metavar="SWEEP"
+        ),
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option(help="Folder for the report; `report` in the sweep's folder by default."),
+    ] = None,
+    storage: Annotated[
+        str, typer.Option(help="Where a sweep's name is looked for, as in the sweep's YAML file.")
+    ] = "results",
+    tracking_uri: Annotated[
+        str | None,
+        typer.Option(
+            help="Read from this MLflow instead of the sweep's own.",
+            # A password on a command line could be read by everyone on the machine.
+            envvar=names.VARIABLE_TRACKING_URI,
+            show_envvar=False,
+        ),
+    ] = None,
+    difference: Annotated[
+        float,
+        typer.Option(
+            min=0.001,
+            max=1.0,
+            help="Difference in success rate that you would want to see: the report says how many "
+            "seeds would likely show it.",
+        ),
+    ] = GAP,
+    seed: Annotated[int, typer.Option(min=0, help="Of the filmed episodes.")] = 0,
+    videos: Annotated[
+        bool, typer.Option(help="Film an episode for each q, where this machine can draw.")
+    ] = True,
+    env: Annotated[
+        Path | None,
+        typer.Option(
+            help="A sweep's YAML file: the environments that it declares are made for videos, "
+            "beside the built-in tasks' and Gymnasium's own.",
+        ),
+    ] = None,
+    attach: Annotated[
+        bool, typer.Option("--attach", help="Also keep the report with the sweep's run in MLflow.")
+    ] = False,
+    export: Annotated[
+        Path | None,
+        typer.Option(help="Write the sweep as tables into this folder instead of a report."),
+    ] = None,
+    format_: Annotated[
+        TableFormat, typer.Option("--format", help="Of the exported tables.")
+    ] = TableFormat.parquet,
+    add: Annotated[
+        bool,
+        typer.Option("--add", help="With --export: keep the runs of an earlier export there."),
+    ] = False,
+) -> None:
+    """One self-contained page about a sweep, with its figures (PNG, SVG) and numbers (CSV)."""
+    try:
+        if export is not None:
+            _export(sweep, storage, tracking_uri, export, format_, add=add)
+        else:
+            _report(
+                sweep,
+                storage,
+                tracking_uri,
+                output,
+                difference,
+                seed,
+                videos=videos,
+                env=env,
+                attach=attach,
+            )
+    except (ConfigError, ReportError, TrackingError) as error:
+        typer.echo(f"error: {for_people(error)}", err=True)
+        raise typer.Exit(BAD_INPUT) from error
+
+
+def _export(
+    place: str,
+    storage: str,
+    tracking_uri: str | None,
+    folder: Path,
+    table_format: TableFormat,
+    *,
+    add: bool,
+) -> None:
+    from music_rllib.report.location import find_sweep
+    from music_rllib.results.archive.folder import is_archive, read_archive, write_archive
+    from music_rllib.results.archive.merge import merged
+
+    sweep = find_sweep(place, storage=storage, tracking_uri=tracking_uri).sweep
+    if add and is_archive(folder):
+        earlier = read_archive(folder)
+        if earlier.name != sweep.name:
+            raise ReportError(
+                f"--add needs an export of the same sweep, got {earlier.name!r} in {folder} and "
+                f"{sweep.name!r}"
+            )
+        sweep = merged(earlier, sweep)
+    write_archive(sweep, folder, table_format.value)
+    values = sum(len(column.run) for column in sweep.history.values())
+    typer.echo(f"{len(sweep.runs)} runs, {values} values: {folder}")
+
+
+def _report(
+    place: str,
+    storage: str,
+    tracking_uri: str | None,
+    output: Path | None,
+    difference: float,
+    seed: int,
+    *,
+    videos: bool,
+    env: Path | None,
+    attach: bool,
+) -> None:
+    from music_rllib.config.load import declared_tasks
+    from music_rllib.report.build import WANTED, build_report, write_report
+    from music_rllib.report.location import find_sweep
+    from music_rllib.results.comparison import verdict
+
+    found = find_sweep(place, storage=storage, tracking_uri=tracking_uri, metrics=WANTED)
+    made = build_report(
+        found.sweep,
+        difference=difference,
+        undelivered=found.undelivered,
+        damaged=found.damaged,
+        store=found.store,
+        video_seed=seed if videos else None,
+        environments=() if env is None else declared_tasks(env),
+        command=redact(shlex.join(["python", "-m", "music_rllib.report", *sys.argv[1:]])),
+    )
+    page = write_report(made, output or found.folder / "report")
+    for note in made.missing:
+        typer.echo(f"missing: {for_people(note)}")
+    for analysis in made.analyses:
+        for line in verdict(analysis.scopes[0], difference):
+            typer.echo(for_people(f"{analysis.stage.name}: {line}"))
+    if attach:
+        _attach(found, page.parent)
+    typer.echo(f"Report: {page.absolute()}")
+    if found.damaged is not None:
+        typer.echo(f"error: {redact(found.damaged)}", err=True)
+        raise typer.Exit(DAMAGED)
+
+
+def _attach(found: Found, folder: Path) -> None:
+    from music_rllib.results.from_mlflow import attach
+
+    if found.store is None:
+        raise ReportError("--attach needs a sweep that is read from MLflow, got an exported one")
+    attach(found.store, found.sweep.run_id, folder, "report")
+    where = found.sweep.url(found.sweep.run_id) or f"run {found.sweep.run_id}"
+    typer.echo(for_people(f"Attached to the sweep's run in MLflow: {where}"))

@@ -1,0 +1,1 @@
+"""The figures of a report, the colours of q, and which sweep gets which figure."""

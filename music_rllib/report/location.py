@@ -1,0 +1,92 @@
+"""What a user means by SWEEP: a sweep's folder, an exported folder, or a name."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+
+from music_rllib.results.archive.folder import is_archive, read_archive
+from music_rllib.results.data import Sweep
+from music_rllib.results.from_mlflow import read_mlflow
+from music_rllib.store.node_store import NodeStore, damage_in_words
+from music_rllib.store.object_folder import StorageError
+from music_rllib.tracking.spool import has_undelivered
+from music_rllib.tracking.store import TrackingStore, local_folder, resolve_store
+
+__all__ = ["Found", "find_sweep"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Found:
+    """A sweep and where it was found."""
+
+    sweep: Sweep
+    folder: Path
+    """Where its report goes."""
+    store: TrackingStore | None
+    """Where it is logged; None for an exported sweep."""
+    undelivered: int = 0
+    """Runs of which MLflow does not have everything yet."""
+    damaged: str | None = None
+    """Finished runs that are not any more in the storage what MLflow says of them, in words."""
+
+
+def find_sweep(
+    place: str,
+    *,
+    storage: str = "results",
+    tracking_uri: str | None = None,
+    metrics: Collection[str] | None = None,
+) -> Found:
+    """Read the sweep that `place` names.
+
+    Args:
+        place: a sweep's folder (`results/smoke`), an exported folder, or a sweep's name.
+        storage: where a name is looked for.
+        tracking_uri: in place of the store that the sweep was logged to.
+        metrics: which ones to read from MLflow; None for all.
+
+    Raises:
+        ReportError: where there is no such sweep.
+        TrackingError: where its store is not reachable.
+    """
+    folder = Path(place).expanduser()
+    if is_archive(folder):
+        return Found(sweep=read_archive(folder), folder=folder, store=None)
+    # Loads MLflow, which an exported sweep does not need.
+    from music_rllib.tracking.session import SweepRecord, tracking_folder
+
+    record = SweepRecord.read(folder)
+    parent = local_folder(storage)
+    if record is None and parent is not None:
+        folder = parent / place
+        record = SweepRecord.read(folder)
+    if record is None:
+        store = resolve_store(tracking_uri, storage)
+        name = Path(place).name
+        sweep = read_mlflow(store, name, metrics=metrics)
+        return Found(sweep=sweep, folder=folder, store=store)
+    place = record.resolve_storage(folder.absolute())
+    store = resolve_store(tracking_uri or record.tracking_uri, place)
+    sweep = read_mlflow(store, record.sweep_name, sweep_id=record.sweep_id, metrics=metrics)
+    spools = tracking_folder(folder)
+    waiting = [spools / "parent", *(spools / "runs").glob("*")]
+    undelivered = sum(map(has_undelivered, waiting))
+    return Found(
+        sweep=sweep,
+        folder=folder,
+        store=store,
+        undelivered=undelivered,
+        damaged=_damaged(sweep, place),
+    )
+
+
+def _damaged(sweep: Sweep, storage: str) -> str | None:
+    try:
+        nodes = NodeStore(storage)
+        labels = {run.node_key: run.name for run in sweep.runs if nodes.is_finished(run.node_key)}
+        damage = nodes.damage(labels)
+    except (OSError, StorageError):  # a report needs MLflow only
+        return None
+    return damage_in_words({labels[key]: why for key, why in damage.items()}) if damage else None

@@ -1,0 +1,1 @@
+"""A sweep exported as plain tables: written, read, merged."""

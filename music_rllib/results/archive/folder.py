@@ -1,0 +1,238 @@
+"""A sweep as a folder of plain tables, readable without MLflow and without this package.
+
+`sweep.json`
+    the sweep's own run: name, status, tags, configuration.
+`runs.csv` or `runs.parquet`
+    one row per run: its number, MLflow's id, and a column per tag (`tag.`) and param (`param.`).
+`metrics.csv` or `metrics.parquet`
+    one row per value: the run's number, metric, environment steps, value, time in ms.
+`search.json`
+    of a sweep that searched: trials, importance of settings, ranking on fresh seeds.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+import pyarrow as pa
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from music_rllib.config.problems import shown
+from music_rllib.limits import MOST_JSON_BYTES, MOST_YAML_BYTES, read_json, read_regular
+from music_rllib.results.archive.tables import read_table, write_table
+from music_rllib.results.data import Column, ReportError, RunRecord, Sweep
+from music_rllib.results.searches import checked_searches
+
+__all__ = ["Format", "is_archive", "read_archive", "write_archive"]
+
+Format = Literal["csv", "parquet"]
+VERSION = 1
+_HEADER, _SEARCHES = "sweep.json", "search.json"
+_OWN_FIELDS = ("name", "status", "run_id", "experiment_id", "started", "source", "tags", "config")
+_RUN_FIELDS = ("run_id", "name", "status", "started", "ended")
+_RUNS = {
+    "run": pa.int64(),
+    **dict.fromkeys(("run_id", "name", "status"), pa.string()),
+    **dict.fromkeys(("started", "ended"), pa.int64()),
+}
+"""What a run must have; every other column is text."""
+_METRICS = {
+    "run": pa.int64(),
+    "metric": pa.string(),
+    "env_steps": pa.int64(),
+    "value": pa.float64(),
+    "time_ms": pa.int64(),
+}
+
+
+_PLACES = re.compile(r"^(?P<name>storage: | *tracking_uri: )(?P<place>.+)$", re.MULTILINE)
+_LOCAL = re.compile(r"(sqlite:///)/(?:.*/)?([^/]+/[^/]+)|(?:file://)?/(?:.*/)?([^/]+)/*")
+
+
+def _without_folders(place: str) -> str:
+    """`place` without what leads to it on this machine; servers, buckets and relative paths stay.
+
+    Of a sqlite file its folder is kept, as it is with the default storage: `results/mlflow.db`.
+    """
+    local = _LOCAL.fullmatch(place)
+    return local.expand(r"\1\2\3") if local else place
+
+
+def is_archive(folder: Path) -> bool:
+    """Whether `folder` holds an exported sweep."""
+    return os.path.lexists(folder / _HEADER)
+
+
+def write_archive(sweep: Sweep, folder: Path, file_format: Format = "parquet") -> None:
+    """Write `sweep` into `folder`; a sweep that was exported there before is replaced.
+
+    An export is what one publishes, so it doesn't say in which folder of a machine the sweep was.
+
+    Raises:
+        ReportError: where the folder is not writable.
+    """
+    header: dict[str, Any] = {"version": VERSION, "format": file_format}
+    header |= {name: getattr(sweep, name) for name in _OWN_FIELDS}
+    header |= {"source": _without_folders(sweep.source)}
+    if sweep.config is not None:
+        header["config"] = _PLACES.sub(
+            lambda found: found["name"] + _without_folders(found["place"]), sweep.config
+        )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for stale in get_args(Format):
+            for table in ("runs", "metrics"):
+                (folder / f"{table}.{stale}").unlink(missing_ok=True)
+        write_table(_runs_table(sweep.runs), folder / f"runs.{file_format}")
+        write_table(_metrics_table(sweep), folder / f"metrics.{file_format}")
+        (folder / _SEARCHES).unlink(missing_ok=True)
+        if sweep.searches:
+            _write_json([_without_place(found) for found in sweep.searches], folder / _SEARCHES)
+        _write_json(header, folder / _HEADER)
+    except OSError as error:
+        raise ReportError(f"{folder} must be writable: {error}") from error
+
+
+def read_archive(folder: Path) -> Sweep:
+    """Inverse of :func:`write_archive`.
+
+    Raises:
+        ReportError: where something is missing or is not what was written.
+    """
+    file = folder / _HEADER
+    try:
+        header = _Header.model_validate(_read_json(file))
+        file = folder / f"runs.{header.format}"
+        runs = read_table(file, _RUNS)
+        records = _records(runs)
+        file = folder / f"metrics.{header.format}"
+        metrics = read_table(file, _METRICS)
+        history = _history(metrics, runs.num_rows)
+        file = folder / _SEARCHES
+        found = checked_searches(_read_json(file)) if file.exists() else ()
+    except (OSError, KeyError, TypeError, ValueError, OverflowError, pa.ArrowException) as error:
+        raise ReportError(
+            f"{folder} must hold an exported sweep: {file.name}: {_reason(error)}"
+        ) from error
+    own = {name: getattr(header, name) for name in _OWN_FIELDS}
+    return Sweep(**own, runs=records, history=history, searches=found)
+
+
+class _Header(BaseModel):
+    """Content of `sweep.json`."""
+
+    model_config = ConfigDict(strict=True)
+
+    version: Literal[1]
+    format: Format
+    name: str
+    status: str
+    run_id: str
+    experiment_id: str
+    started: int | None = Field(ge=0, lt=2**47)  # until the year 6429
+    source: str
+    tags: dict[str, str]
+    config: str | None = Field(max_length=MOST_YAML_BYTES)
+
+
+def _read_json(file: Path) -> Any:
+    return read_json(read_regular(file, MOST_JSON_BYTES))
+
+
+def _reason(error: Exception) -> str:
+    """In one line: of several findings the first."""
+    if isinstance(error, ValidationError):
+        finding = error.errors(include_url=False)[0]
+        place = ".".join(str(part) for part in finding["loc"])
+        rule = finding["msg"].replace("Input should", "must")
+        return f"{place} {rule}, got {shown(finding['input'])}"
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return f"must have {error}" if isinstance(error, KeyError) else str(error).splitlines()[0]
+
+
+def _without_place(search: Mapping[str, Any]) -> dict[str, Any]:
+    storage = search.get("storage")
+    return {**search, "storage": None if storage is None else _without_folders(storage)}
+
+
+def _write_json(document: Any, file: Path) -> None:
+    file.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def _runs_table(runs: Sequence[RunRecord]) -> pa.Table:
+    table: dict[str, Any] = {"run": pa.array(range(len(runs)), pa.int64())}
+    for name in _RUN_FIELDS:
+        kind = pa.int64() if name in ("started", "ended") else pa.string()
+        table[name] = pa.array([getattr(run, name) for run in runs], kind)
+    table |= _wide("tag.", [run.tags for run in runs])
+    table |= _wide("param.", [run.params for run in runs])
+    return pa.table(table)
+
+
+def _wide(prefix: str, rows: Sequence[Mapping[str, str]]) -> dict[str, Any]:
+    keys: Iterable[str] = sorted({key for row in rows for key in row})
+    return {prefix + key: pa.array([row.get(key) for row in rows], pa.string()) for key in keys}
+
+
+def _metrics_table(sweep: Sweep) -> pa.Table:
+    columns = sweep.history
+    metric = [pa.repeat(name, len(found.run)) for name, found in columns.items()]
+    return pa.table(
+        {
+            "run": _concatenated([found.run for found in columns.values()], np.int64),
+            "metric": pa.chunked_array(metric, pa.string()),
+            "env_steps": _concatenated([found.step for found in columns.values()], np.int64),
+            "value": _concatenated([found.value for found in columns.values()], np.float64),
+            "time_ms": _concatenated([found.time for found in columns.values()], np.int64),
+        }
+    )
+
+
+def _concatenated(parts: Sequence[Any], dtype: type) -> Any:
+    return np.concatenate(parts) if parts else np.empty(0, dtype=dtype)
+
+
+def _records(table: pa.Table) -> list[RunRecord]:
+    return [
+        RunRecord(
+            **{name: row[name] for name in _RUN_FIELDS},
+            params=_narrow("param.", row),
+            tags=_narrow("tag.", row),
+        )
+        for row in table.to_pylist()
+    ]
+
+
+def _narrow(prefix: str, row: Mapping[str, Any]) -> dict[str, str]:
+    return {
+        name.removeprefix(prefix): value
+        for name, value in row.items()
+        if name.startswith(prefix) and value is not None
+    }
+
+
+def _history(table: pa.Table, runs: int) -> dict[str, Column]:
+    metrics = table["metric"].combine_chunks().dictionary_encode()
+    codes = metrics.indices.to_numpy(zero_copy_only=False)
+    run, step, value, time = (
+        table[name].to_numpy() for name in ("run", "env_steps", "value", "time_ms")
+    )
+    if len(run) and not 0 <= run.min() <= run.max() < runs:
+        raise ValueError(f"a metric's run must be one of {runs}, got {run.min()} to {run.max()}")
+    order = np.lexsort((step, run, codes))
+    names_of = metrics.dictionary.to_pylist()
+    ends = np.searchsorted(codes[order], np.arange(len(names_of) + 1))
+    history = {}
+    for code, name in enumerate(names_of):
+        chosen = order[ends[code] : ends[code + 1]]
+        history[name] = Column(
+            run=run[chosen], step=step[chosen], value=value[chosen], time=time[chosen]
+        )
+    return history

@@ -1,0 +1,285 @@
+"""A sweep out of MLflow, in bulk.
+
+MLflow's client answers one metric of one run at a time, some milliseconds each: minutes for a
+large sweep. Where the store is a database, the values are read from its `metrics` table instead
+(the same since MLflow 1.0; everything else goes through the client).
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import tempfile
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from music_rllib import names
+from music_rllib.limits import MOST_JSON_BYTES, read_json, read_regular
+from music_rllib.results.data import Column, Points, ReportError, RunRecord, Sweep, columns
+from music_rllib.results.searches import checked_searches
+from music_rllib.tracking.store import TrackingStore, check_reachable
+
+if TYPE_CHECKING:
+    from mlflow import MlflowClient
+    from mlflow.entities import Metric, Run
+
+__all__ = ["attach", "download_policy", "read_mlflow"]
+
+RUNS_PER_PAGE = 1000
+REQUESTS_AT_ONCE = 8
+_LARGEST = float(np.finfo(np.float64).max)
+"""What MLflow's databases hold in place of infinity."""
+
+
+def read_mlflow(
+    store: TrackingStore,
+    name: str,
+    *,
+    sweep_id: str | None = None,
+    metrics: Collection[str] | None = None,
+) -> Sweep:
+    """Read the newest sweep of this name.
+
+    Args:
+        store: where it was logged.
+        name: of the sweep, which is that of its experiment.
+        sweep_id: tells sweeps of the same name apart; None for the one that began last.
+        metrics: which ones to read; None for all.
+
+    Raises:
+        ReportError: where there is no such sweep.
+        TrackingError: where the store does not answer.
+    """
+    client = _open(store)
+    try:
+        found = client.get_experiment_by_name(name)
+        if found is None:
+            raise ReportError(_no_such_sweep(client, store, name))
+        experiment_id = str(found.experiment_id)
+        parent = _parent(client, experiment_id, name, sweep_id)
+        run_id = parent.info.run_id
+        children = _search(client, experiment_id, {names.TAG_PARENT_RUN: run_id})
+        runs = [_record(run) for run in children]
+        return Sweep(
+            name=name,
+            status=parent.info.status,
+            run_id=run_id,
+            experiment_id=experiment_id,
+            started=parent.info.start_time,
+            source=store.public_uri,
+            tags=dict(parent.data.tags),
+            config=_artefact(client, run_id, names.ARTEFACT_SWEEP_CONFIG),
+            runs=runs,
+            history=_history(client, store, children, metrics),
+            searches=checked_searches(
+                read_json(_artefact(client, run_id, names.ARTEFACT_SEARCH) or "[]")
+            ),
+        )
+    except ReportError:
+        raise
+    except Exception as error:
+        raise ReportError(
+            f"MLflow at {store.public_uri} must answer questions about the sweep {name!r}, "
+            f"it answered: {_first_line(error)}"
+        ) from error
+
+
+def attach(store: TrackingStore, run_id: str, folder: Path, name: str) -> None:
+    """Keep the files of `folder` as artefacts of a run, below `name`.
+
+    Raises:
+        ReportError: where MLflow does not take them.
+        TrackingError: where the store does not answer.
+    """
+    client = _open(store)
+    try:
+        client.log_artifacts(run_id, str(folder), name)
+    except Exception as error:
+        raise ReportError(
+            f"MLflow at {store.public_uri} must take the report, it answered: {_first_line(error)}"
+        ) from error
+
+
+def download_policy(
+    store: TrackingStore, experiment_id: str, run_id: str, folder: Path
+) -> Path | None:
+    """The file of the policy that is logged as a run's model, in `folder`; None without one."""
+    client = _open(store)
+    import mlflow
+
+    found = client.search_logged_models(
+        [experiment_id], f"tags.`{names.TAG_SOURCE_RUN}` = '{run_id}'", max_results=1
+    )
+    if not found or found[0].status != "READY":
+        return None
+    place = f"{found[0].artifact_location}/artifacts/{names.ARTEFACT_POLICY}"
+    return Path(
+        mlflow.artifacts.download_artifacts(
+            artifact_uri=place, dst_path=str(folder), tracking_uri=store.uri
+        )
+    )
+
+
+def _open(store: TrackingStore) -> MlflowClient:
+    """A client of a store that exists: MLflow itself would make a new, empty file."""
+    file = _sqlite_file(store)
+    if file is not None and not file.is_file():
+        raise ReportError(
+            f"{file} must be the sqlite file that a sweep was logged to, and there is none. "
+            "Name the sweep's folder, or its storage with --storage, or --tracking-uri."
+        )
+    check_reachable(store)
+    os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "2")
+    os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
+    for chatty in ("mlflow.store.db.utils", "alembic"):
+        logging.getLogger(chatty).setLevel(logging.WARNING)
+    from mlflow import MlflowClient
+
+    return MlflowClient(store.uri)
+
+
+def _first_line(error: Exception) -> str:
+    from music_rllib.tracking.mlflow_client import first_line  # with MLflow, which is loaded by now
+
+    return first_line(error)
+
+
+def _sqlite_file(store: TrackingStore) -> Path | None:
+    if not store.uri.startswith("sqlite"):
+        return None
+    return Path(store.uri.partition(":///")[2].partition("?")[0])
+
+
+def _no_such_sweep(client: MlflowClient, store: TrackingStore, name: str) -> str:
+    known = sorted(found.name for found in client.search_experiments() if found.name != "Default")
+    there = f"It has: {', '.join(known)}." if known else "It has none."
+    return f"{name!r} must be a sweep in MLflow at {store.public_uri}. {there}"
+
+
+def _parent(client: MlflowClient, experiment_id: str, name: str, sweep_id: str | None) -> Run:
+    tags = {names.TAG_KIND: names.KIND_SWEEP}
+    if sweep_id is not None:
+        tags[names.TAG_SWEEP_ID] = sweep_id
+    parents = _search(client, experiment_id, tags)
+    if not parents:
+        which = "" if sweep_id is None else f" with the id {sweep_id}"
+        raise ReportError(
+            f"the experiment {name!r} must hold a sweep's own run{which} (tag "
+            f"{names.TAG_KIND}={names.KIND_SWEEP}), and holds none: no sweep was logged to it"
+        )
+    return max(parents, key=lambda run: run.info.start_time or 0)
+
+
+def _search(client: MlflowClient, experiment_id: str, tags: Mapping[str, str]) -> list[Run]:
+    """All runs with these tags, in the order in which they began."""
+    wanted = " and ".join(f"tags.`{key}` = '{value}'" for key, value in tags.items())
+    found: list[Run] = []
+    token = None
+    while True:
+        page = client.search_runs(
+            [experiment_id],
+            wanted,
+            max_results=RUNS_PER_PAGE,
+            order_by=["attributes.start_time ASC"],
+            page_token=token,
+        )
+        found += page
+        token = page.token
+        if not token:
+            return found
+
+
+def _record(run: Run) -> RunRecord:
+    return RunRecord(
+        run_id=run.info.run_id,
+        name=run.info.run_name or run.info.run_id,
+        status=run.info.status,
+        started=run.info.start_time,
+        ended=run.info.end_time,
+        params=dict(run.data.params),
+        tags=dict(run.data.tags),
+    )
+
+
+def _artefact(client: MlflowClient, run_id: str, name: str) -> str | None:
+    from mlflow.exceptions import MlflowException
+
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            file = client.download_artifacts(run_id, name, folder)
+            return read_regular(file, MOST_JSON_BYTES).decode("utf-8")
+        except (MlflowException, OSError):
+            return None
+
+
+def _history(
+    client: MlflowClient,
+    store: TrackingStore,
+    runs: Sequence[Run],
+    metrics: Collection[str] | None,
+) -> dict[str, Column]:
+    if store.is_server:
+        return columns(_from_server(client, runs, metrics))
+    return columns(_from_database(store, [run.info.run_id for run in runs], metrics))
+
+
+def _from_database(
+    store: TrackingStore, run_ids: Sequence[str], metrics: Collection[str] | None
+) -> Iterator[Points]:
+    """One query per run, which the table's index answers in this order."""
+    import sqlalchemy as sql
+
+    table = sql.table("metrics", *(sql.column(name) for name in _COLUMNS))
+    run, metric, step, time, value, is_nan = table.c
+    chosen = sql.select(metric, step, time, value, is_nan).order_by(metric, step, time)
+    if metrics is not None:
+        chosen = chosen.where(metric.in_(sorted(metrics)))
+    engine = sql.create_engine(store.uri)
+    try:
+        with engine.connect() as connection:
+            # The driver's own cursor: SQLAlchemy's row objects take twice as long.
+            cursor = connection.connection.cursor()
+            for run_id in run_ids:
+                query = chosen.where(run == run_id)
+                cursor.execute(str(query.compile(engine, compile_kwargs={"literal_binds": True})))
+                yield _points(cursor.fetchall())
+    finally:
+        engine.dispose()
+
+
+_COLUMNS = ("run_uuid", "key", "step", "timestamp", "value", "is_nan")
+
+
+def _points(rows: Sequence[Sequence[Any]]) -> Points:
+    """(metric, step, time, value, is NaN) rows, sorted by the first three."""
+    if not rows:
+        return Points((), (), (), ())
+    metrics, steps, times, stored, is_nan = zip(*rows, strict=True)
+    values = np.array(stored, dtype=float)
+    values[np.abs(values) == _LARGEST] *= np.inf
+    values[np.array(is_nan, dtype=bool)] = np.nan
+    return Points(metrics, steps, times, values)
+
+
+def _from_server(
+    client: MlflowClient, runs: Sequence[Run], metrics: Collection[str] | None
+) -> Iterator[Points]:
+    wanted = [
+        (run.info.run_id, metric)
+        for run in runs
+        for metric in run.data.metrics
+        if metrics is None or metric in metrics
+    ]
+    found: dict[str, list[Metric]] = {run.info.run_id: [] for run in runs}
+    with ThreadPoolExecutor(REQUESTS_AT_ONCE) as pool:
+        histories = pool.map(lambda pair: client.get_metric_history(*pair), wanted)
+        for (run_id, _), history in zip(wanted, histories, strict=True):
+            found[run_id] += history
+    for points in found.values():
+        yield _points(
+            sorted((p.key, p.step, p.timestamp, p.value, np.isnan(p.value)) for p in points)
+        )

@@ -1,0 +1,76 @@
+"""A sweep's `search.json` checked: it may come from anybody."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+from pydantic import BaseModel, JsonValue, TypeAdapter
+
+__all__ = ["checked_searches"]
+
+
+class _Trial(BaseModel):
+    number: int
+    state: str
+    values: dict[str, JsonValue]
+    objective: list[float | None] | None = None
+    interval: list[tuple[float | None, float | None]] | None = None
+    reason: str | None
+
+
+class _Arm(BaseModel):
+    values: dict[str, JsonValue]
+    importance: dict[str, float] | None
+    trials: list[_Trial]
+
+
+class _Ranked(BaseModel):
+    trial: JsonValue
+    values: dict[str, JsonValue]
+    failure: str | None = None
+    scores: list[list[JsonValue]] | None = None
+    searched: list[float | None] | None = None
+    fresh: list[float | None] | None = None
+    interval: list[tuple[float | None, float | None]] | None = None
+    best_is_better_with: float | None = None
+
+
+class _Objective(BaseModel):
+    name: str
+    direction: str
+
+
+class _Search(BaseModel):
+    """What is read of a search; there is more."""
+
+    stage: str
+    mode: str
+    sampler: str
+    objectives: list[_Objective]
+    arms: list[_Arm]
+    ranking: list[_Ranked] | None
+
+
+@cache
+def _searches() -> TypeAdapter[list[_Search]]:
+    return TypeAdapter(list[_Search])
+
+
+def checked_searches(document: Any) -> list[dict[str, Any]]:
+    """The searches of a `search.json`, which may come from anybody.
+
+    Raises:
+        ValueError: It is something else.
+    """
+    _searches().validate_python(document)
+    searches: list[dict[str, Any]] = document
+    for search in searches:
+        aims = len(search["objectives"])
+        for row in [t for arm in search["arms"] for t in arm["trials"]] + (search["ranking"] or []):
+            for name in ("objective", "interval", "fresh"):
+                if row.get(name) and len(row[name]) != aims:
+                    raise ValueError(f"{name} must have {aims} entries, it has {len(row[name])}")
+        if any("failure" not in row and not row.get("scores") for row in search["ranking"] or []):
+            raise ValueError("ranking must have scores where it has no failure")
+    return searches

@@ -1,0 +1,89 @@
+"""What is known of this machine and of the environment without loading Ray."""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+
+import psutil
+
+from music_rllib.config.schema import Resources
+from music_rllib.runtime.ray_address import ClusterError, check_reachable, cluster_address
+
+__all__ = [
+    "ClusterError",
+    "check_cpus",
+    "check_memory_and_gpus",
+    "check_reachable",
+    "claimable",
+    "cluster_address",
+    "memory",
+]
+
+
+def check_cpus(resources: Resources) -> int | None:
+    """CPUs of the local Ray to start; None: what Ray finds, or a cluster is used instead.
+
+    Raises:
+        ClusterError: More are asked for than this machine has.
+    """
+    if cluster_address() is not None:
+        return None
+    here = len(os.sched_getaffinity(0))
+    for name in ("num_cpus", "cpus_per_run"):
+        asked = getattr(resources, name)
+        if asked is not None and asked > here:
+            raise ClusterError(
+                f"resources.{name} must be <= {here}, the CPUs of this machine, got {asked}"
+            )
+    return resources.num_cpus
+
+
+MEMORY_LIMITS = ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory.max")
+"""Where a container's limit is, of either version of cgroups."""
+
+
+def check_memory_and_gpus(resources: Resources) -> None:
+    """Look whether this machine has at all what a run reserves, where runs are to run on it.
+
+    Raises:
+        ClusterError: It hasn't.
+    """
+    if cluster_address() is not None:
+        return
+    reserved, gpus = resources.memory_per_run, resources.gpus_per_run
+    if reserved is not None and reserved > (here := memory() / 2**30):
+        raise ClusterError(
+            f"resources.memory_per_run must be <= {math.floor(here * 10) / 10:g}, the GiB of "
+            f"memory of this machine, got {reserved:g}"
+        )
+    if gpus and gpus > (count := _gpus()):
+        raise ClusterError(
+            f"resources.gpus_per_run must be <= {count}, the GPUs of this machine that PyTorch "
+            f"can use, got {gpus:g}"
+        )
+
+
+def memory() -> int:
+    """Bytes of this machine's memory, or of this container's."""
+    found = [int(psutil.virtual_memory().total)]
+    for place in MEMORY_LIMITS:
+        try:
+            text = Path(place).read_text().strip()
+        except OSError:
+            continue
+        if text.isdecimal():  # or "max"
+            found.append(int(text))
+    return min(found)
+
+
+def claimable() -> int:
+    """Bytes that Linux grants a process at once by default, used or not: all memory and swap."""
+    return int(psutil.virtual_memory().total + psutil.swap_memory().total)
+
+
+def _gpus() -> int:
+    import torch  # only where a sweep asks for GPUs
+
+    return torch.cuda.device_count()

@@ -1,0 +1,166 @@
+"""Ray: a local one for the sweep, or the cluster that the environment names."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import ray
+
+from music_rllib.config.schema import Resources
+from music_rllib.runtime import autoscaler
+from music_rllib.runtime.machine import ClusterError, check_cpus, cluster_address
+from music_rllib.runtime.quiet import quiet_third_parties
+
+__all__ = ["Room", "check_fits", "cluster", "slots"]
+
+OBJECT_STORE_BYTES = 128 * 2**20
+"""Enough, as reports are all that workers send; Ray's default takes a third of the memory."""
+
+
+WAITING = 200
+"""Runs that wait at most where nodes are added for those that wait; Tune's own default."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Room:
+    """What a cluster has for runs."""
+
+    now: int
+    """Runs that fit at once into the nodes that there are; 0 only where it grows."""
+    grows: bool = False
+    """Whether nodes may be added for what waits."""
+    memory: int = 0
+    """Bytes of the largest node."""
+
+    @property
+    def at_once(self) -> int:
+        """Runs at a time that can be counted on."""
+        return max(self.now, 1)
+
+    @property
+    def waiting(self) -> int:
+        """How many runs to let wait for a place, beside those that have one."""
+        return max(self.now, WAITING) if self.grows else self.now
+
+    @property
+    def remark(self) -> str | None:
+        """What a person should know who sees nothing happen."""
+        if self.now:
+            return None
+        return (
+            "no node of the cluster can hold a run yet; its autoscaler is asked for one, which may "
+            "take minutes ('ray status' shows what it does)"
+        )
+
+
+@contextlib.contextmanager
+def cluster(resources: Resources) -> Iterator[Room]:
+    """Connect to Ray, and say what it has for runs.
+
+    Raises:
+        ClusterError: There is no cluster at the address, or no node can hold a run: none of
+            those that there are, and none that an autoscaler would add.
+    """
+    address = cluster_address()
+    options: dict[str, Any] = {
+        "runtime_env": {"worker_process_setup_hook": quiet_third_parties},
+        "log_to_driver": False,
+        "logging_level": logging.WARNING,
+    }
+    if address is None:
+        options |= {
+            "address": "local",  # and not one that happens to run on this machine
+            "num_cpus": check_cpus(resources),
+            "include_dashboard": False,
+            "object_store_memory": OBJECT_STORE_BYTES,
+        }
+    try:
+        ray.init(**options)
+    except (ConnectionError, RuntimeError, ValueError) as error:
+        if address is None:
+            raise
+        raise ClusterError(
+            f"RAY_ADDRESS must be a Ray cluster that can be reached, got {address!r}: "
+            f"{str(error).strip().splitlines()[0]}"
+        ) from error
+    try:
+        yield _room(resources)
+    finally:
+        ray.shutdown()
+
+
+def check_fits(resources: Resources) -> str | None:
+    """Ask Ray, where that can't be known without it, whether it can hold a run.
+
+    Returns:
+        What a person should know who will have to wait for it.
+
+    Raises:
+        ClusterError: It can't be reached, or can't.
+    """
+    more = set(resources.bundle) - {"CPU"}
+    if more or (cluster_address() is not None and resources.cpus_per_run > 1):
+        with cluster(resources) as room:
+            return room.remark
+    return None
+
+
+def _room(resources: Resources) -> Room:
+    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    kinds = ("memory", "object_store_memory")
+    memory = int(max(sum(node.get(kind, 0) for kind in kinds) for node in nodes))
+    if cluster_address() is None:
+        return Room(now=slots(resources, nodes, local=True), memory=memory)
+    try:
+        now = slots(resources, nodes, local=False)
+    except ClusterError:
+        if not autoscaler.adds_nodes(resources.bundle):
+            raise
+        return Room(now=0, grows=True, memory=memory)
+    return Room(now=now, grows=autoscaler.is_there(), memory=memory)
+
+
+def slots(resources: Resources, nodes: Sequence[Mapping[str, float]], *, local: bool) -> int:
+    """How many runs fit at once into nodes with these resources.
+
+    Args:
+        resources: What is reserved for a run.
+        nodes: Ray's resources of each node.
+        local: Whether this is the Ray of one sweep; for the message.
+
+    Raises:
+        ClusterError: Not even one fits.
+    """
+    bundle = resources.bundle
+    count = sum(
+        min(int(node.get(name, 0) / amount + 1e-9) for name, amount in bundle.items())
+        for node in nodes
+    )
+    if count:
+        return count
+    where = "this machine, which" if local else "one node of the cluster, whose largest"
+    for name, (setting, unit, scale) in _SETTINGS.items():
+        largest = max((node.get(name, 0) for node in nodes), default=0)
+        if bundle.get(name, 0) > largest:
+            raise ClusterError(
+                f"resources.{setting} must fit into {where} has "
+                f"{math.floor(largest / scale * 10) / 10:g} {unit}, got "
+                f"{getattr(resources, setting):g}"
+            )
+    raise ClusterError(
+        "resources must fit into one node; each of them is on some node, but all together "
+        f"({', '.join(f'{name} {amount:g}' for name, amount in bundle.items())}) on none"
+    )
+
+
+_SETTINGS = {
+    "CPU": ("cpus_per_run", "CPUs", 1),
+    "GPU": ("gpus_per_run", "GPUs", 1),
+    "memory": ("memory_per_run", "GiB of memory for Ray", 2**30),
+}
+"""Ray's name to the setting, the unit in messages, and what a unit is."""

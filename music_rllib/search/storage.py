@@ -1,0 +1,184 @@
+"""The databases that Optuna's studies are in: opened, and looked into without a trace."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+import weakref
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from optuna.exceptions import StorageInternalError
+from optuna.storages import BaseStorage, RDBStorage, get_storage
+from sqlalchemy import create_engine, inspect
+from sqlalchemy.engine import URL, make_url
+from sqlalchemy.exc import ArgumentError, IntegrityError, ProgrammingError, SQLAlchemyError
+
+from music_rllib.redaction import redact
+from music_rllib.store.object_folder import StorageError
+
+__all__ = [
+    "DATABASE_ERRORS",
+    "known_studies",
+    "open_older",
+    "open_studies",
+    "same_database",
+    "studies_of",
+]
+
+DATABASE_ERRORS = (StorageInternalError, SQLAlchemyError)
+"""A database that doesn't answer, or not now."""
+
+
+def open_studies(
+    url: str, *, setting: str = "search.storage", must_exist: bool = False
+) -> BaseStorage:
+    """Open Optuna's storage.
+
+    Args:
+        url: SQLAlchemy's URL, or the path of a sqlite file. PostgreSQL's password comes from
+            `PGPASSWORD` or a password file.
+        setting: Where the user has named it, for messages.
+        must_exist: Change nothing: refuse a sqlite file that isn't there, or has no studies in it.
+
+    Raises:
+        StorageError: The database can't be reached.
+    """
+    with _saying_what_is_wrong(url, setting):
+        parsed = _parsed(url, setting)
+        file = _file_of(parsed)
+        if must_exist and file is not None and not file.is_file():
+            raise StorageError(f"{setting} must be an sqlite file that is there, got {redact(url)}")
+        if must_exist and not _has_studies(parsed):
+            raise StorageError(f"{setting} must be a database with studies, got {redact(url)}")
+        database = _with_tables(parsed, make=not must_exist)
+        storage = get_storage(database)  # with a cache of ended trials
+        # Optuna leaves its connections open, of which Python >= 3.13 warns.
+        weakref.finalize(storage, database.engine.dispose)
+        return storage
+
+
+def open_older(url: str) -> BaseStorage:
+    """Open the storage of a warm start, which must be there.
+
+    Raises:
+        StorageError: It isn't, or can't be reached.
+    """
+    return open_studies(url, setting="search.warm_start.storage", must_exist=True)
+
+
+def known_studies(url: str, *, must_exist: bool = False) -> list[str]:
+    """Names of the studies in a search's database, or a warm start's; nothing is changed there.
+
+    Args:
+        url: As for `open_studies`.
+        must_exist: It is a warm start's.
+
+    Returns:
+        The oldest first; none where the database is still to be made.
+
+    Raises:
+        StorageError: It can't be reached, or made.
+    """
+    if must_exist:
+        return [one.study_name for one in studies_of(open_older(url))]
+    setting = "search.storage"
+    with _saying_what_is_wrong(url, setting):
+        parsed = _parsed(url, setting)
+        file = _file_of(parsed)
+        if file is not None and not file.exists():
+            if not os.access(file.absolute().parent, os.W_OK | os.X_OK):
+                raise StorageError(
+                    f"{setting} must be in a folder that can be written, got {redact(url)}"
+                )
+            return []
+        if not _has_studies(parsed):
+            return []
+        return [one.study_name for one in studies_of(open_studies(url))]
+
+
+def _has_studies(url: URL) -> bool:
+    engine = create_engine(url, **_engine_options(url))
+    try:
+        return inspect(engine).has_table("studies")
+    finally:
+        engine.dispose()
+
+
+def studies_of(storage: BaseStorage) -> list[Any]:
+    """The oldest first."""
+    return sorted(storage.get_all_studies(), key=lambda one: int(one._study_id))
+
+
+def same_database(one: str, other: str) -> bool:
+    """Whether two URLs or paths name the same database."""
+    return _place(one) == _place(other)
+
+
+def _place(url: str) -> str:
+    try:
+        file = _file_of(_parsed(url, ""))
+    except (ArgumentError, StorageError):
+        return url
+    return url if file is None else str(file.resolve())
+
+
+def _parsed(url: str, setting: str) -> URL:
+    parsed = make_url(url if "://" in url else f"sqlite:///{url}")
+    if parsed.password:
+        raise StorageError(
+            f"{setting} must not hold a password, got one in {redact(url)}: put it into the "
+            "environment as PGPASSWORD, or into ~/.pgpass"
+        )
+    if parsed.drivername == "postgresql":
+        parsed = parsed.set(drivername="postgresql+psycopg2")
+    return parsed
+
+
+def _file_of(url: URL) -> Path | None:
+    """The file of a sqlite database; None for any other."""
+    in_file = url.get_backend_name() == "sqlite" and url.database not in (None, "", ":memory:")
+    return Path(str(url.database)) if in_file else None
+
+
+def _engine_options(url: URL) -> dict[str, Any]:
+    local = url.get_backend_name() == "sqlite"
+    # Optuna asks for all unfinished trials by their ids: each number of them is a statement of its
+    # own, and sqlite would keep 128 long ones.
+    sqlite = {"connect_args": {"timeout": 60, "cached_statements": 8}}
+    return {**(sqlite if local else {"pool_size": 2}), "pool_pre_ping": True}
+
+
+@contextlib.contextmanager
+def _saying_what_is_wrong(url: str, setting: str) -> Iterator[None]:
+    try:
+        yield
+    except (*DATABASE_ERRORS, ArgumentError, ImportError, RuntimeError) as error:
+        if isinstance(error, StorageError):
+            raise
+        cause = str(error.__cause__ or error).strip().splitlines()[0]
+        raise StorageError(
+            f"{setting} must be a database that can be used, got {redact(url)}: {redact(cause)}"
+        ) from error
+
+
+def _with_tables(url: URL, *, make: bool) -> RDBStorage:
+    """Optuna's storage, its tables made where they are missing if `make` says so.
+
+    Of two drivers that find a new database at the same moment, one fails to make a table that the
+    other is just making, and finds it there when it looks again.
+    """
+    for wait in (0.5, 1.0, 2.0, 4.0, None) if make else (None,):
+        try:
+            return RDBStorage(
+                url.render_as_string(hide_password=False),
+                engine_kwargs=_engine_options(url),
+                skip_table_creation=not make,
+            )
+        except (IntegrityError, ProgrammingError):
+            if wait is None:
+                raise
+            time.sleep(wait)
+    raise AssertionError("unreachable")

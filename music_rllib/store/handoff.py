@@ -1,0 +1,303 @@
+"""Weights handed from one run to another: plain arrays, and a manifest that says what they are.
+
+A handoff is a folder with one safetensors file per module and ``handoff.json``, which names the
+task, the run that made them, and each file's size, hash and shapes. It is written last and read
+first. Nothing here can execute: a pickle in place of weights is refused by its hash, and by the
+safetensors format if the manifest was forged with it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+import safetensors
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from safetensors.numpy import load as load_safetensors
+from safetensors.numpy import save as save_safetensors
+
+from music_rllib.envs.tasks import Task
+from music_rllib.limits import (
+    MOST_JSON_BYTES,
+    MOST_WEIGHTS_BYTES,
+    check_safetensors,
+    open_regular,
+    read_json,
+    read_regular,
+)
+from music_rllib.store.files import canonical_json, write_atomically
+from music_rllib.version import ALGORITHM_VERSION
+
+if TYPE_CHECKING:
+    import gymnasium as gym
+
+__all__ = [
+    "Architecture",
+    "HandoffError",
+    "HandoffInfo",
+    "HandoffManifest",
+    "Spaces",
+    "Weights",
+    "open_handoff",
+    "read_handoff",
+    "write_handoff",
+]
+
+Weights = Mapping[str, Mapping[str, npt.NDArray[Any]]]
+"""Module name to array name to array."""
+
+MANIFEST = "handoff.json"
+
+
+class HandoffError(ValueError):
+    """A handoff that is missing, damaged or made for something else; says which and where."""
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Architecture(_Strict):
+    """The settings that shape a handoff's arrays."""
+
+    hidden_sizes: tuple[int, ...]
+    policy: str
+    bootstrap: str
+    normalise_observations: bool
+    estimator_hidden_size: int
+    log_std_form: str = "clamp"
+    """What the policy's outputs mean; handoffs from before there was a choice do not say."""
+    log_std_bounds: tuple[float, float] | None = None
+    """Of `tanh`, which scales to them; others only cut off there."""
+
+    def differences(self, other: Architecture, starts_from: str) -> list[str]:
+        """Names of the settings, as in a sweep's YAML, that keep a handoff from fitting."""
+        if starts_from == "estimator":
+            fits = self.estimator_hidden_size == other.estimator_hidden_size
+            return [] if fits else ["music.hidden_size"]
+        fields = ["hidden_sizes", "policy", "bootstrap", "normalise_observations", "log_std_form"]
+        if self.log_std_form == other.log_std_form:
+            fields.append("log_std_bounds")
+        return [f"tac.{name}" for name in fields if getattr(self, name) != getattr(other, name)]
+
+
+class Spaces(_Strict):
+    """What a policy must know of its environment to act without it."""
+
+    observation_size: int = Field(gt=0)
+    goal_size: int = Field(ge=0)
+    """0 without goals."""
+    action_low: tuple[float, ...] = Field(min_length=1)
+    action_high: tuple[float, ...]
+    """The lowest and the highest action."""
+
+    @classmethod
+    def of(cls, observations: gym.Space[Any], actions: gym.Space[Any]) -> Spaces:
+        """Of an environment's spaces.
+
+        Raises:
+            ValueError: Nothing can be trained in them.
+        """
+        from music_rllib.envs.make import check_action_space, observation_sizes
+
+        observation_size, goal_size = observation_sizes(observations)
+        bounds = check_action_space(actions)
+        return cls(
+            observation_size=observation_size,
+            goal_size=goal_size,
+            action_low=tuple(bounds.low.tolist()),
+            action_high=tuple(bounds.high.tolist()),
+        )
+
+
+class HandoffInfo(_Strict):
+    """Where a handoff comes from."""
+
+    task: Task
+    variant: str
+    architecture: Architecture
+    env_steps: int
+    """Environment steps that the source run had trained."""
+    seed: int
+    node_key: str
+    """Key of the source run; determines its settings and its own source."""
+    algorithm_version: str = ALGORITHM_VERSION
+    spaces: Spaces | None = None
+    """None in handoffs of earlier versions."""
+
+
+class _Array(_Strict):
+    shape: tuple[int, ...]
+    dtype: str
+
+
+class _ModuleFile(_Strict):
+    file: Annotated[str, Field(pattern=r"^[a-z_]+\.safetensors$")]
+    """Beside the manifest; the pattern keeps a forged one from pointing elsewhere."""
+    sha256: str
+    bytes: int
+    arrays: dict[str, _Array]
+
+
+class HandoffManifest(_Strict):
+    """Content of ``handoff.json``."""
+
+    format: Literal["music_rllib handoff 1"] = "music_rllib handoff 1"
+    info: HandoffInfo
+    modules: dict[str, _ModuleFile]
+
+    @property
+    def content_hash(self) -> str:
+        """Hash of what a run that starts from this handoff depends on."""
+        content = {
+            "task": self.info.task.identity(),
+            "modules": {name: module.sha256 for name, module in self.modules.items()},
+        }
+        return hashlib.sha256(canonical_json(content).encode()).hexdigest()[:20]
+
+
+def write_handoff(folder: Path, modules: Weights, info: HandoffInfo) -> HandoffManifest:
+    """Write `modules` and their manifest into `folder`.
+
+    Args:
+        folder: Is created; must not hold a handoff already.
+        modules: At least one; names are those of `TrainingRun.modules`.
+        info: Where they come from.
+
+    Raises:
+        ValueError: An array holds NaN or infinity: the run diverged, nobody must start from it.
+        OSError: The folder can't be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    files = {}
+    for name, arrays in modules.items():
+        for key, array in arrays.items():
+            if not np.isfinite(array).all():
+                raise ValueError(f"{name}.{key} must be finite to be handed over, it is not")
+        # C order, because safetensors writes the memory as it lies and ignores strides.
+        data = save_safetensors({key: np.asarray(a, order="C") for key, a in arrays.items()})
+        file = f"{name}.safetensors"
+        write_atomically(folder / file, data)
+        files[name] = _ModuleFile(
+            file=file,
+            sha256=hashlib.sha256(data).hexdigest(),
+            bytes=len(data),
+            arrays={k: _Array(shape=a.shape, dtype=str(a.dtype)) for k, a in arrays.items()},
+        )
+    manifest = HandoffManifest(info=info, modules=files)
+    write_atomically(folder / MANIFEST, manifest.model_dump_json(indent=1).encode())
+    return manifest
+
+
+def open_handoff(folder: Path) -> tuple[Path, HandoffManifest]:
+    """Find and check a handoff's manifest, without its weights.
+
+    Args:
+        folder: A handoff, or a folder that has one below `handoff/`, as finished nodes do.
+
+    Returns:
+        The handoff's own folder, and its manifest.
+
+    Raises:
+        HandoffError: There is none, or it isn't one of this format.
+    """
+    for candidate in (folder, folder / "handoff"):
+        path = candidate / MANIFEST
+        if path.is_file():
+            try:
+                content = read_json(read_regular(path, MOST_JSON_BYTES))
+                return candidate, HandoffManifest.model_validate(content)
+            except (ValueError, OSError) as error:
+                reason = _first_finding(error)
+                raise HandoffError(f"{path} must be a handoff manifest: {reason}") from None
+    found = "the folder is there" if folder.is_dir() else "there is no such folder"
+    raise HandoffError(f"{folder} must hold a handoff ({MANIFEST} and weights): {found}")
+
+
+def _first_finding(error: ValueError | OSError) -> str:
+    if isinstance(error, OSError):
+        return str(error.strerror)
+    if not isinstance(error, ValidationError):
+        return str(error)
+    finding = error.errors(include_url=False)[0]
+    place = ".".join(str(part) for part in finding["loc"])
+    return f"{place}: {finding['msg']}" if place else finding["msg"]
+
+
+def read_handoff(
+    folder: Path, modules: Sequence[str], task: Task
+) -> dict[str, dict[str, npt.NDArray[Any]]]:
+    """Load and verify `modules`.
+
+    Args:
+        folder: As for `open_handoff`.
+        modules: Names of the modules that are needed.
+        task: The task that they must have been trained on; its name may differ.
+
+    Returns:
+        Module name to array name to array, writable.
+
+    Raises:
+        HandoffError: Something is missing, damaged, of another task or not as the manifest says.
+    """
+    folder, manifest = open_handoff(folder)
+    _check_task(folder, manifest.info.task, task)
+    absent = [name for name in modules if name not in manifest.modules]
+    if absent:
+        raise HandoffError(
+            f"{folder} must have {', '.join(modules)}; it lacks {', '.join(absent)} "
+            f"(made by {manifest.info.variant})"
+        )
+    return {name: _read_module(folder, manifest.modules[name]) for name in modules}
+
+
+def _check_task(folder: Path, made_for: Task, wanted: Task) -> None:
+    theirs, ours = made_for.identity(), wanted.identity()
+    differences = [
+        f"{key} is {json.dumps(theirs[key])} there and {json.dumps(ours[key])} here"
+        for key in ours
+        if theirs[key] != ours[key]
+    ]
+    if differences:
+        raise HandoffError(
+            f"{folder} must be of task {wanted.name}, it is of {made_for.name}: "
+            + "; ".join(differences)
+        )
+
+
+def _read_module(folder: Path, expected: _ModuleFile) -> dict[str, npt.NDArray[Any]]:
+    path = folder / expected.file
+    if expected.bytes > MOST_WEIGHTS_BYTES:
+        raise HandoffError(
+            f"{path} must have at most {MOST_WEIGHTS_BYTES} bytes, {MANIFEST} says {expected.bytes}"
+        )
+    try:
+        with open_regular(path) as file:
+            size = os.fstat(file.fileno()).st_size
+            data = file.read(size) if size == expected.bytes else b""
+    except OSError as error:
+        raise HandoffError(f"{path} must be readable: {error.strerror}") from None
+    if size != expected.bytes:
+        raise HandoffError(f"{path} must have {expected.bytes} bytes, it has {size}")
+    if hashlib.sha256(data).hexdigest() != expected.sha256:
+        raise HandoffError(f"{path} must have the hash in {MANIFEST}, its content has changed")
+    try:
+        check_safetensors(data)
+        arrays = load_safetensors(data)
+    except (safetensors.SafetensorError, ValueError, KeyError, TypeError) as error:
+        raise HandoffError(f"{path} must be a safetensors file: {error}") from None
+    found = {key: _Array(shape=a.shape, dtype=str(a.dtype)) for key, a in arrays.items()}
+    if found != expected.arrays:
+        wrong = sorted(
+            key
+            for key in found.keys() | expected.arrays.keys()
+            if found.get(key) != expected.arrays.get(key)
+        )
+        raise HandoffError(f"{path} must have the arrays in {MANIFEST}; wrong: {', '.join(wrong)}")
+    return arrays

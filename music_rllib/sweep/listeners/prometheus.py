@@ -1,0 +1,184 @@
+"""A sweep's own numbers for Prometheus, beside Ray's, by `ray.util.metrics`.
+
+The driver exports them and not the workers: a worker's gauges vanish with it, and a finished run's
+success rate would with them. Ray forgets a gauge that is not set again, so all are, regularly.
+`dashboards/` has what scrapes and shows them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from music_rllib import names
+from music_rllib.experiment.listener import Failure, Listener
+from music_rllib.experiment.plan import Node
+from music_rllib.experiment.scheduler import Board, Status
+from music_rllib.store.files import write_atomically
+from music_rllib.store.run_record import Report, RunResult
+from music_rllib.sweep.views.text import in_words
+from music_rllib.tracking.sender import Backlog
+
+__all__ = ["GAUGES", "TARGETS", "Gauges"]
+
+TARGETS = ".prometheus"
+"""Folder beside the sweeps' own: NAME.json says where this Ray's metrics are. Prometheus' file_sd
+reads it, and wants all of them in one folder."""
+SET_SECONDS = 2.0
+KEPT = 100
+"""Runs that are over and still shown, the newest ones: what is exported every few seconds must not
+grow with a sweep of thousands."""
+RUN_TAGS = ("sweep", "stage", "variant", "task", "q", "seed", "run")
+SWEEP_TAGS = ("sweep",)
+
+_METRICS = {
+    "music_success_rate": names.EVAL_SUCCESS,
+    "music_success_rate_any_step": names.EVAL_SUCCESS_ANY,
+    "music_episode_return": names.EVAL_RETURN,
+    "music_mutual_information_bound_nats": names.MI_BOUND,
+    "music_env_steps": names.ENV_STEPS,
+    "music_grad_updates": names.GRAD_UPDATES,
+}
+_RATES = {
+    "music_env_steps_per_second": names.ENV_STEPS,
+    "music_grad_updates_per_second": names.GRAD_UPDATES,
+}
+GAUGES = {
+    "music_success_rate": "Success at the last step of evaluation episodes, of a run.",
+    "music_success_rate_any_step": "Success at any step of evaluation episodes, of a run.",
+    "music_episode_return": "Return of evaluation episodes, of a run.",
+    "music_mutual_information_bound_nats": "Bound on the mutual information, of a run.",
+    "music_env_steps": "Environment steps that a run has done.",
+    "music_grad_updates": "Gradient updates that a run has done.",
+    "music_env_steps_per_second": "Environment steps per second of a run; 0 when it is over.",
+    "music_grad_updates_per_second": "Gradient updates per second of a run; 0 when it is over.",
+    "music_runs": "Runs of a sweep by their state.",
+    "music_undelivered_records": "Records that MLflow has not received yet.",
+    "music_undelivered_artefacts": "Artefacts that MLflow has not received yet.",
+}
+"""Name, before Ray's `ray_`, to what it means."""
+
+
+class Gauges(Listener):
+    """Sets every gauge of a sweep every few seconds."""
+
+    def __init__(
+        self,
+        sweep: str,
+        board: Board,
+        backlog: Callable[[], Backlog],
+        folder: Path,
+        now: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Say beside the sweep's `folder` where Prometheus finds them; `now` is in seconds."""
+        self._sweep = sweep
+        self._board = board
+        self._backlog = backlog
+        self._targets = folder.parent / TARGETS / f"{folder.name}.json"
+        self._now = now
+        self._next = 0.0
+        self._gauges: dict[str, Any] = {}
+        self._values: dict[str, tuple[dict[str, str], dict[str, float]]] = {}
+        """Node key to tags and values by gauge."""
+        self._last: dict[str, Report] = {}
+        self._ended: dict[str, None] = {}
+        """Node keys, in the order in which they ended."""
+
+    def reported(self, node: Node, reports: list[Report]) -> None:
+        """Keep the newest values."""
+        self._ended.pop(node.key, None)
+        _, values = self._values.setdefault(node.key, (self._tags(node), {}))
+        for report in reports:
+            for gauge, metric in _METRICS.items():
+                if metric in report.metrics:
+                    values[gauge] = report.metrics[metric]
+            before = self._last.get(node.key)
+            if before is not None and report.seconds > before.seconds:
+                for gauge, metric in _RATES.items():
+                    if metric in report.metrics and metric in before.metrics:
+                        done = report.metrics[metric] - before.metrics[metric]
+                        values[gauge] = done / (report.seconds - before.seconds)
+            self._last[node.key] = report
+
+    def finished(self, node: Node, result: RunResult) -> None:
+        """It trains no more."""
+        self._over(node)
+
+    def failed(self, node: Node, failure: Failure) -> None:
+        """It trains no more."""
+        self._over(node)
+
+    def paused(self, node: Node) -> None:
+        """It trains no more, or goes on some time."""
+        self._over(node)
+
+    def tick(self) -> None:
+        """Set them again, now and then."""
+        if self._now() < self._next:
+            return
+        self._next = self._now() + SET_SECONDS
+        # Whatever Ray's metrics say: training goes on.
+        with contextlib.suppress(Exception):
+            self._set_all()
+
+    def close(self) -> None:
+        """Ray ends, and with it what could be scraped."""
+        with contextlib.suppress(OSError):
+            self._targets.unlink(missing_ok=True)
+
+    def _over(self, node: Node) -> None:
+        _, values = self._values.setdefault(node.key, (self._tags(node), {}))
+        values.update(dict.fromkeys(_RATES, 0.0))
+        self._last.pop(node.key, None)
+        self._ended[node.key] = None
+        while len(self._ended) > KEPT:
+            oldest = next(iter(self._ended))
+            del self._ended[oldest], self._values[oldest]
+
+    def _tags(self, node: Node) -> dict[str, str]:
+        return {
+            "sweep": self._sweep,
+            "stage": node.stage,
+            "variant": node.run.variant,
+            "task": node.run.task.name,
+            "q": in_words(node.run.tac.entropic_index),
+            "seed": str(node.run.seed),
+            "run": node.label,
+        }
+
+    def _set_all(self) -> None:
+        if not self._gauges:
+            self._open()
+        for tags, values in self._values.values():
+            for gauge, value in values.items():
+                self._gauges[gauge].set(value, tags=tags)
+        for status in Status:
+            tags = {"sweep": self._sweep, "state": status.value}
+            self._gauges["music_runs"].set(len(self._board.having(status)), tags=tags)
+        backlog, tags = self._backlog(), {"sweep": self._sweep}
+        self._gauges["music_undelivered_records"].set(backlog.records, tags=tags)
+        self._gauges["music_undelivered_artefacts"].set(backlog.artefacts, tags=tags)
+
+    def _open(self) -> None:
+        import ray
+        from ray.util.metrics import Gauge
+
+        self._gauges = {
+            name: Gauge(name, description=text, tag_keys=_tag_keys(name))
+            for name, text in GAUGES.items()
+        }
+        nodes = [node for node in ray.nodes() if node["Alive"] and node["MetricsExportPort"]]
+        found = [f"{node['NodeManagerAddress']}:{node['MetricsExportPort']}" for node in nodes]
+        entry = {"labels": {"job": "music_rllib", "sweep_name": self._sweep}, "targets": found}
+        self._targets.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(self._targets, json.dumps([entry], indent=1).encode())
+
+
+def _tag_keys(name: str) -> tuple[str, ...]:
+    if name == "music_runs":
+        return (*SWEEP_TAGS, "state")
+    return SWEEP_TAGS if name.startswith("music_undelivered") else RUN_TAGS

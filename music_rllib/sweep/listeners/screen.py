@@ -1,0 +1,191 @@
+"""A running sweep on the screen: a live table on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+from music_rllib import names
+from music_rllib.experiment.listener import Failure, Listener
+from music_rllib.experiment.plan import Node, Plan
+from music_rllib.experiment.scheduler import Board, Status
+from music_rllib.store.run_record import Report, RunResult
+from music_rllib.sweep.views.text import clock, evaluated_in_words
+from music_rllib.training.throughput import Pace
+
+__all__ = ["Display"]
+
+REFRESH_SECONDS = 0.5
+QUIET_SECONDS = 30.0
+"""Without a terminal, a line at least this often for each run, if it has something new."""
+
+
+class Display(Listener):
+    """Shows what runs, how fast, how long still; keeps a line of what ended."""
+
+    def __init__(
+        self,
+        console: Console,
+        plan: Plan,
+        board: Board,
+        now: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Show on `console`; `now` is a clock in seconds."""
+        self._console = console
+        self._plan = plan
+        self._board = board
+        self._now = now
+        self._began = now()
+        self.headline: Callable[[], tuple[list[str], str | None]] = lambda: ([], None)
+        """Gives where each stage stands, and the best so far, in words."""
+        self._best: str | None = None
+        self._running: dict[str, tuple[Node, Pace]] = {}
+        self._said: dict[str, float] = {}
+        self._refreshed = self._headed = self._began
+        self._live = (
+            Live(console=console, auto_refresh=False, transient=True)
+            if console.is_terminal
+            else None
+        )
+
+    def __enter__(self) -> Self:
+        if self._live:
+            self._live.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._live:
+            self._live.stop()
+
+    def say(self, text: str, style: str = "") -> None:
+        """A line that stays."""
+        passed = clock(self._now() - self._began)
+        self._console.print(Text(f"[{passed:>6}] {text}", style=style), soft_wrap=True)
+
+    def started(self, node: Node) -> None:
+        self._running[node.key] = (node, self._new_pace(node))
+        self.say(f"{node.label}: started")
+
+    def _new_pace(self, node: Node) -> Pace:
+        return Pace(node.run.env_steps, node.run.tac.random_steps, self._now())
+
+    def reported(self, node: Node, reports: list[Report]) -> None:
+        _, pace = self._running.setdefault(node.key, (node, self._new_pace(node)))
+        pace.hear(reports, self._now())
+        evaluated = any(names.EVAL_EPISODES in report.metrics for report in reports)
+        quiet = self._now() - self._said.get(node.key, self._began) >= QUIET_SECONDS
+        if self._live is None and (evaluated or quiet) and not self._is_over(node, pace):
+            self._said[node.key] = self._now()
+            self.say(f"{node.label}: {self._progress_in_words(node, pace)}")
+
+    @staticmethod
+    def _is_over(node: Node, pace: Pace) -> bool:
+        return pace.env_steps >= node.run.env_steps  # `finished` says it better
+
+    def noted(self, node: Node, text: str) -> None:
+        self.say(f"{node.label}: {text}")
+
+    def remarked(self, text: str) -> None:
+        self.say(text, "yellow")
+
+    def finished(self, node: Node, result: RunResult) -> None:
+        self._running.pop(node.key, None)
+        self.say(
+            f"{node.label}: finished, {evaluated_in_words(node.run.task, result.metrics)}, "
+            f"{result.env_steps:,} env steps in {clock(result.seconds)}",
+            "green",
+        )
+
+    def failed(self, node: Node, failure: Failure) -> None:
+        self._running.pop(node.key, None)
+        cause = failure.cause.replace("\n", "\n" + " " * 13)
+        self.say(f"{node.label}: FAILED: {cause}", "red")
+        self.say(f"    whole traceback: {failure.log}")
+
+    def skipped(self, node: Node, because: Node) -> None:
+        self.say(f"{node.label}: skipped, it starts from {because.label}", "yellow")
+
+    def paused(self, node: Node) -> None:
+        self._running.pop(node.key, None)
+
+    def pruned(self, node: Node, reason: str) -> None:
+        self._running.pop(node.key, None)
+
+    def tick(self) -> None:
+        now = self._now()
+        if self._live is None and now - self._headed >= QUIET_SECONDS:
+            self._headed = now
+            _, best = self.headline()
+            if best is not None and best != self._best:
+                self._best = best
+                self.say(best)
+        if self._live and self._now() - self._refreshed >= REFRESH_SECONDS:
+            self._refreshed = self._now()
+            self._live.update(self._view(), refresh=True)
+
+    def _view(self) -> Group:
+        table = Table(box=None, pad_edge=False)
+        table.add_column("running")
+        table.add_column("", width=16)
+        for name in ("env steps", "steps/s", "left", "last evaluation"):
+            table.add_column(name, justify="right")
+        for node, pace in self._running.values():
+            rate = pace.steps_per_second
+            table.add_row(
+                node.label,
+                ProgressBar(total=pace.budget, completed=pace.env_steps, width=16),
+                f"{pace.env_steps:,} / {pace.budget:,}" if pace.env_steps else "preparing",
+                "-" if rate is None else f"{rate:.0f}",
+                clock(pace.seconds_left(self._now())),
+                evaluated_in_words(node.run.task, pace.metrics)
+                if node.run.task.primary_metric in pace.metrics
+                else "-",
+            )
+        lines, best = self.headline()
+        texts = [Text(line, style="dim") for line in [*lines, self._summary()]]
+        return Group(table, *texts, *([Text(best)] if best else []))
+
+    def _summary(self) -> str:
+        """`1 of 4 runs done, 8,000 of 24,000 env steps, 1:02 passed, about 2:10 left`."""
+        done = self._board.having(Status.FINISHED, Status.REUSED)
+        steps = sum(node.run.env_steps for node in done)
+        steps += sum(pace.env_steps for _, pace in self._running.values())
+        text = (
+            f"{len(done)} of {len(self._plan.nodes)} runs done, "
+            f"{steps:,} of {self._plan.env_steps:,} env steps, "
+            f"{clock(self._now() - self._began)} passed"
+        )
+        left = self._seconds_left()
+        return text if left is None else f"{text}, about {clock(left)} left"
+
+    def _seconds_left(self) -> float | None:
+        """As if what waits went as fast as what runs, and never waited for each other."""
+        paces = [pace for _, pace in self._running.values()]
+        rates = [rate for pace in paces if (rate := pace.steps_per_second) is not None]
+        if not rates or len(rates) < len(paces):
+            return None
+        to_do = self._board.having(Status.WAITING, Status.STARTED)
+        steps = sum(node.run.env_steps for node in to_do) - sum(pace.env_steps for pace in paces)
+        return max(steps / sum(rates), *(pace.seconds_left(self._now()) or 0.0 for pace in paces))
+
+    def _progress_in_words(self, node: Node, pace: Pace) -> str:
+        parts = [f"{pace.env_steps:,} of {pace.budget:,} env steps"]
+        rate, left = pace.steps_per_second, pace.seconds_left(self._now())
+        if rate is not None:
+            parts += [f"{rate:.0f} steps/s", f"{clock(left)} left"]
+        if node.run.task.primary_metric in pace.metrics:
+            parts.append(evaluated_in_words(node.run.task, pace.metrics))
+        return ", ".join(parts)

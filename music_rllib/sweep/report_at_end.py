@@ -1,0 +1,59 @@
+"""The report at a sweep's end: made by the report's own program, kept with the sweep's run."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from music_rllib import names
+from music_rllib.redaction import redact
+
+__all__ = ["report_at_end"]
+
+PATIENCE = 900.0
+"""Seconds after which the sweep ends without a report."""
+
+
+def report_at_end(folder: Path, tracking_uri: str | None, config: Path) -> str | None:
+    """Make the report of the sweep in `folder` and attach it to the sweep's run in MLflow.
+
+    In a process of its own: it draws on all CPUs, and whatever happens in it, the sweep is over and
+    its results are kept.
+
+    Args:
+        folder: the sweep's.
+        tracking_uri: of its MLflow, password included; None for the file in the storage.
+        config: the sweep's YAML file, whose environments are filmed.
+
+    Returns:
+        A line for the user; None where `MUSIC_RLLIB_REPORT=off` says that nobody wants one.
+    """
+    if os.environ.get(names.VARIABLE_REPORT, "").lower() in {"off", "0", "no", "false"}:
+        return None
+    environment = dict(os.environ)
+    if tracking_uri is not None:
+        environment[names.VARIABLE_TRACKING_URI] = tracking_uri
+    command = [sys.executable, "-m", "music_rllib.report", str(folder)]
+    if config.is_file():
+        command += ["--env", str(config.absolute())]
+    try:
+        done = subprocess.run(  # noqa: S603
+            [*command, "--attach"],
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE,
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return _no_report(redact(str(error)), folder)
+    lines = (done.stdout if done.returncode == 0 else done.stderr).strip().splitlines()
+    if done.returncode or not lines:
+        return _no_report(lines[-1] if lines else f"it ended with {done.returncode}", folder)
+    return lines[-1]
+
+
+def _no_report(reason: str, folder: Path) -> str:
+    return f"No report: {reason}. Make it with: python -m music_rllib.report {folder}"

@@ -1,0 +1,181 @@
+"""Tune's callbacks become what happens to nodes, told to whoever listens."""
+
+from __future__ import annotations
+
+import re
+import traceback
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from ray import cloudpickle
+from ray.tune import Callback
+from ray.tune.experiment import Trial
+
+from music_rllib.experiment.listener import Failure, Listener
+from music_rllib.experiment.plan import Node
+from music_rllib.experiment.scheduler import Board
+from music_rllib.redaction import redact
+from music_rllib.store.node_store import NodeStore
+from music_rllib.store.object_folder import DamagedError
+from music_rllib.store.run_record import from_json_lines
+from music_rllib.training.failure_reason import cause_of
+from music_rllib.training.hang_watch import RECORD
+from music_rllib.training.job import NodeJob
+from music_rllib.training.worker import (
+    CAUSE,
+    NOTES,
+    PAUSED,
+    REPORTS,
+    TRACEBACK,
+)
+
+__all__ = ["RESTARTS", "TuneEvents"]
+
+RESTARTS = 3
+"""So often a run whose worker died is started again; one that raises an error fails at once."""
+
+_COLOUR = re.compile(r"\x1b\[[0-9;]*m")
+
+
+class TuneEvents(Callback):
+    """Moves nodes on the board as Tune's trials go, and tells the listeners."""
+
+    def __init__(
+        self, board: Board, store: NodeStore, listeners: Iterable[Listener], failures: Path
+    ) -> None:
+        """Write tracebacks into the folder `failures`."""
+        self._board = board
+        self._store = store
+        self._listeners = list(listeners)
+        self._failures = failures
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Tune pickles its callbacks into a snapshot, which nobody reads.
+        return {}
+
+    def on_step_end(self, iteration: int, trials: list[Trial], **info: Any) -> None:
+        """Tune's loop went round once."""
+        for listener in self._listeners:
+            listener.tick()
+
+    def on_trial_start(
+        self, iteration: int, trials: list[Trial], trial: Trial, **info: Any
+    ) -> None:
+        """The trial's actor is up."""
+        for listener in self._listeners:
+            listener.started(self._node(trial))
+
+    def on_trial_result(
+        self,
+        iteration: int,
+        trials: list[Trial],
+        trial: Trial,
+        result: dict[str, Any],
+        **info: Any,
+    ) -> None:
+        """The trial made a step."""
+        node = self._node(trial)
+        reports = from_json_lines(result[REPORTS].encode())
+        for listener in self._listeners:
+            for note in result[NOTES]:
+                listener.noted(node, redact(note))
+            if reports:
+                listener.reported(node, reports)
+
+    def on_trial_complete(
+        self, iteration: int, trials: list[Trial], trial: Trial, **info: Any
+    ) -> None:
+        """The trial says that it is done; the store has the last word."""
+        try:
+            self._completed(trial)
+        finally:
+            _let_go(trial)
+
+    def _completed(self, trial: Trial) -> None:
+        node = self._node(trial)
+        if (cause := trial.last_result.get(CAUSE)) is not None:
+            self._fail(node, cause, trial.last_result[TRACEBACK])
+            return
+        if (reached := trial.last_result.get(PAUSED)) is not None:
+            self._board.pause(node.key, reached)
+            for listener in self._listeners:
+                listener.paused(node)
+            return
+        try:
+            result = self._store.result(node.key)
+        except DamagedError as error:
+            self._fail(node, str(error), str(error))
+            return
+        assert result is not None, "a run publishes its result"
+        self._board.finish(node.key)
+        for listener in self._listeners:
+            listener.finished(node, result)
+
+    def on_trial_error(
+        self, iteration: int, trials: list[Trial], trial: Trial, **info: Any
+    ) -> None:
+        """The trial's worker died, or never came up, and was not to be started again."""
+        error = _error_of(trial)
+        text = "".join(traceback.format_exception(error)) if error else _text_of(trial)
+        text = _COLOUR.sub("", text)
+        self._fail(self._node(trial), cause_of(error, text), text)
+
+    def on_trial_recover(
+        self, iteration: int, trials: list[Trial], trial: Trial, **info: Any
+    ) -> None:
+        """The trial's worker died, and another one goes on."""
+        error = _error_of(trial)
+        cause = redact(cause_of(error, _COLOUR.sub("", _text_of(trial)))).splitlines()[0]
+        text = (
+            f"{cause} Another worker goes on from the last checkpoint "
+            f"({trial.run_metadata.num_failures} of {RESTARTS} times)."
+        )
+        node = self._node(trial)
+        if self._store.work_folder(node.key).read(RECORD) is not None:
+            text = "its environment hangs, so its worker was ended; another one will say where"
+        for listener in self._listeners:
+            listener.noted(node, text)
+
+    def _fail(self, node: Node, cause: str, text: str) -> None:
+        # An environment may say anything, its database's password too.
+        cause, text = redact(cause), redact(text)
+        log = self._failures / f"{re.sub(r'[^A-Za-z0-9._=,-]+', '_', node.label)}-{node.key}.txt"
+        try:
+            log.parent.mkdir(parents=True, exist_ok=True)
+            log.write_text(f"{node.label} (node {node.key})\n\n{text}\n", encoding="utf-8")
+        except OSError as error:  # perhaps the very reason of the failure: the others go on
+            cause += f"\n(the traceback could not be kept: {error})"
+        dependants = self._board.fail(node.key)
+        for listener in self._listeners:
+            listener.failed(node, Failure(cause, log))
+            for dependant in dependants:
+                listener.skipped(dependant, node)
+
+    def _node(self, trial: Trial) -> Node:
+        return self._board.node(NodeJob.from_tune(trial.config).key)
+
+
+def _error_of(trial: Trial) -> BaseException | None:
+    """The exception, from the file that this very process has just written."""
+    path = Path(trial.pickled_error_file)
+    try:
+        error = cloudpickle.loads(path.read_bytes())
+    except Exception:
+        # Not every exception survives pickling; its text is there in any case.
+        return None
+    return error if isinstance(error, BaseException) else None
+
+
+def _text_of(trial: Trial) -> str:
+    try:
+        return Path(trial.error_file).read_text(encoding="utf-8")
+    except OSError as error:
+        return f"The cause is unknown: {error}"
+
+
+def _let_go(trial: Trial) -> None:
+    """Tune keeps every trial; of one that is done nobody needs averages and reported lines."""
+    known = trial.run_metadata
+    known.metric_analysis, known.metric_n_steps = {}, {}
+    known.last_result = {**known.last_result, REPORTS: "", NOTES: []}

@@ -1,0 +1,105 @@
+"""What a sweep's controls make of alpha at each q, and what follows measurements, for its plan."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from rich.table import Table
+
+from music_rllib.config.run_settings import RunSettings
+from music_rllib.config.tac_settings import MatchedAlpha, NormalisedAlpha, alpha_at
+from music_rllib.envs.make import make_env
+from music_rllib.envs.tasks import Task
+from music_rllib.experiment.plan import Node, Plan
+from music_rllib.schedules import Linear, Measured, Piecewise, value_at
+from music_rllib.sweep.views.text import in_words
+
+__all__ = ["adaptive_rows", "adaptive_text", "alpha_rows", "alpha_table"]
+
+
+def alpha_rows(plan: Plan) -> list[dict[str, Any]]:
+    """One for each stage, control and q: alpha at the start and at the end of a run.
+
+    Only of what depends on q: a learned alpha is not known beforehand, and a plain one is as given.
+    """
+    scaled = [node for node in plan.nodes if _is_scaled(node.run)]
+    # The joint entropy's scale depends on how many dimensions there are; otherwise any number does.
+    joint = {n.run.task.name: n.run.task for n in scaled if n.run.tac.entropy_form == "joint"}
+    actions = {name: _action_size(task) for name, task in joint.items()}
+    rows = [_row(node, actions.get(node.run.task.name, 1)) for node in scaled]
+    unique = {tuple(row.values()): row for row in rows}
+    return sorted(unique.values(), key=lambda row: (row["stage"], row["alpha"], row["q_at_start"]))
+
+
+def _is_scaled(run: RunSettings) -> bool:
+    return isinstance(run.tac.alpha, MatchedAlpha | NormalisedAlpha)
+
+
+def _row(node: Node, actions: int) -> dict[str, Any]:
+    tac, budget = node.run.tac, node.run.env_steps
+    q_at_start, q_at_end = (
+        value_at(tac.entropic_index, 0, budget),
+        _last(tac.entropic_index, budget),
+    )
+    return {
+        "stage": node.stage,
+        "alpha": in_words(tac.alpha),
+        "q": in_words(tac.entropic_index),
+        "q_at_start": q_at_start,
+        "at_start": alpha_at(tac, q_at_start, 0, budget, actions),
+        "at_end": alpha_at(tac, q_at_end, budget, budget, actions),
+    }
+
+
+def _last(q: float | Linear | Piecewise | Measured, budget: int) -> float:
+    """At the run's end; of one that follows a measurement, at the other end of its points."""
+    if isinstance(q, Measured):
+        return q.points[-1 if q.follows == "success_rate" else 0][1]
+    return value_at(q, budget, budget)
+
+
+def _action_size(task: Task) -> int:
+    env = make_env(task.env_id, **task.env_kwargs)
+    try:
+        return int(env.action_space.shape[0])  # type: ignore[index]
+    finally:
+        env.close()
+
+
+def alpha_table(rows: Iterable[dict[str, Any]]) -> Table:
+    """For the screen."""
+    table = Table(title="α at each q", title_justify="left")
+    for name in ("stage", "alpha"):
+        table.add_column(name)
+    for name in ("q", "α at the start", "at the end"):
+        table.add_column(name, justify="right")
+    for row in rows:
+        numbers = (f"{row['at_start']:.4g}", f"{row['at_end']:.4g}")
+        table.add_row(row["stage"], row["alpha"], row["q"], *numbers)
+    return table
+
+
+def adaptive_rows(plan: Plan) -> list[dict[str, Any]]:
+    """One for each stage and setting that follows what is measured, with its points."""
+    rows = [
+        {"stage": node.stage, "setting": name} | setting.model_dump(mode="json")
+        for node in plan.nodes
+        for name, setting in (
+            ("tac.entropic_index", node.run.tac.entropic_index),
+            ("music.mi_reward_weight", node.run.music.mi_reward_weight),
+        )
+        if isinstance(setting, Measured)
+    ]
+    return list({repr(row): row for row in rows}.values())
+
+
+def adaptive_text(row: dict[str, Any]) -> str:
+    """`her: tac.entropic_index follows the success rate: 2 at 0.2, 1 at 0.9`."""
+    points = ", ".join(f"{value:g} at {measured:g}" for measured, value in row["points"])
+    text = (
+        f"{row['stage']}: {row['setting']} follows the {row['follows'].replace('_', ' ')}: {points}"
+    )
+    if row["smoothing"]:
+        text += f"; averaged over {row['smoothing']:g} env steps"
+    return text + ("; never goes back" if row["monotone"] else "")

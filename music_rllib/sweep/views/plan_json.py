@@ -1,0 +1,50 @@
+"""A plan as plain data, for `plan --json`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from music_rllib.config.remarks import remarks
+from music_rllib.experiment.changes import Changes
+from music_rllib.experiment.session import Sweep, plan_document
+from music_rllib.redaction import redact
+from music_rllib.sweep.views.alpha import adaptive_rows, alpha_rows
+from music_rllib.sweep.views.tables import search_runs
+
+__all__ = ["plan_answer"]
+
+
+def plan_answer(opened: Sweep, changes: Changes | None = None) -> dict[str, Any]:
+    """The plan as plain data."""
+    config = opened.config
+    searches = [
+        {
+            "stage": stage.name,
+            "mode": stage.search.mode,
+            "sampler": stage.search.sampler,
+            "studies": len(stage.search.arms()),
+            "trials": stage.search.count,
+            "runs_at_most": search_runs(stage, stage.search, len(config.seeds)),
+            "space": stage.search.model_dump(mode="json", by_alias=True)["space"],
+        }
+        for stage in config.stages
+        if stage.search is not None
+    ]
+    nodes = [
+        node | {"finished": node["key"] in opened.finished}
+        for node in plan_document(opened)["nodes"]
+    ]
+    return {
+        "sweep": config.name,
+        "storage": redact(opened.storage),
+        "seeds": list(config.seeds),
+        "runs": len(opened.plan.runs),
+        "env_steps": opened.plan.env_steps,
+        "env_steps_left": sum(node["env_steps"] for node in nodes if not node["finished"]),
+        "nodes": nodes,
+        "searches": searches,
+        "remarks": remarks(config),
+        "alpha": alpha_rows(opened.plan),
+        "adaptive": adaptive_rows(opened.plan),
+        "changes": None if changes is None else str(changes),
+    }

@@ -1,0 +1,99 @@
+"""A sweep's `state.json` as a person reads it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from music_rllib import names
+from music_rllib.experiment.plan import short
+from music_rllib.search.ranking import best_in_words
+from music_rllib.store.node_store import TRAIN_AGAIN
+from music_rllib.sweep.views.text import clock, measured
+
+__all__ = ["status_view"]
+
+_STATES = (
+    *("finished", "reused", "started", "interrupted", "waiting", "paused", "pruned"),
+    *("failed", "skipped"),
+)
+_STYLES = {"finished": "green", "failed": "red", "interrupted": "yellow", "stopped": "yellow"}
+
+
+def status_view(state: Mapping[str, Any]) -> RenderableType:
+    """Stages, trials, runs, budget, searches, failures."""
+    title = Text(f"Sweep {state['sweep']}: ")
+    title.append(state["state"], _STYLES.get(state["state"], "bold"))
+    title.append(f"  ({state['place']})", "dim")
+    if "driver" not in state:
+        return title
+    parts: list[RenderableType] = [title, Text(_times(state)), _stages(state)]
+    done, left = state["env_steps"]["done"], state["env_steps"]["left"]
+    parts.append(Text(f"Budget: {done:,} env steps spent, {left:,} left of what is known so far"))
+    if state["best"] is not None:
+        parts.append(Text(f"Best so far: {best_in_words(state['best'])}"))
+    parts += [_search(search) for search in state["searches"]]
+    parts += [
+        Text(
+            f"running: {one['run']}  {one['env_steps']:,} / {one['budget']:,} env steps, "
+            f"{names.word_of(one['metric'])} {measured(one['metric'], one['value'])}"
+        )
+        for one in state["running"]
+    ]
+    for one in state["damaged"]:
+        parts.append(Text(f"DAMAGED {one['run']}: {one['cause']}", style="red"))
+    if state["damaged"]:
+        parts.append(Text(f"    {TRAIN_AGAIN}", style="dim"))
+    for failure in state["failures"]:
+        parts.append(Text(f"FAILED {failure['run']}: {failure['cause']}", style="red"))
+        parts.append(Text(f"    {failure['log']}", style="dim"))
+    return Group(*parts)
+
+
+def _times(state: Mapping[str, Any]) -> str:
+    driver = state["driver"]
+    end = driver["ended"] or (driver["heartbeat"] if state["state"] != "running" else time.time())
+    where = f"process {driver['pid']} on {driver['host']}"
+    return f"{where}, {clock(end - driver['started'])} since it was last started"
+
+
+def _stages(state: Mapping[str, Any]) -> Table:
+    table = Table(box=None, pad_edge=False)
+    table.add_column("stage")
+    table.add_column("variant")
+    shown = [name for name in _STATES if any(name in stage["runs"] for stage in state["stages"])]
+    for name in ("trials", "runs", *shown):
+        table.add_column(name, justify="right")
+    for stage in state["stages"]:
+        runs = stage["runs"]
+        table.add_row(
+            stage["name"],
+            stage["variant"],
+            str(stage["trials"]),
+            str(sum(runs.values())),
+            *(str(runs.get(name, 0)) for name in shown),
+        )
+    return table
+
+
+def _search(search: Mapping[str, Any]) -> Text:
+    lines = []
+    for arm in search["arms"]:
+        fixed = "".join(f" {name}={short(value)}" for name, value in arm["values"].items())
+        line = (
+            f"Search {search['stage']}{fixed}: {arm['judged']} of {len(arm['trials'])} trials "
+            f"judged, {arm['pruned']} stopped early, {arm['failed']} failed, "
+            f"{arm['running']} running"
+        )
+        if arm["best"] is not None:
+            best = arm["trials"][arm["best"]]
+            values = ", ".join(f"{n} = {short(v)}" for n, v in best["values"].items())
+            numbers = ", ".join(f"{value:.4g}" for value in best["objective"])
+            line += f"; best trial {arm['best']}: {numbers} ({values})"
+        lines.append(f"{line}\n    study {arm['study']!r} in {search['storage'] or 'study.db'}")
+    return Text("\n".join(lines))

@@ -1,0 +1,334 @@
+"""The plan before a sweep and the results after it, as tables."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from typing import Any
+
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from music_rllib import names
+from music_rllib.config.schema import Source, Stage, SweepConfig
+from music_rllib.config.search.check import most_env_steps
+from music_rllib.config.search.space import Choice, Dimension, SearchSettings
+from music_rllib.envs.tasks import Task
+from music_rllib.experiment.plan import Node, Plan, short
+from music_rllib.experiment.scheduler import Status
+from music_rllib.results.comparison import SHOW_SEEDS_BELOW, with_interval
+from music_rllib.store.run_record import RunResult
+from music_rllib.sweep.views.text import clock, in_words, measured, percent
+
+__all__ = [
+    "plan_view",
+    "ranking_table",
+    "results_table",
+    "search_budget",
+    "search_runs",
+    "search_views",
+    "seeds_in_words",
+]
+
+
+def plan_view(config: SweepConfig, plan: Plan, finished: Collection[str]) -> RenderableType:
+    """Stages, trials, runs, budgets, and what an earlier sweep has finished."""
+    table = Table(title=f"Sweep {plan.name}", title_justify="left")
+    for name in ("stage", "variant", "starts from", "tasks", "grid"):
+        table.add_column(name)
+    for name in ("trials", "seeds", "runs", "env steps a run", "env steps", "finished"):
+        table.add_column(name, justify="right")
+    nodes = {node.key: node for node in plan.nodes}
+    for stage in config.stages:
+        table.add_row(*_stage_row(stage, plan, nodes, finished, len(config.seeds)))
+    text = _summary(plan, finished)
+    searched = [(stage, stage.search) for stage in config.stages if stage.search is not None]
+    if searched:
+        runs = sum(search_runs(stage, search, len(config.seeds)) for stage, search in searched)
+        steps = sum(
+            search_runs(stage, search, len(config.seeds)) * search_budget(stage, search)
+            for stage, search in searched
+        )
+        text += f" Searches: up to {runs} runs and {steps:,} env steps more"
+        fresh = any(search.final and stage.source for stage, search in searched)
+        text += ", and what runs on fresh seeds start from." if fresh else "."
+    return Group(table, Text(text))
+
+
+def _stage_row(
+    stage: Stage,
+    plan: Plan,
+    nodes: Mapping[str, Node],
+    finished: Collection[str],
+    seeds: int,
+) -> list[str]:
+    if stage.search is not None:
+        return _search_row(stage, stage.search, plan, seeds)
+    runs = [run for run in plan.runs if run.stage == stage.name]
+    if not runs:  # its settings are searched for: it runs as trials want it
+        budget = next(iter(stage.points[0].runs.values())).env_steps
+        tasks = ", ".join(map(_judged, stage.tasks))
+        counts = ["as needed", str(seeds), "-", f"{budget:,}", "-", "-"]
+        return [stage.name, stage.variant, _source(stage.source), tasks, "-", *counts]
+    budgets = sorted({nodes[run.key].run.env_steps for run in runs})
+    return [
+        stage.name,
+        stage.variant,
+        _source(stage.source),
+        ", ".join(map(_judged, stage.tasks)),
+        "\n".join(_axes(stage)) or "-",
+        str(len({run.trial for run in runs})),
+        str(seeds),
+        str(len(runs)),
+        " to ".join(f"{steps:,}" for steps in dict.fromkeys((budgets[0], budgets[-1]))),
+        f"{sum(nodes[run.key].run.env_steps for run in runs):,}",
+        str(sum(run.key in finished for run in runs)),
+    ]
+
+
+def _judged(task: Task) -> str:
+    """The task's name, with what it is judged by where that is not its success."""
+    metric = task.primary_metric
+    return task.name if metric == names.EVAL_SUCCESS else f"{task.name} ({names.word_of(metric)})"
+
+
+def _search_row(stage: Stage, search: SearchSettings, plan: Plan, seeds: int) -> list[str]:
+    """What a search takes at most: it may stop trials early, and points may repeat."""
+    studies, budget = len(search.arms()), search_budget(stage, search)
+    runs = search_runs(stage, search, seeds)
+    axes = [f"{name}: {_dimension(one)}" for name, one in search.space.items()]
+    axes += [
+        f"{name}: {', '.join(short(value) for value in values)} ({search.mode})"
+        for name, values in search.compare.items()
+    ]
+    fresh = 0 if search.final is None else search.final.seeds
+    return [
+        stage.name,
+        stage.variant,
+        _source(stage.source),
+        ", ".join(map(_judged, stage.tasks)),
+        "\n".join(axes),
+        f"{studies} x {search.count}\n{search.sampler}"
+        if studies > 1
+        else f"{search.count}\n{search.sampler}",
+        f"{seeds} + {fresh} fresh" if fresh else str(seeds),
+        f"<= {runs}",
+        f"<= {budget:,}",
+        f"<= {runs * budget:,}",
+        "-",
+    ]
+
+
+def search_budget(stage: Stage, search: SearchSettings) -> int:
+    """Environment steps of a searched stage's run, at most."""
+    return most_env_steps(search, stage.points)
+
+
+def search_runs(stage: Stage, search: SearchSettings, seeds: int) -> int:
+    """Runs of a searched stage at most, with those of the final ranking."""
+    trials = search.count * seeds
+    if search.final is not None:
+        finalists = search.final.most(len(search.points_to_evaluate))
+        trials += min(finalists, search.count) * search.final.seeds
+    return trials * len(search.arms()) * len(stage.tasks)
+
+
+def _dimension(dimension: Dimension) -> str:
+    if isinstance(dimension, Choice):
+        return ", ".join(short(value) for value in dimension.choice)
+    low, high = dimension.bounds
+    step = "" if dimension.step in (None, 1) else f" by {dimension.step:g}"
+    return f"{low:g} to {high:g}{step}{' (log)' if dimension.log else ''}"
+
+
+def _source(source: Source | None) -> str:
+    if source is None:
+        return "scratch"
+    origin = source.stage or str(source.checkpoint.folder if source.checkpoint else "")
+    return f"{origin} ({source.task.name})" if source.task else origin
+
+
+def _axes(stage: Stage) -> list[str]:
+    values: dict[str, dict[str, None]] = {}
+    for point in stage.points:
+        for name, value in point.values.items():
+            values.setdefault(name, {})[short(value)] = None
+    return [f"{name}: {', '.join(choices)}" for name, choices in values.items()]
+
+
+def _summary(plan: Plan, finished: Collection[str]) -> str:
+    left = [node for node in plan.nodes if node.key not in finished]
+    parts = [f"{len(plan.runs)} runs"]
+    if len(plan.nodes) < len(plan.runs):
+        parts.append(f"{len(plan.nodes)} different ones")
+    parts.append(f"{plan.env_steps:,} env steps in all")
+    reused = len(plan.nodes) - len(left)
+    if reused:
+        parts.append(f"{reused} finished earlier and reused")
+        parts.append(f"{sum(node.run.env_steps for node in left):,} env steps left")
+    return ", ".join(parts) + "."
+
+
+_COLOURS = {Status.FAILED: "red", Status.SKIPPED: "yellow", Status.WAITING: "yellow"}
+_STATE = {Status.STARTED: "interrupted", Status.WAITING: "not started"}
+
+
+def results_table(
+    plan: Plan,
+    status: Callable[[str], Status],
+    results: Mapping[str, RunResult],
+    mlflow_run: Callable[[str], str | None],
+) -> Table:
+    """One row per run: what it reached, or why there is nothing.
+
+    Args:
+        plan: The sweep's plan.
+        status: Node key to its state.
+        results: Node key to its result, for finished nodes.
+        mlflow_run: Node key to MLflow's id of its run, if there is one.
+    """
+    grid = _grid_columns(plan)
+    table = Table(title=f"Results of {plan.name}", title_justify="left")
+    for name in ("stage", "task", "seed", "q", *grid):
+        table.add_column(name, justify="right" if name in {"seed", "q"} else "left")
+    nodes = {node.key: node for node in plan.nodes}
+    metrics = _columns(node.run.task.primary_metric for node in nodes.values())
+    for name in (*metrics.values(), "MI reward", "env steps", "time"):
+        table.add_column(name, justify="right")
+    table.add_column("MLflow run", no_wrap=True)
+    table.add_column("state", no_wrap=True)
+    for run in plan.runs:
+        if run.part:
+            continue  # one of many: its trial has a row in another table
+        state = status(run.key)
+        table.add_row(
+            run.stage,
+            run.task,
+            str(run.seed),
+            in_words(nodes[run.key].run.tac.entropic_index),
+            *(short(run.values[name]) if name in run.values else "-" for name in grid),
+            *_reached(results.get(run.key), metrics),
+            (mlflow_run(run.key) or "-")[:8],
+            _STATE.get(state, str(state)),
+            style=_COLOURS.get(state),
+        )
+    return table
+
+
+def search_views(searches: Sequence[Mapping[str, Any]]) -> list[RenderableType]:
+    """Tables of what came of searches (`searches.outcome`): trials, importance, the ranking."""
+    views: list[RenderableType] = []
+    for search in searches:
+        for arm in search["arms"]:
+            views.append(_trials_table(search, arm))
+            if arm["importance"]:
+                shares = [f"{name} {percent(share)}" for name, share in arm["importance"].items()]
+                views.append(Text(f"Share of the variance explained (fANOVA): {', '.join(shares)}"))
+        if search["ranking"]:
+            views.append(ranking_table(search))
+    return views
+
+
+def _trials_table(search: Mapping[str, Any], arm: Mapping[str, Any]) -> Table:
+    fixed = ", ".join(f"{name} = {short(value)}" for name, value in arm["values"].items())
+    table = Table(
+        title=f"Trials of {search['stage']}{f' with {fixed}' if fixed else ''}: "
+        f"{arm['judged']} judged, {arm['pruned']} stopped early, {arm['failed']} failed"
+        + ("; in bold what no other is better than in every objective" if arm["front"] else ""),
+        title_justify="left",
+    )
+    names_of = dict.fromkeys(
+        name for trial in arm["trials"] for name in trial["values"] if name not in arm["values"]
+    )
+    table.add_column("trial", justify="right")
+    for name in names_of:
+        table.add_column(name, justify="right")
+    for objective in search["objectives"]:
+        table.add_column(objective["name"], justify="right")
+    table.add_column("state", no_wrap=True)
+    table.add_column("why")
+    for trial in arm["trials"]:
+        if trial["state"] == "waiting":
+            continue
+        values = trial["objective"] or [None] * len(search["objectives"])
+        intervals = trial.get("interval") or [None] * len(values)
+        table.add_row(
+            str(trial["number"]),
+            *(short(trial["values"][n]) if n in trial["values"] else "-" for n in names_of),
+            *(with_interval(v, i) for v, i in zip(values, intervals, strict=True)),
+            trial["state"],
+            trial["reason"] or "",
+            style={"failed": "red", "pruned": "dim"}.get(trial["state"])
+            or ("bold" if trial["number"] in (arm["best"], *arm["front"]) else None),
+        )
+    return table
+
+
+def ranking_table(search: Mapping[str, Any]) -> Table:
+    """Finalists on fresh seeds."""
+    table = Table(
+        title=f"Ranking of {search['stage']} on fresh seeds. 'in the search' is too good: the "
+        "trials were chosen for it",
+        title_justify="left",
+    )
+    names_of = dict.fromkeys(name for row in search["ranking"] for name in row["values"])
+    for name in ("rank", "trial", *names_of):
+        table.add_column(name, justify="right")
+    for objective in search["objectives"]:
+        table.add_column(f"{objective['name']}\non fresh seeds, 95 %", justify="right")
+        table.add_column("in the\nsearch", justify="right")
+    table.add_column("P(best is\nbetter)", justify="right")
+    for rank, row in enumerate(search["ranking"], 1):
+        values = (short(row["values"][n]) if n in row["values"] else "-" for n in names_of)
+        if "failure" in row:
+            table.add_row("-", str(row["trial"]), *values, row["failure"], style="red")
+            continue
+        numbers = [
+            text
+            for fresh, ends, searched in zip(
+                row["fresh"], row["interval"], row["searched"], strict=True
+            )
+            for text in (with_interval(fresh, ends), f"{searched:.3g}")
+        ]
+        chance = row.get("best_is_better_with")
+        table.add_row(str(rank), str(row["trial"]), *values, *numbers, percent(chance))
+    return table
+
+
+def seeds_in_words(scores: Sequence[float]) -> str:
+    """`0.8 0.82 0.84`, the lowest first; nothing where there are too many to read."""
+    few = len(scores) < SHOW_SEEDS_BELOW
+    return " ".join(f"{score:.3g}" for score in sorted(scores)) if few else ""
+
+
+def _grid_columns(plan: Plan) -> list[str]:
+    """What tells trials apart, besides q, which has its column."""
+    found = dict.fromkeys(name for run in plan.runs if not run.part for name in run.values)
+    return [name for name in found if name != "tac.entropic_index"]
+
+
+def _columns(primary: Iterable[str]) -> dict[str, str]:
+    """What runs are judged by to the heads of their columns."""
+    found = set(primary)
+    heads = {
+        names.EVAL_SUCCESS: "success,\nlast step",
+        names.EVAL_SUCCESS_ANY: "success,\nany step",
+        names.EVAL_RETURN: "return",
+    }
+    if names.EVAL_RETURN not in found:
+        del heads[names.EVAL_RETURN]
+    if found == {names.EVAL_RETURN}:
+        heads = {names.EVAL_RETURN: heads[names.EVAL_RETURN]}
+    return heads
+
+
+def _reached(result: RunResult | None, metrics: Iterable[str]) -> list[str]:
+    if result is None:
+        return ["-"] * (len(list(metrics)) + 3)
+    reward = result.metrics.get(names.MI_REWARD)
+    return [
+        *(measured(metric, result.metrics.get(metric)) for metric in metrics),
+        "-" if reward is None else f"{reward:.3f}",
+        f"{result.env_steps:,}",
+        clock(result.seconds),
+    ]

@@ -1,0 +1,1 @@
+"""One run being trained: built from its settings, advanced, checkpointed, watched."""

@@ -1,0 +1,177 @@
+"""Ends a worker whose environment hangs, and keeps where: from a process of its own beside it.
+
+The watching process loads nothing but a bare Python. When one call of `step()` or `reset()` lasts
+too long, it makes the worker write its stack, which `faulthandler` does without Python's lock, puts
+that into the run's work folder, and kills the worker. The one that is started in its place finds it
+there and fails the run.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import signal
+import struct
+import subprocess
+import sys
+import time
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+__all__ = ["HangError", "HangWatch", "check_hung"]
+
+RECORD = "hung.txt"
+"""In a run's work folder: the attempt that hung, for how many seconds, and the stack."""
+LOOKS = 20
+"""So often the watching process looks in the time that a call may take."""
+LONGEST_PAUSE, DUMP_SECONDS = 5.0, 5.0
+
+
+class HangError(RuntimeError):
+    """An environment that did not return; with the stack that it hangs in."""
+
+
+class HangWatch:
+    """The worker's side: has itself watched until `end`."""
+
+    def __init__(self, seconds: float, storage: str, key: str, attempt: str) -> None:
+        """Be ended where a call of an environment lasts longer.
+
+        Args:
+            seconds: How long.
+            storage: Where the record of it goes, below `work/<key>`.
+            key: The run's.
+            attempt: Tells the record from those of earlier sweeps.
+
+        Raises:
+            OSError: The watching process can't be started.
+        """
+        import faulthandler
+
+        from music_rllib.envs.calls import in_environment
+
+        self._calls = in_environment
+        self._folder = TemporaryDirectory(prefix="music-hang-", ignore_cleanup_errors=True)
+        calls, stack = Path(self._folder.name, "calls"), Path(self._folder.name, "stack")
+        self._calls.share(calls)
+        self._stack = stack.open("w")
+        faulthandler.register(signal.SIGUSR2, self._stack, all_threads=True)
+        names = (str(calls), str(stack), storage, f"work/{key}/{RECORD}", attempt)
+        self._process = subprocess.Popen(  # noqa: S603
+            # -P: the folder of this file has names of its own.
+            [sys.executable, "-P", __file__, str(os.getpid()), str(seconds), *names],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        )
+
+    def end(self) -> None:
+        """Be watched no more."""
+        import faulthandler
+
+        assert self._process.stdin is not None
+        self._process.stdin.close()  # that is what it looks for
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(timeout=5.0)
+        self._calls.unshare()
+        faulthandler.unregister(signal.SIGUSR2)
+        self._stack.close()
+        self._folder.cleanup()
+
+
+def check_hung(record: str | None, attempt: str, what: str) -> None:
+    """Look at what a work folder has of a worker that hung.
+
+    Args:
+        record: The content of the record; None where there is none.
+        attempt: What it must be of: in a later sweep, the environment may be mended.
+        what: The environment, for the message.
+
+    Raises:
+        HangError: The worker before this one hung; with where.
+    """
+    if record is None:
+        return
+    of_attempt, seconds, stack = (*record.split("\n", 2), "", "")[:3]
+    if of_attempt != attempt:
+        return
+    raise HangError(
+        f"environment {what} has not returned from {_call_in(stack)} for {float(seconds):g} s "
+        f"(resources.hang_minutes)\nit hangs at {_innermost(stack)}\n{stack}"
+    )
+
+
+def _innermost(stack: str) -> str:
+    """The line that the thread which plays is in, as `faulthandler` writes it."""
+    for thread in stack.split("\n\n"):
+        if "env_runner.py" in thread:
+            lines = [line.strip() for line in thread.splitlines() if line.startswith("  File ")]
+            return lines[0] if lines else "a place that is not known"
+    return "a place that is not known"
+
+
+def _call_in(stack: str) -> str:
+    if "env_runner.py" not in stack:
+        return "step() or reset()"
+    return "reset()" if " in _begin" in stack else "step()"
+
+
+# -- the watching process ---------------------------------------------------------------------
+
+
+def main() -> None:
+    """Watch the process of these arguments until it ends, or hangs."""
+    pid, seconds, calls, stack, storage, record, attempt = sys.argv[1:]
+    if not _hangs(int(pid), float(seconds), Path(calls)):
+        return
+    text = _dump(int(pid), Path(stack))
+    # Only now, as they take tens of megabytes.
+    from music_rllib.experiment.sweep_files import write
+    from music_rllib.store.object_folder import StorageError
+
+    with contextlib.suppress(OSError, StorageError):  # it must not go on in any case
+        write(storage, record, f"{attempt}\n{seconds}\n{text}")
+    os.kill(int(pid), signal.SIGKILL)
+
+
+def _hangs(pid: int, seconds: float, calls: Path) -> bool:
+    """Wait until one call has lasted so long; False where the watched process ends before that.
+
+    What counts is how often it was seen in the same call: a machine that slept, or a worker that
+    was stopped, has not hung for that time.
+    """
+    pause = min(seconds / LOOKS, LONGEST_PAUSE)
+    seen, stalled = 0, 0.0
+    while not select.select([sys.stdin], [], [], pause)[0] and os.getppid() == pid:
+        number = struct.unpack("q", calls.read_bytes())[0]
+        stuck = number % 2 == 1 and number == seen and not _is_stopped(pid)
+        stalled = stalled + pause if stuck else 0.0
+        seen = number
+        if stalled >= seconds:
+            return True
+    return False
+
+
+def _is_stopped(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in "Tt"
+    except (OSError, IndexError):
+        return False
+
+
+def _dump(pid: int, stack: Path) -> str:
+    os.kill(pid, signal.SIGUSR2)
+    deadline, before = time.monotonic() + DUMP_SECONDS, ""
+    while time.monotonic() < deadline:
+        time.sleep(0.2)
+        text = stack.read_text(errors="replace")
+        if text and text == before:
+            break
+        before = text
+    return before
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,255 @@
+"""One training run: a `TAC` algorithm built from `RunSettings`, advanced report by report."""
+
+from __future__ import annotations
+
+import warnings
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import psutil
+from numpy.typing import NDArray
+from ray.rllib.core import DEFAULT_MODULE_ID
+from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, EPISODE_RETURN_MEAN, LEARNER_RESULTS
+
+from music_rllib import names
+from music_rllib.config.run_settings import RunSettings
+from music_rllib.replay.segments import Segment, load_segments, new_segments
+from music_rllib.store.handoff import Spaces
+from music_rllib.store.node_store import Draft, Saved
+from music_rllib.store.state_io import read_arrays, read_state, write_arrays, write_state
+from music_rllib.tac.algorithm import TAC
+from music_rllib.tac.config import TACConfig
+from music_rllib.tac.env_runner import DISPLACEMENT, MOVED, SUCCESS_ANY, SUCCESS_LAST
+from music_rllib.tac.learner import HELD_OUT_STEPS
+from music_rllib.tac.normaliser import for_another_run
+
+__all__ = ["Paused", "TrainingRun", "algorithm_config"]
+
+REPORT_INTERVAL = 1_000
+"""Environment steps between two reports, where evaluations are not more frequent."""
+
+_NEVER = 10**9
+_TRAJECTORIES = "trajectories.safetensors"
+
+_TRAINING = {
+    SUCCESS_LAST: names.TRAIN_SUCCESS,
+    SUCCESS_ANY: names.TRAIN_SUCCESS_ANY,
+    EPISODE_RETURN_MEAN: names.TRAIN_RETURN,
+    DISPLACEMENT: names.TRAIN_DISPLACEMENT,
+}
+_EVALUATION = {
+    SUCCESS_LAST: names.EVAL_SUCCESS,
+    SUCCESS_ANY: names.EVAL_SUCCESS_ANY,
+    EPISODE_RETURN_MEAN: names.EVAL_RETURN,
+    DISPLACEMENT: names.EVAL_DISPLACEMENT,
+    MOVED: names.EVAL_TOUCHED,
+}
+
+
+def algorithm_config(run: RunSettings) -> TACConfig:
+    """The RLlib config of a run: every setting in it comes from `run`."""
+    config = TACConfig()
+    config.environment(run.task.env_id, env_config=dict(run.task.env_kwargs))
+    config.env_runners(num_env_runners=0, num_envs_per_env_runner=run.num_envs)
+    config.training(**dict(run.tac), total_env_steps=run.env_steps)
+    config.max_episode_steps = min(run.tac.max_episode_steps or run.task.horizon, run.task.horizon)
+    config.music(
+        agent_indices=run.task.agent_indices,
+        surrounding_indices=run.task.surrounding_indices,
+        **dict(run.music),
+    )
+    config.replay(moved_distance=run.task.moved_distance, **dict(run.replay))
+    config.success_key = run.task.success_key
+    # Evaluations are asked for by `TrainingRun`, at given environment steps.
+    config.evaluation(
+        evaluation_interval=_NEVER,
+        evaluation_duration=run.evaluation.episodes,
+        evaluation_duration_unit="episodes",
+        evaluation_config=TACConfig.overrides(explore=False),
+    )
+    # One iteration is one episode in every sub-environment; reports are put together here.
+    config.reporting(min_sample_timesteps_per_iteration=1)
+    config.debugging(seed=run.seed)
+    return config
+
+
+class Paused(Exception):  # noqa: N818  not an error
+    """Training stopped between two reports."""
+
+
+class TrainingRun:
+    """Trains one run to its budget.
+
+    Args:
+        run: the settings.
+        handoff: weights to start from, by module name (`TAC.set_parts`).
+        gpus: more than 0: the networks train on a GPU.
+
+    Raises:
+        ValueError: settings or weights that do not fit the environment.
+    """
+
+    def __init__(
+        self,
+        run: RunSettings,
+        handoff: Mapping[str, Mapping[str, NDArray[Any]]] | None = None,
+        gpus: float = 0.0,
+    ) -> None:
+        self.run = run
+        config = algorithm_config(run)
+        if gpus:
+            config.learners(num_gpus_per_learner=gpus)
+        with warnings.catch_warnings():  # of the settings: the sweep has given them, once
+            warnings.filterwarnings("ignore", "target_bounds ")
+            self.algorithm: TAC = config.build_algo()
+        if handoff:
+            if "normaliser" in handoff:
+                handoff = {**handoff, "normaliser": for_another_run(handoff["normaliser"])}
+            self.algorithm.set_parts(handoff)
+        self._rounds: defaultdict[str, list[float]] = defaultdict(list)
+        """What has been measured since the last report."""
+        self._segments: list[Segment] = []
+        """Files of this run's checkpoints that hold trajectories."""
+        self._process = psutil.Process()
+        self._process.cpu_percent()  # the first call only starts the measurement
+
+    @property
+    def env_steps(self) -> int:
+        """Environment steps done."""
+        return self.algorithm.env_steps
+
+    @property
+    def finished(self) -> bool:
+        """Whether the budget is spent."""
+        return self.env_steps >= self.run.env_steps
+
+    def advance(self, pause: Callable[[], bool] = lambda: False) -> dict[str, float]:
+        """Trains until the next report is due.
+
+        Args:
+            pause: asked often; where it says so, training pauses at once.
+
+        Returns:
+            Means since the last report, by the names of `tracking.names`; evaluation metrics
+            where an evaluation was due. Metrics that do not exist yet are left out.
+
+        Raises:
+            Paused: as it was asked to. `save` keeps what has been measured so far, so that the
+                report will be as if there had been no pause.
+        """
+        interval = self.run.evaluation.interval
+        evaluation_at = _next_multiple(self.env_steps, interval)
+        report_at = _next_multiple(self.env_steps, min(interval, REPORT_INTERVAL))
+        goal = min(report_at, evaluation_at, self.run.env_steps)
+        while self.env_steps < goal:
+            if pause():
+                raise Paused
+            for name, value in _training_metrics(self.algorithm.train()):
+                self._rounds[name].append(value)
+        metrics = _means(self._rounds)
+        self._rounds.clear()
+        if self.env_steps >= evaluation_at or self.finished:
+            metrics |= self.evaluate()
+        return metrics | self._counters() | self._system()
+
+    def evaluate(self) -> dict[str, float]:
+        """Deterministic episodes with fresh goals; the same ones for every run of this seed."""
+        results = self.algorithm.evaluate()[ENV_RUNNER_RESULTS]
+        metrics = {name: float(results[key]) for key, name in _EVALUATION.items() if key in results}
+        return metrics | {names.EVAL_EPISODES: float(self.run.evaluation.episodes)}
+
+    def _counters(self) -> dict[str, float]:
+        return {
+            names.ENV_STEPS: float(self.env_steps),
+            names.GRAD_UPDATES: float(self.algorithm.grad_updates),
+        }
+
+    def _system(self) -> dict[str, float]:
+        return {
+            names.SYSTEM_CPU: self._process.cpu_percent(),
+            names.SYSTEM_MEMORY: self._process.memory_info().rss / 2**20,
+        }
+
+    def modules(self) -> dict[str, dict[str, NDArray[Any]]]:
+        """Plain weights of every network, by module name, as a handoff carries them."""
+        return self.algorithm.get_parts()
+
+    @property
+    def spaces(self) -> Spaces:
+        """What the environment observes and takes."""
+        pair = self.algorithm.env_runner.get_spaces()[DEFAULT_MODULE_ID]
+        return Spaces.of(*pair)
+
+    def save(self, draft: Draft) -> None:
+        """Writes everything that `restore` needs to continue exactly from here.
+
+        Of the replay, only trajectories that no earlier checkpoint of this run has.
+
+        Raises:
+            StorageError: the storage cannot be written.
+        """
+
+        def write(label: str, arrays: Mapping[str, NDArray[Any]]) -> str:
+            with draft.new_part(label) as (name, folder):
+                write_arrays(folder / _TRAJECTORIES, arrays)
+            return name
+
+        replay = self.algorithm.replay
+        self._segments = new_segments(replay, self._segments, write)
+        draft.needs = [segment.name for segment in self._segments]
+        state = {
+            "algorithm": self.algorithm.get_state(not_components=TAC.REPLAY),
+            "replay": replay.index(),
+            "segments": [(segment.name, segment.first, segment.end) for segment in self._segments],
+            "rounds": dict(self._rounds),
+        }
+        write_state(draft.folder, state)
+
+    def restore(self, saved: Saved) -> None:
+        """Continues from what `save` wrote. Only before the first `advance`.
+
+        Raises:
+            StateError: it is no checkpoint.
+            ValueError: it is one of other settings.
+        """
+        state = read_state(saved.folder)
+        self.algorithm.set_state(state["algorithm"])
+        self._segments = [Segment(*segment) for segment in state["segments"]]
+        load_segments(
+            self.algorithm.replay,
+            state["replay"],
+            self._segments,
+            lambda name: read_arrays(saved.parts[name] / _TRAJECTORIES),
+        )
+        self._rounds = defaultdict(list, state["rounds"])
+
+    def close(self) -> None:
+        """Releases environments and networks."""
+        self.algorithm.stop()
+
+
+def _means(rounds: Mapping[str, list[float]]) -> dict[str, float]:
+    """Of what was measured in some rounds; the bound on fresh trajectories by their steps."""
+    metrics = {name: float(np.mean(values)) for name, values in rounds.items()}
+    if (steps := metrics.pop(HELD_OUT_STEPS, None)) is not None:
+        weights = np.array(rounds[HELD_OUT_STEPS]) / steps
+        metrics[names.HELD_OUT_BOUND] = float(np.mean(weights * rounds[names.HELD_OUT_BOUND]))
+    return metrics
+
+
+def _next_multiple(steps: int, interval: int) -> int:
+    return (steps // interval + 1) * interval
+
+
+def _training_metrics(result: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
+    """Of an RLlib result, what is ours, by its public name."""
+    episodes = result.get(ENV_RUNNER_RESULTS, {})
+    for key, name in _TRAINING.items():
+        if key in episodes:
+            yield name, float(episodes[key])
+    learner = result.get(LEARNER_RESULTS, {}).get(DEFAULT_MODULE_ID, {})
+    for key, value in learner.items():
+        if key in names.LEARNER or key == HELD_OUT_STEPS or key.startswith(names.PER_DIMENSION):
+            yield key, float(value)

@@ -1,0 +1,498 @@
+"""A sweep's file: precedence, variants, and every mistake named with place, rule and value."""
+
+import copy
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from music_rllib.config.load import ConfigError, RunSettings, SweepConfig, load_sweep
+from music_rllib.config.run_settings import VARIANTS, handed_over, preset
+from music_rllib.envs.tasks import BUILT_IN_TASKS
+from music_rllib.schedules import Linear
+from music_rllib.store.handoff import write_handoff
+
+Document = dict[str, Any]
+
+SOUND: Document = {
+    "name": "sound",
+    "tasks": ["FetchPush"],
+    "seeds": [3, 5],
+    "defaults": {"env_steps": 6000, "tac": {"lr": 0.002}},
+    "stages": [
+        {"name": "pretrain", "variant": "music-u", "tac": {"entropic_index": 1.0}},
+        {
+            "name": "finetune",
+            "variant": "music-r",
+            "init_from": "pretrain",
+            "grid": {"tac.entropic_index": [1.0, 1.5]},
+        },
+    ],
+}
+
+
+@pytest.fixture
+def load(tmp_path: Path) -> Callable[..., SweepConfig]:
+    def load_document(document: Document, **options: str) -> SweepConfig:
+        path = tmp_path / "sweep.yaml"
+        path.write_text(yaml.safe_dump(document, sort_keys=False))
+        return load_sweep(path, **options)
+
+    return load_document
+
+
+@pytest.fixture
+def problems(load: Callable[..., SweepConfig]) -> Callable[[Document], list[str]]:
+    def problems_of(document: Document) -> list[str]:
+        with pytest.raises(ConfigError) as refusal:
+            load(document)
+        return list(refusal.value.lines)
+
+    return problems_of
+
+
+def changed(**changes: Any) -> Document:
+    return copy.deepcopy(SOUND) | changes
+
+
+def with_stage(position: int, **changes: Any) -> Document:
+    document = copy.deepcopy(SOUND)
+    document["stages"][position] |= changes
+    return document
+
+
+def run_of(config: SweepConfig, stage: int = 0, point: int = 0) -> RunSettings:
+    return next(iter(config.stages[stage].points[point].runs.values()))
+
+
+def test_a_sound_file_is_resolved_completely(load: Callable[..., SweepConfig]) -> None:
+    config = load(SOUND)
+    assert (config.name, config.seeds, config.storage) == ("sound", (3, 5), "results")
+    assert [stage.name for stage in config.stages] == ["pretrain", "finetune"]
+    pretrain, finetune = config.stages
+    assert pretrain.source is None
+    assert finetune.source is not None
+    assert finetune.source.stage == "pretrain"
+    assert [point.values for point in finetune.points] == [
+        {"tac.entropic_index": 1.0},
+        {"tac.entropic_index": 1.5},
+    ]
+    run = run_of(config, stage=1, point=1)
+    assert run.task == BUILT_IN_TASKS["FetchPush"]
+    assert (run.env_steps, run.tac.lr, run.tac.entropic_index) == (6000, 0.002, 1.5)
+    assert (run.music.estimator, run.music.mi_reward_weight) == ("frozen", 1.0)
+    assert RunSettings.model_validate_json(run.model_dump_json(), strict=True) == run
+
+
+def test_later_layers_win(load: Callable[..., SweepConfig]) -> None:
+    document = changed(
+        defaults={"env_steps": 6000, "tac": {"gamma": 0.9, "tau": 0.1, "lr": 0.1}},
+        stages=[
+            {
+                "name": "a",
+                "variant": "tac",
+                "tac": {"tau": 0.2, "lr": 0.2},
+                "grid": {"tac.lr": [0.3]},
+            }
+        ],
+    )
+    tac = run_of(load(document)).tac
+    assert (tac.gamma, tac.tau, tac.lr) == (0.9, 0.2, 0.3)
+
+
+def test_a_schedule_replaces_the_one_below_it_whole(load: Callable[..., SweepConfig]) -> None:
+    ramp = {"schedule": "linear", "start": 1.0, "end": 2.0, "begin": 0.2}
+    document = changed(
+        defaults={"env_steps": 6000, "tac": {"alpha": {"learned": True}, "entropic_index": ramp}},
+        stages=[
+            {
+                "name": "a",
+                "variant": "tac",
+                "tac": {"alpha": 0.1},
+                "grid": {"tac.entropic_index.end": [1.5, 3.0]},
+            }
+        ],
+    )
+    config = load(document)
+    assert run_of(config).tac.alpha == 0.1
+    assert run_of(config, point=1).tac.entropic_index == Linear(start=1.0, end=3.0, begin=0.2)
+
+
+def test_a_target_that_is_not_given_leaves_the_keys_of_learned_alphas_alone(
+    load: Callable[..., SweepConfig],
+) -> None:
+    stages = [{"name": "a", "variant": "tac", "tac": {"alpha": {"learned": True}}}]
+    alpha = run_of(load(changed(stages=stages))).identity()["tac"]["alpha"]
+    assert alpha == {"learned": True, "initial": 0.2, "target_entropy": "auto", "lr": 3e-4}
+
+
+def test_the_grid_is_a_product_with_the_last_key_fastest(
+    load: Callable[..., SweepConfig],
+) -> None:
+    grid = {"tac.alpha": [0.1, 0.2], "env_steps": [5000, 6000, 7000]}
+    stages = [{"name": "a", "variant": "tac", "grid": grid}]
+    points = load(changed(stages=stages)).stages[0].points
+    assert [tuple(point.values.values()) for point in points] == [
+        (alpha, steps) for alpha in (0.1, 0.2) for steps in (5000, 6000, 7000)
+    ]
+    assert [run.env_steps for point in points for run in point.runs.values()] == [
+        5000,
+        6000,
+        7000,
+    ] * 2
+
+
+def test_slide_has_half_the_weight_unless_it_is_set(load: Callable[..., SweepConfig]) -> None:
+    document = changed(tasks=["FetchPush", "FetchSlide"])
+    runs = load(document).stages[1].points[0].runs
+    assert {name: run.music.mi_reward_weight for name, run in runs.items()} == {
+        "FetchPush": 1.0,
+        "FetchSlide": 0.5,
+    }
+    document["defaults"]["music"] = {"mi_reward_weight": 0.25}
+    runs = load(document).stages[1].points[0].runs
+    assert {run.music.mi_reward_weight for run in runs.values()} == {0.25}
+
+
+def test_a_tasks_own_settings_lie_between_the_stage_and_its_grid(
+    load: Callable[..., SweepConfig],
+) -> None:
+    stage = {
+        "name": "a",
+        "variant": "tac",
+        "tac": {"tau": 0.2, "lr": 0.2, "gamma": 0.8},
+        "per_task": {"FetchSlide": {"env_steps": 9000, "tac": {"lr": 0.3, "tau": 0.3}}},
+        "grid": {"tac.lr": [0.4]},
+    }
+    runs = load(changed(tasks=["FetchPush", "FetchSlide"], stages=[stage])).stages[0].points[0].runs
+    assert {
+        name: (run.env_steps, run.tac.lr, run.tac.tau, run.tac.gamma) for name, run in runs.items()
+    } == {"FetchPush": (6000, 0.4, 0.2, 0.8), "FetchSlide": (9000, 0.4, 0.3, 0.8)}
+
+
+def test_options_replace_what_the_file_says(load: Callable[..., SweepConfig]) -> None:
+    config = load(SOUND, name="other", storage="elsewhere")
+    assert (config.name, config.storage) == ("other", "elsewhere")
+    with pytest.raises(ConfigError, match=r"^--name must be letters, .*got \"a b\"$"):
+        load(SOUND, name="a b")
+
+
+def test_defaults_that_mean_nothing_to_a_variant_change_nothing(
+    load: Callable[..., SweepConfig],
+) -> None:
+    stages = [{"name": "base", "variant": "tac"}]
+    plain = load(changed(stages=stages))
+    document = changed(stages=stages)
+    document["defaults"]["music"] = {"mi_reward_weight": 0.5, "lr": 0.1}
+    assert run_of(load(document)) == run_of(plain)
+
+
+def test_a_users_task(load: Callable[..., SweepConfig]) -> None:
+    task = {"env_id": "Pendulum-v1", "horizon": 200, "success_key": None}
+    document = changed(
+        environments={"Swing": task},
+        tasks=["Swing"],
+        stages=[{"name": "a", "variant": "tac"}],
+    )
+    assert run_of(load(document)).task.env_id == "Pendulum-v1"
+
+
+BAD: list[tuple[Document, str]] = [
+    (changed(name=1), "sweep.yaml:1: name must be text, got 1"),
+    (changed(name="nodes"), "name must not be 'nodes'"),
+    (changed(storag="x"), "storag is not a known setting (did you mean 'storage'?)"),
+    (changed(tasks=["FetchPsh"]), "got 'FetchPsh' (did you mean 'FetchPush'?)"),
+    (changed(tasks=[]), "tasks must have at least 1 entries, got []"),
+    (changed(tasks=["FetchPush", "FetchPush"]), 'tasks[1] must not repeat, got "FetchPush" again'),
+    (changed(tasks=["FetchReach"]), "to be used with MUSIC, got FetchReach, which has none"),
+    (changed(seeds=[0, 0]), "seeds[1] must not repeat, got 0 again"),
+    (changed(seeds=[-1]), "seeds[0] must be >= 0, got -1"),
+    (changed(seeds=[True]), "seeds[0] must be a whole number, got true"),
+    (changed(seeds="3"), 'seeds must be a list, got "3"'),
+    (changed(resources={"num_cpus": 0}), "resources.num_cpus must be > 0, got 0"),
+    (
+        changed(resources={"num_cpus": 2, "cpus_per_run": 3}),
+        "resources.cpus_per_run must be <= num_cpus (2), got 3",
+    ),
+    (changed(mlflow={"tracking_url": "x"}), "(did you mean 'tracking_uri'?)"),
+    (changed(environments={"FetchPush": {}}), "environments.FetchPush is a built-in task"),
+    (changed(environments={"A": {"env_id": "A-v0"}}), "environments.A.horizon must be given"),
+    (changed(defaults={"env_steps": 6.5e-1}), "env_steps must be a whole number, got 0.65"),
+    (changed(defaults={"seed": 1}), "defaults.seed is not a known setting"),
+    (changed(defaults={"tac": 5}), "defaults.tac must be a mapping of keys to values, got 5"),
+    (changed(defaults={"tac": {"lr": "fast"}}), 'defaults.tac.lr must be a number, got "fast"'),
+    (
+        changed(defaults={"env_steps": 500}),
+        "defaults.env_steps must be > tac.random_steps (1000), or",
+    ),
+    (changed(defaults={"replay": {"capacity": 100}}), "replay.capacity must hold one episode"),
+    (changed(stages=[]), "stages must be a list of at least one stage, got []"),
+    (changed(stages=[1]), "stages[0] must be a mapping, got 1"),
+    (with_stage(0, variant="music-x"), "stages.pretrain.variant must be 'tac', 'music-u'"),
+    (with_stage(0, lr=1), "stages.pretrain.lr is not a known setting"),
+    (with_stage(0, tac={"entropic_index": 0}), "entropic_index must be > 0, got 0"),
+    (with_stage(0, tac={"entropic_index": float("nan")}), "must be a finite number, got nan"),
+    (with_stage(0, tac={"entropic_index": "one"}), 'must be a number, got "one"'),
+    (
+        with_stage(0, tac={"entropic_index": {"schedule": "linear", "start": 1.0}}),
+        "stages.pretrain.tac.entropic_index.end must be given",
+    ),
+    (
+        with_stage(0, tac={"alpha": {"learned": True, "initial": -1.0}}),
+        "stages.pretrain.tac.alpha.initial must be > 0, got -1.0",
+    ),
+    (
+        with_stage(
+            0, tac={"alpha": {"learned": True, "target_shannon": -4.0, "target_width": 0.1}}
+        ),
+        "only one target can be given, got target_shannon and target_width",
+    ),
+    (
+        with_stage(0, tac={"alpha": {"value": 0.1, "matched_width": 0.0}}),
+        "stages.pretrain.tac.alpha.matched_width must be > 0, got 0",
+    ),
+    (
+        with_stage(0, tac={"alpha": {"value": 0.1, "normalised": False}}),
+        "stages.pretrain.tac.alpha.normalised must be",
+    ),
+    (with_stage(0, tac={"hiden_sizes": [1]}), "(did you mean 'hidden_sizes'?)"),
+    (
+        with_stage(
+            0,
+            tac={
+                "alpha": {"learned": True, "target_entropy": -3.0},
+                "entropic_index": {"schedule": "linear", "start": 1.0, "end": 2.0},
+            },
+        ),
+        "stages.pretrain.tac.alpha.target_entropy must be auto where entropic_index is a schedule "
+        "(a value of S_q means another width at each q), got -3; "
+        "target_shannon and target_width hold for every q",
+    ),
+    (
+        with_stage(0, tac={"log_std_bounds": [1.0, 0.0]}),
+        "stages.pretrain.tac.log_std_bounds must be increasing, got 1, 0",
+    ),
+    (
+        with_stage(
+            0, tac={"entropic_index": {"follows": "success_rate", "points": [[0, 0], [1, 1]]}}
+        ),
+        "stages.pretrain.tac.entropic_index must be > 0, got 0",
+    ),
+    (
+        with_stage(
+            0,
+            tac={
+                "policy": "deterministic",
+                "alpha": 0.0,
+                "bootstrap": "critics",
+                "behaviour": {"kind": "gaussian_noise"},
+                "entropic_index": {"follows": "shannon_entropy", "points": [[0, 1], [1, 2]]},
+            },
+        ),
+        "stages.pretrain.tac.entropic_index.follows must not be shannon_entropy for policy: determ",
+    ),
+    (with_stage(0, music={"goals": "environment"}), 'music.goals must be "zero" for music-u'),
+    (with_stage(0, init_from="finetune"), "init_from has no effect with variant music-u"),
+    (
+        with_stage(0, per_task={"FetchSlide": {}}),
+        "FetchSlide is not a task of this stage (",
+    ),
+    (with_stage(0, per_task={"FetchPush": {"seed": 1}}), "per_task.FetchPush.seed is not a known"),
+    (with_stage(0, per_task={"FetchPush": 5}), "per_task.FetchPush must be a mapping"),
+    (
+        with_stage(0, per_task={"FetchPush": {"tac": {"lr": -1.0}}}),
+        "stages.pretrain.per_task.FetchPush.tac.lr must be > 0, got -1.0",
+    ),
+    (
+        with_stage(1, per_task={"FetchPush": {"music": {"lr": 0.1}}}),
+        "stages.finetune.per_task.FetchPush.music.lr has no effect with variant music-r",
+    ),
+    (with_stage(1, init_from=None), "init_from must be given for music-r, which starts from a t"),
+    (with_stage(1, init_from="finetune"), "init_from must be an earlier stage (one of pretrain)"),
+    (with_stage(1, init_from="pretran"), "got 'pretran' (did you mean 'pretrain'?)"),
+    (with_stage(1, init_from={"task": "FetchPush"}), "must have exactly one of stage and check"),
+    (with_stage(1, init_from={"stage": "pretrain", "task": "Fetch"}), "got 'Fetch'"),
+    (with_stage(1, init_from={"checkpoint": "gone"}), "gone must hold a handoff (handoff.json"),
+    (with_stage(1, tasks=["FetchSlide"]), "needs a run of FetchSlide in stage pretrain"),
+    (with_stage(1, music={"lr": 0.1}), "music.lr has no effect with variant music-r"),
+    (with_stage(1, music={"hidden_size": 64}), "needs the same music.hidden_size in stage finetu"),
+    (with_stage(1, name="pretrain"), "stages.pretrain.name must not repeat"),
+    (with_stage(1, grid={"seed": [1]}), "seed is never a grid dimension; list them under 'seed"),
+    (with_stage(1, grid={"tac.entropic_index": []}), "must have at least 1 entries, got []"),
+    (with_stage(1, grid={"tac.entropic_index": 1.0}), "must be a list, got 1.0"),
+    (with_stage(1, grid={"tac.entropic_index": [1, 1.0]}), "[1] must not repeat, got 1.0 again"),
+    (with_stage(1, grid={"tac.entropic_index": [1.0, 0]}), "[1] must be > 0, got 0"),
+    (with_stage(1, grid={"tac.lr.x": [1]}), "needs tac.lr to be a mapping, got 0.002"),
+    (with_stage(1, grid={"entropic_index": [1]}), "(did you mean 'tac.entropic_index'?)"),
+    (with_stage(1, grid={"music.lr": [1.0]}), "has no effect with variant music-r"),
+    (with_stage(1, grid={"music.estimator": ["none"]}), 'must be "frozen" for music-r, got "none"'),
+]
+
+
+@pytest.mark.parametrize(("document", "message"), BAD, ids=[message[:40] for _, message in BAD])
+def test_each_mistake_is_named(
+    problems: Callable[[Document], list[str]], document: Document, message: str
+) -> None:
+    lines = problems(document)
+    assert any(message in line for line in lines), lines
+    assert all(line.startswith("sweep.yaml") for line in lines)
+    assert len(lines) == 1, "one mistake, one line"
+
+
+def test_all_mistakes_are_reported_at_once_in_the_order_of_the_file(
+    problems: Callable[[Document], list[str]],
+) -> None:
+    document = changed(name="a b", tasks=["FetchPsh"], defaults={"tac": {"gamma": 2.0}})
+    document["stages"][0]["tac"] = {"alpha": -1.0}
+    document["stages"][1]["grid"] = {"tac.entropic_index": [-1.0]}
+    document["stages"][1]["init_from"] = "nowhere"
+    lines = problems(document)
+    assert [line.split(" ")[1] for line in lines] == [
+        "name",
+        "tasks[0]",
+        "defaults.tac.gamma",
+        "stages.pretrain.tac.alpha",
+        "stages.finetune.init_from",
+        "stages.finetune.grid.tac.entropic_index[0]",
+    ]
+    numbers = [int(line.split(":")[1]) for line in lines]
+    assert numbers == sorted(numbers)
+
+
+def test_a_broken_stage_is_not_called_unknown(
+    problems: Callable[[Document], list[str]],
+) -> None:
+    assert len(problems(with_stage(0, variant="music-x"))) == 1
+
+
+def test_policies_need_the_same_networks_on_both_sides(
+    load: Callable[..., SweepConfig], problems: Callable[[Document], list[str]]
+) -> None:
+    stages: list[Document] = [
+        {"name": "u", "variant": "music-u"},
+        {"name": "f", "variant": "music-f", "init_from": "u"},
+    ]
+    load(changed(stages=stages))
+    stages[1]["tac"] = {"hidden_sizes": [64], "normalise_observations": False}
+    lines = problems(changed(stages=stages))
+    assert [line.split("needs the same ")[1] for line in lines] == [
+        "tac.hidden_sizes in stage f as in stage u",
+        "tac.normalise_observations in stage f as in stage u",
+    ]
+    # The same numbers would be other widths.
+    for theirs, ours, wrong in (
+        ({}, {"log_std_form": "tanh"}, ["log_std_form"]),
+        ({"log_std_form": "tanh"}, {}, ["log_std_form"]),
+        (
+            {"log_std_form": "tanh"},
+            {"log_std_form": "tanh", "log_std_bounds": [-5.0, 2.0]},
+            ["log_std_bounds"],
+        ),
+    ):
+        stages[0]["tac"], stages[1]["tac"] = theirs, ours
+        lines = problems(changed(stages=stages))
+        named = [line.split("needs the same tac.")[1].split(" in stage")[0] for line in lines]
+        assert named == wrong
+    stages[0]["tac"], stages[1]["tac"] = {}, {"log_std_bounds": [-5.0, 2.0]}
+    load(changed(stages=stages))
+
+
+def test_an_estimator_must_come_from_a_stage_that_has_one(
+    problems: Callable[[Document], list[str]],
+) -> None:
+    document = with_stage(0, variant="tac", name="pretrain")
+    (line,) = problems(document)
+    assert "must be a stage with an estimator, got 'pretrain', which is tac" in line
+
+
+def checkpoint(folder: Path, task: str = "FetchPush", **changes: Any) -> str:
+    run = RunSettings.model_validate(
+        {
+            "task": BUILT_IN_TASKS[task],
+            "variant": "music-u",
+            "seed": 0,
+            "music": preset("music-u", BUILT_IN_TASKS[task]) | changes,
+        }
+    )
+    arrays = {"mi_estimator": {"w": np.zeros((3, 2), np.float32)}}
+    write_handoff(folder, arrays, run.handoff_info("0" * 20, 50))
+    return str(folder)
+
+
+def test_a_checkpoint_from_outside_is_checked_before_anything_starts(
+    tmp_path: Path,
+    load: Callable[..., SweepConfig],
+    problems: Callable[[Document], list[str]],
+) -> None:
+    def from_checkpoint(folder: str, **more: str) -> Document:
+        document = with_stage(1, init_from={"checkpoint": folder, **more})
+        del document["stages"][0]
+        return document
+
+    push = checkpoint(tmp_path / "push")
+    source = load(from_checkpoint(push)).stages[0].source
+    assert source is not None
+    assert source.checkpoint is not None
+    assert source.checkpoint.folder == tmp_path / "push"
+
+    slide = checkpoint(tmp_path / "slide", "FetchSlide")
+    (line,) = problems(from_checkpoint(slide))
+    assert "must be of task FetchPush, got one of FetchSlide" in line
+    load(from_checkpoint(slide, task="FetchSlide"))
+
+    (line,) = problems(from_checkpoint(checkpoint(tmp_path / "small", hidden_size=64)))
+    assert "needs the same music.hidden_size" in line
+
+    document = from_checkpoint(push)
+    document["stages"][0]["variant"] = "music-f"
+    (line,) = problems(document)
+    assert "it lacks policy, critics, value, value_target, normaliser (made by music-u)" in line
+
+    weights = tmp_path / "push" / "mi_estimator.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-1])
+    (line,) = problems(from_checkpoint(push))
+    assert "mi_estimator.safetensors must have" in line
+
+    (tmp_path / "push" / "handoff.json").write_text("{}")
+    (line,) = problems(from_checkpoint(push))
+    assert "must be a handoff manifest" in line
+
+
+def test_every_variant_can_be_built_from_its_preset() -> None:
+    task = BUILT_IN_TASKS["FetchPush"]
+    for variant, rules in VARIANTS.items():
+        run = RunSettings.model_validate(
+            {"task": task, "variant": variant, "seed": 0, "music": preset(variant, task)}
+        )
+        assert {field: getattr(run.music, field) for field in rules.fixed} == dict(rules.fixed)
+        assert json.loads(run.model_dump_json())["variant"] == variant
+
+
+@pytest.mark.parametrize(
+    ("tac", "extra"),
+    [
+        ({}, ("value", "value_target", "normaliser")),
+        ({"bootstrap": "critics", "normalise_observations": False}, ("critics_target",)),
+    ],
+)
+def test_what_is_handed_over_follows_the_networks_there_are(
+    tac: dict[str, Any], extra: tuple[str, ...]
+) -> None:
+    task = BUILT_IN_TASKS["FetchPush"]
+    run = RunSettings.model_validate({"task": task, "variant": "music-f", "seed": 0, "tac": tac})
+    assert handed_over(run) == ("policy", "critics", *extra)
+
+
+def test_settings_from_elsewhere_cannot_contradict_their_variant() -> None:
+    task = BUILT_IN_TASKS["FetchPush"]
+    with pytest.raises(ValueError, match=r'music\.estimator must be "trained" for music-u'):
+        RunSettings(task=task, variant="music-u", seed=0)
+    reach = BUILT_IN_TASKS["FetchReach"]
+    with pytest.raises(ValueError, match="'FetchReach', which has none"):
+        RunSettings.model_validate(
+            {"task": reach, "variant": "music-u", "seed": 0, "music": preset("music-u", reach)}
+        )

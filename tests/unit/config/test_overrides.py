@@ -1,0 +1,131 @@
+"""`KEY=VALUE` behind a sweep's file: what wins, what is recorded, what is refused."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from music_rllib.config.load import ConfigError, RunSettings, SweepConfig, load_sweep
+
+SWEEP = """
+name: mine
+tasks: [FetchReach]
+seeds: 2
+defaults: {env_steps: 1e5, tac: {lr: 0.002, gamma: 0.9}}
+stages:
+  - name: first
+    variant: tac
+    env_steps: 3e4
+    per_task: {FetchReach: {tac: {lr: 0.003}}}
+  - name: second
+    variant: tac
+    tac: {alpha: {matched_width: 0.5, value: 0.1}}
+    grid: {tac.entropic_index: [1, 1.5]}
+"""
+
+
+def load(folder: Path, *arguments: str) -> SweepConfig:
+    path = folder / "sweep.yaml"
+    path.write_text(SWEEP)
+    return load_sweep(path, overrides=arguments)
+
+
+def runs(config: SweepConfig) -> list[RunSettings]:
+    return [point.runs["FetchReach"] for stage in config.stages for point in stage.points]
+
+
+def test_a_setting_holds_in_every_stage(tmp_path: Path) -> None:
+    before = runs(load(tmp_path))
+    assert {(run.env_steps, run.tac.lr) for run in before} == {(30_000, 0.003), (100_000, 0.002)}
+    after = runs(load(tmp_path, "env_steps=1e6", "tac.lr=1e-4"))
+    assert {(run.env_steps, run.tac.lr, run.tac.gamma) for run in after} == {(10**6, 1e-4, 0.9)}
+
+
+def test_the_result_is_that_of_a_file_that_says_the_same(tmp_path: Path) -> None:
+    config = load(tmp_path, "seeds=5", "stages.second.env_steps=7e4", "name=other")
+    assert (config.seeds, config.name) == ((0, 1, 2, 3, 4), "other")
+    path = tmp_path / "written.yaml"
+    path.write_text(
+        SWEEP.replace("seeds: 2", "seeds: [0, 1, 2, 3, 4]")
+        .replace("name: mine", "name: other")
+        .replace("tac: {alpha", "env_steps: 70000\n    tac: {alpha")
+    )
+    assert runs(config) == runs(load_sweep(path))
+    # What the sweep's folder keeps makes the same sweep again.
+    kept = tmp_path / "config.json"
+    kept.write_text(json.dumps(config.document))
+    assert runs(load_sweep(kept)) == runs(config)
+    assert load_sweep(kept).seeds == config.seeds
+
+
+def test_values_inside_of_a_setting_and_of_a_grid(tmp_path: Path) -> None:
+    config = load(
+        tmp_path, "tac.alpha.value=0.3", "stages.second.grid.tac.entropic_index=[1, 2, 3]"
+    )
+    first, *second = runs(config)
+    assert first.tac.alpha == 0.2
+    assert [run.tac.entropic_index for run in second] == [1, 2, 3]
+    assert {run.tac.alpha.value for run in second} == {0.3}  # type: ignore[union-attr]
+
+
+def test_a_preset_of_the_command_line_lies_below_the_file(tmp_path: Path) -> None:
+    first = runs(load(tmp_path, "preset=small"))[0]
+    assert (first.tac.tau, first.tac.gamma) == (0.05, 0.9)
+
+
+REFUSED: list[tuple[str, str]] = [
+    ("q=2", "command line: q is not a known setting (did you mean 'tac.entropic_index'?)"),
+    ("tac.lr=-1", "command line: tac.lr must be > 0, got -1"),
+    ("tac.hidden_sizes=[8, 0]", "command line: tac.hidden_sizes[1] must be > 0, got 0"),
+    ("tac.entropic_index=2", "must not be given where stages.second.grid.tac.entropic_index"),
+    ("tac.alpha=[.1, .2]", "belong in a stage's grid: {tac.alpha: [0.1, 0.2]}"),
+    ("stages.third.env_steps=1", "must be stages.NAME.KEY, with NAME one of first, second"),
+    ("stages.first.q=1", "stages.first.q is not a known setting (did you mean 'tac.entropic"),
+    ("seeds=0", "command line: seeds must be a list like [0, 1], or how many (1 to "),
+    ("env_steps=1.5", "command line: env_steps must be a whole number, got 1.5"),
+    ("tac.lr", "command line: must be KEY=VALUE like tac.alpha=0.1"),
+    ("tac.lr=[", "command line: tac.lr must be valid YAML"),
+    ("storage=", "command line: storage must be text, got null"),
+]
+
+
+@pytest.mark.parametrize(("argument", "message"), REFUSED, ids=[one for one, _ in REFUSED])
+def test_each_mistake_is_named_once(tmp_path: Path, argument: str, message: str) -> None:
+    with pytest.raises(ConfigError) as refusal:
+        load(tmp_path, argument)
+    (line,) = refusal.value.lines
+    assert message in line
+
+
+FILES: list[tuple[str, Any]] = [
+    ("defaults: {q: 1.5}", "defaults.q is not a known setting (did you mean 'tac.entropic_index'"),
+    ("q: 1.5", "q is not a known setting (did you mean 'defaults.tac.entropic_index'?)"),
+    ("defaults: {tac: {q: 1.5}}", "defaults.tac.q is not a known setting (did you mean 'entropic"),
+    ("defaults: {tac: {alpha: [.1, .2]}}", "got [0.1, 0.2]; values to compare belong in a stage's"),
+    ("defaults: {env_steps: 1e6, num_envs: 1.5}", "num_envs must be a whole number, got 1.5"),
+    ("defaults: {tac: {random_steps: 3e5}}", "env_steps must be > tac.random_steps (300000)"),
+]
+
+
+@pytest.mark.parametrize(("text", "message"), FILES, ids=[text for text, _ in FILES])
+def test_each_mistake_of_a_file_is_named_once(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "sweep.yaml"
+    stage = "{name: a, variant: tac, grid: {tac.entropic_index: [1, 2, 3], tac.tau: [.1, .2]}}"
+    path.write_text(f"name: mine\ntasks: [FetchReach]\n{text}\nstages: [{stage}]\n")
+    with pytest.raises(ConfigError) as refusal:
+        load_sweep(path)
+    (line,) = refusal.value.lines
+    assert message in line
+
+
+def test_a_wrong_list_of_a_grid_is_one_mistake(tmp_path: Path) -> None:
+    path = tmp_path / "sweep.yaml"
+    stage = "{name: a, variant: tac, grid: {q: [1, 2, 3], tac.gamma: [0.9, 1.5, 2]}}"
+    path.write_text(f"name: mine\ntasks: [FetchReach]\nstages: [{stage}]\n")
+    with pytest.raises(ConfigError) as refusal:
+        load_sweep(path)
+    assert list(refusal.value.lines) == [
+        "sweep.yaml:3: stages.a.grid.q is not a known setting (did you mean 'tac.entropic_index'?)",
+        "sweep.yaml:3: stages.a.grid.tac.gamma must be < 1, got 1.5, 2",
+    ]

@@ -1,0 +1,134 @@
+"""Bounds of targets against the returns that a configuration can reach."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from music_rllib.config.load import load_sweep
+from music_rllib.config.remarks import remarks
+from music_rllib.config.returns import Range, cut_off
+from music_rllib.config.tac_settings import TACSettings
+from music_rllib.intrinsic.settings import MusicSettings
+
+SPARSE = Range(-1.0, 0.0)
+DDPG = {
+    "policy": "deterministic",
+    "bootstrap": "critics",
+    "alpha": 0.0,
+    "behaviour": {"kind": "gaussian_noise"},
+}
+MUSIC_R = {"estimator": "frozen", "mi_reward_weight": 1.0}
+MUSIC_U = {**MUSIC_R, "estimator": "trained", "task_reward": False}
+RAMP = {"schedule": "linear", "start": 0.25, "end": 0.0}
+
+
+def reached(
+    bounds: tuple[float, float], music: dict[str, Any], task: Range = SPARSE, **tac: Any
+) -> tuple[float, float] | None:
+    """The returns that are said to be cut off; None where nothing is said."""
+    settings = TACSettings.model_validate(
+        {"gamma": 0.98, "alpha": 0.0, **tac, "target_bounds": bounds}
+    )
+    found = cut_off(settings, MusicSettings.model_validate(music), task)
+    return None if found is None else (found.reached.low, found.reached.high)
+
+
+@pytest.mark.parametrize(
+    ("bounds", "music", "tac", "expected"),
+    [
+        ((-50, 0), {}, {}, None),
+        ((-49, 0), {}, {}, (-50, 0)),
+        ((-50, 0), MUSIC_R, {}, (-100, 0)),
+        ((-50, 0), MUSIC_R, DDPG, (-100, 0)),
+        ((-200, 200), MUSIC_R, DDPG, None),
+        ((-50, 0), {**MUSIC_R, "mi_reward_weight": RAMP}, {}, (-62.5, 0)),
+        ((-50, 0), MUSIC_U, {}, None),
+        ((-40, 0), MUSIC_U, {}, (-50, 0)),
+        ((-50, 0), {}, {"gamma": 0.99}, (-100, 0)),
+        ((-50, 0), {}, {"gamma": 0.9}, None),
+    ],
+)
+def test_values_that_rewards_can_reach(
+    bounds: tuple[float, float],
+    music: dict[str, Any],
+    tac: dict[str, Any],
+    expected: tuple[float, float] | None,
+) -> None:
+    assert reached(bounds, music, **tac) == (expected and pytest.approx(expected))
+
+
+def test_it_is_the_reward_of_a_bootstrapped_loop() -> None:
+    """Iterating r + gamma V at the largest and the least reward ends where it is said to."""
+    low = high = 0.0
+    for _ in range(5000):
+        low, high = -3.5 + 0.98 * low, 0.5 + 0.98 * high
+    music = {**MUSIC_R, "mi_reward_weight": 1.5}
+    assert reached((-1, 1), music, Range(-2.0, 0.5)) == pytest.approx((low, high))
+    # Where every reward is positive an episode's end is the least, and the other way round.
+    assert reached((-1, 1), {}, Range(1.0, 2.0)) == pytest.approx((1.0, 100.0))
+
+
+@pytest.mark.parametrize("q", [1.0, 1.5, 2.0])
+def test_the_entropy_of_later_steps_is_part_of_the_target(q: float) -> None:
+    most = math.log(2) if q == 1 else (1 - 2 ** (1 - q)) / (q - 1)
+    tac: dict[str, Any] = {"alpha": 0.05, "entropic_index": q}
+    expected = pytest.approx((-50.0, 0.05 * most * 0.98 / 0.02))
+    assert reached((-50, 0), {}, **tac) == expected
+    assert reached((-50, 5), {}, **tac) is None
+    learned = {"learned": True, "initial": 0.05}
+    assert reached((-50, 0), {}, entropic_index=q, alpha=learned) == expected
+
+
+SWEEP = """
+name: one
+tasks: [FetchPush]
+environments:
+  Dense: {env_id: FetchPush-v4, horizon: 50, env_kwargs: {reward_type: dense},
+          agent_indices: 0:3, surrounding_indices: 3:6}
+defaults: {tac: {gamma: 0.98, alpha: 0.0, target_bounds: [-50, 0]}}
+stages:
+"""
+PRETRAIN = "- {name: u, variant: music-u}"
+
+
+@pytest.mark.parametrize(
+    ("stages", "expected"),
+    [
+        (["- {name: tac, variant: tac}"], []),
+        (
+            [PRETRAIN, "- {name: r, variant: music-r, init_from: u}"],
+            [
+                "r/FetchPush: tac.target_bounds -50 to 0 cut off values that can be reached, "
+                "-100 to 0: rewards of -2 to 0 a step at gamma 0.98"
+            ],
+        ),
+        (
+            ["- {name: tac, variant: tac, tasks: [FetchReach, Dense]}"],
+            [
+                "tac/Dense: tac.target_bounds may cut off values that can be reached: the rewards "
+                "of Dense are not known (environments.Dense.reward_range)"
+            ],
+        ),
+        (["- {name: tac, variant: tac, tasks: [Dense], tac: {target_bounds: null}}"], []),
+        (
+            [
+                "- {name: tac, variant: tac, search: {trials: 2, sampler: random, "
+                "space: {tac.gamma: {float: [0.9, 0.99]}}}}"
+            ],
+            [
+                "tac/FetchPush: tac.target_bounds -50 to 0 cut off values that can be reached, "
+                "-100 to 0: rewards of -1 to 0 a step at gamma 0.99"
+            ],
+        ),
+    ],
+)
+def test_a_sweep_says_where_and_with_both_numbers(
+    stages: list[str], expected: list[str], tmp_path: Path
+) -> None:
+    path = tmp_path / "sweep.yaml"
+    path.write_text(SWEEP + "\n".join(stages))
+    assert remarks(load_sweep(path)) == expected

@@ -1,0 +1,99 @@
+"""Reading YAML strictly: values are what they look like, and mistakes have a line."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from music_rllib.config.problems import ConfigError
+from music_rllib.config.yaml_file import YamlFile, read_yaml
+
+
+def read(tmp_path: Path, text: str) -> YamlFile:
+    path = tmp_path / "sweep.yaml"
+    path.write_text(text, encoding="utf-8")
+    return read_yaml(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("1e-3", 0.001),
+        ("1.5", 1.5),
+        ("-.5", -0.5),
+        ("6e3", 6000.0),
+        ("1_000_000", 1_000_000),
+        ("0:3", "0:3"),
+        ("3:6", "3:6"),
+        ("010", "010"),
+        ("0x10", "0x10"),
+        ("on", "on"),
+        ("no", "no"),
+        ("2020-01-01", "2020-01-01"),
+        ("true", True),
+        ("~", None),
+        ("", None),
+        ("'1'", "1"),
+        ("-.inf", -math.inf),
+    ],
+)
+def test_scalars_are_what_they_look_like(tmp_path: Path, text: str, value: Any) -> None:
+    found = read(tmp_path, f"key: {text}\n").data["key"]
+    assert found == value
+    assert type(found) is type(value)
+
+
+@given(st.floats(allow_nan=False, allow_infinity=False) | st.integers())
+def test_every_number_python_prints_is_read_back(
+    tmp_path_factory: pytest.TempPathFactory, number: float
+) -> None:
+    found = read(tmp_path_factory.mktemp("yaml"), f"key: {number!r}\n").data["key"]
+    assert found == number
+    assert type(found) is type(number)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a: 1\nb: 2\na: 3\n", "sweep.yaml:3: must be valid YAML: key 'a' must not repeat"),
+        ("a:\n  b: 1\n  b: 2\n", "sweep.yaml:3: must be valid YAML: key 'b' must not repeat"),
+        ("a: 1\n2: 3\n", "sweep.yaml:2: must be valid YAML: keys must be text"),
+        ("a: [1, 2\n", "sweep.yaml:2: must be valid YAML"),
+        ("a: &x [*x]\n", "sweep.yaml:1: must be valid YAML: an alias must not contain itself"),
+        ("a: !!python/object/apply:os.getcwd []\n", "sweep.yaml:1: must be valid YAML"),
+        ("a: !!set {b}\n", "is not allowed here"),
+        ("a: 1\n---\nb: 2\n", "sweep.yaml:2: must be valid YAML"),
+        ("- a\n", "sweep.yaml: must be a mapping"),
+        ("", "sweep.yaml: must be a mapping"),
+    ],
+)
+def test_unsound_files_are_refused_with_their_line(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(ConfigError) as refusal:
+        read(tmp_path, text)
+    assert message in str(refusal.value)
+
+
+def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"missing\.yaml: must be an existing file"):
+        read_yaml(tmp_path / "missing.yaml")
+    with pytest.raises(ConfigError, match="must be a readable YAML file: Is a directory"):
+        read_yaml(tmp_path)
+    (tmp_path / "latin.yaml").write_bytes(b"a: \xe9\n")
+    with pytest.raises(ConfigError, match="not UTF-8"):
+        read_yaml(tmp_path / "latin.yaml")
+
+
+def test_places_name_the_line_of_a_value_or_of_what_holds_it(tmp_path: Path) -> None:
+    file = read(tmp_path, "a: 1\nb:\n  - c: 2\n  - d:\n      e: 3\n")
+    assert file.place(("a",)) == "sweep.yaml:1"
+    assert file.place(("b", 1, "d", "e")) == "sweep.yaml:5"
+    assert file.place(("b", 1, "d", "absent", 0)) == "sweep.yaml:4"
+    assert file.place(("absent",)) == "sweep.yaml"
+
+
+def test_merge_keys_share_settings(tmp_path: Path) -> None:
+    file = read(tmp_path, "a: &base {x: 1, y: 2}\nb:\n  <<: *base\n  y: 3\n")
+    assert file.data["b"] == {"x": 1, "y": 3}

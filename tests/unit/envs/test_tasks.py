@@ -1,0 +1,108 @@
+"""Tasks: the built-in ones, and what a user may declare."""
+
+import pytest
+from pydantic import ValidationError
+
+from music_rllib.envs.tasks import BUILT_IN_TASKS, Task, TaskRegistry, UnknownTaskError, closest
+
+FETCH = {name: task for name, task in BUILT_IN_TASKS.items() if name.startswith("Fetch")}
+
+
+def test_built_in_fetch_tasks_have_the_split_of_the_paper() -> None:
+    assert list(FETCH) == ["FetchReach", "FetchPush", "FetchPickAndPlace", "FetchSlide"]
+    for name, task in FETCH.items():
+        assert (task.env_id, task.horizon, task.success_key) == (f"{name}-v4", 50, "is_success")
+        if name != "FetchReach":
+            assert task.agent_indices == (0, 1, 2)
+            assert task.surrounding_indices == (3, 4, 5)
+    assert not BUILT_IN_TASKS["FetchReach"].has_split
+    weights = {name: task.mi_reward_weight for name, task in BUILT_IN_TASKS.items()}
+    assert weights["FetchSlide"] == 0.5
+    assert weights["FetchPush"] == 1.0
+
+
+def test_the_hand_splits_off_the_position_of_its_block() -> None:
+    task = BUILT_IN_TASKS["HandManipulateBlock"]
+    assert (task.env_id, task.horizon) == ("HandManipulateBlock-v1", 100)
+    assert task.agent_indices == tuple(range(24))
+    assert task.surrounding_indices == (54, 55, 56)
+
+
+def test_a_range_is_a_list_of_indices() -> None:
+    task = Task.model_validate_json(
+        '{"name": "T", "env_id": "E-v0", "horizon": 9, "agent_indices": "2:4",'
+        ' "surrounding_indices": [7, 5]}',
+        strict=True,
+    )
+    assert task.agent_indices == (2, 3)
+    assert task.surrounding_indices == (7, 5)
+    assert Task.model_validate_json(task.model_dump_json(), strict=True) == task
+
+
+@pytest.mark.parametrize(
+    ("change", "rule"),
+    [
+        ({"agent_indices": "a:b"}, "range such as 0:3"),
+        ({"agent_indices": [0, 0]}, "must not repeat"),
+        ({"agent_indices": [3]}, "must not overlap"),
+        ({"agent_indices": []}, "agent_indices must be given too"),
+        ({"surrounding_indices": "5:5"}, "surrounding_indices must be given too"),
+        ({"agent_indices": [-1]}, "greater than or equal to 0"),
+        ({"horizon": 0}, "greater than 0"),
+        ({"name": "../up"}, "match pattern"),
+        ({"mi_reward_weight": float("nan")}, "finite"),
+        ({"horizn": 5}, "Extra inputs"),
+    ],
+)
+def test_unsound_tasks_are_rejected(change: dict[str, object], rule: str) -> None:
+    sound = {
+        "name": "T",
+        "env_id": "E-v0",
+        "horizon": 10,
+        "agent_indices": [0, 1],
+        "surrounding_indices": [3, 4],
+    }
+    Task.model_validate(sound)
+    with pytest.raises(ValidationError, match=rule):
+        Task.model_validate(sound | change)
+
+
+def test_identity_ignores_what_does_not_change_the_environment() -> None:
+    push = BUILT_IN_TASKS["FetchPush"]
+    trained_otherwise = {"mi_reward_weight": 0.3, "moved_distance": 0.02}
+    renamed = push.model_copy(update={"name": "Mine", **trained_otherwise})
+    assert renamed.identity() == push.identity()
+    for change in (
+        {"env_id": "FetchSlide-v4"},
+        {"horizon": 49},
+        {"agent_indices": (0, 1)},
+        {"surrounding_indices": (3, 4)},
+        {"success_key": None},
+        {"env_kwargs": {"reward_type": "dense"}},
+    ):
+        assert push.model_copy(update=change).identity() != push.identity()
+
+
+def test_an_unknown_task_is_named_with_its_neighbour() -> None:
+    with pytest.raises(UnknownTaskError, match=r"got 'fetchpush' \(did you mean 'FetchPush'\?\)"):
+        TaskRegistry()["fetchpush"]
+    with pytest.raises(UnknownTaskError, match=r"FetchReach.*got 'Walker2d'$"):
+        TaskRegistry()["Walker2d"]
+
+
+def test_user_tasks_join_the_built_in_ones_and_replace_none() -> None:
+    mine = Task(name="Pendulum", env_id="Pendulum-v1", horizon=200, success_key=None)
+    registry = TaskRegistry([mine])
+    assert registry["Pendulum"] is mine
+    assert set(registry) == {*BUILT_IN_TASKS, "Pendulum"}
+    with pytest.raises(ValueError, match="FetchPush is a built-in task"):
+        TaskRegistry([mine.model_copy(update={"name": "FetchPush"})])
+    with pytest.raises(ValueError, match="declared twice"):
+        TaskRegistry([mine, mine])
+
+
+@pytest.mark.parametrize(("name", "hint"), [("hiden", "'hidden'"), ("zzz", "")])
+def test_closest_only_suggests_what_is_close(name: str, hint: str) -> None:
+    text = closest(name, ["hidden", "lr"])
+    assert hint in text
+    assert bool(hint) == bool(text)

@@ -1,0 +1,203 @@
+"""The plan: its order, its keys, and what is shared."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from music_rllib.config.load import load_sweep
+from music_rllib.config.run_settings import RunSettings, preset
+from music_rllib.envs.tasks import BUILT_IN_TASKS
+from music_rllib.experiment import plan as plan_module
+from music_rllib.experiment.plan import Plan, make_plan, node_key
+
+Document = dict[str, Any]
+
+PRETRAIN: Document = {"name": "pretrain", "variant": "music-u"}
+FINETUNE: Document = {
+    "name": "finetune",
+    "variant": "music-r",
+    "init_from": "pretrain",
+    "grid": {"tac.entropic_index": [1.0, 1.5, 2.0]},
+}
+
+
+def plan(tmp_path: Path, **document: Any) -> Plan:
+    path = tmp_path / "sweep.yaml"
+    base = {"name": "s", "tasks": ["FetchPush"], "defaults": {"env_steps": 6000}}
+    path.write_text(yaml.safe_dump(base | document, sort_keys=False))
+    return make_plan(load_sweep(path))
+
+
+def test_pretrain_then_finetune(tmp_path: Path) -> None:
+    sweep = plan(tmp_path, seeds=[0, 7], stages=[PRETRAIN, FINETUNE])
+    assert len(sweep.nodes) == 2 + 3 * 2
+    assert sweep.env_steps == 8 * 6000
+    assert sweep.imports == ()
+    nodes = {node.label: node for node in sweep.nodes}
+    assert list(nodes)[:3] == [
+        "pretrain/FetchPush/seed0",
+        "pretrain/FetchPush/seed7",
+        "finetune/FetchPush/tac.entropic_index=1/seed0",
+    ]
+    for q, seed in ((1.5, 7), (2, 0)):
+        node = nodes[f"finetune/FetchPush/tac.entropic_index={q}/seed{seed}"]
+        source = nodes[f"pretrain/FetchPush/seed{seed}"]
+        assert node.input is not None
+        assert (node.input.key, node.input.task.name) == (source.key, "FetchPush")
+        assert (node.run.tac.entropic_index, node.run.seed) == (q, seed)
+
+
+def test_every_node_comes_after_its_input(tmp_path: Path) -> None:
+    again = FINETUNE | {"name": "again", "init_from": "finetune"}
+    seen: set[str] = set()
+    for node in plan(tmp_path, stages=[PRETRAIN, FINETUNE, again]).nodes:
+        assert node.input is None or node.input.key in seen
+        seen.add(node.key)
+
+
+def test_the_grid_of_a_source_multiplies(tmp_path: Path) -> None:
+    gridded = PRETRAIN | {"grid": {"tac.alpha": [0.1, 0.2]}}
+    sweep = plan(tmp_path, stages=[gridded, FINETUNE])
+    runs = [run for run in sweep.runs if run.stage == "finetune"]
+    assert [run.trial for run in runs] == list(range(6))
+    assert runs[4].label == (
+        "finetune/FetchPush/pretrain:tac.alpha=0.2,tac.entropic_index=1.5/seed0"
+    )
+    assert len({run.label for run in sweep.runs}) == len(sweep.runs) == len(sweep.nodes) == 8
+
+
+def test_equal_computations_are_one_node(tmp_path: Path) -> None:
+    twin = PRETRAIN | {"name": "twin"}
+    sweep = plan(tmp_path, stages=[PRETRAIN, twin, FINETUNE | {"init_from": "twin"}])
+    assert [run.stage for run in sweep.runs][:2] == ["pretrain", "twin"]
+    assert sweep.runs[0].key == sweep.runs[1].key
+    assert len(sweep.nodes) == 4
+    direct = plan(tmp_path, stages=[PRETRAIN, FINETUNE])
+    assert {node.key for node in direct.nodes} == {node.key for node in sweep.nodes}
+
+
+def test_another_tasks_estimator(tmp_path: Path) -> None:
+    finetune = FINETUNE | {
+        "tasks": ["FetchPickAndPlace"],
+        "init_from": {"stage": "pretrain", "task": "FetchPush"},
+    }
+    sweep = plan(tmp_path, stages=[PRETRAIN, finetune])
+    push = sweep.nodes[0]
+    assert push.run.task.name == "FetchPush"
+    for node in sweep.nodes[1:]:
+        assert node.run.task.name == "FetchPickAndPlace"
+        assert node.input is not None
+        assert (node.input.key, node.input.task.name) == (push.key, "FetchPush")
+
+
+def test_keys_ignore_names_places_and_resources(tmp_path: Path) -> None:
+    plain = plan(tmp_path, stages=[PRETRAIN, FINETUNE])
+    renamed = plan(
+        tmp_path,
+        name="other",
+        storage="elsewhere",
+        resources={"num_cpus": 1},
+        mlflow={"tracking_uri": "http://localhost:5000"},
+        tasks=["Mine"],
+        environments={
+            "Mine": BUILT_IN_TASKS["FetchPush"].model_dump(exclude={"name"}),
+        },
+        stages=[PRETRAIN | {"name": "one"}, FINETUNE | {"name": "two", "init_from": "one"}],
+    )
+    assert [node.key for node in renamed.nodes] == [node.key for node in plain.nodes]
+
+
+def settings(**changes: Any) -> RunSettings:
+    task = BUILT_IN_TASKS["FetchPush"]
+    base = {"task": task, "variant": "music-u", "seed": 0, "music": preset("music-u", task)}
+    return RunSettings.model_validate(base | changes)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"seed": 1},
+        {"env_steps": 200_001},
+        {"num_envs": 5},
+        {"evaluation": {"episodes": 21}},
+        {"tac": {"lr": 0.0011}},
+        {"tac": {"log_std_form": "tanh"}},
+        {"replay": {"hindsight_k": 1.0}},
+        {"music": preset("music-u", BUILT_IN_TASKS["FetchPush"]) | {"lr": 0.0011}},
+        {"task": BUILT_IN_TASKS["FetchPush"].model_copy(update={"horizon": 49})},
+        {"task": BUILT_IN_TASKS["FetchPickAndPlace"]},
+    ],
+    ids=lambda changes: next(iter(changes)),
+)
+def test_every_setting_is_part_of_the_key(changes: dict[str, Any]) -> None:
+    assert node_key(settings(**changes), None) != node_key(settings(), None)
+
+
+def test_what_counts_as_moved_is_part_of_the_key_where_it_counts() -> None:
+    task = BUILT_IN_TASKS["FetchPush"].model_copy(update={"moved_distance": 0.02})
+    assert node_key(settings(task=task), None) == node_key(settings(), None)
+    moved = {"replay": {"hindsight_episodes": "moved"}}
+    assert node_key(settings(task=task, **moved), None) != node_key(settings(**moved), None)
+
+
+def test_source_and_algorithm_version_are_part_of_the_key(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    keys = {node_key(settings(), None), node_key(settings(), "a"), node_key(settings(), "b")}
+    monkeypatch.setattr(plan_module, "ALGORITHM_VERSION", "other")
+    keys.add(node_key(settings(), None))
+    assert len(keys) == 4
+
+
+def test_spelling_a_default_out_changes_nothing() -> None:
+    spelt = settings(tac={"lr": 1e-3, "entropic_index": 1}, env_steps=200_000)
+    assert node_key(spelt, None) == node_key(settings(), None)
+
+
+def test_keys_are_the_same_in_another_process_with_other_hash_seeds(tmp_path: Path) -> None:
+    sweep = plan(tmp_path, stages=[PRETRAIN, FINETUNE])
+    code = (
+        "import sys, json; from music_rllib.config.load import load_sweep;"
+        "from music_rllib.experiment.plan import make_plan;"
+        "print(json.dumps([n.key for n in make_plan(load_sweep(sys.argv[1])).nodes]))"
+    )
+    found = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path / "sweep.yaml")],
+        env={"PYTHONHASHSEED": "12345", "LC_ALL": "C"},
+        capture_output=True,
+        check=True,
+        text=True,
+    )
+    assert json.loads(found.stdout) == [node.key for node in sweep.nodes]
+
+
+def test_keys_are_the_same_on_another_machine(tmp_path: Path) -> None:
+    """Finished runs are found again by these strings, wherever and whenever they were made.
+
+    They change with a setting's default, a new setting that is not in `YOUNGER`, or
+    `ALGORITHM_VERSION`, and then every run is trained anew: put new ones in only where that is
+    meant. Runs of version 2 are found by theirs for docs/results.md.
+    """
+    sweep = plan(tmp_path, stages=[PRETRAIN, FINETUNE])
+    assert {node.label: node.key for node in sweep.nodes} == KEYS
+    earlier = make_plan(load_sweep(tmp_path / "sweep.yaml"), algorithm="2")
+    assert {node.label: node.key for node in earlier.nodes} == KEYS_OF_VERSION_2
+
+
+KEYS = {
+    "pretrain/FetchPush/seed0": "c794936cb2dc8c92c17e",
+    "finetune/FetchPush/tac.entropic_index=1/seed0": "158884ff9a9fb74b58cc",
+    "finetune/FetchPush/tac.entropic_index=1.5/seed0": "1dbd381a355aaa56b154",
+    "finetune/FetchPush/tac.entropic_index=2/seed0": "d8ca6b8b0cbd5aa4dd78",
+}
+KEYS_OF_VERSION_2 = {
+    "pretrain/FetchPush/seed0": "cc3633961479f4eba8e8",
+    "finetune/FetchPush/tac.entropic_index=1/seed0": "114f4269fa291261ddf3",
+    "finetune/FetchPush/tac.entropic_index=1.5/seed0": "2429de382d2fc45ca2c8",
+    "finetune/FetchPush/tac.entropic_index=2/seed0": "f95441a1d346df33391d",
+}

@@ -1,0 +1,200 @@
+"""Mutual-information oracles of algorithms: known values, invariances, the two-frame reward."""
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from benchmarks.gaussians import capped_optimum, trained_bound, true_information
+from music_rllib.functional.mutual_information import (
+    donsker_varadhan,
+    shuffle_time,
+    time_permutations,
+)
+from music_rllib.intrinsic.estimator import MutualInformationEstimator, intrinsic_reward
+
+
+@pytest.mark.parametrize("rho, dims", [(0.5, 1), (0.9, 1), (0.5, 3)])
+def test_bound_approaches_what_the_cap_allows_and_never_exceeds_the_truth(
+    rho: float, dims: int
+) -> None:
+    truth = true_information(rho, dims)
+    bound = trained_bound(rho, dims, seed=0)
+    # 0.01: the sampling error of 160,000 held-out pairs, three standard deviations.
+    assert 0.9 * capped_optimum(rho, dims) < bound < min(truth, 2.0) + 0.01
+
+
+def test_bound_of_independent_inputs_is_zero() -> None:
+    assert abs(trained_bound(0.0, 2, seed=0, steps=200)) < 0.01
+
+
+def test_bound_ignores_a_constant_added_to_the_statistic() -> None:
+    joint, marginals = torch.randn(3, 7), torch.randn(3, 7)
+    shifted = donsker_varadhan(joint + 2.5, marginals + 2.5)
+    torch.testing.assert_close(shifted, donsker_varadhan(joint, marginals))
+
+
+def test_bound_is_capped_by_tanh() -> None:
+    joint, marginals = torch.ones(1, 50), -torch.ones(1, 50)
+    assert float(donsker_varadhan(joint, marginals)) == pytest.approx(2.0)
+
+
+def test_identity_on_two_frames_is_never_positive() -> None:
+    torch.manual_seed(0)
+    estimator = MutualInformationEstimator(3, 3)
+    x, y = torch.randn(100, 2, 3), torch.randn(100, 2, 3)
+    assert (estimator.transition_bound(x, y, swapped=False) <= 1e-6).all()
+    assert (estimator.transition_bound(x, y) > 0).any()
+
+
+def test_transition_bound_is_the_bound_written_out() -> None:
+    torch.manual_seed(1)
+    estimator = MutualInformationEstimator(3, 2)
+    x, y = torch.randn(5, 2, 3), torch.randn(5, 2, 2)
+    joint = (estimator(x[:, 0], y[:, 0]) + estimator(x[:, 1], y[:, 1])) / 2
+    crossed = (estimator(x[:, 0], y[:, 1]).exp() + estimator(x[:, 1], y[:, 0]).exp()) / 2
+    torch.testing.assert_close(estimator.transition_bound(x, y), joint - crossed.log())
+
+
+def test_bound_and_gradients_are_those_of_layer_by_layer() -> None:
+    generator = torch.Generator().manual_seed(2)
+    estimator = MutualInformationEstimator(3, 2, hidden_size=20).double()
+    x, y = (torch.randn(4, 11, n, generator=generator).double() for n in (3, 2))
+    permutations = time_permutations(4, 11, generator)
+
+    def statistics(agent: Tensor, surrounding: Tensor) -> Tensor:
+        hidden = torch.relu(estimator.agent(agent) + estimator.surrounding(surrounding))
+        return torch.tanh(estimator.output(hidden)).squeeze(-1)
+
+    def layer_by_layer(agent: Tensor, surrounding: Tensor) -> Tensor:
+        shuffled = shuffle_time(surrounding, permutations)
+        return donsker_varadhan(statistics(agent, surrounding), statistics(agent, shuffled))
+
+    def with_gradients(bound: Callable[[Tensor, Tensor], Tensor]) -> list[Tensor]:
+        halves = [half.clone().requires_grad_() for half in (x, y)]
+        values = bound(*halves)
+        wanted = [*halves, *estimator.parameters()]
+        return [values, *torch.autograd.grad(values.square().sum(), wanted)]
+
+    ours = with_gradients(lambda a, s: estimator.bound(a, s, permutations))
+    for one, other in zip(ours, with_gradients(layer_by_layer), strict=True):
+        torch.testing.assert_close(one, other)
+
+
+def test_resting_surroundings_earn_the_smallest_reward() -> None:
+    estimator = MutualInformationEstimator(3, 3)
+    x = torch.randn(10, 2, 3)
+    y = torch.randn(10, 1, 3).expand(10, 2, 3)
+    reward = intrinsic_reward(estimator.transition_bound(x, y), 5000.0)
+    # An object at rest makes swapping its frames change nothing: bound <= 0, reward -1.
+    torch.testing.assert_close(reward, torch.full((10,), -1.0), atol=5000 * 1e-6, rtol=0)
+
+
+def test_reward_is_the_clipped_scaled_bound() -> None:
+    bound = torch.tensor([-1.0, 0.0, 1e-4, 1.0])
+    expected = torch.tensor([-1.0, -1.0, -0.5, 0.0])
+    torch.testing.assert_close(intrinsic_reward(bound, 5000.0), expected)
+
+
+def correlated(rows: int) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    x, noise = torch.randn(2, 8, rows, 2, generator=generator)
+    return x, 0.9 * x + (1 - 0.9**2) ** 0.5 * noise
+
+
+@pytest.mark.parametrize(("offset", "spread"), [(1e6, 0.5), (-3e3, 1.0), (0.0, 1e4), (5e5, 3e4)])
+def test_inputs_far_from_0_are_learned_from_like_others(offset: float, spread: float) -> None:
+    def bound(x: Tensor, y: Tensor, *, adapts: bool) -> float:
+        torch.manual_seed(0)
+        estimator = MutualInformationEstimator(2, 2, hidden_size=32)
+        if adapts:
+            estimator.adapt_to(x, y)
+        adam = torch.optim.Adam(estimator.parameters(), 1e-2)
+        generator = torch.Generator().manual_seed(1)
+        for _ in range(100):
+            value = estimator.bound(x, y, time_permutations(8, 200, generator)).mean()
+            adam.zero_grad()
+            (-value).backward()
+            adam.step()
+        return float(value.detach())
+
+    x, y = correlated(200)
+    usual = bound(x, y, adapts=True)
+    assert usual > 0.5
+    far = (offset + spread * x, y - offset)
+    assert bound(*far, adapts=True) == pytest.approx(usual, rel=0.15)
+    if offset:
+        assert bound(*far, adapts=False) == 0.0, "what this is for"
+
+
+def test_inputs_near_0_are_used_raw_and_the_state_says_what_is_not() -> None:
+    x, y = correlated(20)
+    estimator, copy = MutualInformationEstimator(2, 2), MutualInformationEstimator(2, 2)
+    before = estimator(x + 1.3, y)
+    estimator.adapt_to(x + 1.3, y)
+    assert torch.equal(estimator(x + 1.3, y), before)
+    estimator.adapt_to(x + 1e6, y)
+    copy.load_state_dict(estimator.state_dict())
+    assert torch.equal(copy(x + 1e6, y), estimator(x + 1e6, y))
+    assert not torch.equal(copy(x + 1e6, y), before)
+
+
+def test_every_trajectory_has_its_own_permutation_unless_shared() -> None:
+    generator = torch.Generator().manual_seed(0)
+    own = time_permutations(6, 20, generator)
+    assert (own.sort(-1).values == torch.arange(20)).all()
+    assert not (own == own[0]).all()
+    shared = time_permutations(6, 20, generator, sharing=6)
+    assert (shared == shared[0]).all()
+
+
+COUNTS = torch.tensor([11, 2, 7, 3])
+INSIDE = torch.arange(11) < COUNTS.unsqueeze(1)
+
+
+@pytest.mark.parametrize("sharing", [1, 4])
+def test_of_unequal_trajectories_each_is_shuffled_by_itself(sharing: int) -> None:
+    generator = torch.Generator().manual_seed(0)
+    times = [
+        time_permutations(4, 11, generator, sharing=sharing, inside=INSIDE) for _ in range(500)
+    ]
+    for drawn in times:
+        assert (drawn.sort(-1).values == torch.arange(11)).all()
+        for row, count in zip(drawn, COUNTS.tolist(), strict=True):
+            assert (row[:count] < count).all()
+    # Every frame of its own is as likely as any other: 71 of 500 expected, deviation 8.
+    first = torch.stack(times)[:, 2, 0].bincount(minlength=7)
+    assert ((first - 500 / 7).abs() < 5 * 8).all()
+
+
+def test_bound_of_unequal_trajectories_is_that_of_each_by_itself() -> None:
+    generator = torch.Generator().manual_seed(2)
+    estimator = MutualInformationEstimator(3, 2, hidden_size=20).double()
+    x, y = (torch.randn(4, 11, n, generator=generator).double() for n in (3, 2))
+    permutations = time_permutations(4, 11, generator, inside=INSIDE)
+    together = estimator.bound(x, y, permutations, INSIDE)
+    alone = torch.stack(
+        [
+            estimator.bound(x[i : i + 1, :n], y[i : i + 1, :n], permutations[i : i + 1, :n])[0]
+            for i, n in enumerate(COUNTS.tolist())
+        ]
+    )
+    torch.testing.assert_close(together, alone)
+    parameters = list(estimator.parameters())
+    ours = torch.autograd.grad(together.sum(), parameters)
+    for one, other in zip(ours, torch.autograd.grad(alone.sum(), parameters), strict=True):
+        torch.testing.assert_close(one, other)
+    everything = torch.ones(4, 11, dtype=torch.bool)
+    whole = time_permutations(4, 11, generator)
+    torch.testing.assert_close(
+        estimator.bound(x, y, whole, everything), estimator.bound(x, y, whole)
+    )
+
+
+def test_shuffle_moves_whole_frames() -> None:
+    values = torch.arange(24.0).reshape(2, 4, 3)
+    permutation = torch.tensor([[3, 2, 1, 0], [0, 1, 2, 3]])
+    shuffled = shuffle_time(values, permutation)
+    assert torch.equal(shuffled[0], values[0].flip(0))
+    assert torch.equal(shuffled[1], values[1])

@@ -1,0 +1,397 @@
+"""The replay against a plain list of episodes."""
+
+import dataclasses
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from music_rllib.replay.buffer import ReplayLayout, Trajectory, TrajectoryReplay
+from music_rllib.replay.priorities import SumTree, WeightedDraws, rank_weights
+from music_rllib.replay.trajectories import WholeTrajectories
+
+LAYOUT = ReplayLayout(observation=3, action=2, goal=1, horizon=5)
+
+
+def episode(number: int, steps: int, *, terminated: bool = False) -> Trajectory:
+    """Every number in it tells episode and step: observation = (number, step, 0)."""
+    frames = np.zeros((steps + 1, LAYOUT.frame), np.float32)
+    frames[:, 0] = number
+    frames[:, 1] = np.arange(steps + 1)
+    frames[:, 3] = -1.0  # desired
+    frames[:, 4] = 100 * number + np.arange(steps + 1)  # achieved
+    actions = np.stack([np.full(steps, number), np.arange(steps)], 1).astype(np.float32)
+    return Trajectory(frames, actions, np.full(steps, -1.0, np.float32), terminated)
+
+
+def matches(achieved: np.ndarray, desired: np.ndarray) -> np.ndarray:
+    return np.where(achieved[:, 0] == desired[:, 0], 0.0, -1.0)
+
+
+def replay(capacity: int, **settings: Any) -> TrajectoryReplay:
+    return TrajectoryReplay(
+        LAYOUT, capacity, np.random.default_rng(0), goal_reward=matches, **settings
+    )
+
+
+@given(lengths=st.lists(st.integers(1, 5), min_size=1, max_size=40))
+@settings(deadline=None)
+def test_keeps_the_newest_whole_episodes_whatever_their_lengths(lengths: list[int]) -> None:
+    buffer, model = replay(12), deque[tuple[int, int]]()
+    for number, steps in enumerate(lengths):
+        buffer.extend([episode(number, steps, terminated=steps < 5)])
+        model.append((number, steps))
+        held = list(model)[-buffer.trajectories :]
+        assert len(buffer) == sum(steps for _, steps in held)
+        batch = buffer.sample_transitions(200)
+        seen = set(zip(batch.actions[:, 0], batch.actions[:, 1], strict=True))
+        assert seen <= {(n, t) for n, length in held for t in range(length)}
+        # A transition is one step of one episode, and its flags are that step's.
+        np.testing.assert_array_equal(batch.inputs[:, :2], batch.actions)
+        np.testing.assert_array_equal(batch.next_inputs[:, 0], batch.actions[:, 0])
+        np.testing.assert_array_equal(batch.next_inputs[:, 1], batch.actions[:, 1] + 1)
+        last = {n: length - 1 for n, length in held if length < 5}
+        ends = [last.get(int(n)) == t for n, t in batch.actions]
+        np.testing.assert_array_equal(batch.discounts == 0, ends)
+    assert buffer.trajectories >= 1
+    if all(steps == 5 for steps in lengths):
+        assert buffer.trajectories == min(len(lengths), 12 // 5)
+
+
+def test_full_episodes_fill_the_capacity_exactly() -> None:
+    buffer = replay(20)
+    buffer.extend([episode(n, 5) for n in range(11)])
+    assert len(buffer) == 20
+    assert set(buffer.sample_transitions(500).actions[:, 0]) == {7, 8, 9, 10}
+
+
+def test_transitions_are_drawn_uniformly_over_unequal_episodes() -> None:
+    buffer = replay(100)
+    buffer.extend([episode(0, 5), episode(1, 1), episode(2, 2)])
+    batch = buffer.sample_transitions(80_000)
+    counts = np.unique(batch.actions, axis=0, return_counts=True)[1]
+    assert len(counts) == 8
+    # 10,000 expected each, standard deviation 94.
+    assert (abs(counts - 10_000) < 5 * 94).all()
+
+
+def test_hindsight_takes_goals_achieved_later_and_recomputes_rewards() -> None:
+    buffer = replay(100, hindsight_k=4.0)
+    buffer.extend([episode(n, 5) for n in range(4)])
+    batch = buffer.sample_transitions(20_000)
+    goal, step, number = batch.inputs[:, 3], batch.inputs[:, 1], batch.inputs[:, 0]
+    relabelled = goal >= 0
+    assert relabelled.mean() == pytest.approx(0.8, abs=0.02)
+    later = goal[relabelled] - 100 * number[relabelled]
+    assert (later > step[relabelled]).all()
+    assert (later <= 5).all()
+    np.testing.assert_array_equal(batch.next_inputs[:, 3], goal)
+    reached = later == step[relabelled] + 1
+    np.testing.assert_array_equal(batch.rewards[relabelled], np.where(reached, 0.0, -1.0))
+    assert (batch.rewards[~relabelled] == -1.0).all()
+    # `future` is uniform over what follows: from step 0, each of the five later states.
+    first = later[step[relabelled] == 0]
+    assert np.bincount(first.astype(int), minlength=6)[1:].min() > 0.17 * len(first)
+    # Sampling never writes into the store.
+    assert (buffer.state()["frames"][:, 3] == -1.0).all()
+
+
+def resting(number: int, steps: int) -> Trajectory:
+    """An episode that achieves the same goal all the time."""
+    played = episode(number, steps)
+    frames = played.frames.copy()
+    frames[:, 4] = frames[0, 4]
+    return dataclasses.replace(played, frames=frames)
+
+
+def moving_replay(**settings: Any) -> TrajectoryReplay:
+    return replay(1100, hindsight_k=4.0, hindsight_episodes="moved", **settings)
+
+
+def test_hindsight_of_moved_episodes_leaves_out_those_that_reach_every_goal_at_once() -> None:
+    buffer = moving_replay()
+    buffer.extend([resting(n, 5) for n in range(3)])
+    # Nothing has moved yet: hindsight takes what there is.
+    assert (buffer.sample_transitions(1_000).inputs[:, 3] >= 0).mean() > 0.7
+    buffer.extend([episode(n, 5 if n % 2 else 3) for n in range(3, 15)])
+    restored = moving_replay()
+    restored.load_state(buffer.state())
+    for ring in (buffer, restored):
+        batch = ring.sample_transitions(20_000)
+        goal, number, step = batch.inputs[:, 3], batch.inputs[:, 0], batch.inputs[:, 1]
+        relabelled = goal >= 0
+        assert relabelled.mean() == pytest.approx(0.8, abs=0.02)
+        assert set(number[relabelled]) == set(range(3, 15))
+        # Uniform over the 48 transitions of those; the others are so over all that is held.
+        assert (number[relabelled] % 2 == 1).mean() == pytest.approx(30 / 48, abs=0.02)
+        assert set(number[~relabelled]) == set(range(15))
+        later = goal[relabelled] - 100 * number[relabelled]
+        assert (later > step[relabelled]).all()
+        reached = later == step[relabelled] + 1
+        np.testing.assert_array_equal(batch.rewards[relabelled], np.where(reached, 0.0, -1.0))
+
+
+@pytest.mark.parametrize(
+    ("moved", "others", "share"),
+    [
+        # And what it gets as one of all, in place of .8.
+        ([5], 200, 0.4),
+        # Of unequal ones the longest gets as much, each transition as any other.
+        ([5, 1, 1], 200, 0.4),
+        # From two of one length on it does not bind.
+        ([5, 5, 5], 100, 0.8 / 3),
+        ([5] * 10, 100, 0.08),
+    ],
+)
+def test_no_moved_episode_fills_more_than_two_fifths_of_a_minibatch(
+    moved: list[int], others: int, share: float
+) -> None:
+    buffer, again = moving_replay(), moving_replay()
+    buffer.extend([resting(n, 5) for n in range(others)])
+    buffer.extend([episode(others + n, steps) for n, steps in enumerate(moved)])
+    again.load_state(buffer.state())
+    batch, repeated = buffer.sample_transitions(40_000), again.sample_transitions(40_000)
+    np.testing.assert_array_equal(batch.inputs, repeated.inputs)
+    of_first = (batch.inputs[:, 0] == others).mean()
+    assert share - 0.01 < of_first < share + 5 / (5 * others) + 0.01
+    assert (batch.inputs[:, 3] >= 0).mean() == pytest.approx(0.8, abs=0.01)
+    counts = np.bincount(batch.inputs[:, 0].astype(int))[others:]
+    np.testing.assert_allclose(counts / counts[0], np.array(moved) / moved[0], atol=0.15)
+
+
+def dense(achieved: np.ndarray, desired: np.ndarray) -> np.ndarray:
+    away: np.ndarray = np.abs(achieved[:, 0] - desired[:, 0])
+    return -away
+
+
+@pytest.mark.parametrize("jitter", [1e-6, 0.049])
+def test_where_a_distance_is_given_jitter_is_no_move_even_with_dense_rewards(jitter: float) -> None:
+    def shaken(number: int, by: float) -> Trajectory:
+        played = resting(number, 5)
+        frames = played.frames.copy()
+        frames[:, 4] = 1.3
+        frames[3, 4] += by
+        return dataclasses.replace(played, frames=frames)
+
+    buffer = TrajectoryReplay(
+        LAYOUT,
+        500,
+        np.random.default_rng(0),
+        goal_reward=dense,
+        hindsight_k=4.0,
+        hindsight_episodes="moved",
+        moved_distance=0.05,
+    )
+    buffer.extend(
+        [shaken(n, jitter) for n in range(50)] + [shaken(50 + n, -0.06) for n in range(9)]
+    )
+    batch = buffer.sample_transitions(5_000)
+    assert batch.inputs[batch.inputs[:, 3] >= 0, 0].min() == 50
+
+
+def test_trajectories_of_one_length_come_whole_and_in_order() -> None:
+    buffer = replay(100)
+    buffer.extend([episode(n, 5) for n in range(3)])
+    whole = buffer.sample_trajectories(6_000)
+    assert whole.inside is None
+    assert whole.observations.shape == (6_000, 6, 3)
+    assert (whole.observations[:, :, 1] == np.arange(6)).all()
+    counts = np.bincount(whole.observations[:, 0, 0].astype(int))
+    np.testing.assert_allclose(counts, 2_000, atol=5 * 37)
+
+
+def test_trajectories_of_any_length_come_whole_each_by_its_steps() -> None:
+    buffer = replay(1_000)
+    # Mostly short ones, some of a single step, and the longest right at the ring's end.
+    lengths = [2] * 40 + [1] * 7 + [4] * 5 + [5]
+    buffer.extend([episode(n, steps) for n, steps in enumerate(lengths)])
+    whole = buffer.sample_trajectories(10_500)
+    assert whole.inside is not None
+    number = whole.observations[:, 0, 0].astype(int)
+    steps = np.array(lengths)[number]
+    assert (whole.observations[:, :, 0] == number[:, None]).all()
+    np.testing.assert_array_equal(whole.inside, np.arange(6) <= steps[:, None])
+    expected = np.minimum(np.arange(6), steps[:, None])
+    np.testing.assert_array_equal(whole.observations[:, :, 1], expected)
+    counts = np.bincount(number, minlength=len(lengths))
+    # 105 transitions of trajectories with two steps or more, a hundred draws for each.
+    np.testing.assert_allclose(counts, np.where(np.array(lengths) > 1, lengths, 0) * 100, atol=100)
+    assert counts[40:47].max() == 0
+
+
+def test_single_steps_are_whole_trajectories_where_there_is_nothing_else() -> None:
+    buffer = replay(100)
+    buffer.extend([episode(n, 1) for n in range(3)])
+    assert buffer.sample_trajectories(9).observations.shape == (9, 2, 3)
+    buffer.extend([episode(3, 3)])
+    assert set(buffer.sample_trajectories(9).observations[:, 0, 0]) == {3.0}
+
+
+@given(st.lists(st.integers(1, 6), min_size=1, max_size=6))
+def test_trajectories_are_put_side_by_side_as_they_are_read(counts: list[int]) -> None:
+    rng = np.random.default_rng(0)
+    frames = [rng.normal(size=(count, 2)).astype(np.float32) for count in counts]
+    whole = WholeTrajectories.of(frames)
+    inside = np.ones((len(counts), counts[0]), bool) if whole.inside is None else whole.inside
+    assert (whole.inside is None) == (len(set(counts)) == 1)
+    for one, row, held in zip(frames, whole.observations, inside, strict=True):
+        np.testing.assert_array_equal(row[held], one)
+        assert (row[~held] == one[-1]).all()
+
+
+@given(
+    lengths=st.lists(st.integers(1, 5), min_size=1, max_size=12),
+    choice=st.sampled_from(["all", "moved"]),
+)
+@settings(deadline=None, max_examples=40)
+def test_restored_replay_is_the_same_and_goes_on_the_same(lengths: list[int], choice: str) -> None:
+    original, restored = (replay(12, hindsight_k=4.0, hindsight_episodes=choice) for _ in range(2))
+    made = [(resting if n % 2 else episode)(n, steps) for n, steps in enumerate(lengths)]
+    original.extend(made)
+    original.sample_transitions(7)
+    state = original.state()
+    restored.load_state(state)
+    for name, value in restored.state().items():
+        np.testing.assert_equal(value, state[name])
+    for buffer in (original, restored):
+        buffer.extend([episode(50, 4)])
+    ours, theirs = original.sample_transitions(64), restored.sample_transitions(64)
+    for field in ("inputs", "actions", "rewards", "discounts", "next_inputs"):
+        np.testing.assert_array_equal(getattr(ours, field), getattr(theirs, field))
+
+
+def test_memory_is_what_the_documentation_says() -> None:
+    layout = ReplayLayout(observation=25, action=4, goal=3, horizon=50)
+    buffer = TrajectoryReplay(layout, 1_000_000, np.random.default_rng(0))
+    assert buffer.nbytes == pytest.approx(151e6, rel=0.005)
+
+
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (lambda: replay(4), "capacity must hold an episode of 5 steps, got 4"),
+        (lambda: replay(10).sample_transitions(1), "empty replay"),
+        (lambda: replay(10).sample_trajectories(1), "empty replay"),
+        (lambda: replay(10).extend([episode(0, 6)]), "1 to 5 steps, got 6"),
+        (
+            lambda: TrajectoryReplay(LAYOUT, 10, np.random.default_rng(0), hindsight_k=4),
+            "hindsight_k must be 0",
+        ),
+    ],
+)
+def test_bad_use_is_refused(make: Callable[[], object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+# -- by priority --------------------------------------------------------------------------------
+
+
+@given(
+    size=st.integers(1, 70),
+    writes=st.lists(st.tuples(st.integers(0, 69), st.floats(0, 10)), min_size=1, max_size=60),
+)
+def test_tree_holds_the_weights_and_draws_in_proportion(
+    size: int, writes: list[tuple[int, float]]
+) -> None:
+    tree, weights = SumTree(size), np.zeros(size)
+    for start in range(0, len(writes), 5):
+        part = [(index % size, weight) for index, weight in writes[start : start + 5]]
+        indices, values = (np.array(column) for column in zip(*part, strict=True))
+        tree.set(indices, values)
+        weights[indices] = values
+    np.testing.assert_allclose(tree[np.arange(size)], weights)
+    assert tree.total == pytest.approx(weights.sum())
+    if weights.sum() > 1e-6:
+        uniform = (np.arange(2000) + 0.5) / 2000
+        drawn = np.bincount(tree.draw(uniform), minlength=size)
+        # Evenly spread uniform numbers: every count is its expectation, but for rounding.
+        assert (abs(drawn - 2000 * weights / weights.sum()) < 2).all()
+        assert not drawn[weights == 0].any()
+    copy = SumTree(size)
+    copy.load_state(tree.state())
+    assert copy.total == tree.total
+
+
+def test_dense_ranks_leave_the_least_out_and_share_ties() -> None:
+    np.testing.assert_array_equal(rank_weights(np.array([0.3, 0.1, 0.3, 0.7])), [1, 0, 1, 2])
+    np.testing.assert_array_equal(rank_weights(np.array([0.2, 0.2])), [1, 1])
+
+
+@given(
+    weights=st.lists(st.sampled_from([0.0, 1e-9, 1.0, 2.0, 500.0]), min_size=1, max_size=60),
+    drawn=st.lists(st.floats(0, 1, exclude_max=True), max_size=20),
+)
+@settings(deadline=None)
+def test_weighted_draws_invert_the_running_sums(weights: list[float], drawn: list[float]) -> None:
+    assume(any(weights))
+    sums = np.cumsum(weights)
+    uniform = np.array([*drawn, 0.0, np.nextafter(1.0, 0.0), *(sums[:-1] / sums[-1])])
+    uniform = uniform[uniform < 1.0]
+    expected = np.searchsorted(sums, uniform * sums[-1], side="right")
+    np.testing.assert_array_equal(WeightedDraws(np.array(weights)).draw(uniform), expected)
+
+
+def test_music_p_draws_episodes_by_the_rank_of_their_priority() -> None:
+    replay = TrajectoryReplay(LAYOUT, 20, np.random.default_rng(0))
+    replay.extend([episode(n, 5) for n in range(4)], np.array([0.4, 0.1, 0.9, 0.4]))
+    drawn = replay.sample_transitions(60_000).actions
+    share = np.bincount(drawn[:, 0].astype(int), minlength=4) / 60_000
+    np.testing.assert_allclose(share, [0.25, 0.0, 0.5, 0.25], atol=0.01)
+    steps = np.bincount(drawn[:, 1].astype(int)) / 60_000
+    np.testing.assert_allclose(steps, 0.2, atol=0.01)
+    # The oldest episode makes room, and its rank goes with it.
+    replay.extend([episode(4, 5)], np.array([0.2]))
+    drawn = replay.sample_transitions(60_000).actions[:, 0].astype(int)
+    share = np.bincount(drawn, minlength=5) / 60_000
+    np.testing.assert_allclose(share, [0, 0, 3 / 6, 2 / 6, 1 / 6], atol=0.01)
+
+
+def test_per_draws_by_td_error_and_weights_undo_it() -> None:
+    replay = TrajectoryReplay(LAYOUT, 20, np.random.default_rng(0), td_exponent=0.5)
+    replay.extend([episode(0, 5), episode(1, 3)])
+    first = replay.sample_transitions(8_000)
+    assert first.rows is not None
+    assert first.weights is not None
+    np.testing.assert_allclose(np.bincount(first.rows)[first.rows], 1000, rtol=0.15)
+    rows = np.unique(first.rows)
+    errors = np.array([0, 1, 4, 9, 16, 25, 36, 49], np.float32)
+    replay.update_priorities(rows, errors)
+    batch = replay.sample_transitions(56_000, importance_exponent=1.0)
+    assert batch.rows is not None
+    assert batch.weights is not None
+    drawn = np.array([(batch.rows == row).sum() for row in rows])
+    np.testing.assert_allclose(drawn, 2000 * np.sqrt(errors), rtol=0.1, atol=20)
+    # Weighted by beta = 1, every transition with a positive error counts the same.
+    counted = np.array([batch.weights[batch.rows == row].sum() for row in rows[1:]])
+    np.testing.assert_allclose(counted / counted.mean(), 1.0, rtol=0.1)
+    assert batch.weights.max() == 1.0
+
+
+def test_per_forgets_what_was_overwritten_and_keeps_hindsight_inside_its_episode() -> None:
+    replay = TrajectoryReplay(
+        LAYOUT, 10, np.random.default_rng(0), goal_reward=matches, hindsight_k=4, td_exponent=0.6
+    )
+    for number, steps in enumerate([5, 2, 4, 3, 5, 1, 1, 5]):
+        replay.extend([episode(number, steps)])
+        batch = replay.sample_transitions(500)
+        held = set(batch.actions[:, 0].astype(int))
+        assert max(held) == number
+        assert len(held) <= replay.trajectories
+        np.testing.assert_array_equal(batch.next_inputs[:, 1], batch.actions[:, 1] + 1)
+        goal = batch.inputs[:, 3]
+        later = goal[goal >= 0] - 100 * batch.actions[goal >= 0, 0]
+        assert (later > batch.actions[goal >= 0, 1]).all()
+    assert batch.rows is not None
+    replay.update_priorities(batch.rows, np.ones(500, np.float32))
+    restored = TrajectoryReplay(
+        LAYOUT, 10, np.random.default_rng(1), goal_reward=matches, hindsight_k=4, td_exponent=0.6
+    )
+    restored.load_state(replay.state())
+    np.testing.assert_array_equal(
+        replay.sample_transitions(50).inputs, restored.sample_transitions(50).inputs
+    )

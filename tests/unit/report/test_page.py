@@ -1,0 +1,800 @@
+"""Reports on sweeps in every state, from runs in memory: what is said, drawn and left open."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from html import unescape
+from html.parser import HTMLParser
+from itertools import combinations, product
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from music_rllib import names
+from music_rllib.report.build import build_report, write_report
+from music_rllib.report.figures.choice import INFLUENCE
+from music_rllib.report.figures.draw import draw_all
+from music_rllib.report.figures.importance import CHANCE, importances, varied
+from music_rllib.report.figures.palette import DARK, LIGHT, colour_of, marker_of
+from music_rllib.report.figures.plots import _drawn
+from music_rllib.report.limitations import planned_runs
+from music_rllib.report.page import Report, render
+from music_rllib.results.analysis import THRESHOLDS, analyse
+from music_rllib.results.comparison import Scope, verdict
+from music_rllib.results.conditions import SIDE_BY_SIDE, Condition, find_stages, stage_by_stage
+from music_rllib.results.data import Points, RunRecord, Sweep, columns
+
+STEPS = range(20_000, 200_001, 20_000)
+CONFIG = """
+name: smoke
+tasks: [FetchPush]
+seeds: [0]
+stages:
+  - name: finetune
+    variant: tac
+    grid: {tac.entropic_index: [1.0, 1.5]}
+"""
+
+
+def one_run(
+    q: str,
+    seed: int,
+    *,
+    task: str = "FetchPush",
+    stage: str = "finetune",
+    status: str = "FINISHED",
+    params: Mapping[str, str] | None = None,
+    **tags: str,
+) -> RunRecord:
+    key = f"{stage}-{task}-{q}-{seed}-{sorted((params or {}).items())}-{sorted(tags.items())}"
+    return RunRecord(
+        run_id=f"id-{key}",
+        name=f"{stage}/{task}/q={q}/seed{seed}",
+        status=status,
+        started=0,
+        ended=60_000 if status == "FINISHED" else None,
+        params={
+            "seed": str(seed),
+            "env_steps": "200000",
+            "tac.entropic_index": q,
+            "task.name": task,
+            "music.mi_reward_weight": "0.5" if task == "FetchSlide" else "1.0",
+            **(params or {}),
+        },
+        tags={
+            names.TAG_NODE_KEY: key,
+            names.TAG_STAGE: stage,
+            names.TAG_VARIANT: "music-r",
+            names.TAG_TASK: task,
+            names.TAG_SEED: str(seed),
+            names.TAG_ENTROPIC_INDEX: q,
+            names.TAG_MI_REWARD_WEIGHT: "0.5" if task == "FetchSlide" else "1",
+            **tags,
+        },
+    )
+
+
+def climbing(final: float, upto: int = 200_000) -> Points:
+    """Success rises in a straight line to `final` at the end of the budget."""
+    steps = [step for step in STEPS if step <= upto]
+    values = [final * step / STEPS[-1] for step in steps]
+    return Points([names.EVAL_SUCCESS] * len(steps), steps, steps, values)
+
+
+def sweep_of(
+    runs: Sequence[tuple[RunRecord, Points]], *, status: str = "FINISHED", config: str | None = None
+) -> Sweep:
+    return Sweep(
+        name="smoke",
+        status=status,
+        run_id="parent",
+        experiment_id="1",
+        started=0,
+        source="sqlite:////results/mlflow.db",
+        tags={names.TAG_GIT_COMMIT: "c0ffee"},
+        config=config,
+        runs=[run for run, _ in runs],
+        history=columns(points for _, points in runs),
+    )
+
+
+def compared(finals: Mapping[str, Sequence[float]], **changes: str) -> Sweep:
+    return sweep_of(
+        [
+            (one_run(q, seed, **changes), climbing(final))  # type: ignore[arg-type]
+            for q, values in finals.items()
+            for seed, final in enumerate(values)
+        ]
+    )
+
+
+def report_on(sweep: Sweep) -> Report:
+    return build_report(sweep)
+
+
+def first_scope(sweep: Sweep) -> Scope[Condition]:
+    return analyse(sweep)[0].scopes[0]
+
+
+def said_about(sweep: Sweep) -> str:
+    return " ".join(verdict(first_scope(sweep)))
+
+
+# What is said -----------------------------------------------------------------------------------
+
+
+def test_a_clear_winner_is_named() -> None:
+    said = said_about(
+        compared({"1": [0.3, 0.32, 0.35, 0.31, 0.3], "1.5": [0.9, 0.92, 0.88, 0.95, 0.9]})
+    )
+    assert said.startswith(
+        "q = 1.5 is ahead on FetchPush: q = 1.5 with 0.91 (0.87 to 0.94, 5 seeds). "
+        "So large a gap comes by chance with p = 0.0079 at most"
+    )
+    assert "No winner" not in said
+
+
+def test_no_winner_where_a_gap_may_be_chance_and_how_many_seeds_would_tell() -> None:
+    said = said_about(
+        compared({"1": [0.5, 0.9, 0.6, 0.8], "1.5": [0.6, 0.95, 0.7, 0.8], "2": [0.1, 0.2, 0.1, 0]})
+    )
+    assert "No winner on FetchPush: q = 1.5" in said
+    # Four against four give 2 / 70 at best, three times for three comparisons.
+    assert "but from so few seeds the gap to q = 1 (0.06, " in said
+    assert "and q = 2 (0.66, " in said
+    # Squares .1 + .0675 + .02 over 9 degrees of freedom: .146; 34 seeds by the t test.
+    assert re.search(r"differ by 0\.1[45] .* about 3\d seeds per condition .* 3\d more than", said)
+
+
+def test_two_seeds_far_apart_are_no_evidence() -> None:
+    scope = first_scope(compared({"1": [0.1, 0.12], "1.5": [0.9, 0.95]}))
+    (pair,) = scope.comparisons
+    assert not pair.decided
+    assert "may be chance" in " ".join(verdict(scope))
+    assert pair.p_value == pytest.approx(2 / 6)
+
+
+@pytest.mark.parametrize("rate", [0.0, 1.0])
+def test_where_all_are_equal_nobody_is_highest_and_nothing_is_asked_for(rate: float) -> None:
+    said = said_about(compared({"1": [rate] * 3, "1.5": [rate] * 3, "2": [rate] * 3}))
+    assert said == f"All conditions are equal on FetchPush: each of their runs ended at {rate:.2f}."
+
+
+def test_conditions_that_share_the_first_place_are_level() -> None:
+    said = said_about(compared({"1": [1.0] * 3, "1.5": [0.5, 0.6, 0.7], "2": [1.0] * 3}))
+    assert said.startswith(
+        "No winner on FetchPush: q = 1 and q = 2 are level at 1.00, but from so few seeds the gap "
+        "to q = 1.5 (0.40, "
+    )
+    assert "highest" not in said
+
+
+@pytest.mark.parametrize(
+    "finals, end",
+    [
+        ({"1": [1.0, 0.98, 1.0], "1.5": [0.96, 0.98, 1.0]}, "ceiling"),
+        ({"1": [0.0, 0.02, 0.0], "1.5": [0.04, 0.02, 0.0]}, "floor"),
+    ],
+)
+def test_the_spread_at_a_bound_promises_nothing(finals: dict[str, list[float]], end: str) -> None:
+    said = said_about(compared(finals))
+    assert f"All are within 0.1 of the {end}, where seeds differ less" in said
+    assert "standard deviation" not in said
+    # Of two conditions the one that is clear of the bound tells it.
+    clear = said_about(compared({**finals, "2": [0.4, 0.6, 0.5]}))
+    assert "Seeds of the same condition differ by 0.10" in clear
+
+
+def test_a_threshold_that_nobody_reaches_is_said_to_be_that() -> None:
+    sweep = compared({"1": [0.3, 0.4], "1.5": [0.6, 0.7]})
+    page = render(report_on(sweep))
+    assert row_of(page, "FetchPush", "q = 1.5 before q = 1", "85 %") == [
+        *("–", "not reached by either", "–", "no")
+    ]
+    assert row_of(page, "FetchPush", "q = 1.5 before q = 1", "50 %")[0] == "1.00"
+
+
+@pytest.mark.parametrize(
+    "finals, expected",
+    [
+        ({"1.5": [0.5, 0.6]}, "Only one condition has finished"),
+        ({"1": [0.1], "1.5": [0.9]}, "every condition has a single seed, so there is no interval"),
+        ({"1": [0.1], "1.5": [0.9], "2": [0.5, 0.6]}, "q = 1 and q = 1.5 have a single seed"),
+        ({"1": [0.3, 0.3], "1.5": [0.4, 0.4]}, "Seeds ended alike: their spread does not tell"),
+    ],
+)
+def test_too_little_is_said_to_be_too_little(finals: dict[str, list[float]], expected: str) -> None:
+    assert expected in said_about(compared(finals))
+
+
+def searched(*runs: tuple[str, int, str, float]) -> Sweep:
+    """A search's runs, as (q, seed, part, final success rate)."""
+    return sweep_of(
+        [(one_run(q, seed, part=part), climbing(final)) for q, seed, part, final in runs]
+    )
+
+
+TRIALS = [("1", 0, "trial0", 0.5), ("1.2", 0, "trial1", 1.0), ("1.4", 0, "trial2", 0.9)]
+
+
+def test_trials_of_a_search_are_not_compared_on_the_seeds_that_chose_them() -> None:
+    sweep = searched(*TRIALS)
+    (analysis,) = analyse(sweep)
+    assert (analysis.races, analysis.scopes[0].comparisons) == ((), ())
+    assert len(analysis.scopes[0].finals) == 3, "they are in the table all the same"
+    assert said_about(sweep).startswith("Nothing is ranked on FetchPush: no trial of the search")
+
+
+def test_of_a_search_the_ranking_on_fresh_seeds_is_what_is_said() -> None:
+    fresh = [("1.2", seed, "final1", 0.6) for seed in (7, 8)]
+    fresh += [("1", seed, "final0", 0.7) for seed in (7, 8)]
+    said = said_about(searched(*TRIALS, *fresh))
+    assert "q = 1, seeds = fresh with 0.70" in said
+    assert "1.00" not in said, "the best of the trials, by luck"
+    (stage,) = find_stages(searched(*TRIALS, *fresh))
+    assert varied(stage.conditions) == ["q"]
+
+
+def test_of_a_search_the_ranking_is_drawn_as_soon_as_there_is_one() -> None:
+    fresh = [(q, seed, "final1", 0.6) for q in ("1", "1.2") for seed in (7, 8)]
+
+    def drawn(sweep: Sweep) -> set[str]:
+        (curves, *_) = report_on(sweep).drawings
+        return {label for label, _ in curves.legend}
+
+    assert drawn(searched(*TRIALS)) == {f"q = {q}, seeds = search" for q in ("1", "1.2", "1.4")}
+    assert drawn(searched(*TRIALS, *fresh)) == {f"q = {q}, seeds = fresh" for q in ("1", "1.2")}
+
+
+def test_a_run_that_failed_has_no_final_rate_but_counts_as_waiting() -> None:
+    failed = one_run("1", 1, status="FAILED")
+    sweep = sweep_of([(one_run("1", 0), climbing(0.9)), (failed, climbing(0.9, upto=60_000))])
+    (analysis,) = analyse(sweep)
+    (final,) = analysis.scopes[0].finals
+    assert final.seeds == 1
+    assert float(final.estimate.value) == pytest.approx(0.9)
+    half = next(wait for wait in analysis.waits if wait.threshold == THRESHOLDS[0])
+    assert (half.reached, half.runs, half.median) == (1, 2, 120_000)
+
+
+def test_over_all_tasks_only_seeds_that_finished_on_each_count() -> None:
+    """Otherwise a condition whose failures are on the hard task would look better."""
+    runs = [
+        (one_run("1", seed, task=task), climbing(final))
+        for task, finals in (("FetchPush", [0.9, 0.8]), ("FetchSlide", [0.3]))
+        for seed, final in enumerate(finals)
+    ]
+    over_all, push, _ = analyse(sweep_of(runs))[0].scopes
+    assert float(over_all.finals[0].estimate.value) == pytest.approx(0.6)
+    assert (over_all.finals[0].seeds, over_all.finals[0].runs) == (1, 2)
+    assert push.finals[0].seeds == 2
+
+
+# Which runs are compared ------------------------------------------------------------------------
+
+
+def labels(sweep: Sweep, stage: int = 0) -> list[str]:
+    return [condition.label for condition in find_stages(sweep)[stage].conditions]
+
+
+def test_tasks_with_their_own_settings_share_a_condition() -> None:
+    """MUSIC-r's weight is 1, and .5 on FetchSlide: that is no difference between conditions."""
+    runs = [
+        (one_run(q, seed, task=task), climbing(0.5))
+        for task in ("FetchPush", "FetchSlide")
+        for q in ("2", "1.5", "10")
+        for seed in (0, 1)
+    ]
+    assert labels(sweep_of(runs)) == ["q = 1.5", "q = 2", "q = 10"]
+
+
+def test_other_settings_and_the_source_tell_conditions_apart() -> None:
+    sources = [one_run(q, 0, stage="pretrain") for q in ("1", "2")]
+    runs = [
+        one_run("1.5", 0, params={"tac.lr": lr}, source_node=source.node_key)
+        for lr in ("0.001", "0.0003")
+        for source in sources
+    ]
+    sweep = sweep_of([(run, climbing(0.5)) for run in (*sources, *runs)])
+    assert labels(sweep, 1) == [
+        "q = 1.5, tac.lr = 0.0003, pretrain: q = 1",
+        "q = 1.5, tac.lr = 0.0003, pretrain: q = 2",
+        "q = 1.5, tac.lr = 0.001, pretrain: q = 1",
+        "q = 1.5, tac.lr = 0.001, pretrain: q = 2",
+    ]
+
+
+def test_schedules_with_the_same_words_are_not_one_condition() -> None:
+    runs = [
+        one_run("1 to 2", seed, params={"tac.entropic_index.begin": begin})
+        for begin in ("0.1", "0.3")
+        for seed in (0, 1)
+    ]
+    found = labels(sweep_of([(run, climbing(0.5)) for run in runs]))
+    assert len(found) == 2
+    assert all(label.startswith("q = 1 to 2 (") for label in found)
+
+
+# The page ---------------------------------------------------------------------------------------
+
+
+class Page(HTMLParser):
+    """Text, ids and whatever a browser would fetch."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.text = ""
+        self.ids: list[str] = []
+        self.fetched: list[str] = []
+        self.open: list[str] = []
+        self.tags: set[str] = set()
+        self.handlers: list[str] = []
+        self.feed(html)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        found = dict(attrs)
+        self.tags.add(tag)
+        self.handlers += [name for name in found if name.startswith("on")]
+        self.ids += [str(found["id"])] if "id" in found else []
+        for name in ("src", "href", "xlink:href", "srcset", "data"):
+            if tag != "a" and not str(found.get(name, "#")).startswith("#"):
+                self.fetched.append(f"{tag} {name}={found[name]}")
+        if tag not in ("meta", "br", "img", "link"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def row_of(page: str, *begin: str) -> list[str]:
+    """What stands in the one table row that begins so."""
+    rows = [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in page.split("<tr>")]
+    (found,) = [row[len(begin) :] for row in rows if row[: len(begin)] == list(begin)]
+    return found
+
+
+def partial() -> Sweep:
+    failure = "ValueError: <b>state</b> is NaN\n  in step"
+    return sweep_of(
+        [
+            (one_run("1", 0), climbing(0.9)),
+            (
+                one_run("1", 1, status="FAILED", failure=failure),
+                climbing(0.4, 40_000),
+            ),
+            (one_run("1.5", 0, status="RUNNING"), climbing(0.9, 100_000)),
+            (one_run("1.5", 1, status="KILLED"), Points((), (), (), ())),
+        ],
+        status="RUNNING",
+    )
+
+
+SWEEPS: dict[str, Callable[[], tuple[Sweep, Sequence[str]]]] = {
+    "empty": lambda: (
+        sweep_of([], status="RUNNING", config=CONFIG),
+        ["No run has begun", "2 runs not begun", "Sweeprunning"],
+    ),
+    "nothing evaluated": lambda: (
+        sweep_of([(one_run("1", 0, status="RUNNING"), Points((), (), (), ()))]),
+        [
+            "Nothing was evaluated yet",
+            "No condition has finished on FetchPush",
+            "1 run still running",
+        ],
+    ),
+    "partial": lambda: (
+        partial(),
+        [
+            "1 run failed",
+            "1 run still running",
+            "1 run stopped before the end",
+            "What failed and why",
+            "ValueError: <b>state</b> is NaN",
+            "The configuration is not in MLflow",
+            "no run of q = 1.5 has finished",
+        ],
+    ),
+    "single seed": lambda: (
+        compared({"1": [0.5], "1.5": [0.6]}),
+        ["has a single seed (0)", "no interval", "No winner"],
+    ),
+    "single q": lambda: (
+        compared({"1.5": [0.5, 0.6, 0.7]}),
+        ["a single condition (q = 1.5): no comparison", "0.60"],
+    ),
+    "odd name": lambda: (compared({"1.5": [0.5]}, task="My<Task>&"), ["My<Task>&"]),
+    "NaN": lambda: (
+        sweep_of(
+            [(one_run("1", 0), Points([names.EVAL_SUCCESS] * 2, [1, 2], [1, 2], [0.5, np.nan]))]
+        ),
+        ["No condition has finished"],
+    ),
+}
+
+
+@pytest.mark.parametrize("state", SWEEPS)
+def test_any_state_of_a_sweep_has_a_page(state: str) -> None:
+    sweep, expected = SWEEPS[state]()
+    shown = Page(render(report_on(sweep)))
+    for words in expected:
+        assert words in shown.text
+    assert not shown.fetched
+    assert not shown.open
+    assert len(shown.ids) == len(set(shown.ids))
+    assert "nan" not in re.findall(r"[a-z]+", shown.text.replace("NaN", ""))
+
+
+SCRIPT = "\"'><script>steal()</script><img src=//evil/x onerror=steal()><!-- $x_{1$ {{ 7*7 }} &"
+
+
+def hostile() -> Sweep:
+    """Somebody's sweep: a script in every text of it."""
+    tags = {names.TAG_ALPHA: SCRIPT, "failure": SCRIPT, "variant": SCRIPT}
+    runs = [
+        one_run(q, seed, task=SCRIPT, stage=stage, params={SCRIPT: q}, **tags)
+        for stage in (SCRIPT, f"{SCRIPT}2")
+        for q in ("1", "1.5", SCRIPT)
+        for seed in (0, 1)
+    ]
+    runs.append(one_run("1", 2, task=SCRIPT, stage=SCRIPT, status="FAILED", **tags))  # type: ignore[arg-type]
+    runs = [replace(run, name=SCRIPT, run_id=f"{SCRIPT}{i}") for i, run in enumerate(runs)]
+    search = {
+        "stage": SCRIPT,
+        "mode": SCRIPT,
+        "sampler": SCRIPT,
+        "objectives": [{"name": SCRIPT, "direction": SCRIPT}],
+        "arms": [
+            {
+                "values": {SCRIPT: SCRIPT},
+                "importance": {SCRIPT: 0.5},
+                "trials": [
+                    {"number": 0, "state": SCRIPT, "values": {SCRIPT: SCRIPT}, "reason": SCRIPT}
+                ],
+            }
+        ],
+        "ranking": [{"trial": SCRIPT, "values": {SCRIPT: SCRIPT}, "failure": SCRIPT}],
+    }
+    return replace(
+        sweep_of([(run, climbing(0.5)) for run in runs], status=SCRIPT, config=SCRIPT),
+        name=SCRIPT,
+        run_id=SCRIPT,
+        experiment_id=SCRIPT,
+        source=f"http://{SCRIPT}",
+        tags={names.TAG_GIT_COMMIT: SCRIPT, f"{names.TAG_VERSION_PREFIX}{SCRIPT}": SCRIPT},
+        searches=[search],
+    )
+
+
+def test_a_script_in_any_text_of_a_sweep_is_shown_as_text() -> None:
+    made = replace(report_on(hostile()), command=SCRIPT, missing=[SCRIPT])
+    page = render(made)
+    shown, harmless = Page(page), Page(render(report_on(grid_of_settings())))
+    assert shown.tags <= harmless.tags | {"nav", "a", "pre"}
+    assert not shown.handlers
+    assert not shown.fetched
+    assert not shown.open
+    # Whatever the page shows, it shows whole: no text ended a tag, or was taken for a formula.
+    assert shown.text.count(SCRIPT) > 50
+    assert page.count("&lt;script&gt;steal()") == page.count("script&gt;steal()")
+    labels = re.findall(r'<div role="img" aria-label="([^"]*)">', page)
+    assert unescape(labels[0]) == f"Success rate, {SCRIPT}"
+    for drawn in made.pictures.values():
+        elements = ElementTree.fromstring(drawn.files["svg"]).iter()
+        assert "script" not in {element.tag.rpartition("}")[2] for element in elements}
+
+
+def returning(finals: Mapping[str, Sequence[float]], task: str = "Reacher") -> Sweep:
+    """A task without success; each run's return climbs from -100 to its end."""
+    runs = []
+    for q, values in finals.items():
+        for seed, final in enumerate(values):
+            curve = [-100 + (final + 100) * step / STEPS[-1] for step in STEPS]
+            names_ = [names.EVAL_RETURN] * len(curve)
+            run = one_run(q, seed, task=task, params={"task.success_key": "None"})
+            runs.append((run, Points(names_, list(STEPS), list(STEPS), curve)))
+    return sweep_of(runs)
+
+
+def test_a_task_without_success_is_judged_by_its_return_everywhere() -> None:
+    sweep = returning({"1": [-9, -8, -7, -9.5, -8.5], "1.5": [-5, -4, -6, -4.5, -5.5]})
+    report = report_on(sweep)
+    shown = Page(render(report))
+    assert "Nothing was evaluated" not in shown.text
+    assert "q = 1.5 is ahead on Reacher: q = 1.5 with -5.00 (-5.98 to -4.02, 5 seeds)" in shown.text
+    drawn = {drawing.title: drawing for drawing in report.drawings}
+    assert list(drawn) == ["Return", "Final return"]
+    assert "return of an episode" in render(report)
+    assert {row[3] for row in drawn["Return"].values} == {names.EVAL_RETURN}
+    assert not report.analyses[0].waits, "there is no success rate to wait for"
+    assert row_of(render(report), "Reacher", "q = 1.5", "return") == [
+        *("-5.00", "-5.98 to -4.02", "-6.00 -5.50 -5.00 -4.50 -4.00", "5", "5")
+    ]
+    unsure = said_about(returning({"1": [-9, -8, -7], "1.5": [-8, -9, -6]}))
+    assert re.search(
+        r"With 3 seeds per condition a difference of \d\.\d\d is seen with 80 %", unsure
+    )
+
+
+def test_tasks_with_and_without_success_stand_side_by_side_and_are_not_averaged() -> None:
+    both = [
+        compared({"1": [0.5, 0.6], "1.5": [0.6, 0.7]}),
+        returning({"1": [-9, -8], "1.5": [-5, -4]}),
+    ]
+    runs = [run for sweep in both for run in sweep.runs]
+    points = []
+    for sweep in both:
+        metric = sweep.primary_metric(sweep.runs[0].task)
+        for position in range(len(sweep.runs)):
+            steps, values = sweep.series(position, metric)
+            points.append(Points([metric] * len(steps), list(steps), list(steps), list(values)))
+    report = report_on(sweep_of(list(zip(runs, points, strict=True))))
+    (analysis,) = report.analyses
+    assert [(scope.name, scope.metric) for scope in analysis.scopes] == [
+        ("FetchPush", names.EVAL_SUCCESS),
+        ("Reacher", names.EVAL_RETURN),
+    ]
+    titles = [drawing.title for drawing in report.drawings]
+    assert {"Success rate", "Return", "Final success rate", "Final return"} <= set(titles)
+    assert all(len(d.panels) == 1 for d in report.drawings), "each on its own tasks"
+
+
+STAGES = {"pretrain": "music-u", "plain": "tac", "with-a-rather-long-name": "music-r"}
+
+
+def of_stages(*stages: str) -> Sweep:
+    return sweep_of(
+        [
+            (one_run(q, seed, stage=stage, variant=STAGES[stage]), climbing(0.5))
+            for stage in stages
+            for q in ("1.0", "1.5")
+            for seed in range(2)
+        ]
+    )
+
+
+def test_stages_that_train_for_the_task_are_drawn_side_by_side() -> None:
+    report = report_on(of_stages(*STAGES))
+    (drawing,) = [one for one in report.drawings if one.stage == SIDE_BY_SIDE]
+    named = [(label, style.colour, style.line) for label, style in drawing.legend]
+    assert [label for label, _, _ in named] == [
+        f"{stage}, q = {q}" for stage in list(STAGES)[1:] for q in ("1.0", "1.5")
+    ]
+    colours = [colour for _, colour, _ in named]
+    assert colours[0] == colours[1] != colours[2] == colours[3]
+    assert len(set(named)) == 4
+    page = render(report)
+    assert f'id="{drawing.name}"' in page
+    assert page.index("Stages side by side") < page.index("Stage pretrain")
+    for one in (of_stages("pretrain", "plain"), of_stages("plain")):
+        assert "side by side" not in render(report_on(one))
+
+
+def test_stages_race_over_the_conditions_that_all_of_them_have() -> None:
+    finals = {"plain": {"1.0": 0.9, "1.5": 0.6, "2.0": 1.0}, "reward": {"1.0": 1.0, "1.5": 0.8}}
+    sweep = sweep_of(
+        [
+            (one_run(q, seed, stage=stage, variant="tac"), climbing(final))
+            for stage, of_stage in finals.items()
+            for q, final in of_stage.items()
+            for seed in range(2)
+        ]
+    )
+    report = report_on(sweep)
+    # To 50 %: 200,000 / final / 2 steps, the next evaluation; q = 2 has nobody to race with.
+    assert report.together is not None
+    (race,) = [race for race in report.together.races if race.threshold == 0.5]
+    assert (race.first, race.second, race.runs) == ("stage = reward", "stage = plain", (4, 4))
+    assert float(race.estimate.value) == (4 + 4 + 0 + 4) / 16
+    (scope,) = report.together.scopes
+    (pair,) = scope.comparisons
+    assert [final.runs for final in (pair.first, pair.second)] == [4, 4]
+    # At the end: 1 and 0.8 against 0.9 and 0.6, twice each.
+    assert float(pair.estimate.value) == 12 / 16
+    shown = render(report)
+    before, over = (f"stage = reward {word} stage = plain" for word in ("before", "over"))
+    assert shown.index(before) < shown.index(over) < shown.index("Stage plain")
+    plain = of_stages("plain")
+    assert stage_by_stage(plain, find_stages(plain)) is None
+
+
+def test_stages_are_compared_over_what_both_have_on_each_task() -> None:
+    """Otherwise what q does would pass for what the stage does."""
+    cells = [
+        *(("plain", "FetchPush", q) for q in ("1", "1.5")),
+        *(("reward", "FetchPush", q) for q in ("1", "1.5")),
+        ("plain", "FetchSlide", "1.5"),
+        *(("reward", "FetchSlide", q) for q in ("1", "1.5")),
+    ]
+    sweep = sweep_of(
+        [(one_run(q, 0, stage=stage, task=task), climbing(0.9)) for stage, task, q in cells]
+    )
+    together = stage_by_stage(sweep, find_stages(sweep))
+    assert together is not None
+    for condition in together.conditions:
+        found = [(sweep.runs[run].task, sweep.runs[run].entropic_index) for run in condition.runs]
+        assert found == [("FetchPush", "1"), ("FetchPush", "1.5"), ("FetchSlide", "1.5")]
+
+
+def test_a_legend_stays_inside_its_figure() -> None:
+    report = report_on(of_stages(*STAGES))
+    (drawing,) = [one for one in report.drawings if one.stage == SIDE_BY_SIDE]
+    for panels in (drawing.panels, drawing.panels * 2, drawing.panels * 3):
+        figure = _drawn(panels, drawing.legend, opaque=True)
+        figure.canvas.draw()
+        box, whole = figure.legends[0].get_window_extent(), figure.bbox
+        assert 0 <= box.x0 < box.x1 <= whole.x1
+        assert 0 <= box.y0 < box.y1 < figure.axes[0].get_window_extent().y0
+
+
+def test_figures_of_an_earlier_report_go_and_the_same_sweep_is_the_same_file(
+    tmp_path: Path,
+) -> None:
+    made = []
+    for name in ("one", "two"):
+        stale = tmp_path / name / "figures" / "old-stage-success-rate.png"
+        stale.parent.mkdir(parents=True)
+        stale.touch()
+        write_report(report_on(compared({"1": [0.5]})), tmp_path / name)
+        figures = sorted((tmp_path / name / "figures").iterdir())
+        assert [path.name for path in figures] == [
+            f"finetune-success-rate.{kind}" for kind in ("png", "svg")
+        ]
+        made.append(figures[1].read_bytes())
+    assert made[0] == made[1]
+
+
+def test_runs_link_to_a_server_s_pages() -> None:
+    sweep = compared({"1": [0.5]})
+    assert "<a href" not in render(report_on(sweep))
+    served = Sweep(**{**sweep.__dict__, "source": "http://mlflow:5000"})
+    assert f'<a href="http://mlflow:5000/#/experiments/1/runs/{sweep.runs[0].run_id}">' in (
+        render(report_on(served))
+    )
+
+
+def test_planned_runs_of_a_configuration() -> None:
+    planned = planned_runs(CONFIG)
+    assert planned is not None
+    assert len(planned) == 2
+    assert planned_runs("name: [") is None
+
+
+# Influence of settings --------------------------------------------------------------------------
+
+
+def grid_of_settings() -> Sweep:
+    """q decides, α helps a little, the weight does nothing; three seeds each."""
+    runs = []
+    for q, alpha, weight in product(("1", "2"), ("0.01", "0.1"), ("0.5", "1")):
+        for seed in range(3):
+            final = 0.3 + 0.5 * (q == "2") + 0.05 * (alpha == "0.1") + 0.01 * seed
+            params = {"tac.alpha": alpha, "music.mi_reward_weight": weight}
+            tags = {names.TAG_ALPHA: alpha, names.TAG_MI_REWARD_WEIGHT: weight}
+            runs.append((one_run(q, seed, params=params, **tags), climbing(final)))
+    return sweep_of(runs)
+
+
+def test_importance_with_many_seeds_is_found_in_seconds() -> None:
+    """As choices their number would be an exponent of the time it takes."""
+    rng = np.random.default_rng(0)
+    sweep = sweep_of(
+        [
+            (one_run(q, seed, params={"tac.alpha": alpha}), climbing(height + rng.normal(0, 0.05)))
+            for q, height in (("1", 0.2), ("1.5", 0.7))
+            for alpha in ("0.1", "0.2", "0.3")
+            for seed in range(30)
+        ]
+    )
+    shares = {one.setting: one.share for one in importances(sweep, analyse(sweep)[0])}
+    assert max(shares, key=lambda name: shares[name]) == "q"
+    assert 0 < shares[CHANCE] < 0.2
+
+
+def test_what_matters_is_found_and_drawn() -> None:
+    report = report_on(grid_of_settings())
+    (analysis,) = report.analyses
+    shares = {one.setting: one.share for one in importances(report.sweep, analysis)}
+    assert set(shares) == {"q", "α", "MI weight", CHANCE}
+    assert shares["q"] > 0.8
+    assert shares["MI weight"] < 0.05
+    assert sum(shares.values()) == pytest.approx(1.0)
+    panels = {drawing.title: [p.title for p in drawing.panels] for drawing in report.drawings}
+    assert panels["Sensitivity"] == ["FetchPush, q = 1", "FetchPush, q = 2"]
+    assert panels["Importance of settings"] == panels["Parallel coordinates"] == ["FetchPush"]
+    page = render(report)
+    for title in INFLUENCE:
+        assert f"<h3>{title}</h3>" in page
+    assert "Not drawn" not in page
+
+
+def test_one_varied_setting_gives_a_line_and_the_page_says_what_is_not_drawn() -> None:
+    tags = [{names.TAG_ALPHA: alpha} for alpha in ("0.01", "0.1")]
+    lines = sweep_of(
+        [
+            (one_run("1", s, params={"tac.alpha": t[names.TAG_ALPHA]}, **t), climbing(0.5 + s / 10))
+            for s in range(2)
+            for t in tags
+        ]
+    )
+    drawn = {drawing.title for drawing in report_on(lines).drawings}
+    assert "Sensitivity" in drawn
+    assert not drawn & set(INFLUENCE[1:])
+    only_q = Page(render(report_on(compared({"1": [0.5, 0.6], "2": [0.6, 0.7]})))).text
+    assert "Not drawn: sensitivity, importance of settings, parallel coordinates" in only_q
+    assert "This stage varies q;" in only_q
+
+
+def test_many_figures_are_the_same_drawn_one_by_one_and_in_processes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    drawings = report_on(grid_of_settings()).drawings
+    together = draw_all(drawings)
+    monkeypatch.setattr("music_rllib.report.figures.draw.FEW", len(drawings))
+    assert draw_all(drawings) == together
+
+
+# Colours ----------------------------------------------------------------------------------------
+
+COMPARED = ("0.5", "1", "1.5", "2", "3")
+# Machado, Oliveira and Fernandes 2009, severity 1.0, on linear RGB.
+VISION = {
+    "ordinary": np.eye(3),
+    "protanopia": np.array(
+        [
+            [0.152286, 1.052583, -0.204868],
+            [0.114503, 0.786281, 0.099216],
+            [-0.003882, -0.048116, 1.051998],
+        ]
+    ),
+    "deuteranopia": np.array(
+        [
+            [0.367322, 0.860646, -0.227968],
+            [0.280085, 0.672501, 0.047413],
+            [-0.01182, 0.04294, 0.968881],
+        ]
+    ),
+}
+
+
+def linear(colour: str) -> np.ndarray:
+    channels = np.array([int(colour[at : at + 2], 16) / 255 for at in (1, 3, 5)])
+    return np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
+
+
+def lab(rgb: np.ndarray) -> np.ndarray:
+    to_xyz = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
+    x, y, z = np.cbrt(np.clip(np.array(to_xyz) @ rgb, 0, None) / [0.9505, 1.0, 1.089])
+    return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
+
+
+def contrast(one: str, other: str) -> float:
+    light, dark = sorted(float(linear(c) @ [0.2126, 0.7152, 0.0722]) for c in (one, other))[::-1]
+    return (light + 0.05) / (dark + 0.05)
+
+
+@pytest.mark.parametrize("vision", VISION)
+def test_the_paper_s_values_of_q_are_told_apart(vision: str) -> None:
+    seen = {q: lab(np.clip(VISION[vision] @ linear(colour_of(q)), 0, 1)) for q in COMPARED}
+    for one, other in combinations(COMPARED, 2):
+        assert np.linalg.norm(seen[one] - seen[other]) > 15, (one, other)
+
+
+@pytest.mark.parametrize("q", [*COMPARED, "1.25", "1.75", "learned"])
+@pytest.mark.parametrize("paper", [LIGHT, DARK])
+def test_every_colour_stands_out_from_the_paper(q: str, paper: str) -> None:
+    """WCAG 2.1 asks for 3:1 of graphics."""
+    assert contrast(colour_of(q), paper) >= 3
+
+
+def test_a_colour_depends_on_q_alone() -> None:
+    assert colour_of("1.5") == colour_of("1.50") == colour_of("1 to 1.5")
+    assert len({colour_of(str(q)) for q in np.arange(0.5, 3.01, 0.25)}) == 11
+    grid = ("1", "1.25", "1.5", "1.75", "2")
+    assert len({marker_of(q) for q in grid}) == len(grid)

@@ -1,0 +1,121 @@
+"""Sittings put together: no run twice, none lost, and each with its own numbers."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from music_rllib import names
+from music_rllib.config.load import load_sweep
+from music_rllib.experiment.plan import make_plan
+from music_rllib.results.archive.merge import merged, of_plan
+from music_rllib.results.data import Points, RunRecord, Sweep, columns
+from music_rllib.version import ALGORITHM_VERSION
+
+
+def sweep(*runs: tuple[str, str, list[float]], run_id: str = "s") -> Sweep:
+    """(node, status, values at steps 0, 1, ...) each."""
+    records = [
+        RunRecord(
+            run_id=f"{run_id}-{node}",
+            name=node,
+            status=status,
+            started=0,
+            ended=1,
+            params={},
+            tags={names.TAG_NODE_KEY: node},
+        )
+        for node, status, _ in runs
+    ]
+    points = [
+        Points(["m"] * len(values), list(range(len(values))), [0] * len(values), values)
+        for _, _, values in runs
+    ]
+    own: dict[str, Any] = {"name": "n", "status": "FINISHED", "experiment_id": "1", "started": 0}
+    return Sweep(
+        **own,
+        run_id=run_id,
+        source="x",
+        tags={},
+        config=None,
+        runs=records,
+        history=columns(points),
+    )
+
+
+def told(found: Sweep) -> dict[str, tuple[str, list[float]]]:
+    return {
+        run.node_key: (run.run_id, list(found.series(i, "m")[1]))
+        for i, run in enumerate(found.runs)
+    }
+
+
+def test_runs_of_both_sittings_are_there_once_with_their_own_values() -> None:
+    first = sweep(("a", "FINISHED", [1, 2]), ("b", "KILLED", [3]), ("c", "FINISHED", [4]))
+    second = sweep(
+        ("d", "FINISHED", [5, 6]), ("b", "FINISHED", [3, 7]), ("c", "FAILED", [0]), run_id="t"
+    )
+    found = merged(first, second)
+    assert told(found) == {
+        "a": ("s-a", [1, 2]),
+        "b": ("t-b", [3, 7]),
+        "c": ("s-c", [4]),
+        "d": ("t-d", [5, 6]),
+    }
+    assert found.run_id == "t"
+
+
+def test_an_unfinished_run_is_the_later_one_and_merging_again_changes_nothing() -> None:
+    first, second = sweep(("a", "FAILED", [1])), sweep(("a", "RUNNING", []), run_id="t")
+    assert told(merged(first, second)) == {"a": ("t-a", [])}
+    whole = sweep(("a", "FINISHED", [1]), ("b", "FINISHED", [2]))
+    assert told(merged(whole, whole)) == told(whole)
+    empty = sweep()
+    assert told(merged(empty, whole)) == told(merged(whole, empty)) == told(whole)
+    assert np.all(np.diff(merged(whole, whole).history["m"].run) >= 0)
+
+
+def test_a_plans_runs_are_found_in_other_sweeps_exports(tmp_path: Path) -> None:
+    file = tmp_path / "sweep.yaml"
+    file.write_text(
+        "{name: mine, tasks: [FetchPush], seeds: [0, 1, 2], "
+        "stages: [{name: first, variant: tac, grid: {tac.entropic_index: [1.0, 2.0]}}]}"
+    )
+    plan = make_plan(load_sweep(file))
+    keys = [node.key for node in plan.nodes]
+    exports = [
+        sweep(("other", "FINISHED", [9]), (keys[4], "FINISHED", [1, 2]), (keys[0], "KILLED", [3])),
+        sweep((keys[0], "FINISHED", [4]), (keys[4], "FAILED", [5]), run_id="t"),
+    ]
+    found = of_plan(plan, exports)
+    assert found is not None
+    assert told(found) == {keys[0]: ("t-" + keys[0], [4]), keys[4]: ("s-" + keys[4], [1, 2])}
+    assert [(run.name, run.stage, run.tags[names.TAG_TRIAL]) for run in found.runs] == [
+        ("first/FetchPush/tac.entropic_index=1/seed0", "first", "0"),
+        ("first/FetchPush/tac.entropic_index=2/seed1", "first", "1"),
+    ]
+    assert of_plan(plan, [sweep(("other", "FINISHED", [9]))]) is None
+
+
+def test_runs_of_an_earlier_version_are_found_where_there_are_none_of_a_later_one(
+    tmp_path: Path,
+) -> None:
+    """Of a run and of what starts from it; each says which version it is of."""
+    file = tmp_path / "sweep.yaml"
+    file.write_text(
+        "{name: mine, tasks: [FetchPush], seeds: [0, 1], stages: [{name: u, variant: music-u},"
+        " {name: r, variant: music-r, init_from: u}]}"
+    )
+    plan, earlier = make_plan(load_sweep(file)), make_plan(load_sweep(file), algorithm="2")
+    now, before = ([node.key for node in one.nodes] for one in (plan, earlier))
+    assert not set(now) & set(before)
+    exports = [
+        sweep(*((key, "FINISHED", [2.0]) for key in before)),
+        sweep((now[1], "FINISHED", [3])),
+    ]
+    found = of_plan(plan, exports, earlier)
+    assert found is not None
+    expected = [before[0], now[1], *before[2:]]
+    assert [run.node_key for run in found.runs] == expected
+    algorithms = [run.tags[names.TAG_ALGORITHM] for run in found.runs]
+    assert algorithms == ["2", ALGORITHM_VERSION, "2", "2"]

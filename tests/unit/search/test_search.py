@@ -1,0 +1,391 @@
+"""Searches: what a trial is worth, and mistakes in their settings."""
+
+from __future__ import annotations
+
+import math
+import tracemalloc
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from pydantic import ValidationError
+
+from music_rllib import names
+from music_rllib.config.load import load_sweep
+from music_rllib.config.problems import ConfigError
+from music_rllib.config.search.space import Objective, Pruning, Rung, SearchSettings
+from music_rllib.search.objective import aggregate, prune, score
+from music_rllib.search.storage import same_database
+from music_rllib.store.run_record import Report
+from tests.played_search import Document, document
+
+
+@pytest.mark.parametrize(
+    ("how", "expected"),
+    [("iqm", 4.0), ("mean", 14.0), ("median", 4.0), ("worst_task", 2.5)],
+)
+def test_aggregates(how: str, expected: float) -> None:
+    # Two tasks in columns, four seeds: 1..4 and 4, 5, 6, 87; the middle half is 3, 4, 4, 5.
+    scores = np.array([[1.0, 4.0], [2.0, 5.0], [3.0, 6.0], [4.0, 87.0]])
+    assert aggregate(Objective(aggregate=how), scores) == pytest.approx(expected)
+
+
+def test_the_worst_task_of_something_minimised_is_the_highest() -> None:
+    objective = Objective(aggregate="worst_task", direction="minimize")
+    assert aggregate(objective, np.array([[1.0, 9.0], [3.0, 11.0]])) == 10.0
+
+
+@pytest.mark.parametrize(
+    ("objective", "expected"),
+    [
+        ({}, 0.5),
+        ({"read": "best"}, 0.8),
+        ({"read": "mean"}, 0.5),
+        ({"read": "steps_to", "threshold": 0.6}, 2000.0),
+        ({"read": "steps_to", "threshold": 0.9}, 5000.0),
+        ({"metric": "env_steps"}, 3000.0),
+    ],
+)
+def test_a_runs_number(objective: Document, expected: float) -> None:
+    history = [
+        Report(env_steps=1000 * at, seconds=0, timestamp_ms=0, metrics={names.EVAL_SUCCESS: value})
+        for at, value in ((1, 0.2), (2, 0.8), (3, 0.5))
+    ]
+    assert score(Objective(**objective), history, 5000) == pytest.approx(expected)
+
+
+def test_a_trial_is_stopped_only_if_its_interval_says_so() -> None:
+    pruning = Pruning(rungs=(Rung(seeds=2),), keep=0.3, confidence=0.9)
+    others = {n: np.array([[0.7 + 0.01 * n], [0.72 + 0.01 * n]]) for n in range(6)}
+
+    def verdict(values: list[float]) -> Any:
+        scores = np.array(values)[:, None]
+        return prune(Objective(), pruning, scores=scores, others=others, place="here")
+
+    assert verdict([0.2, 0.22]).stop
+    assert "[0.1" in verdict([0.2, 0.22]).reason
+    assert not verdict([0.9, 0.9]).stop
+    wide = verdict([0.2, 0.9])
+    assert not wide.stop
+    assert "its interval" in wide.reason
+    lower = Objective(direction="minimize")
+    worse = prune(lower, pruning, scores=np.array([[2.0], [2.1]]), others=others, place="here")
+    assert worse.stop
+
+
+@pytest.mark.parametrize("how", ["iqm", "mean", "median", "worst_task"])
+@pytest.mark.parametrize(("tasks", "apart"), [(1, 0.0), (8, 0.0), (8, 20.0)])
+def test_a_trial_as_good_as_its_only_rival_is_seldom_stopped(
+    how: str, tasks: int, apart: float
+) -> None:
+    """With 90 % intervals in one of eight cases or less, however far the tasks are apart."""
+    rng = np.random.default_rng(0)
+    draws = rng.normal(size=(1500, 2, 3, tasks)) + apart * np.arange(tasks)
+    objective, pruning = Objective(aggregate=how), Pruning(rungs=(Rung(seeds=3),))
+    stopped = [
+        prune(objective, pruning, scores=mine, others={0: rival}, place="here").stop
+        for mine, rival in draws
+    ]
+    assert np.mean(stopped) < 0.125 + 2 * math.sqrt(0.125 * 0.875 / len(draws))
+
+
+def test_the_spread_counts_each_seed_of_a_trial_once() -> None:
+    rng = np.random.default_rng(0)
+    whole = {number: rng.normal(size=(4, 1)) for number in range(3)}
+    pruning = Pruning(rungs=(Rung(seeds=2),), keep=0.1)
+
+    def reason(seeds: int, more: Mapping[int, Any]) -> str:
+        others = {number: scores[:seeds] + 50 for number, scores in whole.items()}
+        mine = np.zeros((seeds, 1))
+        return prune(
+            Objective(), pruning, scores=mine, others=others, whole=more, place="here"
+        ).reason
+
+    assert reason(2, whole) == reason(2, {}), "their seeds here tell the spread"
+    assert "[-inf, inf]" in reason(1, {})
+    assert "does not reach" in reason(1, whole), "only their later seeds do"
+
+
+@pytest.mark.parametrize("name", ["search", "compare"])
+def test_the_shipped_examples_are_sound(name: str) -> None:
+    config = load_sweep(Path(__file__).parents[3] / f"tune_configs/{name}.yaml")
+    settings = config.stages[-1].search
+    assert settings is not None
+    assert settings.mode == name
+
+
+# --- the space ---------------------------------------------------------------------------------
+
+
+def memory_of(call: Callable[[], Any]) -> int:
+    """Bytes that `call` has allocated at its worst."""
+    tracemalloc.start()
+    try:
+        call()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    ("dimension", "inside", "outside"),
+    [
+        ({"float": [1, 2]}, [1, 1.3, 2.0], [0.9, 2.1, True, "1", {"learned": True}, None]),
+        ({"float": [1, 2], "step": 0.3}, [1, 1.3, 1.9], [1.2, 2, 1.3001]),
+        ({"int": [10, 20_000_000]}, [10, 20.0, 20_000_000], [9, 20.5, False, "20"]),
+        ({"int": [64, 300], "step": 64}, [64, 256], [65, 300]),
+        ({"choice": [1.0, {"a": [1]}]}, [1, {"a": [1.0]}], [True, {"a": [True]}, {"a": 1}, 2]),
+    ],
+)
+def test_which_values_a_dimension_has(
+    dimension: Document, inside: list[Any], outside: list[Any]
+) -> None:
+    found = SearchSettings.model_validate({"space": {"x": dimension}, "trials": 1}).space["x"]
+    assert [value for value in inside if not found.contains(value)] == []
+    assert [value for value in outside if found.contains(value)] == []
+    assert memory_of(lambda: found.contains(15)) < 100_000, "none of the others is made"
+
+
+def test_a_grid_is_counted_before_it_is_made() -> None:
+    numbers = {"int": [1, 1000]}
+    space = {"x": {"choice": ["a", "b"]}, "y": numbers, "z": numbers | {"when": {"x": "a"}}}
+    settings = {"space": space, "sampler": "grid"}
+
+    def refused() -> None:
+        with pytest.raises(ValidationError, match=r"at most 100,000 points .* got 1,001,000 up to"):
+            SearchSettings.model_validate(settings)
+
+    assert memory_of(refused) < 5_000_000
+    space["y"] = {"int": [1, 90]}
+    assert SearchSettings.model_validate(settings).count == 90 * 1000 + 90
+
+
+# --- mistakes ----------------------------------------------------------------------------------
+
+BRANCHES: Document = {
+    "tac.bootstrap": {"choice": ["value", "critics"]},
+    "tac.policy_critic": {"choice": ["first", "min"], "when": {"tac.bootstrap": "critics"}},
+}
+RAMP: Document = {"schedule": "linear", "start": 1.0, "end": 2.0}
+COMPARED: Document = {"mode": "compare", "space": {"tac.alpha": {"float": [0.1, 0.2]}}}
+MISTAKES: list[tuple[Document, str]] = [
+    ({"trials": None}, "search.trials must be given with sampler: tpe, got null"),
+    (
+        {"space": {"tac.alpha": {"float": [0.5, 0.1]}}},
+        "search.space.tac.alpha must be [lowest, highest], got [0.5, 0.1]",
+    ),
+    (
+        {"space": {"tac.alpha": {"float": [0.0, 0.1], "log": True}}},
+        "search.space.tac.alpha must be above 0 to be searched in the logarithm",
+    ),
+    (
+        {"space": {"tac.alpha": {"flaot": [0.0, 0.1]}}},
+        "search.space.tac.alpha must have exactly one of float, int and choice",
+    ),
+    (
+        {"space": {"tac.entropic_index": {"float": [0, 2]}}},
+        "search.space.tac.entropic_index must be > 0, got 0",
+    ),
+    (
+        {"space": {"tac.entropic_indx": {"float": [1, 2]}}},
+        "is not a known setting (did you mean 'entropic_index'?)",
+    ),
+    (
+        {"space": {"seed": {"int": [1, 2]}}},
+        "seed is never a grid dimension",
+    ),
+    (
+        {"space": {"tac.lr": {"float": [0.1, 1], "when": {"tac.tau": 1}}}},
+        "space.tac.lr.when must name settings that stand above it, got 'tac.tau'",
+    ),
+    ({"sampler": "grid"}, "space.tac.alpha must have a step to be part of a grid"),
+    (
+        {"sampler": "cmaes", "space": {"tac.policy_critic": {"choice": ["min", "first"]}}},
+        "space.tac.policy_critic must be a number without 'when' for sampler: cmaes",
+    ),
+    ({"mode": "compare"}, "compare must be given with mode: compare, and only there"),
+    (
+        {"objective": {"metric": "evaluation/succes_rate"}},
+        "must be a metric that runs report",
+    ),
+    ({"objective": {"read": "steps_to"}}, "threshold must be given with read: steps_to"),
+    (
+        {"points_to_evaluate": [{"tac.alpha": 3}]},
+        "points_to_evaluate[0].tac.alpha must be in [0.005, 0.5], got 3",
+    ),
+    (
+        {
+            "space": {"tac.entropic_index": {"float": [1, 2], "step": 0.5}},
+            "points_to_evaluate": [{"tac.entropic_index": 1.3}],
+        },
+        "points_to_evaluate[0].tac.entropic_index must be in [1, 2] and whole steps of 0.5 from 1, "
+        "got 1.3",
+    ),
+    (
+        {
+            "space": {"tac.batch_size": {"int": [10, 30]}},
+            "points_to_evaluate": [{"tac.batch_size": 20.5}],
+        },
+        "points_to_evaluate[0].tac.batch_size must be a whole number in [10, 30], got 20.5",
+    ),
+    (
+        {
+            "space": {"tac.batch_size": {"int": [64, 256], "step": 64}},
+            "points_to_evaluate": [{"tac.batch_size": 128}, {"tac.batch_size": 100}],
+        },
+        "points_to_evaluate[1].tac.batch_size must be a whole number in [64, 256] and whole steps "
+        "of 64 from 64, got 100",
+    ),
+    (
+        {"space": BRANCHES, "points_to_evaluate": [{"tac.bootstrap": "both"}]},
+        'points_to_evaluate[0].tac.bootstrap must be one of ["value", "critics"], got "both"',
+    ),
+    (
+        {
+            "space": BRANCHES,
+            "points_to_evaluate": [{"tac.bootstrap": "value", "tac.policy_critic": "min"}],
+        },
+        '[0].tac.policy_critic must only be given beside tac.bootstrap: "critics", got {"tac',
+    ),
+    (
+        {"space": BRANCHES, "points_to_evaluate": [{"tac.policy_critic": "min"}]},
+        '[0].tac.policy_critic must only be given beside tac.bootstrap: "critics", got {"tac',
+    ),
+    (
+        {"trials": 2, "points_to_evaluate": [{"tac.alpha": 0.1}] * 3},
+        "points_to_evaluate must not be more than the trials (2), got 3",
+    ),
+    (
+        {
+            "space": {
+                "tac.batch_size": {"int": [64, 256]},
+                "tac.lr": {"float": [0.1, 1], "when": {"tac.batch_size": 300}},
+            }
+        },
+        "space.tac.lr.when must hold values of tac.batch_size, got 300",
+    ),
+    (
+        {
+            "space": BRANCHES
+            | {
+                "tac.tau": {
+                    "float": [0.1, 0.2],
+                    "when": {"tac.bootstrap": "value", "tac.policy_critic": "min"},
+                }
+            }
+        },
+        "space.tac.tau.when must be able to hold, got {",
+    ),
+    (
+        {"sampler": "grid", "space": {"tac.batch_size": {"int": [1, 50_000_000]}}},
+        "space must have at most 100,000 points with sampler: grid, got 50,000,000",
+    ),
+    (
+        COMPARED | {"compare": {"tac.entropic_index": [1.0, 1]}},
+        "search.compare.tac.entropic_index[1] must not repeat, got 1 again",
+    ),
+    (
+        COMPARED | {"compare": {"tac.entropic_index": [RAMP, RAMP | {"begin": 0.1}]}},
+        "search.compare.tac.entropic_index must not have two equal values, got {",
+    ),
+    (
+        {"space": {"tac.batch_size": {"choice": [16, 32, 16]}}},
+        "search.space.tac.batch_size.choice[2] must not repeat, got 16 again",
+    ),
+    (
+        {"space": {"pretrain:tac.entropic_index": {"choice": [RAMP, RAMP | {"begin": 0.1}]}}},
+        "search.space.pretrain:tac.entropic_index must not have two equal values, got {",
+    ),
+    (
+        {"pruning": {"rungs": [{"seeds": 2}, {"seeds": 1}]}},
+        "pruning.rungs must grow in seeds or env_steps and never shrink",
+    ),
+    (
+        {"pruning": {"rungs": [{"seeds": 1}, {"seeds": 9}]}},
+        "pruning.rungs[1].seeds must be <= 3, the number of the sweep's seeds, got 9",
+    ),
+    (
+        {"pruning": {"rungs": [{"env_steps": 5000}]}},
+        "pruning.rungs[0].env_steps must be <= 4000, the longest run's env steps, got 5000",
+    ),
+    (
+        {
+            "space": {"env_steps": {"int": [6000, 9000], "step": 1000}},
+            "pruning": {"rungs": [{"env_steps": 9000}, {"env_steps": 9001}]},
+        },
+        "pruning.rungs[1].env_steps must be <= 9000, the longest run's env steps, got 9001",
+    ),
+    (
+        COMPARED
+        | {"compare": {"env_steps": [2000, 3000]}, "pruning": {"rungs": [{"env_steps": 4000}]}},
+        "pruning.rungs[0].env_steps must be <= 3000, the longest run's env steps, got 4000",
+    ),
+    (
+        {"space": {"warmup:tac.lr": {"float": [0.1, 1]}}},
+        "must name settings of this stage or of the one it starts from, which is 'pretrain'",
+    ),
+]
+
+
+@pytest.mark.parametrize(("search", "message"), MISTAKES, ids=[text[:45] for _, text in MISTAKES])
+def test_mistakes_in_a_search_are_named(search: Document, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "sweep.yaml"
+    path.write_text(yaml.safe_dump(document(search)))
+    with pytest.raises(ConfigError) as error:
+        load_sweep(path)
+    assert message in str(error.value)
+    assert "sweep.yaml:" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("objective", "message"),
+    [
+        ({"aggregate": "bogus"}, "search.objective.aggregate must be 'iqm', 'mean', 'median' or"),
+        ([{}, {"aggregate": "bogus"}], "search.objective[1].aggregate must be 'iqm', 'mean',"),
+        ("evaluation/return", "search.objective must be a mapping of keys to values, got"),
+    ],
+)
+def test_a_mistake_in_the_objective_is_one_error(
+    objective: Any, message: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "sweep.yaml"
+    path.write_text(yaml.safe_dump(document({"objective": objective})))
+    with pytest.raises(ConfigError) as error:
+        load_sweep(path)
+    (line,) = error.value.lines
+    assert message in line
+
+
+def test_a_rung_may_be_beyond_the_shorter_tasks(tmp_path: Path) -> None:
+    content = document({"pruning": {"rungs": [{"env_steps": 5000}]}})
+    content["tasks"] = ["FetchPush", "FetchSlide"]
+    content["stages"][1]["per_task"] = {"FetchSlide": {"env_steps": 6000}}
+    path = tmp_path / "sweep.yaml"
+    path.write_text(yaml.safe_dump(content))
+    load_sweep(path)
+    content["stages"][1]["per_task"]["FetchSlide"]["env_steps"] = 4500
+    path.write_text(yaml.safe_dump(content))
+    with pytest.raises(ConfigError, match="must be <= 4500"):
+        load_sweep(path)
+
+
+@pytest.mark.parametrize(
+    ("other", "same"),
+    [
+        ("studies.db", True),
+        ("sqlite:///studies.db", True),
+        ("./here/../studies.db", True),
+        ("{here}/studies.db", True),
+        ("sqlite:///{here}/studies.db", True),
+        ("others.db", False),
+        ("postgresql://host/studies.db", False),
+    ],
+)
+def test_a_database_is_known_by_any_of_its_names(
+    other: str, same: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert same_database("studies.db", other.format(here=tmp_path)) is same

@@ -1,0 +1,295 @@
+"""The served policy's web application, over loopback: answers, refusals, and a fuzzer."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import requests
+import uvicorn
+from pydantic import TypeAdapter, ValidationError
+
+from music_rllib.serve.api import make_api, token_hash
+from music_rllib.serve.docs_page import docs_page
+from music_rllib.serve.schema import Array, PolicyFacts, Rows, compute, request_model
+
+OBSERVATION, GOAL = 4, 2
+
+
+class Sums:
+    """Actions that can be computed by hand: sums of the observation and of the goal."""
+
+    observation_size, goal_size, action_size = OBSERVATION, GOAL, 2
+
+    def act(self, observation: Any) -> Array:
+        return np.stack([observation[name].sum(1) for name in ("observation", "desired_goal")], 1)
+
+
+@contextmanager
+def serving(token: str | None = None) -> Iterator[str]:
+    """The application on a free port; gives its URL."""
+    policy = Sums()
+
+    async def act(rows: Rows) -> Array:
+        return compute(policy, [rows])[0]
+
+    api = make_api(PolicyFacts.of("Point", policy), act, token_hash(token) if token else None)
+    server = uvicorn.Server(uvicorn.Config(api, log_level="critical", ws="none"))
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]})
+        thread.start()
+        while not server.started:
+            time.sleep(0.01)
+        try:
+            yield f"http://127.0.0.1:{listening.getsockname()[1]}"
+        finally:
+            server.should_exit = True
+            thread.join()
+
+
+@pytest.fixture(scope="module")
+def url() -> Iterator[str]:
+    with serving() as url:
+        yield url
+
+
+@pytest.fixture
+def post(url: str) -> Callable[..., tuple[int, Any]]:
+    def send(body: Any) -> tuple[int, Any]:
+        text = body if isinstance(body, bytes) else json.dumps(body)
+        answer = requests.post(
+            f"{url}/act", data=text, headers={"Content-Type": "application/json"}, timeout=60
+        )
+        return answer.status_code, answer.json()
+
+    return send
+
+
+Post = Callable[..., tuple[int, Any]]
+
+
+def test_one_observation(post: Post) -> None:
+    body = {"observation": [1, 2, 3, 4.5], "desired_goal": [0.25, 0.5]}
+    assert post(body) == (200, {"action": [10.5, 0.75]})
+    assert post(body | {"achieved_goal": [9, 9]}) == (200, {"action": [10.5, 0.75]})
+
+
+def test_a_batch_has_one_action_a_row(post: Post) -> None:
+    body = {"observation": [[1, 1, 1, 1], [2, 2, 2, 2]], "desired_goal": [[0, 1], [2, 3]]}
+    assert post(body) == (200, {"action": [[4.0, 1.0], [8.0, 5.0]]})
+
+
+def test_a_batch_of_one_stays_a_batch(post: Post) -> None:
+    body = {"observation": [[1, 1, 1, 1]], "desired_goal": [[0, 1]]}
+    assert post(body) == (200, {"action": [[4.0, 1.0]]})
+
+
+GOOD = {"observation": [0, 0, 0, 0], "desired_goal": [0, 0]}
+
+
+@pytest.mark.parametrize(
+    ("change", "place", "rule"),
+    [
+        ({"observation": [0, 0, 0]}, "observation", "at least 4 items"),
+        ({"observation": [0] * 5}, "observation", "at most 4 items"),
+        ({"observation": []}, "observation", "at least 4 items"),
+        ({"observation": None}, "observation", "valid list"),
+        ({"observation": {"0": 1}}, "observation", "valid list"),
+        ({"observation": [0, 0, 0, "1"]}, "observation.3", "valid number"),
+        ({"observation": [0, 0, 0, True]}, "observation.3", "valid number"),
+        ({"observation": [0, 0, 0, None]}, "observation.3", "valid number"),
+        ({"observation": [0, 0, 0, float("nan")]}, "observation.3", "finite number"),
+        ({"observation": [0, 0, 0, float("-inf")]}, "observation.3", "finite number"),
+        ({"observation": [0, 0, 0, 1e300]}, "observation.3", "less than or equal to"),
+        ({"observation": [0, 0, 0, 10**4000]}, "observation.3", "valid number"),
+        ({"desired_goal": [[0, 0]]}, "desired_goal.0", "valid number"),
+        ({"goal": [0, 0]}, "goal", "not permitted"),
+        ({"observation": [[0] * 4] * 2, "desired_goal": [[0] * 2]}, "", "as many rows as"),
+        ({"observation": [[0] * 4] * 1025}, "observation", "at most 1024 items"),
+        ({"observation": [[0] * 4, 0], "desired_goal": [[0] * 2] * 2}, "observation.1", "list"),
+    ],
+)
+def test_what_is_no_observation_is_refused_with_its_place(
+    post: Post, change: dict[str, Any], place: str, rule: str
+) -> None:
+    status, body = post(GOOD | change)
+    assert status == 422
+    assert body["problems"][0]["place"] == place
+    assert rule in body["problems"][0]["rule"]
+
+
+def test_a_missing_goal_is_named(post: Post) -> None:
+    status, body = post({"observation": [0, 0, 0, 0]})
+    assert (status, body["problems"]) == (
+        422,
+        [{"place": "desired_goal", "rule": "Field required"}],
+    )
+
+
+@pytest.mark.parametrize("body", [[], [1], None, 3, "text", True])
+def test_json_that_is_no_object(post: Post, body: Any) -> None:
+    assert post(body)[0] == 422
+
+
+@pytest.mark.parametrize(
+    "body", [b"", b"{", b"\xff\xfe", b"[" * 50_000, b'{"observation": [' + b"9" * 5000 + b"]}"]
+)
+def test_what_is_no_json(post: Post, body: bytes) -> None:
+    status, answer = post(body)
+    assert status in (400, 413, 422)
+    assert answer["error"]
+
+
+def test_many_problems_are_cut_short(post: Post) -> None:
+    rows = [["x"] * OBSERVATION] * 500
+    status, body = post({"observation": rows, "desired_goal": [[0, 0]] * 500})
+    assert (status, len(body["problems"])) == (422, 10)
+    assert "the first 10 of 2000 problems" in body["error"]
+
+
+def test_a_body_longer_than_any_valid_one(url: str) -> None:
+    def endless() -> Iterator[bytes]:  # chunked, so that no header gives the length away
+        for _ in range(100):
+            yield b"[" * 10_000
+
+    for data in (b"[" * 1_000_000, endless()):
+        answer = requests.post(f"{url}/act", data=data, timeout=60)
+        assert answer.status_code == 413
+        assert "must be <=" in answer.json()["error"]
+
+
+def test_no_action_is_better_than_nan(post: Post) -> None:
+    """Each number is a float32, but their sum is none."""
+    status, body = post(GOOD | {"observation": [3.4e38] * 4})
+    assert status == 422
+    assert "no finite action" in body["error"]
+
+
+def test_facts_health_and_openapi(url: str) -> None:
+    assert requests.get(f"{url}/health", timeout=60).json() == {"status": "ok", "task": "Point"}
+    facts = requests.get(f"{url}/policy", timeout=60).json()
+    assert (facts["observation_size"], facts["goal_size"], facts["action_size"]) == (4, 2, 2)
+    schema = requests.get(f"{url}/openapi.json", timeout=60).json()
+    observation = schema["components"]["schemas"]["Observation"]["properties"]["observation"]
+    assert observation["minItems"] == observation["maxItems"] == OBSERVATION
+    example = schema["paths"]["/act"]["post"]["requestBody"]["content"]["application/json"]
+    body = example["examples"]["zeros"]["value"]
+    assert requests.post(f"{url}/act", json=body, timeout=60).status_code == 200
+    assert requests.get(f"{url}/act", timeout=60).status_code == 405
+    assert requests.get(f"{url}/nowhere", timeout=60).json()["error"] == "Not Found"
+
+
+class Page(HTMLParser):
+    """What a browser would fetch, run or show of a page."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.addresses: list[str] = []
+        self.commands: list[str] = []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.addresses += [value or "" for name, value in attrs if name in ("href", "src")]
+
+    def handle_data(self, data: str) -> None:
+        if data.startswith("curl "):
+            self.commands.append(data)
+
+
+def test_docs_page_needs_nothing_from_elsewhere(url: str) -> None:
+    answer = requests.get(f"{url}/docs", timeout=60)
+    assert (answer.status_code, answer.headers["Content-Type"]) == (200, "text/html; charset=utf-8")
+    page = Page(answer.text)
+    assert page.addresses == ["openapi.json"]
+    assert not {"script", "link", "img", "iframe"} & set(page.tags)
+    # The commands to copy name this very service; no other address is anywhere.
+    assert "://" not in answer.text.replace(url, "")
+    assert "@import" not in answer.text
+    assert "/docs" not in requests.get(f"{url}/openapi.json", timeout=60).text
+
+
+def test_docs_page_has_commands_that_work(url: str) -> None:
+    page = Page(requests.get(f"{url}/docs", timeout=60).text)
+    commands = {shlex.split(command)[2]: shlex.split(command) for command in page.commands}
+    assert list(commands) == [f"{url}/health", f"{url}/policy", f"{url}/act"]
+    body = commands[f"{url}/act"][-1]
+    headers = {"Content-Type": "application/json"}
+    assert headers == dict([commands[f"{url}/act"][4].split(": ")])
+    assert requests.post(f"{url}/act", data=body, headers=headers, timeout=60).status_code == 200
+
+
+def test_docs_page_shows_what_it_is_given_as_text() -> None:
+    document = {
+        "info": {"title": "<b>", "version": "1", "summary": "&", "description": "a `b<` c"},
+        "paths": {"/x": {"get": {"responses": {"200": {"description": "<i>"}}}}},
+    }
+    text = docs_page(document, 'http://h/"><script>')
+    assert not {"b", "i", "script"} & set(Page(text).tags)
+    assert "a <code>b&lt;</code> c" in text
+
+
+def test_a_token_is_asked_for_where_there_is_one() -> None:
+    with serving(token="hunter2") as url:
+
+        def status(headers: dict[str, str], path: str = "/act") -> int:
+            return requests.post(f"{url}{path}", json=GOOD, headers=headers, timeout=60).status_code
+
+        assert status({}) == 401
+        assert status({"Authorization": "Bearer hunter3"}) == 401
+        assert status({"Authorization": "Basic hunter2"}) == 401
+        assert status({"Authorization": "Bearer hunter2"}) == 200
+        assert requests.get(f"{url}/policy", timeout=60).status_code == 401
+        assert requests.get(f"{url}/health", timeout=60).status_code == 200
+        for path in ("/openapi.json", "/docs"):
+            assert "hunter2" not in requests.get(f"{url}{path}", timeout=60).text
+        assert "Authorization: Bearer TOKEN" in requests.get(f"{url}/docs", timeout=60).text
+
+
+def test_a_task_without_goals() -> None:
+    facts = PolicyFacts(task="Pendulum", observation_size=3, goal_size=0, action_size=1)
+    body = TypeAdapter(request_model(facts).annotation)
+    assert body.validate_python({"observation": [1.0, 2.0, 3.0]}).rows()["observation"].shape == (
+        1,
+        3,
+    )
+    with pytest.raises(ValidationError, match="Extra inputs"):
+        body.validate_python({"observation": [1.0, 2.0, 3.0], "desired_goal": []})
+
+
+def fuzz(url: str, token: str, folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
+    """schemathesis as one starts it, on everything that the OpenAPI document lists.
+
+    Left out is the check that whatever fits the document is accepted: that the parts of a batch
+    have the same number of rows can't be said in JSON Schema.
+    """
+    command = [
+        *(str(Path(sys.executable).with_name("schemathesis")), "run", f"{url}/openapi.json"),
+        *("--header", f"Authorization: Bearer {token}"),
+        *("--checks", "all", "--exclude-checks", "positive_data_acceptance"),
+        *("--seed", "1", "--no-color", "--generation-database", "none", *options),
+    ]
+    return subprocess.run(
+        command, cwd=folder, capture_output=True, text=True, timeout=250, check=False
+    )
+
+
+def test_fuzzing_finds_no_server_error(tmp_path: Path) -> None:
+    with serving(token="hunter2") as url:
+        done = fuzz(url, "hunter2", tmp_path, "--max-examples", "100")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "No issues found" in done.stdout

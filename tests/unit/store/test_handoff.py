@@ -1,0 +1,184 @@
+"""Handoffs: the same weights come out, and whatever was tampered with is refused."""
+
+import json
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays_of
+
+from music_rllib.config.run_settings import RunSettings, preset
+from music_rllib.envs.tasks import BUILT_IN_TASKS
+from music_rllib.store.handoff import (
+    HandoffError,
+    Weights,
+    open_handoff,
+    read_handoff,
+    write_handoff,
+)
+
+PUSH, SLIDE = BUILT_IN_TASKS["FetchPush"], BUILT_IN_TASKS["FetchSlide"]
+RUN = RunSettings.model_validate(
+    {"task": PUSH, "variant": "music-u", "seed": 0, "music": preset("music-u", PUSH)}
+)
+INFO = RUN.handoff_info("0" * 20, 6000)
+WEIGHTS: Weights = {
+    "mi_estimator": {"x.weight": np.arange(6, dtype=np.float32).reshape(2, 3)},
+    "normaliser": {"count": np.array(7, np.int64), "mean": np.linspace(0, 1, 5)},
+}
+
+
+@pytest.fixture
+def handoff(tmp_path: Path) -> Path:
+    write_handoff(tmp_path / "handoff", WEIGHTS, INFO)
+    return tmp_path / "handoff"
+
+
+def test_weights_come_back_as_they_were(handoff: Path) -> None:
+    found = read_handoff(handoff, ["normaliser", "mi_estimator"], PUSH)
+    assert list(found) == ["normaliser", "mi_estimator"]
+    for name, arrays in found.items():
+        assert arrays.keys() == WEIGHTS[name].keys()
+        for key, array in arrays.items():
+            expected = WEIGHTS[name][key]
+            assert (array.shape, array.dtype) == (expected.shape, expected.dtype)
+            np.testing.assert_array_equal(array, expected)
+            array += 1  # writable, and nobody else's
+
+
+@given(
+    array=arrays_of.arrays(
+        dtype=st.sampled_from([np.float32, np.float64, np.int64, np.uint8]),
+        shape=arrays_of.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=4),
+        elements={"allow_nan": False, "allow_infinity": False},
+    ),
+    order=st.sampled_from(["C", "F", "reversed"]),
+)
+def test_any_array_survives(
+    tmp_path_factory: pytest.TempPathFactory, array: np.ndarray[Any, Any], order: str
+) -> None:
+    folder = tmp_path_factory.mktemp("handoff")
+    laid = array[..., ::-1] if order == "reversed" and array.ndim else np.asarray(array, order="F")
+    write_handoff(folder, {"policy": {"a": laid}}, INFO)
+    found = read_handoff(folder, ["policy"], PUSH)["policy"]["a"]
+    assert (found.shape, found.dtype) == (laid.shape, laid.dtype)
+    np.testing.assert_array_equal(found, laid)
+
+
+def test_a_task_may_have_another_name_but_nothing_else(handoff: Path) -> None:
+    read_handoff(handoff, ["normaliser"], PUSH.model_copy(update={"name": "Mine"}))
+    with pytest.raises(HandoffError, match="must be of task FetchSlide, it is of FetchPush"):
+        read_handoff(handoff, ["normaliser"], SLIDE)
+    other_split = PUSH.model_copy(update={"surrounding_indices": (3, 4)})
+    with pytest.raises(HandoffError, match=r"indices is \[3, 4, 5\] there and \[3, 4\] here"):
+        read_handoff(handoff, ["normaliser"], other_split)
+
+
+def test_a_handoff_from_before_there_was_a_choice_has_clamped_widths(handoff: Path) -> None:
+    path = handoff / "handoff.json"
+    manifest = json.loads(path.read_text())
+    for name in ("log_std_form", "log_std_bounds"):
+        del manifest["info"]["architecture"][name]
+    path.write_text(json.dumps(manifest))
+    architecture = open_handoff(handoff)[1].info.architecture
+    assert (architecture.log_std_form, architecture.log_std_bounds) == ("clamp", None)
+
+
+def test_a_node_folder_holds_its_handoff_below(handoff: Path) -> None:
+    folder, manifest = open_handoff(handoff.parent)
+    assert folder == handoff
+    assert manifest.info == INFO
+
+
+def refusal(folder: Path, modules: tuple[str, ...] = ("mi_estimator",)) -> str:
+    with pytest.raises(HandoffError) as error:
+        read_handoff(folder, modules, PUSH)
+    return str(error.value)
+
+
+def test_missing_things_are_named(handoff: Path) -> None:
+    assert "there is no such folder" in refusal(handoff / "nowhere")
+    assert "it lacks policy (made by music-u)" in refusal(handoff, ("policy", "normaliser"))
+    (handoff / "mi_estimator.safetensors").unlink()
+    assert "mi_estimator.safetensors must be readable" in refusal(handoff)
+    (handoff / "handoff.json").unlink()
+    assert "the folder is there" in refusal(handoff)
+
+
+def test_damage_is_named(handoff: Path) -> None:
+    weights = handoff / "mi_estimator.safetensors"
+    sound = weights.read_bytes()
+    weights.write_bytes(sound[:-1])
+    assert f"must have {len(sound)} bytes, it has {len(sound) - 1}" in refusal(handoff)
+    weights.write_bytes(sound[:-1] + bytes([sound[-1] ^ 1]))
+    assert "its content has changed" in refusal(handoff)
+    (handoff / "handoff.json").write_text("{")
+    assert "must be a handoff manifest" in refusal(handoff)
+
+
+class Bomb:
+    """Unpickling this leaves a file behind."""
+
+    def __init__(self, trace: Path) -> None:
+        self.trace = trace
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (Path.touch, (self.trace,))
+
+
+def forge(handoff: Path, data: bytes, **changes: Any) -> None:
+    """Put `data` in place of weights, with a manifest that agrees."""
+    import hashlib
+
+    manifest = json.loads((handoff / "handoff.json").read_text())
+    entry = manifest["modules"]["mi_estimator"]
+    entry |= {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()} | changes
+    (handoff / "handoff.json").write_text(json.dumps(manifest))
+    (handoff / "mi_estimator.safetensors").write_bytes(data)
+
+
+def test_a_pickle_in_place_of_weights_never_runs(handoff: Path, tmp_path: Path) -> None:
+    bomb = pickle.dumps(Bomb(tmp_path / "exploded"))
+    weights = handoff / "mi_estimator.safetensors"
+    weights.write_bytes(bomb)
+    assert "bytes, it has" in refusal(handoff)
+    forge(handoff, bomb)
+    assert "must be a safetensors file" in refusal(handoff)
+    assert not (tmp_path / "exploded").exists()
+    pickle.loads(bomb)
+    assert (tmp_path / "exploded").exists(), "the bomb works"
+
+
+def test_a_forged_manifest_cannot_point_elsewhere(handoff: Path) -> None:
+    data = (handoff / "mi_estimator.safetensors").read_bytes()
+    forge(handoff, data, file="../mi_estimator.safetensors")
+    assert "must be a handoff manifest" in refusal(handoff)
+
+
+def test_arrays_must_be_those_of_the_manifest(handoff: Path) -> None:
+    data = (handoff / "mi_estimator.safetensors").read_bytes()
+    forge(handoff, data, arrays={"x.weight": {"shape": [3, 2], "dtype": "float32"}})
+    assert "must have the arrays in handoff.json; wrong: x.weight" in refusal(handoff)
+
+
+def test_a_diverged_run_hands_nothing_over(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"policy\.w must be finite"):
+        write_handoff(tmp_path, {"policy": {"w": np.array([1.0, np.nan])}}, INFO)
+    with pytest.raises(HandoffError):
+        open_handoff(tmp_path)
+
+
+def test_the_content_hash_follows_weights_and_task_only(tmp_path: Path) -> None:
+    def content_hash(name: str, weights: Weights, **changes: Any) -> str:
+        info = INFO.model_copy(update=changes)
+        return write_handoff(tmp_path / name, weights, info).content_hash
+
+    one = content_hash("a", WEIGHTS)
+    assert content_hash("b", WEIGHTS, node_key="1" * 20, env_steps=9) == one
+    assert content_hash("c", WEIGHTS, task=SLIDE) != one
+    shifted = {**WEIGHTS, "normaliser": {"mean": np.zeros(5)}}
+    assert content_hash("d", shifted) != one

@@ -1,0 +1,231 @@
+"""Leases: one owner at a time, and none for ever."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import psutil
+import pyarrow.fs as pafs
+import pytest
+from fsspec.implementations.memory import MemoryFileSystem  # type: ignore[import-untyped]
+
+from music_rllib.store import lease as lease_module
+from music_rllib.store.lease import HeldLease, Lease, LeaseFile, LeaseLostError, runs_here
+from music_rllib.store.object_folder import StorageError
+
+pytestmark = pytest.mark.faults
+
+
+@pytest.fixture(params=["disk", "object store"])
+def place(
+    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> LeaseFile:
+    if request.param == "disk":
+        return LeaseFile(pafs.LocalFileSystem(), str(tmp_path / "work" / "lease.json"))
+    monkeypatch.setattr(lease_module, "SETTLE_SECONDS", 0.05)
+    memory = MemoryFileSystem()
+    memory.store.clear()
+    memory.pseudo_dirs[:] = [""]
+    filesystem = pafs.PyFileSystem(pafs.FSSpecHandler(memory))
+    return LeaseFile(filesystem, "bucket/work/lease.json")
+
+
+def elsewhere(what: str = "another sweep", seconds: float = 60.0) -> Lease:
+    lease = Lease.of_this_process(what, seconds)
+    return lease.model_copy(update={"machine": "another one", "host": "far-away", "pid": 1})
+
+
+def test_a_held_lease_is_refused_and_its_holder_named(place: LeaseFile) -> None:
+    theirs = elsewhere()
+    assert place.acquire(theirs) is None
+    holder = place.acquire(Lease.of_this_process("mine"))
+    assert holder == theirs
+    assert str(holder).startswith("another sweep (process 1 on far-away, since ")
+    place.release(theirs.owner)
+    assert place.acquire(Lease.of_this_process("mine")) is None
+
+
+def test_an_expired_lease_is_taken_over_and_its_old_owner_writes_no_more(place: LeaseFile) -> None:
+    theirs, mine = elsewhere(seconds=-1.0), Lease.of_this_process("mine")
+    assert place.acquire(theirs) is None
+    assert place.acquire(mine) is None
+    held = HeldLease(place, theirs)  # not before: its owner would renew it at once
+    with pytest.raises(
+        LeaseLostError, match=r"lease\.json must name this process .* it names mine"
+    ):
+        held.check()
+    assert not place.renew(theirs)
+    held.release()
+    assert place.is_owned_by(mine.owner), "who lost it removes nothing"
+
+
+def test_a_lease_is_renewed_while_it_is_held(place: LeaseFile) -> None:
+    mine = Lease.of_this_process("mine", seconds=2.0)
+    place.acquire(mine)
+    held = HeldLease(place, mine)
+    deadline = time.monotonic() + 60
+    while (now := place.read()) is None or now.expires <= mine.expires + 2.0:
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    held.check()
+    held.release()
+    assert place.read() is None
+
+
+def test_the_lease_of_a_process_that_was_killed_here_needs_no_waiting(tmp_path: Path) -> None:
+    code = (
+        "import sys, time, pyarrow.fs as pafs\n"
+        "from music_rllib.store.lease import Lease, LeaseFile\n"
+        "LeaseFile(pafs.LocalFileSystem(), sys.argv[1]).acquire(Lease.of_this_process('theirs'))\n"
+        "print('held', flush=True)\n"
+        "time.sleep(600)\n"
+    )
+    path = tmp_path / "lease.json"
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE, text=True
+    )
+    with process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "held\n"
+        file, mine = LeaseFile(pafs.LocalFileSystem(), str(path)), Lease.of_this_process("mine")
+        assert file.acquire(mine) is not None
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+    assert file.acquire(mine) is None
+
+
+def test_of_many_at_once_one_gets_it(tmp_path: Path) -> None:
+    path = str(tmp_path / "lease.json")
+    won: list[str] = []
+
+    def contend() -> None:
+        file, lease = LeaseFile(pafs.LocalFileSystem(), path), Lease.of_this_process("one of many")
+        if file.acquire(lease) is None:
+            won.append(lease.owner)
+
+    threads = [threading.Thread(target=contend) for _ in range(12)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(won) == 1
+
+
+def test_half_a_lease_is_none(tmp_path: Path) -> None:
+    path = tmp_path / "lease.json"
+    path.write_text('{"owner": "x", "pi')
+    file = LeaseFile(pafs.LocalFileSystem(), str(path))
+    assert file.read() is None
+    assert file.acquire(Lease.of_this_process("mine")) is None
+
+
+def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "work").write_text("a file where the folder should be")
+    file = LeaseFile(pafs.LocalFileSystem(), str(tmp_path / "work" / "lease.json"))
+    with pytest.raises(StorageError, match=r"work.* must be writable"):
+        file.acquire(Lease.of_this_process("mine"))
+
+
+def test_a_clock_that_jumps_an_hour_takes_no_lease_from_a_living_owner(
+    place: LeaseFile, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Forwards and backwards: it is renewed at once, by the new time."""
+    mine, day, jump = Lease.of_this_process("mine"), time.time, [0.0]
+    place.acquire(mine)
+    monkeypatch.setattr(time, "time", lambda: day() + jump[0])
+    held = HeldLease(place, mine)
+    for hours in (1, -1):
+        jump[0] = 3600.0 * hours
+        deadline = time.monotonic() + 30
+        while (now := place.read()) is None or not 0 < now.seconds <= 60:
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        assert now.holds(), "the process is the same, whatever the time of day"
+    held.check()
+    held.release()
+
+
+def test_a_lease_from_a_time_that_is_yet_to_come_holds_while_it_is_renewed(
+    place: LeaseFile, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its owner's clock is ahead, or this one was set back after the owner died."""
+    theirs, mine = elsewhere(seconds=3700.0), Lease.of_this_process("mine")
+    steady, passed = time.monotonic, [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: steady() + passed[0])
+    assert place.acquire(theirs) is None
+    assert place.acquire(mine) == theirs
+    passed[0] = 50.0
+    assert place.acquire(mine) == theirs
+    later = theirs.model_copy(update={"expires": theirs.expires + 15})
+    assert place.renew(later)
+    passed[0] = 70.0
+    assert place.acquire(mine) == later, "it was renewed"
+    passed[0] = 140.0
+    assert place.acquire(mine) is None
+
+
+def test_who_lost_a_lease_is_told_and_leaves_no_folder(tmp_path: Path) -> None:
+    """Another sweep took the run over, finished it and deleted its folder."""
+    path = tmp_path / "work" / "key" / "lease.json"
+    file, mine = LeaseFile(pafs.LocalFileSystem(), str(path)), Lease.of_this_process("m", 0.4)
+    assert file.acquire(mine) is None
+    told = threading.Event()
+    held = HeldLease(file, mine, told.set)
+    shutil.rmtree(path.parent)
+    assert told.wait(30)
+    assert held.lost
+    with pytest.raises(LeaseLostError, match="it names nobody"):
+        held.check()
+    assert not file.renew(mine)
+    held.release()
+    assert not path.parent.exists()
+
+
+def test_waiting_for_a_lease_writes_nothing(place: LeaseFile, tmp_path: Path) -> None:
+    assert place.acquire(elsewhere()) is None
+    before = sorted(tmp_path.rglob("*"))
+    assert place.acquire(Lease.of_this_process("mine")) is not None
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_lease_is_acquired_while_its_folder_is_deleted_again_and_again(tmp_path: Path) -> None:
+    folder, over = tmp_path / "work", threading.Event()
+
+    def delete() -> None:
+        while not over.wait(0.0005):
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+
+    deleting = threading.Thread(target=delete)
+    deleting.start()
+    file = LeaseFile(pafs.LocalFileSystem(), str(folder / "lease.json"))
+    try:
+        for _ in range(50):
+            mine = Lease.of_this_process("mine")
+            assert file.acquire(mine) is None
+            assert file.is_owned_by(mine.owner)
+            file.release(mine.owner)
+    finally:
+        over.set()
+        deleting.join()
+
+
+def test_a_process_is_the_same_after_the_time_of_day_was_set(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The boot, by which psutil dates processes, is an hour earlier or later then."""
+    mine = Lease.of_this_process("mine")
+    boot = psutil.boot_time()
+    for hours in (1, -1):
+        monkeypatch.setattr(psutil._psplatform, "boot_time", lambda h=hours: boot + 3600 * h)
+        assert mine.holds()
+        assert runs_here(mine.pid, mine.process_started)
+    assert not runs_here(mine.pid, mine.process_started + 5), "another one with its number"

@@ -1,0 +1,421 @@
+"""The node store: complete or absent, on a disk and in an object store."""
+
+import errno
+import os
+import shutil
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import pyarrow.fs as pafs
+import pytest
+from fsspec.implementations.memory import MemoryFileSystem  # type: ignore[import-untyped]
+
+from music_rllib.store import object_folder, verified
+from music_rllib.store.files import canonical_json, write_atomically
+from music_rllib.store.node_store import NodeStore
+from music_rllib.store.object_folder import DamagedError, SealedFolders, StorageError, open_storage
+from music_rllib.store.run_record import (
+    HISTORY,
+    Report,
+    RunResult,
+    from_json_lines,
+    last_values,
+    to_json_lines,
+)
+
+KEY = "0123456789abcdef0123"
+RESULT = RunResult(label="a/b", env_steps=10, seconds=1.5, metrics={"m": 0.5})
+
+
+@pytest.fixture
+def produced(tmp_path: Path) -> Path:
+    folder = tmp_path / "produced"
+    (folder / "handoff").mkdir(parents=True)
+    (folder / "handoff" / "w.bin").write_bytes(b"weights")
+    reports = [Report(env_steps=5, seconds=1.0, timestamp_ms=7, metrics={"m": float("nan")})]
+    reports.append(Report(env_steps=10, seconds=1.5, timestamp_ms=9, metrics={"m": 0.5}))
+    (folder / HISTORY).write_bytes(to_json_lines(reports))
+    return folder
+
+
+def local_store(tmp_path: Path) -> NodeStore:
+    return NodeStore(str(tmp_path / "storage"))
+
+
+def object_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> NodeStore:
+    """The same over a file system that has no rename and no folders of its own."""
+    memory = MemoryFileSystem()
+    memory.store.clear()
+    memory.pseudo_dirs[:] = [""]
+    filesystem = pafs.PyFileSystem(pafs.FSSpecHandler(memory))
+    monkeypatch.setattr(
+        "music_rllib.store.node_store.open_storage", lambda _: (filesystem, "bucket/path")
+    )
+    return NodeStore("s3://bucket/path")
+
+
+@pytest.fixture(params=["disk", "object store"])
+def store(
+    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> NodeStore:
+    if request.param == "disk":
+        return local_store(tmp_path)
+    return object_store(tmp_path, monkeypatch)
+
+
+def test_a_published_node_comes_back_verified(
+    store: NodeStore, produced: Path, tmp_path: Path
+) -> None:
+    assert not store.is_finished(KEY)
+    store.publish(KEY, produced, RESULT)
+    assert store.is_finished(KEY)
+    assert store.result(KEY) == RESULT
+    report, last = store.history(KEY)
+    assert (report.env_steps, last.env_steps) == (5, 10)
+    assert report.metrics["m"] != report.metrics["m"]
+    store.verify(KEY)
+    store.fetch(KEY, tmp_path / "fetched")
+    assert (tmp_path / "fetched" / "handoff" / "w.bin").read_bytes() == b"weights"
+
+
+def test_a_node_is_published_once_and_for_good(store: NodeStore, produced: Path) -> None:
+    store.publish(KEY, produced, RESULT)
+    (produced / "handoff" / "w.bin").write_bytes(b"other")
+    store.publish(KEY, produced, RESULT.model_copy(update={"label": "other"}))
+    assert store.result(KEY) == RESULT
+    store.verify(KEY)
+
+
+def test_an_imported_handoff_has_no_result(store: NodeStore, produced: Path) -> None:
+    store.publish("handoff-1", produced)
+    assert store.is_finished("handoff-1")
+    assert store.result("handoff-1") is None
+
+
+def test_what_is_not_there_is_named(store: NodeStore) -> None:
+    with pytest.raises(DamagedError, match=r"nodes/absent/manifest\.json must exist"):
+        store.result("absent")
+
+
+def test_an_interrupted_publication_leaves_nothing(
+    store: NodeStore, produced: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    for step in ("_rename", "_upload"):
+        monkeypatch.setattr(SealedFolders, step, interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        store.publish(KEY, produced, RESULT)
+    monkeypatch.undo()
+    assert not store.is_finished(KEY)
+
+
+def test_two_publishers_at_once_leave_one_sound_node(store: NodeStore, produced: Path) -> None:
+    together = threading.Barrier(4)
+    failures = []
+
+    def publish() -> None:
+        together.wait()
+        try:
+            store.publish(KEY, produced, RESULT)
+        except Exception as error:
+            failures.append(error)
+
+    threads = [threading.Thread(target=publish) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert failures == []
+    store.verify(KEY)
+
+
+@pytest.mark.parametrize(
+    ("tamper", "message"),
+    [
+        (lambda path: path.write_bytes(b"weight"), "must have 7 bytes, it has 6"),
+        (lambda path: path.write_bytes(b"weightz"), "its content has changed"),
+        (lambda path: path.unlink(), "must exist, its manifest lists it"),
+    ],
+    ids=["truncated", "flipped", "deleted"],
+)
+def test_damage_is_found_and_named(
+    tmp_path: Path, produced: Path, tamper: Callable[[Path], None], message: str
+) -> None:
+    store = local_store(tmp_path)
+    store.publish(KEY, produced, RESULT)
+    tamper(tmp_path / "storage" / "nodes" / KEY / "handoff" / "w.bin")
+    with pytest.raises(DamagedError, match=message) as error:
+        store.verify(KEY)
+    assert "again with --retrain-damaged" in str(error.value)
+    assert list(store.damage([KEY])) == [KEY]
+    assert not store.is_sound(KEY)
+    store.remove(KEY)
+    store.publish(KEY, produced, RESULT)
+    assert store.is_sound(KEY)
+
+
+def test_what_was_sound_is_not_read_again_and_damage_since_is_found(
+    tmp_path: Path, produced: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read: list[str] = []
+    check = SealedFolders.check
+
+    def counting(folders: SealedFolders, name: str) -> None:
+        read.append(name)
+        check(folders, name)
+
+    monkeypatch.setattr(SealedFolders, "check", counting)
+    # The times of the last change of a file's attributes can't be set: they count as old here.
+    monkeypatch.setattr(verified, "SETTLED_SECONDS", 0.0)
+    keys = [f"{number:020d}" for number in range(3)]
+    for key in keys:
+        local_store(tmp_path).publish(key, produced, RESULT)
+    for _ in range(3):
+        assert local_store(tmp_path).damage(keys) == {}
+    assert read == keys, "each once, by whatever process"
+
+    weights = tmp_path / "storage" / "nodes" / keys[1] / "handoff" / "w.bin"
+    times = weights.stat()
+    weights.write_bytes(b"weightz")
+    os.utime(weights, ns=(times.st_atime_ns, times.st_mtime_ns))
+    assert list(local_store(tmp_path).damage(keys)) == [keys[1]]
+    assert list(local_store(tmp_path).damage(keys)) == [keys[1]], "damage is not remembered"
+    weights.write_bytes(b"weights")
+    assert local_store(tmp_path).damage(keys) == {}
+
+
+@pytest.mark.parametrize("content", [b"", b"[]", b'{"a": 1', b"\xff", b'{"KEY": null}'])
+def test_a_damaged_list_of_what_is_sound_costs_a_second_reading(
+    tmp_path: Path, produced: Path, content: bytes
+) -> None:
+    local_store(tmp_path).publish(KEY, produced, RESULT)
+    listed = tmp_path / "storage" / "verified.json"
+    listed.write_bytes(content.replace(b"KEY", KEY.encode()))
+    assert local_store(tmp_path).damage([KEY]) == {}
+    (tmp_path / "storage" / "nodes" / KEY / HISTORY).unlink()
+    assert list(local_store(tmp_path).damage([KEY])) == [KEY]
+
+
+def test_a_file_that_was_written_just_now_is_read_again(tmp_path: Path, produced: Path) -> None:
+    """It may be written again at what the disk calls the same time."""
+    store = local_store(tmp_path)
+    store.publish(KEY, produced, RESULT)
+    assert store.damage([KEY]) == {}
+    assert not (tmp_path / "storage" / "verified.json").exists()
+
+
+def test_a_result_in_the_manifest_that_is_not_the_end_of_the_history(
+    tmp_path: Path, produced: Path
+) -> None:
+    store = local_store(tmp_path)
+    store.publish(KEY, produced, RESULT.model_copy(update={"metrics": {"m": 0.5}}))
+    assert store.damage([KEY]) == {}, "it is the last value"
+    path = tmp_path / "storage" / "nodes" / KEY / "manifest.json"
+    path.write_text(path.read_text().replace("0.5", "0.75"))
+    (error,) = store.damage([KEY]).values()
+    assert "manifest.json must have the last values of history.jsonl" in str(error)
+
+
+def test_sizes_tell_without_reading(store: NodeStore, produced: Path) -> None:
+    store.publish(KEY, produced, RESULT)
+    assert store.damage([KEY]) == {}
+    (weights,) = [file for file in store._nodes.files(KEY) if file.endswith("w.bin")]
+    with store._fs.open_output_stream(weights) as sink:
+        sink.write(b"weight")
+    (error,) = store.damage([KEY]).values()
+    assert "w.bin must have 7 bytes, it has 6" in str(error)
+    store._fs.delete_file(weights)
+    (error,) = store.damage([KEY]).values()
+    assert "w.bin must exist, its manifest lists it" in str(error)
+
+
+@pytest.mark.parametrize("mask", [0o022, 0o077, 0o007])
+def test_who_may_read_a_node_is_up_to_the_umask(tmp_path: Path, produced: Path, mask: int) -> None:
+    """Of a group that shares a storage all may read it; of a user who is alone nobody else."""
+    shutil.rmtree(tmp_path / "storage", ignore_errors=True)
+    before = os.umask(mask)
+    try:
+        local_store(tmp_path).publish(KEY, produced, RESULT)
+        write_atomically(tmp_path / "storage" / "state.json", b"{}")
+    finally:
+        os.umask(before)
+    manifest = tmp_path / "storage" / "nodes" / KEY / "manifest.json"
+    for path in (manifest, tmp_path / "storage" / "state.json"):
+        assert path.stat().st_mode & 0o777 == 0o666 & ~mask
+    assert manifest.parent.stat().st_mode & 0o777 == 0o777 & ~mask
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "must be a manifest"),
+        (
+            '{"name": "x", "files": {"../../w": {"bytes": 1, "sha256": ""}}, "meta": {}}',
+            "must be a path inside the folder",
+        ),
+        ('{"name": "x", "prefix": "../", "files": {}, "meta": {}}', "must be a manifest"),
+        ('{"name": "x", "files": {}, "meta": {}}', f"must be the manifest of {KEY}, got 'x'"),
+    ],
+    ids=["torn", "path", "prefix", "name"],
+)
+def test_an_unsound_manifest_is_refused(
+    tmp_path: Path, produced: Path, text: str, message: str
+) -> None:
+    store = local_store(tmp_path)
+    store.publish(KEY, produced, RESULT)
+    (tmp_path / "storage" / "nodes" / KEY / "manifest.json").write_text(text)
+    with pytest.raises(DamagedError, match=message):
+        store.result(KEY)
+
+
+def test_a_folder_that_was_copied_without_its_manifest_is_replaced(
+    tmp_path: Path, produced: Path
+) -> None:
+    store = local_store(tmp_path)
+    (tmp_path / "storage" / "nodes" / KEY / "rest").mkdir(parents=True)
+    assert not store.is_finished(KEY)
+    store.publish(KEY, produced, RESULT)
+    store.verify(KEY)
+    assert not (tmp_path / "storage" / "nodes" / KEY / "rest").exists()
+
+
+def test_a_killed_publisher_leaves_no_node(tmp_path: Path, produced: Path) -> None:
+    code = (
+        "import os, sys; from music_rllib.store import node_store, object_folder\n"
+        "object_folder.write_atomically = lambda *_: os._exit(9)\n"
+        "from pathlib import Path\n"
+        "node_store.NodeStore(sys.argv[1]).publish('k', Path(sys.argv[2]))\n"
+    )
+    storage = str(tmp_path / "storage")
+    killed = subprocess.run([sys.executable, "-c", code, storage, str(produced)], check=False)
+    assert killed.returncode == 9
+    store = NodeStore(storage)
+    assert not store.is_finished("k")
+    store.publish("k", produced)
+    store.verify("k")
+
+
+def test_a_full_disk_names_the_path(
+    tmp_path: Path, produced: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(object_folder, "write_atomically", full)
+    with pytest.raises(StorageError, match=f"nodes/{KEY} must be writable: No space left"):
+        local_store(tmp_path).publish(KEY, produced, RESULT)
+    assert list((tmp_path / "storage" / "nodes").iterdir()) == []
+
+
+def test_checkpoints_are_kept_newest_first_and_pruned(store: NodeStore) -> None:
+    work = store.work_folder(KEY)
+    with work.newest() as newest:
+        assert newest is None
+    parts: list[str] = []
+    for env_steps in (1000, 2000, 10_000):
+        with work.new_checkpoint(env_steps) as draft:
+            (draft.folder / "state").write_text(str(env_steps))
+            with draft.new_part("part") as (name, folder):
+                (folder / "data").write_text(str(env_steps))
+            parts.append(name)
+            draft.needs = parts[-2:]
+    with work.newest() as newest:
+        assert newest is not None
+        assert (newest.folder / "state").read_text() == "10000"
+        read = [(newest.parts[name] / "data").read_text() for name in newest.parts]
+        assert read == ["2000", "10000"]
+    assert [int(name.split("-")[0]) for name in work.names()] == [2000, 10_000]
+    work.clear()
+    with work.newest() as newest:
+        assert newest is None
+
+
+def test_a_save_that_fails_leaves_the_older_checkpoint(store: NodeStore) -> None:
+    work = store.work_folder(KEY)
+    with work.new_checkpoint(1000) as draft:
+        (draft.folder / "state").write_text("good")
+
+    def save_half() -> None:
+        with work.new_checkpoint(2000) as draft:
+            (draft.folder / "state").write_text("half")
+            raise RuntimeError("boom")
+
+    with pytest.raises(RuntimeError, match="boom"):
+        save_half()
+    with work.newest() as newest:
+        assert newest is not None
+        assert (newest.folder / "state").read_text() == "good"
+
+
+def test_a_damaged_checkpoint_is_skipped_aloud(tmp_path: Path) -> None:
+    work = local_store(tmp_path).work_folder(KEY)
+    for env_steps in (1000, 2000):
+        with work.new_checkpoint(env_steps) as draft:
+            (draft.folder / "state").write_text(str(env_steps))
+    newest_name = work.names()[-1]
+    (tmp_path / "storage" / "work" / KEY / newest_name / "state").write_text("2001")
+    warnings: list[str] = []
+    with work.newest(warnings.append) as newest:
+        assert newest is not None
+        assert (newest.folder / "state").read_text() == "1000"
+    assert len(warnings) == 1
+    assert newest_name in warnings[0]
+    # The run gets there again, and this time it counts.
+    with work.new_checkpoint(2000) as draft:
+        (draft.folder / "state").write_text("2000")
+    with work.newest(warnings.append) as newest:
+        assert newest is not None
+        assert (newest.folder / "state").read_text() == "2000"
+
+
+def test_storage_that_cannot_be(tmp_path: Path) -> None:
+    with pytest.raises(StorageError, match="must be a folder or an s3:// or gs:// URI"):
+        open_storage("ftp://host/path")
+    (tmp_path / "file").write_text("")
+    store = NodeStore(str(tmp_path / "file"))
+    with pytest.raises(StorageError, match="must be writable: Not a directory"):
+        store.publish(KEY, tmp_path)
+
+
+def test_storage_paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", "/home/somebody")
+    assert open_storage("results/")[1] == f"{tmp_path}/results"
+    assert open_storage("~/results")[1] == "/home/somebody/results"
+    assert open_storage("file:///data/results")[1] == "/data/results"
+
+
+def test_reports_survive_as_json_lines() -> None:
+    reports = [
+        Report(env_steps=i, seconds=i / 3, timestamp_ms=i, metrics={"a": 0.1 * i, "b/c": -i})
+        for i in range(3)
+    ]
+    assert from_json_lines(to_json_lines(reports)) == reports
+    assert len(to_json_lines(reports).splitlines()) == 3
+
+
+def test_the_last_value_of_a_metric_counts_where_later_reports_lack_it() -> None:
+    def report(env_steps: int, **metrics: float) -> Report:
+        return Report(env_steps=env_steps, seconds=0, timestamp_ms=0, metrics=metrics)
+
+    assert last_values([report(1, a=1, b=1), report(2, a=2)]) == {"a": 2, "b": 1}
+
+
+def test_canonical_json_has_one_spelling() -> None:
+    assert canonical_json({"b": 1.0, "a": [True, None]}) == '{"a":[true,null],"b":1.0}'
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        canonical_json(float("nan"))
+
+
+def test_an_atomic_write_leaves_no_trace_when_it_fails(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    write_atomically(path, b"old")
+    with pytest.raises(TypeError):
+        write_atomically(path, "text")  # type: ignore[arg-type]
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]

@@ -1,0 +1,115 @@
+"""Storages that can keep nothing: a message before anything starts, and nothing left behind."""
+
+from __future__ import annotations
+
+import os
+import socket
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from music_rllib.config.load import ConfigError, load_sweep
+from music_rllib.store import paths
+from music_rllib.store.object_folder import StorageError
+from music_rllib.store.paths import check_answers, check_storage, resolve_storage
+from music_rllib.sweep.driver import DEFAULT_CONFIG
+
+
+def tree(folder: Path) -> list[str]:
+    return sorted(str(path) for path in folder.rglob("*"))
+
+
+@pytest.mark.parametrize("place", ["free", "folder", "folder/deep/er", "link", "folder/../free"])
+def test_a_folder_that_can_be_made_is_not_made(tmp_path: Path, place: str) -> None:
+    Path(tmp_path, "folder").mkdir()
+    Path(tmp_path, "link").symlink_to("folder")
+    before = tree(tmp_path)
+    check_storage(f"{tmp_path}/{place}", "sweep")
+    check_storage(f"file://{tmp_path}/{place}", "sweep")
+    assert tree(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    ("place", "message"),
+    [
+        ("file", "is a file"),
+        ("file/below", "is a file"),
+        ("folder/../file/x", "is a file"),
+        ("fifo", "is a pipe"),
+        ("dangling", "is a link to nothing: nowhere"),
+        ("loop/x", "Too many levels of symbolic links"),
+        ("taken", "taken/sweep is a file"),
+        ("broken", "broken/nodes is a link to nothing: gone"),
+        ("x" * 300, "names of at most 255 bytes in its path, got one of 300"),
+        ("ä" * 200, "names of at most 255 bytes in its path, got one of 400"),
+        ("free/" + "x" * 256, "names of at most 255 bytes in its path, got one of 256"),
+        ("a/" * 2500, "File name too long"),
+        ("a\nb", r"without control characters, got '.*a\\nb'"),
+        ("a\x1b[31mb", r"without control characters, got '.*a\\x1b\[31mb'"),
+        ("a\0b", r"without control characters, got '.*a\\x00b'"),
+        (os.fsdecode(b"\xff"), r"UTF-8 text .* got '.*\\udcff'"),
+    ],
+)
+def test_a_place_for_nothing_is_refused(tmp_path: Path, place: str, message: str) -> None:
+    Path(tmp_path, "file").touch()
+    Path(tmp_path, "folder").mkdir()
+    os.mkfifo(tmp_path / "fifo")
+    Path(tmp_path, "dangling").symlink_to("nowhere")
+    Path(tmp_path, "loop").symlink_to("loop")
+    Path(tmp_path, "taken").mkdir()
+    Path(tmp_path, "taken", "sweep").touch()
+    Path(tmp_path, "broken").mkdir()
+    Path(tmp_path, "broken", "nodes").symlink_to("gone")
+    before = tree(tmp_path)
+    with pytest.raises(StorageError, match=message) as refused:
+        check_storage(f"{tmp_path}/{place}", "sweep")
+    assert len(str(refused.value)) < 600
+    assert tree(tmp_path) == before
+
+
+@pytest.mark.parametrize("place", ["/dev/null", "/dev/full", "/proc/self", "/proc/x", "/sys/x"])
+def test_devices_and_what_only_looks_like_folders(place: str) -> None:
+    with pytest.raises(
+        StorageError, match=f"{place.rpartition('/')[0]}.* (is a device|must be wr)"
+    ):
+        check_storage(place, "sweep")
+
+
+def test_a_folder_of_somebody_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As root may write everywhere, the system's answer is given here."""
+
+    def refuse(dir: Path) -> None:  # noqa: A002
+        raise PermissionError(13, "Permission denied", str(dir))
+
+    monkeypatch.setattr("tempfile.TemporaryFile", refuse)
+    with pytest.raises(StorageError, match=f"{tmp_path} must be writable, .* Permission denied"):
+        check_storage(str(tmp_path), "sweep")
+
+
+def test_nobodys_home_and_bytes_that_are_no_text() -> None:
+    with pytest.raises(StorageError, match="home that is known, got '~nobody-at-all/x'"):
+        resolve_storage("~nobody-at-all/x")
+    with pytest.raises(ConfigError, match=r"^--storage must be UTF-8 text, got '\\udcff'$"):
+        load_sweep(DEFAULT_CONFIG, storage=os.fsdecode(b"\xff"))
+
+
+def test_a_bucket_that_does_not_answer_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Somebody takes the connection and says nothing; the client itself would wait for minutes."""
+    monkeypatch.setattr(paths, "ANSWER_SECONDS", 3.0)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        kept = []
+        thread = threading.Thread(target=lambda: kept.append(silent.accept()), daemon=True)
+        thread.start()
+        uri = f"s3://key:secret@b/x?endpoint_override=127.0.0.1:{silent.getsockname()[1]}"
+        began = time.monotonic()
+        with pytest.raises(
+            StorageError, match="must be a bucket that answers, got 's3://b/x"
+        ) as no:
+            check_answers(f"{uri}&scheme=http&region=x")
+        assert time.monotonic() - began < 30
+        assert "no answer within 3 s" in str(no.value)
+        assert "secret" not in str(no.value)
+    for connection, _ in kept:
+        connection.close()

@@ -1,0 +1,414 @@
+"""Bad input at the command line: exit code 2, a clear message, and nothing begun."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from music_rllib.config.run_settings import RunSettings, preset
+from music_rllib.envs.tasks import BUILT_IN_TASKS
+from music_rllib.experiment.session import Sweep, open_sweep
+from music_rllib.store.handoff import write_handoff
+from music_rllib.sweep import cli, driver
+
+Document = dict[str, Any]
+
+
+@dataclass
+class Result:
+    """What the program did."""
+
+    exit_code: int
+    output: str
+    stderr: str
+
+
+Program = Callable[..., Result]
+
+REPOSITORY = Path(__file__).parents[3]
+PRETRAIN: Document = {"name": "pretrain", "variant": "music-u"}
+
+
+@pytest.fixture
+def program(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Program:
+    """`python -m music_rllib.sweep` in a folder of its own, up to where a sweep would begin."""
+    monkeypatch.chdir(tmp_path)
+
+    def begun(*_: object) -> int:
+        raise AssertionError("the sweep began")
+
+    monkeypatch.setattr(driver, "_compute_and_report", begun)
+
+    def run(document: Document | None = None, *options: str) -> Result:
+        arguments = list(options)
+        if document is not None:
+            (tmp_path / "sweep.yaml").write_text(yaml.safe_dump(document))
+            arguments.insert(0, "sweep.yaml")
+        capsys.readouterr()
+        code = cli.main(arguments or ["run"])
+        output, errors = capsys.readouterr()
+        return Result(code, output + errors, errors)
+
+    return run
+
+
+def document(**changes: Any) -> Document:
+    base: Document = {
+        "name": "s",
+        "tasks": ["FetchPush"],
+        "resources": {"num_cpus": 1},
+        "stages": [PRETRAIN],
+    }
+    return base | changes
+
+
+def from_checkpoint(folder: Path) -> Document:
+    source = {"checkpoint": str(folder)}
+    return document(stages=[{"name": "f", "variant": "music-r", "init_from": source}])
+
+
+def test_a_dry_run_shows_the_plan_and_leaves_nothing(program: Program, tmp_path: Path) -> None:
+    result = program(document(), "--dry-run")
+    assert result.exit_code == 0
+    assert "1 runs, 200,000 env steps in all." in result.output
+    assert f"Storage: {tmp_path}/results" in result.output
+    assert [path.name for path in tmp_path.iterdir()] == ["sweep.yaml"]
+
+
+def test_without_a_file_the_packaged_sweep_runs(program: Program) -> None:
+    result = program(None, "--dry-run")
+    assert result.exit_code == 0
+    assert "No CONFIG given" in result.output
+    assert "tac.entropic_index: 1, 1.5, 2" in result.output
+
+
+def test_options_replace_name_and_storage(program: Program, tmp_path: Path) -> None:
+    result = program(document(), "--dry-run", "--name", "other", "--storage", "elsewhere")
+    assert "Sweep other" in result.output
+    assert f"Storage: {tmp_path}/elsewhere" in result.output
+
+
+def test_the_packaged_sweep_is_the_smoke_sweep() -> None:
+    assert driver.DEFAULT_CONFIG.read_text() == (REPOSITORY / "tune_configs/smoke.yaml").read_text()
+
+
+BAD: list[tuple[Document, str]] = [
+    (document(colour="red"), "sweep.yaml:1: colour is not a known setting"),
+    (
+        document(stages=[PRETRAIN | {"tac": {"entropic_index": 0}}]),
+        "stages.pretrain.tac.entropic_index must be > 0, got 0",
+    ),
+    (
+        document(stages=[PRETRAIN | {"tac": {"entropic_index": float("nan")}}]),
+        "stages.pretrain.tac.entropic_index must be a finite number, got nan",
+    ),
+    (document(tasks=["FetchPusch"]), "got 'FetchPusch' (did you mean 'FetchPush'?)"),
+    (document(tasks=["FetchReach"]), "got FetchReach, which has none"),
+    (document(resources={"num_cpus": 4096}), "resources.num_cpus must be <= "),
+    (
+        document(mlflow={"tracking_uri": "http://127.0.0.1:9"}),
+        "mlflow.tracking_uri must name an MLflow server that answers, got http://127.0.0.1:9",
+    ),
+    (document(storage="ftp://host/x"), "storage must be a folder or an s3:// or gs:// URI"),
+    (document(storage="/dev/null/x"), "must be a folder or free, /dev/null is a device"),
+    (document(storage="/proc/self"), "/proc/self must be writable, for /proc/self/s: "),
+    (document(storage="x" * 300), "storage must have names of at most 255 bytes in its path"),
+    (
+        document(defaults={"replay": {"capacity": 10**18}}),
+        "stage pretrain: replay.capacity must fit into what a process may claim on this machine",
+    ),
+    (from_checkpoint(Path("nowhere")), "nowhere must hold a handoff"),
+    (
+        document(
+            tasks=["Mine"],
+            environments={"Mine": {"env_id": "Nope-v7", "horizon": 5}},
+            stages=[{"name": "a", "variant": "tac"}],
+        ),
+        "environments.Mine: env_id must name an environment that can be made, got 'Nope-v7'",
+    ),
+    (
+        document(
+            tasks=["Swing"],
+            environments={
+                "Swing": {
+                    "env_id": "Pendulum-v1",
+                    "horizon": 200,
+                    "agent_indices": [0],
+                    "surrounding_indices": [3],
+                    "success_key": None,
+                }
+            },
+        ),
+        "environments.Swing: surrounding_indices must be < 3, the size of the observation, got 3",
+    ),
+]
+
+
+@pytest.mark.parametrize(("bad", "message"), BAD, ids=[message[:30] for _, message in BAD])
+def test_bad_input_is_refused_before_anything_starts(
+    program: Program, tmp_path: Path, bad: Document, message: str
+) -> None:
+    for options in ((), ("--dry-run",)):
+        if options and "tracking_uri" in message:
+            continue  # a plan needs no MLflow
+        result = program(bad, *options)
+        assert result.exit_code == 2, result.output
+        assert message in result.stderr
+        assert result.stderr.startswith("error: ")
+    assert not (tmp_path / "results" / "nodes").exists()
+
+
+SPACE: Document = {"tac.alpha": {"float": [0.01, 0.5]}}
+
+
+def searched(**search: Any) -> Document:
+    of_stage = {"name": "a", "variant": "tac", "search": {"space": SPACE, "trials": 2} | search}
+    return document(stages=[of_stage])
+
+
+REFUSED: list[tuple[Document, str]] = [
+    (
+        searched(storage="postgresql://me@127.0.0.1:9/studies"),
+        "search.storage must be a database that can be used, got postgresql://127.0.0.1:9",
+    ),
+    (
+        searched(storage="sqlite:///nowhere/studies.db"),
+        "search.storage must be in a folder that can be written, got sqlite:///nowhere/studies.db",
+    ),
+    (
+        searched(warm_start={"study": "older/a"}),
+        "search.warm_start.study must be (the beginning of) a study's name, got 'older/a': there",
+    ),
+    (
+        searched(warm_start={"study": "older/a", "storage": "sqlite:///older.db"}),
+        "search.warm_start.storage must be an sqlite file that is there, got sqlite:///older.db",
+    ),
+    (
+        document(resources={"num_cpus": 1, "memory_per_run": 1e6}),
+        "resources.memory_per_run must be <= ",
+    ),
+    (
+        document(resources={"num_cpus": 1, "gpus_per_run": 64}),
+        "resources.gpus_per_run must be <= ",
+    ),
+    (document(mlflow={"tracking_uri": "http://127.0.0.1:9"}), "an MLflow server that answers"),
+    (from_checkpoint(Path("nowhere")), "nowhere must hold a handoff"),
+]
+
+
+@pytest.mark.parametrize(("bad", "message"), REFUSED, ids=[message[:30] for _, message in REFUSED])
+def test_a_refused_sweep_is_not_recorded(
+    program: Program, tmp_path: Path, bad: Document, message: str
+) -> None:
+    result = program(bad)
+    assert (result.exit_code, message in result.stderr) == (2, True), result.stderr
+    left = [path.name for path in (tmp_path / "results").rglob("*") if path.is_file()]
+    assert not {*left} & {"config.json", "plan.json", "settings.json", "state.json"}
+    assert not list(tmp_path.rglob("*.db"))
+
+
+@pytest.mark.parametrize("command", [("plan",), ("run", "--dry-run")])
+@pytest.mark.parametrize(
+    ("bad", "message"), REFUSED[:-2], ids=[message[:30] for _, message in REFUSED[:-2]]
+)
+def test_a_plan_is_refused_as_its_sweep_would_be(
+    program: Program, tmp_path: Path, command: tuple[str, ...], bad: Document, message: str
+) -> None:
+    (tmp_path / "sweep.yaml").write_text(yaml.safe_dump(bad))
+    result = program(None, command[0], "sweep.yaml", *command[1:])
+    assert (result.exit_code, message in result.stderr) == (2, True), result.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["sweep.yaml"]
+
+
+def test_a_refused_configuration_does_not_replace_the_one_that_ran(
+    program: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(driver, "_compute_and_report", lambda *_: 0)
+    assert program(document()).exit_code == 0
+    before = (tmp_path / "results/s/config.json").read_text()
+    other = document(seeds=[7], mlflow={"tracking_uri": "http://127.0.0.1:9"})
+    assert program(other).exit_code == 2
+    assert (tmp_path / "results/s/config.json").read_text() == before
+
+
+def test_a_search_may_learn_from_a_stage_above_it(program: Program) -> None:
+    """Its study is made with the sweep's own."""
+    first = searched()["stages"][0]
+    second = searched(warm_start={"study": "s/a"})["stages"][0] | {"name": "b"}
+    assert program(document(stages=[first, second]), "--dry-run").exit_code == 0
+
+
+def test_files_that_are_none(program: Program, tmp_path: Path) -> None:
+    result = program(None, "missing.yaml")
+    assert (result.exit_code, "missing.yaml: must be an existing file" in result.stderr) == (
+        2,
+        True,
+    )
+    (tmp_path / "torn.yaml").write_text("name: [")
+    result = program(None, "torn.yaml")
+    assert (result.exit_code, "torn.yaml:1: must be valid YAML" in result.stderr) == (2, True)
+
+
+def handoff(folder: Path, task_name: str) -> Path:
+    task = BUILT_IN_TASKS[task_name]
+    run = RunSettings.model_validate(
+        {"task": task, "variant": "music-u", "seed": 0, "music": preset("music-u", task)}
+    )
+    weights = {"mi_estimator": {"w": np.zeros((4, 4), np.float32)}}
+    write_handoff(folder, weights, run.handoff_info("0" * 20, 1))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("task", "tamper", "message"),
+    [
+        ("FetchSlide", lambda _: None, "must be of task FetchPush, got one of FetchSlide"),
+        ("FetchPush", lambda data: data[:-3], "must have 136 bytes, it has 133"),
+        ("FetchPush", lambda data: data[:-1] + b"x", "its content has changed"),
+    ],
+    ids=["foreign", "truncated", "flipped"],
+)
+def test_checkpoints_that_do_not_fit(
+    program: Program,
+    tmp_path: Path,
+    task: str,
+    tamper: Callable[[bytes], bytes | None],
+    message: str,
+) -> None:
+    folder = handoff(tmp_path / "handoff", task)
+    weights = folder / "mi_estimator.safetensors"
+    weights.write_bytes(tamper(weights.read_bytes()) or weights.read_bytes())
+    result = program(from_checkpoint(folder))
+    assert result.exit_code == 2
+    assert "stages.f.init_from" in result.stderr
+    assert message in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("address", "message"),
+    [
+        ("127.0.0.1:9", "RAY_ADDRESS must be HOST:PORT of a Ray cluster that answers"),
+        ("http://127.0.0.1:8265", "an http address is for 'ray job submit'"),
+        ("nonsense", "RAY_ADDRESS must be HOST:PORT of a Ray cluster that answers"),
+    ],
+)
+def test_a_cluster_that_is_not_there(
+    program: Program, monkeypatch: pytest.MonkeyPatch, address: str, message: str
+) -> None:
+    monkeypatch.setenv("RAY_ADDRESS", address)
+    result = program(document())
+    assert result.exit_code == 2
+    assert message in result.stderr
+
+
+def test_a_damaged_node_that_others_start_from(
+    program: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    finetune = {"name": "f", "variant": "music-r", "init_from": "pretrain"}
+    opened: list[Sweep] = []
+
+    def remember(*arguments: Any) -> Sweep:
+        opened.append(open_sweep(*arguments))
+        return opened[-1]
+
+    monkeypatch.setattr("music_rllib.sweep.driver.open_sweep", remember)
+    program(document(stages=[PRETRAIN, finetune]), "--dry-run")
+    key = opened[-1].plan.nodes[0].key
+    produced = tmp_path / "produced"
+    handoff(produced / "handoff", "FetchPush")
+    opened[-1].store.publish(key, produced)
+    node = tmp_path / "results" / "nodes" / key
+    (node / "handoff" / "handoff.json").write_text("{}")
+    result = program(document(stages=[PRETRAIN, finetune]))
+    assert result.exit_code == 2
+    assert "pretrain/FetchPush/seed0: " in result.stderr
+    assert f"{node}/handoff/handoff.json must have " in result.stderr
+    assert "--retrain-damaged" in result.stderr
+    (node / "manifest.json").write_text("{}")
+    result = program(document(stages=[PRETRAIN, finetune]), "--dry-run")
+    assert result.exit_code == 2
+    assert f"{node}/manifest.json must be a manifest" in result.stderr
+    assert "--retrain-damaged" in result.stderr
+
+
+@pytest.mark.parametrize("command", ["", *sorted(cli._commands())])
+def test_help_answers_at_once_and_shows_how_it_is_used(command: str) -> None:
+    code = (
+        "import contextlib, sys; from music_rllib.sweep import cli\n"
+        "with contextlib.suppress(SystemExit): cli.main([*sys.argv[1:], '--help'])\n"
+        "heavy = {'ray', 'torch', 'mlflow', 'gymnasium', 'optuna', 'pydantic'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+    )
+    found = subprocess.run(
+        [sys.executable, "-c", code, *filter(None, [command])],
+        capture_output=True,
+        check=True,
+        text=True,
+        env=os.environ | {"COLUMNS": "200"},
+    )
+    parts = ["examples:", "python -m music_rllib.sweep"]
+    parts += ["--json"] if command else ["ray job submit", "exit codes", *cli._commands()]
+    for part in parts:
+        assert part in found.stdout
+
+
+def test_a_mistyped_option_is_bad_input(
+    program: Program, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        program(document(), "--dryrun")
+    assert stopped.value.code == 2
+    assert "unrecognized arguments: --dryrun" in capsys.readouterr().err
+    # With the usage of the command that it was given to.
+    with pytest.raises(SystemExit):
+        program(None, "status", "results/s", "--nope")
+    assert capsys.readouterr().err.startswith("usage: python -m music_rllib.sweep status ")
+
+
+@pytest.mark.parametrize("arguments", [("statsu", "results/x"), ("stauts",), ("Status", "x")])
+def test_a_mistyped_command_is_named(program: Program, arguments: tuple[str, ...]) -> None:
+    result = program(None, *arguments)
+    assert result.exit_code == 2
+    assert f"got {arguments[0]!r} (did you mean 'status'?)" in result.stderr
+
+
+def test_a_file_may_be_called_nearly_as_a_command(program: Program, tmp_path: Path) -> None:
+    (tmp_path / "plans").write_text(yaml.safe_dump(document()))
+    assert program(None, "plans", "--dry-run").exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("run", "sweep.yaml", "--name", ""), "--name must "),
+        (("plan", "sweep.yaml", "--storage", ""), "--storage must not be empty"),
+        (("plan", "sweep.yaml", "--seeds", ""), "--seeds must be a number of seeds"),
+        (("status", "s", "--storage", ""), "--storage must not be empty, got ''"),
+        (("status", "sweep.yaml", "--storage", ""), "--storage must not be empty, got ''"),
+        (("evaluate", "a/seed0", "--storage", ""), "--storage must not be empty, got ''"),
+        (("status", ""), "SWEEP must not be empty, got ''"),
+    ],
+)
+def test_an_empty_option_is_not_left_out(
+    program: Program, tmp_path: Path, arguments: tuple[str, ...], message: str
+) -> None:
+    (tmp_path / "sweep.yaml").write_text(yaml.safe_dump(document()))
+    result = program(None, *arguments)
+    assert (result.exit_code, result.stderr.startswith(f"error: {message}")) == (2, True), (
+        result.stderr
+    )
+
+
+def test_a_folder_that_is_not_there(program: Program, tmp_path: Path) -> None:
+    result = program(None, "status", str(tmp_path / "empty"))
+    assert result.exit_code == 2
+    assert f"got {tmp_path}/empty: there is no folder {tmp_path}/empty (" in result.stderr

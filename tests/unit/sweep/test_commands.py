@@ -1,0 +1,563 @@
+"""Sub-commands on a sweep's storage: a folder, and a bucket that another machine reaches."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pyarrow.fs as pafs
+import pytest
+import yaml
+from fsspec.implementations.memory import MemoryFileSystem  # type: ignore[import-untyped]
+
+from music_rllib import names
+from music_rllib.config.load import load_sweep
+from music_rllib.experiment import location, sweep_files
+from music_rllib.experiment.plan import Node, make_plan
+from music_rllib.experiment.session import Sweep, keep_record, open_sweep
+from music_rllib.redaction import flat_params
+from music_rllib.results.analysis import analyse
+from music_rllib.results.comparison import each_seed, verdict
+from music_rllib.results.data import Points, RunRecord, columns
+from music_rllib.results.data import Sweep as Logged
+from music_rllib.store import node_store, object_folder, paths
+from music_rllib.store.object_folder import DamagedError
+from music_rllib.store.paths import sweep_folder
+from music_rllib.store.run_record import HISTORY, Report, RunResult, to_json_lines
+from music_rllib.sweep import clean, cli
+from music_rllib.sweep.listeners.mlflow import run_info
+from music_rllib.sweep.listeners.state_file import Beacon, is_alive
+
+SWEEP: dict[str, Any] = {
+    "name": "mine",
+    "tasks": ["FetchPush"],
+    "seeds": [0, 1, 2],
+    "defaults": {"env_steps": 4000},
+    "stages": [
+        {"name": "train", "variant": "tac", "grid": {"tac.entropic_index": [1.0, 1.5, 2.0]}}
+    ],
+}
+
+
+class Said:
+    """What the program answered."""
+
+    def __init__(self, code: int, output: str, errors: str) -> None:
+        self.code, self.output, self.errors = code, output, errors
+
+    @property
+    def document(self) -> Any:
+        """Its one JSON document."""
+        assert self.code == 0, self.errors
+        return json.loads(self.output)
+
+
+Program = Callable[..., Said]
+
+
+@pytest.fixture(params=["folder", "bucket"])
+def storage(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Where the sweep is; the bucket is a file system without renames or folders of its own."""
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.chdir(tmp_path)
+    if request.param == "folder":
+        return str(tmp_path / "results")
+    memory = MemoryFileSystem()
+    memory.store.clear()
+    memory.pseudo_dirs[:] = [""]
+    bucket = (pafs.PyFileSystem(pafs.FSSpecHandler(memory)), "bucket/path")
+    # All are loaded by now: one that was loaded later would keep this for good.
+    for module in (object_folder, node_store, sweep_files, clean):
+        monkeypatch.setattr(module, "open_storage", lambda _: bucket)
+    for module in (location, paths):
+        monkeypatch.setattr(module, "check_answers", lambda _: None)
+    return "s3://bucket/path"
+
+
+@pytest.fixture
+def program(capsys: pytest.CaptureFixture[str]) -> Program:
+    def run(*arguments: str) -> Said:
+        capsys.readouterr()
+        code = cli.main(arguments)
+        return Said(code, *capsys.readouterr())
+
+    return run
+
+
+def opened(storage: str, tmp_path: Path, **changes: Any) -> Sweep:
+    path = tmp_path / "sweep.yaml"
+    path.write_text(yaml.safe_dump(SWEEP | changes))
+    config = load_sweep(path, storage=storage)
+    folder = sweep_folder(storage, config.name)
+    sweep = open_sweep(config, make_plan(config), storage, folder)
+    keep_record(sweep)
+    return sweep
+
+
+def finish(
+    sweep: Sweep,
+    beacon: Beacon,
+    node: Node,
+    value: float,
+    folder: Path,
+    metric: str = names.EVAL_SUCCESS,
+) -> None:
+    """As if the run had been trained."""
+    metrics = {metric: value, names.EVAL_EPISODES: 20.0}
+    report = Report(env_steps=4000, seconds=1.0, timestamp_ms=1, metrics=metrics)
+    folder.mkdir(exist_ok=True)
+    (folder / HISTORY).write_bytes(to_json_lines([report]))
+    (folder / "handoff").mkdir(exist_ok=True)
+    (folder / "handoff/handoff.json").write_text("{}")
+    result = RunResult(label=node.label, env_steps=4000, seconds=1.0, metrics=metrics)
+    sweep.store.publish(node.key, folder, result)
+    sweep.board.start(node.key)
+    beacon.reported(node, [report])
+    sweep.board.finish(node.key)
+    beacon.finished(node, result)
+
+
+HEIGHTS = {1.0: 0.2, 1.5: 0.8, 2.0: 0.3}
+
+
+def played(storage: str, tmp_path: Path, runs: int = 9, seeds: int = 3) -> Sweep:
+    sweep = opened(storage, tmp_path, seeds=list(range(seeds)))
+    with Beacon(sweep) as beacon:
+        for node in list(sweep.plan.nodes)[:runs]:
+            height = HEIGHTS[float(node.run.tac.entropic_index)]  # type: ignore[arg-type]
+            finish(sweep, beacon, node, height + 0.02 * node.run.seed, tmp_path / "made")
+        beacon.end("finished" if runs == 9 else "stopped")
+    return sweep
+
+
+def test_status_and_compare(storage: str, tmp_path: Path, program: Program) -> None:
+    played(storage, tmp_path)
+    place = f"{storage}/mine"
+    state = program("status", place, "--json").document
+    assert state["state"] == "finished"
+    assert state["stages"][0]["runs"] == {"finished": 9}
+    assert state["env_steps"] == {"done": 36_000, "left": 0}
+    assert state["best"]["values"] == {"tac.entropic_index": 1.5}
+    shown = program("status", "mine", "--storage", storage).output
+    assert "Sweep mine: finished" in shown
+    assert "Best so far: train tac.entropic_index = 1.5: success 0.82 [" in shown
+    (group,) = program("compare", place, "--json").document["groups"]
+    first, *others = group["conditions"]
+    assert first["values"] == {"tac.entropic_index": 1.5}
+    assert first["value"] == pytest.approx(0.82)
+    assert [row["best_is_better_with"] for row in others] == [1.0, 1.0]
+    assert "from so few seeds the gap to" in group["verdict"]
+    assert first["seeds"] == pytest.approx([0.8, 0.82, 0.84])
+    assert others[0]["gap"] == pytest.approx(0.5)
+    assert others[0]["gap_interval"][0] < 0.5 < others[0]["gap_interval"][1]
+    assert "0.8 0.82 0.84" in program("compare", place).output
+    bad = program("compare", place, "--metric", "nonsense")
+    assert (bad.code, "--metric must be one of" in bad.errors) == (2, True)
+
+
+def as_logged(sweep: Sweep) -> Logged:
+    """The sweep as its report reads it from MLflow, finished and unfinished runs."""
+    runs, points, results = [], [], sweep.results()
+    for node in sweep.plan.nodes:
+        info, result = run_info(node), results.get(node.key)
+        tags = {name: str(value) for name, value in info.tags.items() if value is not None}
+        runs.append(
+            RunRecord(
+                run_id=node.key,
+                name=info.name,
+                status="FINISHED" if result else "RUNNING",
+                started=0,
+                ended=None,
+                params=flat_params(info.config),
+                tags={**tags, names.TAG_NODE_KEY: node.key},
+            )
+        )
+        last = sorted((result.metrics if result else {names.EVAL_SUCCESS: 0.99}).items())
+        metrics = [metric for metric, _ in last]
+        points.append(Points(metrics, [4000] * len(last), [1] * len(last), [v for _, v in last]))
+    return Logged(
+        **dict.fromkeys(("name", "status", "run_id", "experiment_id", "source"), "mine"),  # type: ignore[arg-type]
+        started=0,
+        tags={},
+        config=None,
+        runs=runs,
+        history=columns(points),
+    )
+
+
+def test_compare_and_the_report_say_the_same_of_the_same_sweep(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    """Intervals, comparisons, corrections, unfinished seeds, words: there is one definition."""
+    tasks, seeds = ["FetchPush", "FetchSlide"], list(range(6))
+    sweep = opened(storage, tmp_path, tasks=tasks, seeds=seeds)
+    unfinished = {(1.5, "FetchSlide", 5), (1.5, "FetchPush", 2), (2.0, "FetchPush", 0)}
+    with Beacon(sweep) as beacon:
+        for node in sweep.plan.nodes:
+            q, task = float(node.run.tac.entropic_index), node.run.task.name  # type: ignore[arg-type]
+            if (q, task, node.run.seed) not in unfinished:
+                height = HEIGHTS[q] + 0.15 * (task == "FetchPush") + 0.01 * node.run.seed
+                finish(sweep, beacon, node, height, tmp_path / "made")
+        beacon.end("stopped")
+    groups = program("compare", f"{storage}/mine", "--json").document["groups"]
+    (analysis,) = analyse(as_logged(sweep))
+    assert [group["tasks"] for group in groups] == ["all tasks", *tasks]
+    for group, scope in zip(groups, analysis.scopes, strict=True):
+        assert group["metric"] == scope.metric
+        rows = {f"q = {row['values']['tac.entropic_index']:g}": row for row in group["conditions"]}
+        best = f"q = {group['conditions'][0]['values']['tac.entropic_index']:g}"
+        for final in scope.finals:
+            row = rows[final.condition.label]
+            assert (row["value"], row["runs"]) == (final.value, final.runs)
+            assert row["interval"] == [final.estimate.lower, final.estimate.upper]
+            assert sorted(row["seeds"]) == each_seed(final)
+        for pair in scope.comparisons:
+            labels = (pair.first.condition.label, pair.second.condition.label)
+            if best not in labels:
+                continue
+            (row,) = [rows[label] for label in labels if label != best]
+            chance = float(pair.estimate.value)
+            assert row["p_value"] == pair.p_value
+            assert row["best_is_better_with"] == (chance if labels[0] == best else 1 - chance)
+            assert abs(row["gap"]) == pytest.approx(abs(float(pair.gap.value)))
+        assert group["verdict"].replace("tac.entropic_index", "q") == " ".join(verdict(scope))
+    # Seeds that have finished on one of two tasks count there, and not over both.
+    assert [row["runs"] for row in groups[0]["conditions"]] == [8, 10, 12]
+    assert [row["runs"] for row in groups[1]["conditions"]] == [5, 5, 6]
+
+
+def test_compare_names_a_winner_on_evidence(storage: str, tmp_path: Path, program: Program) -> None:
+    played(storage, tmp_path, runs=15, seeds=5)
+    (group,) = program("compare", f"{storage}/mine", "--json").document["groups"]
+    assert group["verdict"].startswith("tac.entropic_index = 1.5 is ahead")
+    first, *others = group["conditions"]
+    assert first["p_value"] is None
+    # All of 5 runs above all of 5: 2 of 252 relabellings, three times for three comparisons.
+    assert [row["p_value"] for row in others] == pytest.approx([6 / 252] * 2)
+    assert "0.024" in program("compare", f"{storage}/mine").output
+
+
+def test_compare_names_no_winner_without_evidence(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    played(storage, tmp_path, runs=4)
+    (group,) = program("compare", f"{storage}/mine", "--json").document["groups"]
+    assert "has a single seed" in group["verdict"]
+    assert sorted(row["runs"] for row in group["conditions"]) == [1, 3]
+    text = program("compare", f"{storage}/mine").output
+    assert "3 of 3" in text
+    assert "1 of 3" in text
+
+
+def test_best_takes_the_middle_run_of_the_best_condition(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    sweep = played(storage, tmp_path)
+    chosen = program("best", f"{storage}/mine", "--output", "out", "--json").document
+    assert chosen["values"] == {"tac.entropic_index": 1.5}
+    (policy,) = chosen["policies"]
+    assert policy["seed"] == 1
+    folder = Path(policy["folder"])
+    assert (folder / "handoff/handoff.json").is_file()
+    settings = yaml.safe_load((folder / "run.yaml").read_text())
+    assert settings["tac"]["entropic_index"] == 1.5
+    assert json.loads((folder / "chosen.json").read_text())["node"] == policy["node"]
+    assert policy["node"] in sweep.finished
+    again = program("best", f"{storage}/mine", "--output", "out")
+    assert (again.code, "first by success" in again.output) == (0, True)
+
+
+def test_a_condition_with_all_its_runs_is_better_than_a_lucky_one(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    sweep = opened(storage, tmp_path)
+    heights = {1.0: 0.2, 1.5: 0.3, 2.0: 0.99}
+
+    def play(beacon: Beacon, *cells: tuple[float, int]) -> None:
+        for node in sweep.plan.nodes:
+            q = float(node.run.tac.entropic_index)  # type: ignore[arg-type]
+            if (q, node.run.seed) in cells:
+                finish(sweep, beacon, node, heights[q], tmp_path / "made")
+
+    with Beacon(sweep) as beacon:
+        play(beacon, (2.0, 0))
+        beacon.end("stopped")
+    assert (
+        "1 of 3 runs (no condition has all of its runs yet)"
+        in program("status", f"{storage}/mine").output
+    )
+    lucky = program("best", f"{storage}/mine", "--output", "lucky", "--json").document
+    assert lucky["values"] == {"tac.entropic_index": 2.0}
+    assert "over 1 runs, of 3 planned: no condition has all of its runs" in lucky["why"]
+    with Beacon(sweep) as beacon:
+        beacon.reused(next(n for n in sweep.plan.nodes if n.key in sweep.finished))
+        play(beacon, (1.0, 0), (1.5, 0), (1.5, 1), (1.5, 2))
+        beacon.end("stopped")
+    whole = program("best", f"{storage}/mine", "--output", "whole", "--json").document
+    assert whole["values"] == {"tac.entropic_index": 1.5}
+    state = program("status", f"{storage}/mine", "--json").document
+    assert (state["best"]["values"], state["best"]["runs"]) == (whole["values"], 3)
+
+
+def test_tasks_without_success_are_judged_by_their_return(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    task = {"env_id": "Reacher-v5", "horizon": 50, "success_key": None}
+    sweep = opened(storage, tmp_path, environments={"Reacher": task}, tasks=["Reacher"])
+    with Beacon(sweep) as beacon:
+        for node in list(sweep.plan.nodes):
+            height = -HEIGHTS[float(node.run.tac.entropic_index)]  # type: ignore[arg-type]
+            finish(sweep, beacon, node, height, tmp_path / "made", names.EVAL_RETURN)
+        beacon.end("finished")
+    place = f"{storage}/mine"
+    document = program("compare", place, "--json").document
+    assert document["metric"] == names.EVAL_RETURN
+    assert document["groups"][0]["conditions"][0]["values"] == {"tac.entropic_index": 1.0}
+    chosen = program("best", place, "--output", "out", "--json").document
+    assert chosen["values"] == {"tac.entropic_index": 1.0}
+    assert (chosen["metric"], chosen["value"]) == (names.EVAL_RETURN, pytest.approx(-0.2))
+    assert chosen["success_rate"] is None
+    assert "first by return" in chosen["why"]
+    shown = program("status", place).output
+    assert "Best so far: train tac.entropic_index = 1: return -0.2" in shown
+
+
+def test_clean_lists_and_deletes_what_no_other_sweep_has(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    sweep = played(storage, tmp_path)
+    other = opened(storage, tmp_path, name="other", seeds=[0])
+    going = program("clean", f"{storage}/mine", "--all", "--json").document
+    assert not going["deleted"]
+    paths = 1 + (sweep.folder != Path(storage) / "mine")  # a bucket's sweep has files here too
+    assert len(going["items"]) == 9 - 3 + paths
+    assert len(going["kept"]) == 3
+    assert all(item["what"].endswith("other has it too") for item in going["kept"])
+    done = program("clean", f"{storage}/mine", "--all", "--yes")
+    assert (done.code, f"{6 + paths} deleted." in done.output) == (0, True)
+    assert not sweep.folder.exists()
+    kept = {node.key for node in sweep.plan.nodes if sweep.store.is_finished(node.key)}
+    assert kept == {node.key for node in other.plan.nodes}
+    gone = program("status", f"{storage}/mine")
+    assert (gone.code, ": other)" in gone.errors) == (2, True)
+
+
+SEARCH: dict[str, Any] = {
+    "space": {"tac.alpha": {"choice": [0.1, 0.2, 0.3]}},
+    "sampler": "grid",
+    "storage": "postgresql://me@host/studies",
+    "study": "together",
+}
+
+
+def test_clean_keeps_what_another_sweep_of_the_same_study_counts_on(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    """Each has only the trials that it judged itself in its plan."""
+    stages = [
+        {"name": "pretrain", "variant": "music-u"},
+        {"name": "tune", "variant": "music-r", "init_from": "pretrain", "search": SEARCH},
+    ]
+    alone = [{"name": "apart", "variant": "tac"}]
+    mine, other = (opened(storage, tmp_path, name=n, stages=stages + alone) for n in ("mine", "b"))
+    mine.plan.add_trial("tune", 0, {"tac.alpha": 0.1}, [0, 1, 2], "trial0")
+    other.plan.add_trial("tune", 1, {"tac.alpha": 0.2}, [0, 1, 2], "trial1")
+    for sweep in (mine, other):
+        keep_record(sweep)
+    done = {node.label: node for node in mine.plan.nodes if node.stage != "apart"}
+    (tmp_path / "made").mkdir()
+    (tmp_path / "made" / HISTORY).write_bytes(b"")
+    for node in done.values():
+        result = RunResult(label=node.label, env_steps=1, seconds=1.0, metrics={})
+        mine.store.publish(node.key, tmp_path / "made", result)
+    asked = program("clean", f"{storage}/mine", "--all", "--json").document
+    assert len(done) == 6
+    assert {item["path"].rpartition("/")[2] for item in asked["kept"][:-1]} == {
+        node.key for node in done.values()
+    }
+    assert asked["kept"][-1]["path"] == "postgresql://host/studies"
+    assert "study 'together/tune'" in asked["kept"][-1]["what"]
+    assert program("clean", f"{storage}/mine", "--all", "--yes").code == 0
+    assert all(mine.store.is_finished(node.key) for node in done.values())
+
+
+def test_clean_is_refused_while_a_sweep_runs_that_shares_runs(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    played(storage, tmp_path)
+    apart = opened(storage, tmp_path, name="apart", seeds=[7])
+    with Beacon(apart) as beacon:
+        assert program("clean", f"{storage}/mine").code == 0
+        beacon.end("stopped")
+    other = opened(storage, tmp_path, name="other", seeds=[0])
+    with Beacon(other) as beacon:
+        refused = program("clean", f"{storage}/mine", "--all", "--yes")
+        assert (refused.code, "mine shares 3 with other: stop that first" in refused.errors) == (
+            2,
+            True,
+        )
+        beacon.end("stopped")
+    assert program("clean", f"{storage}/mine").code == 0
+
+
+DAMAGED = {
+    "state.json": ("[]", ("status", "clean")),
+    "plan.json": ("{}", ("compare", "clean")),
+    "config.json": ("[]", ("status", "compare", "best", "clean")),
+}
+
+
+@pytest.mark.parametrize("file", DAMAGED)
+def test_a_damaged_record_is_said(
+    storage: str, tmp_path: Path, program: Program, file: str
+) -> None:
+    played(storage, tmp_path)
+    content, commands = DAMAGED[file]
+    sweep_files.keep(opened(storage, tmp_path, name="other"), file, content)
+    message = f"other/{file} must be a sweep's {file[:-5]} as its driver writes it, got {content}"
+    for command in commands:
+        said = program(command, f"{storage}/other")
+        assert (said.code, message in said.errors) == (2, True)
+    # What another sweep shares with it can't be told any more.
+    said = program("clean", f"{storage}/mine", "--all", "--yes")
+    assert (said.code, message in said.errors) == (2, True)
+    assert program("status", f"{storage}/mine").code == 0
+
+
+def test_stop_reaches_the_driver(
+    storage: str, tmp_path: Path, program: Program, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    received = threading.Event()
+    monkeypatch.setattr("music_rllib.sweep.listeners.state_file.REMOTE_SECONDS", 1.0)
+    before = signal.signal(signal.SIGINT, lambda *_: received.set())
+    try:
+        sweep = opened(storage, tmp_path)
+        with Beacon(sweep) as beacon:
+            assert is_alive(sweep_files.read(storage, "mine/state.json"))
+            refused = program("clean", f"{storage}/mine")
+            assert (refused.code, "must not be running" in refused.errors) == (2, True)
+            asked = program("stop", f"{storage}/mine", "--wait", "0")
+            assert (asked.code, "was told to stop" in asked.output) == (0, True)
+            assert received.wait(60)
+            beacon.end("stopped")
+    finally:
+        signal.signal(signal.SIGINT, before)
+    again = program("stop", f"{storage}/mine", "--json").document
+    assert again == {"sweep": "mine", "was_running": False, "state": "stopped"}
+
+
+def test_a_driver_that_was_killed_is_interrupted(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    sweep = opened(storage, tmp_path)
+    with Beacon(sweep) as beacon:
+        pass
+    state = sweep_files.read(storage, "mine/state.json")
+    state["driver"] |= {"ended": None, "outcome": "running", "pid": 2**22 + 1}
+    sweep_files.keep(sweep, sweep_files.STATE, sweep_files.as_json(state))
+    assert beacon is not None
+    assert program("status", f"{storage}/mine", "--json").document["state"] == "interrupted"
+
+
+def test_nothing_runs_after_a_crash(storage: str, tmp_path: Path, program: Program) -> None:
+    sweep = opened(storage, tmp_path)
+    node = sweep.plan.nodes[0]
+    with contextlib.suppress(RuntimeError), Beacon(sweep):
+        sweep.board.start(node.key)
+        raise RuntimeError("out of luck")
+    state = program("status", f"{storage}/mine", "--json").document
+    assert (state["state"], state["running"]) == ("failed", [])
+    assert state["stages"][0]["runs"] == {"interrupted": 1, "waiting": 8}
+    shown = program("status", f"{storage}/mine").output
+    assert node.label not in shown
+    assert "interrupted" in shown
+
+
+def test_the_recorded_configuration_is_the_sweeps(storage: str, tmp_path: Path) -> None:
+    from music_rllib.experiment.location import find_sweep
+
+    sweep = opened(storage, tmp_path)
+    found = find_sweep(f"{storage}/mine", None).open()
+    assert [node.key for node in found.plan.nodes] == [node.key for node in sweep.plan.nodes]
+    assert found.storage == storage
+
+
+def test_plan_as_json_with_more_seeds(tmp_path: Path, program: Program) -> None:
+    os.chdir(tmp_path)
+    Path("sweep.yaml").write_text(yaml.safe_dump(SWEEP | {"resources": {"num_cpus": 1}}))
+    plan = program("plan", "sweep.yaml", "--seeds", "5", "--json").document
+    assert plan["seeds"] == [0, 1, 2, 3, 4]
+    assert len(plan["nodes"]) == 15
+    assert plan["env_steps_left"] == 15 * 4000
+    listed = program("plan", "sweep.yaml", "--seeds", "4,9", "--json").document
+    assert listed["seeds"] == [4, 9]
+    assert plan["remarks"] == []
+    narrow = SWEEP | {"defaults": {"env_steps": 4000, "tac": {"target_bounds": [-9.0, 200.0]}}}
+    Path("narrow.yaml").write_text(yaml.safe_dump(narrow))
+    answer = program("plan", "narrow.yaml", "--json")
+    (remark,) = answer.document["remarks"]
+    assert "target_bounds -9 to 200 cut off values that can be reached, -100 to" in remark
+    assert remark in answer.errors
+    bad = program("plan", "sweep.yaml", "--seeds", "many")
+    assert (bad.code, "--seeds must be a number of seeds" in bad.errors) == (2, True)
+
+
+def test_a_damaged_run_is_named_by_every_command_and_trained_again_when_asked(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    sweep = played(storage, tmp_path)
+    good, bad = sweep.plan.nodes[0], sweep.plan.nodes[4]
+    history = next(file for file in sweep.store._nodes.files(bad.key) if file.endswith(HISTORY))
+    with sweep.store._fs.open_output_stream(history) as sink:
+        sink.write(b"")
+    place, file = f"{storage}/mine", str(tmp_path / "sweep.yaml")
+    for arguments in (
+        ("run", file, "--storage", storage),
+        ("run", file, "--storage", storage, "--dry-run"),
+        ("plan", file, "--storage", storage),
+        ("resume", place),
+        ("best", place),
+        ("compare", place),
+    ):
+        said = program(*arguments)
+        assert said.code == 2, arguments
+        assert "1 finished run is damaged" in said.errors
+        assert f"{bad.label}: {history} must have " in said.errors
+        assert "--retrain-damaged" in said.errors
+        assert good.label not in said.errors
+    said = program("status", place, "--json")
+    assert said.code == 1
+    (damaged,) = json.loads(said.output)["damaged"]
+    assert damaged["run"] == bad.label
+    said = program("status", place)
+    assert (said.code, f"DAMAGED {bad.label}: " in said.output) == (1, True)
+
+    removed: list[str] = []
+    again = open_sweep(sweep.config, sweep.plan, storage, sweep.folder, removed.append)
+    assert [line.split(":")[0] for line in removed] == [bad.label]
+    assert again.board.next_ready() == bad
+    assert len(again.finished) == 8
+    assert program("plan", file, "--storage", storage).code == 0
+    assert program("status", place).code == 0
+
+
+def test_what_a_search_has_asked_for_before_is_verified_too(tmp_path: Path) -> None:
+    """Its trials aren't part of the plan before the search begins."""
+    search = {"space": {"tac.lr": {"float": [1e-4, 1e-2]}}, "trials": 4}
+    stages = [{"name": "train", "variant": "tac", "search": search}]
+    storage = str(tmp_path / "results")
+    sweep = opened(storage, tmp_path, stages=stages, seeds=[0])
+    sweep.plan.add_trial("train", 0, {"tac.lr": 1e-3}, [0], "trial0")
+    keep_record(sweep)
+    (node,) = sweep.plan.nodes
+    with contextlib.suppress(KeyError):  # the board doesn't know it, which is enough here
+        finish(sweep, Beacon(sweep), node, 0.5, tmp_path / "made")
+    (tmp_path / "results/nodes" / node.key / "handoff/handoff.json").write_text("{ }")
+    with pytest.raises(DamagedError, match=rf"{node.label}: .*handoff\.json must have 2 bytes"):
+        opened(storage, tmp_path, stages=stages, seeds=[0])

@@ -1,0 +1,70 @@
+"""What a plan takes: kinds of runs, and the arithmetic from their speeds."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from music_rllib.config.load import load_sweep
+from music_rllib.experiment.plan import make_plan
+from music_rllib.sweep import cost
+
+
+def kinds(folder: Path, finished: int = 0, **changes: Any) -> list[cost.Kind]:
+    document: dict[str, Any] = {
+        "name": "s",
+        "tasks": ["FetchPush", "FetchSlide"],
+        "seeds": [0, 1],
+        "defaults": {"env_steps": 10_000, "tac": {"random_steps": 1_000, "replay_ratio": 0.5}},
+        "stages": [
+            {
+                "name": "t",
+                "variant": "tac",
+                "grid": {"tac.entropic_index": [1, 2], "tac.hidden_sizes": [[8], [64]]},
+            },
+        ],
+    }
+    path = folder / "s.yaml"
+    path.write_text(yaml.safe_dump(document | changes))
+    config = load_sweep(path)
+    plan = make_plan(config)
+    return cost.kinds(config, plan, {node.key for node in plan.nodes[:finished]})
+
+
+def test_runs_of_one_task_differ_in_cost_by_their_networks_and_not_by_q(tmp_path: Path) -> None:
+    found = kinds(tmp_path)
+    assert [(kind.label, kind.runs, kind.settings.tac.hidden_sizes) for kind in found] == [
+        ("t/FetchPush", 4, (8,)),
+        ("t/FetchSlide", 4, (8,)),
+        ("t/FetchPush", 4, (64,)),
+        ("t/FetchSlide", 4, (64,)),
+    ]
+    assert {kind.grad_updates for kind in found} == {4_500}
+    assert sum(kind.runs for kind in kinds(tmp_path, finished=5)) == 16 - 5
+
+
+def test_a_search_counts_with_what_it_runs_at_most(tmp_path: Path) -> None:
+    search = {
+        "trials": 5,
+        "space": {"tac.alpha": {"float": [0.01, 0.1], "log": True}},
+        "final": {"trials": 2, "seeds": 3},
+    }
+    stages = [{"name": "t", "variant": "tac", "search": search}]
+    (push, slide) = kinds(tmp_path, stages=stages)
+    assert (push.label, push.runs, push.env_steps) == ("t/FetchPush", 5 * 2 + 2 * 3, 10_000)
+    assert (slide.label, slide.runs) == ("t/FetchSlide", 16)
+
+
+def test_the_time_is_training_evaluations_and_start(tmp_path: Path) -> None:
+    costs = [
+        cost.Cost(kind=kind, steps_per_second=100.0, evaluation_seconds=3.0)
+        for kind in kinds(tmp_path)
+    ]
+    # 10,000 steps, and an evaluation every 5,000.
+    a_run = 100.0 + 2 * 3.0 + cost.START_SECONDS
+    document = cost.cost_document(costs, slots=4)
+    assert document["seconds"] == pytest.approx(16 * a_run / 4)
+    assert document["kinds"][0]["seconds"] == pytest.approx(4 * a_run)
+    assert cost.cost_document(costs, slots=100)["seconds"] == pytest.approx(a_run)
+    assert cost.cost_document([], slots=2) == {"kinds": [], "runs_at_once": 2, "seconds": 0.0}

@@ -1,0 +1,84 @@
+"""What a sweep exports for Prometheus, with Ray's gauges replaced by what remembers them."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import ray
+import ray.util.metrics
+import yaml
+
+from music_rllib import names
+from music_rllib.config.load import load_sweep
+from music_rllib.experiment.plan import Plan, make_plan
+from music_rllib.experiment.scheduler import Board
+from music_rllib.store.run_record import Report, RunResult
+from music_rllib.sweep.listeners.prometheus import Gauges
+from music_rllib.tracking.sender import Backlog
+
+KEPT = 3
+
+
+@pytest.fixture
+def exported(monkeypatch: pytest.MonkeyPatch) -> dict[str, dict[str, float]]:
+    """By gauge and run, what was set in the last round."""
+    found: dict[str, dict[str, float]] = {}
+
+    class Gauge:
+        def __init__(self, name: str, **_: Any) -> None:
+            self.name = name
+
+        def set(self, value: float, tags: dict[str, str]) -> None:
+            if "run" in tags:
+                found.setdefault(self.name, {})[tags["run"]] = value
+
+    monkeypatch.setattr(ray.util.metrics, "Gauge", Gauge)
+    monkeypatch.setattr(ray, "nodes", list)
+    monkeypatch.setattr("music_rllib.sweep.listeners.prometheus.KEPT", KEPT)
+    return found
+
+
+@pytest.fixture
+def plan(tmp_path: Path) -> Plan:
+    document = {
+        "name": "s",
+        "tasks": ["FetchReach"],
+        "seeds": list(range(8)),
+        "stages": [{"name": "train", "variant": "tac"}],
+    }
+    (tmp_path / "s.yaml").write_text(yaml.safe_dump(document))
+    return make_plan(load_sweep(tmp_path / "s.yaml"))
+
+
+def report(env_steps: int, success: float) -> Report:
+    metrics = {names.ENV_STEPS: float(env_steps), names.EVAL_SUCCESS: success}
+    return Report(env_steps=env_steps, seconds=env_steps / 100, timestamp_ms=0, metrics=metrics)
+
+
+def test_what_is_exported_does_not_grow_with_the_runs_that_ended(
+    exported: dict[str, dict[str, float]], plan: Plan, tmp_path: Path
+) -> None:
+    def backlog() -> Backlog:
+        return Backlog(records=0, artefacts=0, error=None)
+
+    now = iter(range(0, 1000, 10))
+    gauges = Gauges("s", Board(plan, set()), backlog, tmp_path / "s", now=lambda: next(now))
+    slow, *others = plan.nodes
+    paused = others.pop()
+    for node in (slow, paused, *others):
+        gauges.reported(node, [report(100, 0.25), report(300, 0.5)])
+    gauges.paused(paused)
+    gauges.tick()
+    rates = exported["music_env_steps_per_second"]
+    assert (rates[slow.label], rates[paused.label]) == (100.0, 0.0)
+    gauges.reported(paused, [report(300, 0.5), report(400, 0.75)])  # it goes on
+    for node in others:
+        gauges.finished(node, RunResult(label="", env_steps=300, seconds=3, metrics={}))
+    exported.clear()
+    gauges.tick()
+    kept = [slow, paused, *others[-KEPT:]]
+    assert exported["music_success_rate"] == {
+        node.label: 0.75 if node is paused else 0.5 for node in kept
+    }
+    assert exported["music_env_steps_per_second"][others[-1].label] == 0.0
+    assert exported["music_env_steps_per_second"][paused.label] == 100.0

@@ -1,0 +1,352 @@
+"""What a person sees: the plan, progress on a terminal and without one, the results."""
+
+import io
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from rich.console import Console
+
+from music_rllib import names
+from music_rllib.config.load import load_sweep
+from music_rllib.config.schema import SweepConfig
+from music_rllib.config.tac_settings import LearnedAlpha
+from music_rllib.experiment.listener import Failure
+from music_rllib.experiment.plan import Plan, make_plan
+from music_rllib.experiment.scheduler import Board
+from music_rllib.report.figures.palette import colour_of
+from music_rllib.schedules import Linear, Piecewise
+from music_rllib.store.paths import resolve_storage, sweep_folder
+from music_rllib.store.run_record import Report, RunResult
+from music_rllib.sweep.listeners.screen import Display
+from music_rllib.sweep.views.alpha import adaptive_rows, adaptive_text, alpha_rows, alpha_table
+from music_rllib.sweep.views.tables import plan_view, results_table
+from music_rllib.sweep.views.text import clock, in_words, percent
+from music_rllib.training.throughput import Pace
+
+DOCUMENT: dict[str, Any] = {
+    "name": "s",
+    "tasks": ["FetchPush"],
+    "seeds": [0, 1],
+    "defaults": {"env_steps": 2000, "tac": {"random_steps": 0}},
+    "stages": [
+        {"name": "pretrain", "variant": "music-u"},
+        {
+            "name": "finetune",
+            "variant": "music-r",
+            "init_from": "pretrain",
+            "env_steps": 5000,
+            "grid": {"tac.entropic_index": [1.0, 1.5], "tac.alpha": [0.1]},
+        },
+    ],
+}
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> SweepConfig:
+    path = tmp_path / "s.yaml"
+    path.write_text(yaml.safe_dump(DOCUMENT, sort_keys=False))
+    return load_sweep(path)
+
+
+@pytest.fixture
+def plan(config: SweepConfig) -> Plan:
+    return make_plan(config)
+
+
+def screen(*, terminal: bool = False) -> tuple[Console, io.StringIO]:
+    text = io.StringIO()
+    return Console(file=text, width=200, highlight=False, force_terminal=terminal), text
+
+
+def report(env_steps: int, seconds: float, **metrics: float) -> Report:
+    return Report(env_steps=env_steps, seconds=seconds, timestamp_ms=0, metrics=metrics)
+
+
+def test_the_plan_counts_runs_budgets_and_what_is_finished(config: SweepConfig, plan: Plan) -> None:
+    console, text = screen()
+    console.print(plan_view(config, plan, {plan.nodes[0].key}))
+    rows = {line.split()[1]: line for line in text.getvalue().splitlines() if "│" in line}
+    cells = [cell.strip() for cell in rows["finetune"].split("│")[1:-1]]
+    assert cells == [
+        "finetune",
+        "music-r",
+        "pretrain",
+        "FetchPush",
+        "tac.entropic_index: 1, 1.5",
+        "2",
+        "2",
+        "4",
+        "5,000",
+        "20,000",
+        "0",
+    ]
+    assert rows["pretrain"].split("│")[-2].strip() == "1"
+    assert "6 runs, 24,000 env steps in all, 1 finished earlier and reused, 22,000 env steps" in (
+        text.getvalue()
+    )
+
+
+def test_the_plan_shows_what_a_control_makes_of_alpha_at_each_q(tmp_path: Path) -> None:
+    alpha = {"value": 0.05, "matched_width": 0.1}
+    ramp = {"schedule": "linear", "start": 1.0, "end": 2.0}
+    stages = [
+        {
+            "name": "fixed",
+            "variant": "tac",
+            "tac": {"alpha": alpha},
+            "grid": {"tac.entropic_index": [2.0, 1.0]},
+        },
+        {
+            "name": "joint",
+            "variant": "tac",
+            "tac": {"alpha": alpha, "entropic_index": ramp, "entropy_form": "joint"},
+        },
+        {"name": "plain", "variant": "tac", "grid": {"tac.alpha": [0.05, 0.1]}},
+    ]
+    path = tmp_path / "s.yaml"
+    path.write_text(yaml.safe_dump(DOCUMENT | {"stages": stages}, sort_keys=False))
+    rows = alpha_rows(make_plan(load_sweep(path)))
+    # G = q^(-1/2) (sqrt(2 pi) sigma)^(1-q) at q = 2, and of four dimensions its fourth power.
+    pressure = 2**-0.5 / ((2 * math.pi) ** 0.5 * 0.1)
+    assert [(row["stage"], row["q"]) for row in rows] == [
+        ("fixed", "1"),
+        ("fixed", "2"),
+        ("joint", "1 to 2"),
+    ]
+    assert [row["at_start"] for row in rows] == pytest.approx([0.05, 0.05 / pressure, 0.05])
+    assert rows[2]["at_end"] == pytest.approx(0.05 / pressure**4)
+    console, text = screen()
+    console.print(alpha_table(rows))
+    assert "0.05 matched at 0.1" in text.getvalue()
+
+
+def test_the_plan_says_what_follows_what_is_measured(tmp_path: Path) -> None:
+    q = {"follows": "success_rate", "points": [[0.2, 2.0], [0.9, 1.0]], "monotone": True}
+    alpha = {"value": 0.05, "matched_width": 0.1}
+    stage = {"name": "her", "variant": "tac", "grid": {"tac.entropic_index": [q, 1.0]}}
+    path = tmp_path / "s.yaml"
+    document = DOCUMENT | {"stages": [stage | {"tac": {"alpha": alpha}}]}
+    path.write_text(yaml.safe_dump(document, sort_keys=False))
+    plan = make_plan(load_sweep(path))
+    assert [adaptive_text(row) for row in adaptive_rows(plan)] == [
+        "her: tac.entropic_index follows the success rate: 2 at 0.2, 1 at 0.9; never goes back"
+    ]
+    row = alpha_rows(plan)[1]
+    assert (row["q"], row["q_at_start"], row["at_end"]) == ("2 to 1 by success rate", 2.0, 0.05)
+    assert colour_of(row["q"]) == colour_of("1"), "it has that of its last value"
+
+
+def test_results_have_a_row_per_run_whatever_became_of_it(plan: Plan) -> None:
+    board = Board(plan, finished=[plan.nodes[1].key])
+    board.start(plan.nodes[0].key)
+    board.fail(plan.nodes[0].key)
+    board.start(plan.nodes[3].key)
+    metrics = {names.EVAL_SUCCESS: 0.25, names.EVAL_SUCCESS_ANY: 0.5, names.MI_REWARD: -0.5}
+    result = RunResult(label="x", env_steps=2000, seconds=125, metrics=metrics)
+    console, text = screen()
+    runs = {plan.nodes[1].key: "0123456789abcdef"}
+    console.print(results_table(plan, board.__getitem__, {plan.nodes[1].key: result}, runs.get))
+    rows = [
+        [cell.strip() for cell in line.split("│")[1:-1]]
+        for line in text.getvalue().splitlines()
+        if line.startswith("│")
+    ]
+    assert rows[1] == [
+        "pretrain", "FetchPush", "1", "1", "-", "25 %", "50 %", "-0.500", "2,000", "2:05",
+        "01234567", "reused",
+    ]  # fmt: skip
+    assert [row[-1] for row in rows] == [
+        "failed", "reused", "skipped", "interrupted", "skipped", "not started",
+    ]  # fmt: skip
+    assert [row[3] for row in rows] == ["1", "1", "1", "1", "1.5", "1.5"]
+    assert [row[4] for row in rows[2:]] == ["0.1"] * 4
+
+
+class Clock:
+    """A clock that a test sets."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def play(display: Display, plan: Plan, board: Board, time: Clock) -> Callable[[float], None]:
+    """One run that ends, one that fails."""
+    good, bad = plan.nodes[:2]
+
+    def wait(seconds: float) -> None:
+        time.now += seconds
+        display.tick()
+
+    for node in (good, bad):
+        board.start(node.key)
+        display.started(node)
+    wait(10)
+    display.reported(
+        good, [report(1000, 10.0, **{names.EVAL_EPISODES: 5, names.EVAL_SUCCESS: 0.2})]
+    )
+    wait(1)
+    board.fail(bad.key)
+    display.failed(bad, Failure("RuntimeError: the gripper fell off", Path("/logs/bad.txt")))
+    display.skipped(plan.nodes[3], bad)
+    wait(1)
+    return wait
+
+
+def test_without_a_terminal_there_are_plain_lines(plan: Plan) -> None:
+    console, text = screen()
+    board, time = Board(plan, finished=()), Clock()
+    with Display(console, plan, board, time) as display:
+        wait = play(display, plan, board, time)
+        wait(8)
+        board.finish(plan.nodes[0].key)
+        metrics = {names.EVAL_SUCCESS: 0.4, names.EVAL_SUCCESS_ANY: 0.6}
+        result = RunResult(label="x", env_steps=2000, seconds=20.4, metrics=metrics)
+        display.reported(plan.nodes[0], [report(2000, 20.4, **metrics)])
+        display.finished(plan.nodes[0], result)
+    assert text.getvalue().splitlines() == [
+        "[  0:00] pretrain/FetchPush/seed0: started",
+        "[  0:00] pretrain/FetchPush/seed1: started",
+        "[  0:10] pretrain/FetchPush/seed0: 1,000 of 2,000 env steps, 100 steps/s, 0:10 left, "
+        "success 20 % (any step -)",
+        "[  0:11] pretrain/FetchPush/seed1: FAILED: RuntimeError: the gripper fell off",
+        "[  0:11]     whole traceback: /logs/bad.txt",
+        "[  0:11] finetune/FetchPush/tac.entropic_index=1,tac.alpha=0.1/seed1: skipped, "
+        "it starts from pretrain/FetchPush/seed1",
+        "[  0:20] pretrain/FetchPush/seed0: finished, success 40 % (any step 60 %), "
+        "2,000 env steps in 0:20",
+    ]
+
+
+def test_a_run_without_evaluations_is_heard_of_now_and_then(plan: Plan) -> None:
+    console, text = screen()
+    board, time = Board(plan, finished=()), Clock()
+    with Display(console, plan, board, time) as display:
+        board.start(plan.nodes[0].key)
+        display.started(plan.nodes[0])
+        for second in range(1, 100):
+            time.now += 1
+            display.reported(plan.nodes[0], [report(10 * second, second)])
+    _, first, *more = text.getvalue().splitlines()
+    assert first == (
+        "[  0:30] pretrain/FetchPush/seed0: 300 of 2,000 env steps, 10 steps/s, 2:50 left"
+    )
+    assert len(more) == 2
+
+
+def test_a_terminal_shows_a_live_table(plan: Plan) -> None:
+    console, text = screen(terminal=True)
+    board, time = Board(plan, finished=()), Clock()
+    with Display(console, plan, board, time) as display:
+        play(display, plan, board, time)
+        shown = text.getvalue()
+    assert "1,000 / 2,000" in shown
+    assert "100" in shown
+    assert "20 %" in shown
+    assert "0 of 6 runs done, 1,000 of 24,000 env steps, 0:12 passed" in shown
+    # What is left is 1,000 steps of this run and two of 5,000, at 100 a second.
+    assert "about 1:50 left" in shown
+
+
+def test_tasks_without_success_are_shown_by_their_return(tmp_path: Path) -> None:
+    path = tmp_path / "s.yaml"
+    task = {"env_id": "Reacher-v5", "horizon": 50, "success_key": None}
+    stage = {"name": "train", "variant": "tac"}
+    both = {"environments": {"Reacher": task}, "tasks": ["Reacher", "FetchReach"]}
+    path.write_text(yaml.safe_dump(DOCUMENT | both | {"stages": [stage], "seeds": [0]}))
+    config = load_sweep(path)
+    plan = make_plan(config)
+    metrics = {names.EVAL_RETURN: -5.25, names.EVAL_EPISODES: 5.0}
+    success = {names.EVAL_SUCCESS: 0.5, names.EVAL_RETURN: -20.0}
+    for terminal in (False, True):
+        console, text = screen(terminal=terminal)
+        with Display(console, plan, Board(plan, finished=()), time := Clock()) as display:
+            display.started(plan.nodes[0])
+            time.now += 10
+            display.reported(plan.nodes[0], [report(1000, 10.0, **metrics)])
+            display.tick()
+        assert "return -5.25" in text.getvalue()
+        assert "success" not in text.getvalue()
+    console, text = screen()
+    with Display(console, plan, Board(plan, finished=())) as display:
+        result = RunResult(label="x", env_steps=2000, seconds=20, metrics=metrics)
+        display.finished(plan.nodes[0], result)
+    assert "finished, return -5.25, 2,000 env steps" in text.getvalue()
+    console, text = screen()
+    console.print(plan_view(config, plan, set()))
+    assert "Reacher (return), FetchReach" in text.getvalue()
+    results = {
+        node.key: RunResult(label="x", env_steps=2000, seconds=20, metrics=found)
+        for node, found in zip(plan.nodes, (metrics, success), strict=True)
+    }
+    console, text = screen()
+    finished = Board(plan, finished=list(results))
+    console.print(results_table(plan, finished.__getitem__, results, lambda _: None))
+    lines = [line for line in text.getvalue().splitlines() if line.startswith("│")]
+    cells = [[cell.strip() for cell in line.split("│")[4:8]] for line in lines]
+    assert cells == [["1", "-", "-", "-5.25"], ["1", "50 %", "-", "-20"]]
+
+
+def test_pace_is_that_of_the_last_reports() -> None:
+    pace = Pace(10_000, warm_up=0, now=0.0)
+    assert pace.steps_per_second is None
+    assert pace.seconds_left(5.0) is None
+    pace.hear([report(1000, 20.0)], now=20.0)
+    assert pace.steps_per_second == pytest.approx(50)
+    pace.hear([report(1000 + 1000 * i, 20.0 + 10 * i) for i in range(1, 7)], now=80.0)
+    assert pace.steps_per_second == pytest.approx(100)
+    assert pace.env_steps == 7000
+    assert pace.seconds_left(80.0) == pytest.approx(30)
+    assert pace.seconds_left(85.0) == pytest.approx(25)
+    assert pace.seconds_left(1000.0) == 0.0
+
+
+def test_random_steps_say_nothing_about_the_pace_of_learning() -> None:
+    pace = Pace(3000, warm_up=1000, now=0.0)
+    pace.hear([report(500, 0.5), report(1000, 1.0)], now=1.0)
+    assert pace.steps_per_second is None
+    pace.hear([report(1500, 11.0)], now=11.0)
+    assert pace.steps_per_second == pytest.approx(50)
+    assert pace.seconds_left(11.0) == pytest.approx(30)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(None, "-"), (0, "0:00"), (59.6, "1:00"), (3599, "59:59"), (3600, "1:00:00")],
+)
+def test_clock(seconds: float | None, text: str) -> None:
+    assert clock(seconds) == text
+
+
+def test_words() -> None:
+    assert in_words(1.0) == "1"
+    assert in_words(1.25) == "1.25"
+    assert in_words(Linear(start=1, end=2)) == "1 to 2"
+    assert in_words(Piecewise(points=((0, 1.0), (5, 3.0), (9, 2.0)))) == "1 to 3 to 2"
+    assert in_words(LearnedAlpha(learned=True)) == "learned"
+    assert percent(None) == "-"
+    assert percent(0.345) == "34 %"
+
+
+def test_storage_is_the_same_place_for_every_worker(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", "/home/somebody")
+    assert resolve_storage("results") == (f"{tmp_path}/results", None)
+    assert resolve_storage("s3://bucket/x") == ("s3://bucket/x", None)
+    monkeypatch.setenv("RAY_JOB_CONFIG_JSON_ENV_VAR", "{}")
+    place, remark = resolve_storage("results")
+    assert place == "/home/somebody/results"
+    assert remark is not None
+    assert "using /home/somebody/results" in remark
+    assert resolve_storage("/data/results") == ("/data/results", None)
+    assert sweep_folder("/data/results", "mine") == Path("/data/results/mine")
+    assert sweep_folder("s3://b/x", "mine") != sweep_folder("s3://b/y", "mine")
+    assert sweep_folder("s3://b/x", "mine").is_relative_to("/home/somebody")

@@ -1,0 +1,34 @@
+"""Names that MLflow accepts, and a module that costs nothing to import."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+from music_rllib import names
+from music_rllib.tracking.tracker import _check_metric_name
+
+CONSTANTS = {
+    key: value for key, value in vars(names).items() if key.isupper() and isinstance(value, str)
+}
+
+
+def test_every_name_is_one_that_mlflow_accepts() -> None:
+    for value in CONSTANTS.values():
+        _check_metric_name(value)
+
+
+def test_no_two_metrics_share_a_name() -> None:
+    metrics = [
+        value for key, value in CONSTANTS.items() if not key.startswith(("TAG_", "KIND_", "ARTEF"))
+    ]
+    assert len(set(metrics)) == len(metrics)
+
+
+def test_names_load_neither_mlflow_nor_ray_nor_torch() -> None:
+    code = (
+        "import sys; import music_rllib.names, music_rllib.tracking.store; "
+        "print(sorted({'mlflow', 'ray', 'torch', 'matplotlib', 'requests'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

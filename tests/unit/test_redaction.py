@@ -1,0 +1,141 @@
+"""What may be written down: flat params, no secrets."""
+
+from __future__ import annotations
+
+import argparse
+import time
+import unicodedata
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.table import Table
+from rich.text import Text
+
+from music_rllib.redaction import (
+    MAX_PARAM_LENGTH,
+    flat_params,
+    printable,
+    redact,
+    without_secrets,
+)
+from music_rllib.sweep.cli import main as sweep_main
+from music_rllib.sweep.cli_helpers import console_for
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("http://host:5000/x", "http://host:5000/x"),
+        ("https://user:pa%40ss@host:5000", "https://host:5000"),
+        ("postgresql+psycopg2://u:p@ss@db/x", "postgresql+psycopg2://db/x"),
+        (
+            "postgresql://db/x?user=u&password=hunter2&a=1",
+            "postgresql://db/x?user=u&password=***&a=1",
+        ),
+        ("cannot reach 'http://u:p@h:1/a' now", "cannot reach 'http://h:1/a' now"),
+        ("someone@example.org wrote http://h/a@b", "someone@example.org wrote http://h/a@b"),
+        ("sqlite:////home/me/mlflow.db", "sqlite:////home/me/mlflow.db"),
+        ("connect(host='h', password='p w', a=1)", "connect(host='h', password=***, a=1)"),
+        ("no login with password=hunter2, user=me", "no login with password=***, user=me"),
+        ("DB_PASSWORD: hunter2", 'DB_PASSWORD: "***"'),
+        ("{'api_key': 'k', \"token\": \"t\"}", "{'api_key': '***', \"token\": \"***\"}"),
+        ("PGPASSWORD=hunter2 psql", "PGPASSWORD=*** psql"),
+        ("Authorization: Bearer abc.def-g", "Authorization: Bearer ***"),
+        ("the password must be given", "the password must be given"),
+        ("5 tokens = 3 words", "5 tokens = *** words"),
+    ],
+)
+def test_uris_lose_their_passwords_and_nothing_else(text: str, expected: str) -> None:
+    assert redact(text) == expected
+
+
+def test_secrets_are_left_out_at_every_depth() -> None:
+    settings = {
+        "mlflow": {"tracking_uri": "http://u:hunter2@h", "password": "hunter2"},
+        "environments": [{"env_kwargs": {"api_key": "hunter2", "url": "s3://k:hunter2@b"}}],
+        "tac": {"alpha": 0.2},
+    }
+    clean = without_secrets(settings)
+    assert "hunter2" not in str(clean)
+    assert clean["tac"] == {"alpha": 0.2}
+    assert clean["environments"] == [{"env_kwargs": {"url": "s3://b"}}]
+    assert "password" in settings["mlflow"]
+
+
+def test_params_are_flat_text() -> None:
+    params = flat_params(
+        {
+            "seed": 3,
+            "tac": {"entropic_index": 1.5, "hidden_sizes": (256, 256), "learned": False},
+            "hindsight_k": None,
+            "environments": {"My=Env": {"horizon": 50}},
+            "stages": [{"name": "pretrain"}],
+        }
+    )
+    assert params == {
+        "seed": "3",
+        "tac.entropic_index": "1.5",
+        "tac.hidden_sizes": "[256, 256]",
+        "tac.learned": "False",
+        "hindsight_k": "None",
+        "environments.My_Env.horizon": "50",
+    }
+
+
+def test_params_that_mlflow_would_refuse_for_their_length_are_left_out() -> None:
+    params = flat_params({"fits": "x" * MAX_PARAM_LENGTH, "long": "x" * (MAX_PARAM_LENGTH + 1)})
+    assert list(params) == ["fits"]
+
+
+@given(st.text(), st.sampled_from(["password=", "https://me:", "token: ", "'secret': '"]))
+def test_what_is_redacted_stays_so(text: str, name: str) -> None:
+    once = redact(f"{text}{name}hunter2@host'{text}")
+    assert redact(once) == once
+
+
+CONTROLS = "\x1b[31m\x07\x9b2J\r\u202e\ud800\x00"
+
+
+@given(st.text(alphabet=st.characters()))
+def test_what_is_printed_commands_no_terminal(text: str) -> None:
+    shown = printable(text + CONTROLS)
+    shown.encode()
+    assert not any(unicodedata.category(one) in {"Cc", "Cs"} for one in shown if one not in "\n\t")
+    assert printable(text) == text or any(not one.isprintable() for one in text)
+
+
+def test_a_console_shows_markup_and_escapes_as_text(capsys: pytest.CaptureFixture[str]) -> None:
+    console = console_for(argparse.Namespace())
+    table = Table(title=f"[red]{CONTROLS[:-2]}")
+    table.add_column("[blink]")
+    table.add_row("[bold]x :smile:")
+    console.print(f"[red]{CONTROLS}")
+    console.print(Text(f"[link=x]{CONTROLS}"))
+    console.print(table)
+    shown = capsys.readouterr().out
+    for word in ("[red]\\u001b[31m", "[link=x]", "[blink]", "[bold]x :smile:"):
+        assert word in shown
+    assert not any(unicodedata.category(one) == "Cc" for one in shown if one != "\n")
+
+
+def test_an_error_shows_control_characters_as_text(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A file's name and its values are somebody's text."""
+    file = tmp_path / "a\x1b[2Jb.yaml"
+    file.write_text('name: "\\e[31m[red]\\u202e"\n"k\\e": 1\n')
+    assert sweep_main(["plan", str(file)]) == 2
+    shown = capsys.readouterr().err
+    assert "\x1b" not in shown
+    assert "\u202e" not in shown
+    assert r"\u001b[2Jb.yaml" in shown
+
+
+@pytest.mark.parametrize("text", ["1" * 100_000, "token" * 20_000, "a://" * 20_000, "secret='" * 9])
+def test_redaction_takes_time_in_proportion_to_a_text(text: str) -> None:
+    """Quadratic, the first would take minutes."""
+    began = time.process_time()
+    redact(text)
+    assert time.process_time() - began < 1

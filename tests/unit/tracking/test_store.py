@@ -1,0 +1,136 @@
+"""Which URIs are accepted, and what a user reads where none answers."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+
+import pytest
+
+from music_rllib.errors import TrackingError
+from music_rllib.tracking import store as store_module
+from music_rllib.tracking.store import check_reachable, resolve_store
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+@contextmanager
+def server_that_answers(status: int, body: bytes) -> Iterator[str]:
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(status)
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, *args: object) -> None:
+            pass
+
+    server = HTTPServer(("127.0.0.1", 0), Handler)
+    thread = threading.Thread(target=server.serve_forever, args=(0.02,))
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}"
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()
+
+
+def test_null_is_a_sqlite_file_in_the_storage(tmp_path: Path) -> None:
+    store = resolve_store(None, str(tmp_path / "results"))
+    assert store.uri == f"sqlite:///{tmp_path}/results/mlflow.db"
+    assert store.artefact_root == f"file://{tmp_path}/results/mlartifacts"
+    assert "ui --backend-store-uri" in store.ui_command()
+
+
+def test_a_relative_storage_is_made_absolute(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert resolve_store(None, "results").database == tmp_path / "results" / "mlflow.db"
+
+
+def test_a_server_keeps_its_artefacts_itself() -> None:
+    store = resolve_store("http://u:secret@mlflow:5000", "s3://bucket/sweeps")
+    assert store.artefact_root is None
+    assert store.ui_command() == "http://mlflow:5000"
+    assert store.run_url("3", "abc") == "http://mlflow:5000/#/experiments/3/runs/abc"
+
+
+def test_a_database_keeps_artefacts_in_the_storage() -> None:
+    store = resolve_store("postgresql+psycopg2://u:p@db/mlflow", "s3://bucket/sweeps/")
+    assert store.artefact_root == "s3://bucket/sweeps/mlartifacts"
+    assert "u:p" not in store.ui_command()
+
+
+@pytest.mark.parametrize(
+    ("uri", "rule"),
+    [
+        ("ftp://host", "got 'ftp://host'"),
+        ("results", "must be null"),
+        ("http://", "must name a host"),
+        ("http://host:port", "must name a host and a numeric port"),
+        ("http://[::1", "must name a host"),
+        ("http://user:hunter2@", "got 'http://'"),
+        ("", "must be null"),
+    ],
+)
+def test_a_wrong_uri_is_refused_with_its_rule(uri: str, rule: str) -> None:
+    with pytest.raises(TrackingError, match=r"mlflow\.tracking_uri") as raised:
+        resolve_store(uri, "results")
+    assert rule in str(raised.value)
+
+
+def test_a_bucket_needs_a_server() -> None:
+    with pytest.raises(TrackingError, match="must be set where storage is not a local folder"):
+        resolve_store(None, "s3://bucket/sweeps")
+
+
+def test_an_unreachable_server_is_named_without_its_password() -> None:
+    port = free_port()
+    store = resolve_store(f"http://user:hunter2@127.0.0.1:{port}", "results")
+    with pytest.raises(TrackingError, match="connection was refused") as raised:
+        check_reachable(store)
+    message = str(raised.value)
+    assert f"http://127.0.0.1:{port}" in message
+    assert "leave it null" in message
+    assert "hunter2" not in message
+
+
+def test_a_server_that_hangs_is_given_up_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(store_module, "ANSWER_SECONDS", 0.2)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        uri = f"http://127.0.0.1:{silent.getsockname()[1]}"
+        with pytest.raises(TrackingError, match="no answer within"):
+            check_reachable(resolve_store(uri, "results"))
+
+
+def test_an_unknown_host_is_called_unknown() -> None:
+    with pytest.raises(TrackingError, match=r"'no-such-host\.invalid' is not known"):
+        check_reachable(resolve_store("http://no-such-host.invalid:5000", "results"))
+
+
+@pytest.mark.parametrize(
+    ("status", "body", "reason"),
+    [
+        (503, b"starting", "status 503"),
+        (403, b"Invalid Host header - possible DNS rebinding attack detected", "--allowed-hosts"),
+    ],
+)
+def test_a_server_that_refuses_says_why(status: int, body: bytes, reason: str) -> None:
+    with server_that_answers(status, body) as uri, pytest.raises(TrackingError, match=reason):
+        check_reachable(resolve_store(uri, "results"))
+
+
+def test_a_healthy_server_passes() -> None:
+    with server_that_answers(200, b"OK") as uri:
+        check_reachable(resolve_store(uri, "results"))
