@@ -20,6 +20,7 @@ import annotated_types
 from pydantic import AfterValidator, BaseModel, BeforeValidator
 from pydantic.fields import FieldInfo
 
+from music_rllib.config.analysis import Analysis
 from music_rllib.config.run_settings import VARIANTS, Evaluation, RunSettings
 from music_rllib.config.schema import (
     Checkpoints,
@@ -153,10 +154,11 @@ def document() -> str:
         "## The file",
         table(
             [
-                *rows(Header, "", skip=("mlflow", "resources", "checkpoints")),
+                *rows(Header, "", skip=("mlflow", "resources", "checkpoints", "analysis")),
                 *rows(MlflowSettings, "mlflow."),
                 *rows(Resources, "resources."),
                 *rows(Checkpoints, "checkpoints."),
+                *rows(Analysis, "analysis."),
                 ("preset", "text", "none", PRESET_MEANING),
                 ("environments", "mapping", "`{}`", "Tasks of your own, [below](#environments)."),
                 ("defaults", "mapping", "`{}`", "[Settings](#settings) of every stage."),

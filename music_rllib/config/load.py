@@ -17,6 +17,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from music_rllib.config.analysis import check_analysis
 from music_rllib.config.layers import (
     LAYER_KEYS,
     SECTIONS,
@@ -213,6 +214,8 @@ def _resolve(file: YamlFile, document: dict[str, Any], findings: Findings) -> Sw
             if one >= FINAL_SEED:
                 rule = f"must be < {FINAL_SEED}, where a search's fresh seeds begin, got {one}"
                 findings.add(("seeds", position), rule)
+    if header and header.analysis:
+        check_analysis(header.analysis, stages, findings)
     if findings.problems or header is None:
         return None
     return SweepConfig(
@@ -225,6 +228,7 @@ def _resolve(file: YamlFile, document: dict[str, Any], findings: Findings) -> Sw
         mlflow=header.mlflow,
         resources=header.resources,
         checkpoints=header.checkpoints,
+        analysis=header.analysis,
         stages=tuple(stage for stage in stages.values() if stage is not None),
     )
 

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from music_rllib import names
+from music_rllib.config.analysis import Analysis
 from music_rllib.config.run_settings import RunSettings, Variant
 from music_rllib.config.search.space import SearchSettings
 from music_rllib.envs.tasks import Task
@@ -112,6 +113,8 @@ class Header(_Strict):
     mlflow: MlflowSettings = MlflowSettings()
     resources: Resources = Resources()
     checkpoints: Checkpoints = Checkpoints()
+    analysis: Analysis | None = None
+    """What is asked, for an analysis plan before the runs (docs/comparing_q.md); null: none."""
 
 
 class InitFrom(_Strict):
@@ -227,4 +230,5 @@ class SweepConfig:
     mlflow: MlflowSettings
     resources: Resources
     checkpoints: Checkpoints
+    analysis: Analysis | None
     stages: tuple[Stage, ...]

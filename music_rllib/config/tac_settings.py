@@ -15,7 +15,16 @@ from pydantic import (
 )
 
 from music_rllib.functional.entropy_scale import matched_alpha, normalised_alpha
-from music_rllib.schedules import AdaptiveSchedule, Schedule, bounded, extremes, value_at
+from music_rllib.schedules import (
+    AdaptiveSchedule,
+    Linear,
+    Measured,
+    Piecewise,
+    Schedule,
+    bounded,
+    extremes,
+    value_at,
+)
 
 __all__ = [
     "Alpha",
@@ -25,6 +34,7 @@ __all__ = [
     "NormalisedAlpha",
     "TACSettings",
     "alpha_at",
+    "in_words",
 ]
 
 
@@ -258,3 +268,29 @@ class TACSettings(_Frozen):
                 "explore, got 'policy'"
             )
         return self
+
+
+def in_words(
+    value: float | Linear | Piecewise | Measured | LearnedAlpha | MatchedAlpha | NormalisedAlpha,
+) -> str:
+    """A constant, a schedule or a coefficient in a few characters: `1.5`, `1 to 2`, `learned`."""
+    match value:
+        case MatchedAlpha():
+            return f"{in_words(value.value)} matched at {value.matched_width:g}"
+        case NormalisedAlpha():
+            return f"{in_words(value.value)} normalised"
+        case Linear():
+            return f"{value.start:g} to {value.end:g}"
+        case Measured():
+            quantity = value.follows.replace("_", " ")
+            return f"{' to '.join(f'{point:g}' for _, point in value.points)} by {quantity}"
+        case Piecewise():
+            return " to ".join(f"{point:g}" for _, point in value.points)
+        case LearnedAlpha(target_shannon=float(nats)):
+            return f"learned, {nats:g} nats"
+        case LearnedAlpha(target_width=float(width)):
+            return f"learned, width {width:g}"
+        case LearnedAlpha():
+            return "learned"
+        case _:
+            return f"{float(value):g}"

@@ -150,11 +150,15 @@ class Plan:
         """
         searched = self._stages[stage]
         point = searched.resolve(_own(values))
+        final = searched.search.final if searched.search else None
+        budget = {}
+        if final is not None and final.env_steps is not None and part.startswith("final"):
+            budget = {"env_steps": final.env_steps}
         runs = []
         for seed in seeds:
             for task in searched.tasks:
                 node_input = self._trial_input(searched.source, values, task, seed)
-                settings = point.runs[task.name].model_copy(update={"seed": seed})
+                settings = point.runs[task.name].model_copy(update={"seed": seed, **budget})
                 run = Run(
                     stage=stage,
                     trial=trial,

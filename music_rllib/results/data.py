@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from music_rllib import names
+from music_rllib.results.claims.plan import PlanVersion
 from music_rllib.results.statistics import Array
 
 __all__ = [
@@ -170,6 +171,8 @@ class Sweep:
     history: History = field(repr=False)
     searches: Sequence[Mapping[str, Any]] = field(default=(), repr=False)
     """What its searches found: trials, importance, ranking; as their driver keeps it."""
+    plans: Sequence[PlanVersion] = field(default=(), repr=False)
+    """Versions of its analysis plan, in the order of their times."""
 
     def series(self, run: int, metric: str) -> tuple[Ints, Array]:
         """Steps and values of a metric of `runs[run]`, `[points]` each; empty where it has none."""

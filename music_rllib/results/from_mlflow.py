@@ -19,6 +19,7 @@ import numpy as np
 
 from music_rllib import names
 from music_rllib.limits import MOST_JSON_BYTES, read_json, read_regular
+from music_rllib.results.claims.plan import checked_plans
 from music_rllib.results.data import Column, Points, ReportError, RunRecord, Sweep, columns
 from music_rllib.results.searches import checked_searches
 from music_rllib.tracking.store import TrackingStore, check_reachable
@@ -77,6 +78,9 @@ def read_mlflow(
             history=_history(client, store, children, metrics),
             searches=checked_searches(
                 read_json(_artefact(client, run_id, names.ARTEFACT_SEARCH) or "[]")
+            ),
+            plans=checked_plans(
+                read_json(_artefact(client, run_id, names.ARTEFACT_ANALYSIS_PLAN) or "[]")
             ),
         )
     except ReportError:

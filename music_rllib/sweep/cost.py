@@ -16,7 +16,7 @@ from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.schema import SweepConfig
 from music_rllib.experiment.plan import Plan
 from music_rllib.runtime.ray_cluster import cluster
-from music_rllib.sweep.views.tables import search_budget, search_runs
+from music_rllib.sweep.views.tables import fresh_runs, search_budget, search_runs
 from music_rllib.sweep.views.text import clock
 from music_rllib.training.run import TrainingRun
 
@@ -94,17 +94,36 @@ def kinds(config: SweepConfig, plan: Plan, finished: Collection[str]) -> list[Ki
 
 
 def _searched(config: SweepConfig) -> Iterator[Kind]:
+    stages = {stage.name: stage for stage in config.stages}
     for stage in config.stages:
         if stage.search is None:
             continue
-        runs = search_runs(stage, stage.search, len(config.seeds)) // len(stage.tasks)
+        source = stages.get(str(stage.source.stage)) if stage.source else None
+        if source is not None and stage.search.final is not None:
+            for task in source.tasks:
+                settings = source.points[0].runs[task.name]
+                yield Kind(
+                    label=f"{source.name}/{task.name}, fresh seeds",
+                    runs=stage.search.final.seeds,
+                    settings=settings,
+                    env_steps=settings.env_steps,
+                )
+        final, budget = stage.search.final, search_budget(stage, stage.search)
+        fresh = fresh_runs(stage, stage.search) // len(stage.tasks)
+        runs = search_runs(stage, stage.search, len(config.seeds)) // len(stage.tasks) - fresh
+        longer = None if final is None else final.env_steps
         for task in stage.tasks:
+            settings, label = stage.points[0].runs[task.name], f"{stage.name}/{task.name}"
             yield Kind(
-                label=f"{stage.name}/{task.name}",
-                runs=runs,
-                settings=stage.points[0].runs[task.name],
-                env_steps=search_budget(stage, stage.search),
+                label=label,
+                runs=runs if longer else runs + fresh,
+                settings=settings,
+                env_steps=budget,
             )
+            if longer:
+                yield Kind(
+                    label=f"{label}, fresh seeds", runs=fresh, settings=settings, env_steps=longer
+                )
 
 
 def measure(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +26,8 @@ from music_rllib.experiment.scheduler import Status
 from music_rllib.experiment.session import Sweep, keep_record, open_sweep
 from music_rllib.experiment.sweep_files import SEARCH, as_json, keep
 from music_rllib.redaction import redact
+from music_rllib.results.claims.plan import PlanVersion, as_document
+from music_rllib.results.claims.record import PLANS_TO_READ, record_plan
 from music_rllib.runtime.allocator import give_back_freed_memory
 from music_rllib.runtime.ending import try_for
 from music_rllib.runtime.machine import (
@@ -197,6 +199,7 @@ def _show(
     if changes is not None:
         console.print(Text(str(changes), style="yellow"), soft_wrap=True)
     document = plan_answer(opened, changes)
+    document["analysis_plan"] = as_document(_record_plan(console, opened))
     if measure:
         from music_rllib.sweep import cost
 
@@ -221,7 +224,26 @@ def _drive(console: Console, opened: Sweep) -> int:
     with tracker:
         keep_record(opened)
         keep_settings(opened)
+        if versions := _record_plan(console, opened):
+            plans = as_json(as_document(versions))
+            tracker.put_sweep_artefact(names.ARTEFACT_ANALYSIS_PLAN, plans)
         return _compute_and_report(console, opened, tracker)
+
+
+def _record_plan(console: Console, opened: Sweep) -> Sequence[PlanVersion]:
+    """Keep the analysis plan before anything runs, and say which one it is."""
+    versions = record_plan(opened)
+    if versions:
+        last = versions[-1]
+        place = redact(f"{opened.storage}/{opened.config.name}/{PLANS_TO_READ}")
+        console.print(
+            Text(
+                f"Analysis plan: {place}, version {last.version} recorded {last.recorded}, hash "
+                f"{last.hash[:12]}"
+            ),
+            soft_wrap=True,
+        )
+    return versions
 
 
 def _check_searches(opened: Sweep) -> None:

@@ -319,6 +319,8 @@ class Final(_Strict):
     judged: what the best ones have to beat."""
     seeds: int = Field(5, gt=0)
     """Fresh seeds for each."""
+    env_steps: int | None = Field(None, gt=0)
+    """Budget of these runs; null: that of the search's."""
 
     def most(self, points: int) -> int:
         """Trials in it at most, of a search with so many `points_to_evaluate`."""

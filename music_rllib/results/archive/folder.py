@@ -8,6 +8,8 @@
     one row per value: the run's number, metric, environment steps, value, time in ms.
 `search.json`
     of a sweep that searched: trials, importance of settings, ranking on fresh seeds.
+`analysis_plan.json`
+    of a sweep with a plan: its versions, each with the time at which it was recorded.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from music_rllib.config.problems import shown
 from music_rllib.limits import MOST_JSON_BYTES, MOST_YAML_BYTES, read_json, read_regular
 from music_rllib.results.archive.tables import read_table, write_table
+from music_rllib.results.claims.plan import as_document, checked_plans
 from music_rllib.results.data import Column, ReportError, RunRecord, Sweep
 from music_rllib.results.searches import checked_searches
 
@@ -33,7 +36,7 @@ __all__ = ["Format", "is_archive", "read_archive", "write_archive"]
 
 Format = Literal["csv", "parquet"]
 VERSION = 1
-_HEADER, _SEARCHES = "sweep.json", "search.json"
+_HEADER, _SEARCHES, _PLANS = "sweep.json", "search.json", "analysis_plan.json"
 _OWN_FIELDS = ("name", "status", "run_id", "experiment_id", "started", "source", "tags", "config")
 _RUN_FIELDS = ("run_id", "name", "status", "started", "ended")
 _RUNS = {
@@ -94,6 +97,9 @@ def write_archive(sweep: Sweep, folder: Path, file_format: Format = "parquet") -
         (folder / _SEARCHES).unlink(missing_ok=True)
         if sweep.searches:
             _write_json([_without_place(found) for found in sweep.searches], folder / _SEARCHES)
+        (folder / _PLANS).unlink(missing_ok=True)
+        if sweep.plans:
+            _write_json(as_document(sweep.plans), folder / _PLANS)
         _write_json(header, folder / _HEADER)
     except OSError as error:
         raise ReportError(f"{folder} must be writable: {error}") from error
@@ -116,12 +122,14 @@ def read_archive(folder: Path) -> Sweep:
         history = _history(metrics, runs.num_rows)
         file = folder / _SEARCHES
         found = checked_searches(_read_json(file)) if file.exists() else ()
+        file = folder / _PLANS
+        plans = checked_plans(_read_json(file)) if file.exists() else ()
     except (OSError, KeyError, TypeError, ValueError, OverflowError, pa.ArrowException) as error:
         raise ReportError(
             f"{folder} must hold an exported sweep: {file.name}: {_reason(error)}"
         ) from error
     own = {name: getattr(header, name) for name in _OWN_FIELDS}
-    return Sweep(**own, runs=records, history=history, searches=found)
+    return Sweep(**own, runs=records, history=history, searches=found, plans=plans)
 
 
 class _Header(BaseModel):

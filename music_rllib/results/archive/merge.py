@@ -9,6 +9,7 @@ import numpy as np
 
 from music_rllib import names
 from music_rllib.experiment.plan import Plan
+from music_rllib.results.claims.plan import PlanVersion
 from music_rllib.results.data import Column, History, Sweep, joined
 
 __all__ = ["merged", "of_plan"]
@@ -27,7 +28,8 @@ def merged(earlier: Sweep, later: Sweep) -> Sweep:
     places = list(_best(_places(earlier) + _places(later)).values())
     runs = [sweep.runs[run] for sweep, run in places]
     searches = later.searches or earlier.searches
-    return replace(later, runs=runs, history=_history(places), searches=searches)
+    history, plans = _history(places), _plans([earlier, later])
+    return replace(later, runs=runs, history=history, searches=searches, plans=plans)
 
 
 def of_plan(plan: Plan, exports: Iterable[Sweep], *earlier: Plan) -> Sweep | None:
@@ -46,6 +48,7 @@ def of_plan(plan: Plan, exports: Iterable[Sweep], *earlier: Plan) -> Sweep | Non
     Returns:
         None where no export has any of its runs.
     """
+    exports = list(exports)
     found = _best([place for export in exports for place in _places(export)])
     # A run has the same position in each plan.
     versions = zip(*([(node, one) for node in one.nodes] for one in (plan, *earlier)), strict=True)
@@ -62,7 +65,20 @@ def of_plan(plan: Plan, exports: Iterable[Sweep], *earlier: Plan) -> Sweep | Non
         tags = {**run.tags, **own, names.TAG_TRIAL: str(node.trial)}
         runs.append(replace(run, name=node.label, tags=tags))
     last = places[-1][0]
-    return replace(last, name=plan.name, runs=runs, history=_history(places), searches=())
+    plans = _plans([sweep for sweep in exports if sweep.name == plan.name])
+    return replace(
+        last, name=plan.name, runs=runs, history=_history(places), searches=(), plans=plans
+    )
+
+
+def _plans(sweeps: Iterable[Sweep]) -> tuple[PlanVersion, ...]:
+    """Every version of a plan once, where it was recorded first."""
+    known: dict[str, PlanVersion] = {}
+    for version in sorted(
+        (v for sweep in sweeps for v in sweep.plans), key=lambda v: v.recorded_ms
+    ):
+        known.setdefault(version.hash, version)
+    return tuple(known.values())
 
 
 def _places(sweep: Sweep) -> list[_Place]:

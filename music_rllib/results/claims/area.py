@@ -7,13 +7,11 @@ say nothing where all runs end at the ceiling.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from music_rllib.results.statistics import Array
 
-__all__ = ["area_under_curve", "horizon_of"]
+__all__ = ["area_under_curve"]
 
 
 def area_under_curve(steps: Array, values: Array, horizon: float) -> float:
@@ -36,8 +34,3 @@ def area_under_curve(steps: Array, values: Array, horizon: float) -> float:
     inside = steps[(steps > 0) & (steps < horizon)]
     at = np.concatenate([[0.0], inside, [horizon]])
     return float(np.trapezoid(np.interp(at, steps, values), at) / horizon)
-
-
-def horizon_of(budgets: Sequence[float]) -> float:
-    """Environment steps over which conditions of different budgets are compared: the smallest."""
-    return min(budgets)

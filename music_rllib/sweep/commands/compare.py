@@ -26,6 +26,11 @@ Each row is the mean over the seeds that have finished on every task, with its 9
 its trials were chosen by. A condition is said to be ahead only where an exact permutation test,
 with Holm's correction over all pairs, gives p < 0.05 against each other one: three seeds are never
 enough. The report says the same.
+
+First comes the answer: conditions by the area under their learning curves (the mean over the
+budget), seed by seed where they share seeds, as superior, worse, equivalent within a margin or
+undecided (docs/comparing_q.md). What the sweep's `analysis` planned before the runs is kept apart
+from what is compared beyond it.
 """
 
 
@@ -57,9 +62,14 @@ def register(commands: Commands) -> None:
 
 
 def _execute(arguments: argparse.Namespace) -> int:
+    from music_rllib import names
     from music_rllib.experiment.location import find_sweep
+    from music_rllib.results.claims.answer import answer
+    from music_rllib.results.claims.study import study_of
+    from music_rllib.results.claims.tables import study_data
     from music_rllib.results.from_store import conditions, scopes
     from music_rllib.search.ranking import measure_of
+    from music_rllib.sweep.as_results import results_of
     from music_rllib.sweep.views.compare import compare_view
 
     found = find_sweep(arguments.sweep, arguments.storage)
@@ -80,6 +90,11 @@ def _execute(arguments: argparse.Namespace) -> int:
             raise BadInputError(
                 f"--metric must be one of {', '.join(known)}, got {arguments.metric!r}"
             )
+    read = {metric, *(task.primary_metric for one in sweep.config.stages for task in one.tasks)}
+    stored = results_of(sweep, {names.EVAL_EPISODES, *filter(None, read)})
+    study = study_of(
+        stored, stage, metric=arguments.metric, maximised=maximised or arguments.metric is None
+    )
     groups = [group for scope in scopes(found_) for group in _groups(scope, maximised)]
     document = {
         "sweep": found.name,
@@ -87,6 +102,8 @@ def _execute(arguments: argparse.Namespace) -> int:
         "metric": metric or measure.metric,
         "direction": "maximize" if maximised else "minimize",
         "groups": groups,
+        "answer": answer(stored, study),
+        **study_data(study),
     }
     if arguments.json:
         print_json(document)

@@ -11,7 +11,7 @@ from typing import Any
 
 from music_rllib import names
 from music_rllib.config.run_settings import RunSettings
-from music_rllib.config.tac_settings import LearnedAlpha, MatchedAlpha, NormalisedAlpha
+from music_rllib.config.tac_settings import LearnedAlpha, MatchedAlpha, NormalisedAlpha, in_words
 from music_rllib.errors import TrackingError
 from music_rllib.experiment.listener import Failure, Listener
 from music_rllib.experiment.plan import Node
@@ -21,7 +21,6 @@ from music_rllib.store.files import content_key
 from music_rllib.store.node_store import NodeStore
 from music_rllib.store.object_folder import DamagedError, StorageError
 from music_rllib.store.run_record import Report, RunResult
-from music_rllib.sweep.views.text import in_words
 from music_rllib.tracking.sender import Backlog
 from music_rllib.tracking.tracker import Point, RunInfo, Tracker
 from music_rllib.version import ALGORITHM_VERSION

@@ -15,12 +15,12 @@ from pathlib import Path
 from typing import Any
 
 from music_rllib import names
+from music_rllib.config.tac_settings import in_words
 from music_rllib.experiment.listener import Failure, Listener
 from music_rllib.experiment.plan import Node
 from music_rllib.experiment.scheduler import Board, Status
 from music_rllib.store.files import write_atomically
 from music_rllib.store.run_record import Report, RunResult
-from music_rllib.sweep.views.text import in_words
 from music_rllib.tracking.sender import Backlog
 
 __all__ = ["GAUGES", "TARGETS", "Gauges"]

@@ -8,12 +8,11 @@ from typing import Any
 from rich.table import Table
 
 from music_rllib.config.run_settings import RunSettings
-from music_rllib.config.tac_settings import MatchedAlpha, NormalisedAlpha, alpha_at
+from music_rllib.config.tac_settings import MatchedAlpha, NormalisedAlpha, alpha_at, in_words
 from music_rllib.envs.make import make_env
 from music_rllib.envs.tasks import Task
 from music_rllib.experiment.plan import Node, Plan
 from music_rllib.schedules import Linear, Measured, Piecewise, value_at
-from music_rllib.sweep.views.text import in_words
 
 __all__ = ["adaptive_rows", "adaptive_text", "alpha_rows", "alpha_table"]
 

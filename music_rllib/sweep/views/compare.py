@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rich.console import Group, RenderableType
@@ -21,10 +21,51 @@ def compare_view(document: Mapping[str, Any]) -> RenderableType:
     """One table for each group of conditions that may be compared."""
     if not document["groups"]:
         return Text(f"Stage {document['stage']} of {document['sweep']} has no finished run yet.")
-    parts: list[RenderableType] = []
+    parts: list[RenderableType] = [*map(Text, document["answer"]), Text()]
+    if document["comparisons"]:
+        parts.append(_comparisons(document))
+    if document["conditions"]:
+        parts.append(_primary(document))
     for group in document["groups"]:
         parts += [_table(document, group), Text(group["verdict"])]
     return Group(*parts)
+
+
+def _comparisons(document: Mapping[str, Any]) -> Table:
+    rows = document["comparisons"]
+    table = Table(title="Comparisons", title_justify="left")
+    for name in ("first - second", *_task(rows), "difference, 95 %", "p", "verdict", "planned"):
+        table.add_column(name)
+    for row in rows:
+        within = row["verdict"] == "equivalent"
+        p_value = row["p_equivalent_holm"] if within else row["p_value_holm"]
+        table.add_row(
+            f"{row['first']} - {row['second']}",
+            *(row[name] for name in _task(rows)),
+            with_interval(row["difference"], (row["lower"], row["upper"])),
+            f"{p_value:.2g}",
+            f"{row['verdict']} (within {row['margin']:g})" if within else row["verdict"],
+            "yes" if row["planned"] else "no",
+        )
+    return table
+
+
+def _primary(document: Mapping[str, Any]) -> Table:
+    rows = document["conditions"]
+    measure = " or ".join(dict.fromkeys(row["measure"] for row in rows))
+    title = f"Area under the learning curve: {measure}"
+    table = Table(title=title, title_justify="left")
+    for name in ("condition", *_task(rows), "mean, 95 %", "each seed", "runs"):
+        table.add_column(name, justify="left" if name == "condition" else "right")
+    for row in rows:
+        table.add_row(
+            row["condition"],
+            *(row[name] for name in _task(rows)),
+            with_interval(row["value"], (row["lower"], row["upper"])),
+            seeds_in_words(list(row["by_seed"].values())),
+            f"{row['seeds']} of {row['runs']}",
+        )
+    return table
 
 
 def _table(document: Mapping[str, Any], group: Mapping[str, Any]) -> Table:
@@ -53,3 +94,8 @@ def _table(document: Mapping[str, Any], group: Mapping[str, Any]) -> Table:
             "" if row["p_value"] is None else f"{row['p_value']:.2g}",
         )
     return table
+
+
+def _task(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The column of tasks, where there are several."""
+    return ["task"] if len({row["task"] for row in rows}) > 1 else []

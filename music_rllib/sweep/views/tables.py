@@ -13,12 +13,13 @@ from music_rllib import names
 from music_rllib.config.schema import Source, Stage, SweepConfig
 from music_rllib.config.search.check import most_env_steps
 from music_rllib.config.search.space import Choice, Dimension, SearchSettings
+from music_rllib.config.tac_settings import in_words
 from music_rllib.envs.tasks import Task
 from music_rllib.experiment.plan import Node, Plan, short
 from music_rllib.experiment.scheduler import Status
 from music_rllib.results.comparison import SHOW_SEEDS_BELOW, with_interval
 from music_rllib.store.run_record import RunResult
-from music_rllib.sweep.views.text import clock, in_words, measured, percent
+from music_rllib.sweep.views.text import clock, measured, percent
 
 __all__ = [
     "plan_view",
@@ -45,10 +46,7 @@ def plan_view(config: SweepConfig, plan: Plan, finished: Collection[str]) -> Ren
     searched = [(stage, stage.search) for stage in config.stages if stage.search is not None]
     if searched:
         runs = sum(search_runs(stage, search, len(config.seeds)) for stage, search in searched)
-        steps = sum(
-            search_runs(stage, search, len(config.seeds)) * search_budget(stage, search)
-            for stage, search in searched
-        )
+        steps = sum(search_steps(stage, search, len(config.seeds)) for stage, search in searched)
         text += f" Searches: up to {runs} runs and {steps:,} env steps more"
         fresh = any(search.final and stage.source for stage, search in searched)
         text += ", and what runs on fresh seeds start from." if fresh else "."
@@ -113,8 +111,8 @@ def _search_row(stage: Stage, search: SearchSettings, plan: Plan, seeds: int) ->
         else f"{search.count}\n{search.sampler}",
         f"{seeds} + {fresh} fresh" if fresh else str(seeds),
         f"<= {runs}",
-        f"<= {budget:,}",
-        f"<= {runs * budget:,}",
+        f"<= {max(budget, (search.final and search.final.env_steps) or 0):,}",
+        f"<= {search_steps(stage, search, seeds):,}",
         "-",
     ]
 
@@ -126,11 +124,22 @@ def search_budget(stage: Stage, search: SearchSettings) -> int:
 
 def search_runs(stage: Stage, search: SearchSettings, seeds: int) -> int:
     """Runs of a searched stage at most, with those of the final ranking."""
-    trials = search.count * seeds
-    if search.final is not None:
-        finalists = search.final.most(len(search.points_to_evaluate))
-        trials += min(finalists, search.count) * search.final.seeds
-    return trials * len(search.arms()) * len(stage.tasks)
+    return search.count * seeds * len(search.arms()) * len(stage.tasks) + fresh_runs(stage, search)
+
+
+def fresh_runs(stage: Stage, search: SearchSettings) -> int:
+    """Those of the final ranking."""
+    if search.final is None:
+        return 0
+    finalists = min(search.final.most(len(search.points_to_evaluate)), search.count)
+    return finalists * search.final.seeds * len(search.arms()) * len(stage.tasks)
+
+
+def search_steps(stage: Stage, search: SearchSettings, seeds: int) -> int:
+    """Environment steps of all of them at most."""
+    budget, fresh = search_budget(stage, search), fresh_runs(stage, search)
+    final = (search.final and search.final.env_steps) or budget
+    return (search_runs(stage, search, seeds) - fresh) * budget + fresh * final
 
 
 def _dimension(dimension: Dimension) -> str:

@@ -13,7 +13,7 @@ from rich.console import Console
 from music_rllib import names
 from music_rllib.config.load import load_sweep
 from music_rllib.config.schema import SweepConfig
-from music_rllib.config.tac_settings import LearnedAlpha
+from music_rllib.config.tac_settings import LearnedAlpha, in_words
 from music_rllib.experiment.listener import Failure
 from music_rllib.experiment.plan import Plan, make_plan
 from music_rllib.experiment.scheduler import Board
@@ -24,7 +24,7 @@ from music_rllib.store.run_record import Report, RunResult
 from music_rllib.sweep.listeners.screen import Display
 from music_rllib.sweep.views.alpha import adaptive_rows, adaptive_text, alpha_rows, alpha_table
 from music_rllib.sweep.views.tables import plan_view, results_table
-from music_rllib.sweep.views.text import clock, in_words, percent
+from music_rllib.sweep.views.text import clock, percent
 from music_rllib.training.throughput import Pace
 
 DOCUMENT: dict[str, Any] = {

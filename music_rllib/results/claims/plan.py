@@ -1,0 +1,215 @@
+"""An analysis plan: what is asked and how it will be decided, kept before the runs.
+
+Every version is kept with the time at which it was recorded, so that a report can tell what was
+planned from what was thought of afterwards: a plan that was recorded after the first of its runs
+had finished is none. The hash is that of the plan alone: the same section of a sweep's file has
+the same one on every machine, and can be cited, or committed, before anything runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from typing import Any, Literal, Self
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, model_validator
+
+from music_rllib import names
+from music_rllib.config.analysis import Hypothesis
+from music_rllib.config.schema import Stage, SweepConfig
+from music_rllib.config.tac_settings import in_words
+from music_rllib.store.files import content_key
+
+__all__ = ["AnalysisPlan", "PlanVersion", "analysis_plan", "as_document", "as_markdown"]
+__all__ += ["checked_plans", "with_plan"]
+
+MARGIN_OF_A_RATE = 0.05
+"""Where nobody states another."""
+_PRIMARY = {
+    "auc": "area under the learning curve of {metric}: its mean over the budget, by the trapezoid "
+    "rule over environment steps",
+    "final": "{metric} of the last evaluation",
+}
+_TEST = (
+    "Student's t test of the differences of a seed, Welch's where the conditions share no seeds; "
+    "equivalence within the margin by two one-sided tests; Holm's correction over the planned "
+    "comparisons, 5 %; finished runs only, none left out"
+)
+MOST_VERSIONS = 1000
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+
+class AnalysisPlan(_Strict):
+    """What is asked, and everything that decides it."""
+
+    question: str | None
+    hypotheses: tuple[str, ...] = Field(min_length=1, max_length=50, strict=False)
+    stage: str
+    """Whose conditions are compared, where a hypothesis names no other."""
+    metric: Literal["auc", "final"]
+    primary_metric: str
+    """The same in words."""
+    margin: float | None = Field(gt=0)
+    seeds: str
+    control: str
+    """What is done for q to be compared fairly."""
+    budget: dict[str, int]
+    """Environment steps over which runs are compared, by task."""
+    test: str
+
+    @model_validator(mode="after")
+    def _are_hypotheses(self) -> Self:
+        for text in self.hypotheses:
+            Hypothesis.of(text)
+        return self
+
+    @property
+    def stages(self) -> frozenset[str]:
+        """Those that the hypotheses are about."""
+        sides = [side for text in self.hypotheses for side in Hypothesis.of(text)[1:3]]
+        return frozenset(side.get("stage", self.stage) for side in sides)
+
+    @property
+    def hash(self) -> str:
+        """Of its content."""
+        return content_key(self.model_dump(mode="json"))
+
+
+class PlanVersion(_Strict):
+    """A plan as it was at one time."""
+
+    version: int = Field(ge=1)
+    recorded_ms: int = Field(ge=0, lt=2**47)
+    """Milliseconds since the epoch."""
+    hash: str
+    plan: AnalysisPlan
+
+    @model_validator(mode="after")
+    def _is_what_was_recorded(self) -> Self:
+        if self.plan.hash != self.hash:
+            raise ValueError(f"the plan must have the hash that it was recorded with, {self.hash}")
+        return self
+
+    @property
+    def recorded(self) -> str:
+        """`2026-11-23 07:20 UTC`."""
+        return datetime.fromtimestamp(self.recorded_ms / 1000, UTC).strftime("%Y-%m-%d %H:%M UTC")
+
+
+_VERSIONS = TypeAdapter(tuple[PlanVersion, ...])
+
+
+def checked_plans(document: Any) -> tuple[PlanVersion, ...]:
+    """Versions from plain data that may come from strangers, in the order of their times.
+
+    Raises:
+        ValueError: it is none, or a plan is not what was recorded.
+    """
+    if not isinstance(document, list) or len(document) > MOST_VERSIONS:
+        raise ValueError(f"must be a list of at most {MOST_VERSIONS} versions of a plan")
+    versions = _VERSIONS.validate_python(document)
+    return tuple(sorted(versions, key=lambda one: one.recorded_ms))
+
+
+def as_document(versions: Sequence[PlanVersion]) -> list[dict[str, Any]]:
+    """Inverse of :func:`checked_plans`."""
+    return [version.model_dump(mode="json") for version in versions]
+
+
+def with_plan(
+    versions: Sequence[PlanVersion], plan: AnalysisPlan, now_ms: int
+) -> tuple[PlanVersion, ...]:
+    """`versions`, and this one as a new version unless it is the last one's."""
+    if versions and versions[-1].hash == plan.hash:
+        return tuple(versions)
+    new = PlanVersion(version=len(versions) + 1, recorded_ms=now_ms, hash=plan.hash, plan=plan)
+    return (*versions, new)
+
+
+def as_markdown(name: str, versions: Sequence[PlanVersion]) -> str:
+    """For readers, the newest version first."""
+    parts = [f"# Analysis plan of {name}\n"]
+    for one in reversed(versions):
+        content = one.plan.model_dump(mode="json", exclude_none=True)
+        text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=88)
+        parts.append(
+            f"## Version {one.version}\n\nRecorded {one.recorded}. Hash of the plan "
+            f"(SHA-256, first digits): `{one.hash}`\n\n```yaml\n{text}```\n"
+        )
+    return "\n".join(parts)
+
+
+# From a sweep's file ------------------------------------------------------------------------------
+
+
+def analysis_plan(config: SweepConfig) -> AnalysisPlan | None:
+    """The plan of a sweep's `analysis`; None where it has none."""
+    analysis = config.analysis
+    if analysis is None:
+        return None
+    default = analysis.stage or config.stages[-1].name
+    about = {
+        side.get("stage", default)
+        for text in analysis.hypotheses
+        for side in Hypothesis.of(text)[1:3]
+    }
+    stages = [stage for stage in config.stages if stage.name in about]
+    metrics = sorted({task.primary_metric for stage in stages for task in stage.tasks})
+    margin = analysis.margin
+    if margin is None and metrics == [names.EVAL_SUCCESS]:
+        margin = MARGIN_OF_A_RATE
+    return AnalysisPlan(
+        question=analysis.question,
+        hypotheses=analysis.hypotheses,
+        stage=default,
+        metric=analysis.metric,
+        primary_metric=_PRIMARY[analysis.metric].format(metric=" or ".join(metrics)),
+        margin=margin,
+        seeds=_each(stages, {stage.name: _seeds(stage, config.seeds) for stage in stages}),
+        control=_each(stages, {stage.name: _control(stage) for stage in stages}),
+        budget=_budget(stages),
+        test=_TEST,
+    )
+
+
+def _each(stages: Sequence[Stage], said: Mapping[str, str]) -> str:
+    """Of each stage, unless all have the same."""
+    if len(set(said.values())) == 1:
+        return said[stages[0].name]
+    return "; ".join(f"{name}: {text}" for name, text in said.items())
+
+
+def _seeds(stage: Stage, seeds: Sequence[int]) -> str:
+    listed = ", ".join(map(str, seeds))
+    if stage.search is None or stage.search.final is None:
+        return listed
+    return f"{stage.search.final.seeds} fresh ones; {listed} for the tuning"
+
+
+def _control(stage: Stage) -> str:
+    search = stage.search
+    if search is not None:
+        tuned = ", ".join(search.space)
+        each = f" for each value of {', '.join(search.compare)}" if search.compare else ""
+        return f"{tuned} tuned{each}, with {search.count} trials"
+    words = sorted({in_words(run.tac.alpha) for p in stage.points for run in p.runs.values()})
+    if len(words) > 1:
+        return f"α varied: {', '.join(words)}; differences are means over it"
+    control = any(word in words[0] for word in ("matched", "learned", "normalised"))
+    return f"α {words[0]}" if control else f"none: one α of {words[0]} for all"
+
+
+def _budget(stages: Sequence[Stage]) -> dict[str, int]:
+    """What is compared over: the least of any stage, of runs on fresh seeds where it searches."""
+    budget: dict[str, int] = {}
+    for stage in stages:
+        final = stage.search.final if stage.search else None
+        for point in stage.points:
+            for task, run in point.runs.items():
+                steps = (final.env_steps if final else None) or run.env_steps
+                budget[task] = min(budget.get(task, steps), steps)
+    return budget

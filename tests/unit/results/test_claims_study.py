@@ -1,0 +1,316 @@
+"""Sweeps with planted effects, from their histories to the sentences of a report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from music_rllib import names
+from music_rllib.results.claims.answer import answer
+from music_rllib.results.claims.contrasts import Verdict
+from music_rllib.results.claims.plan import AnalysisPlan, PlanVersion, checked_plans, with_plan
+from music_rllib.results.claims.plan import as_document as plans_as_document
+from music_rllib.results.claims.power import seeds_needed
+from music_rllib.results.claims.study import Study, study_of
+from music_rllib.results.claims.tables import study_data
+from music_rllib.results.data import Points, RunRecord, Sweep, columns
+
+BUDGET = 10_000
+STEPS = np.arange(1000, BUDGET + 1, 1000)
+EPISODES = 50
+DONE = 1_000_000
+"""When runs end, ms."""
+
+
+def plan(*hypotheses: str, margin: float | None = 0.05, **changes: Any) -> AnalysisPlan:
+    fields: dict[str, Any] = {
+        "question": "Does q matter?",
+        "hypotheses": hypotheses,
+        "stage": "train",
+        "metric": "auc",
+        "primary_metric": "",
+        "margin": margin,
+        "seeds": "",
+        "control": "α tuned for each q",
+        "budget": {"FetchPush": BUDGET},
+        "test": "",
+    }
+    return AnalysisPlan(**fields | changes)
+
+
+def recorded(one: AnalysisPlan, at: int, *earlier: PlanVersion) -> tuple[PlanVersion, ...]:
+    return with_plan(earlier, one, at)
+
+
+def run(
+    settings: Mapping[str, str],
+    seed: int,
+    height: float,
+    rng: np.random.Generator,
+    task: str = "FetchPush",
+    **tags: str,
+) -> tuple[RunRecord, Points]:
+    """A curve that rises to twice its mean, `height`, seen through evaluation episodes."""
+    rates = np.clip(2 * height * STEPS / BUDGET, 0, 1)
+    values = list(rng.binomial(EPISODES, rates) / EPISODES)
+    points = Points(
+        [names.EVAL_EPISODES] * len(STEPS) + [names.EVAL_SUCCESS] * len(STEPS),
+        [*STEPS, *STEPS],
+        [DONE] * 2 * len(STEPS),
+        [float(EPISODES)] * len(STEPS) + values,
+    )
+    stage = tags.pop("stage", "train")
+    label = ",".join(settings.values())
+    record = RunRecord(
+        run_id=f"{stage}{label}{task}{seed}{tags}",
+        name="",
+        status="FINISHED",
+        started=0,
+        ended=DONE,
+        params={"env_steps": str(BUDGET), "task.success_key": "is_success", **settings},
+        tags={
+            names.TAG_NODE_KEY: f"{stage}{label}{task}{seed}{tags}",
+            names.TAG_STAGE: stage,
+            names.TAG_TASK: task,
+            names.TAG_SEED: str(seed),
+            names.TAG_VARIANT: "tac",
+            names.TAG_ENTROPIC_INDEX: settings["tac.entropic_index"],
+            names.TAG_ALPHA: settings.get("tac.alpha", "0.05"),
+            **tags,
+        },
+    )
+    return record, points
+
+
+def sweep_of(runs: Sequence[tuple[RunRecord, Points]], plans: Sequence[PlanVersion] = ()) -> Sweep:
+    return Sweep(
+        **dict.fromkeys(("name", "status", "run_id", "experiment_id", "source"), "s"),  # type: ignore[arg-type]
+        started=0,
+        tags={},
+        config=None,
+        runs=[record for record, _ in runs],
+        history=columns(points for _, points in runs),
+        plans=plans,
+    )
+
+
+def study(
+    heights: Mapping[str, float], seeds: int, rng: np.random.Generator, spread: float = 0.03
+) -> list[tuple[RunRecord, Points]]:
+    """A run for each q and seed; what a seed brings along is shared."""
+    shared = rng.normal(0, 0.05, seeds)
+    return [
+        run({"tac.entropic_index": q}, seed, height + shared[seed] + rng.normal(0, spread), rng)
+        for q, height in heights.items()
+        for seed in range(seeds)
+    ]
+
+
+BEFORE = recorded(plan("q = 1.5 against q = 1"), at=DONE - 1)
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+def verdict(found: Study) -> Verdict:
+    (claim,) = found.planned
+    return claim.verdict
+
+
+def test_a_planted_effect_is_decided_at_nominal_rates(rng: np.random.Generator) -> None:
+    def shares(effect: float, seeds: int, repeats: int = 20) -> dict[Verdict, float]:
+        found = [
+            verdict(study_of(sweep_of(study({"1": 0.3, "1.5": 0.3 + effect}, seeds, rng), BEFORE)))
+            for _ in range(repeats)
+        ]
+        return {one: found.count(one) / repeats for one in Verdict}
+
+    assert shares(0.1, 10)[Verdict.SUPERIOR] > 0.9
+    assert shares(-0.1, 10)[Verdict.WORSE] > 0.9
+    assert shares(0.0, 15)[Verdict.EQUIVALENT] > 0.8
+    assert shares(0.05, 3)[Verdict.UNDECIDED] > 0.6
+    # Exactly the margin is called equivalent in one of twenty.
+    assert shares(0.05, 10)[Verdict.EQUIVALENT] < 0.25
+
+
+def test_the_difference_is_that_of_the_areas(rng: np.random.Generator) -> None:
+    sweep = sweep_of(study({"1": 0.2, "1.5": 0.4}, 6, rng, spread=0.0), BEFORE)
+    (claim,) = study_of(sweep).planned
+    first, second = (
+        [np.trapezoid([v[0], *v], [0, *STEPS]) / BUDGET for v in values]
+        for values in (_values(sweep, "1.5"), _values(sweep, "1"))
+    )
+    assert float(claim.contrast.difference.value) == pytest.approx(np.mean(first) - np.mean(second))
+    assert claim.contrast.paired
+    assert claim.measure.words == "mean success over 10,000 steps"
+
+
+def _values(sweep: Sweep, q: str) -> list[np.ndarray]:
+    positions = [i for i, record in enumerate(sweep.runs) if record.entropic_index == q]
+    return [sweep.series(position, names.EVAL_SUCCESS)[1] for position in positions]
+
+
+def test_what_was_planned_is_told_from_what_was_not(rng: np.random.Generator) -> None:
+    runs = study({"1": 0.2, "1.5": 0.4, "2": 0.2}, 8, rng)
+    found = study_of(sweep_of(runs, BEFORE))
+    assert [one.hypothesis.text for one in found.planned if one.hypothesis] == [
+        "q = 1.5 against q = 1"
+    ]
+    # The pair that was planned is not shown twice, and does not pay for the others.
+    pairs = {(one.first, one.second) for one in found.afterwards}
+    assert pairs == {("q = 2", "q = 1"), ("q = 2", "q = 1.5")}
+    alone = study_of(sweep_of(runs[:16], BEFORE))
+    assert found.planned[0].p_value == alone.planned[0].p_value
+    said = answer(sweep_of(runs, BEFORE), found)
+    assert len(said) <= 10
+    assert said[0].startswith("Asked: Does q matter? (planned 1970-01-01 00:16 UTC, before")
+    assert "q = 1.5 against q = 1 on FetchPush: superior, +0." in said[1]
+    assert "(95 % 0." in said[1]
+    assert "8 per condition, compared in pairs; 24 of 24 runs" in " ".join(said)
+    assert "Control: α tuned for each q." in said
+
+
+def test_a_plan_that_is_younger_than_a_result_is_none(rng: np.random.Generator) -> None:
+    runs = study({"1": 0.2, "1.5": 0.4}, 8, rng)
+    late = recorded(plan("q = 1.5 better than q = 1"), at=DONE)
+    found = study_of(sweep_of(runs, late))
+    assert (found.plan, found.planned) == (None, ())
+    (claim,) = found.afterwards
+    assert claim.confirmed is True
+    assert "when runs had finished already" in answer(sweep_of(runs, late), found)[0]
+    # Of an unfinished run nothing is known yet.
+    begun = [(replace(record, status="RUNNING"), points) for record, points in runs]
+    assert study_of(sweep_of(begun, late)).plan is not None
+
+
+def test_a_plan_that_changes_after_a_result_keeps_what_was_planned(
+    rng: np.random.Generator,
+) -> None:
+    runs = study({"1": 0.2, "1.5": 0.4}, 8, rng)
+    first = recorded(plan("q = 1.5 worse than q = 1"), at=5)
+    both = recorded(plan("q = 1.5 better than q = 1", margin=0.3), DONE + 1, *first)
+    found = study_of(sweep_of(runs, both))
+    assert [(one.margin, one.confirmed) for one in found.planned] == [(0.05, False)]
+    assert [(one.margin, one.confirmed) for one in found.afterwards] == [(0.3, False)]
+    assert found.afterwards[0].verdict is Verdict.EQUIVALENT
+    assert "changed afterwards" in answer(sweep_of(runs, both), found)[0]
+
+
+def test_settings_that_a_hypothesis_leaves_open_are_averaged(rng: np.random.Generator) -> None:
+    runs = [
+        run({"tac.entropic_index": q, "tac.alpha": alpha}, seed, height, rng)
+        for q, gain in (("1", 0.0), ("1.5", 0.1))
+        for alpha, height in (("0.01", 0.1 + gain), ("0.1", 0.3 + gain))
+        for seed in range(5)
+    ]
+    (claim,) = study_of(sweep_of(runs, BEFORE)).planned
+    assert (claim.cells, claim.contrast.seeds) == (2, (5, 5))
+    assert float(claim.contrast.difference.value) == pytest.approx(0.1, abs=0.03)
+    one = recorded(plan("q = 1.5, alpha = 0.1 against q = 1, alpha = 0.01"), at=5)
+    (claim,) = study_of(sweep_of(runs, one)).planned
+    assert (claim.cells, claim.first) == (1, "q = 1.5, α = 0.1")
+    assert float(claim.contrast.difference.value) == pytest.approx(0.3, abs=0.03)
+    vague = recorded(plan("q = 1.5, alpha = 0.1 against q = 1"), at=5)
+    assert "it must name more" in study_of(sweep_of(runs, vague)).untested[0]
+
+
+def test_of_a_search_only_fresh_seeds_count_and_each_q_has_its_own_alpha(
+    rng: np.random.Generator,
+) -> None:
+    searched = [
+        run({"tac.entropic_index": q, "tac.alpha": alpha}, seed, 0.45, rng, part="trial0")
+        for q in ("1", "1.5")
+        for alpha in ("0.01", "0.1")
+        for seed in range(2)
+    ]
+    fresh = [
+        run({"tac.entropic_index": q, "tac.alpha": a}, 10**6 + seed, height, rng, part="final0")
+        for q, a, height in (("1", "0.01", 0.2), ("1.5", "0.1", 0.4))
+        for seed in range(6)
+    ]
+    sweep = sweep_of([*searched, *fresh], BEFORE)
+    found = study_of(sweep)
+    (claim,) = found.planned
+    assert claim.verdict is Verdict.SUPERIOR
+    assert claim.contrast.seeds == (6, 6)
+    assert "fresh ones that no setting was chosen by" in " ".join(answer(sweep, found))
+
+
+def test_stages_are_compared_where_a_hypothesis_names_them(rng: np.random.Generator) -> None:
+    runs = [
+        run({"tac.entropic_index": "1"}, seed, height, rng, stage=stage)
+        for stage, height in (("her", 0.2), ("music", 0.4))
+        for seed in range(5)
+    ]
+    one = recorded(plan("stage = music better than stage = her", stage="music"), at=5)
+    (claim,) = study_of(sweep_of(runs, one)).planned
+    assert claim.confirmed is True
+
+
+def test_seeds_that_are_not_shared_are_compared_without_pairs(rng: np.random.Generator) -> None:
+    runs = [
+        run({"tac.entropic_index": q}, seed + 100 * (q == "1"), 0.3, rng)
+        for q in ("1", "1.5")
+        for seed in range(5)
+    ]
+    (claim,) = study_of(sweep_of(runs, BEFORE)).planned
+    assert (claim.contrast.paired, claim.contrast.seeds) == (False, (5, 5))
+
+
+def test_an_unfinished_run_takes_its_pair_along(rng: np.random.Generator) -> None:
+    runs = study({"1": 0.2, "1.5": 0.4}, 8, rng)
+    runs[3] = (replace(runs[3][0], status="FAILED"), runs[3][1])
+    found = study_of(sweep_of(runs, BEFORE))
+    assert found.planned[0].contrast.seeds == (7, 7)
+    assert "15 of 16 runs" in " ".join(answer(sweep_of(runs, BEFORE), found))
+
+
+def test_smaller_budgets_are_compared_over_themselves(rng: np.random.Generator) -> None:
+    runs = study({"1": 0.3, "1.5": 0.3}, 4, rng)
+    short = [
+        (replace(record, params={**record.params, "env_steps": "5000"}), points)
+        if record.entropic_index == "1"
+        else (record, points)
+        for record, points in runs
+    ]
+    assert study_of(sweep_of(short, BEFORE)).planned[0].measure.horizon == 5000
+
+
+def test_nothing_is_said_of_seeds_needed_at_a_ceiling(rng: np.random.Generator) -> None:
+    def at(height: float) -> str:
+        found = study_of(sweep_of(study({"1": height, "1.5": height}, 4, rng)))
+        return seeds_needed(found.claims, found.means) or ""
+
+    assert "spread does not tell" in at(0.0)
+    assert "shows with 80 % chance from" in at(0.3)
+
+
+def test_as_plain_data_it_has_every_seed(rng: np.random.Generator) -> None:
+    data = study_data(study_of(sweep_of(study({"1": 0.2, "1.5": 0.4}, 4, rng), BEFORE)))
+    assert data["plan"]["before_the_first_result"] is True
+    assert [len(row["by_seed"]) for row in data["conditions"]] == [4, 4]
+    assert data["comparisons"][0]["planned"] is True
+
+
+# The plan -----------------------------------------------------------------------------------------
+
+
+def test_a_plan_is_kept_once_and_each_change_is_a_version() -> None:
+    one, other = plan("q = 2 against q = 1"), plan("q = 2 worse than q = 1")
+    versions = recorded(other, 7, *recorded(one, 6, *recorded(one, 5)))
+    assert [(v.version, v.recorded_ms, v.plan) for v in versions] == [(1, 5, one), (2, 7, other)]
+    assert checked_plans(plans_as_document(versions)) == versions
+    assert one.hash != other.hash
+
+
+def test_a_plan_that_was_edited_is_refused() -> None:
+    document = plans_as_document(recorded(plan("q = 2 against q = 1"), 5))
+    document[0]["plan"]["margin"] = 0.2
+    with pytest.raises(ValueError, match="the hash that it was recorded with"):
+        checked_plans(document)
