@@ -44,9 +44,9 @@ from music_rllib.envs.make import (
     observation_sizes,
 )
 from music_rllib.envs.numbers import BadNumberError
+from music_rllib.envs.recording import Episode, Recording
 from music_rllib.replay.buffer import ReplayLayout
 from music_rllib.runtime.quiet import quiet_third_parties
-from music_rllib.tac.recording import Episode, Recording
 from music_rllib.tac.rl_module import TACModule
 
 __all__ = [

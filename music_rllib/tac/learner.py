@@ -1,4 +1,4 @@
-"""The Learner: TAC's losses, MUSIC's estimator and intrinsic reward, many updates a call.
+"""The Learner: gradient updates of TAC and of an intrinsic reward, many in a call.
 
 A call of `update()` carries K minibatches behind each other, one row each (B transitions,
 N trajectories, T frames, I network inputs, D observation, A actions):
@@ -7,14 +7,13 @@ N trajectories, T frames, I network inputs, D observation, A actions):
   "discounts" [K*B], NEXT_OBS [K*B, I], and "weights" [K*B] where the replay is prioritised
 - module `mi_estimator`, where it is trained: OBS [K*N, T, D] whole trajectories
 
-Each of the K updates prices its transitions with the current estimator, and then takes one step
-of every network and one of the estimator.
+Each of the K updates relabels its transitions with the intrinsic reward as it is then, and takes
+one step of every network.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,32 +30,28 @@ from torch import Tensor
 
 from music_rllib import names
 from music_rllib.config.tac_settings import LearnedAlpha, TACSettings
-from music_rllib.functional import actor_critic
-from music_rllib.functional.mutual_information import time_permutations
-from music_rllib.functional.tsallis import ln_q_of_policy
-from music_rllib.intrinsic.held_out import HeldOutBound
+from music_rllib.intrinsic.interface import IntrinsicReward
+from music_rllib.intrinsic.music import Music
 from music_rllib.replay.buffer import Trajectory
 from music_rllib.runtime.allocator import keep_freed_memory
 from music_rllib.runtime.quiet import quiet_third_parties
 from music_rllib.schedules import Quantity
 from music_rllib.tac import diagnostics
+from music_rllib.tac.fresh_episodes import FreshEpisodes, critic_bias
 from music_rllib.tac.kernels.adam import FusedAdam
 from music_rllib.tac.kernels.cuda_graphs import CapturedUpdate, CudaRecorder
-from music_rllib.tac.kernels.forward import Bootstrap, TACForward
+from music_rllib.tac.kernels.forward import TACForward
 from music_rllib.tac.kernels.precision import check_precision
 from music_rllib.tac.kernels.update import DirectUpdate
 from music_rllib.tac.normaliser import RunningNormaliser
-from music_rllib.tac.rl_module import ESTIMATOR_MODULE, EstimatorModule, TACModule, choose_action
+from music_rllib.tac.objective import Losses, Objective
+from music_rllib.tac.rl_module import ESTIMATOR_MODULE, EstimatorModule, TACModule
 from music_rllib.tac.scheduled import ScheduledSettings
 
-__all__ = ["GRAD_UPDATES", "HELD_OUT_STEPS", "NonFiniteLossError", "TACLearner"]
+__all__ = ["GRAD_UPDATES", "NonFiniteLossError", "TACLearner"]
 
 GRAD_UPDATES = "grad_updates"
-PRIORITY_CLIP = 2e-4
-"""MUSIC-p: largest bound (nats) of one step that counts for its trajectory's priority."""
 LOSSES = "losses"
-HELD_OUT_STEPS = "held_out_steps"
-"""Metric: steps behind the bound on fresh trajectories, which it is averaged by."""
 Minibatch = dict[ModuleID, dict[str, Tensor]]
 FlatMinibatch = Mapping[tuple[ModuleID, str], Tensor]
 
@@ -68,22 +63,10 @@ class _Constants(NamedTuple):
     mi_reward_weight: float
     alpha: float | None
     """None: learned, and a tensor."""
-    swapped: bool
-    """Whether the two frames of a transition are swapped for the intrinsic reward."""
+    drawn: Hashable
+    """By the intrinsic reward, for this update."""
     trajectories: tuple[int, bool] | None
-    """Frames of the estimator's trajectories, and whether some are shorter."""
-
-
-class _Loss(NamedTuple):
-    """The losses of a minibatch, and what their derivatives are made of."""
-
-    total: Tensor
-    target: Tensor
-    """[B] of the critics."""
-    value_target: Tensor
-    """[B] of the value network, where there is one."""
-    excess_entropy: Tensor
-    """[] entropy of the policy less its target, the derivative by a learned log alpha."""
+    """Frames of the trajectories that are learned from, and whether some are shorter."""
 
 
 class NonFiniteLossError(RuntimeError):
@@ -91,7 +74,7 @@ class NonFiniteLossError(RuntimeError):
 
 
 class TACLearner(TorchLearner):
-    """Tsallis actor-critic updates (paper III-B), with MUSIC's reward (III-A) where configured."""
+    """Tsallis actor-critic updates (paper III-B), with an intrinsic reward where configured."""
 
     # -- construction ---------------------------------------------------------------------
 
@@ -109,7 +92,7 @@ class TACLearner(TorchLearner):
         seed = self.config.seed if self.config.seed is not None else torch.seed()
         self._generator = torch.Generator(device=self._device).manual_seed(seed + 7919)
         self._grad_updates = 0
-        self._held_out = HeldOutBound()
+        self._intrinsic: IntrinsicReward = Music(self._music, self._estimator)
         self._losses: dict[str, Tensor] = {}
         self._observed: dict[str, Tensor] = {}
         self._names_of_losses: list[str] = []
@@ -120,7 +103,7 @@ class TACLearner(TorchLearner):
             self.config.total_env_steps or 0,
             self._policy_module.action_size,
         )
-        self._target_entropy = self._resolve_target_entropy()
+        self._objective = Objective(self._settings, self._policy_module, self._now)
         pairs = self._policy_module.get_target_network_pairs()
         self._online: list[Tensor] = [p for online, _ in pairs for p in online.parameters()]
         self._targets: list[Tensor] = [p for _, target in pairs for p in target.parameters()]
@@ -182,21 +165,12 @@ class TACLearner(TorchLearner):
             lr_or_lr_schedule=lr,
         )
 
-    def _resolve_target_entropy(self) -> float:
-        alpha = self._settings.alpha
-        if not isinstance(alpha, LearnedAlpha) or alpha.target_entropy != "auto":
-            return float(getattr(alpha, "target_entropy", 0.0))
-        # S_q of a density of e per dimension: -1 nat each at q = 1, as SAC has it.
-        ones = torch.ones(1, self._policy_module.action_size)
-        q, form = self._now.entropic_index, self._settings.entropy_form
-        return -float(ln_q_of_policy(ones, q, form))
-
     # -- the update loop ------------------------------------------------------------------
 
     def before_gradient_based_update(self, *, timesteps: dict[str, Any]) -> None:
         super().before_gradient_based_update(timesteps=timesteps)
         self._now.advance(int(timesteps.get(NUM_ENV_STEPS_SAMPLED_LIFETIME, 0)))
-        self._target_entropy = self._resolve_target_entropy()
+        self._objective.refresh()
 
     def observe_measured(self, quantity: Quantity, measured: float, env_steps: int) -> None:
         """Takes what was measured after `env_steps`; settings follow it from the next update on."""
@@ -257,11 +231,11 @@ class TACLearner(TorchLearner):
         for (module_id, name), values in minibatch.items():
             columns.setdefault(module_id, {})[name] = values
         self._losses, self._observed = {}, {}
-        priced = self._priced(columns, swapped=constants.swapped)
+        relabelled = self._relabelled(columns, constants.drawn)
         if self._direct is None:
-            self._update(priced)
+            self._update(relabelled)
         else:
-            self._update_directly(self._direct, priced)
+            self._update_directly(self._direct, relabelled)
         self._names_of_losses = list(self._losses)
         return {LOSSES: torch.stack(list(self._losses.values())), **self._observed}
 
@@ -272,31 +246,27 @@ class TACLearner(TorchLearner):
         policy = columns[DEFAULT_MODULE_ID]
         policy |= self._policy_noise(policy[Columns.ACTIONS])
         updates = len(policy[Columns.ACTIONS]) // self._settings.batch_size
-        swapped = [True] * updates
-        if self._music.shuffle == "random":
-            swapped = self._coins(updates)
-        if ESTIMATOR_MODULE in columns:
-            rows[ESTIMATOR_MODULE] = self._music.batch_trajectories
-            trajectories = columns[ESTIMATOR_MODULE]
-            if self._grad_updates == 0 and (estimator := self._estimator) is not None:
-                estimator.adapt_to(trajectories[Columns.OBS])
-            trajectories["permutations"] = self._permutations(trajectories, updates)
+        trajectories = columns.get(ESTIMATOR_MODULE)
+        if trajectories is not None:
+            rows[ESTIMATOR_MODULE] = self._intrinsic.trajectories
+        first = self._grad_updates == 0
+        drawn = self._intrinsic.draw(updates, trajectories, self._generator, first=first)
         for k in range(updates):
             minibatch = {
                 (mid, name): values[k * n : (k + 1) * n]
                 for mid, n in rows.items()
                 for name, values in columns[mid].items()
             }
-            yield minibatch, self._constants(minibatch, swapped=swapped[k])
+            yield minibatch, self._constants(minibatch, drawn[k])
 
-    def _constants(self, minibatch: FlatMinibatch, *, swapped: bool) -> _Constants:
+    def _constants(self, minibatch: FlatMinibatch, drawn: Hashable) -> _Constants:
         alpha = None if isinstance(self._settings.alpha, LearnedAlpha) else self._now.alpha
         shape = None
         if (ESTIMATOR_MODULE, Columns.OBS) in minibatch:
             frames = minibatch[ESTIMATOR_MODULE, Columns.OBS].shape[1]
             shape = (frames, (ESTIMATOR_MODULE, "inside") in minibatch)
         now = self._now
-        return _Constants(now.entropic_index, now.mi_reward_weight, alpha, swapped, shape)
+        return _Constants(now.entropic_index, now.mi_reward_weight, alpha, drawn, shape)
 
     def _policy_noise(self, actions: Tensor) -> dict[str, Tensor]:
         """Standard normal numbers for the policy's actions, and the next ones where needed."""
@@ -308,145 +278,67 @@ class TACLearner(TorchLearner):
     def _normal(self, shape: tuple[int, ...]) -> Tensor:
         return torch.randn(shape, generator=self._generator, device=self._device)
 
-    def _coins(self, updates: int) -> list[bool]:
-        """The original's shuffle of two frames: for a whole minibatch swapped or not."""
-        drawn = torch.rand(updates, generator=self._generator, device=self._device) < 0.5
-        return drawn.tolist()
-
-    def _permutations(self, trajectories: Mapping[str, Tensor], updates: int) -> Tensor:
-        rows, frames = trajectories[Columns.OBS].shape[:2]
-        sharing = 1 if self._music.shuffle == "independent" else rows // updates
-        inside = trajectories.get("inside")
-        return time_permutations(rows, frames, self._generator, sharing=sharing, inside=inside)
-
-    def _priced(self, minibatch: Minibatch, *, swapped: bool) -> Minibatch:
+    def _relabelled(self, minibatch: Minibatch, drawn: Hashable) -> Minibatch:
         """The minibatch with the reward that is learned from: task and intrinsic, weighted."""
-        estimator = self._estimator
-        if estimator is None:
+        if not self._intrinsic.is_on:
             return minibatch
         policy = minibatch[DEFAULT_MODULE_ID]
-        intrinsic = estimator.reward(policy[Columns.OBS], policy[Columns.NEXT_OBS], swapped=swapped)
-        reward = self._total_reward(policy[Columns.REWARDS], intrinsic)
+        states, followers = policy[Columns.OBS], policy[Columns.NEXT_OBS]
+        intrinsic = self._intrinsic.reward(states, followers, drawn)
         self._observed["intrinsic"] = intrinsic
+        weight = self._now.mi_reward_weight
+        reward = self._intrinsic.total(policy[Columns.REWARDS], intrinsic, weight)
         return {**minibatch, DEFAULT_MODULE_ID: {**policy, Columns.REWARDS: reward}}
-
-    def _total_reward(self, task: Tensor, intrinsic: Tensor) -> Tensor:
-        weighted = self._now.mi_reward_weight * intrinsic
-        return task + weighted if self._music.task_reward else weighted
 
     # -- losses ---------------------------------------------------------------------------
 
     def compute_loss_for_module(
         self, *, module_id: ModuleID, config: Any, batch: dict[str, Any], fwd_out: dict[str, Any]
     ) -> Tensor:
-        return self._loss(fwd_out["tac"], batch).total
+        return self._losses_of(fwd_out["tac"], batch).total
 
-    def _loss(self, forward: TACForward, batch: Mapping[str, Tensor]) -> _Loss:
-        settings, alpha = self._settings, self._current_alpha()
-        target = actor_critic.critic_target(
-            batch[Columns.REWARDS],
-            batch["discounts"],
-            self._soft_value(forward.next),
-            settings.gamma,
-            settings.target_bounds,
-        )
-        ln_q_pi = self._ln_q(forward.log_density)
-        critic = actor_critic.critic_loss(forward.q_values, target, batch.get("weights"))
-        improved = actor_critic.policy_value(forward.q_of_policy, settings.policy_critic)
-        policy = actor_critic.policy_loss(improved, ln_q_pi, alpha)
-        if settings.action_l2 > 0:
-            policy = policy + settings.action_l2 * forward.action.square().mean()
-        total = critic + policy
-        value_target = actor_critic.value_target(forward.q_of_policy, ln_q_pi, alpha)
-        if forward.value is not None:
-            value = actor_critic.value_loss(forward.value, value_target)
-            total = total + value
-            self._losses[names.VALUE_LOSS] = value.detach()
-        excess = self._excess_entropy(forward, ln_q_pi)
-        if isinstance(settings.alpha, LearnedAlpha):
-            total = total + actor_critic.alpha_loss(self._policy_module.log_alpha, excess)
-        self._observe(forward, target, critic=critic, policy=policy)
-        return _Loss(total, target, value_target, excess)
+    def _losses_of(self, forward: TACForward, batch: Mapping[str, Tensor]) -> Losses:
+        """The losses; what is measured of them is kept, as reading it out here would wait."""
+        losses = self._objective.losses(forward, batch)
+        self._losses |= losses.named
+        self._observed |= {"q_values": forward.q_values.detach(), "targets": losses.target}
+        if forward.log_density is not None and forward.log_std is not None:
+            self._observed |= {
+                "log_density": forward.log_density.detach(),
+                "log_std": forward.log_std.detach(),
+            }
+        return losses
 
-    def _excess_entropy(self, forward: TACForward, ln_q_pi: Tensor) -> Tensor:
-        """[] how much too random the policy is for a learned alpha, in its target's own measure."""
-        alpha = self._settings.alpha
-        if not isinstance(alpha, LearnedAlpha) or forward.log_density is None:
-            return torch.zeros((), device=self._device)
-        if alpha.target_shannon is not None:
-            return -forward.log_density.detach().sum(-1).mean() - alpha.target_shannon
-        if alpha.target_width is not None:
-            assert forward.log_std is not None
-            return forward.log_std.detach().mean() - math.log(alpha.target_width)
-        return -ln_q_pi.mean().detach() - self._target_entropy
+    def loss_of_trajectories(self, batch: Mapping[str, Tensor]) -> Tensor:
+        """What the intrinsic reward's networks minimise; called by their module."""
+        loss, metrics = self._intrinsic.loss(batch)
+        self._losses |= metrics
+        return loss
 
     def _update_directly(self, direct: DirectUpdate, minibatch: Minibatch) -> None:
         """RLlib's `_update` without its detours and, for the policy's module, without autograd."""
         batch = minibatch[DEFAULT_MODULE_ID]
         forward = direct.forward(batch)
         with torch.no_grad():
-            loss = self._loss(forward, batch)
+            loss = self._losses_of(forward, batch)
         direct.backward(
             forward,
             batch,
             target=loss.target,
             value_target=loss.value_target,
             entropic_index=self._now.entropic_index,
-            alpha=self._current_alpha(),
+            alpha=self._objective.alpha,
         )
         self._adam["networks"].step_flat(direct.flat)
         if "alpha" in self._adam:
             self._policy_module.log_alpha.grad = loss.excess_entropy
             self._adam["alpha"].step()
         if "estimator" in self._adam:
-            self._train_estimator(minibatch[ESTIMATOR_MODULE])
-
-    def _train_estimator(self, batch: dict[str, Tensor]) -> None:
-        module = self.module[ESTIMATOR_MODULE].unwrapped()
-        self._adam["estimator"].zero_grad()
-        module.compute_self_supervised_loss(
-            learner=self,
-            module_id=ESTIMATOR_MODULE,
-            config=self.config,
-            batch=batch,
-            fwd_out=module.forward_train(batch),
-        ).backward()
-        self._adam["estimator"].step()
-
-    def _ln_q(self, log_density: Tensor | None) -> Tensor:
-        """[B, A] -> [B] ln_q of the policy's density; 0 for a deterministic policy."""
-        if log_density is None:
-            return torch.zeros((), device=self._device)
-        return ln_q_of_policy(log_density, self._now.entropic_index, self._settings.entropy_form)
-
-    def _soft_value(self, bootstrap: Bootstrap) -> Tensor:
-        """[B] value of the states, the policy's entropy there included."""
-        if bootstrap.log_density is None:
-            return bootstrap.value
-        return bootstrap.value - self._current_alpha() * self._ln_q(bootstrap.log_density)
-
-    def _current_alpha(self) -> Tensor | float:
-        if isinstance(self._settings.alpha, LearnedAlpha):
-            return self._policy_module.log_alpha.detach().exp()
-        return self._now.alpha
+            self._adam["estimator"].zero_grad()
+            self.loss_of_trajectories(minibatch[ESTIMATOR_MODULE]).backward()
+            self._adam["estimator"].step()
 
     # -- metrics --------------------------------------------------------------------------
-
-    def _observe(
-        self, forward: TACForward, target: Tensor, *, critic: Tensor, policy: Tensor
-    ) -> None:
-        """Keeps what is measured of one minibatch: reading it out here would wait for it."""
-        self._losses |= {names.CRITIC_LOSS: critic.detach(), names.POLICY_LOSS: policy.detach()}
-        self._observed |= {"q_values": forward.q_values.detach(), "targets": target}
-        if forward.log_density is not None and forward.log_std is not None:
-            self._observed |= {
-                "log_density": forward.log_density.detach(),
-                "log_std": forward.log_std.detach(),
-            }
-
-    def observe_bound(self, bound: Tensor) -> None:
-        """Called by the estimator's module with the mean bound of its minibatch, in nats."""
-        self._losses[names.MI_BOUND] = bound
 
     def _log_history(self, history: Sequence[Mapping[str, Tensor]]) -> None:
         """Means of the updates' metrics; `history` has what `_step` returned of each."""
@@ -459,10 +351,9 @@ class TACLearner(TorchLearner):
         means = dict(zip(keys, table.mean(0).tolist(), strict=True))
         for key, mean in {**means, **self._now.metrics()}.items():
             log((DEFAULT_MODULE_ID, key), mean, window=1)
-        if (held_out := self._held_out.take()) is not None:
-            for key, value in zip((names.HELD_OUT_BOUND, HELD_OUT_STEPS), held_out, strict=True):
-                log((DEFAULT_MODULE_ID, key), value, window=1)
-        log((DEFAULT_MODULE_ID, names.ALPHA), float(self._current_alpha()), window=1)
+        for key, value in self._intrinsic.metrics().items():
+            log((DEFAULT_MODULE_ID, key), value, window=1)
+        log((DEFAULT_MODULE_ID, names.ALPHA), float(self._objective.alpha), window=1)
         log((ALL_MODULES, GRAD_UPDATES), self._grad_updates, window=1)
         if names.SHANNON_ENTROPY in means:
             self._now.observe("shannon_entropy", means[names.SHANNON_ENTROPY])
@@ -495,7 +386,7 @@ class TACLearner(TorchLearner):
         step = int(bad.any(1).nonzero()[0])
         culprits = [key for key, is_bad in zip(keys, bad[step].tolist(), strict=True) if is_bad]
         update = self._grad_updates - len(table) + step + 1
-        q, alpha = self._now.entropic_index, float(self._current_alpha())
+        q, alpha = self._now.entropic_index, float(self._objective.alpha)
         raise NonFiniteLossError(
             f"{', '.join(culprits)} not finite at gradient update {update} "
             f"(entropic_index {q:g}, alpha {alpha:g}). "
@@ -509,47 +400,23 @@ class TACLearner(TorchLearner):
     def diagnose(self, episodes: Sequence[Trajectory]) -> None:
         """Measures fresh episodes of the policy, before anything is learned from them.
 
-        Logs the critics' bias at their first steps, and the estimator's bound on them.
+        Logs the critics' bias at their first steps; the intrinsic reward takes its own measures.
         """
-        module, width = self._policy_module, self._input_size
-        lengths = [len(episode) for episode in episodes]
-        states = self._tensor([episode.frames[:-1, :width] for episode in episodes])
-        followers = self._tensor([episode.frames[1:, :width] for episode in episodes])
-        actions = self._tensor([episode.actions for episode in episodes])
-        rewards = self._tensor([episode.rewards for episode in episodes])
-        first = np.cumsum([0, *lengths[:-1]])
-        last = np.cumsum(lengths) - 1
-        if (estimator := self._estimator) is not None:
-            rewards = self._total_reward(rewards, estimator.reward(states, followers))
-            self._held_out.add(episodes, estimator.bound, self._generator)
-        noise = self._policy_noise(actions)
-        mean, log_std = module.policy_parameters(module.normaliser(states))
-        entropy = -self._ln_q(choose_action(mean, log_std, noise.get("noise"))[1]).expand(
-            len(rewards)
-        )
-        earned = (rewards + float(self._current_alpha()) * entropy).cpu().numpy().astype(float)
-        # The first action is what the critic is asked about: its entropy is not in its value.
-        earned[first] = rewards.cpu().numpy()[first]
-        ends = {Columns.NEXT_OBS: followers[last]}
-        ends |= {name: values[last] for name, values in noise.items()}
-        tail = self._soft_value(module.forward_target(ends)).cpu().numpy()
-        bootstrapped = np.array([not episode.terminated for episode in episodes])
-        gamma = self._settings.gamma
-        realised = diagnostics.discounted_returns(earned, lengths, gamma)
-        realised += bootstrapped * gamma ** np.array(lengths) * tail
-        asked = torch.cat([module.normaliser(states[first]), actions[first]], -1)
-        predicted = module.critics(asked).amin(0).cpu().numpy()
-        bias = float((predicted - realised).mean())
+        fresh = FreshEpisodes.of(episodes, self._input_size, self._device)
+        rewards = fresh.rewards
+        if self._intrinsic.is_on:
+            states, followers = fresh.states, fresh.followers
+            intrinsic = self._intrinsic.observe(episodes, states, followers, self._generator)
+            rewards = self._intrinsic.total(rewards, intrinsic, self._now.mi_reward_weight)
+        noise = self._policy_noise(fresh.actions)
+        bias = critic_bias(fresh, rewards, self._policy_module, self._objective, noise)
         self.metrics.log_value((DEFAULT_MODULE_ID, names.Q_BIAS), bias, window=1)
 
     @torch.no_grad()
     def trajectory_priorities(self, episodes: Sequence[Trajectory]) -> NDArray[np.float64]:
-        """MUSIC-p: the sum of each episode's per-step bounds, each clipped to [0, 2e-4] nats."""
-        estimator = self._estimator
-        assert estimator is not None
+        """One number an episode, by which the replay draws them."""
         frames = [torch.as_tensor(e.frames, device=self._device) for e in episodes]
-        sums = [estimator.transition_bounds(f).clamp(0.0, PRIORITY_CLIP).sum() for f in frames]
-        return torch.stack(sums).cpu().numpy().astype(np.float64)
+        return self._intrinsic.priorities(frames)
 
     def take_td_errors(self) -> NDArray[np.float32]:
         """[K*B] absolute TD errors of the last call's transitions, for prioritised replay."""
@@ -557,9 +424,6 @@ class TACLearner(TorchLearner):
         errors: NDArray[np.float32] = self._td_errors.cpu().numpy()
         self._td_errors = None
         return errors
-
-    def _tensor(self, arrays: Sequence[NDArray[Any]]) -> Tensor:
-        return torch.as_tensor(np.concatenate(arrays), device=self._device)
 
     # -- normaliser, state ----------------------------------------------------------------
 
@@ -574,7 +438,7 @@ class TACLearner(TorchLearner):
         state["tac"] = {
             "generator": self._generator.get_state().numpy(),
             GRAD_UPDATES: self._grad_updates,
-            "held_out": self._held_out.state(),
+            "held_out": self._intrinsic.state(),
             "scheduled": self._now.state(),
         }
         return state
@@ -591,6 +455,6 @@ class TACLearner(TorchLearner):
         if "tac" in state:
             self._generator.set_state(torch.from_numpy(state["tac"]["generator"].copy()))
             self._grad_updates = int(state["tac"][GRAD_UPDATES])
-            self._held_out.load_state(state["tac"]["held_out"])
+            self._intrinsic.load_state(state["tac"]["held_out"])
             if "scheduled" in state["tac"]:  # older states have none
                 self._now.load_state(state["tac"]["scheduled"])

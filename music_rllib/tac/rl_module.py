@@ -233,14 +233,13 @@ class EstimatorModule(TorchRLModule, SelfSupervisedLossAPI):
         return intrinsic_reward(bound, self.reward_scale)
 
     def _forward_train(self, batch: dict[str, Any], **kwargs: Any) -> dict[str, Any]:
-        return {"bound": self.bound(batch[Columns.OBS], batch["permutations"], batch.get("inside"))}
+        return {}  # the Learner's intrinsic reward asks for the bound
 
     def compute_self_supervised_loss(
         self, *, learner: Any, module_id: str, config: Any, batch: Any, fwd_out: dict[str, Tensor]
     ) -> Tensor:
-        bound = fwd_out["bound"].mean()
-        learner.observe_bound(bound.detach())
-        return -bound
+        loss: Tensor = learner.loss_of_trajectories(batch)
+        return loss
 
 
 def choose_action(

@@ -15,6 +15,7 @@ from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, EPISODE_RETURN_MEAN, LEA
 
 from music_rllib import names
 from music_rllib.config.run_settings import RunSettings
+from music_rllib.intrinsic.music import HELD_OUT_STEPS
 from music_rllib.replay.segments import Segment, load_segments, new_segments
 from music_rllib.store.handoff import Spaces
 from music_rllib.store.node_store import Draft, Saved
@@ -22,7 +23,6 @@ from music_rllib.store.state_io import read_arrays, read_state, write_arrays, wr
 from music_rllib.tac.algorithm import TAC
 from music_rllib.tac.config import TACConfig
 from music_rllib.tac.env_runner import DISPLACEMENT, MOVED, SUCCESS_ANY, SUCCESS_LAST
-from music_rllib.tac.learner import HELD_OUT_STEPS
 from music_rllib.tac.normaliser import for_another_run
 
 __all__ = ["Paused", "TrainingRun", "algorithm_config"]

@@ -18,11 +18,11 @@ from music_rllib import names
 from music_rllib.config.run_settings import RunSettings, Variant, handed_over, preset
 from music_rllib.envs.tasks import Task
 from music_rllib.experiment.plan import node_key
+from music_rllib.intrinsic.music import HELD_OUT_STEPS
 from music_rllib.policy import find_policy, load_policy
 from music_rllib.store.handoff import read_handoff
 from music_rllib.store.node_store import NodeStore
 from music_rllib.store.run_record import from_json_lines
-from music_rllib.tac.learner import HELD_OUT_STEPS
 from music_rllib.training.job import NodeJob
 from music_rllib.training.run import TrainingRun, _means
 from music_rllib.training.worker import CAUSE, NOTES, REPORTS, RunTrainable

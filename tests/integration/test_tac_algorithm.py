@@ -13,6 +13,7 @@ from music_rllib import TACConfig, names
 from music_rllib.config.tac_settings import TACSettings
 from music_rllib.envs.make import make_env
 from music_rllib.envs.numbers import BadNumberError
+from music_rllib.intrinsic.music import HELD_OUT_STEPS
 from music_rllib.intrinsic.settings import MusicSettings
 from music_rllib.replay.buffer import Trajectory
 from music_rllib.replay.settings import ReplaySettings
@@ -308,12 +309,12 @@ def test_the_bound_on_fresh_episodes_is_taken_over_all_of_them(tmp_path: Path) -
         last = algo.train()
     steps = [int(n) for n in algo.replay.packed(0)["lengths"]]
     found = last["learners"]["default_policy"]
-    assert found["held_out_steps"] == sum(n for n in steps[-2:] if n > 1)
+    assert found[HELD_OUT_STEPS] == sum(n for n in steps[-2:] if n > 1)
     assert len(set(steps)) > 3
     assert abs(found["mutual_information/held_out_bound"]) < 0.5
     # What has been measured and not yet reported is part of the state.
     learner = algo.learner_group._learner
-    assert learner._held_out.take() is None
+    assert learner._intrinsic.metrics() == {}
     held = algo.replay.packed(0)
     ends = np.cumsum([0, *steps])
     for i, (begin, end) in enumerate(itertools.pairwise(ends)):
@@ -321,9 +322,9 @@ def test_the_bound_on_fresh_episodes_is_taken_over_all_of_them(tmp_path: Path) -
         learner.diagnose([Trajectory(held["frames"][begin + i : end + i + 1], *columns)])
     algo.save_to_path(tmp_path / "checkpoint")
     resumed.restore_from_path(tmp_path / "checkpoint")
-    taken = learner._held_out.take()
-    assert taken[1] == sum(n for n in steps if n > 1)
-    assert resumed.learner_group._learner._held_out.take() == taken
+    taken = learner._intrinsic.metrics()
+    assert taken[HELD_OUT_STEPS] == sum(n for n in steps if n > 1)
+    assert resumed.learner_group._learner._intrinsic.metrics() == taken
     assert fingerprint(resumed, 1) == fingerprint(algo, 1)
 
 

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from music_rllib.envs.numbers import LARGEST, BadNumberError, are_usable, bad_number
+from music_rllib.envs.recording import Recording
 from music_rllib.replay.buffer import ReplayLayout
-from music_rllib.tac.recording import Recording
 
 BAD = st.sampled_from([np.nan, np.inf, -np.inf, 1e30, -1e30, 2 * LARGEST])
 SOUND = st.lists(st.floats(-1e12, 1e12), min_size=1, max_size=80)

@@ -1,0 +1,131 @@
+"""What TAC minimises on one minibatch, by the settings of the moment.
+
+Shape legend: B batch, A action dimensions, C critics.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import torch
+from ray.rllib.core.columns import Columns
+from torch import Tensor
+
+from music_rllib import names
+from music_rllib.config.tac_settings import LearnedAlpha, TACSettings
+from music_rllib.functional import actor_critic
+from music_rllib.functional.tsallis import ln_q_of_policy
+from music_rllib.tac.kernels.forward import Bootstrap, TACForward
+from music_rllib.tac.rl_module import TACModule
+from music_rllib.tac.scheduled import ScheduledSettings
+
+__all__ = ["Losses", "Objective"]
+
+
+class Losses(NamedTuple):
+    """The losses of a minibatch, and what their derivatives are made of."""
+
+    total: Tensor
+    named: dict[str, Tensor]
+    """[] each, by the metric's name."""
+    target: Tensor
+    """[B] of the critics."""
+    value_target: Tensor
+    """[B] of the value network, where there is one."""
+    excess_entropy: Tensor
+    """[] entropy of the policy less its target, the derivative by a learned log alpha."""
+
+
+class Objective:
+    """TAC's losses (paper III-B) with the networks, q and alpha that hold now.
+
+    Args:
+        settings: of TAC.
+        module: its networks; a learned alpha is among them.
+        now: what schedules make of q and alpha.
+    """
+
+    def __init__(self, settings: TACSettings, module: TACModule, now: ScheduledSettings) -> None:
+        self._settings, self._module, self._now = settings, module, now
+        self._no_entropy = torch.zeros((), device=next(module.parameters()).device)
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Takes over q, which a learned alpha's target follows; once for many updates."""
+        alpha = self._settings.alpha
+        self._target_entropy = 0.0
+        if isinstance(alpha, LearnedAlpha):
+            self._target_entropy = self._entropy_for(alpha)
+
+    @property
+    def gamma(self) -> float:
+        """The discount factor."""
+        return self._settings.gamma
+
+    @property
+    def alpha(self) -> Tensor | float:
+        """The coefficient of the entropy, learned or by its schedule."""
+        if isinstance(self._settings.alpha, LearnedAlpha):
+            return self._module.log_alpha.detach().exp()
+        return self._now.alpha
+
+    def ln_q(self, log_density: Tensor | None) -> Tensor:
+        """[B, A] -> [B] ln_q of the policy's density; 0 for a deterministic policy."""
+        if log_density is None:
+            return self._no_entropy
+        return ln_q_of_policy(log_density, self._now.entropic_index, self._settings.entropy_form)
+
+    def soft_value(self, bootstrap: Bootstrap) -> Tensor:
+        """[B] value of the states, the policy's entropy there included."""
+        if bootstrap.log_density is None:
+            return bootstrap.value
+        return bootstrap.value - self.alpha * self.ln_q(bootstrap.log_density)
+
+    def losses(self, forward: TACForward, batch: Mapping[str, Tensor]) -> Losses:
+        """Of a minibatch with rewards, discounts and, where prioritised, weights, [B] each."""
+        settings, alpha = self._settings, self.alpha
+        target = actor_critic.critic_target(
+            batch[Columns.REWARDS],
+            batch["discounts"],
+            self.soft_value(forward.next),
+            settings.gamma,
+            settings.target_bounds,
+        )
+        ln_q_pi = self.ln_q(forward.log_density)
+        critic = actor_critic.critic_loss(forward.q_values, target, batch.get("weights"))
+        improved = actor_critic.policy_value(forward.q_of_policy, settings.policy_critic)
+        policy = actor_critic.policy_loss(improved, ln_q_pi, alpha)
+        if settings.action_l2 > 0:
+            policy = policy + settings.action_l2 * forward.action.square().mean()
+        total, named = critic + policy, {}
+        value_target = actor_critic.value_target(forward.q_of_policy, ln_q_pi, alpha)
+        if forward.value is not None:
+            value = actor_critic.value_loss(forward.value, value_target)
+            total, named[names.VALUE_LOSS] = total + value, value.detach()
+        excess = self._excess_entropy(forward, ln_q_pi)
+        if isinstance(settings.alpha, LearnedAlpha):
+            total = total + actor_critic.alpha_loss(self._module.log_alpha, excess)
+        named |= {names.CRITIC_LOSS: critic.detach(), names.POLICY_LOSS: policy.detach()}
+        return Losses(total, named, target, value_target, excess)
+
+    def _excess_entropy(self, forward: TACForward, ln_q_pi: Tensor) -> Tensor:
+        """[] how much too random the policy is for a learned alpha, in its target's own measure."""
+        alpha = self._settings.alpha
+        if not isinstance(alpha, LearnedAlpha) or forward.log_density is None:
+            return self._no_entropy
+        if alpha.target_shannon is not None:
+            return -forward.log_density.detach().sum(-1).mean() - alpha.target_shannon
+        if alpha.target_width is not None:
+            assert forward.log_std is not None
+            return forward.log_std.detach().mean() - math.log(alpha.target_width)
+        return -ln_q_pi.mean().detach() - self._target_entropy
+
+    def _entropy_for(self, alpha: LearnedAlpha) -> float:
+        """The target in units of S_q; `auto` follows q."""
+        if alpha.target_entropy != "auto":
+            return float(alpha.target_entropy)
+        # S_q of a density of e per dimension: -1 nat each at q = 1, as SAC has it.
+        ones = torch.ones(1, self._module.action_size)
+        return -float(ln_q_of_policy(ones, self._now.entropic_index, self._settings.entropy_form))
