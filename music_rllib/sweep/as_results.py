@@ -18,14 +18,14 @@ __all__ = ["results_of"]
 
 
 def results_of(sweep: Sweep, metrics: Collection[str]) -> Results:
-    """Its finished runs, with these metrics.
+    """Its runs, the finished ones with these metrics.
 
     Raises:
         DamagedError: A run has no readable history.
         StorageError: Its plan can't be read.
     """
-    nodes = [node for node in sweep.plan.nodes if node.key in sweep.finished]
-    histories = [sweep.store.history(node.key) for node in nodes]
+    nodes, finished = sweep.plan.nodes, sweep.finished
+    histories = [sweep.store.history(node.key) if node.key in finished else [] for node in nodes]
     return Results(
         name=sweep.config.name,
         status="",
@@ -47,7 +47,7 @@ def _record(node: Node, history: list[Report]) -> RunRecord:
     return RunRecord(
         run_id=node.key,
         name=node.label,
-        status="FINISHED",
+        status="FINISHED" if history else "SCHEDULED",
         started=min(times, default=None),
         ended=max(times, default=None),
         params=flat_params(info.config),

@@ -238,7 +238,7 @@ def test_the_ranking_is_of_fresh_seeds(tmp_path: Path) -> None:
         return share * (0.6 - 0.1 * abs(q - 1.5)) + 0.01 * (run.seed % 3)
 
     space = {"tac.entropic_index": {"float": [1.0, 2.5], "step": 0.5}}
-    final = {"trials": 2, "seeds": 4}
+    final = {"trials": 2, "seeds": 4, "env_steps": 6000}
     driver = Driver(tmp_path, document({"space": space, "sampler": "grid", "final": final}), lucky)
     driver.play()
     found = driver.outcome()
@@ -255,6 +255,11 @@ def test_the_ranking_is_of_fresh_seeds(tmp_path: Path) -> None:
     assert second["best_is_better_with"] == 1.0
     runs = [run for run in driver.sweep.plan.runs if run.part.startswith("final")]
     assert {run.seed for run in runs} == {FINAL_SEED + n for n in range(4)}
+    budgets = {
+        run.part[:5]: driver.sweep.plan.node(run.key).run.env_steps
+        for run in driver.sweep.plan.runs
+    }
+    assert budgets == {"": 4000, "trial": 4000, "final": 6000}
     pretrained = {run.seed for run in driver.sweep.plan.runs if run.stage == "pretrain"}
     assert pretrained == {0, 1, 2} | {run.seed for run in runs}, "one for each seed, shared"
 

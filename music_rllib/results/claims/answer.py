@@ -125,7 +125,7 @@ def _seeds(study: Study, shown: Sequence[Claim]) -> str:
         text += ", compared in pairs" if all(paired) else ", not all of them shared"
     if study.stage is not None and any((SEEDS, FRESH) in c.others for c in study.stage.compared):
         text += ", fresh ones that no setting was chosen by"
-    return f"{text}; {finished} of {runs} runs that have begun are finished."
+    return f"{text}; {finished} of {runs} runs are finished."
 
 
 def _control(sweep: Sweep, study: Study) -> str:

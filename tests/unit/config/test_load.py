@@ -201,6 +201,17 @@ def test_a_users_task(load: Callable[..., SweepConfig]) -> None:
     assert run_of(load(document)).task.env_id == "Pendulum-v1"
 
 
+def asking(hypothesis: str, **analysis: Any) -> Document:
+    return changed(analysis={"hypotheses": [hypothesis], **analysis})
+
+
+def without_success(document: Document) -> Document:
+    task = {"env_id": "Pendulum-v1", "horizon": 50, "success_key": None}
+    grid = {"tac.entropic_index": [1.0, 1.5]}
+    stages = [{"name": "a", "variant": "tac", "grid": grid}]
+    return document | {"environments": {"Swing": task}, "tasks": ["Swing"], "stages": stages}
+
+
 BAD: list[tuple[Document, str]] = [
     (changed(name=1), "sweep.yaml:1: name must be text, got 1"),
     (changed(name="nodes"), "name must not be 'nodes'"),
@@ -330,6 +341,17 @@ BAD: list[tuple[Document, str]] = [
     (with_stage(1, grid={"entropic_index": [1]}), "(did you mean 'tac.entropic_index'?)"),
     (with_stage(1, grid={"music.lr": [1.0]}), "has no effect with variant music-r"),
     (with_stage(1, grid={"music.estimator": ["none"]}), 'must be "frozen" for music-r, got "none"'),
+    (asking("q = 1.5 or q = 1"), "analysis.hypotheses[0] must be two different conditions with"),
+    (asking("q = 1 against q = 1"), "must be two different conditions with"),
+    (asking("q = 3 against q = 1"), "tac.entropic_index is [1.0, 1.5], got 3"),
+    (asking("lr = 3 against q = 1"), "of which finetune varies tac.entropic_index, got 'lr'"),
+    (asking("stage = a against q = 1"), "must name one of the stages pretrain, finetune, got 'a'"),
+    (asking("q = 1.5 against q = 1", stage="x"), "analysis.stage must be one of pretrain, finet"),
+    (asking("q = 1.5 against q = 1", margin=0), "analysis.margin must be > 0, got 0"),
+    (
+        without_success(asking("q = 1.5 against q = 1")),
+        "analysis.margin must be given for tasks without success, got null",
+    ),
 ]
 
 

@@ -21,8 +21,12 @@ from music_rllib.config.load import load_sweep
 from music_rllib.experiment import location, sweep_files
 from music_rllib.experiment.plan import Node, make_plan
 from music_rllib.experiment.session import Sweep, keep_record, open_sweep
+from music_rllib.experiment.sweep_files import as_json
 from music_rllib.redaction import flat_params
 from music_rllib.results.analysis import analyse
+from music_rllib.results.claims.answer import answer
+from music_rllib.results.claims.study import study_of
+from music_rllib.results.claims.tables import claim_rows, mean_rows
 from music_rllib.results.comparison import each_seed, verdict
 from music_rllib.results.data import Points, RunRecord, columns
 from music_rllib.results.data import Sweep as Logged
@@ -227,6 +231,13 @@ def test_compare_and_the_report_say_the_same_of_the_same_sweep(
             assert row["best_is_better_with"] == (chance if labels[0] == best else 1 - chance)
             assert abs(row["gap"]) == pytest.approx(abs(float(pair.gap.value)))
         assert group["verdict"].replace("tac.entropic_index", "q") == " ".join(verdict(scope))
+    # What is claimed, too, from the same curves.
+    document = program("compare", f"{storage}/mine", "--json").document
+    logged = as_logged(sweep)
+    study = study_of(logged)
+    assert document["comparisons"] == json.loads(as_json(claim_rows(study)))
+    assert document["conditions"][0]["by_seed"] == mean_rows(study)[0]["by_seed"]
+    assert document["answer"] == answer(logged, study)
     # Seeds that have finished on one of two tasks count there, and not over both.
     assert [row["runs"] for row in groups[0]["conditions"]] == [8, 10, 12]
     assert [row["runs"] for row in groups[1]["conditions"]] == [5, 5, 6]
@@ -486,6 +497,37 @@ def test_the_recorded_configuration_is_the_sweeps(storage: str, tmp_path: Path) 
     found = find_sweep(f"{storage}/mine", None).open()
     assert [node.key for node in found.plan.nodes] == [node.key for node in sweep.plan.nodes]
     assert found.storage == storage
+
+
+def test_an_analysis_plan_is_recorded_and_changes_no_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: Program
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    plain, planned = tmp_path / "plain.yaml", tmp_path / "planned.yaml"
+    plain.write_text(yaml.safe_dump(SWEEP))
+    folder = tmp_path / "results/mine"
+    keys = {node["key"] for node in program("plan", str(plain), "--json").document["nodes"]}
+    assert not folder.exists()  # a dry run leaves nothing where nothing was planned
+
+    def recorded(**analysis: Any) -> list[Any]:
+        asked = {"hypotheses": ["q = 1.5 better than q = 1"], **analysis}
+        planned.write_text(yaml.safe_dump(SWEEP | {"analysis": asked}))
+        document = program("plan", str(planned), "--json").document
+        assert {node["key"] for node in document["nodes"]} == keys
+        assert document["analysis_plan"] == json.loads((folder / "analysis_plan.json").read_text())
+        versions: list[Any] = document["analysis_plan"]
+        return versions
+
+    assert [one["version"] for one in recorded()] == [1]
+    assert [one["version"] for one in recorded()] == [1]
+    versions = recorded(margin=0.1)
+    assert [(one["version"], one["plan"]["margin"]) for one in versions] == [(1, 0.05), (2, 0.1)]
+    text = (folder / "analysis_plan.md").read_text()
+    assert versions[1]["hash"] in text
+    assert "- q = 1.5 better than q = 1" in text
+    (folder / "analysis_plan.json").write_text(json.dumps(versions).replace("0.05", "0.4"))
+    refused = program("plan", str(planned))
+    assert (refused.code, "as they were recorded" in refused.errors) == (2, True)
 
 
 def test_plan_as_json_with_more_seeds(tmp_path: Path, program: Program) -> None:
