@@ -39,7 +39,7 @@ def answer(sweep: Sweep, study: Study) -> list[str]:
         said.append(f"Of {len(rest)} more comparisons: {found}.")
     said += [_counted(study, shown), _seeds(study, shown), f"Control: {_control(sweep, study)}."]
     if any(one.verdict is Verdict.UNDECIDED for one in study.claims):
-        said += filter(None, [seeds_needed(study.claims, study.means)])
+        said += filter(None, [seeds_needed(shown, study.means, len(study.claims))])
     said += [f"Not tested: {text}." for text in study.untested[:1]]
     return said
 

@@ -17,11 +17,17 @@ FEWEST_SEEDS = 3
 """From two, the spread may be ten times too small."""
 
 
-def seeds_needed(claims: Sequence[Claim], means: Sequence[Mean]) -> str | None:
+def seeds_needed(claims: Sequence[Claim], means: Sequence[Mean], family: int) -> str | None:
     """In a sentence; None without a margin or where no spread is known.
 
     Nothing is said from what is within the margin of a ceiling or floor, where seeds differ less
-    than elsewhere. The level is that of the first of so many comparisons by Holm's method.
+    than elsewhere.
+
+    Args:
+        claims: whose spread counts.
+        means: of the conditions.
+        family: comparisons that are tested together; the first of them has 5 % / family by Holm's
+            method.
     """
     stated = [one for one in claims if one.margin is not None]
     if not stated:
@@ -44,7 +50,7 @@ def seeds_needed(claims: Sequence[Claim], means: Sequence[Mean]) -> str | None:
         return None
     paired = all(one.contrast.paired for one in clear)
     spread = float(np.sqrt(np.mean([float(one.contrast.spread) ** 2 for one in clear])))
-    level = SIGNIFICANCE / len(claims)
+    level = SIGNIFICANCE / family
     shown = seeds_for_difference(margin, spread, paired=paired, level=level)
     alike = seeds_for_equivalence(margin, spread, paired=paired, level=level)
     pairs = "paired seeds" if paired else "single seeds"

@@ -26,7 +26,8 @@ class Measure:
     value."""
     metric: str
     horizon: float
-    """Environment steps of the area: the smallest budget of what is compared."""
+    """Environment steps of the area: the smallest budget of what is compared; NaN for tasks
+    together, each of which has its own."""
     maximised: bool = True
 
     @property
@@ -38,11 +39,10 @@ class Measure:
     def words(self) -> str:
         """`mean success over 100,000 steps`."""
         word = names.word_of(self.metric)
-        return (
-            f"final {word}"
-            if self.kind == "final"
-            else f"mean {word} over {self.horizon:,.0f} steps"
-        )
+        if self.kind == "final":
+            return f"final {word}"
+        budget = "the budget" if np.isnan(self.horizon) else f"{self.horizon:,.0f} steps"
+        return f"mean {word} over {budget}"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -206,7 +206,7 @@ def _claims(
             [scores_of(sweep, pair[side], task, m) for pair in cells for task, m in own.items()]
             for side in (0, 1)
         ]
-        one = _claim(columns, next(iter(own.values())), margin)
+        one = _claim(columns, _common(own), margin)
         if one is not None:
             yield replace(
                 one,
@@ -237,6 +237,14 @@ def _scopes(measures: Mapping[str, Measure]) -> Iterator[tuple[str, dict[str, Me
         yield task, {task: one}
 
 
+def _common(measures: Mapping[str, Measure]) -> Measure:
+    """What a scope's tasks have in common."""
+    first, *others = measures.values()
+    if all(one.horizon == first.horizon for one in others):
+        return first
+    return replace(first, horizon=np.nan)
+
+
 def _pairs_of(
     sweep: Sweep, stage: Stage, measures: Mapping[str, Measure], margin: float | None
 ) -> Iterator[Claim]:
@@ -246,7 +254,7 @@ def _pairs_of(
                 [scores_of(sweep, side, task, m) for task, m in own.items()]
                 for side in (first, second)
             ]
-            one = _claim(columns, next(iter(own.values())), margin)
+            one = _claim(columns, _common(own), margin)
             if one is not None:
                 yield replace(one, first=label_of(first), second=label_of(second), task=name)
 

@@ -285,7 +285,7 @@ def test_smaller_budgets_are_compared_over_themselves(rng: np.random.Generator) 
 def test_nothing_is_said_of_seeds_needed_at_a_ceiling(rng: np.random.Generator) -> None:
     def at(height: float) -> str:
         found = study_of(sweep_of(study({"1": height, "1.5": height}, 4, rng)))
-        return seeds_needed(found.claims, found.means) or ""
+        return seeds_needed(found.claims, found.means, 1) or ""
 
     assert "spread does not tell" in at(0.0)
     assert "shows with 80 % chance from" in at(0.3)
