@@ -18,7 +18,7 @@ from music_rllib import names
 from music_rllib.config.load import load_sweep
 from music_rllib.config.schema import SweepConfig
 from music_rllib.experiment.plan import make_plan
-from music_rllib.sweep.listeners.mlflow import run_info
+from music_rllib.experiment.run_info import run_info
 from music_rllib.tracking import Tracker
 
 __all__ = ["rows"]

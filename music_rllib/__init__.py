@@ -10,6 +10,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from music_rllib.results.frames.tables import load_sweep
     from music_rllib.tac.algorithm import TAC
     from music_rllib.tac.config import TACConfig
     from music_rllib.tac.learner import TACLearner
@@ -17,13 +18,14 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-__all__ = ["TAC", "TACConfig", "TACLearner", "TACModule", "__version__"]
+__all__ = ["TAC", "TACConfig", "TACLearner", "TACModule", "__version__", "load_sweep"]
 
 _HOMES = {
     "TAC": "music_rllib.tac.algorithm",
     "TACConfig": "music_rllib.tac.config",
     "TACLearner": "music_rllib.tac.learner",
     "TACModule": "music_rllib.tac.rl_module",
+    "load_sweep": "music_rllib.results.frames.tables",
 }
 
 

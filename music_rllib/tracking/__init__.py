@@ -9,10 +9,11 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from music_rllib.experiment.run_info import RunInfo
     from music_rllib.tracking.sender import Backlog
     from music_rllib.tracking.session import deliver
     from music_rllib.tracking.store import check_reachable, resolve_store
-    from music_rllib.tracking.tracker import Point, RunInfo, Tracker
+    from music_rllib.tracking.tracker import Point, Tracker
 
 __all__ = [
     "Backlog",

@@ -11,7 +11,7 @@ import re
 import shlex
 import time
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -20,6 +20,7 @@ import yaml
 
 from music_rllib import names
 from music_rllib.errors import TrackingError
+from music_rllib.experiment.run_info import RunInfo
 from music_rllib.redaction import flat_params, redact, without_secrets
 from music_rllib.tracking.provenance import provenance_tags
 from music_rllib.tracking.sender import Backlog
@@ -32,24 +33,6 @@ MAX_FAILURE_LENGTH = 1000
 
 _PART = r"(?!\.{1,2}(?:/|$))[\w.\-: ]+"
 _METRIC_NAME = re.compile(rf"{_PART}(?:/{_PART})*")
-
-
-@dataclass(frozen=True, kw_only=True)
-class RunInfo:
-    """One run of the sweep, as MLflow shows it."""
-
-    node_key: str
-    """The node's content hash; the run is found again by it."""
-    name: str
-    """Shown in MLflow's lists, for example ``finetune/q=1.5/FetchPush/seed=0``."""
-    config: Mapping[str, object]
-    """Everything that determines the run: becomes params and the artefact ``config/run.yaml``."""
-    tags: Mapping[str, object] = field(default_factory=dict)
-    """``names.TAG_*`` to values; None is left out."""
-    settings: Mapping[str, float] = field(default_factory=dict)
-    """``names.SETTING_*`` to numbers, logged as metrics at step 0, so that MLflow compares them."""
-    source_node: str | None = None
-    """Node key of the run whose handoff this one starts from."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,13 +25,13 @@ from typer.testing import CliRunner, Result
 from music_rllib import names
 from music_rllib.config.load import load_sweep
 from music_rllib.experiment.plan import Node, make_plan
+from music_rllib.experiment.run_info import run_info
 from music_rllib.report.build import PAGE
 from music_rllib.report.cli import app
 from music_rllib.report.location import find_sweep
 from music_rllib.results.archive.folder import Format, read_archive
 from music_rllib.results.data import Sweep
 from music_rllib.results.from_mlflow import read_mlflow
-from music_rllib.sweep.listeners.mlflow import run_info
 from music_rllib.tracking import Tracker, resolve_store
 
 STEPS = range(20_000, 100_001, 20_000)

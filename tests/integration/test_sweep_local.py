@@ -10,10 +10,14 @@ from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pytest
 from mlflow import MlflowClient
 
-from music_rllib import names
+from music_rllib import load_sweep, names
+from music_rllib.results.archive.folder import write_archive
+from music_rllib.results.from_mlflow import read_mlflow
+from music_rllib.tracking import resolve_store
 from tests.integration.conftest import listening
 
 pytestmark = pytest.mark.integration
@@ -71,6 +75,7 @@ def test_a_sweep_from_the_plan_to_mlflow_and_then_a_finer_one(
     assert [row[-1] for row in again] == ["reused", "reused", "finished", "reused"]
     assert [row[:-1] for row in again if row[-1] == "reused"] == [row[:-1] for row in found]
     assert len(mlflow_runs()) == 1 + 4
+    check_frames(tmp_path)
 
     code, output, errors = sweep_program.run("--name", "other")
     assert (code, errors) == (0, "")
@@ -102,6 +107,33 @@ def check_mlflow(runs: dict[str, Any], folder: Path, found: list[list[str]]) -> 
         assert metric_steps(folder, run, names.EVAL_SUCCESS) == [400, 800, 1200]
     ids = [run.info.run_id[:8] for name, run in sorted(runs.items()) if name != "points"]
     assert sorted(ids) == sorted(row[-2] for row in found)
+
+
+def check_frames(folder: Path) -> None:
+    """The same from the storage, from MLflow and from an export."""
+    store = f"sqlite:///{folder}/results/mlflow.db"
+    write_archive(read_mlflow(resolve_store(store, "results"), "points"), folder / "export")
+    read = [
+        load_sweep(folder / "results" / "points"),
+        load_sweep("points", tracking_uri=store),
+        load_sweep(folder / "export"),
+    ]
+    # MLflow has the moment when it was told.
+    told = {"runs": ["started", "ended"], "curves": ["time"], "conditions": []}
+    order = {
+        "runs": ["name"],
+        "curves": ["key", "metric", "env_steps"],
+        "conditions": ["stage", "q"],
+    }
+    for name, columns in told.items():
+        first, *others = (
+            getattr(one, name).drop(columns=columns).sort_values(order[name]) for one in read
+        )
+        assert len(first)
+        for other in others:
+            pd.testing.assert_frame_equal(
+                first.reset_index(drop=name != "runs"), other.reset_index(drop=name != "runs")
+            )
 
 
 def test_a_task_without_success_shows_its_return_from_the_first_line_to_the_report(

@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tarfile
 import tomllib
 import zipfile
 from collections.abc import Iterator
@@ -39,23 +40,51 @@ def _run_python(
     )
 
 
-# --- the wheel -----------------------------------------------------------------------------
+# --- the source distribution and the wheel ----------------------------------------------------
+
+
+def _tracked() -> list[str]:
+    """The repository's files; of an unpacked source distribution all that are not caches."""
+    found = subprocess.run(
+        ["git", "ls-files", "--cached", "--others", "--exclude-standard"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    listed = found.stdout.splitlines() or [
+        path.relative_to(ROOT).as_posix()
+        for path in ROOT.rglob("*")
+        if path.is_file()
+        and not re.search(r"/(\.venv|[^/]*cache[^/]*|[^/]*\.egg-info)/", f"{path}")
+    ]
+    return [name for name in listed if (ROOT / name).is_file()]
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Build the wheel from a copy (setuptools leaves files behind), without a network."""
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of both, built from a copy (setuptools leaves files behind), without a network."""
     source = tmp_path_factory.mktemp("source")
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(ROOT / name, source)
-    shutil.copytree(
-        ROOT / "music_rllib", source / "music_rllib", ignore=shutil.ignore_patterns("__pycache__")
-    )
-    built = _run_python(
-        "-W", "ignore", "-m", "build", "--wheel", "--no-isolation", "--outdir", "dist", cwd=source
-    )
-    assert built.returncode == 0, built.stdout + built.stderr
-    (path,) = (source / "dist").glob("*.whl")
+    for name in _tracked():
+        (source / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, source / name)
+    # The wheel is built from the source distribution, as an installer does it.
+    done = _run_python("-W", "ignore", "-m", "build", "--no-isolation", cwd=source)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return source / "dist"
+
+
+def test_source_distribution_holds_the_repository(built: Path) -> None:
+    (path,) = built.glob("*.tar.gz")
+    with tarfile.open(path) as archive:
+        packed = {name.partition("/")[2] for name in archive.getnames()}
+    tracked = {name for name in _tracked() if not name.startswith(".ci/")}
+    assert tracked <= packed, sorted(tracked - packed)
+
+
+@pytest.fixture(scope="module")
+def wheel(built: Path) -> Path:
+    (path,) = built.glob("*.whl")
     return path
 
 

@@ -67,9 +67,9 @@ def _execute(arguments: argparse.Namespace) -> int:
     from music_rllib.results.claims.answer import answer
     from music_rllib.results.claims.study import study_of
     from music_rllib.results.claims.tables import study_data
+    from music_rllib.results.frames.from_storage import results_of
     from music_rllib.results.from_store import conditions, scopes
     from music_rllib.search.ranking import measure_of
-    from music_rllib.sweep.as_results import results_of
     from music_rllib.sweep.views.compare import compare_view
 
     found = find_sweep(arguments.sweep, arguments.storage)

@@ -7,68 +7,20 @@ import dataclasses
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 from music_rllib import names
-from music_rllib.config.run_settings import RunSettings
-from music_rllib.config.tac_settings import LearnedAlpha, MatchedAlpha, NormalisedAlpha, in_words
 from music_rllib.errors import TrackingError
 from music_rllib.experiment.listener import Failure, Listener
 from music_rllib.experiment.plan import Node
+from music_rllib.experiment.run_info import run_info
 from music_rllib.policy.policy import policy_from_folder
-from music_rllib.schedules import Linear, Measured, Piecewise, value_at
-from music_rllib.store.files import content_key
 from music_rllib.store.node_store import NodeStore
 from music_rllib.store.object_folder import DamagedError, StorageError
 from music_rllib.store.run_record import Report, RunResult
 from music_rllib.tracking.sender import Backlog
-from music_rllib.tracking.tracker import Point, RunInfo, Tracker
-from music_rllib.version import ALGORITHM_VERSION
+from music_rllib.tracking.tracker import Point, Tracker
 
-__all__ = ["Logbook", "run_info"]
-
-
-def _at_start(
-    value: float | Linear | Piecewise | Measured | LearnedAlpha | MatchedAlpha | NormalisedAlpha,
-    run: RunSettings,
-) -> float:
-    if isinstance(value, LearnedAlpha):
-        return value.initial
-    # As it was set: alpha at q = 1. What becomes of it at q is a metric of the run.
-    given = value.value if isinstance(value, MatchedAlpha | NormalisedAlpha) else value
-    return value_at(given, 0, run.env_steps)
-
-
-def run_info(node: Node) -> RunInfo:
-    """A node as MLflow shows it."""
-    run = node.run
-    config: dict[str, Any] = run.model_dump(mode="json")
-    q, alpha, weight = run.tac.entropic_index, run.tac.alpha, run.music.mi_reward_weight
-    return RunInfo(
-        node_key=node.key,
-        name=node.label,
-        config=config,
-        tags={
-            names.TAG_STAGE: node.stage,
-            names.TAG_TRIAL: node.trial,
-            names.TAG_PART: node.part or None,
-            names.TAG_VARIANT: run.variant,
-            names.TAG_TASK: run.task.name,
-            names.TAG_SEED: run.seed,
-            names.TAG_ENTROPIC_INDEX: in_words(q),
-            names.TAG_ALPHA: in_words(alpha),
-            names.TAG_MI_REWARD_WEIGHT: in_words(weight),
-            names.TAG_CONFIG_HASH: content_key(config),
-            names.TAG_ALGORITHM: ALGORITHM_VERSION,
-            names.TAG_SOURCE_NODE: node.input.key if node.input else None,
-        },
-        settings={
-            names.SETTING_ENTROPIC_INDEX: _at_start(q, run),
-            names.SETTING_ALPHA: _at_start(alpha, run),
-            names.SETTING_MI_REWARD_WEIGHT: _at_start(weight, run),
-        },
-        source_node=node.input.key if node.input and not node.input.checkpoint else None,
-    )
+__all__ = ["Logbook"]
 
 
 class Logbook(Listener):

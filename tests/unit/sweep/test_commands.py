@@ -20,6 +20,7 @@ from music_rllib import names
 from music_rllib.config.load import load_sweep
 from music_rllib.experiment import location, sweep_files
 from music_rllib.experiment.plan import Node, make_plan
+from music_rllib.experiment.run_info import run_info
 from music_rllib.experiment.session import Sweep, keep_record, open_sweep
 from music_rllib.experiment.sweep_files import as_json
 from music_rllib.redaction import flat_params
@@ -35,7 +36,6 @@ from music_rllib.store.object_folder import DamagedError
 from music_rllib.store.paths import sweep_folder
 from music_rllib.store.run_record import HISTORY, Report, RunResult, to_json_lines
 from music_rllib.sweep import clean, cli
-from music_rllib.sweep.listeners.mlflow import run_info
 from music_rllib.sweep.listeners.state_file import Beacon, is_alive
 
 SWEEP: dict[str, Any] = {

@@ -1,0 +1,78 @@
+"""A node as MLflow shows it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from music_rllib import names
+from music_rllib.config.run_settings import RunSettings
+from music_rllib.config.tac_settings import LearnedAlpha, MatchedAlpha, NormalisedAlpha, in_words
+from music_rllib.experiment.plan import Node
+from music_rllib.schedules import Linear, Measured, Piecewise, value_at
+from music_rllib.store.files import content_key
+from music_rllib.version import ALGORITHM_VERSION
+
+__all__ = ["RunInfo", "run_info"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunInfo:
+    """One run of the sweep, as MLflow shows it."""
+
+    node_key: str
+    """The node's content hash; the run is found again by it."""
+    name: str
+    """Shown in MLflow's lists, for example ``finetune/q=1.5/FetchPush/seed=0``."""
+    config: Mapping[str, object]
+    """Everything that determines the run: becomes params and the artefact ``config/run.yaml``."""
+    tags: Mapping[str, object] = field(default_factory=dict)
+    """``names.TAG_*`` to values; None is left out."""
+    settings: Mapping[str, float] = field(default_factory=dict)
+    """``names.SETTING_*`` to numbers, logged as metrics at step 0, so that MLflow compares them."""
+    source_node: str | None = None
+    """Node key of the run whose handoff this one starts from."""
+
+
+def run_info(node: Node) -> RunInfo:
+    """A node as MLflow shows it."""
+    run = node.run
+    config: dict[str, Any] = run.model_dump(mode="json")
+    q, alpha, weight = run.tac.entropic_index, run.tac.alpha, run.music.mi_reward_weight
+    return RunInfo(
+        node_key=node.key,
+        name=node.label,
+        config=config,
+        tags={
+            names.TAG_STAGE: node.stage,
+            names.TAG_TRIAL: node.trial,
+            names.TAG_PART: node.part or None,
+            names.TAG_VARIANT: run.variant,
+            names.TAG_TASK: run.task.name,
+            names.TAG_SEED: run.seed,
+            names.TAG_ENTROPIC_INDEX: in_words(q),
+            names.TAG_ALPHA: in_words(alpha),
+            names.TAG_MI_REWARD_WEIGHT: in_words(weight),
+            names.TAG_CONFIG_HASH: content_key(config),
+            names.TAG_ALGORITHM: ALGORITHM_VERSION,
+            names.TAG_SOURCE_NODE: node.input.key if node.input else None,
+        },
+        settings={
+            names.SETTING_ENTROPIC_INDEX: _at_start(q, run),
+            names.SETTING_ALPHA: _at_start(alpha, run),
+            names.SETTING_MI_REWARD_WEIGHT: _at_start(weight, run),
+        },
+        source_node=node.input.key if node.input and not node.input.checkpoint else None,
+    )
+
+
+def _at_start(
+    value: float | Linear | Piecewise | Measured | LearnedAlpha | MatchedAlpha | NormalisedAlpha,
+    run: RunSettings,
+) -> float:
+    if isinstance(value, LearnedAlpha):
+        return value.initial
+    # As it was set: alpha at q = 1. What becomes of it at q is a metric of the run.
+    given = value.value if isinstance(value, MatchedAlpha | NormalisedAlpha) else value
+    return value_at(given, 0, run.env_steps)

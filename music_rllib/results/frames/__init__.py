@@ -1,0 +1,1 @@
+"""A sweep as pandas frames, wherever it is kept."""

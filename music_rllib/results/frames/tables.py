@@ -1,0 +1,196 @@
+"""A sweep as pandas frames: the same columns from a storage, from MLflow and from an export."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from music_rllib import names
+from music_rllib.results.analysis import analyse
+from music_rllib.results.archive.folder import is_archive, read_archive
+from music_rllib.results.conditions import find_stages
+from music_rllib.results.data import Column, Sweep, joined
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+__all__ = ["Frames", "frames_of", "load_sweep"]
+
+_SETTINGS = {
+    "q": names.SETTING_ENTROPIC_INDEX,
+    "alpha": names.SETTING_ALPHA,
+    "mi_reward_weight": names.SETTING_MI_REWARD_WEIGHT,
+}
+_SAID_ALREADY = ("env_steps", "seed", "variant")
+"""Params that have a column of their own."""
+_RUN_COLUMNS = {
+    **dict.fromkeys(("name", "stage", "variant", "task", "condition"), "str"),
+    "seed": "Int64",
+    **dict.fromkeys(_SETTINGS, "float64"),
+    "status": "str",
+    **dict.fromkeys(("started", "ended"), "datetime64[ms, UTC]"),
+    **dict.fromkeys(("last_step", "budget"), "Int64"),
+    "primary_metric": "str",
+    "score": "float64",
+    **dict.fromkeys(("source", "failure"), "str"),
+}
+_CURVE_COLUMNS = {
+    **dict.fromkeys(("key", "metric"), "str"),
+    "env_steps": "int64",
+    "value": "float64",
+    "time": "datetime64[ms, UTC]",
+}
+_CONDITION_COLUMNS = {
+    **dict.fromkeys(("stage", "variant", "task", "condition"), "str"),
+    "q": "float64",
+    "metric": "str",
+    **dict.fromkeys(("seeds", "runs"), "int64"),
+    **dict.fromkeys(("mean", "lower", "upper"), "float64"),
+}
+
+
+_NOTHING = Column(
+    run=np.empty(0, int), step=np.empty(0, int), value=np.empty(0), time=np.empty(0, int)
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Frames:
+    """One sweep; docs/reports.md describes the columns."""
+
+    name: str
+    runs: pd.DataFrame = field(repr=False)
+    """A row for each run, by its `key`: what it is, its settings, how it ended."""
+    curves: pd.DataFrame = field(repr=False)
+    """A row for each value of a metric: `key`, `metric`, `env_steps`, `value`, `time`."""
+    conditions: pd.DataFrame = field(repr=False)
+    """A row for each condition on each task: the mean of its seeds with its 95 % interval."""
+
+
+def load_sweep(
+    place: str | Path, *, tracking_uri: str | None = None, storage: str = "results"
+) -> Frames:
+    """Runs, curves and conditions of a sweep, as pandas frames.
+
+    Args:
+        place: a sweep's folder in a storage (`results/my_sweep`, `s3://bucket/sweeps/my_sweep`), a
+            folder that `report --export` wrote, or a sweep's name.
+        tracking_uri: read the sweep of that name from this MLflow instead
+            (`sqlite:///results/mlflow.db`, `http://mlflow:5000`).
+        storage: where a name is looked for.
+
+    Raises:
+        ReportError: there is no such sweep, or what is there is not one.
+        StorageError: its storage can't be read, or finished runs in it are damaged.
+        TrackingError: MLflow does not answer.
+    """
+    place = str(place)
+    if tracking_uri is not None:
+        from music_rllib.results.from_mlflow import read_mlflow
+        from music_rllib.tracking.store import resolve_store
+
+        return frames_of(read_mlflow(resolve_store(tracking_uri, storage), Path(place).name))
+    if "://" not in place and is_archive(Path(place).expanduser()):
+        return frames_of(read_archive(Path(place).expanduser()))
+    from music_rllib.results.frames.from_storage import read_storage
+
+    return frames_of(read_storage(place, storage))
+
+
+def frames_of(sweep: Sweep) -> Frames:
+    """The frames of a sweep that has been read with all its metrics."""
+    keys = [run.node_key or run.run_id for run in sweep.runs]
+    return Frames(
+        name=sweep.name,
+        runs=_runs(sweep, keys),
+        curves=_curves(sweep, keys),
+        conditions=_frame(list(_conditions(sweep)), _CONDITION_COLUMNS),
+    )
+
+
+def _runs(sweep: Sweep, keys: list[str]) -> pd.DataFrame:
+    condition = {
+        run: one.label
+        for stage in find_stages(sweep)
+        for one in stage.conditions
+        for run in one.runs
+    }
+    rows = []
+    for position, run in enumerate(sweep.runs):
+        metric = sweep.primary_metric(run.task)
+        rows.append(
+            {
+                **{name: getattr(run, name) for name in ("name", "stage", "variant", "task")},
+                "condition": condition[position],
+                "seed": run.seed,
+                **{name: sweep.final(position, setting) for name, setting in _SETTINGS.items()},
+                "status": run.status,
+                "started": run.started,
+                "ended": run.ended,
+                "last_step": sweep.last_step(position),
+                "budget": run.budget,
+                "primary_metric": metric,
+                "score": sweep.final(position, metric) if run.status == "FINISHED" else None,
+                "source": run.tags.get(names.TAG_SOURCE_NODE),
+                "failure": run.failure,
+            }
+        )
+    frame = _frame(rows, _RUN_COLUMNS)
+    params = sorted({name for run in sweep.runs for name in run.params} - {*_SAID_ALREADY})
+    settings = {name: _typed([run.params.get(name) for run in sweep.runs]) for name in params}
+    frame = pd.concat([frame, pd.DataFrame(settings, index=frame.index)], axis=1)
+    return frame.set_index(pd.Index(keys, name="key", dtype="str"))
+
+
+def _typed(texts: list[str | None]) -> Any:
+    """Numbers where all of them are."""
+    try:
+        return pd.to_numeric(pd.Series(texts))
+    except ValueError:
+        return pd.Series(texts, dtype="str")
+
+
+def _curves(sweep: Sweep, keys: list[str]) -> pd.DataFrame:
+    found = list(sweep.history.values())
+    every = joined(found) if found else _NOTHING
+    metrics = np.repeat(np.array(list(sweep.history), str), [len(one.run) for one in found])
+    key = pd.Series(keys, dtype="str").take(every.run.astype(int))
+    columns = {"key": key.array, "metric": metrics, "env_steps": every.step, "value": every.value}
+    return _frame({**columns, "time": every.time}, _CURVE_COLUMNS)
+
+
+def _conditions(sweep: Sweep) -> Iterator[dict[str, Any]]:
+    for analysis in analyse(sweep):
+        stage = analysis.stage
+        for scope in analysis.scopes:
+            for final in scope.finals:
+                setting = sweep.final(final.condition.runs[0], names.SETTING_ENTROPIC_INDEX)
+                yield {
+                    "stage": stage.name,
+                    "variant": stage.variant,
+                    "task": scope.name,
+                    "condition": final.condition.label,
+                    "q": setting,
+                    "metric": scope.metric,
+                    "seeds": final.seeds,
+                    "runs": final.runs,
+                    "mean": final.value,
+                    "lower": float(final.estimate.lower),
+                    "upper": float(final.estimate.upper),
+                }
+
+
+def _frame(rows: Any, columns: dict[str, str]) -> pd.DataFrame:
+    """With these columns and types, whatever the rows hold, and without any."""
+    frame = pd.DataFrame(rows, columns=list(columns))
+    for name, kind in columns.items():
+        column = frame[name]
+        if kind.startswith("datetime"):
+            frame[name] = pd.to_datetime(column, unit="ms", utc=True).astype(kind)
+        else:
+            frame[name] = (pd.to_numeric(column) if kind == "Int64" else column).astype(kind)
+    return frame

@@ -1,0 +1,76 @@
+"""Frames of a sweep: what they hold, and that an export says the same."""
+
+from __future__ import annotations
+
+import ast
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import pandas as pd
+import pytest
+
+from music_rllib import load_sweep, names
+from music_rllib.results.archive.folder import read_archive, write_archive
+from music_rllib.results.frames.tables import frames_of
+
+DOCS = Path(__file__).parents[3] / "docs"
+EXPORT = DOCS / "results" / "data" / "v3-fetch-push-music-f"
+
+
+def test_frames_join_to_what_the_export_holds() -> None:
+    sweep, frames = read_archive(EXPORT), load_sweep(EXPORT)
+    assert frames.name == sweep.name
+    assert list(frames.runs.index) == [run.node_key for run in sweep.runs]
+    assert dict(frames.runs.dtypes[["q", "tac.lr", "score"]]) == dict.fromkeys(
+        ("q", "tac.lr", "score"), "float64"
+    )
+    joined = frames.curves.join(frames.runs, on="key")
+    assert len(joined) == sum(len(column.run) for column in sweep.history.values())
+    for position, run in enumerate(sweep.runs):
+        steps, values = sweep.series(position, names.EVAL_DISPLACEMENT)
+        of_run = joined[(joined.key == run.node_key) & (joined.metric == names.EVAL_DISPLACEMENT)]
+        assert of_run.env_steps.tolist() == steps.tolist()
+        assert of_run.value.tolist() == values.tolist()
+        assert set(of_run.stage) == {run.stage}
+    started = frames.runs.loc[frames.runs.source.dropna()]
+    assert set(started.stage) == {"pretrain"}
+    again = frames.runs.groupby(["stage", "task", "condition"]).score.mean()
+    said = frames.conditions.set_index(["stage", "task", "condition"])["mean"]
+    pd.testing.assert_series_equal(again.sort_index(), said.sort_index(), check_names=False)
+
+
+def test_an_export_as_csv_gives_the_same_frames(tmp_path: Path) -> None:
+    write_archive(read_archive(EXPORT), tmp_path / "csv", "csv")
+    first, second = load_sweep(EXPORT), load_sweep(tmp_path / "csv")
+    for name in ("runs", "curves", "conditions"):
+        pd.testing.assert_frame_equal(getattr(first, name), getattr(second, name))
+
+
+def test_a_sweep_without_runs_has_empty_frames_of_the_same_types() -> None:
+    whole = load_sweep(EXPORT)
+    empty = frames_of(replace(read_archive(EXPORT), runs=[], history={}))
+    for name in ("runs", "curves", "conditions"):
+        frame = getattr(empty, name)
+        assert frame.empty
+        assert dict(frame.dtypes) == dict(getattr(whole, name).dtypes[frame.columns])
+
+
+def test_the_notebook_still_says_what_it_shows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its code cells one after the other, their results as text."""
+    monkeypatch.chdir(DOCS)
+    mpl.use("Agg")
+    notebook = json.loads((DOCS / "first_results.ipynb").read_text(encoding="utf-8"))
+    namespace: dict[str, Any] = {}
+    for cell in notebook["cells"]:
+        if cell["cell_type"] != "code":
+            continue
+        *steps, last = ast.parse("".join(cell["source"])).body
+        exec(compile(ast.Module(steps, []), "cell", "exec"), namespace)
+        if not isinstance(last, ast.Expr):
+            continue
+        value = eval(compile(ast.Expression(last.value), "cell", "eval"), namespace)
+        shown = ["".join(output["data"]["text/plain"]) for output in cell["outputs"]]
+        assert shown in ([repr(value)], ["<Figure>"])
