@@ -32,7 +32,7 @@ from music_rllib.report.figures.choice import (
     slug,
     stage_drawings,
 )
-from music_rllib.report.figures.plots import files
+from music_rllib.report.figures.draw import files
 from music_rllib.report.search_tables import search_in_words, search_tables
 from music_rllib.results import statistics as st
 from music_rllib.results.analysis import StageAnalysis, analyse
@@ -281,7 +281,7 @@ def stage_curves(sweep: Sweep, figures: dict[str, bytes], stages: Sequence[str])
 def figure(sweep: Sweep, drawing: Drawing, figures: dict[str, bytes]) -> Iterator[str]:
     """Puts the drawing into `figures` and shows it."""
     name = f"{slug(sweep.name)}-{drawing.name}.svg"
-    figures[name] = files(drawing.panels, drawing.legend)["svg"]
+    figures[name] = files(drawing.panels, drawing.legend)[".svg"]
     yield f"![{drawing.title} of {sweep.name}, {drawing.stage}](results/figures/{name})"
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from music_rllib import names
 from music_rllib.envs.tasks import Task
 from music_rllib.report.figures.choice import Drawing, drawings_of_stages, stage_drawings
-from music_rllib.report.figures.draw import draw_all
+from music_rllib.report.figures.draw import draw_files, draw_inline, stale_files
 from music_rllib.report.figures.plots import METRICS
 from music_rllib.report.limitations import missing
 from music_rllib.report.page import Report, render
@@ -29,7 +29,12 @@ from music_rllib.tracking.store import TrackingStore
 __all__ = ["PAGE", "WANTED", "build_report", "write_report"]
 
 PAGE = "report.html"
-WANTED = (*(metric.name for metric in METRICS), names.EVAL_EPISODES, names.ENV_STEPS)
+WANTED = (
+    *(metric.name for metric in METRICS),
+    names.EVAL_EPISODES,
+    names.ENV_STEPS,
+    names.GRAD_UPDATES,
+)
 """Metrics that a report reads."""
 _CURVE_COLUMNS = (
     *("stage", "task", "condition", "metric", "env_steps", "runs", "mean", "lower", "upper"),
@@ -68,7 +73,7 @@ def build_report(
         analyses=analyses,
         together=analyse_stages(sweep, stages),
         drawings=drawings,
-        pictures=draw_all(drawings),
+        pictures=draw_inline(drawings),
         missing=missing(sweep, analyses, undelivered) + ([damaged] if damaged else []),
         difference=difference,
         command=command,
@@ -79,7 +84,7 @@ def build_report(
 
 
 def write_report(report: Report, folder: Path) -> Path:
-    """Write the page, `figures/*` (PNG, SVG), `videos/*` and `tables/*.csv` into `folder`.
+    """Write the page, `figures/*` (PNG, SVG, PDF), `videos/*` and `tables/*.csv` into `folder`.
 
     Figures of an earlier report that this one does not have are removed.
 
@@ -93,10 +98,12 @@ def write_report(report: Report, folder: Path) -> Path:
     try:
         for part in (figures, tables):
             part.mkdir(parents=True, exist_ok=True)
-        _remove_others(figures, {drawing.name for drawing in report.drawings})
-        for drawing in report.drawings:
-            for kind, content in report.pictures[drawing.name].files.items():
-                (figures / f"{drawing.name}.{kind}").write_bytes(content)
+        here = [file.name for file in figures.iterdir()]
+        for stale in stale_files({drawing.name for drawing in report.drawings}, here):
+            (figures / stale).unlink()
+        for name, drawn in draw_files(report.drawings).items():
+            for ending, content in drawn.items():
+                (figures / f"{name}{ending}").write_bytes(content)
         if report.films is not None and report.films.films:
             (folder / "videos").mkdir(exist_ok=True)
             for film in report.films.films:
@@ -123,9 +130,3 @@ def _tables(report: Report) -> Iterable[Table]:
 def _curves_table(drawings: Iterable[Drawing]) -> Table:
     rows = [row for drawing in drawings for row in drawing.values]
     return Table(name="curves", columns=_CURVE_COLUMNS, rows=rows)
-
-
-def _remove_others(folder: Path, kept: set[str]) -> None:
-    for file in folder.iterdir():
-        if file.suffix in (".png", ".svg") and file.stem not in kept:
-            file.unlink()

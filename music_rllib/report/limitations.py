@@ -78,14 +78,6 @@ def _missing_evidence(sweep: Sweep, analyses: Sequence[StageAnalysis]) -> list[s
         notes.append(f"Nothing was evaluated yet on {_some(unevaluated)}.")
     for analysis in analyses:
         stage = analysis.stage
-        if len(stage.conditions) == 1:
-            only = stage.conditions[0].label
-            notes.append(f"Stage {stage.name} has a single condition ({only}): no comparison.")
-        if len(stage.seeds) == 1:
-            notes.append(
-                f"Stage {stage.name} has a single seed ({stage.seeds[0]}): one run shows what can "
-                "happen and not what usually does; there are no intervals."
-            )
         unfinished = [c.label for c in stage.conditions if not _finished(sweep, c.runs)]
         if unfinished and len(unfinished) < len(stage.conditions):
             notes.append(f"Stage {stage.name}: no run of {_some(unfinished)} has finished.")

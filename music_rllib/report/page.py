@@ -1,51 +1,46 @@
-"""The page: every section of a sweep's report."""
+"""The page: the answer first, then everything behind it in groups."""
 
 from __future__ import annotations
 
-import math
 import statistics
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
 from music_rllib import names
 from music_rllib.report.figures.choice import (
-    CURVES,
-    FINALS,
+    COST,
+    GROUPS,
     INFLUENCE,
+    PERFORMANCE,
     PRIMARY,
-    PROFILES,
+    SETTINGS,
     Drawing,
     slug,
 )
-from music_rllib.report.figures.draw import Pictures
 from music_rllib.report.figures.importance import FEWEST_RUNS, varied
-from music_rllib.report.pieces import Cell, Figure, TextTable, document, number
-from music_rllib.report.search_tables import search_in_words, search_tables
+from music_rllib.report.pieces import Figure, Panels, TextTable, document
 from music_rllib.report.videos import Films
-from music_rllib.results.analysis import StageAnalysis, Wait
-from music_rllib.results.comparison import (
-    SHOW_SEEDS_BELOW,
-    each_seed,
-    interval_text,
-    p_text,
-    verdict,
+from music_rllib.report.web.charts import chart_data
+from music_rllib.report.web.sections import (
+    all_runs,
+    budget,
+    failures,
+    origin,
+    performance_tables,
+    search_section,
+    state_in_words,
 )
-from music_rllib.results.comparison import number as in_short
-from music_rllib.results.conditions import SIDE_BY_SIDE
+from music_rllib.results.analysis import StageAnalysis
+from music_rllib.results.comparison import verdict
+from music_rllib.results.conditions import SIDE_BY_SIDE, Stage
 from music_rllib.results.data import Sweep
-from music_rllib.results.statistics import SIGNIFICANCE
-from music_rllib.results.time_to_threshold import FEWEST_FOR_INTERVAL
 
 __all__ = ["Report", "render"]
 
 DASH = "–"
-MOST_ROWS = 30
-"""Of a search's table; a longer one is folded."""
-LONG = 40
-"""Characters from which on a cell has several lines."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,8 +52,8 @@ class Report:
     together: StageAnalysis | None
     """Stages against each other; None where there is nothing to compare."""
     drawings: Sequence[Drawing]
-    pictures: Mapping[str, Pictures]
-    """By the drawings' names."""
+    pictures: Mapping[str, Sequence[str]]
+    """An SVG element for each panel, by the drawings' names."""
     missing: Sequence[str]
     difference: float
     """In success rate, which the reader would want to be able to see."""
@@ -68,23 +63,31 @@ class Report:
     """None where nobody asked for videos."""
 
 
-def render(report: Report) -> str:
-    """The page as HTML that needs nothing else."""
+def render(report: Report, *, live: bool = False) -> str:
+    """The page as HTML that needs nothing else.
+
+    Args:
+        report: what it shows.
+        live: whether it is served, and follows a sweep that runs.
+    """
     sweep = report.sweep
+    data = chart_data(sweep, report.drawings)
+    numbers = {stage["name"]: number for number, stage in enumerate(data["stages"])}
     return document(
+        data,
+        live=live,
         name=sweep.name,
         facts=_facts(report),
         missing=report.missing,
-        searches=[_search(search) for search in sweep.searches],
-        side_by_side=_side_by_side(report),
-        # What comes of a sweep is in its last stage.
-        stages=[_stage(report, analysis) for analysis in reversed(report.analyses)],
+        asked=_asked(report),
+        said=_said(report),
+        large=_large(report, numbers),
+        groups=list(_groups(report, numbers)),
+        searches=[search_section(search) for search in sweep.searches],
         films=report.films,
         outcomes=_OUTCOMES,
-        budget=_budget(sweep, report.analyses),
-        failures=_failures(sweep),
-        runs=_all_runs(sweep),
-        origin=_origin(report),
+        runs=all_runs(sweep),
+        origin=origin(sweep, report.command),
         config=sweep.config,
         method=_METHOD,
     )
@@ -96,7 +99,7 @@ def _facts(report: Report) -> Sequence[tuple[str, object]]:
     stages = [analysis.stage for analysis in report.analyses]
     seeds = sorted({len(stage.seeds) for stage in stages})
     return (
-        ("Sweep", _state(sweep.status)),
+        ("Sweep", state_in_words(sweep.status)),
         ("Runs finished", f"{states['FINISHED']} of {len(sweep.runs)} begun"),
         ("Seeds per condition", _range(seeds)),
         ("Tasks", ", ".join(dict.fromkeys(t for s in stages for t in s.tasks)) or DASH),
@@ -104,295 +107,169 @@ def _facts(report: Report) -> Sequence[tuple[str, object]]:
     )
 
 
-def _search(search: Mapping[str, Any]) -> Mapping[str, Any]:
-    tables = [
-        replace(
-            found,
-            rows=[[_search_cell(shown) for shown in row] for row in found.rows],
-            long=len(found.rows) > MOST_ROWS,
-        )
-        for found in search_tables(search)
-    ]
-    return {"stage": search["stage"], "words": search_in_words(search), "tables": tables}
+# The answer -------------------------------------------------------------------------------------
 
 
-def _search_cell(shown: object) -> Cell:
-    text = str(shown)
-    is_number = text.rstrip(" %").replace(".", "").replace("-", "").isdigit()
-    return number(text) if is_number else Cell(text=text, kind="long" * (len(text) > LONG))
-
-
-def _side_by_side(report: Report) -> Mapping[str, Any] | None:
-    figures = _figures(report, SIDE_BY_SIDE)
-    if not figures:
-        return None
-    shown: dict[str, Any] = {"figures": list(figures.values()), "tables": [], "said": []}
+def _main(report: Report) -> StageAnalysis | None:
+    """What came of the sweep: its stages against each other, or the last that has the task."""
     if report.together is not None:
-        shown["tables"] = [_races_table(report.together), _improvement_table(report.together)]
-        shown["said"] = ["Of each stage the runs of the conditions that all have."]
-    return shown
+        return report.together
+    last = [one for one in report.analyses if one.stage.has_task_reward] or report.analyses
+    return last[-1] if last else None
 
 
-def _stage(report: Report, analysis: StageAnalysis) -> Mapping[str, Any]:
-    stage = analysis.stage
-    count, seeds = len(stage.conditions), ", ".join(stage.seeds)
-    said = []
-    if stage.compared not in ((), stage.conditions):
-        said.append("Curves and comparisons are of the runs on fresh seeds; tables have all.")
-    if not stage.has_task_reward:
-        said.append("It trains without the task's reward: success is not its aim.")
-    drawn = _figures(report, stage.name)
-    return {
-        "name": stage.name,
-        "slug": slug(stage.name),
-        "variant": stage.variant,
-        "runs": f"{count} condition{'s' * (count != 1)} on {', '.join(stage.tasks)}; "
-        f"seeds {seeds}.",
-        "said": said,
-        "verdicts": [verdict(scope, report.difference) for scope in analysis.scopes],
-        "first_figures": [drawn.get(title) for title in (*PRIMARY, *FINALS.values())],
-        "tables": [
-            _final_table(analysis),
-            _waits_table(analysis),
-            _races_table(analysis),
-            _improvement_table(analysis),
-        ],
-        "figures": [drawn.get(title) for title in (PROFILES, *INFLUENCE, *CURVES[2:])],
-        "not_drawn": _why_no_influence(analysis, drawn),
-    }
+def _asked(report: Report) -> str:
+    main = _main(report)
+    if main is None:
+        return "Nothing has run yet."
+    stage = main.stage
+    metrics = dict.fromkeys(names.word_of(report.sweep.primary_metric(t)) for t in stage.tasks)
+    aim = " or ".join("success rate" if word == "success" else word for word in metrics)
+    budgets = [b for run in stage.runs if (b := report.sweep.runs[run].budget)]
+    steps = f", {statistics.median(budgets):,.0f} environment steps per run" if budgets else ""
+    seeds = f"{len(stage.seeds)} seed{'s' * (len(stage.seeds) != 1)}"
+    where = f"on {_and(stage.tasks)} ({seeds}{steps})"
+    if len(stage.conditions) == 1:
+        return f"What {aim} does {stage.conditions[0].label} reach {where}?"
+    settings = _and(varied(stage.conditions) or ["the stage"])
+    choices = len(stage.conditions)
+    which = f"{choices} settings of {settings}" if choices > 4 else _and(_labels(stage), "or")
+    return f"Which ends at the higher {aim} {where}: {which}?"
 
 
-def _figures(report: Report, stage: str) -> dict[str, Figure]:
-    """A stage's figures by their titles."""
-    return {
-        drawing.title: Figure(
-            name=drawing.name,
-            title=drawing.title,
-            caption=drawing.caption,
-            legend=drawing.legend,
-            panels=[
-                (f"{drawing.title}, {panel.title}", svg)
-                for panel, svg in zip(
-                    drawing.panels, report.pictures[drawing.name].inline, strict=True
-                )
-            ],
-        )
-        for drawing in report.drawings
-        if drawing.stage == stage
-    }
+def _labels(stage: Stage) -> list[str]:
+    return [condition.label for condition in stage.conditions]
 
 
-def _why_no_influence(analysis: StageAnalysis, drawn: Mapping[str, Figure]) -> list[str]:
-    """What would have to vary for the figures that are not there."""
-    absent = [title for title in INFLUENCE if title not in drawn]
-    if not absent or len(analysis.stage.conditions) == 1:
+def _said(report: Report) -> list[str]:
+    """Of the main comparison everything; of stages that have nothing in common each one's first."""
+    main = _main(report)
+    if main is None or not main.scopes:
         return []
-    settings = ", ".join(varied(analysis.stage.conditions)) or "nothing"
-    return [
-        f"Not drawn: {', '.join(title.lower() for title in absent)}. This stage varies {settings}; "
-        "sensitivity needs α or the MI weight, the other two need a second setting beside q and "
-        f"finished runs (importance: {FEWEST_RUNS} on a task)."
-    ]
+    others = [one for one in report.analyses if one.stage.has_task_reward and one is not main]
+    firsts = [] if report.together else [verdict(s.scopes[0])[0] for s in others if s.scopes]
+    return [*verdict(main.scopes[0], report.difference), *firsts]
 
 
-def _final_table(analysis: StageAnalysis) -> TextTable:
-    rows = [
-        (
-            scope.name,
-            final.condition.label,
-            names.word_of(scope.metric),
-            number(in_short(final.value)),
-            interval_text(final.estimate),
-            " ".join(map(in_short, each_seed(final))) or DASH,
-            final.seeds,
-            final.runs,
-        )
-        for scope in analysis.scopes
-        for final in scope.finals
-    ]
-    return TextTable(
-        title="What runs ended at",
-        header=(
-            *("Task", "Condition", "Metric", "Mean", "95 % interval"),
-            *("Each seed", "Seeds", "Runs"),
-        ),
-        rows=rows,
-        note="Mean of the last evaluation of finished runs; over all tasks, of the seeds that have "
-        f"finished on each of them. Fewer than {SHOW_SEEDS_BELOW} seeds are shown one by one.",
+# Figures ----------------------------------------------------------------------------------------
+
+
+def _large(report: Report, numbers: Mapping[str, int]) -> Figure | None:
+    """All tasks of what came of the sweep, by what they are judged by."""
+    stages = [stage for stage in numbers if stage == SIDE_BY_SIDE] or list(numbers)[-1:]
+    drawn = [d for d in report.drawings if d.stage in stages and d.title in PRIMARY]
+    return _figure(report, "Learning curves", drawn, numbers, metric="") if drawn else None
+
+
+def _groups(report: Report, numbers: Mapping[str, int]) -> Iterable[Mapping[str, Any]]:
+    own = {drawing.stage for drawing in report.drawings if drawing.stage != SIDE_BY_SIDE}
+    pairs = [*([report.together] if report.together else []), *report.analyses]
+    tables: dict[str, Sequence[TextTable]] = {
+        PERFORMANCE: performance_tables(pairs) if pairs else [],
+        COST: [budget(report.sweep, report.analyses), failures(report.sweep)],
+    }
+    for group in GROUPS:
+        by_title: dict[str, list[Drawing]] = {}
+        for drawing in report.drawings:
+            on_top = drawing.stage == SIDE_BY_SIDE and drawing.title in PRIMARY
+            if drawing.group == group and not on_top:
+                by_title.setdefault(drawing.title, []).append(drawing)
+        figures = [
+            _figure(report, title, drawn, numbers)
+            for title, drawn in by_title.items()
+            # The large figure has them already.
+            if len(own) > 1 or title not in PRIMARY
+        ]
+        said = {PERFORMANCE: list(_remarks(report)), SETTINGS: _not_drawn(report)}.get(group, [])
+        shown = [table for table in tables.get(group, ()) if table.rows]
+        if figures or shown or said:
+            yield {"title": group, "figures": figures, "tables": shown, "said": said}
+
+
+def _figure(
+    report: Report,
+    title: str,
+    drawings: Sequence[Drawing],
+    numbers: Mapping[str, int],
+    metric: str | None = None,
+) -> Figure:
+    if metric is None and drawings[0].metric is not None:
+        metric = drawings[0].metric.name
+    return Figure(
+        name=slug(title),
+        title=title,
+        caption=drawings[-1].caption,
+        metric=metric,
+        stages=[
+            Panels(
+                name=drawing.name,
+                stage=drawing.stage if len(drawings) > 1 else "",
+                number=numbers.get(drawing.stage, -1),
+                legend=drawing.legend,
+                panels=[
+                    (f"{drawing.title}, {panel.title}", panel.title, svg)
+                    for panel, svg in zip(
+                        drawing.panels, report.pictures[drawing.name], strict=True
+                    )
+                ],
+            )
+            for drawing in drawings
+        ],
     )
 
 
-def _waits_table(analysis: StageAnalysis) -> TextTable:
-    rows = [
-        (
-            wait.task,
-            wait.condition.label,
-            f"{wait.threshold * 100:.0f} %",
-            f"{wait.reached} of {wait.runs}",
-            number(_steps(wait.median)),
-            _between(wait),
-            _each_wait(wait),
+def _remarks(report: Report) -> Iterable[Sequence[str]]:
+    """Of each stage what else is to be known, and what may be said on each task."""
+    several = len(report.analyses) > 1
+    main = _main(report)
+    for analysis in [*([report.together] if report.together else []), *reversed(report.analyses)]:
+        stage, said = analysis.stage, []
+        if stage.compared not in ((), stage.conditions):
+            said.append("Curves and comparisons are of the runs on fresh seeds; tables have all.")
+        if not stage.has_task_reward:
+            said.append("It trains without the task's reward: success is not its aim.")
+        if len(stage.conditions) == 1:
+            said.append(f"It has a single condition ({_labels(stage)[0]}): no comparison.")
+        if len(stage.seeds) == 1:
+            said.append(
+                f"It has a single seed ({stage.seeds[0]}): one run shows what can happen and not "
+                "what usually does; there are no intervals."
+            )
+        skipped = 1 if analysis is main else 0
+        said += [
+            line
+            for scope in analysis.scopes[skipped:]
+            for line in verdict(scope, report.difference)
+        ]
+        head = f"Stage {stage.name} ({stage.variant}), seeds {', '.join(stage.seeds)}"
+        if analysis is report.together:
+            head = "Stages side by side, each by the runs of the conditions that all have"
+        if said or several:
+            yield [head, *said]
+
+
+def _not_drawn(report: Report) -> list[Sequence[str]]:
+    """What would have to vary for the figures that are not there."""
+    drawn = {(drawing.stage, drawing.title) for drawing in report.drawings}
+    found: list[Sequence[str]] = []
+    for analysis in report.analyses:
+        stage = analysis.stage
+        absent = [title for title in INFLUENCE if (stage.name, title) not in drawn]
+        if not absent or len(stage.conditions) == 1:
+            continue
+        settings = ", ".join(varied(stage.conditions)) or "nothing"
+        found.append(
+            (
+                f"Stage {stage.name}",
+                f"Not drawn: {', '.join(title.lower() for title in absent)}. This stage varies "
+                f"{settings}; sensitivity needs α or the MI weight, the other two need a second "
+                f"setting beside q and finished runs (importance: {FEWEST_RUNS} on a task).",
+            )
         )
-        for wait in sorted(analysis.waits, key=lambda wait: (wait.threshold, wait.task))
-    ]
-    return TextTable(
-        title="Environment steps to a success rate",
-        header=(
-            *("Task", "Condition", "Success", "Got there", "Median steps", "95 % interval"),
-            "Each run",
-        ),
-        rows=rows,
-        note="First evaluation at or above the success rate. Runs that never got there count as "
-        "not there yet at their last evaluation (Kaplan-Meier median): none is left out. The "
-        f"interval is that of the runs' order, which needs {FEWEST_FOR_INTERVAL} of them.",
-    )
-
-
-def _races_table(analysis: StageAnalysis) -> TextTable:
-    rows = [
-        (
-            race.task,
-            f"{race.first} before {race.second}",
-            f"{race.threshold * 100:.0f} %",
-            *(
-                (
-                    number(in_short(race.estimate.value)),
-                    interval_text(race.estimate),
-                    p_text(race.p_value),
-                    "yes" if race.decided else "no",
-                )
-                if race.reached
-                else (number(DASH), "not reached by either", DASH, "no")
-            ),
-        )
-        for race in sorted(analysis.races, key=lambda race: (race.threshold, race.task))
-    ]
-    return TextTable(
-        title="Who gets there sooner",
-        header=(
-            *("Task", "Pair", "Success", "Probability"),
-            *("95 % interval", "Permutation", "Decided"),
-        ),
-        rows=rows,
-        note="Probability that a run of the first reaches the success rate in fewer environment "
-        "steps than a run of the second (ties half; whoever ends below it is last). Decided: "
-        f"p < {SIGNIFICANCE:g} after Holm's correction.",
-    )
-
-
-def _improvement_table(analysis: StageAnalysis) -> TextTable:
-    rows = [
-        (
-            scope.name,
-            f"{pair.first.condition.label} over {pair.second.condition.label}",
-            number(in_short(pair.gap.value)),
-            interval_text(pair.gap),
-            number(in_short(pair.estimate.value)),
-            interval_text(pair.estimate),
-            p_text(pair.p_value),
-            "yes" if pair.decided else "no",
-        )
-        for scope in analysis.scopes
-        for pair in scope.comparisons
-    ]
-    return TextTable(
-        title="Who ends higher",
-        header=(
-            *("Task", "Pair", "Gap", "95 % interval", "Probability", "95 % interval"),
-            *("Permutation", "Decided"),
-        ),
-        rows=rows,
-        note="Gap: of the means. Probability of improvement: that a run of the first ends higher "
-        f"than a run of the second (ties half). Decided: p < {SIGNIFICANCE:g} after Holm's "
-        "correction.",
-    )
+    return found
 
 
 _OUTCOMES = {True: "goal reached", False: "goal not reached", None: "the task names no success"}
-
-
-def _budget(sweep: Sweep, analyses: Sequence[StageAnalysis]) -> TextTable:
-    rows = []
-    for analysis in analyses:
-        runs = analysis.stage.runs
-        done = sum(sweep.last_step(run) for run in runs)
-        budget = sum(sweep.runs[run].budget or 0 for run in runs)
-        seconds = [s for run in runs if (s := sweep.runs[run].seconds) is not None]
-        rows.append(
-            (
-                analysis.stage.name,
-                len(runs),
-                number(f"{done:,}"),
-                number(f"{budget:,}" if budget else DASH),
-                number(_clock(sum(seconds)) if seconds else DASH),
-                number(_clock(statistics.median(seconds)) if seconds else DASH),
-            )
-        )
-    return TextTable(
-        title="Budget and wall time",
-        header=("Stage", "Runs", "Env steps done", "Planned", "Wall time, all runs", "Median run"),
-        rows=rows,
-        note="h:min:s from each run's start to its end in MLflow, pauses included. Runs that are "
-        "not over count for no time.",
-    )
-
-
-def _failures(sweep: Sweep) -> TextTable:
-    return TextTable(
-        title="What failed and why",
-        header=("Run", "Env steps", "Cause"),
-        rows=[
-            (
-                _run_cell(sweep, position),
-                f"{sweep.last_step(position):,}",
-                Cell(text=run.failure or "no cause was recorded", kind="long", code=True),
-            )
-            for position, run in enumerate(sweep.runs)
-            if run.status == "FAILED"
-        ],
-    )
-
-
-def _all_runs(sweep: Sweep) -> TextTable:
-    return TextTable(
-        title=f"All {len(sweep.runs)} runs",
-        header=("Run", "State", "Env steps", "Last evaluation", "Wall time", "MLflow run"),
-        rows=[
-            (
-                _run_cell(sweep, position),
-                _state(run.status),
-                number(f"{sweep.last_step(position):,}"),
-                number(_last(sweep, position)),
-                number(DASH if run.seconds is None else _clock(run.seconds)),
-                Cell(text=run.run_id, code=True),
-            )
-            for position, run in enumerate(sweep.runs)
-        ],
-    )
-
-
-def _origin(report: Report) -> TextTable:
-    sweep = report.sweep
-    versions = sorted(
-        (name.removeprefix(names.TAG_VERSION_PREFIX), value)
-        for name, value in sweep.tags.items()
-        if name.startswith(names.TAG_VERSION_PREFIX)
-    )
-    said = ", ".join(f"{name} {value}" for name, value in versions)
-    commit = sweep.tags.get(names.TAG_GIT_COMMIT, "unknown")
-    return TextTable(
-        title="Where it comes from",
-        header=("What", "Value"),
-        rows=[
-            ("MLflow", Cell(text=sweep.source, kind="long", code=True)),
-            ("Experiment", f"{sweep.name}, id {sweep.experiment_id}"),
-            ("Sweep's run", Cell(text=sweep.run_id, url=sweep.url(sweep.run_id))),
-            ("Code", Cell(text=commit, code=True)),
-            ("Versions", Cell(text=said or "unknown", kind="long")),
-            ("This report", Cell(text=report.command, kind="long", code=True)),
-        ],
-    )
-
 
 _METHOD = (
     "A task is judged by its success rate, that of deterministic evaluation episodes at their last "
@@ -405,43 +282,13 @@ _METHOD = (
     "give less than 0.1.",
     "Probability of improvement and performance profiles: Agarwal et al. 2021, Deep Reinforcement "
     "Learning at the Edge of the Statistical Precipice (arXiv:2108.13264).",
+    "Against gradient updates or wall time a curve is at the mean over its runs of the updates, or "
+    "of the time since their start with pauses included, by which they were at these steps.",
 )
 
 
-def _run_cell(sweep: Sweep, run: int) -> Cell:
-    record = sweep.runs[run]
-    return Cell(text=record.name, url=sweep.url(record.run_id))
-
-
-def _last(sweep: Sweep, run: int) -> str:
-    value = sweep.final(run, sweep.primary_metric(sweep.runs[run].task))
-    return DASH if value is None else in_short(value)
-
-
-def _steps(value: float) -> str:
-    return "not reached" if math.isinf(value) else f"{value:,.0f}"
-
-
-def _each_wait(wait: Wait) -> str:
-    if wait.runs >= SHOW_SEEDS_BELOW:
-        return DASH
-    found = zip(wait.waits.steps, wait.waits.reached, strict=True)
-    return " ".join(
-        f"{steps:,.0f}" if there else f">{steps:,.0f}" for steps, there in sorted(found)
-    )
-
-
-def _between(wait: Wait) -> str:
-    if math.isnan(wait.lower) or not wait.reached:
-        return "no interval"
-    upper = "beyond the budget" if math.isinf(wait.upper) else f"{wait.upper:,.0f}"
-    return upper if math.isinf(wait.lower) else f"{wait.lower:,.0f} to {upper}"
-
-
-def _clock(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}"
+def _and(words: Sequence[str], last: str = "and") -> str:
+    return f" {last} ".join(filter(None, (", ".join(words[:-1]), words[-1])))
 
 
 def _range(values: Sequence[int]) -> str:
@@ -454,7 +301,3 @@ def _date(milliseconds: int | None) -> str:
     if milliseconds is None:
         return DASH
     return datetime.fromtimestamp(milliseconds / 1000, UTC).strftime("%Y-%m-%d %H:%M UTC")
-
-
-def _state(status: str) -> str:
-    return {"KILLED": "stopped", "SCHEDULED": "waiting"}.get(status, status.lower())

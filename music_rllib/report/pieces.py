@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,16 +11,17 @@ from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from jinja2.utils import htmlsafe_json_dumps
 
 from music_rllib.report.figures.palette import Style
 
-__all__ = ["Cell", "Figure", "TextTable", "document", "number"]
+__all__ = ["Cell", "Figure", "Panels", "TextTable", "document", "number"]
 
-# Nothing may be fetched or run, whatever finds its way into a page. Matplotlib's drawings have
-# style attributes, for which no hash can stand.
+# Nothing may be fetched, and nothing run but the page's own script, whatever finds its way into a
+# page. Matplotlib's drawings have style attributes, for which no hash can stand.
 _POLICY = (
-    "default-src 'none'; style-src 'unsafe-inline'; img-src data:; media-src data:; "
-    "base-uri 'none'; form-action 'none'"
+    "default-src 'none'; script-src 'sha256-{script}'; connect-src {connect}; "
+    "style-src 'unsafe-inline'; img-src data:; media-src data:; base-uri 'none'; form-action 'none'"
 )
 _DASHES = {"solid": "", "dashed": "6 3", "dashdot": "6 2 1.5 2", "dotted": "1.5 2.5"}
 _MARKS = {"o": "●", "s": "■", "D": "◆", "^": "▲", "v": "▼", "P": "✚", "X": "✖", "*": "★"}
@@ -72,19 +75,39 @@ def _cell(value: object) -> Cell:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Panels:
+    """What a figure shows without a script: the panels of one stage."""
+
+    name: str
+    stage: str
+    """Empty where the figure has one only."""
+    number: int
+    """Of the stage in the page's data; -1 where it is not there."""
+    legend: Sequence[tuple[str, Style]]
+    panels: Sequence[tuple[str, str, str]]
+    """What each shows in words, its title, and its SVG element."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Figure:
-    """A drawing of the page."""
+    """A figure of the page."""
 
     name: str
     title: str
     caption: str
-    legend: Sequence[tuple[str, Style]]
-    panels: Sequence[tuple[str, str]]
-    """What each shows in words, and its SVG element."""
+    metric: str | None
+    """Whose curves the page's script draws; empty: the one that the reader chooses."""
+    stages: Sequence[Panels]
+
+    @property
+    def span(self) -> str:
+        """Over how many of the page's columns it goes."""
+        panels = sum(len(stage.panels) for stage in self.stages)
+        return ("one", "two", "three")[min(panels, 3) - 1]
 
 
 _PAGES = Environment(
-    loader=FileSystemLoader(Path(__file__).parent),
+    loader=FileSystemLoader(Path(__file__).parent / "web"),
     autoescape=True,
     undefined=StrictUndefined,
     trim_blocks=True,
@@ -92,11 +115,30 @@ _PAGES = Environment(
 )
 
 
-def document(**content: Any) -> str:
-    """The whole page, with its style inside; what `page.html` names is the `content`."""
-    style = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
-    page = _PAGES.get_template("page.html")
-    return (
-        page.render(style=style, policy=_POLICY, dashes=_DASHES, marks=_MARKS, **content).strip()
-        + "\n"
+def document(data: Any, *, live: bool, **content: Any) -> str:
+    """The whole page, with its style and scripts inside.
+
+    Args:
+        data: what its script draws.
+        live: whether it follows a sweep on the server that it came from.
+        content: what `page.html` names.
+    """
+    scripts = ("chart.js", "page.js", *(("live.js",) if live else ()))
+    script = "\n".join(_own(name) for name in scripts)
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    page = _PAGES.get_template("page.html").render(
+        style=_own("page.css"),
+        script=script,
+        # As JSON, in which no text can end the element.
+        data=htmlsafe_json_dumps(data, separators=(",", ":"), allow_nan=False),
+        policy=_POLICY.format(script=digest, connect="'self'" if live else "'none'"),
+        dashes=_DASHES,
+        marks=_MARKS,
+        live=live,
+        **content,
     )
+    return page.strip() + "\n"
+
+
+def _own(name: str) -> str:
+    return (Path(__file__).parent / "web" / name).read_text(encoding="utf-8")

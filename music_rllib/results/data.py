@@ -188,6 +188,15 @@ class Sweep:
         there = np.isfinite(values)
         return steps[there].astype(float), values[there]
 
+    def seconds_at(self, run: int) -> tuple[Array, Array]:
+        """Steps of a run's evaluations, and seconds since its start, pauses included."""
+        record = self.runs[run]
+        found = self.history.get(self.primary_metric(record.task))
+        if found is None or record.started is None:
+            return np.empty(0), np.empty(0)
+        begin, end = np.searchsorted(found.run, [run, run + 1])
+        return found.step[begin:end].astype(float), (found.time[begin:end] - record.started) / 1000
+
     def final(self, run: int, metric: str) -> float | None:
         """A run's last value of a metric; None where it has none, or NaN."""
         values = self.series(run, metric)[1]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 
 from music_rllib import names
@@ -31,19 +31,34 @@ from music_rllib.results.conditions import Condition, Stage, side_by_side
 from music_rllib.results.data import Sweep
 
 __all__ = [
+    "COST",
     "CURVES",
     "FINALS",
+    "GROUPS",
     "INFLUENCE",
+    "PERFORMANCE",
     "PRIMARY",
     "PROFILES",
     "Drawing",
     "drawings_of_stages",
+    "named_by_stage",
     "slug",
     "stage_drawings",
 ]
 
 FINALS = {names.EVAL_SUCCESS: "Final success rate", names.EVAL_RETURN: "Final return"}
 PROFILES = "Performance profile"
+PERFORMANCE, EXPLORATION, INFORMATION = "Performance", "Exploration", "Information"
+SETTINGS, COST = "Settings", "Cost"
+GROUPS = (PERFORMANCE, EXPLORATION, INFORMATION, SETTINGS, COST)
+"""Headings of the page."""
+_GROUP_OF = {
+    names.EVAL_DISPLACEMENT: EXPLORATION,
+    names.ENTROPY: EXPLORATION,
+    names.SHANNON_ENTROPY: EXPLORATION,
+    names.MI_BOUND: INFORMATION,
+    names.MI_REWARD: INFORMATION,
+}
 INFLUENCE = ("Sensitivity", "Importance of settings", "Parallel coordinates")
 CURVES = tuple(metric.title for metric in METRICS)
 PRIMARY = CURVES[:2]
@@ -61,6 +76,12 @@ class Drawing:
     caption: str
     panels: tuple[Panel, ...]
     legend: Legend
+    group: str = PERFORMANCE
+    """Under which heading of the page it stands."""
+    metric: Metric | None = None
+    """Of curves: what is drawn against environment steps."""
+    curves: Mapping[str, Sequence[Curve]] = field(default_factory=dict)
+    """By task."""
     values: tuple[tuple[object, ...], ...] = ()
     """(stage, task, condition, metric, env_steps, runs, mean, lower, upper) rows."""
 
@@ -136,12 +157,13 @@ def drawings_of_stages(sweep: Sweep, stages: Sequence[Stage]) -> Iterator[Drawin
     for metric in OF_ALL_STAGES:
         drawing = _curves(together, metric, found, styles)
         if drawing is not None:
-            legend = [(_named_by_stage(condition), style) for condition, style in styles.items()]
+            legend = [(named_by_stage(condition), style) for condition, style in styles.items()]
             # Each stage's own drawing has the values.
             yield replace(drawing, legend=legend, values=())
 
 
-def _named_by_stage(condition: Condition) -> str:
+def named_by_stage(condition: Condition) -> str:
+    """`music-r, q = 1.5`: of all stages together."""
     (_, stage), *others = condition.others
     rest = replace(condition, others=tuple(others))
     return f"{stage}, {rest.label}"
@@ -168,10 +190,8 @@ def _curves(
     styles: Mapping[Condition, Style],
 ) -> Drawing | None:
     panels, values = [], []
-    for task in stage.tasks:
-        curves = found.get((metric.name, task), [])
-        if not curves:
-            continue
+    shown = {task: found[metric.name, task] for task in stage.tasks if (metric.name, task) in found}
+    for task, curves in shown.items():
         panels.append(curve_panel(metric, task, curves, styles))
         for one in curves:
             head = (stage.name, task, one.condition.label, metric.name)
@@ -184,6 +204,9 @@ def _curves(
         caption=_caption(stage, metric),
         panels=tuple(panels),
         legend=_legend(stage),
+        group=_GROUP_OF.get(metric.name, PERFORMANCE),
+        metric=metric,
+        curves=shown,
         values=tuple(values),
     )
 
@@ -202,6 +225,7 @@ def _caption(stage: Stage, metric: Metric) -> str:
         band = f"Mean over up to {seeds} seeds with its 95 % band."
         if seeds < SHOW_SEEDS_BELOW:
             band += " The thinnest lines: single seeds."
+        band += " Dashed in turn: lines that coincide."
     thin = "A line is thin where some of its runs had ended."
     target = "" if metric.target is None else f" Dotted: {metric.target * 100:.0f} %."
     return f"{band} {thin}{target}"
@@ -233,6 +257,7 @@ def _influence(sweep: Sweep, analysis: StageAnalysis) -> Iterator[Drawing]:
                 caption=caption,
                 panels=tuple(panels),
                 legend=legend,
+                group=SETTINGS,
             )
 
 

@@ -8,13 +8,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
+import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import LogFormatter
 
 from music_rllib import names
 from music_rllib.report.figures.palette import BARS, colour_of, style_of
-from music_rllib.report.figures.plots import RATE_LIMITS, Panel
+from music_rllib.report.figures.plots import RATE_LIMITS, Panel, labelled_rows, rules_behind_rows
 from music_rllib.results.analysis import StageAnalysis
 from music_rllib.results.comparison import Final, Scope
 from music_rllib.results.conditions import ENTROPIC_INDEX, SEEDS, Condition
@@ -139,7 +140,7 @@ def _contour(
         axes.set_ylabel("MI reward weight")
         axes.grid(visible=False)
         bar = axes.figure.colorbar(surface, ax=axes, ticks=np.linspace(*ends, 5))
-        bar.ax.set_title(names.word_of(metric), fontsize=8)
+        bar.ax.set_title(names.word_of(metric), fontsize="small")
 
     return Panel(title=title, draw=draw)
 
@@ -264,18 +265,19 @@ def _fanova(rows: Sequence[tuple[Mapping[str, str], float]]) -> dict[str, float]
 def importance_panel(task: str, found: Sequence[Importance]) -> Panel:
     """A bar for each setting, the largest on top."""
     ordered = sorted(found, key=lambda one: -one.share)
+    labels, height = labelled_rows([f"{one.setting}: {one.share:.2f}" for one in ordered])
 
     def draw(axes: Axes) -> None:
-        for row, one in enumerate(ordered):
-            chance = one.setting == CHANCE
-            axes.barh(row, one.share, color=BARS[chance], height=0.5, alpha=0.8)
-            axes.text(0.0, row - 0.28, f" {one.setting}: {one.share:.2f}", va="bottom", fontsize=9)
-        axes.set_yticks([])
         axes.set_ylim(len(ordered) - 0.5, -0.8)
         axes.set_xlim(0.0, 1.0)
+        rules_behind_rows(axes, len(ordered), above=0.24)
+        for row, (one, label) in enumerate(zip(ordered, labels, strict=True)):
+            chance = one.setting == CHANCE
+            axes.barh(row, one.share, color=BARS[chance], height=0.48, alpha=0.8)
+            axes.text(0.0, row - 0.28, f" {label}", va="bottom", fontsize="small")
         axes.set_xlabel("share of the variance at the end")
 
-    return Panel(title=task, draw=draw)
+    return Panel(title=task, draw=draw, height=height)
 
 
 # Parallel coordinates ---------------------------------------------------------------------------
@@ -304,11 +306,21 @@ def parallel_panel(scope: Scope[Condition], conditions: Sequence[Condition]) -> 
                 linewidth=1.4,
                 alpha=0.35 + 0.6 * heights[-1][number],
             )
+        # No line of the figure runs through a label.
+        behind = {"facecolor": mpl.rcParams["axes.facecolor"], "edgecolor": "none", "pad": 0.8}
         for place, labels in enumerate(ticks):
             axes.axvline(place, color=axes.spines["left"].get_edgecolor(), linewidth=0.8)
             side = {"ha": "right", "x": place - 0.04} if place else {"ha": "left", "x": 0.04}
             for height, label in labels:
-                axes.text(side["x"], height, label, ha=side["ha"], va="center", fontsize=8)  # type: ignore[arg-type]
+                axes.text(
+                    side["x"],  # type: ignore[arg-type]
+                    height,
+                    label,
+                    ha=side["ha"],
+                    va="center",
+                    fontsize="small",
+                    bbox=behind,
+                )
         axes.set_xticks(
             range(len(heights)),
             [*(_short(n) for n in wanted), f"final\n{names.word_of(scope.metric)}"],

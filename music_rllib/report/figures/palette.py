@@ -9,6 +9,7 @@ stand side by side is the colour the stage's.
 from __future__ import annotations
 
 import functools
+from collections.abc import Mapping
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
@@ -42,6 +43,8 @@ _UNKNOWN = "#808080"
 BARS = ("#1f7fc4", "#808080")
 """Of settings, and of what is only chance."""
 _MARKERS = "osD^vPX"
+_ALIKE = 30.0
+"""Distance in RGB."""
 
 Line = Literal["solid", "dashed", "dashdot", "dotted"]
 _LINES: tuple[Line, ...] = get_args(Line)
@@ -74,19 +77,28 @@ def marker_of(entropic_index: str) -> str:
 
 
 def style_of(condition: Condition, siblings: tuple[Condition, ...]) -> Style:
-    """Colour and marker by q; the line tells conditions of the same q apart."""
-    colour = colour_of(condition.entropic_index)
-    same = [other for other in siblings if colour_of(other.entropic_index) == colour]
-    return Style(
-        colour=colour,
-        marker=marker_of(condition.entropic_index),
-        line=_LINES[same.index(condition) % len(_LINES)],
-    )
+    """Colour and marker by q; line, then marker, tell conditions of like colours apart."""
+    return styles_of(siblings)[condition]
 
 
-def styles_of(conditions: tuple[Condition, ...]) -> dict[Condition, Style]:
+@functools.cache
+def styles_of(conditions: tuple[Condition, ...]) -> Mapping[Condition, Style]:
     """Of the conditions of one stage."""
-    return {condition: style_of(condition, conditions) for condition in conditions}
+    styles: dict[Condition, Style] = {}
+    for condition in conditions:
+        colour, marker = colour_of(condition.entropic_index), marker_of(condition.entropic_index)
+        alike = sum(_alike(colour, style.colour) for style in styles.values())
+        turn, line = divmod(alike, len(_LINES))
+        if turn:
+            marker = _MARKERS[(_MARKERS.find(marker) + turn) % len(_MARKERS)]
+        styles[condition] = Style(colour=colour, marker=marker, line=_LINES[line])
+    return styles
+
+
+def _alike(one: str, other: str) -> bool:
+    """Whether two colours are hard to tell apart in thin lines."""
+    differences = np.subtract(_channels(one), _channels(other))
+    return bool(np.linalg.norm(differences) < _ALIKE)
 
 
 def styles_by_stage(conditions: tuple[Condition, ...]) -> dict[Condition, Style]:

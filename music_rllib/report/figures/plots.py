@@ -1,45 +1,42 @@
 """The report's figures: the paper's Figures 4 to 7 and what explains them.
 
-Every figure is drawn on its own canvas, never through pyplot, so no display is needed. A *panel* is
-one task's; on the page each panel is an SVG of its own, so that a narrow window stacks them, and
-takes its ink from the page, so that it follows light and dark. The files have all panels together.
+A *panel* is one task's; it draws itself on the axes that it is given.
 """
 
 from __future__ import annotations
 
-import io
-import math
-import re
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
+from matplotlib.collections import LineCollection
 from matplotlib.ticker import EngFormatter
 
 from music_rllib import names
 from music_rllib.report.figures.palette import Style, style_of
 from music_rllib.results import statistics as st
 from music_rllib.results.analysis import Curve
-from music_rllib.results.comparison import SHOW_SEEDS_BELOW, Final, Scope
+from music_rllib.results.comparison import SHOW_SEEDS_BELOW, Final, Scope, interval_text, number
 from music_rllib.results.conditions import Condition
 from music_rllib.results.statistics import Array, Estimate
 
 __all__ = [
+    "EPOCH",
     "METRICS",
+    "PANEL",
     "Legend",
     "Metric",
     "Panel",
     "curve_panel",
-    "files",
     "finals_panel",
+    "labelled_rows",
     "profile_panel",
-    "svg_inline",
+    "rules_behind_rows",
 ]
 
 Legend = Sequence[tuple[str, Style]]
@@ -49,17 +46,16 @@ EPOCH = 80_000
 """Environment steps of an epoch in the original MUSIC: 16 workers x 2 rollouts x 50 cycles x 50."""
 PANEL = (4.3, 3.0)
 """Width and height in inches, at which 10 pt are readable on a page of 400 px."""
-_LEFT, _RIGHT, _BOTTOM, _TOP_WITH_EPOCHS = 0.84, 0.2, 0.52, 0.62
-"""A panel's margins in inches."""
-_HANDLE, _LETTER = 0.6, 0.08
-"""Widths in inches in a legend."""
+_TOP_WITH_EPOCHS = 0.62
+SAME = 0.008
+"""Of an axis: lines that are closer together cover each other."""
+_DASH = 2.5
+"""Of lines that cover others, in line widths."""
+_MOST_RANKS = 9
+_LABEL = 46
+"""Letters of a label in one line of a panel."""
 TARGET = 0.85
 """Success rate that Figure 4 of the paper waits for."""
-
-# Stand for "the page's own colour" in an SVG, and are replaced by it.
-_INK, _GRID = "#010203", "#040506"
-_PAPER_INK, _PAPER_GRID = "#1a1a1a", "#d9d9d9"
-_FONT = ("DejaVu Sans", "Verdana", "sans-serif")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,6 +110,8 @@ class Panel:
     draw: Callable[[Axes], None]
     top: float = 0.32
     """Margin in inches for the title, and for an axis above the panel."""
+    height: float = PANEL[1]
+    """In inches, margins included."""
 
 
 def curve_panel(
@@ -124,10 +122,15 @@ def curve_panel(
     The original's epochs stand above where the budget is at least one of them.
     """
     epochs = max(float(curve.steps[-1]) for curve in curves) >= EPOCH
+    ranks = _ranks(curves, metric)
+
+    numbers = {condition: number for number, condition in enumerate(styles)}
 
     def draw(axes: Axes) -> None:
-        for curve in curves:
-            _draw_curve(axes, curve, styles[curve.condition])
+        for at, (curve, rank) in enumerate(zip(curves, ranks, strict=True)):
+            artists = _draw_curve(axes, curve, styles[curve.condition], rank, at / len(curves))
+            _belongs(artists, numbers[curve.condition], curve.condition.label)
+        axes.set_xlim(left=0.0)
         axes.set_ylabel(metric.axis)
         axes.set_xlabel("environment steps")
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -149,10 +152,11 @@ def profile_panel(scope: Scope[Condition], siblings: tuple[Condition, ...]) -> P
     def draw(axes: Axes) -> None:
         for final, profile in profiles:
             colour, _, line = style_of(final.condition, siblings)
-            axes.step(
+            lines = axes.step(
                 thresholds, profile.value, where="post", color=colour, linestyle=line, linewidth=1.8
             )
-            _band(axes, thresholds, profile, colour, step="post")
+            band = _band(axes, thresholds, profile, colour, step="post")
+            _belongs([*lines, band], siblings.index(final.condition), final.condition.label)
         axes.set_xlabel("final success rate τ")
         axes.set_ylabel("share of runs above τ")
         axes.set_xlim(-0.02, 1.02)
@@ -164,136 +168,116 @@ def profile_panel(scope: Scope[Condition], siblings: tuple[Condition, ...]) -> P
 def finals_panel(scope: Scope[Condition], siblings: tuple[Condition, ...]) -> Panel:
     """How conditions ended, with their intervals, and every run as a point."""
     is_rate = scope.metric in names.EVAL_RATES
+    labels, height = labelled_rows([final.condition.label for final in scope.finals])
 
     def draw(axes: Axes) -> None:
         scores = np.concatenate([final.scores.ravel() for final in scope.finals])
         # Intervals of two or three returns may be many times as wide as what was seen.
         room = 0.5 * (np.ptp(scores) or 1.0)
         limits = RATE_LIMITS if is_rate else (scores.min() - room, scores.max() + room)
-        for row, final in enumerate(scope.finals):
-            _draw_final(axes, row, final, siblings, limits[0])
-        axes.set_yticks([])
-        axes.set_ylim(len(scope.finals) - 0.5, -0.7)
+        axes.set_ylim(len(scope.finals) - 0.5, -0.75)
         axes.set_xlim(*limits)
         axes.locator_params(axis="x", nbins=6)
+        rules_behind_rows(axes, len(scope.finals))
+        for row, (final, label) in enumerate(zip(scope.finals, labels, strict=True)):
+            artists = _draw_final(axes, row, final, siblings, label)
+            said = (
+                f"{final.condition.label}: {number(final.value)}, {interval_text(final.estimate)}"
+            )
+            _belongs(artists, siblings.index(final.condition), said)
         axes.set_xlabel("final success rate" if is_rate else f"final {names.word_of(scope.metric)}")
 
-    return Panel(title=scope.name, draw=draw)
+    return Panel(title=scope.name, draw=draw, height=height)
 
 
-def svg_inline(panel: Panel, name: str) -> str:
-    """A panel as an SVG element for the page; ids begin with `name`, to be the page's only ones.
-
-    Matplotlib escapes the texts in it.
-    """
-    with mpl.rc_context(_settings(_INK, _GRID)):
-        drawn = _drawn([panel], [], opaque=False)
-        buffer = io.StringIO()
-        drawn.savefig(buffer, format="svg", metadata={"Date": None})
-    text = buffer.getvalue()
-    text = re.sub(r'\b(id="|xlink:href="#|url\(#)', rf"\g<1>{name}-", text[text.index("<svg") :])
-    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
-    text = text.replace(_INK, "currentColor").replace(_GRID, "var(--grid)")
-    size = re.search(r'width="([\d.]+)pt" height="([\d.]+)pt"', text)
-    assert size is not None, "matplotlib gives an SVG a size in points"
-    text = text.replace(size[0], "")
-    return re.sub(r">\s+<", "><", text)
+def labelled_rows(labels: Sequence[str]) -> tuple[list[str], float]:
+    """Labels broken into lines that fit, and the height of a panel with a row for each."""
+    broken = [textwrap.fill(label, _LABEL, break_long_words=True) for label in labels]
+    lines = max((label.count("\n") + 1 for label in broken), default=1)
+    return broken, max(PANEL[1], 1.0 + len(labels) * (0.34 + 0.18 * lines))
 
 
-def files(panels: Sequence[Panel], legend: Legend) -> dict[str, bytes]:
-    """All panels side by side on white paper, with a legend, as ``svg`` and ``png`` (150 dpi).
-
-    Drawn once for both.
-    """
-    made = {}
-    with mpl.rc_context(_settings(_PAPER_INK, _PAPER_GRID)):
-        drawn = _drawn(panels, legend, opaque=True)
-        for kind, metadata in (("svg", {"Date": None}), ("png", {})):
-            buffer = io.BytesIO()
-            drawn.savefig(buffer, format=kind, dpi=150, metadata=metadata)
-            made[kind] = buffer.getvalue()
-    return made
-
-
-def _settings(ink: str, grid: str) -> Any:
-    colours = ("axes.edgecolor", "axes.labelcolor", "axes.titlecolor", "text.color")
-    return {
-        **dict.fromkeys((*colours, "xtick.color", "ytick.color"), ink),
-        "grid.color": grid,
-        "axes.grid": True,
-        "axes.axisbelow": True,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "font.family": "sans-serif",
-        "font.sans-serif": list(_FONT),
-        "font.size": 10,
-        "xtick.labelsize": 9,
-        "ytick.labelsize": 9,
-        "svg.fonttype": "none",
-        # A task may be called $x_{1$.
-        "text.parse_math": False,
-        # The same figure is the same file.
-        "svg.hashsalt": "music_rllib",
-    }
-
-
-def _drawn(panels: Sequence[Panel], legend: Legend, *, opaque: bool) -> Figure:
-    """Margins are fixed: matplotlib's own layout takes longer than everything else together."""
-    longest = max((len(label) for label, _ in legend), default=0)
-    columns = max(1, int(PANEL[0] * len(panels) / (_HANDLE + _LETTER * longest)))
-    below = 0.28 * math.ceil(len(legend) / columns)
-    width, height = PANEL[0] * len(panels), PANEL[1] + below
-    figure = Figure(figsize=(width, height))
-    FigureCanvasAgg(figure)
-    figure.patch.set_alpha(1.0 if opaque else 0.0)
-    for number, panel in enumerate(panels):
-        left = number * PANEL[0]
-        axes = figure.add_axes(
-            (
-                (left + _LEFT) / width,
-                (below + _BOTTOM) / height,
-                (PANEL[0] - _LEFT - _RIGHT) / width,
-                (PANEL[1] - _BOTTOM - panel.top) / height,
-            )
+def rules_behind_rows(axes: Axes, rows: int, above: float = 0.14, below: float = 0.34) -> None:
+    """Grid lines where a row has its marks, and not where it has its label."""
+    axes.set_yticks([])
+    axes.grid(visible=False)
+    low, high = axes.get_xlim()
+    at = [tick for tick in axes.get_xticks() if low <= tick <= high]
+    for row in range(rows):
+        axes.vlines(
+            at,
+            row - above,
+            row + below,
+            color=mpl.rcParams["grid.color"],
+            linewidth=0.8,
+            zorder=0.5,
         )
-        axes.patch.set_alpha(0.0)
-        middle = left + _LEFT + (PANEL[0] - _LEFT - _RIGHT) / 2
-        figure.text(middle / width, 1 - 0.07 / height, panel.title, ha="center", va="top", size=11)
-        panel.draw(axes)
-    if legend:
-        handles = [
-            Line2D(
-                [], [], color=style.colour, marker=style.marker, linestyle=style.line, label=label
+    axes.set_xlim(low, high)
+
+
+def _ranks(curves: Sequence[Curve], metric: Metric) -> list[Array]:
+    """For each point of each curve, how many earlier curves run through it too."""
+    if metric.limits is not None:
+        height = metric.limits[1] - metric.limits[0]
+    else:
+        values = np.concatenate([curve.estimate.value for curve in curves])
+        height = float(np.nanmax(values) - np.nanmin(values)) or 1.0
+    ranks = []
+    for place, curve in enumerate(curves):
+        rank = np.zeros(len(curve.steps))
+        for other in curves[:place]:
+            there = np.interp(
+                curve.steps, other.steps, other.estimate.value, left=np.nan, right=np.nan
             )
-            for label, style in legend
-        ]
-        figure.legend(handles=handles, loc="lower center", ncols=columns, frameon=False)
-    return figure
+            rank += np.abs(there - curve.estimate.value) <= SAME * height
+        ranks.append(np.minimum(rank, _MOST_RANKS))
+    return ranks
 
 
-def _draw_curve(axes: Axes, curve: Curve, style: Style) -> None:
-    """Thick where every run counts, thin from where the first one ended; few seeds each apart."""
+def _draw_curve(
+    axes: Axes, curve: Curve, style: Style, rank: Array, stagger: float
+) -> list[Artist]:
+    """Thick where every run counts, thin from where the first one ended; few seeds each apart.
+
+    Where lines coincide the later ones are dashed, so that each earlier one shows in the gaps.
+    """
     colour, marker, line = style
     value = curve.estimate.value
+    artists: list[Artist] = []
+    if 1 < len(curve.values) < SHOW_SEEDS_BELOW:
+        artists += axes.plot(curve.steps, curve.values.T, color=colour, linewidth=0.6, alpha=0.55)
+    points = np.column_stack([curve.steps, value])
+    whole = curve.runs == curve.runs.max()
+    segments: dict[tuple[int, bool], list[Array]] = {}
+    for at in range(len(points) - 1):
+        key = (int(min(rank[at], rank[at + 1])), bool(whole[at + 1]))
+        runs = segments.setdefault(key, [])
+        if runs and runs[-1][-1][0] == points[at][0]:
+            runs[-1] = np.vstack([runs[-1], points[at + 1]])
+        else:
+            runs.append(points[at : at + 2])
+    for (covers, thick), runs in segments.items():
+        dashed = (0.0, (_DASH, _DASH * covers)) if covers else line
+        width = 1.8 if thick else 0.8
+        made = LineCollection(runs, colors=colour, linestyles=[dashed], linewidths=width, zorder=2)
+        artists.append(axes.add_collection(made))
     every = max(1, len(curve.steps) // 8)
-    axes.plot(curve.steps, value, color=colour, linestyle=line, linewidth=0.8)
-    whole = np.where(curve.runs == curve.runs.max(), value, np.nan)
-    axes.plot(
+    marks = np.where(whole, value, np.nan)
+    artists += axes.plot(
         curve.steps,
-        whole,
+        marks,
         color=colour,
-        linestyle=line,
-        linewidth=1.8,
+        linestyle="none",
         marker=marker,
-        markevery=every,
+        markevery=(int(stagger * every), every),
         markersize=5,
     )
-    if 1 < len(curve.values) < SHOW_SEEDS_BELOW:
-        axes.plot(curve.steps, curve.values.T, color=colour, linewidth=0.6, alpha=0.55)
+    axes.autoscale_view()
     limits = axes.get_ylim()  # of what was seen: a band of two seeds may be many times as wide
-    _band(axes, curve.steps, curve.estimate, colour)
+    artists.append(_band(axes, curve.steps, curve.estimate, colour))
     axes.set_ylim(*limits)
     axes.set_autoscaley_on(True)
+    return artists
 
 
 def _band(
@@ -302,25 +286,33 @@ def _band(
     estimate: Estimate,
     colour: str,
     step: Literal["post"] | None = None,
-) -> None:
-    axes.fill_between(
+) -> Artist:
+    return axes.fill_between(
         at, estimate.lower, estimate.upper, color=colour, alpha=0.2, linewidth=0, step=step
     )
 
 
 def _draw_final(
-    axes: Axes, row: int, final: Final[Condition], siblings: tuple[Condition, ...], left: float
-) -> None:
+    axes: Axes, row: int, final: Final[Condition], siblings: tuple[Condition, ...], label: str
+) -> list[Artist]:
     colour, marker, _ = style_of(final.condition, siblings)
     scores = final.scores.ravel()
-    axes.plot(scores, np.full(len(scores), row + 0.22), "|", color=colour, alpha=0.6, markersize=7)
+    places = np.full(len(scores), row + 0.22)
+    artists: list[Artist] = [*axes.plot(scores, places, "|", color=colour, alpha=0.6, markersize=7)]
     estimate = final.estimate
     if estimate.has_interval:
-        axes.plot(
-            [estimate.lower, estimate.upper], [row, row], color=colour, linewidth=5, alpha=0.35
-        )
-    axes.plot(estimate.value, row, marker, color=colour, markersize=7)
-    axes.text(left, row - 0.2, f" {final.condition.label}", va="bottom", fontsize=9)
+        ends = [float(estimate.lower), float(estimate.upper)]
+        artists += axes.plot(ends, [row, row], color=colour, linewidth=5, alpha=0.35)
+    artists += axes.plot(estimate.value, row, marker, color=colour, markersize=7)
+    left = axes.get_xlim()[0]
+    artists.append(axes.text(left, row - 0.2, f" {label}", va="bottom", fontsize="small"))
+    return artists
+
+
+def _belongs(artists: Sequence[Artist], condition: int, said: str) -> None:
+    """Mark what belongs to a condition, by its number: a page shows and hides it by that."""
+    for artist in artists:
+        artist.set_gid(f"condition-{condition}-{said}")
 
 
 def _add_epochs(axes: Axes) -> None:
@@ -331,8 +323,8 @@ def _add_epochs(axes: Axes) -> None:
         return epochs * EPOCH
 
     above = axes.secondary_xaxis("top", functions=(epochs, steps))
-    above.set_xlabel("epochs of 80 000 steps", fontsize=8, labelpad=2)
-    above.tick_params(labelsize=8, pad=1)
+    above.set_xlabel("epochs of 80 000 steps", fontsize="small", labelpad=2)
+    above.tick_params(labelsize="small", pad=1)
 
 
 def _ink() -> str:
