@@ -33,6 +33,8 @@ class Page:
         ]
         self.errors: list[str] = []
         """What the page logged as an error, or did not catch."""
+        self.requests: list[str] = []
+        """What was asked of a server."""
         self._answers: dict[int, asyncio.Future[dict[str, Any]]] = {}
         self._number = 0
 
@@ -46,7 +48,7 @@ class Page:
         self._session = aiohttp.ClientSession()
         self._socket = await self._session.ws_connect(address, max_msg_size=0)
         self._listening = asyncio.create_task(self._listen())
-        for domain in ("Page", "Runtime", "Log"):
+        for domain in ("Page", "Runtime", "Log", "Network"):
             await self._send(f"{domain}.enable")
         return self
 
@@ -78,6 +80,9 @@ class Page:
                 self._answers.pop(event["id"]).set_result(event)
             elif event["method"] == "Runtime.exceptionThrown":
                 self.errors.append(str(event["params"]["exceptionDetails"]))
+            elif event["method"] == "Network.requestWillBeSent":
+                url = event["params"]["request"]["url"]
+                self.requests += [] if url.startswith(("file:", "data:", "about:")) else [url]
             elif event["method"] == "Log.entryAdded":
                 entry = event["params"]["entry"]
                 if entry["level"] == "error":
@@ -96,6 +101,23 @@ class Page:
         """Open `url` anew, even where only what follows its # is another."""
         await self._send("Page.navigate", url="about:blank")
         await self._send("Page.navigate", url=url)
+
+    async def view(
+        self, width: int, height: int, *, dark: bool = False, medium: str = "screen"
+    ) -> None:
+        """Make the window so large, smaller than a window of Chromium can be, too."""
+        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        await self._send("Emulation.setDeviceMetricsOverride", **size)
+        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+        await self._send("Emulation.setEmulatedMedia", media=medium, features=[scheme])
+
+    async def without_script(self, *, off: bool = True) -> None:
+        """Whether pages may run scripts, from the next one on."""
+        await self._send("Emulation.setScriptExecutionDisabled", value=off)
+
+    async def point_at(self, x: float, y: float) -> None:
+        """Move the pointer."""
+        await self._send("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
 
     async def evaluate(self, script: str) -> Any:
         """The value of a JavaScript expression."""
