@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.measure import Row, compared, interleaved, middle, ratio_row
-from music_rllib.replay.buffer import ReplayLayout, Trajectory, TrajectoryReplay
+from music_rllib.replay.buffer import TrajectoryReplay
+from music_rllib.replay.trajectories import ReplayLayout, Trajectory
 
 __all__ = ["filled_replay", "random_trajectory", "rows"]
 

@@ -30,17 +30,15 @@ from music_rllib.config.schema import (
     Resources,
     StageHeader,
 )
-from music_rllib.config.search.space import (
-    Choice,
+from music_rllib.config.search.settings import (
     Final,
-    FloatRange,
-    IntRange,
     Objective,
     Pruning,
     Rung,
     SearchSettings,
     WarmStart,
 )
+from music_rllib.config.search.space import Choice, FloatRange, IntRange
 from music_rllib.config.tac_settings import (
     GaussianNoise,
     LearnedAlpha,

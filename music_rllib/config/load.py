@@ -51,7 +51,7 @@ from music_rllib.config.schema import (
     Stage,
     SweepConfig,
 )
-from music_rllib.config.search.space import FINAL_SEED
+from music_rllib.config.search.settings import FINAL_SEED
 from music_rllib.config.yaml_file import YamlFile, read_yaml
 from music_rllib.envs.tasks import (
     BUILT_IN_TASKS,

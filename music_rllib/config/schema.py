@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from music_rllib import names
 from music_rllib.config.analysis import Analysis
 from music_rllib.config.run_settings import RunSettings, Variant
-from music_rllib.config.search.space import SearchSettings
+from music_rllib.config.search.settings import SearchSettings
 from music_rllib.envs.tasks import Task
 from music_rllib.store.handoff import HandoffManifest
 

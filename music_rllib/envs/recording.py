@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from music_rllib.envs.numbers import LARGEST, are_usable, bad_number
-from music_rllib.replay.buffer import ReplayLayout, Trajectory
+from music_rllib.replay.trajectories import ReplayLayout, Trajectory
 
 __all__ = ["Episode", "Recording"]
 

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from music_rllib.functional.mutual_information import time_permutations
-from music_rllib.replay.buffer import Trajectory
-from music_rllib.replay.trajectories import WholeTrajectories, long_enough
+from music_rllib.replay.trajectories import Trajectory, WholeTrajectories, long_enough
 
 __all__ = ["HeldOutBound"]
 

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from music_rllib.replay.buffer import Trajectory
+from music_rllib.replay.trajectories import Trajectory
 
 __all__ = ["IntrinsicReward"]
 

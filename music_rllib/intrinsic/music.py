@@ -17,7 +17,7 @@ from music_rllib import names
 from music_rllib.functional.mutual_information import time_permutations
 from music_rllib.intrinsic.held_out import HeldOutBound
 from music_rllib.intrinsic.settings import MusicSettings
-from music_rllib.replay.buffer import Trajectory
+from music_rllib.replay.trajectories import Trajectory
 
 __all__ = ["HELD_OUT_STEPS", "Music"]
 

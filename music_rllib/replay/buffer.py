@@ -1,14 +1,7 @@
-"""Replay of whole trajectories in one array, seen as transitions or as trajectories.
+"""Replay of whole trajectories, seen as transitions or as trajectories.
 
-All steps of all trajectories lie behind each other in one float32 ring. A row is the frame
-(observation, desired goal, achieved goal), then the action taken there, its reward, and whether it
-was terminal: a transition is two neighbouring rows, one stretch of memory. A trajectory of n steps
-takes n + 1 rows and is never split by the ring's end, so a replay of capacity C holds exactly C
-transitions of full episodes, fewer where episodes end early.
-
-Memory, h being the longest episode: ``4 (D + 2G + A + 2) bytes * C (h + 1)/h`` plus 16 bytes a
-trajectory, claimed from the system as it fills. A million FetchPush transitions: 151 MB.
-Prioritised replay by TD error adds 8 bytes a row and a tree of 16 to 32.
+Its memory is that of the ring (`music_rllib.replay.ring`); prioritised replay by TD error adds
+8 bytes a row and a tree of 16 to 32.
 
 Shape legend: B transitions, N trajectories, T frames, D observation, G goal, A action.
 """
@@ -16,82 +9,31 @@ Shape legend: B transitions, N trajectories, T frames, D observation, G goal, A 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from music_rllib.replay.priorities import TDPriorities, WeightedDraws, ranges, rank_weights
+from music_rllib.replay.ring import TrajectoryRing
 from music_rllib.replay.sampling import Places
-from music_rllib.replay.trajectories import WholeTrajectories, long_enough
+from music_rllib.replay.trajectories import (
+    Floats,
+    ReplayLayout,
+    Rows,
+    Trajectory,
+    Transitions,
+    WholeTrajectories,
+    long_enough,
+)
 
-__all__ = ["ReplayLayout", "Trajectory", "TrajectoryReplay", "Transitions"]
+__all__ = ["GoalReward", "TrajectoryReplay"]
 
-Floats = NDArray[np.float32]
-Rows = NDArray[np.int64]
 GoalReward = Callable[[Floats, Floats], NDArray[Any]]
 """(achieved [B, G], desired [B, G]) -> [B] rewards, without touching a simulator."""
 
 
-@dataclass(frozen=True)
-class ReplayLayout:
-    """Sizes of what is stored."""
-
-    observation: int
-    action: int
-    goal: int
-    horizon: int
-    """Steps of the longest episode."""
-
-    @property
-    def frame(self) -> int:
-        return self.observation + 2 * self.goal
-
-    @property
-    def network_input(self) -> int:
-        """Observation and desired goal: the first columns of a frame."""
-        return self.observation + self.goal
-
-
-@dataclass(frozen=True)
-class Trajectory:
-    """One finished episode of n steps."""
-
-    frames: Floats
-    """[n+1, D + 2G]: observation, desired goal, achieved goal."""
-    actions: Floats
-    """[n, A] in [-1, 1]."""
-    rewards: Floats
-    """[n] the environment's."""
-    terminated: bool
-    """Whether it ended in a terminal state (a truncated one keeps its bootstrap)."""
-
-    def __len__(self) -> int:
-        return len(self.actions)
-
-
-@dataclass(frozen=True)
-class Transitions:
-    """A minibatch, or several behind each other."""
-
-    inputs: Floats
-    """[B, D + G] observation and desired goal."""
-    actions: Floats
-    """[B, A]"""
-    rewards: Floats
-    """[B] task reward, recomputed where the goal was relabelled."""
-    discounts: Floats
-    """[B] 0 where the episode terminated, else 1."""
-    next_inputs: Floats
-    """[B, D + G]"""
-    weights: Floats | None = None
-    """[B] importance weights in (0, 1] where transitions are drawn by TD error."""
-    rows: Rows | None = None
-    """[B] where they lie, for `update_priorities`."""
-
-
-class TrajectoryReplay:
+class TrajectoryReplay(TrajectoryRing):
     """Ring of trajectories with uniform transition sampling, hindsight, and a trajectory view.
 
     Args:
@@ -127,15 +69,12 @@ class TrajectoryReplay:
         moved_distance: float | None = None,
         td_exponent: float | None = None,
     ) -> None:
-        if capacity < layout.horizon:
-            raise ValueError(
-                f"replay.capacity must hold an episode of {layout.horizon} steps, got {capacity}"
-            )
+        super().__init__(layout, capacity)
         if hindsight_k > 0 and (goal_reward is None or layout.goal == 0):
             raise ValueError(
                 f"replay.hindsight_k must be 0 without a goal environment, got {hindsight_k:g}"
             )
-        self.layout, self.rng = layout, rng
+        self.rng = rng
         self._goal_reward = goal_reward
         self._hindsight_share = hindsight_k / (1.0 + hindsight_k)
         self._only_moved = hindsight_episodes == "moved" and hindsight_k > 0
@@ -143,34 +82,13 @@ class TrajectoryReplay:
         self._moved = np.zeros(0, np.bool_)
         self._places: tuple[Places, Places] | None = None
         self._whole: Places | None = None
-        ring = capacity // layout.horizon * (layout.horizon + 1)
-        # Untouched pages of zeros cost nothing: the system hands them out as they are written.
-        self._steps = np.zeros((ring, layout.frame + layout.action + 2), np.float32)
-        self._frames = self._steps[:, : layout.frame]
-        self._actions = self._steps[:, layout.frame : -2]
-        self._rewards, self._terminal = self._steps[:, -2], self._steps[:, -1]
-        self._starts = np.zeros(0, np.int64)
-        self._lengths = np.zeros(0, np.int64)
         self._priorities = np.zeros(0, np.float64)
         self._by_rank: WeightedDraws | None = None
-        self._write = 0
-        self._used = 0
-        self.trajectories_added = 0
-        self._td = None if td_exponent is None else TDPriorities(ring, td_exponent)
+        self._td = None if td_exponent is None else TDPriorities(len(self._steps), td_exponent)
 
     def __len__(self) -> int:
         """Transitions held."""
         return self._all_and_moved()[0].total
-
-    @property
-    def trajectories(self) -> int:
-        """Trajectories held."""
-        return len(self._lengths)
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of the ring when full."""
-        return self._steps.nbytes
 
     # -- storing --------------------------------------------------------------------------
 
@@ -183,7 +101,7 @@ class TrajectoryReplay:
             priorities: [N] MUSIC-p: episodes are drawn by the rank of these. Given always or never.
         """
         for i, trajectory in enumerate(trajectories):
-            self._store(trajectory)
+            self._add(trajectory)
             if priorities is not None:
                 self._priorities = np.append(self._priorities, priorities[i])
         if priorities is not None:
@@ -193,46 +111,21 @@ class TrajectoryReplay:
         if len(self._priorities):
             self._by_rank = WeightedDraws(rank_weights(self._priorities))
 
-    def _store(self, trajectory: Trajectory) -> None:
-        steps = len(trajectory)
-        if not 0 < steps <= self.layout.horizon:
-            raise ValueError(f"an episode must have 1 to {self.layout.horizon} steps, got {steps}")
-        start = self._make_room(steps + 1)
-        end = start + steps
-        self._frames[start : end + 1] = trajectory.frames
-        self._actions[start:end] = trajectory.actions
-        self._rewards[start:end] = trajectory.rewards
-        self._terminal[start : end + 1] = 0.0
-        self._terminal[end - 1] = trajectory.terminated
-        self._starts = np.append(self._starts, start)
-        self._lengths = np.append(self._lengths, steps)
+    def _add(self, trajectory: Trajectory) -> None:
+        start, steps = self._store(trajectory), len(trajectory)
         if self._only_moved:
             self._moved = np.append(self._moved, self._has_moved(start, steps))
         if self._td is not None:
             self._td.add(start, steps)
-        self._write = end + 1
-        self._used = max(self._used, self._write)
-        self.trajectories_added += 1
         self._places = self._whole = None
 
-    def _make_room(self, frames: int) -> int:
-        """Start of `frames` free consecutive frames; the oldest trajectories there are dropped."""
-        stale, held = 0, len(self._starts)
-        if self._write + frames > len(self._frames):
-            # What lies between here and the ring's end is the oldest: it goes, and the ring wraps.
-            while stale < held and self._starts[stale] >= self._write:
-                stale += 1
-            self._write = 0
-        end = self._write + frames
-        while stale < held and self._write <= self._starts[stale] < end:
-            stale += 1
+    def _drop(self, count: int) -> None:
         if self._td is not None:
-            for start, steps in zip(self._starts[:stale], self._lengths[:stale], strict=True):
+            for start, steps in zip(self._starts[:count], self._lengths[:count], strict=True):
                 self._td.remove(start, steps)
-        self._starts, self._lengths = self._starts[stale:], self._lengths[stale:]
-        self._priorities = self._priorities[stale:]
-        self._moved = self._moved[stale:]
-        return self._write
+        super()._drop(count)
+        self._priorities = self._priorities[count:]
+        self._moved = self._moved[count:]
 
     def _has_moved(self, start: int, steps: int) -> bool:
         """Whether a goal achieved later is not reached by the state that the episode begins in."""
@@ -302,20 +195,6 @@ class TrajectoryReplay:
         discounts = 1.0 - both[:, after - 1]
         return Transitions(inputs, actions, rewards, discounts, next_inputs, weights, row)
 
-    def _read(self, rows: Rows, first: int, count: int) -> Floats:
-        """`count` numbers of each row from column `first` on, and on into the row after it.
-
-        Args:
-            rows: [...] rows of the ring.
-
-        Returns:
-            [..., count], a copy. Each stretch is copied as a whole, not number by number.
-        """
-        stretch, stride = np.dtype((np.void, 4 * count)), self._steps.strides[0]
-        fitting = (self._steps.nbytes - 4 * (first + count)) // stride + 1
-        stretches = np.ndarray((fitting,), stretch, self._steps.data, 4 * first, (stride,))
-        return stretches[rows].view(np.float32).reshape(*rows.shape, count)
-
     def update_priorities(self, rows: Rows, errors: Floats) -> None:
         """PER: takes over the absolute TD errors [B] of transitions drawn from `rows` [B]."""
         assert self._td is not None
@@ -372,29 +251,6 @@ class TrajectoryReplay:
 
     # -- checkpoints ----------------------------------------------------------------------
 
-    @property
-    def oldest(self) -> int:
-        """Number of the oldest trajectory held: they are counted from 0 as they are added."""
-        return self.trajectories_added - self.trajectories
-
-    def packed(self, first: int, end: int | None = None) -> dict[str, NDArray[Any]]:
-        """The trajectories from number `first` (>= `oldest`) up to `end`, behind each other.
-
-        Returns:
-            lengths [N], terminated [N], frames [sum of n+1, D + 2G], actions [sum of n, A],
-            rewards [sum of n]: copies. Together with `index()` all that there is.
-        """
-        held = slice(first - self.oldest, None if end is None else end - self.oldest)
-        starts, lengths = self._starts[held], self._lengths[held]
-        steps = ranges(starts, lengths)
-        return {
-            "lengths": lengths.copy(),
-            "terminated": self._terminal[starts + lengths - 1] > 0,
-            "frames": self._frames[ranges(starts, lengths + 1)],
-            "actions": self._actions[steps],
-            "rewards": self._rewards[steps],
-        }
-
     def index(self) -> dict[str, Any]:
         """Everything that `packed` lacks: places of trajectories, priorities, random generator.
 
@@ -448,33 +304,6 @@ class TrajectoryReplay:
             self._td.load_packed(self._starts, self._lengths, index["td"])
         self._write = int(index["write"])
         self.rng.bit_generator.state = index["rng"]
-
-    def _place(self, first: int, arrays: Mapping[str, NDArray[Any]]) -> int:
-        """Puts the held ones of the trajectories `first`, ... in their rows; number after them."""
-        lengths = np.asarray(arrays["lengths"], np.int64)
-        begin, end = max(first, self.oldest), min(first + len(lengths), self.trajectories_added)
-        if begin >= end:
-            return begin
-        given, held = (
-            slice(begin - first, end - first),
-            slice(begin - self.oldest, end - self.oldest),
-        )
-        starts, own = self._starts[held], self._lengths[held]
-        frames, actions = arrays["frames"], arrays["actions"]
-        if not np.array_equal(own, lengths[given]) or frames.shape[1] != self.layout.frame:
-            raise ValueError(
-                f"trajectories {begin} to {end - 1} must be those of the checkpoint's index, with "
-                f"{self.layout.frame} numbers a frame, got {frames.shape[1]}"
-            )
-        # Where trajectory i begins among the rows of all: its steps, and one frame more of each.
-        before = np.cumsum(lengths) - lengths
-        skipped, frames_skipped = before[given], (before + np.arange(len(lengths)))[given]
-        rows, source = ranges(starts, own), ranges(skipped, own)
-        self._frames[ranges(starts, own + 1)] = frames[ranges(frames_skipped, own + 1)]
-        self._actions[rows] = actions[source]
-        self._rewards[rows] = arrays["rewards"][source]
-        self._terminal[starts + own - 1] = arrays["terminated"][given]
-        return end
 
     def state(self) -> dict[str, Any]:
         """Everything that sampling and storing depend on, as arrays and plain values."""

@@ -1,6 +1,7 @@
-"""Whole trajectories of unequal lengths side by side, as the estimator learns from them.
+"""What a replay takes and gives: trajectories, transitions, whole trajectories side by side.
 
-Shape legend: N trajectories, T frames of the longest one, D observation.
+Shape legend: B transitions, N trajectories, n steps of one, T frames of the longest one,
+D observation, G goal, A action.
 """
 
 from __future__ import annotations
@@ -11,13 +12,79 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["WholeTrajectories", "long_enough"]
+__all__ = [
+    "Floats",
+    "ReplayLayout",
+    "Rows",
+    "Trajectory",
+    "Transitions",
+    "WholeTrajectories",
+    "long_enough",
+]
 
 SHORTEST = 2
 """Steps of a trajectory that time can be shuffled in: of two frames half of all permutations are
 the identity."""
 
 Floats = NDArray[np.float32]
+Rows = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class ReplayLayout:
+    """Sizes of what is stored."""
+
+    observation: int
+    action: int
+    goal: int
+    horizon: int
+    """Steps of the longest episode."""
+
+    @property
+    def frame(self) -> int:
+        return self.observation + 2 * self.goal
+
+    @property
+    def network_input(self) -> int:
+        """Observation and desired goal: the first columns of a frame."""
+        return self.observation + self.goal
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """One finished episode of n steps."""
+
+    frames: Floats
+    """[n+1, D + 2G]: observation, desired goal, achieved goal."""
+    actions: Floats
+    """[n, A] in [-1, 1]."""
+    rewards: Floats
+    """[n] the environment's."""
+    terminated: bool
+    """Whether it ended in a terminal state (a truncated one keeps its bootstrap)."""
+
+    def __len__(self) -> int:
+        return len(self.actions)
+
+
+@dataclass(frozen=True)
+class Transitions:
+    """A minibatch, or several behind each other."""
+
+    inputs: Floats
+    """[B, D + G] observation and desired goal."""
+    actions: Floats
+    """[B, A]"""
+    rewards: Floats
+    """[B] task reward, recomputed where the goal was relabelled."""
+    discounts: Floats
+    """[B] 0 where the episode terminated, else 1."""
+    next_inputs: Floats
+    """[B, D + G]"""
+    weights: Floats | None = None
+    """[B] importance weights in (0, 1] where transitions are drawn by TD error."""
+    rows: Rows | None = None
+    """[B] where they lie, for `update_priorities`."""
 
 
 def long_enough(lengths: NDArray[np.int64]) -> NDArray[np.bool_]:

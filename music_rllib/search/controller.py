@@ -5,88 +5,32 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from optuna.trial import FrozenTrial, TrialState
 
-from music_rllib import names
 from music_rllib.config.problems import ConfigError
-from music_rllib.config.schema import Stage
-from music_rllib.config.search.space import FINAL_SEED, Rung, SearchSettings
-from music_rllib.experiment.listener import Failure, Listener
+from music_rllib.config.search.settings import FINAL_SEED, SearchSettings
+from music_rllib.experiment.listener import Listener
 from music_rllib.experiment.plan import Node, Run
 from music_rllib.experiment.scheduler import Status
 from music_rllib.experiment.session import Sweep
 from music_rllib.redaction import redact
 from music_rllib.search.objective import aggregate, prune, score
 from music_rllib.search.storage import DATABASE_ERRORS
-from music_rllib.search.study import SCORES, VALUES, Study
+from music_rllib.search.trials import Active, Arm, Finalist, Search, in_words, ranked, up_to
+from music_rllib.search.warm_start import SCORES, VALUES
 from music_rllib.store.object_folder import DamagedError
 from music_rllib.store.run_record import Report
 
-__all__ = ["Arm", "Campaign", "Finalist", "Search", "ranked"]
+__all__ = ["Campaign"]
 
 POLL_SECONDS = 1.0
 """Between two looks at what other drivers have done."""
 
 Array = NDArray[np.float64]
-
-
-@dataclass
-class Active:
-    """A trial that this driver judges."""
-
-    trial: FrozenTrial
-    values: Mapping[str, Any]
-    """With the compared ones."""
-    runs: list[Run] = field(default_factory=list)
-    """Of the rung that it is on."""
-    rung: int = 0
-
-
-@dataclass
-class Finalist:
-    """A trial that is run again on fresh seeds."""
-
-    number: int
-    values: Mapping[str, Any]
-    searched: tuple[float, ...]
-    """Its values in the search."""
-    runs: list[Run]
-    scores: list[Array] | None = None
-    """For each objective `[seeds, tasks]` on fresh seeds; None before all are there."""
-    failure: str = ""
-
-
-@dataclass
-class Arm:
-    """One study: of one compared value, or the only one."""
-
-    values: Mapping[str, Any]
-    study: Study
-    position: int
-    active: dict[int, Active] = field(default_factory=dict)
-    finalists: list[Finalist] | None = None
-    """None before the study is over."""
-
-    @property
-    def over(self) -> bool:
-        """Whether every trial has ended, whoever has judged it."""
-        return all(trial.state.is_finished() for trial in self.study.trials())
-
-
-@dataclass
-class Search:
-    """A searched stage."""
-
-    stage: Stage
-    settings: SearchSettings
-    arms: list[Arm]
-    rungs: tuple[Rung, ...]
-    """The last one is the end."""
 
 
 class Campaign(Listener):
@@ -152,13 +96,9 @@ class Campaign(Listener):
         reached = [int(rung) for rung in trial.user_attrs.get(SCORES, {})]
         rung = search.rungs[min(max(reached, default=0), len(search.rungs) - 1)]
         try:
-            runs = self._plan.add_trial(
-                search.stage.name,
-                trial.number * len(search.arms) + arm.position,
-                {**arm.values, **trial.user_attrs[VALUES]},
-                self._plan.seeds[: rung.seeds],
-                f"trial{trial.number}",
-            )
+            values = {**arm.values, **trial.user_attrs[VALUES]}
+            seeds = self._plan.seeds[: rung.seeds]
+            runs = self._runs_of(search, arm, trial, values, seeds)
         except ConfigError:
             return  # that is why it failed
         for run in runs:
@@ -170,6 +110,19 @@ class Campaign(Listener):
                 self._board.recall(one, finished=finished)
                 if finished:
                     self._reused(one)
+
+    def _runs_of(
+        self,
+        search: Search,
+        arm: Arm,
+        trial: FrozenTrial,
+        values: Mapping[str, Any],
+        seeds: Sequence[int],
+        phase: str = "trial",
+    ) -> list[Run]:
+        """Put a trial into the plan; arms take turns in numbering theirs."""
+        number, name = trial.number * len(search.arms) + arm.position, f"{phase}{trial.number}"
+        return self._plan.add_trial(search.stage.name, number, values, seeds, name)
 
     def _source_of(self, node: Node) -> Node | None:
         if node.input is None or node.input.checkpoint is not None:
@@ -265,13 +218,7 @@ class Campaign(Listener):
         rung = search.rungs[active.rung]
         seeds = self._plan.seeds[: rung.seeds]
         try:
-            active.runs = self._plan.add_trial(
-                search.stage.name,
-                active.trial.number * len(search.arms) + arm.position,
-                active.values,
-                seeds,
-                f"trial{active.trial.number}",
-            )
+            active.runs = self._runs_of(search, arm, active.trial, active.values, seeds)
         except ConfigError as error:
             self._end(search, arm, active, TrialState.FAIL, None, "; ".join(error.lines))
             return
@@ -337,7 +284,7 @@ class Campaign(Listener):
         found: list[list[float]] = [[] for _ in settings.objectives]
         for run in runs:
             node = self._plan.node(run.key)
-            history = _up_to(self._history(run.key), until)
+            history = up_to(self._history(run.key), until)
             for objective, numbers in zip(settings.objectives, found, strict=True):
                 try:
                     numbers.append(score(objective, history, until or node.run.env_steps))
@@ -389,7 +336,7 @@ class Campaign(Listener):
     ) -> None:
         arm.study.end(active.trial, state, values, reason)
         del arm.active[active.trial.number]
-        name = f"{search.stage.name} {_in_words(arm.values)}trial {active.trial.number}"
+        name = f"{search.stage.name} {in_words(arm.values)}trial {active.trial.number}"
         if state is TrialState.COMPLETE:
             self._say(f"{name}: {', '.join(f'{value:.4g}' for value in values or ())}")
         else:
@@ -425,22 +372,12 @@ class Campaign(Listener):
             if len(finalists) >= final.trials and not baseline:
                 continue
             seen.append(values)
-            runs = self._plan.add_trial(
-                search.stage.name,
-                trial.number * len(search.arms) + arm.position,
-                values,
-                seeds,
-                f"final{trial.number}",
-            )
+            runs = self._runs_of(search, arm, trial, values, seeds, phase="final")
             for run in runs:
                 self._want(run, None)
+            searched = tuple(trial.values or ())
             finalists.append(
-                Finalist(
-                    number=trial.number,
-                    values=values,
-                    searched=tuple(trial.values or ()),
-                    runs=runs,
-                )
+                Finalist(number=trial.number, values=values, searched=searched, runs=runs)
             )
         return finalists
 
@@ -457,47 +394,7 @@ class Campaign(Listener):
                 finalist.failure = str(error)
         return finalist.scores is not None or bool(finalist.failure)
 
-    def failed(self, node: Node, failure: Failure) -> None:
-        """Nothing: the board knows."""
-
 
 _FINISHED = (Status.FINISHED, Status.REUSED)
 _THERE = (*_FINISHED, Status.PAUSED)
 _LOST = (Status.FAILED, Status.SKIPPED)
-
-
-def _up_to(history: Sequence[Report], until: int | None) -> list[Report]:
-    """Reports up to the first evaluation from `until` environment steps on."""
-    if until is None:
-        return list(history)
-    found = []
-    for report in history:
-        found.append(report)
-        if report.env_steps >= until and names.EVAL_EPISODES in report.metrics:
-            break
-    return found
-
-
-def ranked(settings: SearchSettings, trials: Sequence[FrozenTrial]) -> list[FrozenTrial]:
-    """Judged trials, the best first; of several objectives the Pareto front, by the first one."""
-    judged = [trial for trial in trials if trial.state is TrialState.COMPLETE and trial.values]
-    signs = [1.0 if objective.maximised else -1.0 for objective in settings.objectives]
-
-    def goodness(trial: FrozenTrial) -> tuple[float, ...]:
-        return tuple(sign * value for sign, value in zip(signs, trial.values, strict=True))
-
-    if len(signs) > 1:
-        judged = [
-            trial
-            for trial in judged
-            if not any(_dominates(goodness(other), goodness(trial)) for other in judged)
-        ]
-    return sorted(judged, key=lambda trial: (*(-part for part in goodness(trial)), trial.number))
-
-
-def _dominates(one: tuple[float, ...], other: tuple[float, ...]) -> bool:
-    return one != other and all(a >= b for a, b in zip(one, other, strict=True))
-
-
-def _in_words(values: Mapping[str, Any]) -> str:
-    return "".join(f"{name}={value} " for name, value in values.items())

@@ -13,7 +13,7 @@ import numpy as np
 from scipy import stats
 
 from music_rllib import names
-from music_rllib.config.search.space import Objective, Pruning
+from music_rllib.config.search.settings import Objective, Pruning
 from music_rllib.results import statistics as st
 from music_rllib.results.statistics import Array, Estimate
 from music_rllib.store.run_record import Report

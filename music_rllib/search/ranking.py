@@ -15,7 +15,7 @@ import numpy as np
 
 from music_rllib import names
 from music_rllib.config.schema import Stage
-from music_rllib.config.search.space import SearchSettings
+from music_rllib.config.search.settings import SearchSettings
 from music_rllib.experiment.plan import Plan, short
 from music_rllib.results.comparison import with_interval
 from music_rllib.results.from_store import Condition, conditions

@@ -27,7 +27,8 @@ from optuna.samplers import BaseSampler, CmaEsSampler, NSGAIISampler, RandomSamp
 from optuna.trial import FrozenTrial, TrialState, create_trial
 
 from music_rllib.config.problems import same
-from music_rllib.config.search.space import Choice, Dimension, FloatRange, IntRange, SearchSettings
+from music_rllib.config.search.settings import SearchSettings
+from music_rllib.config.search.space import Choice, Dimension, FloatRange, IntRange
 
 __all__ = ["Proposal", "Proposer", "as_proposal", "decoded", "seed_of"]
 

@@ -14,7 +14,6 @@ import socket
 import time
 import uuid
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import optuna
@@ -24,74 +23,38 @@ from optuna.storages import BaseStorage
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState, create_trial
 
-from music_rllib.config.problems import same
-from music_rllib.config.search.space import SearchSettings, WarmStart
+from music_rllib.config.search.settings import SearchSettings
 from music_rllib.experiment.plan import short
-from music_rllib.redaction import redact
-from music_rllib.search.sampler import Proposal, Proposer, as_proposal
-from music_rllib.search.storage import open_older, studies_of
+from music_rllib.search.sampler import Proposal, Proposer
+from music_rllib.search.storage import studies_of
+from music_rllib.search.warm_start import (
+    ARM,
+    BASE,
+    FINGERPRINT,
+    LEARNT,
+    OWNER,
+    POINTS,
+    PRIOR,
+    REASON,
+    SCORES,
+    SEARCH,
+    SETTINGS,
+    VALUES,
+    Identity,
+    as_data,
+    fits,
+    from_data,
+    warm_start,
+)
 from music_rllib.store.files import content_key
-from music_rllib.store.object_folder import StorageError
 
-__all__ = [
-    "REASON",
-    "SCORES",
-    "VALUES",
-    "Study",
-    "no_study_error",
-]
+__all__ = ["Study"]
 
 LEASE_SECONDS = 120.0
 """After so long without a sign of life a driver on another machine counts as dead."""
 SIGN_SECONDS = 20.0
 
-FINGERPRINT, SETTINGS, POINTS, PRIOR, LEARNT, BASE, SEARCH, ARM = (
-    "music_rllib:fingerprint",
-    "music_rllib:settings",
-    "music_rllib:points",
-    "music_rllib:prior",
-    "music_rllib:learnt",
-    "music_rllib:base",
-    "music_rllib:search",
-    "music_rllib:arm",
-)
-OWNER, VALUES, REASON, SCORES = "owner", "values", "reason", "scores"
 DRIVER = "driver:"
-
-
-def no_study_error(warm: WarmStart, known: Sequence[str]) -> StorageError:
-    """That none of the `known` studies is the one to learn from."""
-    if known:
-        rule = f"must be (the beginning of) one of {', '.join(known)}, got {warm.study!r}"
-    else:
-        place = "the search's own storage" if warm.storage is None else redact(warm.storage)
-        rule = (
-            f"must be (the beginning of) a study's name, got {warm.study!r}: there are no other "
-            f"studies in {place}"
-        )
-    return StorageError(f"search.warm_start.study {rule}")
-
-
-def _search_of(study: Any) -> str:
-    """What the studies of one search have in common; its own name for one that doesn't say."""
-    return str(study.user_attrs.get(SEARCH, study.study_name))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Identity:
-    """What makes a study this study."""
-
-    base: str
-    """`sweep/stage`, with the compared values behind it."""
-    fingerprint: str
-    """Hash of all that determines its points and values."""
-    search: str
-    """The same for all compared values: theirs are the studies of one search."""
-
-    @property
-    def name(self) -> str:
-        """In the storage."""
-        return f"{self.base} @{self.fingerprint}"
 
 
 class Study:
@@ -159,14 +122,14 @@ class Study:
 
     def _contents(self) -> dict[str, Any]:
         """What is kept with a new study: from then on it holds, whatever becomes of older ones."""
-        prior, learnt = self._warm_start()
+        prior, learnt = warm_start(self._storage, self.settings, self.identity, self._arm)
         return {
             FINGERPRINT: self.identity.fingerprint,
             BASE: self.identity.base,
             SEARCH: self.identity.search,
             ARM: self._arm,
             SETTINGS: _of_study(self.settings),
-            PRIOR: [_as_data(trial) for trial in prior],
+            PRIOR: [as_data(trial) for trial in prior],
             LEARNT: learnt,
             POINTS: [*self.settings.points_to_evaluate, *self._taken_over()],
         }
@@ -176,14 +139,14 @@ class Study:
     ) -> tuple[int, list[dict[str, Any]], list[FrozenTrial]]:
         for key, value in contents.items():  # the points are the last: they say that all is there
             self._storage.set_study_user_attr(study, key, value)
-        prior = [_from_data(data, self.settings) for data in contents[PRIOR]]
+        prior = [from_data(data, self.settings) for data in contents[PRIOR]]
         return study, contents[POINTS], prior
 
     def _once_made(self, study: int) -> tuple[int, list[dict[str, Any]], list[FrozenTrial]]:
         for _ in range(100):
             attributes = self._storage.get_study_user_attrs(study)
             if POINTS in attributes:
-                prior = [_from_data(data, self.settings) for data in attributes[PRIOR]]
+                prior = [from_data(data, self.settings) for data in attributes[PRIOR]]
                 return study, attributes[POINTS], prior
             time.sleep(0.1)
         # Its maker died in between: nothing has been searched with it yet.
@@ -212,64 +175,11 @@ class Study:
             if (
                 trial.state.is_finished()
                 and values
-                and _fits(values, self.settings)
+                and fits(values, self.settings)
                 and json.dumps(values, sort_keys=True) not in given
             ):
                 points.append(values)
         return points
-
-    def _warm_start(self) -> tuple[list[FrozenTrial], str]:
-        """Trials of older studies to learn from, as far as they fit, and in words which they are.
-
-        Raises:
-            StorageError: There are none.
-        """
-        warm = self.settings.warm_start
-        if warm is None:
-            return [], ""
-        storage = self._storage if warm.storage is None else open_older(warm.storage)
-        older = self._older(storage, warm)
-        prior, ended = [], 0
-        for study in older:
-            for trial in storage.get_all_trials(study._study_id, deepcopy=False):
-                ended += trial.state.is_finished()
-                values = self._as_mine(study, trial)
-                if values is not None:
-                    data = {"values": values, "judged": list(trial.values)}
-                    prior.append(_from_data(data, self.settings))
-        names = ", ".join(study.study_name for study in older)
-        if not prior:
-            raise StorageError(
-                f"search.warm_start.study must have judged trials that {self.identity.base} can "
-                f"learn from, got {names}, none of whose {ended} trials has the same objectives "
-                "and lies in the space"
-            )
-        return prior, f"learnt from {len(prior)} of {ended} trials of {names}"
-
-    def _older(self, storage: BaseStorage, warm: WarmStart) -> list[Any]:
-        """Studies of the newest search whose names begin as is wished: one, or compared ones."""
-        others = [
-            one for one in studies_of(storage) if one.user_attrs.get(SEARCH) != self.identity.search
-        ]
-        found = [one for one in others if one.study_name.startswith(warm.study)]
-        if found:
-            newest = _search_of(found[-1])
-            return [one for one in found if _search_of(one) == newest]
-        raise no_study_error(warm, [one.study_name for one in others])
-
-    def _as_mine(self, study: Any, trial: FrozenTrial) -> dict[str, Any] | None:
-        """The point of another study's trial as one of this study's; None if it can't be one."""
-        objectives = self.settings.objectives
-        maximised = [one is StudyDirection.MAXIMIZE for one in study.directions]
-        if trial.state is not TrialState.COMPLETE or trial.values is None:
-            return None
-        if maximised != [one.maximised for one in objectives]:
-            return None
-        values = study.user_attrs.get(ARM, {}) | trial.user_attrs.get(VALUES, dict(trial.params))
-        for name, value in self._arm.items():
-            if name in values and not same(values.pop(name), value):
-                return None  # it tells of another compared value
-        return values if _fits(values, self.settings) else None
 
     def lay_out(self) -> None:
         """Make the trials that aren't there yet, waiting."""
@@ -433,34 +343,3 @@ def _of_study(settings: SearchSettings) -> dict[str, Any]:
     if settings.warm_start is not None:
         found["warm_start"] = settings.warm_start.study
     return found
-
-
-def _fits(values: Mapping[str, Any], settings: SearchSettings) -> bool:
-    """Whether a point lies in the space."""
-    seen: dict[str, Any] = {}
-    for name, dimension in settings.space.items():
-        if not dimension.applies(seen):
-            if name in values:
-                return False
-            continue
-        if name not in values:
-            return False
-        if not dimension.contains(values[name]):
-            return False
-        seen[name] = values[name]
-    return len(seen) == len(values)
-
-
-def _as_data(trial: FrozenTrial) -> dict[str, Any]:
-    return {"values": trial.user_attrs[VALUES], "judged": list(trial.values or [])}
-
-
-def _from_data(data: Mapping[str, Any], settings: SearchSettings) -> FrozenTrial:
-    """A trial of an older study, without what its sampler kept: that may be a pickle."""
-    proposal = as_proposal(settings.space, data["values"])
-    return create_trial(
-        values=list(data["judged"]),
-        params=dict(proposal.params),
-        distributions=dict(proposal.distributions),
-        user_attrs={VALUES: dict(data["values"])},
-    )

@@ -12,12 +12,12 @@ from optuna.trial import FrozenTrial, TrialState
 
 from music_rllib.config.schema import Stage
 from music_rllib.config.search.check import most_env_steps
-from music_rllib.config.search.space import Rung, SearchSettings, WarmStart
+from music_rllib.config.search.settings import Rung, SearchSettings, WarmStart
 from music_rllib.experiment.plan import node_key
 from music_rllib.experiment.session import Sweep
 from music_rllib.redaction import redact
 from music_rllib.results.statistics import improvement
-from music_rllib.search.controller import Arm, Campaign, Finalist, Search, ranked
+from music_rllib.search.controller import Campaign
 from music_rllib.search.objective import aggregate, interval
 from music_rllib.search.storage import (
     DATABASE_ERRORS,
@@ -25,7 +25,9 @@ from music_rllib.search.storage import (
     open_studies,
     same_database,
 )
-from music_rllib.search.study import REASON, SCORES, VALUES, Study, no_study_error
+from music_rllib.search.study import Study
+from music_rllib.search.trials import Arm, Finalist, Search, ranked
+from music_rllib.search.warm_start import REASON, SCORES, VALUES, no_study_error
 
 __all__ = ["check_studies", "learnings", "open_searches", "outcome"]
 

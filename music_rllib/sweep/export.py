@@ -13,7 +13,7 @@ import yaml
 
 from music_rllib import names
 from music_rllib.config.schema import Stage
-from music_rllib.config.search.space import Objective
+from music_rllib.config.search.settings import Objective
 from music_rllib.errors import BadInputError
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.plan import Run

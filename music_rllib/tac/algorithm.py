@@ -35,7 +35,8 @@ from ray.rllib.utils.typing import StateDict
 
 from music_rllib.envs.make import goal_reward_of, moved_distance_of
 from music_rllib.envs.numbers import BadNumberError
-from music_rllib.replay.buffer import TrajectoryReplay, Transitions
+from music_rllib.replay.buffer import TrajectoryReplay
+from music_rllib.replay.trajectories import Transitions
 from music_rllib.schedules import value_at
 from music_rllib.tac.config import TACConfig
 from music_rllib.tac.env_runner import SUCCESS_LAST, Episode, TrajectoryEnvRunner, seed_or_entropy

@@ -8,7 +8,7 @@ other.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -16,9 +16,69 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from music_rllib import names
+from music_rllib.config.tac_settings import TACSettings
 from music_rllib.functional.tsallis import MAX_EXPONENT, bound_active, ln_q_of_log, ln_q_of_policy
 
-__all__ = ["discounted_returns", "of_intrinsic_reward", "of_policy", "of_targets"]
+__all__ = [
+    "NonFiniteLossError",
+    "check_finite",
+    "discounted_returns",
+    "of_intrinsic_reward",
+    "of_policy",
+    "of_targets",
+    "of_updates",
+    "td_errors",
+]
+
+
+class NonFiniteLossError(RuntimeError):
+    """A loss became infinite or NaN; the message names it and the update."""
+
+
+def check_finite(keys: Sequence[str], table: Tensor, updates: int, q: float, alpha: float) -> None:
+    """Raises where a metric of a call is not finite.
+
+    Args:
+        keys: M names.
+        table: [K, M]
+        updates: of the run, after this call's.
+        q: entropic index, for the message, as `alpha`.
+
+    Raises:
+        NonFiniteLossError: names what, and at which update.
+    """
+    bad = ~torch.isfinite(table)
+    if not bad.any():
+        return
+    step = int(bad.any(1).nonzero()[0])
+    culprits = [key for key, is_bad in zip(keys, bad[step].tolist(), strict=True) if is_bad]
+    raise NonFiniteLossError(
+        f"{', '.join(culprits)} not finite at gradient update {updates - len(table) + step + 1} "
+        f"(entropic_index {q:g}, alpha {alpha:g}). "
+        "The run stops here; its last checkpoint is good. Try a smaller tac.lr or tac.alpha, "
+        "or an entropic_index nearer to 1."
+    )
+
+
+def of_updates(
+    observed: Mapping[str, Tensor], settings: TACSettings, q: float
+) -> dict[str, Tensor]:
+    """Metrics of K updates, [K] each, from what was observed of them, [K, ...] each."""
+    metrics = {names.Q_MEAN: observed["q_values"].mean((1, 2))}
+    metrics |= of_targets(observed["targets"], settings.target_bounds)
+    if "log_density" in observed:
+        density, log_std = observed["log_density"], observed["log_std"]
+        form, bounds = settings.entropy_form, settings.log_std_bounds
+        metrics |= of_policy(density, log_std, q, form, bounds)
+    if "intrinsic" in observed:
+        metrics |= of_intrinsic_reward(observed["intrinsic"])
+    return metrics
+
+
+def td_errors(observed: Mapping[str, Tensor]) -> Tensor:
+    """[K*B] mean absolute TD error over the critics."""
+    errors = observed["q_values"] - observed["targets"].unsqueeze(1)
+    return errors.abs().mean(1).flatten()
 
 
 @torch.no_grad()

@@ -45,7 +45,7 @@ from music_rllib.envs.make import (
 )
 from music_rllib.envs.numbers import BadNumberError
 from music_rllib.envs.recording import Episode, Recording
-from music_rllib.replay.buffer import ReplayLayout
+from music_rllib.replay.trajectories import ReplayLayout
 from music_rllib.runtime.quiet import quiet_third_parties
 from music_rllib.tac.rl_module import TACModule
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ray.rllib.core.columns import Columns
 from torch import Tensor
 
-from music_rllib.replay.buffer import Trajectory
+from music_rllib.replay.trajectories import Trajectory
 from music_rllib.tac.diagnostics import discounted_returns
 from music_rllib.tac.objective import Objective
 from music_rllib.tac.rl_module import TACModule, choose_action

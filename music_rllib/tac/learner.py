@@ -14,7 +14,7 @@ one step of every network.
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,45 +32,28 @@ from music_rllib import names
 from music_rllib.config.tac_settings import LearnedAlpha, TACSettings
 from music_rllib.intrinsic.interface import IntrinsicReward
 from music_rllib.intrinsic.music import Music
-from music_rllib.replay.buffer import Trajectory
+from music_rllib.replay.trajectories import Trajectory
 from music_rllib.runtime.allocator import keep_freed_memory
 from music_rllib.runtime.quiet import quiet_third_parties
 from music_rllib.schedules import Quantity
 from music_rllib.tac import diagnostics
 from music_rllib.tac.fresh_episodes import FreshEpisodes, critic_bias
 from music_rllib.tac.kernels.adam import FusedAdam
-from music_rllib.tac.kernels.cuda_graphs import CapturedUpdate, CudaRecorder
+from music_rllib.tac.kernels.cuda_graphs import CapturedUpdate, CudaRecorder, UpdateConstants
 from music_rllib.tac.kernels.forward import TACForward
 from music_rllib.tac.kernels.precision import check_precision
 from music_rllib.tac.kernels.update import DirectUpdate
 from music_rllib.tac.normaliser import RunningNormaliser
 from music_rllib.tac.objective import Losses, Objective
-from music_rllib.tac.rl_module import ESTIMATOR_MODULE, EstimatorModule, TACModule
+from music_rllib.tac.rl_module import ESTIMATOR_MODULE, TACModule
 from music_rllib.tac.scheduled import ScheduledSettings
 
-__all__ = ["GRAD_UPDATES", "NonFiniteLossError", "TACLearner"]
+__all__ = ["GRAD_UPDATES", "TACLearner"]
 
 GRAD_UPDATES = "grad_updates"
 LOSSES = "losses"
 Minibatch = dict[ModuleID, dict[str, Tensor]]
 FlatMinibatch = Mapping[tuple[ModuleID, str], Tensor]
-
-
-class _Constants(NamedTuple):
-    """What an update depends on and what is no tensor: captured, it stays as it was."""
-
-    entropic_index: float
-    mi_reward_weight: float
-    alpha: float | None
-    """None: learned, and a tensor."""
-    drawn: Hashable
-    """By the intrinsic reward, for this update."""
-    trajectories: tuple[int, bool] | None
-    """Frames of the trajectories that are learned from, and whether some are shorter."""
-
-
-class NonFiniteLossError(RuntimeError):
-    """A loss became infinite or NaN; the message names it and the update."""
 
 
 class TACLearner(TorchLearner):
@@ -92,7 +75,9 @@ class TACLearner(TorchLearner):
         seed = self.config.seed if self.config.seed is not None else torch.seed()
         self._generator = torch.Generator(device=self._device).manual_seed(seed + 7919)
         self._grad_updates = 0
-        self._intrinsic: IntrinsicReward = Music(self._music, self._estimator)
+        has_one = ESTIMATOR_MODULE in self.module
+        estimator = self.module[ESTIMATOR_MODULE].unwrapped() if has_one else None
+        self._intrinsic: IntrinsicReward = Music(self._music, estimator)
         self._losses: dict[str, Tensor] = {}
         self._observed: dict[str, Tensor] = {}
         self._names_of_losses: list[str] = []
@@ -108,7 +93,7 @@ class TACLearner(TorchLearner):
         self._online: list[Tensor] = [p for online, _ in pairs for p in online.parameters()]
         self._targets: list[Tensor] = [p for _, target in pairs for p in target.parameters()]
         on_gpu, plain = self._device.type == "cuda", self._keeps_gradients_to_itself
-        self._captured: CapturedUpdate[_Constants] | None = None
+        self._captured: CapturedUpdate[UpdateConstants] | None = None
         if on_gpu and plain:
             self._captured = CapturedUpdate(self._step, CudaRecorder(self._device))
         standard = not on_gpu and plain and self._is_standard
@@ -130,17 +115,6 @@ class TACLearner(TorchLearner):
     @property
     def _policy_module(self) -> TACModule:
         return self.module[DEFAULT_MODULE_ID].unwrapped()  # type: ignore[no-any-return]
-
-    @property
-    def _input_size(self) -> int:
-        """Features of a network input: the first columns of a frame."""
-        return self._policy_module.input_size
-
-    @property
-    def _estimator(self) -> EstimatorModule | None:
-        if ESTIMATOR_MODULE not in self.module:
-            return None
-        return self.module[ESTIMATOR_MODULE].unwrapped()  # type: ignore[no-any-return]
 
     def configure_optimizers_for_module(self, module_id: ModuleID, config: Any = None) -> None:
         named = dict(self.module[module_id].named_parameters())
@@ -187,7 +161,7 @@ class TACLearner(TorchLearner):
         """Runs all minibatches of the batch; metrics are their means, logged once.
 
         Raises:
-            NonFiniteLossError: a loss is not finite any more.
+            diagnostics.NonFiniteLossError: a loss is not finite any more.
         """
         self._check_is_built()
         self.before_gradient_based_update(timesteps=timesteps or {})
@@ -221,11 +195,12 @@ class TACLearner(TorchLearner):
             return gradients_dict
         return super().postprocess_gradients(gradients_dict)
 
-    def _step(self, minibatch: FlatMinibatch, constants: _Constants) -> dict[str, Tensor]:
+    def _step(self, minibatch: FlatMinibatch, constants: UpdateConstants) -> dict[str, Tensor]:
         """One update of every network but the targets; nothing in it waits for the device.
 
         Returns:
-            `LOSSES` [M], in the order of `_names_of_losses`, and what `_diagnosed` takes.
+            `LOSSES` [M], in the order of `_names_of_losses`, and what is
+            diagnosed of it.
         """
         columns: Minibatch = {}
         for (module_id, name), values in minibatch.items():
@@ -239,7 +214,9 @@ class TACLearner(TorchLearner):
         self._names_of_losses = list(self._losses)
         return {LOSSES: torch.stack(list(self._losses.values())), **self._observed}
 
-    def _minibatches(self, batch: MultiAgentBatch) -> Iterator[tuple[FlatMinibatch, _Constants]]:
+    def _minibatches(
+        self, batch: MultiAgentBatch
+    ) -> Iterator[tuple[FlatMinibatch, UpdateConstants]]:
         """Cuts the batch up; random numbers of all its updates are drawn here, in one go."""
         columns: Minibatch = {mid: dict(b) for mid, b in batch.policy_batches.items()}
         rows = {DEFAULT_MODULE_ID: self._settings.batch_size}
@@ -259,24 +236,22 @@ class TACLearner(TorchLearner):
             }
             yield minibatch, self._constants(minibatch, drawn[k])
 
-    def _constants(self, minibatch: FlatMinibatch, drawn: Hashable) -> _Constants:
+    def _constants(self, minibatch: FlatMinibatch, drawn: Hashable) -> UpdateConstants:
         alpha = None if isinstance(self._settings.alpha, LearnedAlpha) else self._now.alpha
         shape = None
         if (ESTIMATOR_MODULE, Columns.OBS) in minibatch:
             frames = minibatch[ESTIMATOR_MODULE, Columns.OBS].shape[1]
             shape = (frames, (ESTIMATOR_MODULE, "inside") in minibatch)
         now = self._now
-        return _Constants(now.entropic_index, now.mi_reward_weight, alpha, drawn, shape)
+        return UpdateConstants(now.entropic_index, now.mi_reward_weight, alpha, drawn, shape)
 
     def _policy_noise(self, actions: Tensor) -> dict[str, Tensor]:
         """Standard normal numbers for the policy's actions, and the next ones where needed."""
         if self._settings.policy == "deterministic":
             return {}
         wanted = ["noise"] if self._settings.bootstrap == "value" else ["noise", "next_noise"]
-        return {name: self._normal(actions.shape) for name in wanted}
-
-    def _normal(self, shape: tuple[int, ...]) -> Tensor:
-        return torch.randn(shape, generator=self._generator, device=self._device)
+        options = {"generator": self._generator, "device": self._device}
+        return {name: torch.randn(actions.shape, **options) for name in wanted}
 
     def _relabelled(self, minibatch: Minibatch, drawn: Hashable) -> Minibatch:
         """The minibatch with the reward that is learned from: task and intrinsic, weighted."""
@@ -344,55 +319,23 @@ class TACLearner(TorchLearner):
         """Means of the updates' metrics; `history` has what `_step` returned of each."""
         columns = {name: torch.stack([outputs[name] for outputs in history]) for name in history[0]}
         losses_of_updates = dict(zip(self._names_of_losses, columns.pop(LOSSES).T, strict=True))
-        metrics = losses_of_updates | self._diagnosed(columns)
+        q, alpha = self._now.entropic_index, float(self._objective.alpha)
+        metrics = losses_of_updates | diagnostics.of_updates(columns, self._settings, q)
+        if self.config.replay_priority == "td_error":
+            self._td_errors = diagnostics.td_errors(columns)
         keys, table = list(metrics), torch.stack([m.float() for m in metrics.values()], dim=1)
-        self._check_finite(keys, table)
+        # A NaN never leaves the networks again, so looking once a call is enough.
+        diagnostics.check_finite(keys, table, self._grad_updates, q, alpha)
         log = self.metrics.log_value
         means = dict(zip(keys, table.mean(0).tolist(), strict=True))
         for key, mean in {**means, **self._now.metrics()}.items():
             log((DEFAULT_MODULE_ID, key), mean, window=1)
         for key, value in self._intrinsic.metrics().items():
             log((DEFAULT_MODULE_ID, key), value, window=1)
-        log((DEFAULT_MODULE_ID, names.ALPHA), float(self._objective.alpha), window=1)
+        log((DEFAULT_MODULE_ID, names.ALPHA), alpha, window=1)
         log((ALL_MODULES, GRAD_UPDATES), self._grad_updates, window=1)
         if names.SHANNON_ENTROPY in means:
             self._now.observe("shannon_entropy", means[names.SHANNON_ENTROPY])
-
-    def _diagnosed(self, observed: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Metrics of K updates, [K] each, from what was observed of them, [K, ...] each."""
-        settings = self._settings
-        q_values, targets = observed["q_values"], observed["targets"]
-        metrics = {names.Q_MEAN: q_values.mean((1, 2))}
-        metrics |= diagnostics.of_targets(targets, settings.target_bounds)
-        if "log_density" in observed:
-            metrics |= diagnostics.of_policy(
-                observed["log_density"],
-                observed["log_std"],
-                self._now.entropic_index,
-                settings.entropy_form,
-                settings.log_std_bounds,
-            )
-        if "intrinsic" in observed:
-            metrics |= diagnostics.of_intrinsic_reward(observed["intrinsic"])
-        if self.config.replay_priority == "td_error":
-            self._td_errors = (q_values - targets.unsqueeze(1)).abs().mean(1).flatten()
-        return metrics
-
-    def _check_finite(self, keys: list[str], table: Tensor) -> None:
-        """A NaN never leaves the networks again, so looking once a call is enough."""
-        bad = ~torch.isfinite(table)
-        if not bad.any():
-            return
-        step = int(bad.any(1).nonzero()[0])
-        culprits = [key for key, is_bad in zip(keys, bad[step].tolist(), strict=True) if is_bad]
-        update = self._grad_updates - len(table) + step + 1
-        q, alpha = self._now.entropic_index, float(self._objective.alpha)
-        raise NonFiniteLossError(
-            f"{', '.join(culprits)} not finite at gradient update {update} "
-            f"(entropic_index {q:g}, alpha {alpha:g}). "
-            "The run stops here; its last checkpoint is good. Try a smaller tac.lr or tac.alpha, "
-            "or an entropic_index nearer to 1."
-        )
 
     # -- fresh episodes, td errors --------------------------------------------------------
 
@@ -402,7 +345,7 @@ class TACLearner(TorchLearner):
 
         Logs the critics' bias at their first steps; the intrinsic reward takes its own measures.
         """
-        fresh = FreshEpisodes.of(episodes, self._input_size, self._device)
+        fresh = FreshEpisodes.of(episodes, self._policy_module.input_size, self._device)
         rewards = fresh.rewards
         if self._intrinsic.is_on:
             states, followers = fresh.states, fresh.followers

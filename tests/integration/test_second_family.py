@@ -21,7 +21,8 @@ from music_rllib.config.run_settings import Evaluation, RunSettings, Variant, pr
 from music_rllib.envs.make import goal_reward_of, make_env
 from music_rllib.envs.tasks import BUILT_IN_TASKS, Task
 from music_rllib.experiment.plan import make_plan
-from music_rllib.replay.buffer import ReplayLayout, Trajectory, TrajectoryReplay
+from music_rllib.replay.buffer import TrajectoryReplay
+from music_rllib.replay.trajectories import ReplayLayout, Trajectory
 from music_rllib.sweep.preflight import check_environments
 
 Floats = NDArray[np.float64]

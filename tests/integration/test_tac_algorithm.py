@@ -15,8 +15,8 @@ from music_rllib.envs.make import make_env
 from music_rllib.envs.numbers import BadNumberError
 from music_rllib.intrinsic.music import HELD_OUT_STEPS
 from music_rllib.intrinsic.settings import MusicSettings
-from music_rllib.replay.buffer import Trajectory
 from music_rllib.replay.settings import ReplaySettings
+from music_rllib.replay.trajectories import Trajectory
 from music_rllib.tac.algorithm import TAC
 from music_rllib.tac.kernels.precision import PrecisionError, has_bf16
 

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from music_rllib import names
 from music_rllib.tac.config import TACConfig
-from music_rllib.tac.learner import NonFiniteLossError, TACLearner
+from music_rllib.tac.diagnostics import NonFiniteLossError
+from music_rllib.tac.learner import TACLearner
 
 OBSERVATION, ACTION, BATCH = 6, 3, 32
 

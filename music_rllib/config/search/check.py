@@ -11,7 +11,8 @@ from music_rllib.config.problems import ConfigError, Findings, shown
 from music_rllib.config.problems import Path as KeyPath
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.schema import Point, Source, Stage, StageHeader
-from music_rllib.config.search.space import Choice, SearchSettings
+from music_rllib.config.search.settings import SearchSettings
+from music_rllib.config.search.space import Choice
 from music_rllib.envs.tasks import closest
 
 __all__ = ["check_search", "most_env_steps", "of_stage", "stages_in"]

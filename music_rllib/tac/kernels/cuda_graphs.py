@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Hashable, Mapping
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import torch
 from torch import Tensor
 
-__all__ = ["CapturedUpdate", "CudaRecorder", "Recorder", "Replay"]
+__all__ = ["CapturedUpdate", "CudaRecorder", "Recorder", "Replay", "UpdateConstants"]
 
 logger = logging.getLogger(__name__)
 
@@ -24,6 +24,19 @@ KEPT = 2
 Tensors = Mapping[Any, Tensor]
 Key = TypeVar("Key", bound=Hashable)
 Replay = Callable[[], None]
+
+
+class UpdateConstants(NamedTuple):
+    """What an update depends on and what is no tensor: captured, it stays as it was."""
+
+    entropic_index: float
+    mi_reward_weight: float
+    alpha: float | None
+    """None: learned, and a tensor."""
+    drawn: Hashable
+    """By the intrinsic reward, for this update."""
+    trajectories: tuple[int, bool] | None
+    """Frames of the trajectories that are learned from, and whether some are shorter."""
 
 
 class Recorder(Protocol):

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from music_rllib.envs.numbers import LARGEST, BadNumberError, are_usable, bad_number
 from music_rllib.envs.recording import Recording
-from music_rllib.replay.buffer import ReplayLayout
+from music_rllib.replay.trajectories import ReplayLayout
 
 BAD = st.sampled_from([np.nan, np.inf, -np.inf, 1e30, -1e30, 2 * LARGEST])
 SOUND = st.lists(st.floats(-1e12, 1e12), min_size=1, max_size=80)

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from music_rllib.replay.buffer import ReplayLayout, Trajectory, TrajectoryReplay
+from music_rllib.replay.buffer import TrajectoryReplay
 from music_rllib.replay.priorities import SumTree, WeightedDraws, rank_weights
-from music_rllib.replay.trajectories import WholeTrajectories
+from music_rllib.replay.trajectories import ReplayLayout, Trajectory, WholeTrajectories
 
 LAYOUT = ReplayLayout(observation=3, action=2, goal=1, horizon=5)
 

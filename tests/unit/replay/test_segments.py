@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from music_rllib.replay import segments as module
-from music_rllib.replay.buffer import ReplayLayout, Trajectory, TrajectoryReplay
+from music_rllib.replay.buffer import TrajectoryReplay
 from music_rllib.replay.segments import MOST, Segment, load_segments, new_segments
+from music_rllib.replay.trajectories import ReplayLayout, Trajectory
 from music_rllib.store.state_io import read_arrays, read_state, write_arrays, write_state
 
 pytestmark = pytest.mark.faults

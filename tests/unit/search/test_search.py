@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from music_rllib import names
 from music_rllib.config.load import load_sweep
 from music_rllib.config.problems import ConfigError
-from music_rllib.config.search.space import Objective, Pruning, Rung, SearchSettings
+from music_rllib.config.search.settings import Objective, Pruning, Rung, SearchSettings
 from music_rllib.search.objective import aggregate, prune, score
 from music_rllib.search.storage import same_database
 from music_rllib.store.run_record import Report
