@@ -265,8 +265,6 @@ class TACLearner(TorchLearner):
         reward = self._intrinsic.total(policy[Columns.REWARDS], intrinsic, weight)
         return {**minibatch, DEFAULT_MODULE_ID: {**policy, Columns.REWARDS: reward}}
 
-    # -- losses ---------------------------------------------------------------------------
-
     def compute_loss_for_module(
         self, *, module_id: ModuleID, config: Any, batch: dict[str, Any], fwd_out: dict[str, Any]
     ) -> Tensor:
@@ -312,8 +310,6 @@ class TACLearner(TorchLearner):
             self._adam["estimator"].zero_grad()
             self.loss_of_trajectories(minibatch[ESTIMATOR_MODULE]).backward()
             self._adam["estimator"].step()
-
-    # -- metrics --------------------------------------------------------------------------
 
     def _log_history(self, history: Sequence[Mapping[str, Tensor]]) -> None:
         """Means of the updates' metrics; `history` has what `_step` returned of each."""
