@@ -38,18 +38,18 @@ def both_gradients(
     """Autograd's and ours, by the parameters' names, log alpha left out."""
     module = built.module[DEFAULT_MODULE_ID].unwrapped()
     trained = {n: p for n, p in module.named_parameters() if p.requires_grad and n != "log_alpha"}
-    total = built._loss(module.forward_train(batch)["tac"], batch).total
+    total = built._losses_of(module.forward_train(batch)["tac"], batch).total
     grads = torch.autograd.grad(total, list(trained.values()))
     direct = DirectUpdate(module, by)
     forward = direct.forward(batch)
-    loss = built._loss(forward, batch)
+    loss = built._losses_of(forward, batch)
     direct.backward(
         forward,
         batch,
         target=loss.target,
         value_target=loss.value_target,
         entropic_index=built._now.entropic_index,
-        alpha=built._current_alpha(),
+        alpha=built._objective.alpha,
     )
     ours = {name: direct.flat.gradient(parameter) for name, parameter in trained.items()}
     return dict(zip(trained, grads, strict=True)), ours

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from music_rllib import names
 from music_rllib.tac.config import TACConfig
-from music_rllib.tac.diagnostics import NonFiniteLossError
+from music_rllib.tac.diagnostics import NonFiniteLossError, of_updates
 from music_rllib.tac.learner import TACLearner
 
 OBSERVATION, ACTION, BATCH = 6, 3, 32
@@ -181,7 +181,8 @@ def test_metrics_stay_finite_where_the_losses_do() -> None:
     module.policy[-1].bias.data[:ACTION], module.policy[-1].bias.data[ACTION:] = 5.0, -20.0
     loss = tac_loss(built, {name: values.float() for name, values in minibatch().items()})
     assert torch.isfinite(loss)
-    metrics = built._diagnosed({name: values[None] for name, values in built._observed.items()})
+    observed = {name: values[None] for name, values in built._observed.items()}
+    metrics = of_updates(observed, built._settings, 5.0)
     assert float(metrics[names.CLIPPED_DENSITIES]) == 1.0
     for name, value in (metrics | built._losses).items():
         assert torch.isfinite(value), name
@@ -211,8 +212,8 @@ def test_learned_alpha_moves_towards_the_target_entropy() -> None:
 
 
 def test_automatic_target_entropy_is_sacs_at_q_1() -> None:
-    assert learner(alpha={"learned": True})._target_entropy == pytest.approx(-ACTION)
-    at_2 = learner(alpha={"learned": True}, entropic_index=2.0)._target_entropy
+    assert learner(alpha={"learned": True})._objective._target_entropy == pytest.approx(-ACTION)
+    at_2 = learner(alpha={"learned": True}, entropic_index=2.0)._objective._target_entropy
     assert at_2 == pytest.approx(-ACTION * (np.e - 1))
 
 
