@@ -31,7 +31,7 @@ def learner(**settings: Any) -> TACLearner:
 
 
 def learn(built: TACLearner, updates: int, env_steps: int = 0) -> dict[str, float]:
-    """Updates on a bandit whose reward falls with the squared distance to an action: its metrics."""
+    """Metrics of updates on a bandit whose reward falls with the squared distance to an action."""
     rows, rng = updates * BATCH, np.random.default_rng(built._grad_updates)
     actions = rng.uniform(-1, 1, (rows, ACTIONS)).astype(np.float32)
     states = np.ones((rows, 1), np.float32)
