@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -102,3 +103,17 @@ def finish(program: Program, timeout: float = 600) -> str:
     code, output, errors = program.run(timeout=timeout)
     assert code == 0, output + errors
     return output
+
+
+def deliver(program: Program, code: int = 0) -> str:
+    """What the end of a sweep says to do where MLflow lacks something; what it says."""
+    done = subprocess.run(
+        [sys.executable, "-m", "music_rllib.tracking", "deliver", "results/points"],
+        cwd=program.folder,
+        env=program.environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == code, done.stdout + done.stderr
+    return done.stdout + done.stderr

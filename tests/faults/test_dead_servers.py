@@ -1,4 +1,4 @@
-"""An MLflow server that is killed while a sweep goes on: for a minute, and for good."""
+"""An MLflow server that is killed while a sweep goes on, fails, or takes its password no more."""
 
 from __future__ import annotations
 
@@ -8,11 +8,16 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import requests
 
 from tests.faults import comparison, sweeps
-from tests.faults.test_full_disks import deliver
+from tests.faults.sweeps import deliver
 from tests.integration.conftest import Program
 from tests.integration.test_mlflow_tracking import Server
+from tests.integration.test_refusing_mlflow import TODO, refusing
+from tests.integration.test_secrets import PASSWORD, USER, mlflow_server
+
+__all__ = ["mlflow_server"]
 
 pytestmark = pytest.mark.thorough
 
@@ -28,11 +33,11 @@ def server(tmp_path: Path) -> Iterator[Server]:
     own.signal(signal.SIGKILL)
 
 
-def same(unbroken: Path, program: Program, server: Server) -> None:
+def same(unbroken: Path, program: Program, uri: str) -> None:
     results = program.folder / "results"
     assert comparison.nodes(results) == comparison.nodes(unbroken)
     expected = comparison.logged(f"sqlite:///{unbroken}/mlflow.db")
-    assert comparison.logged(server.uri) == expected
+    assert comparison.logged(uri) == expected
 
 
 def test_a_server_that_is_away_for_a_minute(
@@ -49,7 +54,7 @@ def test_a_server_that_is_away_for_a_minute(
     assert process.returncode == 0, output
     if "did not reach MLflow" in output:  # the sweep was over before the server was back
         deliver(program)
-    same(unbroken, program, server)
+    same(unbroken, program, server.uri)
 
 
 def test_a_server_that_stays_away(program: Program, unbroken: Path, server: Server) -> None:
@@ -64,4 +69,51 @@ def test_a_server_that_stays_away(program: Program, unbroken: Path, server: Serv
     server.wait()
     deliver(program)
     deliver(program)  # twice changes nothing
-    same(unbroken, program, server)
+    same(unbroken, program, server.uri)
+
+
+def test_a_server_that_answers_500(program: Program, unbroken: Path, server: Server) -> None:
+    """To everything, from the first run on; what it is to get follows when it is well again."""
+    program.write(sweeps.document(mlflow={"tracking_uri": server.uri}))
+    process = sweeps.start_until(program, "pretrain/Point/seed0: started")
+    server.signal(signal.SIGKILL)
+    with refusing(500, server.port):
+        output, errors = process.communicate(timeout=600)
+        assert process.returncode == 0, output + errors
+        assert f"did not reach MLflow at {server.uri}" in output
+        assert TODO[500] in output
+        assert TODO[500] in deliver(program, code=2)
+    server.start()
+    server.wait()
+    deliver(program)
+    same(unbroken, program, server.uri)
+
+
+def test_a_password_that_is_changed(
+    program: Program, unbroken: Path, mlflow_server: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While the sweep goes on with the old one, until somebody delivers with the new one."""
+    monkeypatch.setenv("MLFLOW_TRACKING_USERNAME", USER)
+    program.environment |= {
+        "MLFLOW_TRACKING_USERNAME": USER,
+        "MLFLOW_TRACKING_PASSWORD": PASSWORD,
+    }
+    program.write(sweeps.document(mlflow={"tracking_uri": mlflow_server}))
+    process = sweeps.start_until(program, "pretrain/Point/seed0: started")
+    changed = requests.patch(
+        f"{mlflow_server}/api/2.0/mlflow/users/update-password",
+        json={"username": USER, "password": PASSWORD[::-1], "current_password": PASSWORD},
+        auth=(USER, PASSWORD),
+        timeout=60,
+    )
+    assert changed.ok, changed.text
+    output, errors = process.communicate(timeout=600)
+    assert process.returncode == 0, output + errors
+    assert f"did not reach MLflow at {mlflow_server}" in output
+    assert TODO[401] in output
+    assert TODO[401] in deliver(program, code=2)
+    program.environment["MLFLOW_TRACKING_PASSWORD"] = PASSWORD[::-1]
+    monkeypatch.setenv("MLFLOW_TRACKING_PASSWORD", PASSWORD[::-1])
+    deliver(program)
+    same(unbroken, program, mlflow_server)
+    assert PASSWORD not in output

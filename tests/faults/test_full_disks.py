@@ -13,6 +13,7 @@ import pytest
 from music_rllib.store.node_store import NodeStore
 from music_rllib.store.object_folder import StorageError
 from tests.faults import comparison, sweeps
+from tests.faults.sweeps import deliver
 from tests.integration.conftest import Program
 
 KEY = "a" * 20
@@ -140,18 +141,3 @@ def test_a_full_disk_below_mlflow(program: Program, unbroken: Path, small_disk: 
     results = program.folder / "results"
     assert comparison.nodes(results) == comparison.nodes(unbroken)
     assert comparison.logged(uri) == comparison.logged(f"sqlite:///{unbroken}/mlflow.db")
-
-
-def deliver(program: Program) -> None:
-    """What the end of a sweep says to do."""
-    import sys
-
-    done = subprocess.run(
-        [sys.executable, "-m", "music_rllib.tracking", "deliver", "results/points"],
-        cwd=program.folder,
-        env=program.environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr

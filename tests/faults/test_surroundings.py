@@ -20,6 +20,8 @@ from tests.integration.conftest import ENVIRONMENTS, REPOSITORY
 pytestmark = pytest.mark.thorough
 
 NOBODY = ("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups")
+READS_ALL = ("--inh-caps=+dac_read_search", "--ambient-caps=+dac_read_search")
+"""For a tree, or a Python, that lies in somebody's home: it may read everything, and write nothing."""
 
 
 @pytest.fixture
@@ -47,7 +49,7 @@ def turkish(public: Path) -> dict[str, str]:
 
 def as_nobody(folder: Path, environment: dict[str, str], *command: str) -> tuple[int, str, str]:
     done = subprocess.run(
-        [*NOBODY, "sh", "-c", 'umask 077; exec "$@"', "sh", *command],
+        [*NOBODY, *READS_ALL, "sh", "-c", 'umask 077; exec "$@"', "sh", *command],
         cwd=folder,
         env=environment,
         capture_output=True,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -29,9 +30,9 @@ def status(request: pytest.FixtureRequest) -> int:
     return int(request.param)
 
 
-@pytest.fixture
-def uri(status: int) -> Iterator[str]:
-    """Of a server that is in health, and refuses everything else."""
+@contextlib.contextmanager
+def refusing(status: int, port: int = 0) -> Iterator[int]:
+    """A server that is in health, and refuses everything else; its port."""
 
     class Refusing(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
@@ -46,10 +47,16 @@ def uri(status: int) -> Iterator[str]:
         def log_message(self, *_: Any) -> None:
             pass
 
-    with ThreadingHTTPServer(("127.0.0.1", 0), Refusing) as server:
+    with ThreadingHTTPServer(("127.0.0.1", port), Refusing) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        yield f"http://user:planted-password@127.0.0.1:{server.server_address[1]}"
+        yield server.server_address[1]
         server.shutdown()
+
+
+@pytest.fixture
+def uri(status: int) -> Iterator[str]:
+    with refusing(status) as port:
+        yield f"http://user:planted-password@127.0.0.1:{port}"
 
 
 def check(code: int, message: str, status: int) -> None:

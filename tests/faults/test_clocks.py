@@ -1,0 +1,81 @@
+"""A time of day that is set while a sweep runs, for its driver and all of its workers.
+
+By a module that Python imports when it starts. Not by libfaketime: with it, `time.sleep` of Python
+3.11 fails where only the time of day is to be another (EINVAL, version 0.9.10 of Debian 12).
+"""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+
+import pytest
+
+from tests.faults import comparison, sweeps
+from tests.integration.conftest import Program
+
+pytestmark = pytest.mark.thorough
+
+HOUR = 3600
+CLOCK = """
+import os, time
+_time, _time_ns = time.time, time.time_ns
+def ahead():
+    with open(os.environ["TEST_CLOCK"]) as file:
+        return int(file.read())
+time.time = lambda: _time() + ahead()
+time.time_ns = lambda: _time_ns() + ahead() * 10**9
+"""
+
+
+class Clock:
+    """The time of day of a program and of whatever it starts."""
+
+    def __init__(self, program: Program, folder: Path) -> None:
+        self._file = folder / "clock"
+        self.set(0)
+        (folder / "sitecustomize.py").write_text(CLOCK)
+        paths = f"{folder}:{program.environment['PYTHONPATH']}"
+        program.environment |= {"PYTHONPATH": paths, "TEST_CLOCK": str(self._file)}
+
+    def set(self, seconds: int) -> None:
+        """So much later than it is."""
+        fresh = self._file.with_suffix(".new")
+        fresh.write_text(str(seconds))
+        fresh.replace(self._file)
+
+
+@pytest.fixture
+def clock(program: Program, tmp_path: Path) -> Clock:
+    folder = tmp_path / "clock"
+    folder.mkdir()
+    return Clock(program, folder)
+
+
+def test_an_hour_ahead_and_then_an_hour_back(
+    program: Program, clock: Clock, unbroken: Path, tmp_path: Path
+) -> None:
+    process = sweeps.start_until(program, "pretrain/Point/seed0: 8")
+    clock.set(HOUR)
+    sweeps.read_until(process, "finetune/Point/tac.entropic_index=1/seed0: 8")
+    clock.set(-HOUR)
+    output, errors = process.communicate(timeout=600)
+    assert process.returncode == 0, output + errors
+    assert "taken over" not in output
+    comparison.same(unbroken, tmp_path / "results")
+
+
+def test_killed_an_hour_ahead_and_continued_in_time(
+    program: Program, clock: Clock, unbroken: Path, tmp_path: Path
+) -> None:
+    """What the dead ones hold in an hour's time keeps nobody waiting."""
+    process = sweeps.start_until(program, "pretrain/Point/seed0: 8")
+    clock.set(HOUR)
+    sweeps.read_until(process, "pretrain/Point/seed0: finished")
+    for worker in sweeps.workers(process):
+        worker.send_signal(signal.SIGKILL)
+    sweeps.kill(process)
+    clock.set(0)
+    output = sweeps.finish(program)
+    assert "pretrain/Point/seed0: finished earlier, reused" in output
+    comparison.same(unbroken, tmp_path / "results")
