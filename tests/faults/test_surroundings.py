@@ -21,7 +21,7 @@ pytestmark = pytest.mark.thorough
 
 NOBODY = ("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups")
 READS_ALL = ("--inh-caps=+dac_read_search", "--ambient-caps=+dac_read_search")
-"""For a tree, or a Python, that lies in somebody's home: it may read everything, and write nothing."""
+"""For a tree, or a Python, in somebody's home: it may read everything, and write nothing."""
 
 
 @pytest.fixture
