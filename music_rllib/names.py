@@ -132,6 +132,20 @@ SETTING_ENTROPIC_INDEX = "setting/entropic_index"
 SETTING_ALPHA = "setting/alpha"
 SETTING_MI_REWARD_WEIGHT = "setting/mi_reward_weight"
 
+GROUPS = (
+    "bounds",
+    "critics",
+    "entropy",
+    "evaluation",
+    "loss",
+    "mutual_information",
+    "schedule",
+    "setting",
+    "system",
+    "training",
+)
+"""Of the names above."""
+
 # Tags -------------------------------------------------------------------------------------------
 TAG_PARENT_RUN = "mlflow.parentRunId"
 """MLflow's own tag that nests a run below another."""
@@ -145,6 +159,8 @@ TAG_SWEEP_ID = "sweep_id"
 """Tells apart sweeps of the same name that share a server; kept in the sweep's folder."""
 TAG_NODE_KEY = "node_key"
 """Content hash of the node; a child run is found again by it."""
+TAG_LABEL = "label"
+"""What the run is called in the sweep, and by `sweep evaluate`."""
 TAG_STAGE = "stage"
 TAG_TRIAL = "trial"
 TAG_VARIANT = "variant"
@@ -175,6 +191,10 @@ TAG_ALGORITHM = TAG_VERSION_PREFIX + "algorithm"
 """Version of what is computed; runs without this tag are of version 2."""
 TAG_CHANGED_PREFIX = "changed."
 """Followed by a param: its newer value (MLflow params never change) after a sweep was changed."""
+TAG_VIEW_PREFIX = "mlflow.sharedViewState."
+"""MLflow's own, of an experiment, followed by a view's key."""
+TAG_NOTE = "mlflow.note.content"
+"""MLflow's own: what the run's page shows as its description, in Markdown."""
 EXPERIMENT_TAGS = {"mlflow.experimentKind": "custom_model_development"}
 """MLflow 3 shows an experiment without it as one of language models: traces, judges, prompts."""
 TAGS_OF_A_MODEL = (

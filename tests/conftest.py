@@ -55,6 +55,10 @@ _TIERS = {
 }
 
 
+_THOROUGH_SECONDS = 1800
+"""For programs that start several times, on a machine that others keep busy."""
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Mark each test with its folder's tier, so that ``-m`` works without markers in every file.
 
@@ -65,9 +69,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             tier = _TIERS.get(item.path.relative_to(_TESTS).parts[0])
             if tier is not None:
                 item.add_marker(tier)
-    if "thorough" in (config.option.markexpr or ""):
-        return
     thorough = [item for item in items if item.get_closest_marker("thorough")]
+    if "thorough" in (config.option.markexpr or ""):
+        for item in thorough:
+            if item.get_closest_marker("timeout") is None:
+                item.add_marker(pytest.mark.timeout(_THOROUGH_SECONDS))
+        return
     if thorough:
         config.hook.pytest_deselected(items=thorough)
         items[:] = [item for item in items if not item.get_closest_marker("thorough")]

@@ -8,7 +8,7 @@ within a sweep and between sweeps.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from music_rllib.config.run_settings import RunSettings
@@ -70,6 +70,8 @@ class Node:
     trial: int
     label: str
     part: str = ""
+    values: Mapping[str, Any] = field(default_factory=dict, compare=False)
+    """As those of the run."""
 
 
 class Plan:
@@ -216,6 +218,7 @@ class Plan:
             trial=run.trial,
             label=run.label,
             part=run.part,
+            values=run.values,
         )
         self._nodes.setdefault(run.key, node)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -9,12 +10,12 @@ from typing import Any
 from music_rllib import names
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.tac_settings import LearnedAlpha, MatchedAlpha, NormalisedAlpha, in_words
-from music_rllib.experiment.plan import Node
+from music_rllib.experiment.plan import Node, short
 from music_rllib.schedules import Linear, Measured, Piecewise, value_at
 from music_rllib.store.files import content_key
 from music_rllib.version import ALGORITHM_VERSION
 
-__all__ = ["RunInfo", "run_info"]
+__all__ = ["RunInfo", "run_info", "run_name"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,7 +25,7 @@ class RunInfo:
     node_key: str
     """The node's content hash; the run is found again by it."""
     name: str
-    """Shown in MLflow's lists, for example ``finetune/q=1.5/FetchPush/seed=0``."""
+    """Shown in MLflow's lists, for example ``q=1.5 seed 0 FetchPush finetune``."""
     config: Mapping[str, object]
     """Everything that determines the run: becomes params and the artefact ``config/run.yaml``."""
     tags: Mapping[str, object] = field(default_factory=dict)
@@ -35,6 +36,21 @@ class RunInfo:
     """Node key of the run whose handoff this one starts from."""
 
 
+_SHORT = {"tac.entropic_index": "q", "music.mi_reward_weight": "weight"}
+
+
+def run_name(node: Node) -> str:
+    """What differs between runs, then what they are runs of: `q=1.5 seed 0 FetchPush finetune`."""
+    last = Counter(name.rpartition(".")[2] for name in node.values)
+    parts = []
+    for name, value in sorted(node.values.items(), key=lambda item: item[0] not in _SHORT):
+        end = name.rpartition(".")[2]
+        shown = _SHORT.get(name, end if last[end] == 1 and ":" not in name else name)
+        parts.append(f"{shown}={short(value)}")
+    seed = f"seed {node.run.seed}"
+    return " ".join(filter(None, (*parts, seed, node.run.task.name, node.stage, node.part)))
+
+
 def run_info(node: Node) -> RunInfo:
     """A node as MLflow shows it."""
     run = node.run
@@ -42,9 +58,10 @@ def run_info(node: Node) -> RunInfo:
     q, alpha, weight = run.tac.entropic_index, run.tac.alpha, run.music.mi_reward_weight
     return RunInfo(
         node_key=node.key,
-        name=node.label,
+        name=run_name(node),
         config=config,
         tags={
+            names.TAG_LABEL: node.label,
             names.TAG_STAGE: node.stage,
             names.TAG_TRIAL: node.trial,
             names.TAG_PART: node.part or None,

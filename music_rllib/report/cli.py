@@ -18,6 +18,7 @@ from music_rllib.results.comparison import GAP
 from music_rllib.results.data import ReportError
 
 if TYPE_CHECKING:
+    from music_rllib.report.build import Report
     from music_rllib.report.location import Found
 
 __all__ = ["app"]
@@ -194,18 +195,21 @@ def _report(
         for line in verdict(analysis.scopes[0], difference):
             typer.echo(for_people(f"{analysis.stage.name}: {line}"))
     if attach:
-        _attach(found, page.parent)
+        _attach(found, page.parent, made)
     typer.echo(f"Report: {page.absolute()}")
     if found.damaged is not None:
         typer.echo(f"error: {redact(found.damaged)}", err=True)
         raise typer.Exit(DAMAGED)
 
 
-def _attach(found: Found, folder: Path) -> None:
+def _attach(found: Found, folder: Path, made: Report) -> None:
+    from music_rllib.report.tables import note
     from music_rllib.results.from_mlflow import attach
 
     if found.store is None:
         raise ReportError("--attach needs a sweep that is read from MLflow, got an exported one")
-    attach(found.store, found.sweep.run_id, folder, "report")
+    figure = f"report/figures/{made.drawings[0].name}.png" if made.drawings else None
+    text = note(made.analyses, found.sweep.run_id, figure)
+    attach(found.store, found.sweep.run_id, folder, "report", text)
     where = found.sweep.url(found.sweep.run_id) or f"run {found.sweep.run_id}"
     typer.echo(for_people(f"Attached to the sweep's run in MLflow: {where}"))

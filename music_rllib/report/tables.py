@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -15,6 +16,7 @@ __all__ = [
     "Table",
     "finals_table",
     "improvement_table",
+    "note",
     "races_table",
     "runs_table",
     "waits_table",
@@ -64,6 +66,34 @@ def finals_table(analyses: Iterable[StageAnalysis]) -> Table:
             for final in scope.finals
         ],
     )
+
+
+def note(analyses: Iterable[StageAnalysis], run_id: str, figure: str | None) -> str:
+    """The last stage's conditions and the report's first figure, in Markdown for MLflow's page.
+
+    Args:
+        analyses: Of the sweep's stages.
+        run_id: Of the sweep's own run.
+        figure: An artefact of it; None where nothing is drawn.
+    """
+    columns = ("tasks", "condition", "seeds", "metric", "mean", "lower", "upper")
+    final = finals_table(list(analyses)[-1:])
+    cells = [[str(row[final.columns.index(name)]) for name in columns] for row in _rounded(final)]
+    lines = [f"| {' | '.join(map(_escaped, row))} |" for row in (columns, *cells)]
+    lines.insert(1, "|---" * len(columns) + "|")
+    if figure is not None:
+        # MLflow's pages and artefacts have one origin.
+        lines[:0] = [f"![{figure}](get-artifact?path={figure}&run_uuid={run_id})", ""]
+    return "\n".join(lines)
+
+
+def _rounded(table: Table) -> Iterable[list[object]]:
+    for row in table.rows:
+        yield [f"{value:.3g}" if isinstance(value, float) else value for value in row]
+
+
+def _escaped(text: str) -> str:
+    return re.sub(r"([\\`*_\[\]<>|#!~])", r"\\\1", text)
 
 
 def improvement_table(analyses: Iterable[StageAnalysis]) -> Table:

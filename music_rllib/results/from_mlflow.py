@@ -92,8 +92,8 @@ def read_mlflow(
         ) from error
 
 
-def attach(store: TrackingStore, run_id: str, folder: Path, name: str) -> None:
-    """Keep the files of `folder` as artefacts of a run, below `name`.
+def attach(store: TrackingStore, run_id: str, folder: Path, name: str, note: str) -> None:
+    """Keep the files of `folder` as artefacts of a run, below `name`, and `note` on its page.
 
     Raises:
         ReportError: where MLflow does not take them.
@@ -102,6 +102,7 @@ def attach(store: TrackingStore, run_id: str, folder: Path, name: str) -> None:
     client = _open(store)
     try:
         client.log_artifacts(run_id, str(folder), name)
+        client.set_tag(run_id, names.TAG_NOTE, note)
     except Exception as error:
         raise ReportError(
             f"MLflow at {store.public_uri} must take the report, it answered: {_first_line(error)}"
@@ -200,7 +201,7 @@ def _search(client: MlflowClient, experiment_id: str, tags: Mapping[str, str]) -
 def _record(run: Run) -> RunRecord:
     return RunRecord(
         run_id=run.info.run_id,
-        name=run.info.run_name or run.info.run_id,
+        name=run.data.tags.get(names.TAG_LABEL) or run.info.run_name or run.info.run_id,
         status=run.info.status,
         started=run.info.start_time,
         ended=run.info.end_time,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import signal
 import sys
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -299,15 +300,18 @@ def _open(console: Console, config: SweepConfig, *, retrain_damaged: bool = Fals
 
 
 def _open_tracker(opened: Sweep) -> Tracker:
+    from music_rllib.sweep.listeners.mlflow_view import VERSIONS, comparison_view
     from music_rllib.tracking.tracker import Tracker
 
-    return Tracker(
+    tracker = Tracker(
         sweep_name=opened.config.name,
         storage=opened.storage,
         config=opened.config.document,
         tracking_uri=opened.config.mlflow.tracking_uri,
         sweep_folder=opened.folder,
     )
+    tracker.keep_view(comparison_view(opened.plan, tracker.sweep_id, time.time()), VERSIONS)
+    return tracker
 
 
 def _compute_and_report(console: Console, opened: Sweep, tracker: Tracker) -> int:
@@ -338,6 +342,7 @@ def _compute_and_report(console: Console, opened: Sweep, tracker: Tracker) -> in
         report = report_at_end(opened.folder, config.mlflow.tracking_uri, config.path)
         if report is not None:
             console.print(Text(report), soft_wrap=True)
+    console.print(Text(f"Compare in MLflow: {tracker.comparison_url()}"), soft_wrap=True)
     console.print(Text(f"Open MLflow's pages with: {tracker.ui_command()}"), soft_wrap=True)
     if stopped_by is not None:
         _say_how_to_continue(console)

@@ -155,6 +155,10 @@ class Experiment:
         """Mark the run as ended at ``time`` (ms since the epoch)."""
         self._client.set_terminated(run_id, status=status, end_time=time)
 
+    def keep_view(self, key: str, content: str) -> None:
+        """Keep a view of the experiment's pages under a key of its own."""
+        self._client.set_experiment_tag(self.id, names.TAG_VIEW_PREFIX + key, content)
+
     def upload(self, run_id: str, name: str, file: Path) -> None:
         """Store ``file`` as the artefact ``name`` (its last part is the file's name)."""
         folder = name.rpartition("/")[0]

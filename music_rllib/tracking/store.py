@@ -49,11 +49,16 @@ class TrackingStore:
         arguments = [_mlflow_program(), "ui", "--backend-store-uri", self.public_uri]
         return f"{_LOW_MEMORY} {shlex.join(arguments)}"
 
+    @property
+    def pages(self) -> str:
+        """The address of MLflow's pages: the server's, or that of what `ui_command` starts."""
+        return self.public_uri.rstrip("/") if self.is_server else "http://127.0.0.1:5000"
+
     def run_url(self, experiment_id: str, run_id: str) -> str | None:
         """The page of a run, where a server shows it."""
         if not self.is_server:
             return None
-        return f"{self.public_uri.rstrip('/')}/#/experiments/{experiment_id}/runs/{run_id}"
+        return f"{self.pages}/#/experiments/{experiment_id}/runs/{run_id}"
 
 
 def resolve_store(tracking_uri: str | None, storage: str) -> TrackingStore:
@@ -116,6 +121,22 @@ def check_reachable(store: TrackingStore) -> None:
         )
     if answer.status_code >= 500:
         raise _unreachable(store, f"it answered with status {answer.status_code}")
+
+
+def version(store: TrackingStore) -> str | None:
+    """The MLflow whose pages show the store; None where a server doesn't say."""
+    import mlflow
+    import requests
+
+    if not store.is_server:
+        return mlflow.__version__
+    try:
+        answer = requests.get(
+            f"{store.uri.rstrip('/')}/version", timeout=(CONNECT_SECONDS, ANSWER_SECONDS)
+        )
+        return answer.text.strip() if answer.ok else None
+    except requests.RequestException:
+        return None
 
 
 def _embedded(folder: Path) -> TrackingStore:

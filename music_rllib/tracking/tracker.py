@@ -7,14 +7,16 @@ sweep's folder (:mod:`music_rllib.tracking.spool`), and a thread delivers it.
 from __future__ import annotations
 
 import json
+import logging
 import re
 import shlex
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Self
+from urllib.parse import urlencode
 
 import yaml
 
@@ -22,11 +24,14 @@ from music_rllib import names
 from music_rllib.errors import TrackingError
 from music_rllib.experiment.run_info import RunInfo
 from music_rllib.redaction import flat_params, redact, without_secrets
+from music_rllib.tracking.mlflow_client import first_line
 from music_rllib.tracking.provenance import provenance_tags
 from music_rllib.tracking.sender import Backlog
 from music_rllib.tracking.session import Session, SweepRecord, new_sweep_id, relative_storage
 from music_rllib.tracking.spool import Finish, Metrics, Record, Spool, Start, Status
-from music_rllib.tracking.store import check_reachable, local_folder, resolve_store
+from music_rllib.tracking.store import check_reachable, local_folder, resolve_store, version
+
+logger = logging.getLogger(__name__)
 
 MAX_FAILURE_LENGTH = 1000
 """Characters of a failure's cause that are kept as a tag; the rest is in the run's log."""
@@ -102,6 +107,7 @@ class Tracker:
         self._open: dict[str, Spool] = {}
         self._checked_names: set[str] = set()
         self._left: Backlog | None = None
+        self._view: dict[str, str] = {}
         self._unwritten: str | None = None
         """Why something could not even be kept on disk."""
         try:
@@ -228,6 +234,31 @@ class Tracker:
         """The page of a run; None without a server, or until the server has the run."""
         run_id = self.run_id(node_key)
         return None if run_id is None else self.store.run_url(self.experiment_id, run_id)
+
+    @property
+    def sweep_id(self) -> str:
+        """What the sweep's runs are tagged with."""
+        return self._sweep_tags[names.TAG_SWEEP_ID]
+
+    def keep_view(self, content: str, versions: Sequence[str]) -> None:
+        """Have :meth:`comparison_url` open a view, where MLflow is of one of these versions.
+
+        Another one may have another format. Never fails: the page is of use without a view.
+        """
+        found = version(self.store) or ""
+        if not found.startswith(tuple(f"{known}." for known in versions)):
+            return
+        try:
+            self._session.experiment.keep_view(self.sweep_id, content)
+        except Exception as error:
+            logger.warning("MLflow's page has no view of the sweep: %s", first_line(error))
+        else:
+            self._view = {"viewStateShareKey": self.sweep_id}
+
+    def comparison_url(self) -> str:
+        """The chart page of the sweep's experiment, with the view of `keep_view`."""
+        query = urlencode({"compareRunsMode": "CHART", **self._view})
+        return f"{self.store.pages}/#/experiments/{self.experiment_id}/runs?{query}"
 
     def ui_command(self) -> str:
         """What opens MLflow's pages: a command, or a server's address."""

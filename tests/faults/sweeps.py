@@ -17,8 +17,10 @@ import yaml
 
 from tests.integration.conftest import ENVIRONMENTS, REPOSITORY, SWEEP, Program, end
 
-FIRST_SIGN = 180.0
+FIRST_SIGN = 400.0
 """Seconds that a start may take on a busy machine."""
+PATIENCE = 900.0
+"""Seconds that a whole sweep may take there."""
 
 
 def document(**changes: Any) -> dict[str, Any]:
@@ -74,7 +76,7 @@ def read_until(process: subprocess.Popen[str], *signs: str) -> str:
 def kill(process: subprocess.Popen[str]) -> None:
     """`kill -9` the driver alone; Ray's processes must notice by themselves."""
     os.kill(process.pid, signal.SIGKILL)
-    process.communicate(timeout=120)
+    process.communicate(timeout=PATIENCE)
 
 
 def workers(process: subprocess.Popen[str]) -> Iterator[psutil.Process]:
@@ -98,7 +100,7 @@ def kill_a_worker(process: subprocess.Popen[str]) -> None:
     raise AssertionError("no worker came up")
 
 
-def finish(program: Program, timeout: float = 600) -> str:
+def finish(program: Program, timeout: float = PATIENCE) -> str:
     """Run to the end, which is good; what was said."""
     code, output, errors = program.run(timeout=timeout)
     assert code == 0, output + errors

@@ -59,7 +59,7 @@ def test_an_hour_ahead_and_then_an_hour_back(
     clock.set(HOUR)
     sweeps.read_until(process, "finetune/Point/tac.entropic_index=1/seed0: 8")
     clock.set(-HOUR)
-    output, errors = process.communicate(timeout=600)
+    output, errors = process.communicate(timeout=sweeps.PATIENCE)
     assert process.returncode == 0, output + errors
     assert "taken over" not in output
     comparison.same(unbroken, tmp_path / "results")

@@ -48,7 +48,7 @@ def two_nodes() -> Iterator[tuple[str, int]]:
         line: Any = next(line for line in process.stdout if ":" in line).split()
         yield line[0], int(line[1])
     finally:
-        process.communicate("", timeout=120)
+        process.communicate("", timeout=sweeps.PATIENCE)
 
 
 def test_the_raylet_of_a_second_node_is_killed(
@@ -58,6 +58,6 @@ def test_the_raylet_of_a_second_node_is_killed(
     program.environment["RAY_ADDRESS"] = address
     process = sweeps.start_until(program, "finetune/Point/tac.entropic_index=2/seed0: started")
     os.kill(raylet, signal.SIGKILL)
-    output, errors = process.communicate(timeout=600)
+    output, errors = process.communicate(timeout=sweeps.PATIENCE)
     assert process.returncode == 0, output + errors
     comparison.same(unbroken, program.folder / "results")

@@ -37,7 +37,7 @@ def test_a_local_ray_that_dies_ends_the_driver_in_good_order(
     process = sweeps.start_until(program, "pretrain/Point/seed0: started")
     pid = daemon(process.pid, name)
     os.kill(pid, signal.SIGKILL)
-    output, errors = process.communicate(timeout=60)
+    output, errors = process.communicate(timeout=sweeps.PATIENCE)
     assert process.returncode == 1, output + errors
     assert f"the local Ray has died: its {name} (process {pid}) is gone" in output
     check_end(program, output)
@@ -58,7 +58,7 @@ def test_a_cluster_whose_head_dies_ends_the_driver_in_good_order(
     head = psutil.Process(raylet).parent()
     assert head is not None
     os.kill(daemon(head.pid, "gcs_server"), signal.SIGKILL)
-    output, errors = process.communicate(timeout=60)
+    output, errors = process.communicate(timeout=sweeps.PATIENCE)
     assert process.returncode == 1, output + errors
     assert f"the Ray cluster at {address} has died or can't be reached: {address} has" in output
     check_end(program, output)

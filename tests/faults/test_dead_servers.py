@@ -50,7 +50,7 @@ def test_a_server_that_is_away_for_a_minute(
     time.sleep(60.0)
     server.start()
     server.wait()
-    output, _ = process.communicate(timeout=600)
+    output, _ = process.communicate(timeout=sweeps.PATIENCE)
     assert process.returncode == 0, output
     if "did not reach MLflow" in output:  # the sweep was over before the server was back
         deliver(program)
@@ -61,7 +61,7 @@ def test_a_server_that_stays_away(program: Program, unbroken: Path, server: Serv
     program.write(sweeps.document(mlflow={"tracking_uri": server.uri}))
     process = sweeps.start_until(program, "pretrain/Point/seed0: started")
     server.signal(signal.SIGKILL)
-    output, _ = process.communicate(timeout=600)
+    output, _ = process.communicate(timeout=sweeps.PATIENCE)
     assert process.returncode == 0, output
     assert f"did not reach MLflow at {server.uri}" in output
     assert "python -m music_rllib.tracking deliver" in output
@@ -78,7 +78,7 @@ def test_a_server_that_answers_500(program: Program, unbroken: Path, server: Ser
     process = sweeps.start_until(program, "pretrain/Point/seed0: started")
     server.signal(signal.SIGKILL)
     with refusing(500, server.port):
-        output, errors = process.communicate(timeout=600)
+        output, errors = process.communicate(timeout=sweeps.PATIENCE)
         assert process.returncode == 0, output + errors
         assert f"did not reach MLflow at {server.uri}" in output
         assert TODO[500] in output
@@ -107,7 +107,7 @@ def test_a_password_that_is_changed(
         timeout=60,
     )
     assert changed.ok, changed.text
-    output, errors = process.communicate(timeout=600)
+    output, errors = process.communicate(timeout=sweeps.PATIENCE)
     assert process.returncode == 0, output + errors
     assert f"did not reach MLflow at {mlflow_server}" in output
     assert TODO[401] in output

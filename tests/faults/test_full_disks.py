@@ -113,7 +113,7 @@ def test_a_disk_that_fills_up_during_a_sweep(
     program.write(sweeps.document(storage=str(disk / "results")))
     process = sweeps.start_until(program, "pretrain/Point/seed0: 4", "pretrain/Point/seed0: 8")
     ballast = fill(disk)
-    output, errors = process.communicate(timeout=300)
+    output, errors = process.communicate(timeout=sweeps.PATIENCE)
     assert process.returncode == 1, output + errors
     assert "pretrain/Point/seed0: FAILED: StorageError: " in output
     assert f"{disk}/results" in output
@@ -131,7 +131,7 @@ def test_a_full_disk_below_mlflow(program: Program, unbroken: Path, small_disk: 
     program.write(sweeps.document(mlflow={"tracking_uri": uri}))
     process = sweeps.start_until(program, "pretrain/Point/seed0: started")
     ballast = fill(disk)
-    output, errors = process.communicate(timeout=600)
+    output, errors = process.communicate(timeout=sweeps.PATIENCE)
     assert process.returncode == 0, output + errors
     assert "did not reach MLflow" in output
     assert "python -m music_rllib.tracking deliver" in output

@@ -121,7 +121,7 @@ def test_one_that_hangs_while_it_is_checked_ends_the_program(
     }
     document["resources"] |= {"hang_minutes": 0.1}
     program.write(document)
-    code, _, errors = program.run("--dry-run", timeout=120)
+    code, _, errors = program.run("--dry-run", timeout=sweeps.PATIENCE)
     if locked:  # nothing else in the process can say more
         assert (code, "Timeout (0:00:11" in errors) == (1, True), errors
     else:
@@ -144,7 +144,7 @@ def test_a_run_whose_environment_hangs_fails_and_the_others_finish(
     document["resources"] |= {"hang_minutes": 0.1}
     document["stages"] = document["stages"][:1]
     program.write(document)
-    code, output, errors = program.run(timeout=300)
+    code, output, errors = program.run(timeout=sweeps.PATIENCE)
     assert code == 1, output + errors
     assert (
         "pretrain/Hanging/seed0: FAILED: HangError: environment point_env:Hanging-v0 has not "

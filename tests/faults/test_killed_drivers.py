@@ -27,7 +27,7 @@ def test_a_killed_worker_then_sigterm_then_a_killed_driver(
     assert "The worker process died" in output
     assert f"Another worker goes on from the last checkpoint (1 of {RESTARTS} times)." in output
     process.send_signal(signal.SIGTERM)
-    output, errors = process.communicate(timeout=180)
+    output, errors = process.communicate(timeout=sweeps.PATIENCE)
     assert process.returncode == 128 + signal.SIGTERM, output + errors
     assert "continue with: python -m music_rllib.sweep" in output
 
@@ -47,7 +47,7 @@ def test_told_to_stop_in_each_stage(
     process = sweeps.start_until(program, sign)
     time.sleep(1.0)
     process.send_signal(number)
-    output, errors = process.communicate(timeout=180)
+    output, errors = process.communicate(timeout=sweeps.PATIENCE)
     if sign == "starting a local Ray":  # nothing to save yet
         assert process.returncode in {128 + number, -number}, output + errors
     else:
@@ -68,7 +68,7 @@ def test_a_signal_to_the_whole_process_group_costs_an_interval_and_no_number(
     process = sweeps.start_until(program, "pretrain/Point/seed0: started")
     time.sleep(1.0)
     os.killpg(process.pid, signal.SIGTERM)
-    output, errors = process.communicate(timeout=30)
+    output, errors = process.communicate(timeout=sweeps.PATIENCE)
     assert process.returncode == 128 + signal.SIGTERM, output + errors
     assert "Ray was told to stop as well" in output
     assert "continue with: python -m music_rllib.sweep" in output
@@ -82,7 +82,7 @@ def test_a_second_signal_ends_it_at_once(program: Program, unbroken: Path) -> No
     process.send_signal(signal.SIGINT)
     sweeps.read_until(process, "stopping, this takes a few seconds")
     process.send_signal(signal.SIGINT)
-    process.communicate(timeout=30)
+    process.communicate(timeout=sweeps.PATIENCE)
     assert process.returncode == 128 + signal.SIGINT
     sweeps.finish(program)
     comparison.same(unbroken, program.folder / "results")
@@ -104,7 +104,7 @@ def test_a_run_whose_worker_dies_again_and_again_fails_with_the_cause(
         output = sweeps.read_until(process, sign)
     assert ": FAILED: The worker process died" in output
     assert last in output
-    output, errors = process.communicate(timeout=180)
+    output, errors = process.communicate(timeout=sweeps.PATIENCE)
     assert process.returncode == 1, output + errors
 
 

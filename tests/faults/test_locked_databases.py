@@ -62,7 +62,7 @@ def test_a_locked_mlflow_holds_no_run_up_and_has_each_step_once(
     with locked(results / "mlflow.db"):
         sweeps.read_until(process, "pretrain/Point/seed0: finished")
         time.sleep(10.0)
-    output, errors = process.communicate(timeout=300)
+    output, errors = process.communicate(timeout=sweeps.PATIENCE)
     assert process.returncode == 0, output + errors
     assert "did not reach MLflow" not in output
     comparison.same(unbroken, results)

@@ -54,7 +54,7 @@ def as_nobody(folder: Path, environment: dict[str, str], *command: str) -> tuple
         env=environment,
         capture_output=True,
         text=True,
-        timeout=600,
+        timeout=sweeps.PATIENCE,
         check=False,
     )
     return done.returncode, done.stdout, done.stderr

@@ -58,10 +58,10 @@ def test_a_suspended_sweep_waits_for_the_one_that_took_its_runs_over(
     second = other.start("--name", "second")
     sweeps.read_until(second, "pretrain/Point/seed0: ")
     signal_all(process, signal.SIGCONT)
-    output, errors = process.communicate(timeout=300)
+    output, errors = process.communicate(timeout=sweeps.PATIENCE)
     assert process.returncode == 0, output + errors
     assert "pretrain/Point/seed0: was taken over while this process was suspended" in output
-    output, errors = second.communicate(timeout=300)
+    output, errors = second.communicate(timeout=sweeps.PATIENCE)
     assert second.returncode == 0, output + errors
     comparison.same(unbroken, tmp_path / "results")
     theirs = comparison.logged(f"sqlite:///{other.folder}/mlflow.db", "second")
@@ -79,14 +79,14 @@ def test_a_suspended_driver_goes_on_where_nobody_drives_its_sweep(
     code, output, errors = other.run()
     assert code == 2, output + errors
     signal_all(process, signal.SIGCONT)
-    output, errors = process.communicate(timeout=300)
+    output, errors = process.communicate(timeout=sweeps.PATIENCE)
     assert process.returncode == 0, output + errors
     comparison.same(unbroken, tmp_path / "results")
 
 
 def wait_for_lease(storage: Path) -> list[Path]:
     """The run's, which its worker acquires in its first step."""
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + sweeps.FIRST_SIGN
     while not (found := list((storage / "work").glob("*/lease.json"))):
         assert time.monotonic() < deadline
         time.sleep(0.05)

@@ -1,0 +1,114 @@
+"""How MLflow's chart page shows a sweep: the link at its end opens this view of the runs.
+
+MLflow keeps what its *Save view* makes as a tag of the experiment, and opens it by the tag's key
+(`?viewStateShareKey=KEY`). That format is MLflow's own: it is read out of the pages of `VERSIONS`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from music_rllib import names
+from music_rllib.experiment.plan import Plan
+
+__all__ = ["VERSIONS", "comparison_view"]
+
+VERSIONS = ("3.17",)
+"""Of MLflow, whose pages were seen to open such a view; for others there is a plain link."""
+GROUPED = {
+    "tac.entropic_index": names.TAG_ENTROPIC_INDEX,
+    "tac.alpha": names.TAG_ALPHA,
+    "music.mi_reward_weight": names.TAG_MI_REWARD_WEIGHT,
+}
+"""Setting -> the tag by which its values are told apart."""
+OPEN, FOLDED = "comparison", "folded-"
+
+
+def comparison_view(plan: Plan, sweep_id: str, now: float) -> str:
+    """The view of a sweep's last stage: a line per condition, its metric first, the rest folded.
+
+    Args:
+        plan: The sweep's.
+        sweep_id: As its runs are tagged with it.
+        now: Seconds since the epoch.
+    """
+    runs = [node.run for node in plan.nodes]
+    stage = plan.nodes[-1].stage if plan.nodes else plan.searched[-1].name
+    tasks = list({run.task.name: run.task for run in runs}.values())
+    metrics = list(dict.fromkeys(task.primary_metric for task in tasks)) or [names.EVAL_SUCCESS]
+    metrics += [names.EVAL_RETURN, names.SHANNON_ENTROPY, names.ENTROPY, names.MI_BOUND]
+    metrics = list(dict.fromkeys(metrics))
+    varied = {name for node in plan.nodes if node.stage == stage for name in node.values}
+    tags = [names.TAG_ENTROPIC_INDEX, *(tag for name, tag in GROUPED.items() if name in varied)]
+    tags += [names.TAG_TASK] if len(tasks) > 1 else []
+    state = {
+        "searchFilter": f"tags.sweep_id = '{sweep_id}' and tags.stage = '{stage}'",
+        "orderByKey": "attributes.start_time",
+        "orderByAsc": True,
+        "startTime": "ALL",
+        "lifecycleFilter": "Active",
+        "datasetsFilter": [],
+        "selectedColumns": [
+            *(f"tags.`{tag}`" for tag in dict.fromkeys((*tags, names.TAG_SEED, names.TAG_TASK))),
+            f"metrics.`{metrics[0]}`",
+        ],
+        "runsHiddenMode": "SHOW_ALL",
+        "compareRunCharts": list(_charts(metrics)),
+        "compareRunSections": list(_sections()),
+        "isAccordionReordered": True,
+        "groupBy": {
+            "aggregateFunction": "average",
+            "groupByKeys": [{"mode": "tag", "groupByData": tag} for tag in dict.fromkeys(tags)],
+        },
+        "useGroupedValuesInCharts": True,
+        "hideEmptyCharts": True,
+    }
+    when = round(now * 1000)
+    view = {"name": f"{plan.name}: comparison", "createdAt": when, "updatedAt": when}
+    return json.dumps({**view, "state": json.dumps(state, separators=(",", ":"))})
+
+
+def _charts(metrics: Sequence[str]) -> Iterator[dict[str, Any]]:
+    for number, metric in enumerate(metrics):
+        yield _card("LINE", f"line-{number}", metric) | {
+            "metricKey": metric,
+            "selectedMetricKeys": [metric],
+            "lineSmoothness": 0,
+            "xAxisScaleType": "linear",
+            "scaleType": "linear",
+            "range": {},
+            "xAxisKey": "step",
+            "selectedXAxisMetricKey": "",
+            "yAxisKey": "metric",
+            "yAxisExpressions": [],
+            "ignoreOutliers": False,
+            "useGlobalXaxisKey": True,
+            "useGlobalLineSmoothing": True,
+        }
+        if number == 0:
+            yield _card("SCATTER", "at-its-end", f"{metric} at the end, against q") | {
+                "xaxis": {"key": names.SETTING_ENTROPIC_INDEX, "type": "METRIC"},
+                "yaxis": {"key": metric, "type": "METRIC"},
+            }
+
+
+def _card(kind: str, uuid: str, title: str) -> dict[str, Any]:
+    return {
+        "type": kind,
+        "uuid": uuid,
+        "displayName": title,
+        "metricSectionId": OPEN,
+        "runsCountToCompare": 100,
+        "deleted": False,
+        "isGenerated": False,
+    }
+
+
+def _sections() -> Iterator[dict[str, Any]]:
+    """MLflow makes one of each group of metrics; what is there already stays as it is."""
+    yield {"uuid": OPEN, "name": "Comparison", "display": True, "isReordered": True}
+    for group in (*names.GROUPS, "Model metrics", "System metrics"):
+        section = {"uuid": f"{FOLDED}{group}", "name": group, "display": False}
+        yield section | {"isReordered": False}
