@@ -18,8 +18,8 @@ from music_rllib.results.comparison import GAP
 from music_rllib.results.data import ReportError
 
 if TYPE_CHECKING:
-    from music_rllib.report.build import Report
     from music_rllib.report.location import Found
+    from music_rllib.report.page import Report
 
 __all__ = ["app"]
 
@@ -208,7 +208,9 @@ def _attach(found: Found, folder: Path, made: Report) -> None:
 
     if found.store is None:
         raise ReportError("--attach needs a sweep that is read from MLflow, got an exported one")
-    figure = f"report/figures/{made.drawings[0].name}.png" if made.drawings else None
+    last = made.analyses[-1].stage.name if made.analyses else ""
+    shown = sorted((d.name for d in made.drawings), key=lambda name: not name.startswith(last))
+    figure = f"report/figures/{shown[0]}.png" if shown else None
     text = note(made.analyses, found.sweep.run_id, figure)
     attach(found.store, found.sweep.run_id, folder, "report", text)
     where = found.sweep.url(found.sweep.run_id) or f"run {found.sweep.run_id}"

@@ -83,7 +83,7 @@ def note(analyses: Iterable[StageAnalysis], run_id: str, figure: str | None) -> 
     lines.insert(1, "|---" * len(columns) + "|")
     if figure is not None:
         # MLflow's pages and artefacts have one origin.
-        lines[:0] = [f"![{figure}](get-artifact?path={figure}&run_uuid={run_id})", ""]
+        lines += ["", f"![{figure}](get-artifact?path={figure}&run_uuid={run_id})"]
     return "\n".join(lines)
 
 

@@ -110,7 +110,15 @@ def finish(program: Program, timeout: float = PATIENCE) -> str:
 def deliver(program: Program, code: int = 0) -> str:
     """What the end of a sweep says to do where MLflow lacks something; what it says."""
     done = subprocess.run(
-        [sys.executable, "-m", "music_rllib.tracking", "deliver", "results/points"],
+        [
+            sys.executable,
+            "-m",
+            "music_rllib.tracking",
+            "deliver",
+            "results/points",
+            "--timeout",
+            "600",
+        ],
         cwd=program.folder,
         env=program.environment,
         capture_output=True,

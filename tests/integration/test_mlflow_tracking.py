@@ -576,6 +576,16 @@ def server(tmp_path_factory: pytest.TempPathFactory, fresh_store: FreshStore) ->
     server.signal(signal.SIGKILL)
 
 
+def test_a_view_is_kept_for_the_mlflow_that_knows_it(tracker_on: MakeTracker) -> None:
+    tracker = tracker_on()
+    plain = tracker.comparison_url()
+    tracker.keep_view("{}", ["2.0", "3"])
+    assert tracker.comparison_url() == f"{plain}&viewStateShareKey={tracker.sweep_id}"
+    other = tracker_on(sweep_name="other")
+    other.keep_view("{}", ["2.0", "4"])
+    assert "viewStateShareKey" not in other.comparison_url()
+
+
 def test_a_server_killed_while_logging_loses_and_doubles_nothing(
     server: Server, tracker_on: MakeTracker, policy: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

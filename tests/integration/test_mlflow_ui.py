@@ -23,7 +23,7 @@ from mlflow import MlflowClient
 from music_rllib import names
 from music_rllib.report.build import PAGE
 from tests.integration.conftest import ENVIRONMENTS, REPOSITORY, SWEEP
-from tests.integration.devtools import Page
+from tests.integration.devtools import PATIENCE, Page
 
 # A server without accounts has nobody to name.
 HARMLESS = ("mlflow/users/current",)
@@ -80,7 +80,8 @@ def test_each_run_has_its_policy_and_evaluate_finds_it_by_label(finished: Finish
     runs = {name: run for name, run in finished.runs().items() if name != "points"}
     models = finished.client.search_logged_models([finished.experiment_id])
     assert {model.source_run_id for model in models} == {run.info.run_id for run in runs.values()}
-    label = next(name for name in runs if name.startswith("finetune"))
+    name = next(name for name in runs if name.startswith("q=1 "))
+    label = runs[name].data.tags[names.TAG_LABEL]
     # The policy's file names a module, which only the user may have imported.
     options = ["--episodes", "2", "--json", "--env", "point_env:Point-v0"]
     done = subprocess.run(
@@ -95,7 +96,7 @@ def test_each_run_has_its_policy_and_evaluate_finds_it_by_label(finished: Finish
     assert (done.returncode, done.stderr) == (0, "")
     document = json.loads(done.stdout)
     assert (document["task"], document["env_steps"]) == ("Point", 1200)
-    assert document["node_key"] == runs[label].data.tags[names.TAG_NODE_KEY]
+    assert document["node_key"] == runs[name].data.tags[names.TAG_NODE_KEY]
 
 
 def _python_path() -> str:
@@ -136,9 +137,41 @@ def test_mlflow_s_pages_filter_and_compare(
 ) -> None:
     program = require_service("chromium")
     runs = finished.runs()
-    pair = [run.info.run_id for name, run in runs.items() if name.startswith("finetune")]
+    pair = [run.info.run_id for name, run in runs.items() if name.startswith("q=")]
     assert len(pair) == 2
     asyncio.run(_look(finished, server, program, tmp_path, pair))
+
+
+def test_the_link_at_the_end_opens_the_comparison(
+    finished: Finished, server: str, require_service: Callable[[str], Path], tmp_path: Path
+) -> None:
+    """Grouped by q, the task's metric first; and the sweep's page shows its result."""
+    program = require_service("chromium")
+    said, _, link = finished.output.splitlines()[-2].partition("http://127.0.0.1:5000/")
+    assert said == "Compare in MLflow: "
+    asyncio.run(_compare(finished, f"{server}/{link}", server, program, tmp_path))
+
+
+async def _compare(finished: Finished, link: str, server: str, program: Path, folder: Path) -> None:
+    async with Page(program, folder) as page:
+        await page.go(link)
+        text = await page.wait_for(
+            "Group by: entropic_index",
+            *("Group: 1", "Group: 2", "q=2 seed 0 Point"),
+            *("Comparison", names.EVAL_SUCCESS, "setting/entropic_index vs."),
+        )
+        assert "seed 0 Point pretrain" not in text
+        assert names.CRITIC_LOSS not in text, "it is folded away"
+        run_id = finished.runs()["points"].info.run_id
+        await page.go(f"{server}/#/experiments/{finished.experiment_id}/runs/{run_id}")
+        await page.wait_for("Description", "condition", "q = 1", "q = 2")
+        loaded = "[...document.images].some(i => i.src.includes('get-artifact') && i.naturalWidth)"
+        deadline = time.monotonic() + PATIENCE
+        while not await page.evaluate(loaded):
+            assert time.monotonic() < deadline, "the report's figure is on the page"
+            await asyncio.sleep(0.3)
+        errors = [e for e in page.errors if not any(words in e for words in HARMLESS)]
+    assert not errors
 
 
 async def _look(
@@ -159,8 +192,8 @@ async def _look(
         compared = quote(json.dumps(pair, separators=(",", ":")))
         experiments = quote(json.dumps([finished.experiment_id]))
         await page.go(f"{server}/#/compare-runs?runs={compared}&experiments={experiments}")
-        await page.wait_for("Comparing 2 Runs", "finetune/Point/", "tac.entropic_index")
+        await page.wait_for("Comparing 2 Runs", "q=2 seed 0 Point", "tac.entropic_index")
         await page.go(f"{pages}/models")
-        await page.wait_for("policy", "Ready", "finetune/Point/")
+        await page.wait_for("policy", "Ready", "q=2 seed 0 Point")
         errors = [e for e in page.errors if not any(words in e for words in HARMLESS)]
     assert not errors

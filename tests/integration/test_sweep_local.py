@@ -28,7 +28,7 @@ Runs = Callable[[], dict[str, Any]]
 
 EXPECTED = re.compile(
     r"\[ *\d+:\d\d\] (pretrain/|finetune/|starting a local Ray$|best so far: finetune )"
-    r"|[│┃┏┡└]|Sweep |Results |Storage: |3 runs, |Open MLflow's pages with: "
+    r"|[│┃┏┡└]|Sweep |Results |Storage: |3 runs, |Compare in MLflow: |Open MLflow's pages with: "
 )
 """Lines of a sweep in which nothing goes wrong."""
 
@@ -87,16 +87,17 @@ def test_a_sweep_from_the_plan_to_mlflow_and_then_a_finer_one(
 def check_mlflow(runs: dict[str, Any], folder: Path, found: list[list[str]]) -> None:
     assert set(runs) == {
         "points",
-        "pretrain/Point/seed0",
-        "finetune/Point/tac.entropic_index=1/seed0",
-        "finetune/Point/tac.entropic_index=2/seed0",
+        "seed 0 Point pretrain",
+        "q=1 seed 0 Point finetune",
+        "q=2 seed 0 Point finetune",
     }
-    parent, pretrain = runs["points"], runs["pretrain/Point/seed0"]
+    parent, pretrain = runs["points"], runs["seed 0 Point pretrain"]
     for run in runs.values():
         assert run.info.status == "FINISHED"
     for q in (1, 2):
-        run = runs[f"finetune/Point/tac.entropic_index={q}/seed0"]
+        run = runs[f"q={q} seed 0 Point finetune"]
         tags = run.data.tags
+        assert tags[names.TAG_LABEL] == f"finetune/Point/tac.entropic_index={q}/seed0"
         assert tags[names.TAG_PARENT_RUN] == parent.info.run_id
         assert tags[names.TAG_SOURCE_RUN] == pretrain.info.run_id
         assert (tags[names.TAG_VARIANT], tags[names.TAG_TASK]) == ("music-r", "Point")
@@ -201,10 +202,10 @@ def test_a_failure_is_explained_and_the_others_finish(
     text = log.read_text()
     assert 'raise RuntimeError(f"the gripper fell off' in text
     assert "point_env.py" in text
-    failed = mlflow_runs()["pretrain/Broken/seed0"]
+    failed = mlflow_runs()["seed 0 Broken pretrain"]
     assert failed.info.status == "FAILED"
     assert failed.data.tags[names.TAG_FAILURE].startswith("RuntimeError: the gripper fell off")
-    assert "finetune/Broken/seed0" not in mlflow_runs()
+    assert "seed 0 Broken finetune" not in mlflow_runs()
     # What the environment said holds passwords: they are in no byte of what is kept and shown.
     files = [file for file in tmp_path.rglob("*") if file.is_file()]
     assert [file for file in files if b"planted-" in file.read_bytes()] == []
@@ -237,7 +238,7 @@ def test_stopped_killed_and_continued(
     (continued,) = re.findall(r"continues at ([\d,]+) env steps", output)
     assert int(continued.replace(",", "")) >= 2000
     assert [row[-1] for row in rows(output)] == ["finished"]
-    assert metric_steps(tmp_path, mlflow_runs()["pretrain/Point/seed0"]) == list(
+    assert metric_steps(tmp_path, mlflow_runs()["seed 0 Point pretrain"]) == list(
         range(400, 4001, 400)
     )
     assert list((tmp_path / "results" / "work").iterdir()) == []

@@ -17,7 +17,7 @@ from music_rllib.limits import (
     MOST_TABLE_TEXT,
     open_regular,
 )
-from music_rllib.results.parquet_pages import check_pages
+from music_rllib.results.archive.parquet_pages import check_pages
 
 __all__ = ["read_table", "write_table"]
 

@@ -23,6 +23,8 @@ GROUPED = {
     "music.mi_reward_weight": names.TAG_MI_REWARD_WEIGHT,
 }
 """Setting -> the tag by which its values are told apart."""
+METRICS = (names.EVAL_RETURN, names.SHANNON_ENTROPY, names.ENTROPY, names.MI_BOUND)
+"""After the tasks' own."""
 OPEN, FOLDED = "comparison", "folded-"
 
 
@@ -37,9 +39,7 @@ def comparison_view(plan: Plan, sweep_id: str, now: float) -> str:
     runs = [node.run for node in plan.nodes]
     stage = plan.nodes[-1].stage if plan.nodes else plan.searched[-1].name
     tasks = list({run.task.name: run.task for run in runs}.values())
-    metrics = list(dict.fromkeys(task.primary_metric for task in tasks)) or [names.EVAL_SUCCESS]
-    metrics += [names.EVAL_RETURN, names.SHANNON_ENTROPY, names.ENTROPY, names.MI_BOUND]
-    metrics = list(dict.fromkeys(metrics))
+    metrics = list(dict.fromkeys((*(task.primary_metric for task in tasks), *METRICS)))
     varied = {name for node in plan.nodes if node.stage == stage for name in node.values}
     tags = [names.TAG_ENTROPIC_INDEX, *(tag for name, tag in GROUPED.items() if name in varied)]
     tags += [names.TAG_TASK] if len(tasks) > 1 else []
@@ -72,7 +72,7 @@ def comparison_view(plan: Plan, sweep_id: str, now: float) -> str:
 
 def _charts(metrics: Sequence[str]) -> Iterator[dict[str, Any]]:
     for number, metric in enumerate(metrics):
-        yield _card("LINE", f"line-{number}", metric) | {
+        yield _card("LINE", f"line-{number}") | {
             "metricKey": metric,
             "selectedMetricKeys": [metric],
             "lineSmoothness": 0,
@@ -88,17 +88,16 @@ def _charts(metrics: Sequence[str]) -> Iterator[dict[str, Any]]:
             "useGlobalLineSmoothing": True,
         }
         if number == 0:
-            yield _card("SCATTER", "at-its-end", f"{metric} at the end, against q") | {
+            yield _card("SCATTER", "against-q") | {
                 "xaxis": {"key": names.SETTING_ENTROPIC_INDEX, "type": "METRIC"},
                 "yaxis": {"key": metric, "type": "METRIC"},
             }
 
 
-def _card(kind: str, uuid: str, title: str) -> dict[str, Any]:
+def _card(kind: str, uuid: str) -> dict[str, Any]:
     return {
         "type": kind,
         "uuid": uuid,
-        "displayName": title,
         "metricSectionId": OPEN,
         "runsCountToCompare": 100,
         "deleted": False,
@@ -108,7 +107,7 @@ def _card(kind: str, uuid: str, title: str) -> dict[str, Any]:
 
 def _sections() -> Iterator[dict[str, Any]]:
     """MLflow makes one of each group of metrics; what is there already stays as it is."""
-    yield {"uuid": OPEN, "name": "Comparison", "display": True, "isReordered": True}
+    yield {"uuid": OPEN, "name": "Comparison", "display": True, "isReordered": True, "columns": 2}
     for group in (*names.GROUPS, "Model metrics", "System metrics"):
         section = {"uuid": f"{FOLDED}{group}", "name": group, "display": False}
         yield section | {"isReordered": False}

@@ -1,0 +1,56 @@
+"""What MLflow shows of a sweep: the runs' names, and the view that its link opens."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from music_rllib import names
+from music_rllib.config.load import load_sweep
+from music_rllib.experiment.plan import Plan, make_plan
+from music_rllib.sweep.listeners.mlflow import run_name
+from music_rllib.sweep.listeners.mlflow_view import comparison_view
+
+STAGES: list[dict[str, Any]] = [
+    {"name": "pretrain", "variant": "music-u"},
+    {
+        "name": "finetune",
+        "variant": "music-r",
+        "init_from": "pretrain",
+        "grid": {
+            "tac.alpha": [0.1, 0.2],
+            "tac.entropic_index": [1.0, 1.5],
+            "tac.lr": [0.001],
+        },
+    },
+]
+
+
+def plan(folder: Path, tasks: list[str]) -> Plan:
+    file = folder / "sweep.yaml"
+    file.write_text(yaml.safe_dump({"name": "s", "tasks": tasks, "seeds": 2, "stages": STAGES}))
+    return make_plan(load_sweep(file))
+
+
+def test_a_run_s_name_begins_with_what_differs(tmp_path: Path) -> None:
+    called = [run_name(node) for node in plan(tmp_path, ["FetchPush", "FetchSlide"]).nodes]
+    assert len(set(called)) == len(called)
+    assert "seed 1 FetchSlide pretrain" in called
+    assert "q=1.5 alpha=0.2 lr=0.001 seed 0 FetchPush finetune" in called
+
+
+def test_the_view_has_a_line_for_each_condition_of_the_last_stage(tmp_path: Path) -> None:
+    view = json.loads(comparison_view(plan(tmp_path, ["FetchPush", "FetchSlide"]), "c0ffee", 1.5))
+    assert (view["name"], view["createdAt"]) == ("s: comparison", 1500)
+    state = json.loads(view["state"])
+    assert state["searchFilter"] == "tags.sweep_id = 'c0ffee' and tags.stage = 'finetune'"
+    grouped = [key["groupByData"] for key in state["groupBy"]["groupByKeys"]]
+    assert grouped == [names.TAG_ENTROPIC_INDEX, names.TAG_ALPHA, names.TAG_TASK]
+    assert state["compareRunCharts"][0]["metricKey"] == names.EVAL_SUCCESS
+    known = {section["uuid"] for section in state["compareRunSections"]}
+    assert {chart["metricSectionId"] for chart in state["compareRunCharts"]} <= known
+    opened = [section["name"] for section in state["compareRunSections"] if section["display"]]
+    assert opened == ["Comparison"]
