@@ -11,7 +11,7 @@ import yaml
 from music_rllib import names
 from music_rllib.config.load import load_sweep
 from music_rllib.experiment.plan import Plan, make_plan
-from music_rllib.sweep.listeners.mlflow import run_name
+from music_rllib.experiment.run_info import run_name
 from music_rllib.sweep.listeners.mlflow_view import comparison_view
 
 STAGES: list[dict[str, Any]] = [
