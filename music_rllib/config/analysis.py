@@ -77,7 +77,7 @@ class Analysis(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    question: str | None = Field(None, min_length=1, max_length=500)
+    question: str | None = Field(None, min_length=1, max_length=500, pattern=r"^[^\x00-\x1f\x7f]*$")
     """In a sentence, for the report's first line."""
     hypotheses: tuple[
         Annotated[str, Field(max_length=500), AfterValidator(_is_hypothesis)], ...

@@ -12,6 +12,7 @@ from music_rllib.report.figures.draw import draw_files, draw_inline, stale_files
 from music_rllib.report.figures.plots import METRICS
 from music_rllib.report.limitations import missing
 from music_rllib.report.page import Report, render
+from music_rllib.report.study import study_csv, study_drawings
 from music_rllib.report.tables import (
     Table,
     finals_table,
@@ -22,6 +23,7 @@ from music_rllib.report.tables import (
 )
 from music_rllib.report.videos import make_films
 from music_rllib.results.analysis import analyse, analyse_stages
+from music_rllib.results.claims.study import study_of
 from music_rllib.results.comparison import GAP
 from music_rllib.results.data import ReportError, Sweep
 from music_rllib.tracking.store import TrackingStore
@@ -68,10 +70,13 @@ def build_report(
     drawings = [d for analysis in analyses for d in stage_drawings(sweep, analysis)]
     stages = [analysis.stage for analysis in analyses]
     drawings += drawings_of_stages(sweep, stages)
+    study = study_of(sweep)
+    drawings += study_drawings(study)
     return Report(
         sweep=sweep,
         analyses=analyses,
         together=analyse_stages(sweep, stages),
+        study=study,
         drawings=drawings,
         pictures=draw_inline(drawings),
         missing=missing(sweep, analyses, undelivered) + ([damaged] if damaged else []),
@@ -119,6 +124,7 @@ def write_report(report: Report, folder: Path) -> Path:
 
 def _tables(report: Report) -> Iterable[Table]:
     pairs = [*report.analyses, *([report.together] if report.together else [])]
+    yield from study_csv(report.study)
     yield finals_table(report.analyses)
     yield waits_table(report.analyses)
     yield races_table(pairs)

@@ -22,6 +22,7 @@ from music_rllib.report.figures.choice import (
 )
 from music_rllib.report.figures.importance import FEWEST_RUNS, varied
 from music_rllib.report.pieces import Figure, Panels, TextTable, document
+from music_rllib.report.study import study_tables
 from music_rllib.report.videos import Films
 from music_rllib.report.web.charts import chart_data
 from music_rllib.report.web.sections import (
@@ -34,6 +35,8 @@ from music_rllib.report.web.sections import (
     state_in_words,
 )
 from music_rllib.results.analysis import StageAnalysis
+from music_rllib.results.claims.answer import answer, planned_in_words
+from music_rllib.results.claims.study import Study
 from music_rllib.results.comparison import verdict
 from music_rllib.results.conditions import SIDE_BY_SIDE, Stage
 from music_rllib.results.data import Sweep
@@ -51,6 +54,8 @@ class Report:
     analyses: Sequence[StageAnalysis]
     together: StageAnalysis | None
     """Stages against each other; None where there is nothing to compare."""
+    study: Study
+    """What is claimed, planned or not."""
     drawings: Sequence[Drawing]
     pictures: Mapping[str, Sequence[str]]
     """An SVG element for each panel, by the drawings' names."""
@@ -119,6 +124,9 @@ def _main(report: Report) -> StageAnalysis | None:
 
 
 def _asked(report: Report) -> str:
+    """What the plan asks, or what the sweep's conditions do."""
+    if report.study.question is not None:
+        return report.study.question
     main = _main(report)
     if main is None:
         return "Nothing has run yet."
@@ -142,13 +150,16 @@ def _labels(stage: Stage) -> list[str]:
 
 
 def _said(report: Report) -> list[str]:
-    """Of the main comparison everything; of stages that have nothing in common each one's first."""
+    """The study's answer; of final values the main comparison, and other stages' first lines."""
     main = _main(report)
     if main is None or not main.scopes:
         return []
+    planned = planned_in_words(report.study)
+    said = [f"{planned[0].upper()}{planned[1:]}.", *answer(report.sweep, report.study)[1:]]
     others = [one for one in report.analyses if one.stage.has_task_reward and one is not main]
     firsts = [] if report.together else [verdict(s.scopes[0])[0] for s in others if s.scopes]
-    return [*verdict(main.scopes[0], report.difference), *firsts]
+    finals = [verdict(main.scopes[0], report.difference)[0], *firsts]
+    return [*said, *(f"At the end of training: {line}" for line in finals)]
 
 
 # Figures ----------------------------------------------------------------------------------------
@@ -165,7 +176,7 @@ def _groups(report: Report, numbers: Mapping[str, int]) -> Iterable[Mapping[str,
     own = {drawing.stage for drawing in report.drawings if drawing.stage != SIDE_BY_SIDE}
     pairs = [*([report.together] if report.together else []), *report.analyses]
     tables: dict[str, Sequence[TextTable]] = {
-        PERFORMANCE: performance_tables(pairs) if pairs else [],
+        PERFORMANCE: [*study_tables(report.study), *(performance_tables(pairs) if pairs else [])],
         COST: [budget(report.sweep, report.analyses), failures(report.sweep)],
     }
     for group in GROUPS:
@@ -278,6 +289,10 @@ _METHOD = (
     "tie; of a return Student's; of a gap from both of its ends; of a probability of "
     "improvement Newcombe's. Simulated, they cover 93 % or more from three seeds on; rare failures "
     "that no seed has shown are not in them. From one seed there is none.",
+    "The area under a learning curve is the mean over the budget, by the trapezoid rule. It is "
+    "compared seed by seed (Student's t; Welch's without common seeds), for a difference and for "
+    "equivalence within the margin (two one-sided tests, Schuirmann 1987), with Holm's correction "
+    "over what was planned and over the rest.",
     "Permutation: the exact test over all relabellings of the runs. Three runs against three never "
     "give less than 0.1.",
     "Probability of improvement and performance profiles: Agarwal et al. 2021, Deep Reinforcement "

@@ -20,17 +20,15 @@ __all__ = ["alpha_panels", "area_profile_panels"]
 
 
 def area_profile_panels(study: Study) -> list[Panel]:
-    """Share of finished runs above each value of the primary metric, a panel for each task."""
-    by_task = groupby(study.means, key=lambda mean: mean.task)
+    """Share of finished runs above each mean success, a panel for each task that has one."""
+    rates = [mean for mean in study.means if mean.measure.is_rate]
+    by_task = groupby(rates, key=lambda mean: mean.task)
     found = [(task, list(means)) for task, means in by_task]
     return [_profile(task, means, study) for task, means in found if len(means) > 1]
 
 
 def _profile(task: str, means: Sequence[Mean], study: Study) -> Panel:
-    values = np.concatenate([list(mean.scores.by_seed.values()) for mean in means])
-    is_rate = means[0].measure.is_rate
-    ends = (0.0, 1.0) if is_rate else (float(values.min()), float(values.max()))
-    thresholds = np.linspace(*ends, 101)
+    thresholds = np.linspace(0.0, 1.0, 101)
 
     def draw(axes: Axes) -> None:
         for mean in means:

@@ -63,12 +63,10 @@ def planned_in_words(study: Study) -> str:
 
 
 def _asked(study: Study) -> str:
-    version = study.plan or study.latest
-    question = version.plan.question if version else None
-    if question is None and version is not None:
-        question = "; ".join(version.plan.hypotheses)
     text = planned_in_words(study)
-    return f"{text[0].upper()}{text[1:]}." if question is None else f"Asked: {question} ({text})."
+    if study.question is None:
+        return f"{text[0].upper()}{text[1:]}."
+    return f"Asked: {study.question} ({text})."
 
 
 def in_words(claim: Claim) -> str:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, model_validator
@@ -39,6 +39,10 @@ _TEST = (
 MOST_VERSIONS = 1000
 
 
+Line = Annotated[str, Field(max_length=100_000, pattern=r"^[^\x00-\x1f\x7f]*$")]
+"""A plan may come from strangers: without control characters, which a terminal would obey."""
+
+
 class _Strict(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -46,20 +50,20 @@ class _Strict(BaseModel):
 class AnalysisPlan(_Strict):
     """What is asked, and everything that decides it."""
 
-    question: str | None
-    hypotheses: tuple[str, ...] = Field(min_length=1, max_length=50, strict=False)
-    stage: str
+    question: Line | None
+    hypotheses: tuple[Line, ...] = Field(min_length=1, max_length=50, strict=False)
+    stage: Line
     """Whose conditions are compared, where a hypothesis names no other."""
     metric: Literal["auc", "final"]
-    primary_metric: str
+    primary_metric: Line
     """The same in words."""
     margin: float | None = Field(gt=0)
-    seeds: str
-    control: str
+    seeds: Line
+    control: Line
     """What is done for q to be compared fairly."""
-    budget: dict[str, int]
+    budget: dict[Line, int]
     """Environment steps over which runs are compared, by task."""
-    test: str
+    test: Line
 
     @model_validator(mode="after")
     def _are_hypotheses(self) -> Self:

@@ -99,6 +99,14 @@ class Study:
     """Hypotheses that can't be tested, with the reason."""
 
     @property
+    def question(self) -> str | None:
+        """The plan's; its hypotheses where it has none; None without a plan."""
+        version = self.plan or self.latest
+        if version is None:
+            return None
+        return version.plan.question or "; ".join(version.plan.hypotheses)
+
+    @property
     def claims(self) -> tuple[Claim, ...]:
         """What answers the study's question: what was planned, or all there is."""
         return self.planned or self.afterwards

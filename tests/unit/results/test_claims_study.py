@@ -309,6 +309,11 @@ def test_a_plan_is_kept_once_and_each_change_is_a_version() -> None:
     assert one.hash != other.hash
 
 
+def test_a_plan_has_no_control_characters() -> None:
+    with pytest.raises(ValueError, match="question"):
+        plan("q = 2 against q = 1", question="\x1b[2J")
+
+
 def test_a_plan_that_was_edited_is_refused() -> None:
     document = plans_as_document(recorded(plan("q = 2 against q = 1"), 5))
     document[0]["plan"]["margin"] = 0.2
