@@ -4,7 +4,8 @@ PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
-CONFIG ?= tune_configs/smoke.yaml
+# Empty: the sweep of the package, music_rllib/sweep/default.yaml.
+CONFIG ?=
 PYTEST_ARGS ?=
 SECONDS ?= 600
 SEED    ?= 0
@@ -21,7 +22,7 @@ help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 	@echo
 	@echo "  PYTHON=python3.12    the interpreter for the virtual environment (>= 3.11)"
-	@echo "  CONFIG=my.yaml       the sweep for 'make sweep' (default $(CONFIG))"
+	@echo "  CONFIG=my.yaml       another sweep for 'make sweep'"
 	@echo "  PYTEST_ARGS='-k q'   more arguments for pytest"
 	@echo "  JOBS=4               so many tests at a time (default $(JOBS); each may use two cores)"
 
@@ -45,7 +46,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@touch $@
 	@echo "$(VENV) is ready"
 
-sweep: venv  ## train the smoke sweep: MUSIC-u, then MUSIC-r over q, on FetchPush
+sweep: venv  ## the first picture: FetchReach over q, MUSIC on FetchPush (two to four minutes)
 	@$(BIN)/python -m music_rllib.sweep $(CONFIG)
 
 test: venv  ## run the whole suite (CI=true: a missing service is a failure, not a skip)

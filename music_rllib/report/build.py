@@ -8,7 +8,8 @@ from pathlib import Path
 from music_rllib import names
 from music_rllib.envs.tasks import Task
 from music_rllib.report.figures.choice import Drawing, drawings_of_stages, stage_drawings
-from music_rllib.report.figures.draw import draw_files, draw_inline, stale_files
+from music_rllib.report.figures.draw import draw_files, draw_inline, files, stale_files
+from music_rllib.report.figures.overview import overview
 from music_rllib.report.figures.plots import METRICS
 from music_rllib.report.limitations import missing
 from music_rllib.report.page import Report, render
@@ -28,9 +29,11 @@ from music_rllib.results.comparison import GAP
 from music_rllib.results.data import ReportError, Sweep
 from music_rllib.tracking.store import TrackingStore
 
-__all__ = ["PAGE", "WANTED", "build_report", "write_report"]
+__all__ = ["PAGE", "PICTURE", "WANTED", "build_report", "write_report"]
 
 PAGE = "report.html"
+PICTURE = "overview"
+"""The figure that shows the whole sweep."""
 WANTED = (
     *(metric.name for metric in METRICS),
     names.EVAL_EPISODES,
@@ -106,6 +109,9 @@ def write_report(report: Report, folder: Path) -> Path:
         here = [file.name for file in figures.iterdir()]
         for stale in stale_files({drawing.name for drawing in report.drawings}, here):
             (figures / stale).unlink()
+        if panels := overview(report.sweep, [one.stage for one in report.analyses]):
+            for ending, content in files(panels, []).items():
+                (figures / f"{PICTURE}{ending}").write_bytes(content)
         for name, drawn in draw_files(report.drawings).items():
             for ending, content in drawn.items():
                 (figures / f"{name}{ending}").write_bytes(content)

@@ -173,7 +173,7 @@ def _report(
     attach: bool,
 ) -> None:
     from music_rllib.config.load import declared_tasks
-    from music_rllib.report.build import WANTED, build_report, write_report
+    from music_rllib.report.build import PICTURE, WANTED, build_report, write_report
     from music_rllib.report.location import find_sweep
     from music_rllib.results.comparison import verdict
 
@@ -197,6 +197,9 @@ def _report(
     if attach:
         _attach(found, page.parent, made)
     typer.echo(f"Report: {page.absolute()}")
+    picture = page.parent / "figures" / f"{PICTURE}.png"
+    if picture.exists():
+        typer.echo(f"Picture: {picture.absolute()}")
     if found.damaged is not None:
         typer.echo(f"error: {redact(found.damaged)}", err=True)
         raise typer.Exit(DAMAGED)

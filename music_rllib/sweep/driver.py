@@ -337,13 +337,13 @@ def _compute_and_report(console: Console, opened: Sweep, tracker: Tracker) -> in
         console.print(view)
     if undelivered := tracker.undelivered_message():
         console.print(Text(undelivered, style="yellow"), soft_wrap=True)
+    console.print(Text(f"Compare in MLflow: {tracker.comparison_url()}"), soft_wrap=True)
+    console.print(Text(f"Open MLflow's pages with: {tracker.ui_command()}"), soft_wrap=True)
     if stopped_by is None:
         config = opened.config
         report = report_at_end(opened.folder, config.mlflow.tracking_uri, config.path)
         if report is not None:
             console.print(Text(report), soft_wrap=True)
-    console.print(Text(f"Compare in MLflow: {tracker.comparison_url()}"), soft_wrap=True)
-    console.print(Text(f"Open MLflow's pages with: {tracker.ui_command()}"), soft_wrap=True)
     if stopped_by is not None:
         _say_how_to_continue(console)
         return 128 + stopped_by

@@ -28,7 +28,8 @@ def report_at_end(folder: Path, tracking_uri: str | None, config: Path) -> str |
         config: the sweep's YAML file, whose environments are filmed.
 
     Returns:
-        A line for the user; None where `MUSIC_RLLIB_REPORT=off` says that nobody wants one.
+        Where the page and its picture are, for the user; None where `MUSIC_RLLIB_REPORT=off` says
+        that nobody wants them.
     """
     if os.environ.get(names.VARIABLE_REPORT, "").lower() in {"off", "0", "no", "false"}:
         return None
@@ -52,7 +53,8 @@ def report_at_end(folder: Path, tracking_uri: str | None, config: Path) -> str |
     lines = (done.stdout if done.returncode == 0 else done.stderr).strip().splitlines()
     if done.returncode or not lines:
         return _no_report(lines[-1] if lines else f"it ended with {done.returncode}", folder)
-    return lines[-1]
+    kept = 2 if lines[-1].startswith("Picture: ") else 1
+    return "\n".join(lines[-kept:])
 
 
 def _no_report(reason: str, folder: Path) -> str:

@@ -147,8 +147,9 @@ def test_the_link_at_the_end_opens_the_comparison(
 ) -> None:
     """Grouped by q, the task's metric first; and the sweep's page shows its result."""
     program = require_service("chromium")
-    said, _, link = finished.output.splitlines()[-2].partition("http://127.0.0.1:5000/")
-    assert said == "Compare in MLflow: "
+    _, said, rest = finished.output.partition("\nCompare in MLflow: http://127.0.0.1:5000/")
+    assert said
+    link = rest.splitlines()[0]
     asyncio.run(_compare(finished, f"{server}/{link}", server, program, tmp_path))
 
 

@@ -165,7 +165,9 @@ def page(sweep_folder: Path) -> Path:
     assert done.returncode == 0, done.stderr
     assert not done.stderr
     path = sweep_folder / "report" / PAGE
-    assert done.stdout.splitlines()[-1] == f"Report: {path}"
+    picture = path.parent / "figures" / "overview.png"
+    assert done.stdout.splitlines()[-2:] == [f"Report: {path}", f"Picture: {picture}"]
+    assert picture.is_file()
     assert "missing: 1 run not begun: finetune/FetchPush/" in done.stdout
     assert "finetune: No winner on FetchPush" in done.stdout
     return path

@@ -32,7 +32,6 @@ class Result:
 
 Program = Callable[..., Result]
 
-REPOSITORY = Path(__file__).parents[3]
 PRETRAIN: Document = {"name": "pretrain", "variant": "music-u"}
 
 
@@ -95,10 +94,6 @@ def test_options_replace_name_and_storage(program: Program, tmp_path: Path) -> N
     result = program(document(), "--dry-run", "--name", "other", "--storage", "elsewhere")
     assert "Sweep other" in result.output
     assert f"Storage: {tmp_path}/elsewhere" in result.output
-
-
-def test_the_packaged_sweep_is_the_smoke_sweep() -> None:
-    assert driver.DEFAULT_CONFIG.read_text() == (REPOSITORY / "tune_configs/smoke.yaml").read_text()
 
 
 BAD: list[tuple[Document, str]] = [

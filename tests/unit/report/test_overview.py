@@ -1,0 +1,61 @@
+"""The picture of a sweep: which panels it has, and whose lines are in them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from music_rllib.report.build import PICTURE, build_report, write_report
+from music_rllib.report.figures.overview import overview
+from music_rllib.results.analysis import analyse
+from music_rllib.results.archive.folder import read_archive
+from music_rllib.results.data import Sweep
+
+DATA = Path(__file__).parents[3] / "docs" / "results" / "data"
+
+
+def panels(sweep: Sweep) -> dict[str, list[str]]:
+    """What is drawn of each task, and the legend of that."""
+    shown = {}
+    for panel in overview(sweep, [one.stage for one in analyse(sweep)]):
+        axes = Figure().add_subplot()
+        panel.draw(axes)
+        legend = axes.get_legend()
+        assert legend is not None
+        shown[f"{panel.title}: {axes.get_ylabel()}"] = [t.get_text() for t in legend.get_texts()]
+    return shown
+
+
+def test_stages_stand_side_by_side_with_what_music_u_has_learnt() -> None:
+    assert panels(read_archive(DATA / "v3-fetch-push-music-f")) == {
+        "FetchPush: success rate": ["her", "music-f"],
+        "FetchPush: object displacement (m)": ["her", "pretrain", "music-f"],
+        "FetchPush: MI bound (nats)": ["pretrain"],
+    }
+
+
+def test_before_any_success_the_moved_object_is_shown_alone() -> None:
+    sweep = read_archive(DATA / "v3-fetch-push-music-f")
+    early = {
+        name: replace(
+            column,
+            **{
+                part: getattr(column, part)[column.step <= 10_000]
+                for part in ("run", "step", "value", "time")
+            },
+        )
+        for name, column in sweep.history.items()
+    }
+    assert list(panels(replace(sweep, history=early))) == [
+        "FetchPush: object displacement (m)",
+        "FetchPush: MI bound (nats)",
+    ]
+
+
+def test_one_stage_is_told_by_its_q(tmp_path: Path) -> None:
+    sweep = read_archive(DATA / "proof-fetch-push-her")
+    assert panels(sweep)["FetchPush: success rate"] == ["q = 1", "q = 1.5", "q = 2"]
+    write_report(build_report(sweep), tmp_path)
+    assert (tmp_path / "figures" / f"{PICTURE}.png").read_bytes().startswith(b"\x89PNG")
