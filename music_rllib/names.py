@@ -63,6 +63,8 @@ ENTROPY = "entropy/tsallis"
 """S_q of the policy in the form that the loss uses (per dimension summed, or joint)."""
 SHANNON_ENTROPY = "entropy/shannon"
 """Shannon entropy of the joint policy on [-1, 1]^A, in nats."""
+ENTROPIES = (SHANNON_ENTROPY, ENTROPY)
+"""Of the whole policy."""
 CLIPPED_DENSITIES = "bounds/density_share"
 """Share of densities beyond which ln_q follows its tangent (`tsallis.MAX_EXPONENT`)."""
 LOG_STD_AT_BOUND = "bounds/log_std_share"

@@ -47,6 +47,8 @@ def finals_table(analyses: Iterable[StageAnalysis]) -> Table:
         columns=(
             *("stage", "tasks", "metric", "condition", "runs", "seeds", "mean", "lower", "upper"),
             "each_seed",
+            *("shannon_entropy", "shannon_entropy_lower", "shannon_entropy_upper"),
+            *("tsallis_entropy", "tsallis_entropy_lower", "tsallis_entropy_upper"),
         ),
         rows=[
             (
@@ -60,6 +62,7 @@ def finals_table(analyses: Iterable[StageAnalysis]) -> Table:
                 float(final.estimate.lower),
                 float(final.estimate.upper),
                 " ".join(f"{score:g}" for score in final.scores.mean(axis=1)),
+                *analysis.entropies[scope.name, final.condition].numbers,
             )
             for analysis in analyses
             for scope in analysis.scopes
@@ -189,6 +192,7 @@ def runs_table(sweep: Sweep) -> Table:
         columns=(
             *("run_id", "name", "stage", "task", "entropic_index", "seed", "status", "env_steps"),
             *("budget", "seconds", "success_rate", "episode_return", "failure"),
+            *("shannon_entropy", "tsallis_entropy"),
         ),
         rows=[
             (
@@ -205,6 +209,7 @@ def runs_table(sweep: Sweep) -> Table:
                 sweep.final(position, names.EVAL_SUCCESS),
                 sweep.final(position, names.EVAL_RETURN),
                 run.failure,
+                *(sweep.final(position, metric) for metric in names.ENTROPIES),
             )
             for position, run in enumerate(sweep.runs)
         ],

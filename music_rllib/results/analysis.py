@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from music_rllib import names
 from music_rllib.results import statistics as st
-from music_rllib.results.comparison import Scope, scopes_of
+from music_rllib.results.comparison import ALL_TASKS, Scope, scopes_of
 from music_rllib.results.conditions import Condition, Stage, find_stages, stage_by_stage
 from music_rllib.results.data import Ints, Sweep
 from music_rllib.results.statistics import Array, Estimate
@@ -28,7 +29,7 @@ from music_rllib.results.time_to_threshold import (
     waits_of,
 )
 
-__all__ = ["Curve", "StageAnalysis", "Wait", "analyse", "analyse_stages", "curve"]
+__all__ = ["Curve", "Entropies", "StageAnalysis", "Wait", "analyse", "analyse_stages", "curve"]
 
 THRESHOLDS = (0.5, 0.85)
 """Success rates whose first evaluation is looked for; the paper's Figure 4 has 85 %."""
@@ -75,6 +76,23 @@ class Curve:
     """`[points]`: how many runs there are that far."""
 
 
+class Entropies(NamedTuple):
+    """How random policies are at the end, means over finished runs; None where there is no entropy.
+
+    S_q has the run's own q and form, so that its values at different q are not to be compared.
+    """
+
+    shannon: Estimate | None
+    """In nats, over all action dimensions."""
+    tsallis: Estimate | None
+
+    @property
+    def numbers(self) -> list[float]:
+        """Mean and ends of both, NaN where there is none."""
+        ends = ((one.value, one.lower, one.upper) if one else (np.nan,) * 3 for one in self)
+        return [float(end) for three in ends for end in three]
+
+
 @dataclass(frozen=True, kw_only=True)
 class StageAnalysis:
     """All numbers of one stage."""
@@ -84,6 +102,8 @@ class StageAnalysis:
     waits: tuple[Wait, ...]
     races: tuple[Race, ...]
     """Of each pair of conditions, to each threshold."""
+    entropies: Mapping[tuple[str, Condition], Entropies]
+    """By scope and condition."""
 
 
 def analyse(sweep: Sweep) -> list[StageAnalysis]:
@@ -115,7 +135,28 @@ def _analyse(sweep: Sweep, stage: Stage) -> StageAnalysis:
     ]
     groups = {condition.label: condition.runs for condition in stage.compared}
     found = [race for task, threshold in cells for race in races(sweep, task, groups, threshold)]
-    return StageAnalysis(stage=stage, scopes=scopes, waits=tuple(waits), races=tuple(found))
+    return StageAnalysis(
+        stage=stage,
+        scopes=scopes,
+        waits=tuple(waits),
+        races=tuple(found),
+        entropies={
+            (scope.name, final.condition): _entropies(sweep, final.condition, stage, scope.name)
+            for scope in scopes
+            for final in scope.finals
+        },
+    )
+
+
+def _entropies(sweep: Sweep, condition: Condition, stage: Stage, scope: str) -> Entropies:
+    tasks = stage.tasks if scope == ALL_TASKS else (scope,)
+    runs = tuple(run for run in condition.runs if sweep.runs[run].task in tasks)
+    found = []
+    for metric in (names.SHANNON_ENTROPY, names.ENTROPY):
+        scores = _final_scores(sweep, replace(condition, runs=runs), dict.fromkeys(tasks, metric))
+        there = scores[~np.isnan(scores).any(axis=1)]
+        found.append(st.estimate(there) if len(there) else None)
+    return Entropies(*found)
 
 
 def analyse_stages(sweep: Sweep, stages: Sequence[Stage]) -> StageAnalysis | None:

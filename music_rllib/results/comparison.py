@@ -25,6 +25,8 @@ ALL_TASKS = "all tasks"
 GAP = 0.1
 """In a rate, which a reader would want to be able to see where nobody says another."""
 POWER = 0.8
+_AVERAGED = {*names.EVAL_RATES, *names.ENTROPIES}
+"""Over tasks: metrics that have the same unit on each."""
 SHOW_SEEDS_BELOW = 10
 """So few are shown one by one."""
 
@@ -115,7 +117,7 @@ def scopes_of(
         may_be_compared: which of them.
     """
     columns = [(task, metric, [column]) for column, (task, metric) in enumerate(metrics.items())]
-    if len(columns) > 1 and len(set(metrics.values())) == 1 and columns[0][1] in names.EVAL_RATES:
+    if len(columns) > 1 and len(set(metrics.values())) == 1 and columns[0][1] in _AVERAGED:
         columns.insert(0, (ALL_TASKS, columns[0][1], list(range(len(columns)))))
     return tuple(
         _scope(name, metric, [(c, x[:, chosen], n) for c, x, n in conditions], may_be_compared)

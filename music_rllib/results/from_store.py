@@ -15,7 +15,7 @@ from music_rllib.results.comparison import Scope, scopes_of
 from music_rllib.results.statistics import Array, Estimate
 from music_rllib.store.run_record import RunResult
 
-__all__ = ["Condition", "conditions", "scopes"]
+__all__ = ["Condition", "conditions", "entropies", "scopes"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -98,6 +98,24 @@ def conditions(
                     episodes=float(np.mean(episodes)),
                 )
             )
+    return found
+
+
+def entropies(
+    plan: Plan, results: Mapping[str, RunResult], stage: str, part: str, values: Mapping[str, Any]
+) -> dict[str, dict[str, Any]]:
+    """How random a condition's policies are at the end, over all its tasks.
+
+    Returns:
+        Metric (of `names.ENTROPIES`) to `value` and `interval`; empty where there is none.
+    """
+    found = {}
+    for metric in names.ENTROPIES:
+        for one in conditions(plan, results, metric):
+            if (one.stage, one.part, dict(one.values)) == (stage, part, dict(values)):
+                ends = one.estimate()
+                interval = [float(ends.lower), float(ends.upper)]
+                found[metric] = {"value": float(ends.value), "interval": interval}
     return found
 
 

@@ -18,7 +18,7 @@ from music_rllib.config.schema import Stage
 from music_rllib.config.search.settings import SearchSettings
 from music_rllib.experiment.plan import Plan, short
 from music_rllib.results.comparison import with_interval
-from music_rllib.results.from_store import Condition, conditions
+from music_rllib.results.from_store import Condition, conditions, entropies
 from music_rllib.search.objective import interval
 from music_rllib.store.run_record import RunResult
 
@@ -123,7 +123,9 @@ def best_so_far(
         else:
             found = _best_trial(stage, stage.search, by_stage.get(stage.name))
         if found is not None:
-            return found
+            part = "" if stage.search is None else "final" if found["on_fresh_seeds"] else "search"
+            random = entropies(plan, results, stage.name, part, found["values"])
+            return found | {"entropies": random}
     return None
 
 
@@ -181,5 +183,8 @@ def best_in_words(best: Mapping[str, Any]) -> str:
     runs, planned = best["runs"], best.get("planned", best["runs"])
     text = f"{best['stage']} {values}".rstrip() + f": {best.get('by', 'success')} {number}, "
     if runs < planned:
-        return f"{text}{runs} of {planned} runs (no condition has all of its runs yet)"
-    return f"{text}{runs} runs{' on fresh seeds' if best['on_fresh_seeds'] else ''}"
+        text += f"{runs} of {planned} runs (no condition has all of its runs yet)"
+    else:
+        text += f"{runs} runs{' on fresh seeds' if best['on_fresh_seeds'] else ''}"
+    entropy = best.get("entropies", {}).get(names.SHANNON_ENTROPY)
+    return text if entropy is None else f"{text}, entropy {entropy['value']:.3g} nats"

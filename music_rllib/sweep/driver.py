@@ -330,7 +330,9 @@ def _compute_and_report(console: Console, opened: Sweep, tracker: Tracker) -> in
         searches = [] if campaign is None else _close_campaign(opened, campaign, tracker)
         beacon.end("stopped" if stopped_by else "failed" if failed else "finished")
     tracker.close("KILLED" if stopped_by else "FAILED" if failed else "FINISHED")
-    results = results_table(opened.plan, opened.board.__getitem__, opened.results(), tracker.run_id)
+    results = results_table(
+        opened.plan, opened.board.__getitem__, opened.results(), tracker.run_id, console.width
+    )
     if results.rows:  # a sweep may consist of searches only
         console.print(results)
     for view in search_views(searches):

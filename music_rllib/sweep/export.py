@@ -20,7 +20,7 @@ from music_rllib.experiment.plan import Run
 from music_rllib.experiment.session import Sweep
 from music_rllib.redaction import redact
 from music_rllib.results.comparison import with_interval
-from music_rllib.results.from_store import Condition, conditions
+from music_rllib.results.from_store import Condition, conditions, entropies
 from music_rllib.search.objective import interval
 from music_rllib.search.ranking import best_of, leader, measure_of
 from music_rllib.store.files import write_atomically
@@ -55,6 +55,7 @@ def export_best(sweep: Sweep, stage: str | None, output: Path) -> dict[str, Any]
         "values": dict(best.values),
         **about,
         "success_rate": _success(sweep, best),
+        "entropies": entropies(sweep.plan, sweep.results(), best.stage, best.part, best.values),
         "on_fresh_seeds": best.part == "final",
         "why": f"{best.stage}: {best.label} is first by {by} {fresh}; {by} "
         f"({'' if 'trial' in about else 'mean, '}95 %): {number} over "

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from itertools import product
 
 from music_rllib import names
+from music_rllib.report.figures.entropy import entropy_panel
 from music_rllib.report.figures.importance import (
     CHANCE,
     importance_panel,
@@ -31,6 +32,7 @@ from music_rllib.results.conditions import Condition, Stage, side_by_side
 from music_rllib.results.data import Sweep
 
 __all__ = [
+    "AGAINST_ENTROPY",
     "COST",
     "CURVES",
     "FINALS",
@@ -48,6 +50,7 @@ __all__ = [
 
 FINALS = {names.EVAL_SUCCESS: "Final success rate", names.EVAL_RETURN: "Final return"}
 PROFILES = "Performance profile"
+AGAINST_ENTROPY = "Performance against entropy"
 PERFORMANCE, EXPLORATION, INFORMATION = "Performance", "Exploration", "Information"
 SETTINGS, COST = "Settings", "Cost"
 GROUPS = (PERFORMANCE, EXPLORATION, INFORMATION, SETTINGS, COST)
@@ -108,6 +111,7 @@ def stage_drawings(sweep: Sweep, analysis: StageAnalysis) -> Iterator[Drawing]:
     scopes = [scope for scope in of_shown if len(scope.finals) > 1]
     for metric_name, title in FINALS.items():
         yield from _finals(stage, title, [one for one in scopes if one.metric == metric_name])
+    yield from _against_entropy(sweep, stage)
     if any(len(scope.finals) > 1 for scope in analysis.scopes):
         yield from _influence(sweep, analysis)
 
@@ -145,6 +149,23 @@ def _finals(stage: Stage, title: str, scopes: Sequence[Scope[Condition]]) -> Ite
         panels=tuple(profile_panel(scope, stage.conditions) for scope in scopes),
         legend=legend,
     )
+
+
+def _against_entropy(sweep: Sweep, stage: Stage) -> Iterator[Drawing]:
+    """Colour by q alone: what else varies moves the points along."""
+    by_q = {c.entropic_index: style_of(c, stage.conditions) for c in stage.conditions}
+    styles = {condition: by_q[condition.entropic_index] for condition in stage.conditions}
+    found = (entropy_panel(sweep, task, styles) for task in stage.tasks)
+    panels = tuple(panel for panel in found if panel is not None)
+    if panels and len(stage.conditions) > 1:
+        yield Drawing(
+            stage=stage.name,
+            title=AGAINST_ENTROPY,
+            caption="One point for each finished run. Where the values of q lie on one curve, the "
+            "entropy explains what they end at; where they differ at the same entropy, q does.",
+            panels=panels,
+            legend=[(f"q = {q}", style._replace(line="solid")) for q, style in by_q.items()],
+        )
 
 
 def drawings_of_stages(sweep: Sweep, stages: Sequence[Stage]) -> Iterator[Drawing]:

@@ -32,6 +32,7 @@ __all__ = [
     "Legend",
     "Metric",
     "Panel",
+    "belongs",
     "curve_panel",
     "finals_panel",
     "labelled_rows",
@@ -129,7 +130,7 @@ def curve_panel(
     def draw(axes: Axes) -> None:
         for at, (curve, rank) in enumerate(zip(curves, ranks, strict=True)):
             artists = _draw_curve(axes, curve, styles[curve.condition], rank, at / len(curves))
-            _belongs(artists, numbers[curve.condition], curve.condition.label)
+            belongs(artists, numbers[curve.condition], curve.condition.label)
         axes.set_xlim(left=0.0)
         axes.set_ylabel(metric.axis)
         axes.set_xlabel("environment steps")
@@ -156,7 +157,7 @@ def profile_panel(scope: Scope[Condition], siblings: tuple[Condition, ...]) -> P
                 thresholds, profile.value, where="post", color=colour, linestyle=line, linewidth=1.8
             )
             band = _band(axes, thresholds, profile, colour, step="post")
-            _belongs([*lines, band], siblings.index(final.condition), final.condition.label)
+            belongs([*lines, band], siblings.index(final.condition), final.condition.label)
         axes.set_xlabel("final success rate τ")
         axes.set_ylabel("share of runs above τ")
         axes.set_xlim(-0.02, 1.02)
@@ -184,7 +185,7 @@ def finals_panel(scope: Scope[Condition], siblings: tuple[Condition, ...]) -> Pa
             said = (
                 f"{final.condition.label}: {number(final.value)}, {interval_text(final.estimate)}"
             )
-            _belongs(artists, siblings.index(final.condition), said)
+            belongs(artists, siblings.index(final.condition), said)
         axes.set_xlabel("final success rate" if is_rate else f"final {names.word_of(scope.metric)}")
 
     return Panel(title=scope.name, draw=draw, height=height)
@@ -309,7 +310,7 @@ def _draw_final(
     return artists
 
 
-def _belongs(artists: Sequence[Artist], condition: int, said: str) -> None:
+def belongs(artists: Sequence[Artist], condition: int, said: str) -> None:
     """Mark what belongs to a condition, by its number: a page shows and hides it by that."""
     for artist in artists:
         artist.set_gid(f"condition-{condition}-{said}")

@@ -15,7 +15,7 @@ from music_rllib.results.analysis import StageAnalysis, Wait
 from music_rllib.results.comparison import SHOW_SEEDS_BELOW, each_seed, interval_text, p_text
 from music_rllib.results.comparison import number as in_short
 from music_rllib.results.data import Sweep
-from music_rllib.results.statistics import SIGNIFICANCE
+from music_rllib.results.statistics import SIGNIFICANCE, Estimate
 from music_rllib.results.time_to_threshold import FEWEST_FOR_INTERVAL
 
 __all__ = [
@@ -37,7 +37,7 @@ LONG = 40
 
 def performance_tables(analyses: Sequence[StageAnalysis]) -> list[TextTable]:
     """What runs ended at, when they got somewhere, and the comparisons: of every stage."""
-    kinds = (_final_table, _waits_table, _races_table, _improvement_table)
+    kinds = (_final_table, _entropy_table, _waits_table, _races_table, _improvement_table)
     return [_of_stages([(one.stage.name, kind(one)) for one in analyses]) for kind in kinds]
 
 
@@ -75,6 +75,40 @@ def _final_table(analysis: StageAnalysis) -> TextTable:
         note="Mean of the last evaluation of finished runs; over all tasks, of the seeds that have "
         f"finished on each of them. Fewer than {SHOW_SEEDS_BELOW} seeds are shown one by one.",
     )
+
+
+def _entropy_table(analysis: StageAnalysis) -> TextTable:
+    rows = [
+        (
+            scope.name,
+            final.condition.label,
+            *(
+                cell
+                for one in analysis.entropies[scope.name, final.condition]
+                for cell in _with_interval(one)
+            ),
+        )
+        for scope in analysis.scopes
+        for final in scope.finals
+        if any(analysis.entropies[scope.name, final.condition])
+    ]
+    return TextTable(
+        title="How random policies are at the end",
+        header=(
+            *("Task", "Condition", "Shannon entropy (nats)", "95 % interval"),
+            *("S_q", "95 % interval"),
+        ),
+        rows=rows,
+        note="Entropies of the policy over all action dimensions, means over finished runs. Where "
+        "the Shannon entropies of two q differ, what they end at may differ for that and not for "
+        "q. S_q is measured with each run's own q: over different q it is not to be compared.",
+    )
+
+
+def _with_interval(estimate: Estimate | None) -> tuple[Cell, str]:
+    if estimate is None:
+        return number(DASH), DASH
+    return number(in_short(estimate.value)), interval_text(estimate)
 
 
 def _waits_table(analysis: StageAnalysis) -> TextTable:

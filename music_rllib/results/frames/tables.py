@@ -35,7 +35,7 @@ _RUN_COLUMNS = {
     **dict.fromkeys(("started", "ended"), "datetime64[ms, UTC]"),
     **dict.fromkeys(("last_step", "budget"), "Int64"),
     "primary_metric": "str",
-    "score": "float64",
+    **dict.fromkeys(("score", "shannon_entropy", "tsallis_entropy"), "float64"),
     **dict.fromkeys(("source", "failure"), "str"),
 }
 _CURVE_COLUMNS = {
@@ -44,12 +44,16 @@ _CURVE_COLUMNS = {
     "value": "float64",
     "time": "datetime64[ms, UTC]",
 }
+_ENTROPIES = [
+    f"{name}_entropy{end}" for name in ("shannon", "tsallis") for end in ("", "_lower", "_upper")
+]
 _CONDITION_COLUMNS = {
     **dict.fromkeys(("stage", "variant", "task", "condition"), "str"),
     "q": "float64",
     "metric": "str",
     **dict.fromkeys(("seeds", "runs"), "int64"),
     **dict.fromkeys(("mean", "lower", "upper"), "float64"),
+    **dict.fromkeys(_ENTROPIES, "float64"),
 }
 
 
@@ -135,6 +139,8 @@ def _runs(sweep: Sweep, keys: list[str]) -> pd.DataFrame:
                 "budget": run.budget,
                 "primary_metric": metric,
                 "score": sweep.final(position, metric) if run.status == "FINISHED" else None,
+                "shannon_entropy": sweep.final(position, names.SHANNON_ENTROPY),
+                "tsallis_entropy": sweep.final(position, names.ENTROPY),
                 "source": run.tags.get(names.TAG_SOURCE_NODE),
                 "failure": run.failure,
             }
@@ -181,6 +187,13 @@ def _conditions(sweep: Sweep) -> Iterator[dict[str, Any]]:
                     "mean": final.value,
                     "lower": float(final.estimate.lower),
                     "upper": float(final.estimate.upper),
+                    **dict(
+                        zip(
+                            _ENTROPIES,
+                            analysis.entropies[scope.name, final.condition].numbers,
+                            strict=True,
+                        )
+                    ),
                 }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from music_rllib.sweep.cli_helpers import Commands, add_json, add_place, console_for, print_json
 
@@ -54,6 +55,20 @@ def _execute(arguments: argparse.Namespace) -> int:
         return 0
     console = console_for(arguments)
     console.print(chosen["why"], soft_wrap=True)
+    if chosen["entropies"]:
+        console.print(_entropies(chosen["entropies"]), soft_wrap=True)
     for policy in chosen["policies"]:
         console.print(f"{policy['task']}: {policy['folder']}", soft_wrap=True)
     return 0
+
+
+def _entropies(found: dict[str, Any]) -> str:
+    from music_rllib import names
+    from music_rllib.results.comparison import with_interval
+
+    words = {names.SHANNON_ENTROPY: "Shannon entropy (nats)", names.ENTROPY: "S_q"}
+    texts = (
+        f"{words[metric]} {with_interval(one['value'], one['interval'])}"
+        for metric, one in found.items()
+    )
+    return f"its policies at the end: {', '.join(texts)}"

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from music_rllib.errors import BadInputError
 from music_rllib.sweep.cli_helpers import Commands, add_json, add_place, console_for, print_json
 
 if TYPE_CHECKING:
+    from music_rllib.experiment.plan import Plan
     from music_rllib.results.comparison import Final, Scope
     from music_rllib.results.from_store import Condition
+    from music_rllib.store.run_record import RunResult
 
 __all__ = ["register"]
 
@@ -95,7 +97,8 @@ def _execute(arguments: argparse.Namespace) -> int:
     study = study_of(
         stored, stage, metric=arguments.metric, maximised=maximised or arguments.metric is None
     )
-    groups = [group for scope in scopes(found_) for group in _groups(scope, maximised)]
+    entropies = _entropies(sweep.plan, results, stage)
+    groups = [group for scope in scopes(found_) for group in _groups(scope, maximised, entropies)]
     document = {
         "sweep": found.name,
         "stage": stage,
@@ -112,7 +115,30 @@ def _execute(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _groups(scope: Scope[Condition], maximised: bool) -> Iterator[dict[str, Any]]:
+Entropies = Mapping[tuple[str, str, str], dict[str, dict[str, Any]]]
+"""By scope, part and condition: of each entropy, value and interval at the end."""
+
+
+def _entropies(plan: Plan, results: Mapping[str, RunResult], stage: str) -> Entropies:
+    from music_rllib import names
+    from music_rllib.results.from_store import conditions, scopes
+
+    found: dict[tuple[str, str, str], dict[str, dict[str, Any]]] = {}
+    for metric in names.ENTROPIES:
+        of_stage = [one for one in conditions(plan, results, metric) if one.stage == stage]
+        for scope in scopes(of_stage):
+            for final in scope.finals:
+                one, ends = final.condition, final.estimate
+                found.setdefault((scope.name, one.part, one.label), {})[metric] = {
+                    "value": final.value,
+                    "interval": [float(ends.lower), float(ends.upper)],
+                }
+    return found
+
+
+def _groups(
+    scope: Scope[Condition], maximised: bool, entropies: Entropies
+) -> Iterator[dict[str, Any]]:
     """What is compared on a task; apart from it the runs that a search's trials were chosen by."""
     from music_rllib.results.comparison import verdict
 
@@ -128,13 +154,16 @@ def _groups(scope: Scope[Condition], maximised: bool) -> Iterator[dict[str, Any]
                 "part": part,
                 "tasks": scope.name,
                 "metric": scope.metric,
-                "conditions": list(_rows(scope, finals, maximised)),
+                "conditions": list(_rows(scope, finals, maximised, entropies)),
                 "verdict": " ".join(said),
             }
 
 
 def _rows(
-    scope: Scope[Condition], finals: Sequence[Final[Condition]], maximised: bool
+    scope: Scope[Condition],
+    finals: Sequence[Final[Condition]],
+    maximised: bool,
+    entropies: Entropies,
 ) -> Iterator[dict[str, Any]]:
     """The best first, each with what tells it from the best."""
     from music_rllib.results.statistics import difference
@@ -157,6 +186,7 @@ def _rows(
             "gap_interval": None,
             "best_is_better_with": None,
             "p_value": None,
+            "entropies": entropies.get((scope.name, one.part, one.label), {}),
         }
         pair = next((p for p in scope.comparisons if {p.first, p.second} == {best, final}), None)
         if pair is not None:

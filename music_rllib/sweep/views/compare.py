@@ -9,6 +9,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from music_rllib import names
 from music_rllib.experiment.plan import short
 from music_rllib.results.comparison import with_interval
 from music_rllib.sweep.views.tables import seeds_in_words
@@ -28,6 +29,8 @@ def compare_view(document: Mapping[str, Any]) -> RenderableType:
         parts.append(_primary(document))
     for group in document["groups"]:
         parts += [_table(document, group), Text(group["verdict"])]
+        if any(row["entropies"] for row in group["conditions"]):
+            parts.append(_entropies(group))
     return Group(*parts)
 
 
@@ -93,6 +96,20 @@ def _table(document: Mapping[str, Any], group: Mapping[str, Any]) -> Table:
             percent(row["best_is_better_with"]),
             "" if row["p_value"] is None else f"{row['p_value']:.2g}",
         )
+    return table
+
+
+def _entropies(group: Mapping[str, Any]) -> Table:
+    table = Table(title=f"Entropy of the policies at the end on {group['tasks']}")
+    table.title_justify = "left"
+    for name in ("condition", "Shannon, nats, 95 %", "S_q, 95 %"):
+        table.add_column(name, justify="left" if name == "condition" else "right")
+    for row in group["conditions"]:
+        found = [row["entropies"].get(metric) for metric in names.ENTROPIES]
+        cells = (
+            "-" if one is None else with_interval(one["value"], one["interval"]) for one in found
+        )
+        table.add_row(row["label"], *cells)
     return table
 
 

@@ -188,6 +188,7 @@ def results_table(
     status: Callable[[str], Status],
     results: Mapping[str, RunResult],
     mlflow_run: Callable[[str], str | None],
+    width: int | None = None,
 ) -> Table:
     """One row per run: what it reached, or why there is nothing.
 
@@ -196,22 +197,21 @@ def results_table(
         status: Node key to its state.
         results: Node key to its result, for finished nodes.
         mlflow_run: Node key to MLflow's id of its run, if there is one.
+        width: Of the screen; columns of `_SPARE` that it has no room for are left out.
     """
     grid = _grid_columns(plan)
-    table = Table(title=f"Results of {plan.name}", title_justify="left")
-    for name in ("stage", "task", "seed", "q", *grid):
-        table.add_column(name, justify="right" if name in {"seed", "q"} else "left")
     nodes = {node.key: node for node in plan.nodes}
     metrics = _columns(node.run.task.primary_metric for node in nodes.values())
-    for name in (*metrics.values(), "MI reward", "env steps", "time"):
-        table.add_column(name, justify="right")
-    table.add_column("MLflow run", no_wrap=True)
-    table.add_column("state", no_wrap=True)
-    for run in plan.runs:
-        if run.part:
-            continue  # one of many: its trial has a row in another table
-        state = status(run.key)
-        table.add_row(
+    # A reward or an entropy that no run has is no column.
+    metrics |= {
+        metric: head
+        for metric, head in _BESIDE.items()
+        if any(metric in result.metrics for result in results.values())
+    }
+    heads = ["stage", "task", "seed", "q", *grid, *metrics.values(), "env steps", "time"]
+    heads += ["MLflow run", "state"]
+    rows = [
+        (
             run.stage,
             run.task,
             str(run.seed),
@@ -219,10 +219,52 @@ def results_table(
             *(short(run.values[name]) if name in run.values else "-" for name in grid),
             *_reached(results.get(run.key), metrics),
             (mlflow_run(run.key) or "-")[:8],
-            _STATE.get(state, str(state)),
-            style=_COLOURS.get(state),
+            _STATE.get(status(run.key), str(status(run.key))),
         )
+        for run in plan.runs
+        if not run.part  # one of many: its trial has a row in another table
+    ]
+    shown = _fitting(heads, rows, width)
+    missing = [head.replace("\n", " ") for head in heads if head not in shown]
+    table = Table(
+        title=f"Results of {plan.name}",
+        title_justify="left",
+        caption=f"A wider screen also shows: {'; '.join(missing)}" if missing else None,
+        caption_justify="left",
+    )
+    left = {"stage", "task", *grid, "MLflow run", "state"}
+    for head in shown:
+        table.add_column(
+            head,
+            justify="left" if head in left else "right",
+            no_wrap=head in ("MLflow run", "state"),
+        )
+    keys = (run.key for run in plan.runs if not run.part)
+    for key, row in zip(keys, rows, strict=True):
+        cells = dict(zip(heads, row, strict=True))
+        table.add_row(*(cells[head] for head in shown), style=_COLOURS.get(status(key)))
     return table
+
+
+_SPARE = ("MLflow run", "success,\nany step", "time", "MI\nreward", "S_q", "env steps")
+"""Columns that a narrow screen can do without, the first one first."""
+
+
+def _fitting(
+    heads: Sequence[str], rows: Sequence[Sequence[str]], width: int | None
+) -> Sequence[str]:
+    """Heads of the columns that there is room for."""
+    widths = {
+        head: max(len(line) for text in (head, *column) for line in text.split("\n"))
+        for head, *column in zip(heads, *rows, strict=True)
+    }
+    left = list(heads)
+    for head in _SPARE:
+        # Beside each column a line and two spaces.
+        if width is None or sum(widths[one] + 3 for one in left) + 1 <= width:
+            break
+        left = [one for one in left if one != head]
+    return left
 
 
 def search_views(searches: Sequence[Mapping[str, Any]]) -> list[RenderableType]:
@@ -332,13 +374,25 @@ def _columns(primary: Iterable[str]) -> dict[str, str]:
     return heads
 
 
+_BESIDE = {
+    names.MI_REWARD: "MI\nreward",
+    names.SHANNON_ENTROPY: "entropy,\nnats",
+    names.ENTROPY: "S_q",
+}
+"""What runs are not judged by, to the heads of their columns."""
+
+
 def _reached(result: RunResult | None, metrics: Iterable[str]) -> list[str]:
     if result is None:
-        return ["-"] * (len(list(metrics)) + 3)
-    reward = result.metrics.get(names.MI_REWARD)
+        return ["-"] * (len(list(metrics)) + 2)
     return [
-        *(measured(metric, result.metrics.get(metric)) for metric in metrics),
-        "-" if reward is None else f"{reward:.3f}",
+        *(_cell(metric, result.metrics.get(metric)) for metric in metrics),
         f"{result.env_steps:,}",
         clock(result.seconds),
     ]
+
+
+def _cell(metric: str, value: float | None) -> str:
+    return (
+        "-" if value is None else f"{value:.2f}" if metric in _BESIDE else measured(metric, value)
+    )

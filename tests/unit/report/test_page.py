@@ -16,7 +16,7 @@ import pytest
 
 from music_rllib import names
 from music_rllib.report.build import build_report, write_report
-from music_rllib.report.figures.choice import INFLUENCE
+from music_rllib.report.figures.choice import AGAINST_ENTROPY, INFLUENCE
 from music_rllib.report.figures.draw import TEXT_WIDTH, draw_files, draw_inline, drawn_figure
 from music_rllib.report.figures.importance import CHANCE, importances, varied
 from music_rllib.report.figures.palette import DARK, LIGHT, colour_of, marker_of
@@ -247,6 +247,22 @@ def test_of_a_search_the_ranking_is_drawn_as_soon_as_there_is_one() -> None:
 
     assert drawn(searched(*TRIALS)) == {f"q = {q}, seeds = search" for q in ("1", "1.2", "1.4")}
     assert drawn(searched(*TRIALS, *fresh)) == {f"q = {q}, seeds = fresh" for q in ("1", "1.2")}
+
+
+def test_how_random_policies_are_stands_beside_what_they_ended_at() -> None:
+    sweep = compared({"1": [0.5, 0.6, 0.7], "2": [0.4, 0.5, 0.6]})
+    last, entropies = STEPS[-1], {"1": [-0.4, -0.3, -0.2], "2": [0.2, 0.3, 0.4]}
+    values = [value for q in entropies for value in entropies[q]]
+    shannon = columns([Points([names.SHANNON_ENTROPY], [last], [0], [value]) for value in values])
+    sweep = replace(sweep, history={**sweep.history, **shannon})
+    report = report_on(sweep)
+    row = row_of(render(report), "FetchPush", "q = 2", "0.30")
+    # Student's: .1/sqrt(3) times 4.303.
+    assert row == ["0.05 to 0.55", "–", "–"]
+    (drawing,) = [one for one in report.drawings if one.title == AGAINST_ENTROPY]
+    axes = drawn_figure(drawing.panels, drawing.legend, TEXT_WIDTH, 8.0).axes[0]
+    points = {tuple(np.asarray(line.get_xydata())[0].tolist()) for line in axes.lines}
+    assert points == set(zip(values, [0.5, 0.6, 0.7, 0.4, 0.5, 0.6], strict=True))
 
 
 def test_a_run_that_failed_has_no_final_rate_but_counts_as_waiting() -> None:

@@ -114,6 +114,7 @@ def finish(
 ) -> None:
     """As if the run had been trained."""
     metrics = {metric: value, names.EVAL_EPISODES: 20.0}
+    metrics |= {names.SHANNON_ENTROPY: 0.5 - value, names.ENTROPY: 0.25 - value}
     report = Report(env_steps=4000, seconds=1.0, timestamp_ms=1, metrics=metrics)
     folder.mkdir(exist_ok=True)
     (folder / HISTORY).write_bytes(to_json_lines([report]))
@@ -160,7 +161,12 @@ def test_status_and_compare(storage: str, tmp_path: Path, program: Program) -> N
     assert first["seeds"] == pytest.approx([0.8, 0.82, 0.84])
     assert others[0]["gap"] == pytest.approx(0.5)
     assert others[0]["gap_interval"][0] < 0.5 < others[0]["gap_interval"][1]
-    assert "0.8 0.82 0.84" in program("compare", place).output
+    assert first["entropies"][names.SHANNON_ENTROPY]["value"] == pytest.approx(0.5 - 0.82)
+    assert first["entropies"][names.ENTROPY]["interval"][0] < 0.25 - 0.82
+    text = program("compare", place).output
+    assert "0.8 0.82 0.84" in text
+    assert "Entropy of the policies at the end on FetchPush" in text
+    assert "3 runs, entropy -0.32 nats" in program("status", place).output
     bad = program("compare", place, "--metric", "nonsense")
     assert (bad.code, "--metric must be one of" in bad.errors) == (2, True)
 
@@ -282,6 +288,7 @@ def test_best_takes_the_middle_run_of_the_best_condition(
     assert policy["node"] in sweep.finished
     again = program("best", f"{storage}/mine", "--output", "out")
     assert (again.code, "first by success" in again.output) == (0, True)
+    assert "Shannon entropy (nats) -0.32 [-0.37, -0.27], S_q -0.57" in again.output
 
 
 def test_a_condition_with_all_its_runs_is_better_than_a_lucky_one(

@@ -146,17 +146,20 @@ def test_results_have_a_row_per_run_whatever_became_of_it(plan: Plan) -> None:
     board.fail(plan.nodes[0].key)
     board.start(plan.nodes[3].key)
     metrics = {names.EVAL_SUCCESS: 0.25, names.EVAL_SUCCESS_ANY: 0.5, names.MI_REWARD: -0.5}
+    metrics |= {names.SHANNON_ENTROPY: 0.29, names.ENTROPY: -0.121}
     result = RunResult(label="x", env_steps=2000, seconds=125, metrics=metrics)
     console, text = screen()
     runs = {plan.nodes[1].key: "0123456789abcdef"}
-    console.print(results_table(plan, board.__getitem__, {plan.nodes[1].key: result}, runs.get))
+    given = (plan, board.__getitem__, {plan.nodes[1].key: result}, runs.get)
+    console.print(results_table(*given))
     rows = [
         [cell.strip() for cell in line.split("│")[1:-1]]
         for line in text.getvalue().splitlines()
         if line.startswith("│")
     ]
     assert rows[1] == [
-        "pretrain", "FetchPush", "1", "1", "-", "25 %", "50 %", "-0.500", "2,000", "2:05",
+        "pretrain", "FetchPush", "1", "1", "-", "25 %", "50 %", "-0.50", "0.29", "-0.12",
+        "2,000", "2:05",
         "01234567", "reused",
     ]  # fmt: skip
     assert [row[-1] for row in rows] == [
@@ -164,6 +167,10 @@ def test_results_have_a_row_per_run_whatever_became_of_it(plan: Plan) -> None:
     ]  # fmt: skip
     assert [row[3] for row in rows] == ["1", "1", "1", "1", "1.5", "1.5"]
     assert [row[4] for row in rows[2:]] == ["0.1"] * 4
+    narrow = results_table(*given, width=90)
+    assert console.measure(narrow).maximum <= 90
+    assert [str(column.header) for column in narrow.columns][-2:] == ["entropy,\nnats", "state"]
+    assert "MLflow run" in str(narrow.caption)
 
 
 class Clock:
