@@ -13,10 +13,12 @@ from music_rllib.report.figures.palette import style_of
 from music_rllib.report.figures.plots import RATE_LIMITS, Panel
 from music_rllib.results import statistics as st
 from music_rllib.results.claims.sensitivity import AlphaLine, alpha_sensitivity
-from music_rllib.results.claims.study import Mean, Study
+from music_rllib.results.claims.study import MOST_CONDITIONS, Mean, Study
 from music_rllib.results.conditions import Condition
 
 __all__ = ["alpha_panels", "area_profile_panels"]
+
+MOST_TICKS = 8
 
 
 def area_profile_panels(study: Study) -> list[Panel]:
@@ -24,7 +26,9 @@ def area_profile_panels(study: Study) -> list[Panel]:
     rates = [mean for mean in study.means if mean.measure.is_rate]
     by_task = groupby(rates, key=lambda mean: mean.task)
     found = [(task, list(means)) for task, means in by_task]
-    return [_profile(task, means, study) for task, means in found if len(means) > 1]
+    return [
+        _profile(task, means, study) for task, means in found if 1 < len(means) <= MOST_CONDITIONS
+    ]
 
 
 def _profile(task: str, means: Sequence[Mean], study: Study) -> Panel:
@@ -70,11 +74,13 @@ def _alpha(task: str, lines: Sequence[AlphaLine], study: Study) -> Panel:
         places = np.concatenate([line.alphas for line in lines])
         if places.min() > 0 and places.max() / places.min() > 5:
             axes.set_xscale("log")
+        distinct = np.unique(places)
+        if len(distinct) <= MOST_TICKS:
+            axes.set_xticks(distinct, [f"{place:g}" for place in distinct], minor=False)
+            axes.set_xticks([], minor=True)
+        elif axes.get_xscale() == "log":
             # The scale's own labels are formulas, which nothing is read as.
             axes.xaxis.set_major_formatter(LogFormatter())
-            axes.xaxis.set_minor_formatter(LogFormatter())
-        if lines[0].means[0].measure.is_rate:
-            axes.set_ylim(*RATE_LIMITS)
         axes.set_xlabel("α")
         axes.set_ylabel(lines[0].means[0].measure.words)
 

@@ -10,11 +10,14 @@ import numpy as np
 import pytest
 
 from music_rllib import names
+from music_rllib.report.figures.draw import files
+from music_rllib.report.study import study_csv, study_drawings
 from music_rllib.results.claims.answer import answer
 from music_rllib.results.claims.contrasts import Verdict
 from music_rllib.results.claims.plan import AnalysisPlan, PlanVersion, checked_plans, with_plan
 from music_rllib.results.claims.plan import as_document as plans_as_document
 from music_rllib.results.claims.power import seeds_needed
+from music_rllib.results.claims.sensitivity import alpha_sensitivity
 from music_rllib.results.claims.study import Study, study_of
 from music_rllib.results.claims.tables import study_data
 from music_rllib.results.data import Points, RunRecord, Sweep, columns
@@ -218,6 +221,45 @@ def test_settings_that_a_hypothesis_leaves_open_are_averaged(rng: np.random.Gene
     assert float(claim.contrast.difference.value) == pytest.approx(0.3, abs=0.03)
     vague = recorded(plan("q = 1.5, alpha = 0.1 against q = 1"), at=5)
     assert "it must name more" in study_of(sweep_of(runs, vague)).untested[0]
+
+
+def test_sensitivity_to_alpha_is_a_line_for_each_q(rng: np.random.Generator) -> None:
+    runs = [
+        run({"tac.entropic_index": q, "tac.alpha": alpha}, seed, height, rng)
+        for q in ("1", "1.5")
+        for alpha, height in (("0.1", 0.3), ("0.01", 0.1), ("0.02", 0.2))
+        for seed in range(4)
+    ]
+    found = study_of(sweep_of(runs))
+    lines = alpha_sensitivity(found.means)
+    assert [(line.entropic_index, list(line.alphas)) for line in lines] == [
+        ("1", [0.01, 0.02, 0.1]),
+        ("1.5", [0.01, 0.02, 0.1]),
+    ]
+    np.testing.assert_allclose(lines[0].estimate.value, [0.1, 0.2, 0.3], atol=0.04)
+    assert np.all(lines[0].estimate.lower < lines[0].estimate.value)
+    profile, area = study_drawings(found)
+    assert [len(drawing.panels) for drawing in (profile, area)] == [1, 1]
+    assert [label for label, _ in area.legend] == ["q = 1", "q = 1.5"]
+    for drawing in (profile, area):
+        assert files(drawing.panels, drawing.legend)
+    tables = {table.name: table for table in study_csv(found)}
+    assert [row[3] for row in tables["alpha_sensitivity"].rows] == [0.01, 0.02, 0.1] * 2
+    assert len(tables["area_under_curve"].rows) == 6
+    # Six conditions, each with each.
+    assert len(tables["comparisons"].rows) == 15
+
+
+def test_many_conditions_are_held_against_q_1_alike_in_the_rest(rng: np.random.Generator) -> None:
+    runs = [
+        run({"tac.entropic_index": q, "tac.alpha": alpha}, seed, 0.2, rng)
+        for q in ("1", "1.5", "2", "3")
+        for alpha in ("0.01", "0.1")
+        for seed in range(2)
+    ]
+    pairs = [(one.first, one.second) for one in study_of(sweep_of(runs)).afterwards]
+    assert ("q = 2, α = 0.1", "q = 1, α = 0.1") in pairs
+    assert len(pairs) == 6
 
 
 def test_of_a_search_only_fresh_seeds_count_and_each_q_has_its_own_alpha(
