@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from music_rllib.config.problems import shown
 from music_rllib.store.files import write_atomically
+from music_rllib.store.lease import runs_here, this_machine
 from music_rllib.store.object_folder import StorageError, open_storage
 
 if TYPE_CHECKING:
@@ -25,6 +27,7 @@ __all__ = [
     "STATE",
     "STOP",
     "as_json",
+    "is_alive",
     "keep",
     "plain",
     "read",
@@ -34,6 +37,18 @@ __all__ = [
 CONFIG, PLAN, SEARCH, STATE = "config.json", "plan.json", "search.json", "state.json"
 STOP = "stop.json"
 """Asks the driver to stop."""
+SILENCE_SECONDS = 90.0
+"""After so long a driver on another machine counts as dead."""
+
+
+def is_alive(state: Mapping[str, Any] | None) -> bool:
+    """Whether a sweep's driver is at work, by its `state.json`."""
+    if state is None or state["driver"]["ended"] is not None:
+        return False
+    driver = state["driver"]
+    if driver["machine"] == this_machine():
+        return runs_here(driver["pid"], driver["process_started"])
+    return bool(time.time() - driver["heartbeat"] < SILENCE_SECONDS)
 
 
 def plain(value: Any) -> Any:

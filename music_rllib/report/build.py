@@ -13,6 +13,7 @@ from music_rllib.report.figures.overview import overview
 from music_rllib.report.figures.plots import METRICS
 from music_rllib.report.limitations import missing
 from music_rllib.report.page import Report, render
+from music_rllib.report.side_by_side import difference_tables
 from music_rllib.report.study import study_csv, study_drawings
 from music_rllib.report.tables import (
     Table,
@@ -56,6 +57,7 @@ def build_report(
     store: TrackingStore | None = None,
     video_seed: int | None = None,
     environments: Sequence[Task] = (),
+    beside: tuple[Sweep, Sweep] | None = None,
 ) -> Report:
     """Compute and arrange everything.
 
@@ -68,6 +70,7 @@ def build_report(
         store: where the sweep is logged, with its policies.
         video_seed: of the filmed episodes; None: no videos.
         environments: of tasks that may be made for videos, beside the known ones.
+        beside: the two that `sweep` puts side by side.
     """
     analyses = analyse(sweep)
     drawings = [d for analysis in analyses for d in stage_drawings(sweep, analysis)]
@@ -82,6 +85,7 @@ def build_report(
         study=study,
         drawings=drawings,
         pictures=draw_inline(drawings),
+        differences=() if beside is None else difference_tables(*beside, analyses),
         missing=missing(sweep, analyses, undelivered) + ([damaged] if damaged else []),
         difference=difference,
         command=command,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,10 +13,11 @@ import typer
 
 from music_rllib import names
 from music_rllib.config.problems import ConfigError
-from music_rllib.errors import TrackingError
+from music_rllib.errors import BadInputError, TrackingError
 from music_rllib.redaction import for_people, redact
 from music_rllib.results.comparison import GAP
 from music_rllib.results.data import ReportError
+from music_rllib.store.object_folder import StorageError
 
 if TYPE_CHECKING:
     from music_rllib.report.location import Found
@@ -34,6 +36,12 @@ EPILOG = """
 
     python -m music_rllib.report smoke --tracking-uri http://mlflow:5000 --output reports/smoke
         a sweep that was logged to a server, from any machine
+
+    python -m music_rllib.report results/smoke --serve
+        the same page while it runs, with its progress; stop and resume it there
+
+    python -m music_rllib.report results/smoke results/other
+        what differs in the settings and in the results of two sweeps
 
     python -m music_rllib.report results/smoke --export published/smoke --format csv
         its runs and metrics as plain tables; `report published/smoke` reads them again
@@ -55,10 +63,11 @@ class TableFormat(StrEnum):
 
 @app.command(epilog=EPILOG)
 def report(
-    sweep: Annotated[
-        str,
+    sweeps: Annotated[
+        list[str],
         typer.Argument(
-            help="A sweep's folder, an exported one, or a sweep's name.", metavar="SWEEP"
+            help="A sweep's folder, an exported one, or a sweep's name; two are put side by side.",
+            metavar="SWEEP [OTHER]",
         ),
     ],
     output: Annotated[
@@ -97,6 +106,17 @@ def report(
             "beside the built-in tasks' and Gymnasium's own.",
         ),
     ] = None,
+    serve: Annotated[
+        bool,
+        typer.Option(
+            "--serve",
+            help="Serve the page on loopback while the sweep runs: its progress, and buttons to "
+            "stop and resume it.",
+        ),
+    ] = False,
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="With --serve; 0 takes a free one.")
+    ] = 0,
     attach: Annotated[
         bool, typer.Option("--attach", help="Also keep the report with the sweep's run in MLflow.")
     ] = False,
@@ -112,13 +132,17 @@ def report(
         typer.Option("--add", help="With --export: keep the runs of an earlier export there."),
     ] = False,
 ) -> None:
-    """One self-contained page about a sweep, with its figures (PNG, SVG) and numbers (CSV)."""
+    """One self-contained page about a sweep, with its figures (PNG, SVG, PDF) and numbers (CSV)."""
     try:
-        if export is not None:
-            _export(sweep, storage, tracking_uri, export, format_, add=add)
+        if len(sweeps) > 1:
+            _beside(sweeps, storage, tracking_uri, output, alone=serve or attach or bool(export))
+        elif export is not None:
+            _export(sweeps[0], storage, tracking_uri, export, format_, add=add)
+        elif serve:
+            _serve(sweeps[0], storage, tracking_uri, difference, port)
         else:
             _report(
-                sweep,
+                sweeps[0],
                 storage,
                 tracking_uri,
                 output,
@@ -128,7 +152,7 @@ def report(
                 env=env,
                 attach=attach,
             )
-    except (ConfigError, ReportError, TrackingError) as error:
+    except (BadInputError, ConfigError, ReportError, StorageError, TrackingError) as error:
         typer.echo(f"error: {for_people(error)}", err=True)
         raise typer.Exit(BAD_INPUT) from error
 
@@ -186,7 +210,7 @@ def _report(
         store=found.store,
         video_seed=seed if videos else None,
         environments=() if env is None else declared_tasks(env),
-        command=redact(shlex.join(["python", "-m", "music_rllib.report", *sys.argv[1:]])),
+        command=_command(),
     )
     page = write_report(made, output or found.folder / "report")
     for note in made.missing:
@@ -203,6 +227,62 @@ def _report(
     if found.damaged is not None:
         typer.echo(f"error: {redact(found.damaged)}", err=True)
         raise typer.Exit(DAMAGED)
+
+
+def _command() -> str:
+    return redact(shlex.join(["python", "-m", "music_rllib.report", *sys.argv[1:]]))
+
+
+def _beside(
+    places: Sequence[str],
+    storage: str,
+    tracking_uri: str | None,
+    output: Path | None,
+    *,
+    alone: bool,
+) -> None:
+    from music_rllib.report.build import WANTED, build_report, write_report
+    from music_rllib.report.figures.choice import slug
+    from music_rllib.report.location import find_sweep
+    from music_rllib.report.side_by_side import side_by_side
+
+    if len(places) > 2 or alone:
+        raise ReportError(
+            "SWEEP must be one, or two to put side by side; --serve, --attach and --export take one"
+        )
+    found = [
+        find_sweep(place, storage=storage, tracking_uri=tracking_uri, metrics=WANTED)
+        for place in places
+    ]
+    first, second = (one.sweep for one in found)
+    made = build_report(side_by_side(first, second), beside=(first, second), command=_command())
+    page = write_report(made, output or found[0].folder / f"report-beside-{slug(second.name)}")
+    typer.echo(f"Report: {page.absolute()}")
+
+
+def _serve(
+    place: str, storage: str, tracking_uri: str | None, difference: float, port: int
+) -> None:
+    from music_rllib.experiment import location
+    from music_rllib.report.build import WANTED, build_report
+    from music_rllib.report.live.server import LivePage, make_server, serve
+    from music_rllib.report.live.state import Progress
+    from music_rllib.report.location import find_sweep
+    from music_rllib.report.page import render
+    from music_rllib.store.paths import sweep_folder
+
+    sweep = location.find_sweep(place, None if Path(place).exists() else storage)
+
+    def make() -> str:
+        found = find_sweep(place, storage=storage, tracking_uri=tracking_uri, metrics=WANTED)
+        made = build_report(
+            found.sweep, difference=difference, undelivered=found.undelivered, command=_command()
+        )
+        return render(made, live=True)
+
+    folder = sweep_folder(sweep.storage, sweep.name)
+    page = LivePage(make, Progress(sweep))
+    serve(make_server(page, sweep, folder, port), page, typer.echo)
 
 
 def _attach(found: Found, folder: Path, made: Report) -> None:

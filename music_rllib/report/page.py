@@ -66,6 +66,8 @@ class Report:
     """That made this report."""
     films: Films | None = None
     """None where nobody asked for videos."""
+    differences: Sequence[TextTable] = ()
+    """Of two sweeps: what was set otherwise, and what came of it."""
 
 
 def render(report: Report, *, live: bool = False) -> str:
@@ -88,6 +90,7 @@ def render(report: Report, *, live: bool = False) -> str:
         said=_said(report),
         large=_large(report, numbers),
         groups=list(_groups(report, numbers)),
+        differences=[table for table in report.differences if table.rows],
         searches=[search_section(search) for search in sweep.searches],
         films=report.films,
         outcomes=_OUTCOMES,
@@ -155,7 +158,7 @@ def _said(report: Report) -> list[str]:
     if main is None or not main.scopes:
         return []
     planned = planned_in_words(report.study)
-    said = [f"{planned[0].upper()}{planned[1:]}.", *answer(report.sweep, report.study)[1:]]
+    said = [*answer(report.sweep, report.study)[1:], f"{planned[0].upper()}{planned[1:]}."]
     others = [one for one in report.analyses if one.stage.has_task_reward and one is not main]
     firsts = [] if report.together else [verdict(s.scopes[0])[0] for s in others if s.scopes]
     finals = [verdict(main.scopes[0], report.difference)[0], *firsts]
@@ -232,7 +235,6 @@ def _figure(
 def _remarks(report: Report) -> Iterable[Sequence[str]]:
     """Of each stage what else is to be known, and what may be said on each task."""
     several = len(report.analyses) > 1
-    main = _main(report)
     for analysis in [*([report.together] if report.together else []), *reversed(report.analyses)]:
         stage, said = analysis.stage, []
         if stage.compared not in ((), stage.conditions):
@@ -246,12 +248,7 @@ def _remarks(report: Report) -> Iterable[Sequence[str]]:
                 f"It has a single seed ({stage.seeds[0]}): one run shows what can happen and not "
                 "what usually does; there are no intervals."
             )
-        skipped = 1 if analysis is main else 0
-        said += [
-            line
-            for scope in analysis.scopes[skipped:]
-            for line in verdict(scope, report.difference)
-        ]
+        said += [line for scope in analysis.scopes for line in verdict(scope, report.difference)]
         head = f"Stage {stage.name} ({stage.variant}), seeds {', '.join(stage.seeds)}"
         if analysis is report.together:
             head = "Stages side by side, each by the runs of the conditions that all have"

@@ -15,7 +15,6 @@ from music_rllib.experiment.location import Found, sweeps_in
 from music_rllib.redaction import redact
 from music_rllib.store.object_folder import open_storage
 from music_rllib.store.paths import sweep_folder
-from music_rllib.sweep.listeners.state_file import is_alive
 
 __all__ = ["Cleaning", "delete", "what_can_go"]
 
@@ -53,7 +52,7 @@ def what_can_go(found: Found, *, unfinished: bool, everything: bool) -> Cleaning
             then what that one needs.
     """
     state = found.read(sweep_files.STATE)
-    if is_alive(state):
+    if sweep_files.is_alive(state):
         raise BadInputError(
             f"SWEEP must not be running to be cleaned, {found.name} is: stop it first"
         )
@@ -114,7 +113,7 @@ def _users(found: Found, nodes: Iterable[Mapping[str, Any]]) -> dict[str, list[s
         for study in studies.keys() & _studies(other).keys():
             theirs |= _of_stage(studies[study], mine)
         shared = theirs & mine.keys()
-        if shared and is_alive(other.read(sweep_files.STATE)):
+        if shared and sweep_files.is_alive(other.read(sweep_files.STATE)):
             raise BadInputError(
                 f"SWEEP must share no runs with a running sweep to be cleaned, {found.name} shares "
                 f"{len(shared)} with {other.name}: stop that first"

@@ -76,13 +76,12 @@ def state_of(found: Found) -> dict[str, Any]:
     """`state.json`, with what became of its driver and of its finished runs."""
     from music_rllib.experiment import sweep_files
     from music_rllib.store.node_store import NodeStore
-    from music_rllib.sweep.listeners.state_file import is_alive
 
     state = found.read(sweep_files.STATE)
     if state is None:
         return {"sweep": found.name, "place": found.place, "state": "not started"}
     outcome = state["driver"]["outcome"]
-    if not is_alive(state):
+    if not sweep_files.is_alive(state):
         outcome = "interrupted" if outcome == "running" else outcome
         _nothing_runs(state)
     store, nodes = (

@@ -13,7 +13,7 @@ import socket
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from types import TracebackType
 from typing import Any, Self
 
@@ -25,27 +25,15 @@ from music_rllib.experiment.plan import Node
 from music_rllib.experiment.scheduler import Status
 from music_rllib.experiment.session import Sweep, plan_document
 from music_rllib.search.ranking import best_in_words, best_so_far
-from music_rllib.store.lease import process_start, runs_here, this_machine
+from music_rllib.store.lease import process_start, this_machine
 from music_rllib.store.object_folder import StorageError
 from music_rllib.store.run_record import Report, RunResult, last_values
 
-__all__ = ["Beacon", "is_alive"]
+__all__ = ["Beacon"]
 
 LOCAL_SECONDS, REMOTE_SECONDS = 2.0, 15.0
 """Between two signs of life."""
-SILENCE_SECONDS = 90.0
-"""After so long a driver on another machine counts as dead."""
 SHOWN_FAILURES = 20
-
-
-def is_alive(state: Mapping[str, Any] | None) -> bool:
-    """Whether a sweep's driver is at work, by its `state.json`."""
-    if state is None or state["driver"]["ended"] is not None:
-        return False
-    driver = state["driver"]
-    if driver["machine"] == this_machine():
-        return runs_here(driver["pid"], driver["process_started"])
-    return bool(time.time() - driver["heartbeat"] < SILENCE_SECONDS)
 
 
 class Beacon(Listener):

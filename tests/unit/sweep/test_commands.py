@@ -36,7 +36,7 @@ from music_rllib.store.object_folder import DamagedError
 from music_rllib.store.paths import sweep_folder
 from music_rllib.store.run_record import HISTORY, Report, RunResult, to_json_lines
 from music_rllib.sweep import clean, cli
-from music_rllib.sweep.listeners.state_file import Beacon, is_alive
+from music_rllib.sweep.listeners.state_file import Beacon
 
 SWEEP: dict[str, Any] = {
     "name": "mine",
@@ -457,7 +457,7 @@ def test_stop_reaches_the_driver(
     try:
         sweep = opened(storage, tmp_path)
         with Beacon(sweep) as beacon:
-            assert is_alive(sweep_files.read(storage, "mine/state.json"))
+            assert sweep_files.is_alive(sweep_files.read(storage, "mine/state.json"))
             refused = program("clean", f"{storage}/mine")
             assert (refused.code, "must not be running" in refused.errors) == (2, True)
             asked = program("stop", f"{storage}/mine", "--wait", "0")

@@ -1,0 +1,76 @@
+"""How far a sweep is: what its driver writes, with its speed and the time left."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+from music_rllib import names
+from music_rllib.experiment import sweep_files
+from music_rllib.experiment.location import Found
+
+__all__ = ["Progress"]
+
+WINDOW = 120.0
+"""Seconds over which the speed is measured."""
+SHOWN = 50
+"""Of running and of failed runs."""
+
+
+class Progress:
+    """What the page shows of a sweep's `state.json`."""
+
+    def __init__(self, found: Found) -> None:
+        self._found = found
+        self._seen: deque[tuple[float, int]] = deque()
+
+    def read(self) -> dict[str, Any]:
+        """How far the sweep is now.
+
+        Raises:
+            StorageError: its record is damaged or not reachable.
+        """
+        state = self._found.read(sweep_files.STATE)
+        if state is None:
+            return {"sweep": self._found.name, "state": "not started"}
+        driver, steps = state["driver"], state["env_steps"]
+        running = sweep_files.is_alive(state)
+        outcome = driver["outcome"]
+        speed = self._speed(driver["heartbeat"], steps["done"]) if running else None
+        return {
+            "sweep": self._found.name,
+            "state": "interrupted" if outcome == "running" and not running else outcome,
+            "since": driver["started"],
+            "ended": None if running else driver["ended"],
+            "done": steps["done"],
+            "left": steps["left"],
+            "speed": speed,
+            "seconds_left": steps["left"] / speed if speed else None,
+            "stages": [{"name": one["name"], "runs": one["runs"]} for one in state["stages"]],
+            "running": [
+                {
+                    "run": one["run"],
+                    "done": one["env_steps"],
+                    "budget": one["budget"],
+                    "metric": names.word_of(one["metric"]),
+                    "value": one["value"],
+                }
+                for one in state["running"][:SHOWN]
+                if running
+            ],
+            "failures": [
+                {"run": one["run"], "cause": one["cause"]} for one in state["failures"][-SHOWN:]
+            ],
+        }
+
+    def _speed(self, now: float, done: int) -> float | None:
+        """Environment steps per second, of all runs together; None until there are some."""
+        seen = self._seen
+        if seen and (now < seen[-1][0] or done < seen[-1][1]):
+            seen.clear()  # another driver has taken over
+        if not seen or now > seen[-1][0]:
+            seen.append((now, done))
+        while len(seen) > 2 and now - seen[0][0] > WINDOW:
+            seen.popleft()
+        (begin, before), (end, after) = seen[0], seen[-1]
+        return (after - before) / (end - begin) if after > before else None

@@ -1,0 +1,102 @@
+// The sweep now: its progress every two seconds, a new page where there is one, stop and resume.
+"use strict";
+
+const token = new URLSearchParams(location.search).get("token") ?? "";
+const asked = (path, method = "GET") => fetch(path, { method, headers: { "X-Token": token }, cache: "no-store" });
+const PARTS = ["facts", "notes", "answer", "curves", "groups", "searches", "origin"];
+let version = 0, said = "";
+
+function time(seconds) {
+  if (seconds === null || seconds === undefined) return "–";
+  const [hours, minutes] = [Math.floor(seconds / 3600), Math.floor(seconds / 60) % 60];
+  return hours ? `${hours} h ${minutes} min` : minutes ? `${minutes} min` : `${Math.round(seconds)} s`;
+}
+
+/** What is new of the page takes the place of what was there; the rest does not move. */
+async function renew() {
+  const page = new DOMParser().parseFromString(await (await asked("/")).text(), "text/html");
+  data = JSON.parse(page.getElementById("data").textContent);
+  for (const id of PARTS) {
+    const [before, now] = [document.getElementById(id), page.getElementById(id)];
+    if (!before || !now || before.source === now.innerHTML) continue;
+    const open = [...before.querySelectorAll("details")].map((one) => one.open);
+    before.source = now.innerHTML;
+    before.style.minHeight = `${before.offsetHeight}px`;
+    const charts = new Map([...before.querySelectorAll("figure")].map((one) => [one.id, one.querySelector(".live")]));
+    before.replaceChildren(...now.childNodes);
+    // Charts stay until they are drawn anew, in the same place.
+    for (const figure of before.querySelectorAll("figure")) {
+      const chart = charts.get(figure.id);
+      if (chart) figure.querySelector(".live")?.replaceWith(chart);
+    }
+    [...before.querySelectorAll("details")].forEach((one, i) => { one.open = open[i] ?? one.open; });
+    requestAnimationFrame(() => { before.style.minHeight = ""; });
+  }
+  refresh();
+}
+
+function bar(parent, label, done, whole, text) {
+  const row = element("div", { class: "row" }, parent);
+  element("span", {}, row, label);
+  const meter = element("progress", { max: Math.max(1, whole), "aria-label": label }, row);
+  meter.value = done;
+  element("span", { class: "soft" }, row, text);
+}
+
+function act(parent, name, path, enabled) {
+  const button = element("button", { type: "button", id: `${name}-button` }, parent, name);
+  button.disabled = !enabled;
+  button.addEventListener("click", async () => {
+    button.disabled = true;
+    said = (await (await asked(path, "POST")).json()).said ?? "";
+    look();
+  });
+}
+
+function showState(state) {
+  const parent = document.getElementById("live"), focus = document.activeElement?.id;
+  const box = document.createDocumentFragment();
+  const head = element("p", {}, box);
+  element("strong", {}, head, `The sweep is ${state.state}. `);
+  if (state.done !== undefined) {
+    const speed = state.speed ? `, ${shown(state.speed)} env steps per second` : "";
+    const left = state.seconds_left ? `, ${time(state.seconds_left)} left` : "";
+    head.append(`${state.done.toLocaleString("en")} env steps done, ${state.left.toLocaleString("en")} to go${speed}${left}. `);
+  }
+  if (state.error) head.append(state.error);
+  act(head, "stop", "/stop", state.state === "running");
+  head.append(" ");
+  act(head, "resume", "/resume", !["running", "unknown", "finished"].includes(state.state));
+  element("p", { role: "status", class: "soft" }, box, said);
+  const bars = element("div", { class: "bars" }, box);
+  for (const stage of state.stages ?? []) {
+    const counts = Object.entries(stage.runs), all = counts.reduce((sum, [, n]) => sum + n, 0);
+    const over = (stage.runs.finished ?? 0) + (stage.runs.reused ?? 0) + (stage.runs.failed ?? 0) + (stage.runs.pruned ?? 0);
+    bar(bars, stage.name, over, all, counts.map(([name, n]) => `${n} ${name}`).join(", "));
+  }
+  for (const run of state.running ?? []) {
+    bar(bars, run.run, run.done, run.budget, `${run.metric} ${shown(run.value)}`);
+  }
+  for (const failure of state.failures ?? []) {
+    const line = element("p", { class: "note" }, box);
+    element("strong", {}, line, `${failure.run} failed: `);
+    line.append(failure.cause);
+  }
+  parent.replaceChildren(box);
+  if (focus?.endsWith("-button")) document.getElementById(focus)?.focus();
+}
+
+async function look() {
+  try {
+    const state = await (await asked("/state")).json();
+    showState(state);
+    if (version && state.version !== version) await renew();
+    version = state.version;
+  } catch {
+    showState({ state: "not to be reached: its page has ended" });
+  }
+}
+
+document.title = `live: ${document.title}`;
+look();
+setInterval(look, 2000);

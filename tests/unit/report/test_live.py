@@ -1,0 +1,143 @@
+"""The live page: who may see it, what it says of a sweep, and what its buttons do."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.error import HTTPError
+from urllib.request import Request, urlopen
+
+import pytest
+
+from music_rllib.experiment import sweep_files
+from music_rllib.experiment.location import Found
+from music_rllib.report.live import server
+from music_rllib.report.live.state import Progress
+from music_rllib.store.lease import this_machine
+
+RUNNING = {"run": "train/A", "env_steps": 40, "budget": 100, "metric": "m", "value": None}
+
+
+def write_state(folder: Path, done: int, heartbeat: float, **driver: Any) -> None:
+    state = {
+        "sweep": "tiny",
+        "driver": {
+            "pid": 1,
+            "host": "elsewhere",
+            "machine": f"not {this_machine()}",
+            "process_started": 0.0,
+            "started": heartbeat - 100,
+            "heartbeat": heartbeat,
+            "ended": None,
+            "outcome": "running",
+            **driver,
+        },
+        "stages": [{"name": "train", "runs": {"started": 1, "waiting": 2}}],
+        "env_steps": {"done": done, "left": 300 - done},
+        "running": [RUNNING],
+        "best": None,
+        "searches": [],
+        "failures": [{"run": "train/B", "cause": "<b>no</b>", "log": "x"}],
+    }
+    (folder / "tiny").mkdir(exist_ok=True)
+    (folder / "tiny" / sweep_files.STATE).write_text(json.dumps(state))
+
+
+@pytest.fixture
+def found(tmp_path: Path) -> Found:
+    return Found(storage=str(tmp_path), name="tiny")
+
+
+def test_speed_and_the_time_left_are_those_of_the_last_minutes(
+    found: Found, tmp_path: Path
+) -> None:
+    progress, now = Progress(found), time.time()
+    assert progress.read() == {"sweep": "tiny", "state": "not started"}
+    write_state(tmp_path, 100, now - 20)
+    assert progress.read()["speed"] is None
+    write_state(tmp_path, 200, now - 10)
+    seen = progress.read()
+    assert (seen["state"], seen["done"], seen["left"]) == ("running", 200, 100)
+    assert (seen["speed"], seen["seconds_left"]) == pytest.approx((10.0, 10.0))
+    assert seen["running"][0]["run"] == "train/A"
+    # A driver that has been silent for long does not run, whatever it said last.
+    write_state(tmp_path, 200, now - 1000)
+    seen = progress.read()
+    assert (seen["state"], seen["speed"], seen["running"]) == ("interrupted", None, [])
+    write_state(tmp_path, 300, now, ended=now, outcome="finished")
+    assert progress.read()["state"] == "finished"
+
+
+@pytest.fixture
+def served(
+    found: Found, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[tuple[str, str]]:
+    """The address without its token, and the token."""
+    monkeypatch.setattr(server, "LEAST_PAUSE", 0.05)
+    write_state(tmp_path, 100, time.time())
+    made = iter(range(1000))
+    page = server.LivePage(lambda: f"<p>page {next(made)}", Progress(found))
+    http = server.make_server(page, found, tmp_path, 0)
+    thread = threading.Thread(target=http.serve_forever, daemon=True)
+    thread.start()
+    yield f"http://127.0.0.1:{http.server_port}", http.token
+    http.shutdown()
+    http.server_close()
+    page.close()
+
+
+def ask(url: str, method: str = "GET", **headers: str) -> tuple[int, str]:
+    request = Request(
+        url, method=method, headers={k.replace("_", "-"): v for k, v in headers.items()}
+    )
+    try:
+        with urlopen(request, timeout=30) as answer:
+            return answer.status, answer.read().decode()
+    except HTTPError as error:
+        return error.code, error.read().decode()
+
+
+def test_nobody_without_the_token_sees_or_stops_anything(
+    served: tuple[str, str], tmp_path: Path
+) -> None:
+    address, token = served
+    for path in ("/", "/state", "/?token=", "/?token=wrong"):
+        assert ask(address + path)[0] == 403
+    assert ask(f"{address}/?token={token}", Host="evil.example:80")[0] == 403
+    for headers in ({}, {"X_Token": "wrong"}):
+        assert ask(f"{address}/stop", "POST", **headers)[0] == 403
+    # A form of another site can send what is in an address, and no header.
+    assert ask(f"{address}/stop?token={token}", "POST")[0] == 403
+    assert not (tmp_path / "tiny" / sweep_files.STOP).exists()
+
+
+def test_the_page_is_made_anew_while_the_sweep_runs(served: tuple[str, str]) -> None:
+    address, token = served
+    assert ask(f"{address}/?token={token}")[1].startswith("<p>page ")
+    before = json.loads(ask(f"{address}/state", X_Token=token)[1])
+    assert before["state"] == "running"
+    deadline = time.monotonic() + 60
+    while json.loads(ask(f"{address}/state", X_Token=token)[1])["version"] == before["version"]:
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def test_the_buttons_stop_a_running_sweep_and_resume_a_stopped_one(
+    served: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    address, token = served
+    started: list[list[str]] = []
+    monkeypatch.setattr(server.subprocess, "Popen", lambda command, **_: started.append(command))
+    assert ask(f"{address}/resume", "POST", X_Token=token)[0] == 409, "it runs"
+    assert ask(f"{address}/stop", "POST", X_Token=token)[0] == 200
+    assert (tmp_path / "tiny" / sweep_files.STOP).exists()
+    write_state(tmp_path, 100, time.time(), ended=time.time(), outcome="stopped")
+    assert ask(f"{address}/stop", "POST", X_Token=token)[0] == 409
+    assert ask(f"{address}/resume", "POST", X_Token=token)[0] == 200
+    ((*_, command, name, option, storage),) = started
+    assert (command, name, option, storage) == ("resume", "tiny", "--storage", str(tmp_path))
+    assert (tmp_path / "resume.log").exists()

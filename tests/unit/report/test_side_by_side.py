@@ -1,0 +1,39 @@
+"""Two sweeps in one report: what was set otherwise, and what came of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from music_rllib.report.build import build_report
+from music_rllib.report.page import render
+from music_rllib.report.side_by_side import side_by_side
+from music_rllib.results.archive.folder import read_archive
+
+DATA = Path(__file__).parents[3] / "docs" / "results" / "data"
+
+
+def test_the_page_of_two_sweeps_says_what_differs() -> None:
+    first = read_archive(DATA / "proof-fetch-reach")
+    changed = [replace(run, params={**run.params, "tac.alpha": "0.125"}) for run in first.runs]
+    second = replace(first, name="other", runs=changed)
+    both = side_by_side(first, second)
+    assert len(both.runs) == 2 * len(first.runs), "runs of the same node are two"
+    made = build_report(both, beside=(first, second))
+    settings, results = made.differences
+    ((_, setting, before, after),) = settings.rows
+    assert (setting, after) == ("tac.alpha", "0.125")
+    assert before == first.runs[0].params["tac.alpha"]
+    ((*_, mean, other, gap, _),) = results.rows
+    assert mean == other
+    assert float(getattr(gap, "text", gap)) == 0
+    assert made.together is not None
+    (scope,) = made.together.scopes
+    assert {final.seeds for final in scope.finals} == {3}
+    page = render(made)
+    assert page.count("<h2>Differences</h2>") == 1
+    same = side_by_side(first, first)
+    assert {run.stage.partition(":")[0] for run in same.runs} == {
+        "proof-fetch-reach (first)",
+        "proof-fetch-reach (second)",
+    }
