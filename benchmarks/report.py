@@ -14,7 +14,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from benchmarks.measure import Row, middle, taken_by
+from benchmarks.measure import Row, Taken, middle, taken_by
 from music_rllib import names
 from music_rllib.config.load import load_sweep
 from music_rllib.config.schema import SweepConfig
@@ -75,7 +75,7 @@ def rows(repeats: int) -> Iterator[Row]:
             yield Row("report", "it opens", took, "s", cpu=cpu, target=target, met=took <= OPENS)
 
 
-def _opened(chromium: str, address: str) -> tuple[float, float]:
+def _opened(chromium: str, address: str) -> Taken:
     """Wall and CPU seconds of Chromium's start, a page with its script run, and Chromium's end."""
     with TemporaryDirectory() as profile:
         command = [chromium, "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run"]

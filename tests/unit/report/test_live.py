@@ -131,7 +131,7 @@ def test_the_buttons_stop_a_running_sweep_and_resume_a_stopped_one(
 ) -> None:
     address, token = served
     started: list[list[str]] = []
-    monkeypatch.setattr(server.subprocess, "Popen", lambda command, **_: started.append(command))
+    monkeypatch.setattr("subprocess.Popen", lambda command, **_: started.append(command))
     assert ask(f"{address}/resume", "POST", X_Token=token)[0] == 409, "it runs"
     assert ask(f"{address}/stop", "POST", X_Token=token)[0] == 200
     assert (tmp_path / "tiny" / sweep_files.STOP).exists()

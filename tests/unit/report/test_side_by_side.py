@@ -7,6 +7,7 @@ from pathlib import Path
 
 from music_rllib.report.build import build_report
 from music_rllib.report.page import render
+from music_rllib.report.pieces import Cell
 from music_rllib.report.side_by_side import side_by_side
 from music_rllib.results.archive.folder import read_archive
 
@@ -26,7 +27,8 @@ def test_the_page_of_two_sweeps_says_what_differs() -> None:
     assert before == first.runs[0].params["tac.alpha"]
     ((*_, mean, other, gap, _),) = results.rows
     assert mean == other
-    assert float(getattr(gap, "text", gap)) == 0
+    assert isinstance(gap, Cell)
+    assert float(gap.text) == 0
     assert made.together is not None
     (scope,) = made.together.scopes
     assert {final.seeds for final in scope.finals} == {3}
