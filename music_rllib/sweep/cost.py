@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import time
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -15,17 +14,14 @@ from rich.table import Table
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.schema import SweepConfig
 from music_rllib.experiment.plan import Plan
+from music_rllib.runtime import machine
 from music_rllib.runtime.ray_cluster import cluster
 from music_rllib.sweep.views.tables import fresh_runs, search_budget, search_runs
 from music_rllib.sweep.views.text import clock
-from music_rllib.training.run import TrainingRun
+from music_rllib.training.sample_run import RunSample, sample_run
 
 __all__ = ["Kind", "cost_document", "cost_table", "kinds", "measure"]
 
-START_SECONDS = 6.0
-"""From a run's beginning to its first step, most of it importing (docs/performance.md)."""
-MEASURED_SECONDS = 4.0
-"""So long each kind of run is trained at least, after a round that warms up."""
 BUSY = 0.75
 """Load average per CPU above which other programs ran beside the one that measures."""
 _WITHOUT_COST: dict[str, bool | set[str]] = {
@@ -60,17 +56,14 @@ class Cost:
     """What one run of a kind takes."""
 
     kind: Kind
-    steps_per_second: float
-    """Environment steps, while it learns."""
-    evaluation_seconds: float
-    """Of one evaluation."""
+    sample: RunSample
 
     @property
     def seconds(self) -> float:
         """Of one run, from its start to its end."""
         evaluations = math.ceil(self.kind.env_steps / self.kind.settings.evaluation.interval)
-        training = self.kind.env_steps / self.steps_per_second
-        return START_SECONDS + training + evaluations * self.evaluation_seconds
+        training = self.kind.env_steps / self.sample.steps_per_second
+        return self.sample.start_seconds + training + evaluations * self.sample.evaluation_seconds
 
 
 def kinds(config: SweepConfig, plan: Plan, finished: Collection[str]) -> list[Kind]:
@@ -129,7 +122,7 @@ def _searched(config: SweepConfig) -> Iterator[Kind]:
 def measure(
     config: SweepConfig, found: list[Kind], say: Callable[[str], None]
 ) -> tuple[list[Cost], int]:
-    """Train a run of each kind for some seconds in this process, one after the other.
+    """Train a run of each kind for some seconds, one after the other.
 
     Args:
         config: For the resources of a run.
@@ -148,53 +141,52 @@ def measure(
         costs = []
         for number, kind in enumerate(found, 1):
             say(f"measuring {number} of {len(found)}: {kind.label}")
-            costs.append(_measure_one(kind, config.resources.gpus_per_run))
+            run = kind.settings.model_copy(update={"env_steps": kind.env_steps})
+            sample = sample_run(run, config.resources)
+            costs.append(Cost(kind=kind, sample=sample))
         return costs, room.at_once
-
-
-def _measure_one(kind: Kind, gpus: float) -> Cost:
-    run = kind.settings
-    # Steps that teach nothing are many times cheaper than the others, and soon over.
-    tac = run.tac.model_copy(update={"random_steps": 0})
-    training = TrainingRun(run.model_copy(update={"tac": tac}), gpus=gpus)
-    try:
-        training.algorithm.train()
-        first, began = training.env_steps, time.perf_counter()
-        while (elapsed := time.perf_counter() - began) < MEASURED_SECONDS:
-            training.algorithm.train()
-        steps = training.env_steps - first
-        began = time.perf_counter()
-        training.evaluate()
-        evaluation = time.perf_counter() - began
-    finally:
-        training.close()
-    return Cost(kind=kind, steps_per_second=steps / elapsed, evaluation_seconds=evaluation)
 
 
 def cost_table(costs: list[Cost], slots: int) -> Table:
     """One row per kind of run, and the whole sweep's time below."""
     document = cost_document(costs, slots)
     table = Table(title="What it takes on this machine", title_justify="left")
-    table.add_column("stage/task")
-    for name in ("runs", "env steps a run", "updates a run", "env steps/s", "a run", "all"):
-        table.add_column(name, justify="right")
+    table.add_column("stage/task", overflow="fold")
+    for name in ("runs", "env steps", "steps/s", "memory", "start", "a run", "all"):
+        table.add_column(name, justify="right", no_wrap=True)
     for row in document["kinds"]:
         table.add_row(
             row["label"],
             f"{row['runs']:,}",
             f"{row['env_steps']:,}",
-            f"{row['grad_updates']:,}",
             f"{row['env_steps_per_second']:.0f}",
+            f"{row['memory'] / 2**30:.1f} GiB",
+            f"{row['start_seconds']:.0f} s",
             clock(row["seconds_a_run"]),
             clock(row["seconds"]),
         )
     at_once = "one run at a time" if slots == 1 else f"{slots} runs at a time"
     table.caption = f"About {clock(document['seconds'])} with {at_once}, each measured by itself."
+    largest = max((cost.sample.memory for cost in costs), default=0)
+    table.caption += f"\n{_memory_in_words(largest, slots)}"
     load = os.getloadavg()[0]
     if load > BUSY * len(os.sched_getaffinity(0)):
         table.caption += f"\nThe machine was busy with something else (load {load:.1f})."
     table.caption_justify = "left"
     return table
+
+
+def _memory_in_words(largest: int, slots: int) -> str:
+    """What runs side by side take of this machine's memory, and how to have fewer of them."""
+    wanted, here = slots * largest / 2**30, machine.memory() / 2**30
+    if machine.cluster_address() is not None:
+        return f"A run takes up to {largest / 2**30:.1f} GiB of memory."
+    if wanted <= here:
+        return f"Together they take up to {wanted:.1f} of this machine's {here:.1f} GiB of memory."
+    return (
+        f"Together they would take {wanted:.1f} GiB of memory, of which this machine has "
+        f"{here:.1f}: set resources.memory_per_run to {math.ceil(10 * largest / 2**30) / 10:g}."
+    )
 
 
 def cost_document(costs: list[Cost], slots: int) -> dict[str, Any]:
@@ -205,7 +197,10 @@ def cost_document(costs: list[Cost], slots: int) -> dict[str, Any]:
             "runs": cost.kind.runs,
             "env_steps": cost.kind.env_steps,
             "grad_updates": cost.kind.grad_updates,
-            "env_steps_per_second": cost.steps_per_second,
+            "env_steps_per_second": cost.sample.steps_per_second,
+            "start_seconds": cost.sample.start_seconds,
+            "evaluation_seconds": cost.sample.evaluation_seconds,
+            "memory": cost.sample.memory,
             "seconds_a_run": cost.seconds,
             "seconds": cost.seconds * cost.kind.runs,
         }

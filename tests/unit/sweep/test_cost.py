@@ -8,7 +8,9 @@ import yaml
 
 from music_rllib.config.load import load_sweep
 from music_rllib.experiment.plan import make_plan
+from music_rllib.runtime import machine
 from music_rllib.sweep import cost
+from music_rllib.training.sample_run import RunSample
 
 
 def kinds(folder: Path, finished: int = 0, **changes: Any) -> list[cost.Kind]:
@@ -56,15 +58,36 @@ def test_a_search_counts_with_what_it_runs_at_most(tmp_path: Path) -> None:
     assert (slide.label, slide.runs) == ("t/FetchSlide", 16)
 
 
+SAMPLE = RunSample(
+    start_seconds=5.0, steps_per_second=100.0, evaluation_seconds=3.0, memory=3 * 2**29
+)
+
+
+def costs(folder: Path) -> list[cost.Cost]:
+    return [cost.Cost(kind=kind, sample=SAMPLE) for kind in kinds(folder)]
+
+
 def test_the_time_is_training_evaluations_and_start(tmp_path: Path) -> None:
-    costs = [
-        cost.Cost(kind=kind, steps_per_second=100.0, evaluation_seconds=3.0)
-        for kind in kinds(tmp_path)
-    ]
     # 10,000 steps, and an evaluation every 5,000.
-    a_run = 100.0 + 2 * 3.0 + cost.START_SECONDS
-    document = cost.cost_document(costs, slots=4)
+    a_run = 100.0 + 2 * 3.0 + 5.0
+    document = cost.cost_document(costs(tmp_path), slots=4)
     assert document["seconds"] == pytest.approx(16 * a_run / 4)
     assert document["kinds"][0]["seconds"] == pytest.approx(4 * a_run)
-    assert cost.cost_document(costs, slots=100)["seconds"] == pytest.approx(a_run)
+    assert cost.cost_document(costs(tmp_path), slots=100)["seconds"] == pytest.approx(a_run)
     assert cost.cost_document([], slots=2) == {"kinds": [], "runs_at_once": 2, "seconds": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("here", "told"),
+    [
+        (16, "Together they take up to 6.0 of this machine's 16.0 GiB of memory."),
+        (4, "this machine has 4.0: set resources.memory_per_run to 1.5."),
+    ],
+)
+def test_runs_that_no_memory_holds_side_by_side_are_told_of(
+    here: int, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.setattr(machine, "memory", lambda: here * 2**30)
+    caption = cost.cost_table(costs(tmp_path), slots=4).caption
+    assert told in str(caption)
