@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from music_rllib import names
 from music_rllib.results.claims.contrasts import Verdict
+from music_rllib.results.claims.plan import AnalysisPlan
 from music_rllib.results.claims.power import seeds_needed
 from music_rllib.results.claims.study import Claim, Study, label_of
 from music_rllib.results.comparison import ALL_TASKS, interval_text, number, p_text
@@ -52,14 +53,20 @@ def planned_in_words(study: Study) -> str:
             f"planned {plan.recorded}, before its first run finished; version {plan.version}, "
             f"hash {plan.hash[:12]}"
         )
-        changed = latest is not None and latest.version > plan.version
-        return f"{text}; changed afterwards, which does not count as planned" if changed else text
+        changed = [] if latest is None else _changed(plan.plan, latest.plan)
+        return f"{text}; changed afterwards: {', '.join(changed)}" if changed else text
     if latest is not None:
         return (
             f"planned {latest.recorded}, when runs had finished already: it counts as thought of "
             "afterwards"
         )
     return "nothing was planned beforehand: every comparison here was thought of afterwards"
+
+
+def _changed(before: AnalysisPlan, after: AnalysisPlan) -> list[str]:
+    """Parts of a plan that a later version has otherwise, such as more seeds."""
+    known, now = before.model_dump(), after.model_dump()
+    return [name.replace("_", " ") for name in known if known[name] != now[name]]
 
 
 def _asked(study: Study) -> str:

@@ -26,7 +26,8 @@ def register(commands: Commands) -> None:
     parser = commands.add_parser(
         "plan",
         help="check a sweep and show what it would run",
-        description="Check a sweep's file and show what it would run; no run is started.",
+        description="Check a sweep's file and show what it would run; no run is started. What its "
+        "`analysis` states is kept as an analysis plan in the sweep's folder.",
         epilog=EPILOG,
     )
     add_sweep_options(parser)

@@ -202,7 +202,7 @@ def test_a_plan_that_changes_after_a_result_keeps_what_was_planned(
     assert [(one.margin, one.confirmed) for one in found.planned] == [(0.05, False)]
     assert [(one.margin, one.confirmed) for one in found.afterwards] == [(0.3, False)]
     assert found.afterwards[0].verdict is Verdict.EQUIVALENT
-    assert "changed afterwards" in answer(sweep_of(runs, both), found)[0]
+    assert "changed afterwards: hypotheses, margin)" in answer(sweep_of(runs, both), found)[0]
 
 
 def test_settings_that_a_hypothesis_leaves_open_are_averaged(rng: np.random.Generator) -> None:
