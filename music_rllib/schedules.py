@@ -24,6 +24,7 @@ from pydantic import (
 )
 
 __all__ = [
+    "QUANTITIES",
     "AdaptiveSchedule",
     "Follower",
     "Linear",
@@ -39,6 +40,8 @@ __all__ = [
 
 Quantity = Literal["success_rate", "shannon_entropy"]
 """What a setting may follow."""
+QUANTITIES = {"success_rate": "success rate", "shannon_entropy": "Shannon entropy"}
+"""In words."""
 
 
 class _Frozen(BaseModel):

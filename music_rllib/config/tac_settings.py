@@ -16,6 +16,7 @@ from pydantic import (
 
 from music_rllib.functional.entropy_scale import matched_alpha, normalised_alpha
 from music_rllib.schedules import (
+    QUANTITIES,
     AdaptiveSchedule,
     Linear,
     Measured,
@@ -282,7 +283,7 @@ def in_words(
         case Linear():
             return f"{value.start:g} to {value.end:g}"
         case Measured():
-            quantity = value.follows.replace("_", " ")
+            quantity = QUANTITIES[value.follows]
             return f"{' to '.join(f'{point:g}' for _, point in value.points)} by {quantity}"
         case Piecewise():
             return " to ".join(f"{point:g}" for _, point in value.points)

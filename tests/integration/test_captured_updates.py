@@ -108,13 +108,14 @@ def captured(algo: TAC, recorder: Any) -> TAC:
 
 
 RAMP = {"schedule": "linear", "start": 1.0, "end": 2.0}
+BY_ENTROPY = {"follows": "shannon_entropy", "points": [[1.0, 1.0], [3.0, 2.0]]}
 VARIANTS: dict[str, dict[str, Any]] = {
     "tac": HER,
     "music-u": {"music": MUSIC_U},
     "music-r": {"music": MUSIC_R, "entropic_index": 1.5},
     "episodes of unequal lengths": {"task": "Uneven", "music": MUSIC_U},
     "frames shuffled as in 2021": {"music": {**MUSIC_U, "shuffle": "random"}},
-    "q and alpha scheduled": {"entropic_index": RAMP, "alpha": {**RAMP, "start": 0.1}},
+    "q measured, alpha scheduled": {"entropic_index": BY_ENTROPY, "alpha": {**RAMP, "start": 0.1}},
     "alpha learned": {"alpha": {"learned": True}, "bootstrap": "critics"},
     "ddpg": {**DDPG, "target_update_interval": 2, "action_l2": 1.0},
     "per": PER,

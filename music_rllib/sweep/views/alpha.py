@@ -12,7 +12,7 @@ from music_rllib.config.tac_settings import MatchedAlpha, NormalisedAlpha, alpha
 from music_rllib.envs.make import make_env
 from music_rllib.envs.tasks import Task
 from music_rllib.experiment.plan import Node, Plan
-from music_rllib.schedules import Linear, Measured, Piecewise, value_at
+from music_rllib.schedules import QUANTITIES, Linear, Measured, Piecewise, value_at
 
 __all__ = ["adaptive_rows", "adaptive_text", "alpha_rows", "alpha_table"]
 
@@ -96,9 +96,7 @@ def adaptive_rows(plan: Plan) -> list[dict[str, Any]]:
 def adaptive_text(row: dict[str, Any]) -> str:
     """`her: tac.entropic_index follows the success rate: 2 at 0.2, 1 at 0.9`."""
     points = ", ".join(f"{value:g} at {measured:g}" for measured, value in row["points"])
-    text = (
-        f"{row['stage']}: {row['setting']} follows the {row['follows'].replace('_', ' ')}: {points}"
-    )
+    text = f"{row['stage']}: {row['setting']} follows the {QUANTITIES[row['follows']]}: {points}"
     if row["smoothing"]:
         text += f"; averaged over {row['smoothing']:g} env steps"
     return text + ("; never goes back" if row["monotone"] else "")
