@@ -188,4 +188,4 @@ def test_yaml_is_a_sweep_or_a_part_of_the_one_before_it(page: Path, tmp_path: Pa
 def test_python_compiles_and_finds_what_it_imports(block: str) -> None:
     module = ast.parse(block)
     imports = [line for line in module.body if isinstance(line, ast.Import | ast.ImportFrom)]
-    exec(compile(ast.Module(imports, []), "snippet", "exec"), {})
+    exec(compile(ast.Module([*imports], []), "snippet", "exec"), {})
