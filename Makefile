@@ -16,7 +16,7 @@ PYTEST := $(BIN)/python -m pytest -n $(JOBS) --dist loadscope
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help venv sweep test test-unit test-faults fuzz lint type bench profile results clean
+.PHONY: help venv sweep test test-unit test-faults fuzz lint type bench profile results docs clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -78,6 +78,15 @@ profile: venv  ## write a flame graph of a training run to results/profile.svg
 
 results: venv  ## rebuild docs/results.md and its figures from docs/results/data
 	@$(BIN)/python docs/generate_results.py
+
+docs: venv  ## build the documentation site in build/docs, with search; open its index.html
+	@$(BIN)/python -m pip install -qq -c constraints.txt -e '.[docs]'
+	@rm -rf build/docs build/docs-source && mkdir -p build && cp -r docs build/docs-source
+	@cp README.md build/docs-source/index.md
+	@cp CHANGELOG.md build/docs-source/changelog.md
+	@cp docs/search.md build/docs-source/searching.md
+	@$(BIN)/python -m sphinx -q -W -c docs -d build/doctrees build/docs-source build/docs
+	@echo "open build/docs/index.html"
 
 clean:  ## remove caches and build output (keeps .venv and results)
 	@rm -rf build dist *.egg-info .pytest_cache .hypothesis .mypy_cache .ruff_cache

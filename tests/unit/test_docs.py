@@ -107,3 +107,9 @@ def test_tests_that_the_documentation_names_exist() -> None:
             assert (ROOT / file).is_file(), f"{name}: {file}"
         mentioned = set(re.findall(r"`(test_\w+)`", text))
         assert mentioned <= defined, f"{name}: {mentioned - defined}"
+
+
+def test_every_page_is_on_the_documentation_site() -> None:
+    contents = (ROOT / "docs" / "conf.py").read_text().split("CONTENTS = ")[1].split()
+    pages = {path.stem for path in (ROOT / "docs").glob("*.md")} - {"search"}
+    assert pages | {"searching", "changelog"} <= set(contents)

@@ -1,0 +1,82 @@
+"""The documentation site: `make docs`. It opens from disk, with its search, and fetches nothing.
+
+Its pages are copies of docs/ and of what `PAGES` adds, as build/docs-source.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[1]
+
+project = "music_rllib"
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+exclude_patterns = ["results/*", "search.md"]
+root_doc = "index"
+html_theme = "furo"
+html_title = "music_rllib"
+html_copy_source = False
+html_show_sphinx = False
+html_show_copyright = False
+# Summaries are fetched, which a browser refuses on pages from a disk.
+html_show_search_summary = False
+myst_heading_anchors = 4
+autodoc_member_order = "bysource"
+autodoc_typehints = "description"
+autodoc_default_options = {"members": True, "exclude-members": "model_config"}
+# Examples show parts of files, and shell sessions.
+suppress_warnings = ["misc.highlighting_failure", "myst.header"]
+
+PAGES = {"index": "README.md", "changelog": "CHANGELOG.md", "searching": "docs/search.md"}
+"""Of the site, and their files; `search` is Sphinx's own page."""
+CONTENTS = """
+```{toctree}
+:hidden:
+:caption: Use
+configuration
+add_an_environment
+comparing_q
+searching
+reports
+operations
+```
+```{toctree}
+:hidden:
+:caption: Reference
+algorithms
+api
+reliability
+performance
+```
+```{toctree}
+:hidden:
+:caption: What came out
+results
+changelog
+```
+"""
+_LINK = re.compile(r"(!?\[[^\]]*\])\(([^)\s:#]+)(#[^)]*)?\)")
+
+
+def _with_links_of_the_site(app: Any, page: str, source: list[str]) -> None:
+    """Links to files become links to their pages, or names where they have none."""
+    above = (ROOT / PAGES.get(page, f"docs/{page}.md")).parent
+
+    def link(found: re.Match[str]) -> str:
+        path = (above / found[2]).resolve()
+        name = path.relative_to(ROOT).as_posix()
+        for own, file in PAGES.items():
+            if name == file:
+                return f"{found[1]}({own}.md{found[3] or ''})"
+        if path.is_relative_to(ROOT / "docs"):
+            return f"{found[1]}({path.relative_to(ROOT / 'docs')}{found[3] or ''})"
+        return f"`{name}`"
+
+    source[0] = _LINK.sub(link, source[0]) + (CONTENTS if page == root_doc else "")
+
+
+def setup(app: Any) -> None:
+    """Called by Sphinx."""
+    app.connect("source-read", _with_links_of_the_site)
