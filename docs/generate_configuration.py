@@ -1,4 +1,4 @@
-"""Writes docs/configuration.md from the settings' own types, defaults and docstrings.
+"""Writes docs/configuration.md and a sweep's JSON Schema from the settings' own definitions.
 
 python docs/generate_configuration.py            # writes it
 python docs/generate_configuration.py --check    # exit code 1 where it is out of date
@@ -6,11 +6,8 @@ python docs/generate_configuration.py --check    # exit code 1 where it is out o
 
 from __future__ import annotations
 
-import ast
-import inspect
 import json
 import sys
-import textwrap
 import types
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,6 +17,9 @@ import annotated_types
 from pydantic import AfterValidator, BaseModel, BeforeValidator
 from pydantic.fields import FieldInfo
 
+from music_rllib.authoring import SCHEMA
+from music_rllib.authoring.docstrings import docstrings
+from music_rllib.authoring.json_schema import json_schema
 from music_rllib.config.analysis import Analysis
 from music_rllib.config.run_settings import VARIANTS, Evaluation, RunSettings
 from music_rllib.config.schema import (
@@ -371,33 +371,15 @@ def _bare(annotation: Any) -> Any:
     return get_args(annotation)[0] if get_origin(annotation) is Annotated else annotation
 
 
-# --- docstrings --------------------------------------------------------------------------------
-
-
-def docstrings(model: type[BaseModel]) -> dict[str, str]:
-    """The text under each field of a class, on one line."""
-    (definition,) = ast.parse(textwrap.dedent(inspect.getsource(model))).body
-    assert isinstance(definition, ast.ClassDef)
-    found = {}
-    for field, below in zip(definition.body, definition.body[1:], strict=False):
-        if (
-            isinstance(field, ast.AnnAssign)
-            and isinstance(field.target, ast.Name)
-            and isinstance(below, ast.Expr)
-            and isinstance(below.value, ast.Constant)
-        ):
-            found[field.target.id] = " ".join(str(below.value.value).split())
-    return found
-
-
 def main() -> int:
-    """Write the page, or check it; the exit code."""
-    if sys.argv[1:] == ["--check"]:
-        if TARGET.read_text(encoding="utf-8") == document():
-            return 0
-        print(f"{TARGET.name} is out of date: run python docs/{Path(__file__).name}")
-        return 1
-    TARGET.write_text(document(), encoding="utf-8")
+    """Write the page and the schema, or check them; the exit code."""
+    wanted = {TARGET: document(), SCHEMA: json.dumps(json_schema(), indent=1) + "\n"}
+    for path, text in wanted.items():
+        if sys.argv[1:] != ["--check"]:
+            path.write_text(text, encoding="utf-8")
+        elif path.read_text(encoding="utf-8") != text:
+            print(f"{path.name} is out of date: run python docs/{Path(__file__).name}")
+            return 1
     return 0
 
 

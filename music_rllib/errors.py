@@ -6,10 +6,13 @@ FAILED, BAD_INPUT = 1, 2
 
 
 class BadInputError(Exception):
-    """Something that the user must change; nothing has been started."""
+    """Something that the user must change; nothing has been started.
+
+    The message names the place, the rule and the value. Commands print it, without a traceback.
+    """
 
 
-class TrackingError(RuntimeError):
+class TrackingError(BadInputError, RuntimeError):
     """Tracking cannot be set up, or a spool cannot be read or written.
 
     The message names the place (URI or path), the rule and what to do; it holds no password.

@@ -15,6 +15,8 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
 from music_rllib.envs.tasks import closest
+from music_rllib.errors import BadInputError
+from music_rllib.labels import SYMBOLS
 
 __all__ = [
     "ConfigError",
@@ -45,7 +47,7 @@ class Problem(NamedTuple):
     """What must hold, and what was found instead: `must be > 0, got -1`."""
 
 
-class ConfigError(ValueError):
+class ConfigError(BadInputError, ValueError):
     """A configuration that can't be used; the message has one line per problem."""
 
     def __init__(self, lines: Sequence[str]) -> None:
@@ -89,10 +91,6 @@ def lookup(document: Any, path: Iterable[str | int]) -> Any:
         else:
             raise LookupError(part)
     return document
-
-
-SYMBOLS = {"q": "entropic_index", "weight": "mi_reward_weight"}
-"""What papers, tables and labels call a setting to its name."""
 
 
 def unknown(key: str, known: Iterable[str]) -> str:

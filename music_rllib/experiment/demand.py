@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from music_rllib.config.problems import shown
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.envs.tasks import Task
+from music_rllib.errors import BadInputError
 from music_rllib.runtime import machine as local
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ CERTAIN_BYTES = 2 * 2**30
 """Memory that a cluster's nodes are not asked for."""
 
 
-class DemandError(ValueError):
+class DemandError(BadInputError, ValueError):
     """A run that no machine at hand can hold."""
 
 

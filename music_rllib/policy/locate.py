@@ -11,6 +11,7 @@ import pyarrow.fs as pafs
 
 from music_rllib.config.load import declared_tasks
 from music_rllib.envs.tasks import Task
+from music_rllib.labels import is_meant
 from music_rllib.policy.policy import PolicyError
 from music_rllib.store.object_folder import SealedFolders, open_storage
 
@@ -25,7 +26,7 @@ def find_policy(wanted: str, storage: str) -> str:
 
     Args:
         wanted: a place (folder, file, URI), the key of a run or its beginning, or a run's label
-            as the sweep shows it (`finetune/q=1.5/FetchPush/seed=0`).
+            or the parts of it that tell which (`q=1.5/seed0`).
         storage: the sweeps' storage, a folder or a URI, in which keys and labels are looked up.
 
     Returns:
@@ -51,8 +52,11 @@ def find_policy(wanted: str, storage: str) -> str:
             f"{wanted!r} must be a folder, or the key or label of a run in {storage}; {there}"
         )
     if len(keys) > 1:
+        fits = [f"{labels[key][0]} ({key[:8]})" if key in labels else key for key in keys[:_NAMED]]
+        more = f" and {len(keys) - _NAMED} more" if len(keys) > _NAMED else ""
         raise PolicyError(
-            f"{wanted!r} must mean one run, it fits {', '.join(keys[:_NAMED])}; give a longer key"
+            f"{wanted!r} must mean one run, it fits {', '.join(fits)}{more}; say more of its "
+            "label, or its key"
         )
     prefix = storage.rstrip("/")
     if keys[0] in finished:
@@ -83,8 +87,9 @@ def _matching(wanted: str, keys: list[str], labels: dict[str, list[str]]) -> lis
         return by_label
     if wanted in keys:
         return [wanted]
-    long_enough = len(wanted) >= _SHORTEST_KEY
-    return [key for key in keys if long_enough and key.startswith(wanted)]
+    if len(wanted) >= _SHORTEST_KEY and (found := [k for k in keys if k.startswith(wanted)]):
+        return found
+    return [key for key in keys if any(is_meant(wanted, label) for label in labels.get(key, ()))]
 
 
 def _labels(filesystem: pafs.FileSystem, root: str) -> Iterator[tuple[str, str]]:

@@ -20,6 +20,7 @@ from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.tac_settings import TACSettings
 from music_rllib.envs.make import Known, known_environment, make_env
 from music_rllib.envs.tasks import Task
+from music_rllib.errors import BadInputError
 from music_rllib.limits import MOST_JSON_BYTES, MOST_WEIGHTS_BYTES, read_json, read_regular
 from music_rllib.policy.network import Floats, PolicyFileError, PolicyNetwork
 from music_rllib.store.handoff import MANIFEST as HANDOFF_FILE
@@ -49,7 +50,7 @@ NAMED = 8
 """Sub-folders that a message lists."""
 
 
-class PolicyError(ValueError):
+class PolicyError(BadInputError, ValueError):
     """A policy that can't be loaded; says from where and why."""
 
 

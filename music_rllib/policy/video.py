@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from music_rllib.envs.make import Env
+from music_rllib.errors import BadInputError
 from music_rllib.policy.policy import Policy
 from music_rllib.policy.rollout import EpisodeResult, Moment, open_task, play
 
@@ -40,7 +41,7 @@ DARK, LIGHT = "#1b1b1b", "#ffffff"
 Frame = NDArray[np.uint8]
 
 
-class VideoError(RuntimeError):
+class VideoError(BadInputError, RuntimeError):
     """No video can be made here; says why and what to do."""
 
 

@@ -1,4 +1,4 @@
-"""The command line of reports."""
+"""`report`: one page about a sweep, or its tables."""
 
 from __future__ import annotations
 
@@ -12,45 +12,33 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from music_rllib import names
-from music_rllib.config.problems import ConfigError
-from music_rllib.errors import BadInputError, TrackingError
-from music_rllib.redaction import for_people, redact
-from music_rllib.results.comparison import GAP
-from music_rllib.results.data import ReportError
-from music_rllib.store.object_folder import StorageError
+from music_rllib.command_line import add_command, called_as, new_app, run_app
+from music_rllib.errors import FAILED
 
 if TYPE_CHECKING:
     from music_rllib.report.location import Found
     from music_rllib.report.page import Report
 
-__all__ = ["app"]
+__all__ = ["EXAMPLES", "app", "main", "report"]
 
-app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
+EXAMPLES = """\
+Examples:
+  music-rllib report results/smoke
+      on the sweep in that folder, while it runs or afterwards
+  music-rllib report smoke --tracking-uri http://mlflow:5000 --output reports
+      on a sweep that was logged to a server, from any machine
+  music-rllib report results/smoke --serve
+      the same page while it runs, with its progress; stop and resume it there
+  music-rllib report results/smoke results/other
+      what differs in the settings and in the results of two sweeps
+  music-rllib report results/smoke --export published/smoke --format csv
+      its runs and metrics as plain tables; 'report published/smoke' reads them
+  music-rllib report results/smoke --export published/smoke --add
+      the same, and what another machine has exported there stays
 
-DAMAGED, BAD_INPUT = 1, 2
-EPILOG = """
-**Examples**
-
-    python -m music_rllib.report results/smoke
-        report on the sweep in that folder, while it runs or afterwards
-
-    python -m music_rllib.report smoke --tracking-uri http://mlflow:5000 --output reports/smoke
-        a sweep that was logged to a server, from any machine
-
-    python -m music_rllib.report results/smoke --serve
-        the same page while it runs, with its progress; stop and resume it there
-
-    python -m music_rllib.report results/smoke results/other
-        what differs in the settings and in the results of two sweeps
-
-    python -m music_rllib.report results/smoke --export published/smoke --format csv
-        its runs and metrics as plain tables; `report published/smoke` reads them again
-
-    python -m music_rllib.report results/smoke --export published/smoke --add
-        the same, and what another machine has exported there stays
-
-**Exit codes**: 0 the report is written, whatever state the sweep is in; 1 it is, by what MLflow
-has, and finished runs in the sweep's storage are damaged; 2 there is no such sweep.
+Exit codes: 0 the report is written, whatever state the sweep is in; 1 it is, by
+what MLflow has, and finished runs in the sweep's storage are damaged; 2 there
+is no such sweep.
 """
 
 
@@ -61,13 +49,12 @@ class TableFormat(StrEnum):
     parquet = "parquet"
 
 
-@app.command(epilog=EPILOG)
 def report(
     sweeps: Annotated[
         list[str],
         typer.Argument(
             help="A sweep's folder, an exported one, or a sweep's name; two are put side by side.",
-            metavar="SWEEP [OTHER]",
+            metavar="SWEEP",
         ),
     ],
     output: Annotated[
@@ -87,14 +74,15 @@ def report(
         ),
     ] = None,
     difference: Annotated[
-        float,
+        float | None,
         typer.Option(
             min=0.001,
             max=1.0,
             help="Difference in success rate that you would want to see: the report says how many "
             "seeds would likely show it.",
+            show_default="0.1",
         ),
-    ] = GAP,
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the filmed episodes.")] = 0,
     videos: Annotated[
         bool, typer.Option(help="Film an episode for each q, where this machine can draw.")
@@ -131,30 +119,33 @@ def report(
         bool,
         typer.Option("--add", help="With --export: keep the runs of an earlier export there."),
     ] = False,
-) -> None:
-    """One self-contained page about a sweep, with its figures (PNG, SVG, PDF) and numbers (CSV)."""
-    try:
-        if len(sweeps) > 1:
-            _beside(sweeps, storage, tracking_uri, output, alone=serve or attach or bool(export))
-        elif export is not None:
-            _export(sweeps[0], storage, tracking_uri, export, format_, add=add)
-        elif serve:
-            _serve(sweeps[0], storage, tracking_uri, difference, port)
-        else:
-            _report(
-                sweeps[0],
-                storage,
-                tracking_uri,
-                output,
-                difference,
-                seed,
-                videos=videos,
-                env=env,
-                attach=attach,
-            )
-    except (BadInputError, ConfigError, ReportError, StorageError, TrackingError) as error:
-        typer.echo(f"error: {for_people(error)}", err=True)
-        raise typer.Exit(BAD_INPUT) from error
+) -> int:
+    """Write one page about a sweep, or about two.
+
+    Self-contained, with its figures (PNG, SVG, PDF) and numbers (CSV).
+    """
+    from music_rllib.results.comparison import GAP
+
+    gap = GAP if difference is None else difference
+    if len(sweeps) > 1:
+        _beside(sweeps, storage, tracking_uri, output, alone=serve or attach or bool(export))
+    elif export is not None:
+        _export(sweeps[0], storage, tracking_uri, export, format_, add=add)
+    elif serve:
+        _serve(sweeps[0], storage, tracking_uri, gap, port)
+    else:
+        return _report(
+            sweeps[0],
+            storage,
+            tracking_uri,
+            output,
+            gap,
+            seed,
+            videos=videos,
+            env=env,
+            attach=attach,
+        )
+    return 0
 
 
 def _export(
@@ -169,6 +160,7 @@ def _export(
     from music_rllib.report.location import find_sweep
     from music_rllib.results.archive.folder import is_archive, read_archive, write_archive
     from music_rllib.results.archive.merge import merged
+    from music_rllib.results.data import ReportError
 
     sweep = find_sweep(place, storage=storage, tracking_uri=tracking_uri).sweep
     if add and is_archive(folder):
@@ -195,8 +187,9 @@ def _report(
     videos: bool,
     env: Path | None,
     attach: bool,
-) -> None:
+) -> int:
     from music_rllib.config.load import declared_tasks
+    from music_rllib.redaction import for_people, redact
     from music_rllib.report.build import PICTURE, WANTED, build_report, write_report
     from music_rllib.report.location import find_sweep
     from music_rllib.results.comparison import verdict
@@ -226,11 +219,14 @@ def _report(
         typer.echo(f"Picture: {picture.absolute()}")
     if found.damaged is not None:
         typer.echo(f"error: {redact(found.damaged)}", err=True)
-        raise typer.Exit(DAMAGED)
+        return FAILED
+    return 0
 
 
 def _command() -> str:
-    return redact(shlex.join(["python", "-m", "music_rllib.report", *sys.argv[1:]]))
+    from music_rllib.redaction import redact
+
+    return redact(shlex.join([*called_as(), *sys.argv[1:]]))
 
 
 def _beside(
@@ -245,6 +241,7 @@ def _beside(
     from music_rllib.report.figures.choice import slug
     from music_rllib.report.location import find_sweep
     from music_rllib.report.side_by_side import side_by_side
+    from music_rllib.results.data import ReportError
 
     if len(places) > 2 or alone:
         raise ReportError(
@@ -286,7 +283,9 @@ def _serve(
 
 
 def _attach(found: Found, folder: Path, made: Report) -> None:
+    from music_rllib.redaction import for_people
     from music_rllib.report.tables import note
+    from music_rllib.results.data import ReportError
     from music_rllib.results.from_mlflow import attach
 
     if found.store is None:
@@ -298,3 +297,12 @@ def _attach(found: Found, folder: Path, made: Report) -> None:
     attach(found.store, found.sweep.run_id, folder, "report", text)
     where = found.sweep.url(found.sweep.run_id) or f"run {found.sweep.run_id}"
     typer.echo(for_people(f"Attached to the sweep's run in MLflow: {where}"))
+
+
+app = new_app()
+add_command(app, "report", report, EXAMPLES)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `python -m music_rllib.report`; its exit code."""
+    return run_app(app, "python -m music_rllib.report", arguments)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from music_rllib import names
+from music_rllib.errors import BadInputError
 from music_rllib.results.claims.plan import PlanVersion
 from music_rllib.results.statistics import Array
 
@@ -28,7 +29,7 @@ __all__ = [
 Ints = NDArray[np.int64]
 
 
-class ReportError(Exception):
+class ReportError(BadInputError):
     """There is nothing to report on; names the place and what to do."""
 
 

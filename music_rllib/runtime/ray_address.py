@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 import socket
 
+from music_rllib.errors import BadInputError
+
 __all__ = ["ClusterError", "check_reachable", "cluster_address"]
 
 REACH_SECONDS = 5.0
 
 
-class ClusterError(RuntimeError):
+class ClusterError(BadInputError, RuntimeError):
     """Ray can't be reached, or can't hold a single run."""
 
 

@@ -8,6 +8,8 @@ import threading
 from types import FrameType
 from typing import Any
 
+from music_rllib.command_line import say_stopped_at_once
+
 __all__ = ["SIGNALS", "EarlySignals", "early"]
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -45,6 +47,7 @@ class EarlySignals:
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if self.received is not None:
+            say_stopped_at_once()
             os._exit(128 + number)
         self.received = number
         raise KeyboardInterrupt

@@ -23,9 +23,10 @@ from ray.serve.config import BackpressureConfig
 
 from music_rllib.policy import Policy, PolicyNetwork, find_policy, load_policy, named_environment
 from music_rllib.runtime.allocator import give_back_freed_memory
+from music_rllib.serve import TOKEN_VARIABLE
 from music_rllib.serve.api import make_api, token_hash
 from music_rllib.serve.load_limits import FOR_HEALTH, RETRY_SECONDS, Limits
-from music_rllib.serve.schema import TOKEN_VARIABLE, Array, PolicyFacts, Rows, compute
+from music_rllib.serve.schema import Array, PolicyFacts, Rows, compute
 
 __all__ = ["ServeSettings", "app", "application", "policy_of"]
 

@@ -2,128 +2,114 @@
 
 from __future__ import annotations
 
-import argparse
 import logging
 import os
 import signal
 import socket
-import sys
 import threading
 from collections.abc import Sequence
 from ipaddress import ip_address
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
-from music_rllib.runtime.ray_address import ClusterError, check_reachable, cluster_address
-from music_rllib.serve.schema import TOKEN_VARIABLE
+import typer
+
+from music_rllib.command_line import add_command, new_app, run_app
+from music_rllib.errors import BadInputError
+from music_rllib.runtime.ray_address import check_reachable, cluster_address
+from music_rllib.serve import TOKEN_VARIABLE
 
 if TYPE_CHECKING:
     from music_rllib.serve.application import ServeSettings
     from music_rllib.serve.load_limits import Limits
 
-__all__ = ["main"]
+__all__ = ["EXAMPLES", "app", "main", "serve"]
 
-BAD_INPUT = 2
-DESCRIPTION = """\
-Serve a trained policy over HTTP with Ray Serve: POST /act takes a goal observation, or a batch of
-them, and answers with actions; GET /health, GET /policy. GET /docs describes them on a page, GET
-/openapi.json for programs.
-"""
-EPILOG = f"""\
-examples:
-  python -m music_rllib.serve results/nodes/KEY
-  python -m music_rllib.serve finetune/q=1.5/FetchPush/seed=0 --storage results
+EXAMPLES = f"""\
+Examples:
+  music-rllib serve results/smoke/best
+  music-rllib serve finetune/q=1.5/seed0 --storage results
   curl -s localhost:8000/act -H 'Content-Type: application/json' \\
     -d '{{"observation": [1.3, ...25 numbers], "desired_goal": [1.4, 0.7, 0.5]}}'
 
-{TOKEN_VARIABLE} in the environment makes clients send it as 'Authorization: Bearer ...'.
-To listen on other addresses than loopback it must be set. RAY_ADDRESS chooses a Ray cluster.
+{TOKEN_VARIABLE} in the environment makes clients send it as
+'Authorization: Bearer ...'. To listen on other addresses than loopback it must
+be set. RAY_ADDRESS=HOST:PORT chooses a Ray cluster.
 
-exit codes: 0 stopped by Ctrl-C or SIGTERM, 1 serving failed, 2 bad input
+Exit codes: 0 stopped by Ctrl-C or SIGTERM, 1 serving failed, 2 bad input.
 """
 
 
-class _BadInputError(Exception):
-    """Something that the user must change."""
+class _Address(NamedTuple):
+    host: str
+    port: int
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; its exit code."""
-    arguments = _parser().parse_args(argv)
-    try:
-        _check_exposure(arguments.host)
-        _check_port(arguments.host, arguments.port)
-        _check_cluster()
-        return _serve(arguments)
-    except _BadInputError as error:
-        from music_rllib.redaction import for_people
+def serve(
+    policy: Annotated[
+        str,
+        typer.Argument(
+            metavar="POLICY",
+            help="Folder or URI of a finished run or an exported policy, or a run's key or label.",
+        ),
+    ],
+    storage: Annotated[
+        str, typer.Option(metavar="PLACE", help="Where keys and labels are looked up.")
+    ] = "results",
+    env: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ENV",
+            help="The environment, where neither this package nor the policy's own file says what "
+            "it takes and gives: a sweep's YAML file that declares it, or its id.",
+        ),
+    ] = None,
+    host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=1, max=2**16 - 1, help="Port to listen on.")] = 8000,
+    replicas: Annotated[int, typer.Option(min=1, help="Processes that compute actions.")] = 1,
+    max_requests: Annotated[
+        int,
+        typer.Option(
+            metavar="N",
+            min=1,
+            help="Requests that are answered at a time; further ones get status 503 and are asked "
+            "to come again.",
+        ),
+    ] = 256,
+    send_seconds: Annotated[
+        int,
+        typer.Option(
+            metavar="S",
+            min=1,
+            help="For a client to send a request, and to take the answer; then it is cut off.",
+        ),
+    ] = 10,
+) -> int:
+    """Serve a trained policy over HTTP, until it is stopped.
 
-        print(f"error: {for_people(error)}", file=sys.stderr)
-        return BAD_INPUT
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m music_rllib.serve",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    POST /act takes a goal observation, or a batch of them, and answers with actions; GET /health,
+    GET /policy. GET /docs describes them on a page, GET /openapi.json for programs.
+    """
+    _check_exposure(host)
+    _check_port(host, port)
+    _check_cluster()
+    return _serve(
+        _Address(host, port),
+        policy=policy,
+        storage=storage,
+        env=env,
+        replicas=replicas,
+        max_requests=max_requests,
+        send_seconds=send_seconds,
     )
-    parser.add_argument(
-        "policy",
-        metavar="POLICY",
-        help="Folder or URI of a finished run or an exported policy, or a run's key or label.",
-    )
-    parser.add_argument(
-        "--storage", default="results", help="Where keys and labels are looked up (results)."
-    )
-    parser.add_argument(
-        "--env",
-        metavar="ENV",
-        help="The environment, where neither this package nor the policy's own file says what it "
-        "takes and gives: a sweep's YAML file that declares it, or its id.",
-    )
-    parser.add_argument("--host", default="127.0.0.1", help="Address to listen on (127.0.0.1).")
-    parser.add_argument("--port", type=_port, default=8000, help="Port to listen on (8000).")
-    parser.add_argument(
-        "--replicas", type=_positive, default=1, help="Processes that compute actions (1)."
-    )
-    parser.add_argument(
-        "--max-requests",
-        type=_positive,
-        metavar="N",
-        default=256,
-        help="Requests that are answered at a time (256); further ones get status 503 and are "
-        "asked to come again.",
-    )
-    parser.add_argument(
-        "--send-seconds",
-        type=_positive,
-        metavar="S",
-        default=10,
-        help="For a client to send a request, and to take the answer (10); then it is cut off.",
-    )
-    return parser
 
 
-def _port(text: str) -> int:
-    port = _whole(text)
-    if not 0 < port < 2**16:
-        raise argparse.ArgumentTypeError(f"must be in 1..65535, got {port}")
-    return port
+app = new_app()
+add_command(app, "serve", serve, EXAMPLES)
 
 
-def _positive(text: str) -> int:
-    number = _whole(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"must be >= 1, got {number}")
-    return number
-
-
-def _whole(text: str) -> int:
-    try:
-        return int(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"must be a whole number, got {text!r}") from None
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `python -m music_rllib.serve`; its exit code."""
+    return run_app(app, "python -m music_rllib.serve", arguments)
 
 
 def _check_exposure(host: str) -> None:
@@ -132,7 +118,7 @@ def _check_exposure(host: str) -> None:
     except ValueError:
         loopback = False
     if not loopback and not os.environ.get(TOKEN_VARIABLE):
-        raise _BadInputError(
+        raise BadInputError(
             f"--host must be a loopback address unless {TOKEN_VARIABLE} is set, got {host!r}: "
             "without a token anyone who reaches that address can use the policy"
         )
@@ -148,7 +134,7 @@ def _check_port(host: str, port: int) -> None:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind((host, port))
     except OSError as error:
-        raise _BadInputError(
+        raise BadInputError(
             f"--host and --port must name a free port of this machine, got {host}:{port}: "
             f"{error.strerror}"
         ) from error
@@ -156,59 +142,53 @@ def _check_port(host: str, port: int) -> None:
 
 def _check_cluster() -> None:
     """Before anything is loaded for it; Ray itself would go on trying for minutes."""
-    address = cluster_address()
-    if address is None:
-        return
-    try:
+    if (address := cluster_address()) is not None:
         check_reachable(address)
-    except ClusterError as error:
-        raise _BadInputError(str(error)) from error
 
 
-def _serve(arguments: argparse.Namespace) -> int:
+def _serve(
+    address: _Address,
+    *,
+    policy: str,
+    storage: str,
+    env: str | None,
+    replicas: int,
+    max_requests: int,
+    send_seconds: int,
+) -> int:
     try:
-        from ray import serve
+        from ray import serve as ray_serve
     except ImportError as error:
-        raise _BadInputError(
+        raise BadInputError(
             f"Ray Serve must be installed (pip install 'music_rllib[serve]'): {error}"
         ) from error
-    from music_rllib.config.load import ConfigError
-    from music_rllib.policy import PolicyError
     from music_rllib.serve.application import ServeSettings, application, policy_of
     from music_rllib.serve.load_limits import Limits
     from music_rllib.serve.schema import PolicyFacts, request_model
-    from music_rllib.store.object_folder import StorageError
 
     settings = ServeSettings(
-        policy=arguments.policy,
-        storage=arguments.storage,
-        env=arguments.env,
-        replicas=arguments.replicas,
-        max_requests=arguments.max_requests,
+        policy=policy, storage=storage, env=env, replicas=replicas, max_requests=max_requests
     )
-    try:
-        policy = policy_of(settings)
-    except (ConfigError, PolicyError, StorageError) as error:
-        raise _BadInputError(str(error)) from error
+    served = policy_of(settings)
     if cluster_address() is None:
         _check_room(settings, [len(os.sched_getaffinity(0))])
     limits = Limits(
-        max_requests=arguments.max_requests,
-        max_body_bytes=request_model(PolicyFacts.of(policy.task.name, policy)).max_bytes,
-        send_seconds=arguments.send_seconds,
+        max_requests=max_requests,
+        max_body_bytes=request_model(PolicyFacts.of(served.task.name, served)).max_bytes,
+        send_seconds=send_seconds,
     )
     stop = _stop_signal()
     _connect(settings)
     try:
-        _listen(arguments, limits, serve)
+        _listen(address, limits, ray_serve)
     except BaseException:
         _disconnect()
         raise
     try:
-        _run(application(policy, settings), arguments, serve)
+        _run(application(served, settings), address, policy, ray_serve)
         stop.wait()
     finally:
-        _shut_down(serve)
+        _shut_down(ray_serve)
     return 0
 
 
@@ -236,7 +216,7 @@ def _connect(settings: ServeSettings) -> None:
     except (ConnectionError, RuntimeError, ValueError) as error:
         if address is None:
             raise
-        raise _BadInputError(
+        raise BadInputError(
             f"RAY_ADDRESS must be a Ray cluster that can be reached, got {address!r}: "
             f"{str(error).strip().splitlines()[0]}"
         ) from error
@@ -247,7 +227,7 @@ def _connect(settings: ServeSettings) -> None:
     nodes = [node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"]]
     try:
         _check_room(settings, nodes)
-    except _BadInputError:
+    except BadInputError:
         if address is not None and _waits_for_nodes(settings):
             return
         ray.shutdown()
@@ -272,7 +252,7 @@ def _check_room(settings: ServeSettings, cpus_of_nodes: Sequence[float]) -> None
     """Ray would wait for ever for more replicas than can be placed."""
     room = sum(int(cpus // settings.cpus_per_replica) for cpus in cpus_of_nodes)
     if settings.replicas > room:
-        raise _BadInputError(
+        raise BadInputError(
             f"--replicas must be <= {room}, as many as there are CPUs, got {settings.replicas}"
         )
 
@@ -283,19 +263,18 @@ ANSWER_SECONDS = 60.0
 """A request that a replica has had for so long is answered with status 408."""
 
 
-def _listen(arguments: argparse.Namespace, limits: Limits, serve: Any) -> None:
+def _listen(address: _Address, limits: Limits, serve: Any) -> None:
     """Start Serve's proxy; on a cluster where Serve runs already, see that we would not disturb."""
     from ray.serve.context import _get_global_client
 
     from music_rllib.serve.load_limits import controller_environment
 
     logging.getLogger("ray.serve").setLevel(logging.ERROR)
-    wanted = (arguments.host, arguments.port)
     serve.start(
         proxy_location="HeadOnly",
         http_options={
-            "host": arguments.host,
-            "port": arguments.port,
+            "host": address.host,
+            "port": address.port,
             "request_timeout_s": ANSWER_SECONDS,
         },
         controller_options={"runtime_env": {"env_vars": controller_environment(limits)}},
@@ -303,23 +282,23 @@ def _listen(arguments: argparse.Namespace, limits: Limits, serve: Any) -> None:
     )
     # Serve ignores new options where it runs already.
     options = _get_global_client().http_config
-    if (options.host, options.port) != wanted:
-        raise _BadInputError(
+    if (options.host, options.port) != address:
+        raise BadInputError(
             "--host and --port must be those on which Ray Serve listens on this cluster already, "
-            f"{options.host}:{options.port}, got {arguments.host}:{arguments.port}"
+            f"{options.host}:{options.port}, got {address.host}:{address.port}"
         )
     if APPLICATION in serve.status().applications:
-        raise _BadInputError(
+        raise BadInputError(
             "RAY_ADDRESS must be a cluster that serves no policy yet, this one does; stop that "
             "service first"
         )
 
 
-def _run(application: Any, arguments: argparse.Namespace, serve: Any) -> None:
-    host, port = arguments.host, arguments.port
+def _run(application: Any, address: _Address, policy: str, serve: Any) -> None:
+    host, port = address
     serve.run(application, name=APPLICATION, route_prefix="/", logging_config=QUIET)
     shown = f"[{host}]" if ":" in host else host
-    print(f"Serving {arguments.policy} at http://{shown}:{port}", flush=True)
+    print(f"Serving {policy} at http://{shown}:{port}", flush=True)
     print(
         f"POST /act, GET /health, GET /policy; described at http://{shown}:{port}/docs", flush=True
     )

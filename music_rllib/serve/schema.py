@@ -14,7 +14,6 @@ from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, create_mo
 
 __all__ = [
     "MAX_ROWS",
-    "TOKEN_VARIABLE",
     "Answer",
     "Failure",
     "Health",
@@ -26,8 +25,6 @@ __all__ = [
     "request_model",
 ]
 
-TOKEN_VARIABLE = "MUSIC_RLLIB_SERVE_TOKEN"  # noqa: S105 - the name of a variable
-"""What clients must send as bearer token is read from this environment variable only."""
 MAX_ROWS = 1024
 """Observations in one request."""
 _FLOAT32 = float(np.finfo(np.float32).max)

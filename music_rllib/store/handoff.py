@@ -23,6 +23,7 @@ from safetensors.numpy import load as load_safetensors
 from safetensors.numpy import save as save_safetensors
 
 from music_rllib.envs.tasks import Task
+from music_rllib.errors import BadInputError
 from music_rllib.limits import (
     MOST_JSON_BYTES,
     MOST_WEIGHTS_BYTES,
@@ -55,7 +56,7 @@ Weights = Mapping[str, Mapping[str, npt.NDArray[Any]]]
 MANIFEST = "handoff.json"
 
 
-class HandoffError(ValueError):
+class HandoffError(BadInputError, ValueError):
     """A handoff that is missing, damaged or made for something else; says which and where."""
 
 

@@ -193,6 +193,11 @@ class NodeStore:
         except DamagedError as error:
             raise DamagedError(f"{error}. {TRAIN_AGAIN}") from error
 
+    def begun(self) -> set[str]:
+        """Keys of runs that have a work folder."""
+        selector = pafs.FileSelector(f"{self._root}/work", allow_not_found=True)
+        return {info.base_name for info in self._fs.get_file_info(selector)}
+
     def work_folder(self, key: str, keep: int = KEEP) -> WorkFolder:
         """Where a run that isn't finished keeps its newest `keep` checkpoints."""
         return WorkFolder(self._fs, f"{self._root}/work/{key}", keep)

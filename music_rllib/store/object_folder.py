@@ -22,6 +22,7 @@ from typing import IO, Annotated, Any, Literal
 import pyarrow.fs as pafs
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue, ValidationError
 
+from music_rllib.errors import BadInputError
 from music_rllib.limits import MOST_JSON_BYTES, open_regular, read_json
 from music_rllib.store.files import sync_folder, write_atomically
 
@@ -32,7 +33,7 @@ _CHUNK = 1 << 20
 _CANNOT_WRITE = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO}
 
 
-class StorageError(RuntimeError):
+class StorageError(BadInputError, RuntimeError):
     """Storage that can't be used; the message names the place and what to do."""
 
 

@@ -93,6 +93,8 @@ def check_storage(storage: str, name: str) -> None:
         plain = os.path.normpath(folder)  # a folder that isn't there yet has no ".."
         for entry in (name, "nodes", "work"):
             _check_folder(Path(plain, entry))
+    else:  # its own files are on this machine as well
+        _check_folder(sweep_folder(storage, name))
 
 
 def check_answers(storage: str) -> None:

@@ -16,7 +16,7 @@ from music_rllib.config.schema import SweepConfig
 from music_rllib.experiment.plan import Plan
 from music_rllib.runtime import machine
 from music_rllib.runtime.ray_cluster import cluster
-from music_rllib.sweep.views.tables import fresh_runs, search_budget, search_runs
+from music_rllib.sweep.views.tables import fresh_runs, new_table, search_budget, search_runs
 from music_rllib.sweep.views.text import clock
 from music_rllib.training.sample_run import RunSample, sample_run
 
@@ -150,10 +150,10 @@ def measure(
 def cost_table(costs: list[Cost], slots: int) -> Table:
     """One row per kind of run, and the whole sweep's time below."""
     document = cost_document(costs, slots)
-    table = Table(title="What it takes on this machine", title_justify="left")
+    table = new_table("What it takes on this machine")
     table.add_column("stage/task", overflow="fold")
     for name in ("runs", "env steps", "steps/s", "memory", "start", "a run", "all"):
-        table.add_column(name, justify="right", no_wrap=True)
+        table.add_column(name, justify="right", overflow="fold")
     for row in document["kinds"]:
         table.add_row(
             row["label"],

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import shlex
 import signal
-import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -14,6 +12,7 @@ from rich.console import Console
 from rich.text import Text
 
 from music_rllib import names
+from music_rllib.command_line import how_to_continue
 from music_rllib.config.load import load_sweep
 from music_rllib.config.remarks import remarks
 from music_rllib.config.schema import SweepConfig
@@ -77,6 +76,7 @@ def run_sweep(
     storage: str | None = None,
     name: str | None = None,
     seeds: str | None = None,
+    overrides: Sequence[str] = (),
     accept_changes: bool = False,
     retrain_damaged: bool = False,
     must_exist: bool = False,
@@ -92,6 +92,7 @@ def run_sweep(
         storage: Replaces the file's `storage`.
         name: Replaces the file's `name`.
         seeds: Replaces the file's `seeds`: how many, or a list with commas.
+        overrides: `KEY=VALUE` each, laid over the file.
         accept_changes: Train runs anew whose settings are others than the last time.
         retrain_damaged: Delete finished runs that are damaged, and train them again.
         must_exist: Refuse to begin a sweep; only go on with one.
@@ -105,7 +106,7 @@ def run_sweep(
     """
     try:
         path = config or DEFAULT_CONFIG
-        loaded = load_sweep(path, name=name, storage=storage, seeds=seeds)
+        loaded = load_sweep(path, name=name, storage=storage, seeds=seeds, overrides=overrides)
         if must_exist:
             check_begun(loaded)
         if dry_run:
@@ -331,7 +332,11 @@ def _compute_and_report(console: Console, opened: Sweep, tracker: Tracker) -> in
         beacon.end("stopped" if stopped_by else "failed" if failed else "finished")
     tracker.close("KILLED" if stopped_by else "FAILED" if failed else "FINISHED")
     results = results_table(
-        opened.plan, opened.board.__getitem__, opened.results(), tracker.run_id, console.width
+        opened.plan,
+        opened.board.__getitem__,
+        beacon.reached() | opened.results(),
+        tracker.run_id,
+        console.width,
     )
     if results.rows:  # a sweep may consist of searches only
         console.print(results)
@@ -356,7 +361,7 @@ def _take_over(opened: Sweep, display: Display, logbook: Logbook) -> None:
     """Say which runs are reused, and give MLflow those that it doesn't have."""
     reused = opened.board.having(Status.REUSED)
     for node in reused[:NAMED]:
-        display.say(f"{node.label}: finished earlier, reused")
+        display.say(f"{display.short(node.label)}: finished earlier, reused")
     if len(reused) > NAMED:
         display.say(f"{len(reused) - NAMED} more: finished earlier, reused")
     for node in reused:
@@ -435,7 +440,7 @@ def _compute(
         display.say(cause or told, "red" if cause else "yellow")
         outcome = "failed" if cause else "stopped"
         try_for(LAST_SECONDS, lambda: beacon.end(outcome), lambda: logbook.end(killed=not cause))
-        display.say(_how_to_continue())
+        display.say(how_to_continue())
 
     try:
         return compute(opened, listeners, on_stop, on_ray_gone, campaign).stopped_by
@@ -444,9 +449,4 @@ def _compute(
 
 
 def _say_how_to_continue(console: Console) -> None:
-    console.print(Text(_how_to_continue()), soft_wrap=True)
-
-
-def _how_to_continue() -> str:
-    command = shlex.join(["python", "-m", "music_rllib.sweep", *sys.argv[1:]])
-    return f"Stopped. Finished runs and the last checkpoints are kept; continue with: {command}"
+    console.print(Text(how_to_continue()), soft_wrap=True)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.envs.tasks import BUILT_IN_TASKS, Task, closest
+from music_rllib.errors import BadInputError
 from music_rllib.experiment.plan import Input, Plan
 from music_rllib.experiment.scheduler import Board, Status
 from music_rllib.runtime.in_time import in_time
@@ -29,7 +30,7 @@ __all__ = [
 ]
 
 
-class TaskError(ValueError):
+class TaskError(BadInputError, ValueError):
     """A task whose environment can't be made, or isn't as the task says."""
 
 
@@ -58,7 +59,7 @@ def check_environments(plan: Plan, hang_minutes: float | None = None) -> None:
         raise TaskError("\n".join(problems))
 
 
-class HardwareError(ValueError):
+class HardwareError(BadInputError, ValueError):
     """A setting that this machine's hardware does not allow."""
 
 

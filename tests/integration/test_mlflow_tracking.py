@@ -31,7 +31,7 @@ from music_rllib import names
 from music_rllib.errors import TrackingError
 from music_rllib.policy import PolicyNetwork
 from music_rllib.tracking import Point, RunInfo, Tracker, deliver
-from music_rllib.tracking.__main__ import app
+from music_rllib.tracking.cli import app
 from music_rllib.tracking.policy_model import write_model
 
 MakeTracker = Callable[..., Tracker]

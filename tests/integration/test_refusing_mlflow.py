@@ -14,7 +14,7 @@ import yaml
 from typer.testing import CliRunner
 
 from music_rllib.sweep import cli
-from music_rllib.tracking.__main__ import app as tracking
+from music_rllib.tracking.cli import app as tracking
 from music_rllib.tracking.session import SweepRecord, tracking_folder
 from tests.integration.conftest import SWEEP
 

@@ -22,7 +22,7 @@ MAY_LOAD_RAY = (
 # torch and numpy only: no environments, no tracking.
 PURE = ("functional", "intrinsic", "replay", "runtime.allocator", "schedules")
 # Read by the command line before anything heavy is needed.
-LIGHT = ("", "errors", "names", "runtime.quiet")
+LIGHT = ("", "command_line", "errors", "names", "runtime.quiet")
 
 
 def _modules() -> list[str]:

@@ -100,7 +100,8 @@ def test_wheel_holds_the_whole_package_and_nothing_else(unpacked: Path) -> None:
     wanted = {
         path.relative_to(ROOT).as_posix()
         for path in (ROOT / "music_rllib").rglob("*")
-        if path.suffix in {".css", ".html", ".js", ".py", ".yaml"} or path.name == "py.typed"
+        if path.suffix in {".css", ".html", ".js", ".json", ".py", ".yaml"}
+        or path.name == "py.typed"
     }
     packed = {path.relative_to(unpacked) for path in unpacked.rglob("*") if path.is_file()}
     assert {path.as_posix() for path in packed if path.parts[0] == "music_rllib"} == wanted
@@ -117,10 +118,15 @@ def test_wheel_states_version_licence_and_python(unpacked: Path) -> None:
     assert (metadata.parent / "licenses" / "LICENSE").is_file()
 
 
+def test_wheel_installs_the_command(unpacked: Path) -> None:
+    (scripts,) = unpacked.glob("*.dist-info/entry_points.txt")
+    assert "music-rllib = music_rllib.program:main" in scripts.read_text()
+
+
 def test_wheel_alone_plans_its_default_sweep(unpacked: Path, tmp_path: Path) -> None:
     """Without a file the program uses a default that must have travelled in the wheel."""
     shown = _run_python(
-        "-m", "music_rllib.sweep", "--dry-run", "--storage", "results", cwd=tmp_path, path=unpacked
+        "-m", "music_rllib.sweep", "--dry-run", "preset=small", cwd=tmp_path, path=unpacked
     )
     assert shown.returncode == 0, shown.stdout + shown.stderr
     assert "FetchPush" in shown.stdout

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import time
 import unicodedata
 from pathlib import Path
@@ -13,6 +12,7 @@ from hypothesis import strategies as st
 from rich.table import Table
 from rich.text import Text
 
+from music_rllib.command_line import console_for
 from music_rllib.redaction import (
     MAX_PARAM_LENGTH,
     flat_params,
@@ -21,7 +21,6 @@ from music_rllib.redaction import (
     without_secrets,
 )
 from music_rllib.sweep.cli import main as sweep_main
-from music_rllib.sweep.cli_helpers import console_for
 
 
 @pytest.mark.parametrize(
@@ -107,7 +106,7 @@ def test_what_is_printed_commands_no_terminal(text: str) -> None:
 
 
 def test_a_console_shows_markup_and_escapes_as_text(capsys: pytest.CaptureFixture[str]) -> None:
-    console = console_for(argparse.Namespace())
+    console = console_for()
     table = Table(title=f"[red]{CONTROLS[:-2]}")
     table.add_column("[blink]")
     table.add_row("[bold]x :smile:")

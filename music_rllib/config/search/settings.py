@@ -125,7 +125,7 @@ class WarmStart(Strict):
     """An earlier study to learn from; its trials are not ranked again."""
 
     study: str
-    """Its name, as `python -m music_rllib.sweep status` shows it, or the beginning of it."""
+    """Its name, as `music-rllib status` shows it, or the beginning of it."""
     storage: str | None = None
     """Its Optuna storage: a database URL or a sqlite file; null: this search's own."""
 

@@ -2,58 +2,57 @@
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from music_rllib.sweep.cli_helpers import Commands, add_json, add_place, console_for, print_json
+import typer
 
-__all__ = ["register"]
+from music_rllib.command_line import Json, console_for, print_json
+from music_rllib.sweep.cli_helpers import Place, Storage
 
-EPILOG = """\
-examples:
-  python -m music_rllib.sweep best results/smoke
+__all__ = ["EXAMPLES", "best"]
+
+EXAMPLES = """\
+Examples:
+  music-rllib best results/smoke
       into results/smoke/best
-  python -m music_rllib.sweep best s3://bucket/sweeps/search --output policy
+  music-rllib best s3://bucket/sweeps/search --output policy
       from a cluster's storage into a local folder
-  python -m music_rllib.sweep evaluate policy --episodes 100
+  music-rllib evaluate policy --episodes 100
 """
 
 
-def register(commands: Commands) -> None:
-    """Add the command."""
-    parser = commands.add_parser(
-        "best",
-        help="export the winning policy with its configuration",
-        description="Export the policy of the best condition, with its configuration and how it "
-        "was chosen. After a search that is the first of the ranking on fresh seeds, and the best "
-        "judged trial where there is no ranking yet.",
-        epilog=EPILOG,
-    )
-    add_place(parser)
-    parser.add_argument("--stage", help="Of which stage; the last one by default.")
-    parser.add_argument(
-        "--output",
-        type=Path,
-        metavar="FOLDER",
-        help="Where to put it: 'best' in the sweep's folder by default. Of several tasks each has "
-        "a folder of its own in it.",
-    )
-    add_json(parser)
-    parser.set_defaults(execute=_execute)
+def best(
+    sweep: Place,
+    storage: Storage = None,
+    stage: Annotated[
+        str | None, typer.Option(metavar="STAGE", help="Of which stage; the last by default.")
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Where to put it: 'best' in the sweep's folder by default. Of several tasks each "
+            "has a folder of its own in it.",
+        ),
+    ] = None,
+    json: Json = False,
+) -> int:
+    """Export the best policy with its configuration.
 
-
-def _execute(arguments: argparse.Namespace) -> int:
+    After a search that is the first of the ranking on fresh seeds, and the best judged trial where
+    there is no ranking yet. It also says how it was chosen.
+    """
     from music_rllib.experiment.location import find_sweep
     from music_rllib.sweep.export import export_best
 
-    found = find_sweep(arguments.sweep, arguments.storage)
-    sweep = found.open()
-    chosen = export_best(sweep, arguments.stage, arguments.output or sweep.folder / "best")
-    if arguments.json:
+    found = find_sweep(sweep, storage)
+    opened = found.open()
+    chosen = export_best(opened, stage, output or opened.folder / "best")
+    if json:
         print_json(chosen)
         return 0
-    console = console_for(arguments)
+    console = console_for()
     console.print(chosen["why"], soft_wrap=True)
     if chosen["entropies"]:
         console.print(_entropies(chosen["entropies"]), soft_wrap=True)

@@ -2,78 +2,79 @@
 
 from __future__ import annotations
 
-import argparse
+from typing import Annotated
 
-from music_rllib.sweep.cli_helpers import Commands, add_json, add_place, console_for, print_json
+import typer
 
-__all__ = ["register"]
+from music_rllib.command_line import Json, console_for, print_json
+from music_rllib.sweep.cli_helpers import Place, Storage
 
-EPILOG = """\
-examples:
-  python -m music_rllib.sweep clean results/smoke
-      list the checkpoints of runs that are finished or were stopped early
-  python -m music_rllib.sweep clean results/smoke --yes
+__all__ = ["EXAMPLES", "clean"]
+
+EXAMPLES = """\
+Examples:
+  music-rllib clean results/smoke
+      list the checkpoints of runs that were stopped early
+  music-rllib clean results/smoke --yes
       delete them
-  python -m music_rllib.sweep clean results/smoke --all --yes
-      the sweep's own files and every run that no other sweep in the storage has, nor any whose
-      search shares its study: MLflow's records stay, and studies in a database of their own
+  music-rllib clean results/smoke --all --yes
+      the sweep's own files and every run that no other sweep in the storage
+      has, nor any whose search shares its study: MLflow's records stay, and
+      studies in a database of their own
 """
 
 
-def register(commands: Commands) -> None:
-    """Add the command."""
-    parser = commands.add_parser(
-        "clean",
-        help="list, and delete with --yes, what a sweep has left and nobody needs",
-        description="List what can go; with --yes delete it. Checkpoints of runs that a search "
-        "stopped early by default, since an interrupted run may go on from its own.",
-        epilog=EPILOG,
-    )
-    add_place(parser)
-    parser.add_argument(
-        "--unfinished",
-        action="store_true",
-        help="Checkpoints of interrupted runs too: they would begin from scratch.",
-    )
-    parser.add_argument(
-        "--all",
-        action="store_true",
-        help="The whole sweep: its files, checkpoints and results that no other sweep here has.",
-    )
-    parser.add_argument("--yes", action="store_true", help="Delete.")
-    add_json(parser)
-    parser.set_defaults(execute=_execute)
+def clean(
+    sweep: Place,
+    storage: Storage = None,
+    unfinished: Annotated[
+        bool,
+        typer.Option(
+            "--unfinished",
+            help="Checkpoints of interrupted runs too: they would begin from scratch.",
+        ),
+    ] = False,
+    everything: Annotated[
+        bool,
+        typer.Option(
+            "--all",
+            help="The whole sweep: its files, checkpoints and results that no other sweep has.",
+        ),
+    ] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Delete.")] = False,
+    json: Json = False,
+) -> int:
+    """List, or delete with --yes, what nobody needs.
 
-
-def _execute(arguments: argparse.Namespace) -> int:
+    By default these are the checkpoints of runs that a search stopped early, since an interrupted
+    run may go on from its own.
+    """
     from music_rllib.experiment.location import find_sweep
     from music_rllib.sweep.clean import delete, what_can_go
 
-    found = find_sweep(arguments.sweep, arguments.storage)
-    cleaning = what_can_go(
-        found, unfinished=arguments.unfinished or arguments.all, everything=arguments.all
-    )
+    found = find_sweep(sweep, storage)
+    cleaning = what_can_go(found, unfinished=unfinished or everything, everything=everything)
     going = cleaning.items
-    if arguments.yes:
+    if yes:
         delete(found, cleaning)
-    if arguments.json:
+    if json:
         print_json(
             {
                 "sweep": found.name,
-                "deleted": arguments.yes,
+                "deleted": yes,
                 "items": going,
                 "kept": cleaning.kept,
             }
         )
         return 0
-    console = console_for(arguments)
+    console = console_for()
     for item in going:
         console.print(f"{item['path']}  ({item['what']})", soft_wrap=True)
     for item in cleaning.kept:
         console.print(f"kept: {item['path']}  ({item['what']})", soft_wrap=True)
     if not going:
         console.print("Nothing to delete.")
-    elif not arguments.yes:
+    elif not yes:
         console.print(f"{len(going)} to delete: say --yes to do it.")
     else:
         console.print(f"{len(going)} deleted.")

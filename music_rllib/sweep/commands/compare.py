@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+import typer
+
+from music_rllib.command_line import Json, console_for, print_json
 from music_rllib.errors import BadInputError
-from music_rllib.sweep.cli_helpers import Commands, add_json, add_place, console_for, print_json
+from music_rllib.sweep.cli_helpers import Place, Storage
 
 if TYPE_CHECKING:
     from music_rllib.experiment.plan import Plan
@@ -15,55 +17,54 @@ if TYPE_CHECKING:
     from music_rllib.results.from_store import Condition
     from music_rllib.store.run_record import RunResult
 
-__all__ = ["register"]
+__all__ = ["EXAMPLES", "compare"]
 
-EPILOG = """\
-examples:
-  python -m music_rllib.sweep compare results/smoke
-  python -m music_rllib.sweep compare results/smoke --metric evaluation/object_displacement
-  python -m music_rllib.sweep compare results/search --stage finetune --json
+EXAMPLES = """\
+Examples:
+  music-rllib compare results/smoke
+  music-rllib compare results/smoke --metric evaluation/object_displacement
+  music-rllib compare results/search --stage finetune --json
 
-Each row is the mean over the seeds that have finished on every task, with its 95 % interval
-(docs/reports.md). Runs on the fresh seeds of a search's final ranking are never mixed with those
-its trials were chosen by. A condition is said to be ahead only where an exact permutation test,
-with Holm's correction over all pairs, gives p < 0.05 against each other one: three seeds are never
+Each row is the mean over the seeds that have finished on every task, with its
+95 % interval (docs/reports.md). Runs on the fresh seeds of a search's final
+ranking are never mixed with those its trials were chosen by. A condition is
+said to be ahead only where an exact permutation test, with Holm's correction
+over all pairs, gives p < 0.05 against each other one: three seeds are never
 enough. The report says the same.
 
-First comes the answer: conditions by the area under their learning curves (the mean over the
-budget), seed by seed where they share seeds, as superior, worse, equivalent within a margin or
-undecided (docs/comparing_q.md). What the sweep's `analysis` planned before the runs is kept apart
-from what is compared beyond it.
+First comes the answer: conditions by the area under their learning curves (the
+mean over the budget), seed by seed where they share seeds, as superior, worse,
+equivalent within a margin or undecided (docs/comparing_q.md). What the sweep's
+'analysis' planned before the runs is kept apart from what is compared beyond.
 """
-
-
 IN_THE_SEARCH = "Trials were chosen by these runs, so their order is biased: fresh seeds count."
 
 
-def register(commands: Commands) -> None:
-    """Add the command."""
-    parser = commands.add_parser(
-        "compare",
-        help="values of q, or whatever a sweep varies, side by side with intervals",
-        description="What a sweep varies, such as q, side by side with 95 % intervals.",
-        epilog=EPILOG,
-    )
-    add_place(parser)
-    parser.add_argument("--stage", help="Of which stage; the last one by default.")
-    parser.add_argument(
-        "--metric",
-        help="A run's last value of it. Without it: what a searched stage's objective reads, else "
-        "each task's own, evaluation/success_rate, or evaluation/episode_return without success.",
-    )
-    parser.add_argument(
-        "--minimize",
-        action="store_true",
-        help="The metric is better where it is lower, as that of an objective that says so is.",
-    )
-    add_json(parser)
-    parser.set_defaults(execute=_execute)
-
-
-def _execute(arguments: argparse.Namespace) -> int:
+def compare(
+    sweep: Place,
+    storage: Storage = None,
+    stage: Annotated[
+        str | None, typer.Option(metavar="STAGE", help="Of which stage; the last by default.")
+    ] = None,
+    metric: Annotated[
+        str | None,
+        typer.Option(
+            metavar="METRIC",
+            help="A run's last value of it. Without it: what a searched stage's objective reads, "
+            "else each task's own, evaluation/success_rate, or evaluation/episode_return without "
+            "success.",
+        ),
+    ] = None,
+    minimize: Annotated[
+        bool,
+        typer.Option(
+            "--minimize",
+            help="The metric is better where it is lower, as that of an objective that says so is.",
+        ),
+    ] = False,
+    json: Json = False,
+) -> int:
+    """Values of q, or whatever varies, with 95 % intervals."""
     from music_rllib import names
     from music_rllib.experiment.location import find_sweep
     from music_rllib.results.claims.answer import answer
@@ -74,30 +75,26 @@ def _execute(arguments: argparse.Namespace) -> int:
     from music_rllib.search.ranking import measure_of
     from music_rllib.sweep.views.compare import compare_view
 
-    found = find_sweep(arguments.sweep, arguments.storage)
-    sweep = found.open()
-    stages = {stage.name: stage for stage in sweep.config.stages}
-    stage = arguments.stage or list(stages)[-1]
+    found = find_sweep(sweep, storage)
+    opened = found.open()
+    stages = {stage.name: stage for stage in opened.config.stages}
+    stage = stage or list(stages)[-1]
     if stage not in stages:
         raise BadInputError(f"--stage must be one of {', '.join(stages)}, got {stage!r}")
-    results = sweep.results()
-    measure = measure_of(stages[stage], sweep.plan, results)
+    results = opened.results()
+    measure = measure_of(stages[stage], opened.plan, results)
     # Without a word about it, each task is judged by its own.
-    metric = arguments.metric or (measure.metric if stages[stage].search else None)
-    maximised = not arguments.minimize and (measure.maximised or metric != measure.metric)
-    found_ = [one for one in conditions(sweep.plan, results, metric) if one.stage == stage]
-    if not found_ and results and arguments.metric is not None:
+    given, metric = metric, metric or (measure.metric if stages[stage].search else None)
+    maximised = not minimize and (measure.maximised or metric != measure.metric)
+    found_ = [one for one in conditions(opened.plan, results, metric) if one.stage == stage]
+    if not found_ and results and given is not None:
         known = sorted({name for result in results.values() for name in result.metrics})
-        if arguments.metric not in known:
-            raise BadInputError(
-                f"--metric must be one of {', '.join(known)}, got {arguments.metric!r}"
-            )
-    read = {metric, *(task.primary_metric for one in sweep.config.stages for task in one.tasks)}
-    stored = results_of(sweep, {names.EVAL_EPISODES, *filter(None, read)})
-    study = study_of(
-        stored, stage, metric=arguments.metric, maximised=maximised or arguments.metric is None
-    )
-    entropies = _entropies(sweep.plan, results, stage)
+        if given not in known:
+            raise BadInputError(f"--metric must be one of {', '.join(known)}, got {given!r}")
+    read = {metric, *(task.primary_metric for one in opened.config.stages for task in one.tasks)}
+    stored = results_of(opened, {names.EVAL_EPISODES, *filter(None, read)})
+    study = study_of(stored, stage, metric=given, maximised=maximised or given is None)
+    entropies = _entropies(opened.plan, results, stage)
     groups = [group for scope in scopes(found_) for group in _groups(scope, maximised, entropies)]
     document = {
         "sweep": found.name,
@@ -108,10 +105,10 @@ def _execute(arguments: argparse.Namespace) -> int:
         "answer": answer(stored, study),
         **study_data(study),
     }
-    if arguments.json:
+    if json:
         print_json(document)
     else:
-        console_for(arguments).print(compare_view(document))
+        console_for().print(compare_view(document))
     return 0
 
 

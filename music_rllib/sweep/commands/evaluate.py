@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+import typer
+
+from music_rllib.command_line import Json, console_for, print_json
 from music_rllib.errors import BadInputError
-from music_rllib.sweep.cli_helpers import Commands, add_json, console_for, print_json
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -15,111 +16,81 @@ if TYPE_CHECKING:
     from music_rllib.policy.policy import Policy
     from music_rllib.policy.rollout import EpisodeResult
 
-__all__ = ["register"]
+__all__ = ["EXAMPLES", "evaluate"]
 
-EPILOG = """\
-examples:
-  python -m music_rllib.sweep evaluate finetune/q=1.5/FetchPush/seed=0
-      20 episodes of a run, by its label; keys and their beginnings do as well
-  python -m music_rllib.sweep evaluate results/nodes/4f2a09c1b7d35e8806aa --episodes 100 --json
-      a finished node, or a checkpoint (results/work/KEY/NUMBER), by its folder
-  python -m music_rllib.sweep evaluate 4f2a09 --storage s3://bucket/sweeps --video push.mp4
-      and a film of the first three episodes
-  python -m music_rllib.sweep evaluate policy --env my.yaml
+EXAMPLES = """\
+Examples:
+  music-rllib evaluate finetune/q=1.5/seed0
+      20 episodes of a run, by its label or the parts of it that tell which
+  music-rllib evaluate 4f2a09c1 --episodes 100 --json
+      by its key or the key's beginning
+  music-rllib evaluate results/smoke/best --video push.gif
+      a policy's folder; and a film of the first three episodes
+  music-rllib evaluate q=2/seed1 --storage s3://bucket/sweeps
+  music-rllib evaluate policy --env my.yaml
       a policy for an environment of your own, as my.yaml declares it
-  MLFLOW_TRACKING_URI=http://server:5000 python -m music_rllib.sweep evaluate models:/m-...
+  MLFLOW_TRACKING_URI=http://server:5000 music-rllib evaluate models:/m-1234
       a policy that was logged to MLflow
 """
 
 
-def register(commands: Commands) -> None:
-    """Add the command."""
-    parser = commands.add_parser(
-        "evaluate",
-        help="play episodes with a run's policy, count and film them",
-        description="Play deterministic episodes with the policy of a run, finished or not, and "
-        "say how often it succeeds. Starts no Ray.",
-        epilog=EPILOG,
-    )
-    parser.add_argument(
-        "run",
-        metavar="RUN",
-        help="A run's label, key or folder; a checkpoint's folder; a policy's file; or an MLflow "
-        "model (models:/..., runs:/...).",
-    )
-    parser.add_argument(
-        "--storage",
-        default="results",
-        metavar="PLACE",
-        help="Where labels and keys are looked up (default: results).",
-    )
-    parser.add_argument(
-        "--env",
-        metavar="ENV",
-        help="The environment, where it is neither a built-in task's nor Gymnasium's own: a "
-        "sweep's YAML file that declares it, or its id. What a policy's file says is not enough: "
-        "making an environment runs its code.",
-    )
-    parser.add_argument(
-        "--episodes", type=_positive, default=20, metavar="N", help="How many (default: 20)."
-    )
-    parser.add_argument(
-        "--seed",
-        type=_not_negative,
-        default=0,
-        metavar="N",
-        help="Equal seeds give equal starts and goals (default: 0).",
-    )
-    parser.add_argument(
-        "--video", type=Path, metavar="FILE", help="Film the first episodes, as .mp4 or .gif."
-    )
-    parser.add_argument(
-        "--video-episodes",
-        type=_positive,
-        default=3,
-        metavar="N",
-        help="How many of them (default: 3).",
-    )
-    add_json(parser)
-    parser.set_defaults(execute=_execute)
+def evaluate(
+    run: Annotated[
+        str,
+        typer.Argument(
+            metavar="RUN",
+            help="A run's label, key or folder; a checkpoint's folder; a policy's file; or an "
+            "MLflow model (models:/..., runs:/...).",
+        ),
+    ],
+    storage: Annotated[
+        str, typer.Option(metavar="PLACE", help="Where labels and keys are looked up.")
+    ] = "results",
+    env: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ENV",
+            help="The environment, where it is neither a built-in task's nor Gymnasium's own: a "
+            "sweep's YAML file that declares it, or its id. What a policy's file says is not "
+            "enough: making an environment runs its code.",
+        ),
+    ] = None,
+    episodes: Annotated[int, typer.Option(metavar="N", min=1, help="How many.")] = 20,
+    seed: Annotated[
+        int, typer.Option(metavar="N", min=0, help="Equal seeds give equal starts and goals.")
+    ] = 0,
+    video: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Film the first episodes, as .mp4 or .gif."),
+    ] = None,
+    video_episodes: Annotated[int, typer.Option(metavar="N", min=1, help="How many of them.")] = 3,
+    json: Json = False,
+) -> int:
+    """Play episodes with a run's policy, count and film them.
 
+    Deterministic ones; the run may be finished or not. Starts no Ray.
+    """
+    from music_rllib.policy import find_policy, load_policy, named_environment
 
-def _positive(text: str) -> int:
-    number = _not_negative(text)
-    if number == 0:
-        raise argparse.ArgumentTypeError("must be > 0, got 0")
-    return number
-
-
-def _not_negative(text: str) -> int:
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"must be a whole number >= 0, got {text!r}")
-    return int(text)
-
-
-def _execute(arguments: argparse.Namespace) -> int:
-    from music_rllib.policy import PolicyError, find_policy, load_policy, named_environment
-    from music_rllib.policy.video import VideoError
-
-    if not arguments.storage:
+    if not storage:
         raise BadInputError("--storage must not be empty, got ''")
-    _check_video(arguments.video)
-    console = console_for(arguments)
+    _check_video(video)
+    place = find_policy(run, storage)
     try:
-        place = find_policy(arguments.run, arguments.storage)
-        policy = load_policy(place, named_environment(arguments.env))
-        results = _play(policy, arguments)
-        if arguments.video:
-            _film(policy, arguments)
-    except (PolicyError, VideoError, OSError) as error:
+        policy = load_policy(place, named_environment(env))
+        results = _play(policy, episodes, seed)
+        if video:
+            _film(policy, video, min(video_episodes, episodes), seed)
+    except OSError as error:
         raise BadInputError(str(error)) from error
-    document = _document(place, policy, results, arguments)
-    if arguments.json:
+    document = _document(place, policy, results, seed) | {"video": str(video) if video else None}
+    if json:
         print_json(document)
         return 0
+    console = console_for()
     console.print(_table(document))
-    if arguments.video:
-        console.print(f"Video: {arguments.video}", soft_wrap=True)
+    if video:
+        console.print(f"Video: {video}", soft_wrap=True)
     return 0
 
 
@@ -135,27 +106,26 @@ def _check_video(path: Path | None) -> None:
         raise BadInputError(f"--video must be in a folder that exists, got {str(path)!r}")
 
 
-def _play(policy: Policy, arguments: argparse.Namespace) -> list[EpisodeResult]:
+def _play(policy: Policy, episodes: int, seed: int) -> list[EpisodeResult]:
     from music_rllib.policy.rollout import open_task, play
 
     env = open_task(policy)
     try:
-        return list(play(policy, env, arguments.episodes, arguments.seed))
+        return list(play(policy, env, episodes, seed))
     finally:
         env.close()
 
 
-def _film(policy: Policy, arguments: argparse.Namespace) -> None:
+def _film(policy: Policy, path: Path, episodes: int, seed: int) -> None:
     from music_rllib.policy.video import film, write_video
 
-    episodes = min(arguments.video_episodes, arguments.episodes)
     title = f"{policy.task.name}  ·  {policy.variant}  ·  {policy.env_steps:,} env steps"
-    frames, _ = film(policy, episodes, arguments.seed, title)
-    write_video(arguments.video, frames)
+    frames, _ = film(policy, episodes, seed, title)
+    write_video(path, frames)
 
 
 def _document(
-    place: str, policy: Policy, results: list[EpisodeResult], arguments: argparse.Namespace
+    place: str, policy: Policy, results: list[EpisodeResult], seed: int
 ) -> dict[str, Any]:
     from dataclasses import asdict
 
@@ -171,13 +141,12 @@ def _document(
         "training_seed": policy.seed,
         "env_steps": policy.env_steps,
         "episodes": len(results),
-        "seed": arguments.seed,
+        "seed": seed,
         "success_rate": _mean(success),
         "success_rate_interval": _interval(success),
         "success_rate_any_step": _mean(some),
         "episode_return": _mean([result.episode_return for result in results]),
         "object_displacement": _mean(moved),
-        "video": str(arguments.video) if arguments.video else None,
         "results": [asdict(result) for result in results],
     }
 

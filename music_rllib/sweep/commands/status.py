@@ -2,70 +2,72 @@
 
 from __future__ import annotations
 
-import argparse
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+import typer
+
+from music_rllib.command_line import Json, console_for, print_json
 from music_rllib.errors import FAILED, BadInputError
-from music_rllib.sweep.cli_helpers import Commands, add_json, add_place, console_for, print_json
+from music_rllib.sweep.cli_helpers import Place, Storage
 
 if TYPE_CHECKING:
     from music_rllib.experiment.location import Found
 
-__all__ = ["register", "state_of"]
+__all__ = ["EXAMPLES", "state_of", "status"]
 
-EPILOG = """\
-examples:
-  python -m music_rllib.sweep status results/smoke
-  python -m music_rllib.sweep status results/smoke --watch
+EXAMPLES = """\
+Examples:
+  music-rllib status results/smoke
+  music-rllib status results/smoke --watch
       again and again, until the sweep ends
-  python -m music_rllib.sweep status s3://bucket/sweeps/smoke --json
+  music-rllib status s3://bucket/sweeps/smoke --json
 """
 
 
-def register(commands: Commands) -> None:
-    """Add the command."""
-    parser = commands.add_parser(
-        "status",
-        help="how far a sweep is: stages, trials, runs, budget, best so far",
-        description="How far a sweep is: stages, trials, runs, budget spent and left, best so far.",
-        epilog=EPILOG,
-    )
-    add_place(parser)
-    parser.add_argument(
-        "--watch", action="store_true", help="Show it again every few seconds until it ends."
-    )
-    parser.add_argument(
-        "--interval", type=float, default=3.0, metavar="SECONDS", help="Of --watch (default 3)."
-    )
-    add_json(parser)
-    parser.set_defaults(execute=_execute)
+def status(
+    sweep: Place,
+    storage: Storage = None,
+    watch: Annotated[
+        bool, typer.Option("--watch", help="Show it again every few seconds until it ends.")
+    ] = False,
+    interval: Annotated[float, typer.Option(metavar="SECONDS", help="Of --watch.")] = 3.0,
+    json: Json = False,
+) -> int:
+    """How far a sweep is.
 
-
-def _execute(arguments: argparse.Namespace) -> int:
+    Stages, trials, runs, budget spent and left, the best so far.
+    """
     from music_rllib.experiment.location import find_sweep
     from music_rllib.sweep.views.status import status_view
 
-    found = find_sweep(arguments.sweep, arguments.storage)
-    if arguments.json and arguments.watch:
+    found = find_sweep(sweep, storage)
+    if json and watch:
         raise BadInputError("--json must be given without --watch, got both")
-    console = console_for(arguments)
+    console = console_for(as_json=json)
     state = state_of(found)
-    if arguments.json:
+    if json:
         print_json(state)
         return _code(state)
-    if not arguments.watch:
-        console.print(status_view(state))
+    if not watch:
+        console.print(status_view(state, labels_of(found)))
         return _code(state)
     from rich.live import Live
 
     with Live(console=console, auto_refresh=False) as live:
         while True:
-            live.update(status_view(state), refresh=True)
+            live.update(status_view(state, labels_of(found)), refresh=True)
             if state["state"] != "running":
                 return _code(state)
-            time.sleep(max(arguments.interval, 0.2))
+            time.sleep(max(interval, 0.2))
             state = state_of(found)
+
+
+def labels_of(found: Found) -> list[str]:
+    """The labels of the sweep's runs, as far as they are known."""
+    from music_rllib.experiment import sweep_files
+
+    return [node["label"] for node in (found.read(sweep_files.PLAN) or {"nodes": []})["nodes"]]
 
 
 def _code(state: dict[str, Any]) -> int:
@@ -97,6 +99,7 @@ def state_of(found: Found) -> dict[str, Any]:
 
 def _nothing_runs(state: dict[str, Any]) -> None:
     """A driver that crashed or was killed has left its runs as they were when it last spoke."""
+    state["interrupted"] = [*state.get("interrupted", ()), *state["running"]]
     state["running"] = []
     for stage in state["stages"]:
         if "started" in stage["runs"]:

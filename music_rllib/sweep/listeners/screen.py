@@ -9,16 +9,16 @@ from typing import Self
 
 from rich.console import Console, Group
 from rich.live import Live
-from rich.progress_bar import ProgressBar
-from rich.table import Table
 from rich.text import Text
 
 from music_rllib import names
 from music_rllib.experiment.listener import Failure, Listener
 from music_rllib.experiment.plan import Node, Plan
 from music_rllib.experiment.scheduler import Board, Status
+from music_rllib.labels import ShortLabels
 from music_rllib.store.run_record import Report, RunResult
-from music_rllib.sweep.views.text import clock, evaluated_in_words
+from music_rllib.sweep.views.tables import ROOMY, new_table
+from music_rllib.sweep.views.text import clock, evaluated_in_words, measured, percent
 from music_rllib.training.throughput import Pace
 
 __all__ = ["Display"]
@@ -44,9 +44,16 @@ class Display(Listener):
         self._board = board
         self._now = now
         self._began = now()
+        self.short = ShortLabels(
+            {node.stage for node in plan.nodes} | {stage.name for stage in plan.searched},
+            {node.run.task.name for node in plan.nodes}
+            | {task.name for stage in plan.searched for task in stage.tasks},
+        )
         self.headline: Callable[[], tuple[list[str], str | None]] = lambda: ([], None)
         """Gives where each stage stands, and the best so far, in words."""
         self._best: str | None = None
+        self._ended: dict[str, int] = {}
+        """Environment steps that runs had spent which were interrupted, stopped early or failed."""
         self._running: dict[str, tuple[Node, Pace]] = {}
         self._said: dict[str, float] = {}
         self._refreshed = self._headed = self._began
@@ -76,8 +83,9 @@ class Display(Listener):
         self._console.print(Text(f"[{passed:>6}] {text}", style=style), soft_wrap=True)
 
     def started(self, node: Node) -> None:
+        self._ended.pop(node.key, None)
         self._running[node.key] = (node, self._new_pace(node))
-        self.say(f"{node.label}: started")
+        self.say(f"{self.short(node.label)}: started")
 
     def _new_pace(self, node: Node) -> Pace:
         return Pace(node.run.env_steps, node.run.tac.random_steps, self._now())
@@ -89,40 +97,49 @@ class Display(Listener):
         quiet = self._now() - self._said.get(node.key, self._began) >= QUIET_SECONDS
         if self._live is None and (evaluated or quiet) and not self._is_over(node, pace):
             self._said[node.key] = self._now()
-            self.say(f"{node.label}: {self._progress_in_words(node, pace)}")
+            self.say(f"{self.short(node.label)}: {self._progress_in_words(node, pace)}")
 
     @staticmethod
     def _is_over(node: Node, pace: Pace) -> bool:
         return pace.env_steps >= node.run.env_steps  # `finished` says it better
 
     def noted(self, node: Node, text: str) -> None:
-        self.say(f"{node.label}: {text}")
+        self.say(f"{self.short(node.label)}: {text}")
 
     def remarked(self, text: str) -> None:
         self.say(text, "yellow")
 
     def finished(self, node: Node, result: RunResult) -> None:
         self._running.pop(node.key, None)
+        evaluated = evaluated_in_words(node.run.task, result.metrics)
         self.say(
-            f"{node.label}: finished, {evaluated_in_words(node.run.task, result.metrics)}, "
+            f"{self.short(node.label)}: finished, {evaluated}, "
             f"{result.env_steps:,} env steps in {clock(result.seconds)}",
             "green",
         )
 
     def failed(self, node: Node, failure: Failure) -> None:
-        self._running.pop(node.key, None)
+        self._leave(node)
         cause = failure.cause.replace("\n", "\n" + " " * 13)
-        self.say(f"{node.label}: FAILED: {cause}", "red")
+        self.say(f"{self.short(node.label)}: FAILED: {cause}", "red")
         self.say(f"    whole traceback: {failure.log}")
 
     def skipped(self, node: Node, because: Node) -> None:
-        self.say(f"{node.label}: skipped, it starts from {because.label}", "yellow")
+        self.say(
+            f"{self.short(node.label)}: skipped, it starts from {self.short(because.label)}",
+            "yellow",
+        )
 
     def paused(self, node: Node) -> None:
-        self._running.pop(node.key, None)
+        self._leave(node)
 
     def pruned(self, node: Node, reason: str) -> None:
-        self._running.pop(node.key, None)
+        self._leave(node)
+
+    def _leave(self, node: Node) -> None:
+        """What an unfinished run has spent is spent."""
+        if (found := self._running.pop(node.key, None)) is not None:
+            self._ended[node.key] = found[1].env_steps
 
     def tick(self) -> None:
         now = self._now()
@@ -137,22 +154,22 @@ class Display(Listener):
             self._live.update(self._view(), refresh=True)
 
     def _view(self) -> Group:
-        table = Table(box=None, pad_edge=False)
-        table.add_column("running")
-        table.add_column("", width=16)
-        for name in ("env steps", "steps/s", "left", "last evaluation"):
-            table.add_column(name, justify="right")
+        width = self._console.width
+        table = new_table("", ["running"], ["env steps"])
+        for name in ["steps/s"] * (width >= ROOMY) + ["left", "evaluated"]:
+            table.add_column(name, justify="right", overflow="fold")
         for node, pace in self._running.values():
-            rate = pace.steps_per_second
+            rate, metric = pace.steps_per_second, node.run.task.primary_metric
+            done = f"{pace.env_steps:,} / {pace.budget:,}"
+            if width < ROOMY:
+                done = percent(pace.env_steps / pace.budget)
+            value = measured(metric, pace.metrics.get(metric))
             table.add_row(
-                node.label,
-                ProgressBar(total=pace.budget, completed=pace.env_steps, width=16),
-                f"{pace.env_steps:,} / {pace.budget:,}" if pace.env_steps else "preparing",
-                "-" if rate is None else f"{rate:.0f}",
+                self.short(node.label),
+                done if pace.env_steps else "preparing",
+                *["-" if rate is None else f"{rate:.0f}"] * (width >= ROOMY),
                 clock(pace.seconds_left(self._now())),
-                evaluated_in_words(node.run.task, pace.metrics)
-                if node.run.task.primary_metric in pace.metrics
-                else "-",
+                "-" if value == "-" else f"{names.word_of(metric)} {value}",
             )
         lines, best = self.headline()
         texts = [Text(line, style="dim") for line in [*lines, self._summary()]]
@@ -163,6 +180,7 @@ class Display(Listener):
         done = self._board.having(Status.FINISHED, Status.REUSED)
         steps = sum(node.run.env_steps for node in done)
         steps += sum(pace.env_steps for _, pace in self._running.values())
+        steps += sum(self._ended.values())
         text = (
             f"{len(done)} of {len(self._plan.nodes)} runs done, "
             f"{steps:,} of {self._plan.env_steps:,} env steps, "

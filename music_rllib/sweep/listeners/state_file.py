@@ -50,6 +50,8 @@ class Beacon(Listener):
         """Gives what came of the sweep's searches so far."""
         self._progress: dict[str, Report] = {}
         self._metrics: dict[str, dict[str, float]] = {}
+        self._spent_before = _checkpointed(sweep)
+        """Environment steps in the checkpoints of runs that are not finished, by node key."""
         self._results: dict[str, RunResult] = {}
         self._failures: list[dict[str, str]] = []
         self._driver: dict[str, Any] = {
@@ -114,12 +116,24 @@ class Beacon(Listener):
             self._results[node.key] = result
 
     def failed(self, node: Node, failure: Failure) -> None:
-        self._forget(node)
         self._failures.append({"run": node.label, "cause": failure.cause, "log": str(failure.log)})
 
     def _forget(self, node: Node) -> None:
         self._progress.pop(node.key, None)
         self._metrics.pop(node.key, None)
+
+    def reached(self) -> dict[str, RunResult]:
+        """What unfinished runs have spent and measured, by node key, as far as it is known."""
+        labels = {node.key: node.label for node in self._sweep.plan.nodes}
+        return {
+            key: RunResult(
+                label=labels[key],
+                env_steps=report.env_steps,
+                seconds=report.seconds,
+                metrics=self._metrics.get(key, {}),
+            )
+            for key, report in self._progress.items()
+        }
 
     def tick(self) -> None:
         if self._now() >= self._due:
@@ -164,7 +178,7 @@ class Beacon(Listener):
                 steps_done += node.run.env_steps
                 continue
             reached = self._progress.get(node.key)
-            steps = 0 if reached is None else reached.env_steps
+            steps = self._spent_before.get(node.key, 0) if reached is None else reached.env_steps
             steps_done += steps
             if status in (Status.WAITING, Status.STARTED, Status.PAUSED):
                 steps_left += node.run.env_steps - steps
@@ -241,3 +255,13 @@ class Beacon(Listener):
             sweep_files.keep(
                 self._sweep, sweep_files.PLAN, sweep_files.as_json(plan_document(self._sweep))
             )
+
+
+def _checkpointed(sweep: Sweep) -> dict[str, int]:
+    begun = sweep.store.begun()
+    nodes = (node for node in sweep.plan.nodes if node.key in begun)
+    return {
+        node.key: int(checkpoints[-1].split("-")[0])
+        for node in nodes
+        if (checkpoints := sweep.store.work_folder(node.key).names())
+    }

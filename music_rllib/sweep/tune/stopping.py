@@ -14,6 +14,7 @@ from typing import Any
 from ray import tune
 from ray.tune.experiment import Trial
 
+from music_rllib.command_line import say_stopped_at_once
 from music_rllib.errors import FAILED
 from music_rllib.runtime.ending import end_process
 from music_rllib.runtime.ray_watch import RayWatch
@@ -170,4 +171,5 @@ class StopSignals(tune.Callback):
             end_process(FAILED if stopped_by is None else 128 + stopped_by)
 
     def _stop_at_once(self, number: int, frame: FrameType | None) -> None:
+        say_stopped_at_once()
         end_process(128 + number)

@@ -13,6 +13,7 @@ from music_rllib.envs.make import make_env
 from music_rllib.envs.tasks import Task
 from music_rllib.experiment.plan import Node, Plan
 from music_rllib.schedules import QUANTITIES, Linear, Measured, Piecewise, value_at
+from music_rllib.sweep.views.tables import new_table
 
 __all__ = ["adaptive_rows", "adaptive_text", "alpha_rows", "alpha_table"]
 
@@ -68,11 +69,11 @@ def _action_size(task: Task) -> int:
 
 def alpha_table(rows: Iterable[dict[str, Any]]) -> Table:
     """For the screen."""
-    table = Table(title="α at each q", title_justify="left")
+    table = new_table("α at each q")
     for name in ("stage", "alpha"):
-        table.add_column(name)
+        table.add_column(name, overflow="fold")
     for name in ("q", "α at the start", "at the end"):
-        table.add_column(name, justify="right")
+        table.add_column(name, justify="right", overflow="fold")
     for row in rows:
         numbers = (f"{row['at_start']:.4g}", f"{row['at_end']:.4g}")
         table.add_row(row["stage"], row["alpha"], row["q"], *numbers)

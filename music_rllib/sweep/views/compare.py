@@ -12,7 +12,7 @@ from rich.text import Text
 from music_rllib import names
 from music_rllib.experiment.plan import short
 from music_rllib.results.comparison import with_interval
-from music_rllib.sweep.views.tables import seeds_in_words
+from music_rllib.sweep.views.tables import new_table, seeds_in_words
 from music_rllib.sweep.views.text import percent
 
 __all__ = ["compare_view"]
@@ -36,9 +36,9 @@ def compare_view(document: Mapping[str, Any]) -> RenderableType:
 
 def _comparisons(document: Mapping[str, Any]) -> Table:
     rows = document["comparisons"]
-    table = Table(title="Comparisons", title_justify="left")
+    table = new_table("Comparisons")
     for name in ("first - second", *_task(rows), "difference, 95 %", "p", "verdict", "planned"):
-        table.add_column(name)
+        table.add_column(name, overflow="fold")
     for row in rows:
         within = row["verdict"] == "equivalent"
         p_value = row["p_equivalent_holm"] if within else row["p_value_holm"]
@@ -57,9 +57,9 @@ def _primary(document: Mapping[str, Any]) -> Table:
     rows = document["conditions"]
     measure = " or ".join(dict.fromkeys(row["measure"] for row in rows))
     title = f"Area under the learning curve: {measure}"
-    table = Table(title=title, title_justify="left")
+    table = new_table(title)
     for name in ("condition", *_task(rows), "mean, 95 %", "each seed", "runs"):
-        table.add_column(name, justify="left" if name == "condition" else "right")
+        table.add_column(name, justify="left" if name == "condition" else "right", overflow="fold")
     for row in rows:
         table.add_row(
             row["condition"],
@@ -74,18 +74,18 @@ def _primary(document: Mapping[str, Any]) -> Table:
 def _table(document: Mapping[str, Any], group: Mapping[str, Any]) -> Table:
     rows = group["conditions"]
     title = f"{group['metric']} of {document['stage']} on {group['tasks']} {group['part']}".strip()
-    table = Table(title=title, title_justify="left")
+    table = new_table(title)
     settings = dict.fromkeys(name for row in rows for name in row["values"])
     for name in (
-        *settings,
+        *map(_broken, settings),
         "mean, 95 %",
         "each seed",
         "runs",
         "gap, 95 %",
-        "P(first is better)",
+        "P(first\nis better)",
         "p",
     ):
-        table.add_column(name, justify="right")
+        table.add_column(name, justify="right", overflow="fold")
     for row in rows:
         table.add_row(
             *(short(row["values"][name]) if name in row["values"] else "-" for name in settings),
@@ -116,3 +116,9 @@ def _entropies(group: Mapping[str, Any]) -> Table:
 def _task(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """The column of tasks, where there are several."""
     return ["task"] if len({row["task"] for row in rows}) > 1 else []
+
+
+def _broken(setting: str) -> str:
+    """The head of a column: `tac.` above `entropic_index`."""
+    section, dot, name = setting.rpartition(".")
+    return f"{section}{dot}\n{name}" if dot else name

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from rich.console import Group, RenderableType
@@ -12,6 +12,7 @@ from rich.text import Text
 
 from music_rllib import names
 from music_rllib.experiment.plan import short
+from music_rllib.labels import ShortLabels
 from music_rllib.search.ranking import best_in_words
 from music_rllib.store.node_store import TRAIN_AGAIN
 from music_rllib.sweep.views.text import clock, measured
@@ -25,14 +26,15 @@ _STATES = (
 _STYLES = {"finished": "green", "failed": "red", "interrupted": "yellow", "stopped": "yellow"}
 
 
-def status_view(state: Mapping[str, Any]) -> RenderableType:
-    """Stages, trials, runs, budget, searches, failures."""
+def status_view(state: Mapping[str, Any], labels: Iterable[str] = ()) -> RenderableType:
+    """Stages, trials, runs, budget, searches, failures; with the `labels` of all runs in short."""
     title = Text(f"Sweep {state['sweep']}: ")
     title.append(state["state"], _STYLES.get(state["state"], "bold"))
     title.append(f"  ({state['place']})", "dim")
     if "driver" not in state:
         return title
     parts: list[RenderableType] = [title, Text(_times(state)), _stages(state)]
+    label = ShortLabels.of(labels)
     done, left = state["env_steps"]["done"], state["env_steps"]["left"]
     parts.append(Text(f"Budget: {done:,} env steps spent, {left:,} left of what is known so far"))
     if state["best"] is not None:
@@ -40,17 +42,20 @@ def status_view(state: Mapping[str, Any]) -> RenderableType:
     parts += [_search(search) for search in state["searches"]]
     parts += [
         Text(
-            f"running: {one['run']}  {one['env_steps']:,} / {one['budget']:,} env steps, "
-            f"{names.word_of(one['metric'])} {measured(one['metric'], one['value'])}"
+            f"{one['state']}: {label(one['run'])}  {one['env_steps']:,} / {one['budget']:,} env "
+            f"steps, {names.word_of(one['metric'])} {measured(one['metric'], one['value'])}"
         )
-        for one in state["running"]
+        for one in (
+            *({"state": "running"} | one for one in state["running"]),
+            *({"state": "interrupted"} | one for one in state.get("interrupted", ())),
+        )
     ]
     for one in state["damaged"]:
-        parts.append(Text(f"DAMAGED {one['run']}: {one['cause']}", style="red"))
+        parts.append(Text(f"DAMAGED {label(one['run'])}: {one['cause']}", style="red"))
     if state["damaged"]:
         parts.append(Text(f"    {TRAIN_AGAIN}", style="dim"))
     for failure in state["failures"]:
-        parts.append(Text(f"FAILED {failure['run']}: {failure['cause']}", style="red"))
+        parts.append(Text(f"FAILED {label(failure['run'])}: {failure['cause']}", style="red"))
         parts.append(Text(f"    {failure['log']}", style="dim"))
     return Group(*parts)
 

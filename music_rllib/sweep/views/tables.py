@@ -14,15 +14,16 @@ from music_rllib.config.schema import Source, Stage, SweepConfig
 from music_rllib.config.search.check import most_env_steps
 from music_rllib.config.search.settings import SearchSettings
 from music_rllib.config.search.space import Choice, Dimension
-from music_rllib.config.tac_settings import in_words
 from music_rllib.envs.tasks import Task
 from music_rllib.experiment.plan import Node, Plan, short
 from music_rllib.experiment.scheduler import Status
+from music_rllib.labels import ShortLabels
 from music_rllib.results.comparison import SHOW_SEEDS_BELOW, with_interval
 from music_rllib.store.run_record import RunResult
 from music_rllib.sweep.views.text import clock, measured, percent
 
 __all__ = [
+    "new_table",
     "plan_view",
     "ranking_table",
     "results_table",
@@ -33,16 +34,31 @@ __all__ = [
 ]
 
 
+def new_table(title: str, left: Iterable[str] = (), right: Iterable[str] = ()) -> Table:
+    """A table whose cells are never cut, with columns of text on the left and of numbers."""
+    table = Table(title=title, title_justify="left", box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for name in left:
+        table.add_column(name, overflow="fold")
+    for name in right:
+        table.add_column(name, justify="right", overflow="fold")
+    return table
+
+
+ROOMY = 76
+"""Columns of a screen from which progress has all that there is to say."""
+
+
 def plan_view(config: SweepConfig, plan: Plan, finished: Collection[str]) -> RenderableType:
     """Stages, trials, runs, budgets, and what an earlier sweep has finished."""
-    table = Table(title=f"Sweep {plan.name}", title_justify="left")
-    for name in ("stage", "variant", "starts from", "tasks", "grid"):
-        table.add_column(name)
-    for name in ("trials", "seeds", "runs", "env steps a run", "env steps", "finished"):
-        table.add_column(name, justify="right")
+    table = new_table(
+        f"Sweep {plan.name}",
+        ["stage"],
+        ["trials", "runs", "env steps a run", "env steps", "finished"],
+    )
     nodes = {node.key: node for node in plan.nodes}
     for stage in config.stages:
-        table.add_row(*_stage_row(stage, plan, nodes, finished, len(config.seeds)))
+        table.add_row(stage.name, *_stage_row(stage, plan, nodes, finished, len(config.seeds)))
+    about = [_about(stage, len(config.seeds)) for stage in config.stages]
     text = _summary(plan, finished)
     searched = [(stage, stage.search) for stage in config.stages if stage.search is not None]
     if searched:
@@ -51,7 +67,19 @@ def plan_view(config: SweepConfig, plan: Plan, finished: Collection[str]) -> Ren
         text += f" Searches: up to {runs} runs and {steps:,} env steps more"
         fresh = any(search.final and stage.source for stage, search in searched)
         text += ", and what runs on fresh seeds start from." if fresh else "."
-    return Group(table, Text(text))
+    return Group(table, *map(Text, about), Text(text))
+
+
+def _about(stage: Stage, seeds: int) -> str:
+    """What a stage is, and what it varies."""
+    search = stage.search
+    fresh = f" and {search.final.seeds} fresh" if search and search.final else ""
+    text = (
+        f"{stage.name}: {stage.variant} on {', '.join(map(_judged, stage.tasks))} from "
+        f"{_source(stage.source)}, {seeds} seed{'s' * (seeds > 1)}{fresh}"
+    )
+    axes = _axes(stage) if search is None else _searched_axes(search)
+    return "\n  ".join((text, *axes))
 
 
 def _stage_row(
@@ -62,22 +90,14 @@ def _stage_row(
     seeds: int,
 ) -> list[str]:
     if stage.search is not None:
-        return _search_row(stage, stage.search, plan, seeds)
+        return _search_row(stage, stage.search, seeds)
     runs = [run for run in plan.runs if run.stage == stage.name]
     if not runs:  # its settings are searched for: it runs as trials want it
         budget = next(iter(stage.points[0].runs.values())).env_steps
-        tasks = ", ".join(map(_judged, stage.tasks))
-        counts = ["as needed", str(seeds), "-", f"{budget:,}", "-", "-"]
-        return [stage.name, stage.variant, _source(stage.source), tasks, "-", *counts]
+        return ["as needed", "-", f"{budget:,}", "-", "-"]
     budgets = sorted({nodes[run.key].run.env_steps for run in runs})
     return [
-        stage.name,
-        stage.variant,
-        _source(stage.source),
-        ", ".join(map(_judged, stage.tasks)),
-        "\n".join(_axes(stage)) or "-",
         str(len({run.trial for run in runs})),
-        str(seeds),
         str(len(runs)),
         " to ".join(f"{steps:,}" for steps in dict.fromkeys((budgets[0], budgets[-1]))),
         f"{sum(nodes[run.key].run.env_steps for run in runs):,}",
@@ -91,31 +111,25 @@ def _judged(task: Task) -> str:
     return task.name if metric == names.EVAL_SUCCESS else f"{task.name} ({names.word_of(metric)})"
 
 
-def _search_row(stage: Stage, search: SearchSettings, plan: Plan, seeds: int) -> list[str]:
+def _search_row(stage: Stage, search: SearchSettings, seeds: int) -> list[str]:
     """What a search takes at most: it may stop trials early, and points may repeat."""
     studies, budget = len(search.arms()), search_budget(stage, search)
-    runs = search_runs(stage, search, seeds)
+    return [
+        f"{studies} x {search.count}" if studies > 1 else str(search.count),
+        f"<= {search_runs(stage, search, seeds)}",
+        f"<= {max(budget, (search.final and search.final.env_steps) or 0):,}",
+        f"<= {search_steps(stage, search, seeds):,}",
+        "-",
+    ]
+
+
+def _searched_axes(search: SearchSettings) -> list[str]:
     axes = [f"{name}: {_dimension(one)}" for name, one in search.space.items()]
     axes += [
         f"{name}: {', '.join(short(value) for value in values)} ({search.mode})"
         for name, values in search.compare.items()
     ]
-    fresh = 0 if search.final is None else search.final.seeds
-    return [
-        stage.name,
-        stage.variant,
-        _source(stage.source),
-        ", ".join(map(_judged, stage.tasks)),
-        "\n".join(axes),
-        f"{studies} x {search.count}\n{search.sampler}"
-        if studies > 1
-        else f"{search.count}\n{search.sampler}",
-        f"{seeds} + {fresh} fresh" if fresh else str(seeds),
-        f"<= {runs}",
-        f"<= {max(budget, (search.final and search.final.env_steps) or 0):,}",
-        f"<= {search_steps(stage, search, seeds):,}",
-        "-",
-    ]
+    return [f"searched by {search.sampler}:", *axes]
 
 
 def search_budget(stage: Stage, search: SearchSettings) -> int:
@@ -195,11 +209,10 @@ def results_table(
     Args:
         plan: The sweep's plan.
         status: Node key to its state.
-        results: Node key to its result, for finished nodes.
+        results: Node key to its result, or to what it has reached so far.
         mlflow_run: Node key to MLflow's id of its run, if there is one.
         width: Of the screen; columns of `_SPARE` that it has no room for are left out.
     """
-    grid = _grid_columns(plan)
     nodes = {node.key: node for node in plan.nodes}
     metrics = _columns(node.run.task.primary_metric for node in nodes.values())
     # A reward or an entropy that no run has is no column.
@@ -208,15 +221,11 @@ def results_table(
         for metric, head in _BESIDE.items()
         if any(metric in result.metrics for result in results.values())
     }
-    heads = ["stage", "task", "seed", "q", *grid, *metrics.values(), "env steps", "time"]
-    heads += ["MLflow run", "state"]
+    heads = ["run", *metrics.values(), "env steps", "time", "MLflow run", "state"]
+    label = ShortLabels.of(run.label for run in plan.runs)
     rows = [
         (
-            run.stage,
-            run.task,
-            str(run.seed),
-            in_words(nodes[run.key].run.tac.entropic_index),
-            *(short(run.values[name]) if name in run.values else "-" for name in grid),
+            label(run.label),
             *_reached(results.get(run.key), metrics),
             (mlflow_run(run.key) or "-")[:8],
             _STATE.get(status(run.key), str(status(run.key))),
@@ -226,19 +235,12 @@ def results_table(
     ]
     shown = _fitting(heads, rows, width)
     missing = [head.replace("\n", " ") for head in heads if head not in shown]
-    table = Table(
-        title=f"Results of {plan.name}",
-        title_justify="left",
-        caption=f"A wider screen also shows: {'; '.join(missing)}" if missing else None,
-        caption_justify="left",
-    )
-    left = {"stage", "task", *grid, "MLflow run", "state"}
+    table = new_table(f"Results of {plan.name}")
+    table.caption = f"A wider screen also shows: {'; '.join(missing)}" if missing else None
+    table.caption_justify = "left"
     for head in shown:
-        table.add_column(
-            head,
-            justify="left" if head in left else "right",
-            no_wrap=head in ("MLflow run", "state"),
-        )
+        left = head in ("run", "MLflow run", "state")
+        table.add_column(head, justify="left" if left else "right", overflow="fold")
     keys = (run.key for run in plan.runs if not run.part)
     for key, row in zip(keys, rows, strict=True):
         cells = dict(zip(heads, row, strict=True))
@@ -246,7 +248,7 @@ def results_table(
     return table
 
 
-_SPARE = ("MLflow run", "success,\nany step", "time", "MI\nreward", "S_q", "env steps")
+_SPARE = ("MLflow run", "at any\nstep", "time", "MI\nreward", "S_q", "env steps")
 """Columns that a narrow screen can do without, the first one first."""
 
 
@@ -260,8 +262,8 @@ def _fitting(
     }
     left = list(heads)
     for head in _SPARE:
-        # Beside each column a line and two spaces.
-        if width is None or sum(widths[one] + 3 for one in left) + 1 <= width:
+        # Two spaces stand between columns.
+        if width is None or sum(widths[one] + 2 for one in left) <= width:
             break
         left = [one for one in left if one != head]
     return left
@@ -283,22 +285,21 @@ def search_views(searches: Sequence[Mapping[str, Any]]) -> list[RenderableType]:
 
 def _trials_table(search: Mapping[str, Any], arm: Mapping[str, Any]) -> Table:
     fixed = ", ".join(f"{name} = {short(value)}" for name, value in arm["values"].items())
-    table = Table(
-        title=f"Trials of {search['stage']}{f' with {fixed}' if fixed else ''}: "
+    table = new_table(
+        f"Trials of {search['stage']}{f' with {fixed}' if fixed else ''}: "
         f"{arm['judged']} judged, {arm['pruned']} stopped early, {arm['failed']} failed"
         + ("; in bold what no other is better than in every objective" if arm["front"] else ""),
-        title_justify="left",
     )
     names_of = dict.fromkeys(
         name for trial in arm["trials"] for name in trial["values"] if name not in arm["values"]
     )
-    table.add_column("trial", justify="right")
+    table.add_column("trial", justify="right", overflow="fold")
     for name in names_of:
-        table.add_column(name, justify="right")
+        table.add_column(name, justify="right", overflow="fold")
     for objective in search["objectives"]:
-        table.add_column(objective["name"], justify="right")
-    table.add_column("state", no_wrap=True)
-    table.add_column("why")
+        table.add_column(objective["name"], justify="right", overflow="fold")
+    table.add_column("state", overflow="fold")
+    table.add_column("why", overflow="fold")
     for trial in arm["trials"]:
         if trial["state"] == "waiting":
             continue
@@ -318,18 +319,19 @@ def _trials_table(search: Mapping[str, Any], arm: Mapping[str, Any]) -> Table:
 
 def ranking_table(search: Mapping[str, Any]) -> Table:
     """Finalists on fresh seeds."""
-    table = Table(
-        title=f"Ranking of {search['stage']} on fresh seeds. 'in the search' is too good: the "
+    table = new_table(
+        f"Ranking of {search['stage']} on fresh seeds. 'in the search' is too good: the "
         "trials were chosen for it",
-        title_justify="left",
     )
     names_of = dict.fromkeys(name for row in search["ranking"] for name in row["values"])
     for name in ("rank", "trial", *names_of):
-        table.add_column(name, justify="right")
+        table.add_column(name, justify="right", overflow="fold")
     for objective in search["objectives"]:
-        table.add_column(f"{objective['name']}\non fresh seeds, 95 %", justify="right")
-        table.add_column("in the\nsearch", justify="right")
-    table.add_column("P(best is\nbetter)", justify="right")
+        table.add_column(
+            f"{objective['name']}\non fresh seeds, 95 %", justify="right", overflow="fold"
+        )
+        table.add_column("in the\nsearch", justify="right", overflow="fold")
+    table.add_column("P(best is\nbetter)", justify="right", overflow="fold")
     for rank, row in enumerate(search["ranking"], 1):
         values = (short(row["values"][n]) if n in row["values"] else "-" for n in names_of)
         if "failure" in row:
@@ -353,18 +355,12 @@ def seeds_in_words(scores: Sequence[float]) -> str:
     return " ".join(f"{score:.3g}" for score in sorted(scores)) if few else ""
 
 
-def _grid_columns(plan: Plan) -> list[str]:
-    """What tells trials apart, besides q, which has its column."""
-    found = dict.fromkeys(name for run in plan.runs if not run.part for name in run.values)
-    return [name for name in found if name != "tac.entropic_index"]
-
-
 def _columns(primary: Iterable[str]) -> dict[str, str]:
     """What runs are judged by to the heads of their columns."""
     found = set(primary)
     heads = {
-        names.EVAL_SUCCESS: "success,\nlast step",
-        names.EVAL_SUCCESS_ANY: "success,\nany step",
+        names.EVAL_SUCCESS: "success",
+        names.EVAL_SUCCESS_ANY: "at any\nstep",
         names.EVAL_RETURN: "return",
     }
     if names.EVAL_RETURN not in found:

@@ -1,8 +1,6 @@
 """Bad input at the command line: exit code 2, a clear message, and nothing begun."""
 
-import os
-import subprocess
-import sys
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -335,38 +333,34 @@ def test_a_damaged_node_that_others_start_from(
     assert "--retrain-damaged" in result.stderr
 
 
-@pytest.mark.parametrize("command", ["", *sorted(cli._commands())])
-def test_help_answers_at_once_and_shows_how_it_is_used(command: str) -> None:
-    code = (
-        "import contextlib, sys; from music_rllib.sweep import cli\n"
-        "with contextlib.suppress(SystemExit): cli.main([*sys.argv[1:], '--help'])\n"
-        "heavy = {'ray', 'torch', 'mlflow', 'gymnasium', 'optuna', 'pydantic'} & set(sys.modules)\n"
-        "assert not heavy, heavy\n"
-    )
-    found = subprocess.run(
-        [sys.executable, "-c", code, *filter(None, [command])],
-        capture_output=True,
-        check=True,
-        text=True,
-        env=os.environ | {"COLUMNS": "200"},
-    )
-    parts = ["examples:", "python -m music_rllib.sweep"]
-    parts += ["--json"] if command else ["ray job submit", "exit codes", *cli._commands()]
-    for part in parts:
-        assert part in found.stdout
-
-
-def test_a_mistyped_option_is_bad_input(
-    program: Program, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit) as stopped:
-        program(document(), "--dryrun")
-    assert stopped.value.code == 2
-    assert "unrecognized arguments: --dryrun" in capsys.readouterr().err
+def test_a_mistyped_option_is_bad_input(program: Program) -> None:
+    result = program(document(), "--dryrun")
+    assert result.exit_code == 2
+    assert "No such option: --dryrun" in result.stderr
     # With the usage of the command that it was given to.
-    with pytest.raises(SystemExit):
-        program(None, "status", "results/s", "--nope")
-    assert capsys.readouterr().err.startswith("usage: python -m music_rllib.sweep status ")
+    result = program(None, "status", "results/s", "--nope")
+    assert result.exit_code == 2
+    assert result.stderr.startswith("Usage: python -m music_rllib.sweep status ")
+
+
+def test_the_command_line_is_recorded_with_the_file(
+    program: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(driver, "_compute_and_report", lambda *_: 0)
+    assert program(document(), "seeds=2", "env_steps=7e3").exit_code == 0
+    kept = json.loads((tmp_path / "results/s/config.json").read_text())
+    assert (kept["seeds"], kept["defaults"]["env_steps"]) == ([0, 1], 7000)
+    text = (tmp_path / "results/s/sweep.yaml").read_text()
+    assert text.startswith("# seeds=2  (command line)\n# env_steps=7e3  (command line)\n")
+    result = program(None, "resume", "results/s", "--json")
+    assert result.exit_code == 0
+    assert "14,000 env steps" in result.output
+
+
+def test_without_a_file_the_command_line_changes_the_packaged_sweep(program: Program) -> None:
+    result = program(None, "plan", "seeds=2", "stages.reach.grid.tac.entropic_index=[3]")
+    assert result.exit_code == 0, result.stderr
+    assert "2 seeds\n  tac.entropic_index: 3\n" in result.output
 
 
 @pytest.mark.parametrize("arguments", [("statsu", "results/x"), ("stauts",), ("Status", "x")])

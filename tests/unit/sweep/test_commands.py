@@ -23,6 +23,7 @@ from music_rllib.experiment.plan import Node, make_plan
 from music_rllib.experiment.run_info import run_info
 from music_rllib.experiment.session import Sweep, keep_record, open_sweep
 from music_rllib.experiment.sweep_files import as_json
+from music_rllib.labels import ShortLabels
 from music_rllib.redaction import flat_params
 from music_rllib.results.analysis import analyse
 from music_rllib.results.claims.answer import answer
@@ -585,7 +586,8 @@ def test_a_damaged_run_is_named_by_every_command_and_trained_again_when_asked(
     (damaged,) = json.loads(said.output)["damaged"]
     assert damaged["run"] == bad.label
     said = program("status", place)
-    assert (said.code, f"DAMAGED {bad.label}: " in said.output) == (1, True)
+    label = ShortLabels.of(node.label for node in sweep.plan.nodes)
+    assert (said.code, f"DAMAGED {label(bad.label)}: " in said.output) == (1, True)
 
     removed: list[str] = []
     again = open_sweep(sweep.config, sweep.plan, storage, sweep.folder, removed.append)

@@ -69,22 +69,13 @@ def report(env_steps: int, seconds: float, **metrics: float) -> Report:
 def test_the_plan_counts_runs_budgets_and_what_is_finished(config: SweepConfig, plan: Plan) -> None:
     console, text = screen()
     console.print(plan_view(config, plan, {plan.nodes[0].key}))
-    rows = {line.split()[1]: line for line in text.getvalue().splitlines() if "│" in line}
-    cells = [cell.strip() for cell in rows["finetune"].split("│")[1:-1]]
-    assert cells == [
-        "finetune",
-        "music-r",
-        "pretrain",
-        "FetchPush",
-        "tac.entropic_index: 1, 1.5",
-        "2",
-        "2",
-        "4",
-        "5,000",
-        "20,000",
-        "0",
-    ]
-    assert rows["pretrain"].split("│")[-2].strip() == "1"
+    rows = {line.split()[0]: line.split()[1:] for line in text.getvalue().splitlines()}
+    assert rows["finetune"] == ["2", "4", "5,000", "20,000", "0"]
+    assert rows["pretrain"][-1] == "1"
+    assert (
+        "finetune: music-r on FetchPush from pretrain, 2 seeds\n  tac.entropic_index: 1, 1.5"
+        in (text.getvalue())
+    )
     assert "6 runs, 24,000 env steps in all, 1 finished earlier and reused, 22,000 env steps" in (
         text.getvalue()
     )
@@ -152,23 +143,17 @@ def test_results_have_a_row_per_run_whatever_became_of_it(plan: Plan) -> None:
     runs = {plan.nodes[1].key: "0123456789abcdef"}
     given = (plan, board.__getitem__, {plan.nodes[1].key: result}, runs.get)
     console.print(results_table(*given))
-    rows = [
-        [cell.strip() for cell in line.split("│")[1:-1]]
-        for line in text.getvalue().splitlines()
-        if line.startswith("│")
-    ]
+    rows = [line.split() for line in text.getvalue().splitlines()[3:]]
     assert rows[1] == [
-        "pretrain", "FetchPush", "1", "1", "-", "25 %", "50 %", "-0.50", "0.29", "-0.12",
-        "2,000", "2:05",
+        "pretrain/seed1", "25", "%", "50", "%", "-0.50", "0.29", "-0.12", "2,000", "2:05",
         "01234567", "reused",
     ]  # fmt: skip
     assert [row[-1] for row in rows] == [
-        "failed", "reused", "skipped", "interrupted", "skipped", "not started",
+        "failed", "reused", "skipped", "interrupted", "skipped", "started",
     ]  # fmt: skip
-    assert [row[3] for row in rows] == ["1", "1", "1", "1", "1.5", "1.5"]
-    assert [row[4] for row in rows[2:]] == ["0.1"] * 4
-    narrow = results_table(*given, width=90)
-    assert console.measure(narrow).maximum <= 90
+    assert rows[4][0] == "finetune/q=1.5,alpha=0.1/seed0"
+    narrow = results_table(*given, width=64)
+    assert console.measure(narrow).maximum <= 64
     assert [str(column.header) for column in narrow.columns][-2:] == ["entropy,\nnats", "state"]
     assert "MLflow run" in str(narrow.caption)
 
@@ -218,16 +203,14 @@ def test_without_a_terminal_there_are_plain_lines(plan: Plan) -> None:
         display.reported(plan.nodes[0], [report(2000, 20.4, **metrics)])
         display.finished(plan.nodes[0], result)
     assert text.getvalue().splitlines() == [
-        "[  0:00] pretrain/FetchPush/seed0: started",
-        "[  0:00] pretrain/FetchPush/seed1: started",
-        "[  0:10] pretrain/FetchPush/seed0: 1,000 of 2,000 env steps, 100 steps/s, 0:10 left, "
+        "[  0:00] pretrain/seed0: started",
+        "[  0:00] pretrain/seed1: started",
+        "[  0:10] pretrain/seed0: 1,000 of 2,000 env steps, 100 steps/s, 0:10 left, "
         "success 20 % (any step -)",
-        "[  0:11] pretrain/FetchPush/seed1: FAILED: RuntimeError: the gripper fell off",
+        "[  0:11] pretrain/seed1: FAILED: RuntimeError: the gripper fell off",
         "[  0:11]     whole traceback: /logs/bad.txt",
-        "[  0:11] finetune/FetchPush/tac.entropic_index=1,tac.alpha=0.1/seed1: skipped, "
-        "it starts from pretrain/FetchPush/seed1",
-        "[  0:20] pretrain/FetchPush/seed0: finished, success 40 % (any step 60 %), "
-        "2,000 env steps in 0:20",
+        "[  0:11] finetune/q=1,alpha=0.1/seed1: skipped, it starts from pretrain/seed1",
+        "[  0:20] pretrain/seed0: finished, success 40 % (any step 60 %), 2,000 env steps in 0:20",
     ]
 
 
@@ -241,9 +224,7 @@ def test_a_run_without_evaluations_is_heard_of_now_and_then(plan: Plan) -> None:
             time.now += 1
             display.reported(plan.nodes[0], [report(10 * second, second)])
     _, first, *more = text.getvalue().splitlines()
-    assert first == (
-        "[  0:30] pretrain/FetchPush/seed0: 300 of 2,000 env steps, 10 steps/s, 2:50 left"
-    )
+    assert first == ("[  0:30] pretrain/seed0: 300 of 2,000 env steps, 10 steps/s, 2:50 left")
     assert len(more) == 2
 
 
@@ -295,9 +276,56 @@ def test_tasks_without_success_are_shown_by_their_return(tmp_path: Path) -> None
     console, text = screen()
     finished = Board(plan, finished=list(results))
     console.print(results_table(plan, finished.__getitem__, results, lambda _: None))
-    lines = [line for line in text.getvalue().splitlines() if line.startswith("│")]
-    cells = [[cell.strip() for cell in line.split("│")[4:8]] for line in lines]
-    assert cells == [["1", "-", "-", "-5.25"], ["1", "50 %", "-", "-20"]]
+    rows = [line.split()[1:-4] for line in text.getvalue().splitlines()[3:]]
+    assert rows == [["-", "-", "-5.25"], ["50", "%", "-", "-20"]]
+
+
+LONG = {
+    "environments": {"Reacher": {"env_id": "Reacher-v5", "horizon": 50, "success_key": None}},
+    "tasks": ["Reacher", "FetchPickAndPlace"],
+    "seeds": [0, 1],
+}
+
+
+@pytest.mark.parametrize("width", [80, 60])
+def test_no_cell_is_cut(tmp_path: Path, width: int) -> None:
+    """What is shown in wide columns is all there in narrow ones, if it must be on several lines."""
+    path = tmp_path / "s.yaml"
+    grid = {"tac.entropic_index": [1.0, 1.5], "tac.alpha": [0.05, 0.1]}
+    stage = {"name": "train-all-of-it", "variant": "tac", "env_steps": 1_000_000, "grid": grid}
+    path.write_text(yaml.safe_dump(DOCUMENT | LONG | {"stages": [stage]}))
+    config = load_sweep(path)
+    plan = make_plan(config)
+    metrics = {names.EVAL_RETURN: -1234.5, names.EVAL_SUCCESS: 0.25, names.EVAL_SUCCESS_ANY: 0.5}
+    result = RunResult(label="x", env_steps=1_000_000, seconds=40_000, metrics=metrics)
+    board = Board(plan, finished=[plan.nodes[0].key])
+    text = io.StringIO()
+    console = Console(file=text, width=width, highlight=False, force_terminal=True)
+    with Display(console, plan, board, time := Clock()) as display:
+        for node in plan.nodes[1:4]:
+            board.start(node.key)
+            display.started(node)
+        time.now += 10
+        for node in plan.nodes[1:4]:
+            display.reported(node, [report(900_000, 10.0, **metrics)])
+        console.print(display._view())
+    console.print(plan_view(config, plan, set()))
+    results = {node.key: result for node in plan.nodes[:3]}
+    console.print(results_table(plan, board.__getitem__, results, lambda _: None, width))
+    shown = text.getvalue()
+    assert "…" not in shown
+    for word in ("25 %", "-1234", "interrupted", "1,000,000", "seed1"):
+        assert word in shown, shown
+
+
+def test_what_a_failed_run_has_spent_stays_spent(plan: Plan) -> None:
+    console, _ = screen(terminal=True)
+    board, time = Board(plan, finished=()), Clock()
+    with Display(console, plan, board, time) as display:
+        play(display, plan, board, time)
+        board.fail(plan.nodes[0].key)
+        display.failed(plan.nodes[0], Failure("RuntimeError: it broke", Path("/logs/x.txt")))
+        assert display._summary().startswith("0 of 6 runs done, 1,000 of 24,000 env steps")
 
 
 def test_pace_is_that_of_the_last_reports() -> None:

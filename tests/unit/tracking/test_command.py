@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from music_rllib.tracking.__main__ import app
+from music_rllib.tracking.cli import app
 
 
 def test_help_shows_an_example() -> None:
     command = [sys.executable, "-m", "music_rllib.tracking", "deliver", "--help"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert "python -m music_rllib.tracking deliver results/smoke" in done.stdout
+    assert "music-rllib tracking deliver results/smoke" in done.stdout
 
 
 @pytest.mark.parametrize(

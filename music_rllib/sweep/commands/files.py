@@ -1,0 +1,78 @@
+"""`init`, `presets` and `schema`: help with writing a sweep's file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from music_rllib.command_line import Json, print_json
+from music_rllib.errors import BadInputError
+
+__all__ = ["INIT_EXAMPLES", "PRESETS_EXAMPLES", "SCHEMA_EXAMPLES", "init", "presets", "schema"]
+
+INIT_EXAMPLES = """\
+Examples:
+  music-rllib init
+  music-rllib init reach.yaml
+  music-rllib run reach.yaml
+"""
+PRESETS_EXAMPLES = """\
+Examples:
+  music-rllib presets
+  music-rllib plan my.yaml preset=paper
+"""
+SCHEMA_EXAMPLES = """\
+Examples:
+  music-rllib schema > sweep.schema.json
+
+Editors with the YAML language server read it where a file begins with
+# yaml-language-server: $schema=sweep.schema.json
+"""
+
+
+def init(
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="What to write; never over a file.")
+    ] = Path("sweep.yaml"),
+) -> int:
+    """Write a commented sweep to begin with."""
+    from music_rllib.authoring import starter
+
+    text = starter(file)
+    try:
+        with file.open("x", encoding="utf-8") as sink:
+            sink.write(text)
+    except FileExistsError:
+        raise BadInputError(f"FILE must not exist yet, got {file}") from None
+    except OSError as error:
+        raise BadInputError(f"FILE must be writable, got {file}: {error.strerror}") from error
+    typer.echo(f"{file} is written. Check it with: music-rllib plan {file}")
+    return 0
+
+
+def presets(json: Json = False) -> int:
+    """List the presets, settings that a file takes over.
+
+    By 'preset: NAME' in it.
+    """
+    from music_rllib.config.presets import SHIPPED, shipped_presets
+
+    found = shipped_presets()
+    if json:
+        print_json([{"name": name, "about": about} for name, about in found.items()])
+        return 0
+    width = max(map(len, found))
+    for name, about in found.items():
+        typer.echo(f"{name:{width}}  {about}")
+    typer.echo(f"\nEach file says where its numbers come from: {SHIPPED}")
+    return 0
+
+
+def schema() -> int:
+    """Print a JSON Schema of a sweep's file for editors."""
+    from music_rllib.authoring.json_schema import json_schema
+
+    print_json(json_schema())
+    return 0

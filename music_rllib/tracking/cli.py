@@ -1,0 +1,71 @@
+"""`tracking`: look after what sweeps log to MLflow."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from music_rllib.command_line import add_command, new_app, run_app
+from music_rllib.errors import FAILED
+
+__all__ = ["app", "main"]
+
+EXAMPLES = """\
+Examples:
+  music-rllib tracking deliver results/smoke
+  music-rllib tracking deliver results/smoke --timeout 600
+
+Exit codes: 0 all is delivered, 1 something is left, 2 bad input.
+"""
+
+
+app = new_app(no_args_is_help=True)
+
+
+@app.callback()
+def tracking() -> None:
+    """Look after what sweeps log to MLflow."""
+
+
+def deliver(
+    sweep_folder: Annotated[
+        Path,
+        typer.Argument(metavar="FOLDER", help="The sweep's folder: the one that holds tracking/."),
+    ],
+    tracking_uri: Annotated[
+        str | None,
+        typer.Option(
+            metavar="URI",
+            help="Send there instead of where the sweep was logged; needed where that URI holds "
+            "a password, which is not kept.",
+        ),
+    ] = None,
+    timeout: Annotated[
+        float, typer.Option(metavar="SECONDS", min=1.0, help="How long to try.")
+    ] = 60.0,
+) -> int:
+    """Send to MLflow what a sweep could not deliver. Sending twice changes nothing."""
+    from music_rllib.redaction import for_people
+    from music_rllib.tracking.session import deliver as deliver_sweep
+
+    left = deliver_sweep(sweep_folder, tracking_uri, timeout)
+    if left:
+        reason = left.error or f"not done within {timeout:.0f} s"
+        typer.echo(
+            f"{left.records} records and {left.artefacts} artefacts are left: {for_people(reason)}",
+            err=True,
+        )
+        return FAILED
+    typer.echo(f"MLflow has everything of {sweep_folder}")
+    return 0
+
+
+add_command(app, "deliver", deliver, EXAMPLES)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `python -m music_rllib.tracking`; its exit code."""
+    return run_app(app, "python -m music_rllib.tracking", arguments)

@@ -1,0 +1,53 @@
+"""Runs' labels in short: what is shown is understood, and means one run."""
+
+import itertools
+
+import pytest
+
+from music_rllib.labels import ShortLabels, is_meant
+
+LABEL = "finetune/FetchPush/pretrain:tac.alpha=0.1,tac.entropic_index=1.5,tac.tau=0.05/seed0"
+
+
+@pytest.mark.parametrize(
+    ("wanted", "meant"),
+    [
+        (LABEL, True),
+        ("finetune/q=1.5/FetchPush/seed=0", True),
+        ("q=1.5/seed0", True),
+        ("q=1.50,tau=5e-2", True),
+        ("tau=0.05/seed0", True),
+        ("tac.tau=0.05", True),
+        ("q=1.5/seed01", False),
+        ("q=1/seed0", False),
+        ("q=15/seed0", False),
+        ("pretrain/seed0", False),
+        ("alpha=0.1", True),
+        ("seed", False),
+        ("tune", False),
+    ],
+)
+def test_parts_of_a_label_in_any_order(wanted: str, meant: bool) -> None:
+    assert is_meant(wanted, LABEL) is meant
+
+
+@pytest.mark.parametrize("stages", [["a"], ["a", "b"]])
+@pytest.mark.parametrize("tasks", [["FetchPush"], ["FetchPush", "FetchSlide"]])
+def test_what_is_shown_means_one_run(stages: list[str], tasks: list[str]) -> None:
+    values = ["tac.entropic_index=1", "tac.entropic_index=1.5", "music.reward_scale=1,tac.tau=0.5"]
+    cells = itertools.product(stages, tasks, values, ["seed0", "seed1", "seed10"])
+    labels = ["/".join(cell) for cell in cells]
+    short = ShortLabels.of(labels)
+    for label in labels:
+        assert [other for other in labels if is_meant(short(label), other)] == [label]
+    assert len(short(labels[0]).split("/")) == 2 + (len(stages) > 1) + (len(tasks) > 1)
+    assert "q=1/" in short(labels[0])
+
+
+def test_what_is_no_label_of_the_sweep_stays() -> None:
+    short = ShortLabels(["a"], ["FetchPush"])
+    assert short("a/FetchPush/seed0") == "seed0"
+    assert short("handoff /somewhere/else") == "handoff /somewhere/else"
+    assert short("a/FetchPush/trial7/tac.entropic_index={schedule:linear,start:1,end:2}/seed0") == (
+        "trial7/q={schedule:linear,start:1,end:2}/seed0"
+    )

@@ -1,0 +1,170 @@
+"""`music-rllib`: every command's help, quick and within 80 columns, with examples that hold."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+import yaml
+from typer.main import get_command
+
+from music_rllib import __version__
+from music_rllib.authoring import SCHEMA
+from music_rllib.config.load import load_sweep
+from music_rllib.program import app, main
+
+REPOSITORY = Path(__file__).parents[2]
+PROGRAMS = ("music-rllib", "music_rllib.sweep")
+HEAVY = {"ray", "torch", "mlflow", "gymnasium", "optuna", "numpy", "pandas", "music_rllib.config"}
+
+
+def commands() -> list[tuple[str, ...]]:
+    """Every command, by the words that call it."""
+
+    def below(group: Any, words: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
+        yield words
+        for name, command in getattr(group, "commands", {}).items():
+            yield from below(command, (*words, name))
+
+    return list(below(get_command(app), ()))
+
+
+def help_of(words: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> str:
+    capsys.readouterr()
+    assert main([*words, "--help"]) == 0
+    return capsys.readouterr().out
+
+
+def examples() -> list[list[str]]:
+    """The commands that help shows, without what stands in front of the program's name."""
+    found = []
+    for words in commands():
+        command: Any = get_command(app)
+        for word in words:
+            command = command.commands[word]
+        text = (command.epilog or "").replace("\\\n", " ")
+        for line in text.splitlines():
+            if line.startswith("  ") and not line.startswith("   "):
+                given = shlex.split(line)
+                found += [given[given.index(name) + 1 :] for name in PROGRAMS if name in given]
+    return found
+
+
+def test_help_has_one_look(capsys: pytest.CaptureFixture[str], monkeypatch: Any) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    for words in commands():
+        text = help_of(words, capsys)
+        assert text.startswith(f"Usage: {shlex.join(['music-rllib', *words])} "), text
+        assert max(map(len, text.splitlines())) <= 80, text
+        assert "Examples:\n" in text or words == ("tracking",), words
+
+
+def test_help_and_version_load_nothing_heavy(tmp_path: Path) -> None:
+    calls: list[list[str]] = [[], ["--version"], *([*words, "--help"] for words in commands())]
+    code = (
+        "import json, sys; from music_rllib.program import main\n"
+        "for call in json.loads(sys.argv[1]): assert main(call) == 0, call\n"
+        f"loaded = {HEAVY!r} & set(sys.modules)\n"
+        "assert not loaded, loaded\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, json.dumps(calls)],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert f"music-rllib {__version__}\n" in done.stdout
+
+
+def test_examples_are_calls_that_the_program_takes() -> None:
+    """Every option and argument is known; what they name is not looked at."""
+    found = examples()
+    assert len(found) > 30
+    for given in found:
+        command: Any = get_command(app)
+        words = list(given)
+        while hasattr(command, "commands") and words and words[0] in command.commands:
+            command = command.commands[words.pop(0)]
+        if hasattr(command, "commands"):
+            command = command.commands["run"]  # python -m music_rllib.sweep my.yaml
+        words = words[: words.index(">")] if ">" in words else words
+        command.make_context("x", words)
+
+
+def test_mistakes_before_the_command_say_what_is_meant(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["statsu", "x"]) == 2
+    assert "Did you mean 'status'?" in capsys.readouterr().err
+    assert main(["my.yaml"]) == 2
+    assert "music-rllib run my.yaml" in capsys.readouterr().err
+
+
+def test_init_writes_a_sweep_that_runs_and_replaces_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["init", "my reach.yaml"]) == 0
+    assert main(["plan", "my reach.yaml", "seeds=2"]) == 0
+    assert "6 runs, 60,000 env steps in all" in capsys.readouterr().out
+    assert load_sweep("my reach.yaml").name == "my_reach"
+    # The other sweep that its comments show.
+    text = Path("my reach.yaml").read_text()
+    kept, _, other = text.partition("# With MUSIC")
+    shown = [line.removeprefix("#").removeprefix(" ") for line in other.splitlines()[2:]]
+    document = yaml.safe_load(kept) | yaml.safe_load("\n".join(shown))
+    Path("other.yaml").write_text(yaml.safe_dump(document))
+    assert [stage.name for stage in load_sweep("other.yaml").stages] == ["pretrain", "finetune"]
+    assert main(["init", "my reach.yaml"]) == 2
+    assert "must not exist yet" in capsys.readouterr().err
+    assert Path("my reach.yaml").read_text() == text
+    assert main(["init", "nowhere/x.yaml"]) == 2
+
+
+def test_presets_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["presets", "--json"]) == 0
+    found = {one["name"] for one in json.loads(capsys.readouterr().out)}
+    assert found == {path.stem for path in (REPOSITORY / "music_rllib/presets").glob("*.yaml")}
+
+
+def test_the_schema_takes_every_shipped_sweep_and_no_wrong_name(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["schema"]) == 0
+    schema = json.loads(capsys.readouterr().out)
+    assert schema == json.loads(SCHEMA.read_text())
+    check = jsonschema.Draft202012Validator(schema)
+    for path in (REPOSITORY / "tune_configs").rglob("*.yaml"):
+        text = path.read_text()
+        assert not list(check.iter_errors(yaml.safe_load(text))), path
+        _, given, named = text.partition("\n")[0].partition("yaml-language-server: $schema=")
+        assert not given or (path.parent / named).resolve() == SCHEMA.resolve(), path
+    stage = {"name": "a", "variant": "tac", "tac": {"alpha": 0.1, "hidden_sizes": [8]}}
+    sweep = {"name": "a", "tasks": ["FetchPush"], "seeds": 3, "stages": [stage]}
+    assert check.is_valid(sweep)
+    for wrong in ({"q": 1}, {"tac": {"q": 1}}, {"env_steps": "many"}, {"variant": "sac"}):
+        assert not check.is_valid(sweep | {"stages": [stage | wrong]}), wrong
+    described = schema["$defs"]["TACSettings"]["properties"]
+    assert all("description" in field for field in described.values())
+
+
+def test_it_runs_as_a_module_from_any_folder(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "music_rllib", "plan", "tac.alpha=-1"],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "error: command line: tac.alpha must be >= 0, got -1\n"
+    assert list(tmp_path.iterdir()) == []
