@@ -28,12 +28,12 @@ OTHERS: dict[str, str] = {
     "SBX SAC+HER": "sbx",
 }
 """What ours is compared with, and the package that it takes."""
-SETTINGS: dict[tuple[int, float], dict[str, float]] = {
-    (128, 0.4): {"RLlib SAC, same networks": 10.0, "SB3 SAC+HER": 3.0, "SBX SAC+HER": 1.3},
-    (128, 1.0): {"SB3 SAC+HER": 3.0, "SBX SAC+HER": 1.3},
-    (256, 0.4): {"RLlib SAC, same networks": 5.0, "SB3 SAC+HER": 1.7, "SBX SAC+HER": 1.0},
+SETTINGS: dict[tuple[int, float], dict[str, float | None]] = {
+    (128, 0.4): {"RLlib SAC, same networks": 15.0, "SB3 SAC+HER": 3.0, "SBX SAC+HER": 1.3},
+    (128, 1.0): {"SB3 SAC+HER": None, "SBX SAC+HER": None},
+    (256, 0.4): {"RLlib SAC, same networks": None, "SB3 SAC+HER": 1.7, "SBX SAC+HER": None},
     (256, 1.0): {
-        "RLlib SAC": 5.0, "RLlib SAC, same networks": 5.0, "SB3 SAC+HER": 1.7, "SBX SAC+HER": 1.0,
+        "RLlib SAC": None, "RLlib SAC, same networks": 5.0, "SB3 SAC+HER": 1.7, "SBX SAC+HER": None,
     },
 }  # fmt: skip
 """Width of the three layers and replay ratio (`small`'s first), and the targets of the ratios."""
