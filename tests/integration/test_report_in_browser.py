@@ -4,19 +4,26 @@ from __future__ import annotations
 
 import asyncio
 import os
+import threading
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from PIL import Image
 
+from music_rllib.experiment.location import Found
 from music_rllib.report.build import build_report
-from music_rllib.report.page import render
+from music_rllib.report.live import server
+from music_rllib.report.live.state import Progress
+from music_rllib.report.page import Report, render
 from music_rllib.results.archive.folder import read_archive
 from music_rllib.results.archive.merge import merged
 from music_rllib.results.data import Sweep
 from tests.integration.devtools import Page
+from tests.unit.report.test_live import write_state
 
 DATA = Path(__file__).parents[2] / "docs" / "results" / "data"
 PICTURES = os.environ.get("MUSIC_RLLIB_PICTURES")
@@ -45,10 +52,9 @@ def two_tasks() -> Sweep:
 
 
 @pytest.fixture(scope="module")
-def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    made = build_report(two_tasks(), command="python -m music_rllib.report results/two-tasks")
+def page(report: Report, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("report") / "report.html"
-    path.write_text(render(made))
+    path.write_text(render(report))
     return path
 
 
@@ -61,6 +67,11 @@ async def drawn(page: Page, path: Path) -> None:
     raise AssertionError(page.errors)
 
 
+@pytest.fixture(scope="module")
+def report() -> Report:
+    return build_report(two_tasks(), command="python -m music_rllib.report results/two-tasks")
+
+
 @pytest.fixture
 def open_page(require_service: Callable[[str], Path], tmp_path: Path) -> Callable[[], Page]:
     return lambda: Page(require_service("chromium"), tmp_path)
@@ -68,7 +79,9 @@ def open_page(require_service: Callable[[str], Path], tmp_path: Path) -> Callabl
 
 async def picture(page: Page, folder: Path, name: str) -> None:
     await asyncio.sleep(0.5)
-    await page.picture(Path(PICTURES or folder) / name)
+    path = Path(PICTURES or folder) / name
+    await page.picture(path)
+    Image.open(path).quantize(96, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
 def test_the_page_can_be_read_in_every_size_light_and_dark(
@@ -82,7 +95,8 @@ def test_the_page_can_be_read_in_every_size_light_and_dark(
                 await drawn(tab, page)
                 await tab.evaluate("[...pending.keys()].forEach(drawNow)")
                 seen.append((width, await tab.evaluate(LOOK)))
-                await picture(tab, tmp_path, f"report-{width}{'-dark' * dark}.png")
+                name = "-dark" if dark else "" if width == 1400 else f"-{width}"
+                await picture(tab, tmp_path, f"report{name}.png")
             assert not tab.errors
             assert not tab.requests
         return seen
@@ -173,3 +187,52 @@ def test_printed_and_without_a_script_everything_is_there(
     assert seen["width"] <= 800
     assert not seen["cut"]
     assert not seen["faint"]
+
+
+def test_the_live_page_takes_up_what_is_new_and_leaves_the_reader_where_he_is(
+    open_page: Callable[[], Page],
+    report: Report,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(server, "LEAST_PAUSE", 0.2)
+    monkeypatch.setattr(server, "_RELAX", 1.0)
+    write_state(tmp_path, 100, time.time())
+    pages = {"html": render(report, live=True)}
+    live = server.LivePage(
+        lambda: pages["html"], Progress(Found(storage=str(tmp_path), name="tiny"))
+    )
+    http = server.make_server(live, Found(storage=str(tmp_path), name="tiny"), tmp_path, 0)
+    threading.Thread(target=http.serve_forever, daemon=True).start()
+    address = f"http://127.0.0.1:{http.server_port}/"
+
+    async def use() -> None:
+        async with open_page() as tab:
+            await tab.view(1400, 1000)
+            await tab.go(f"{address}?token={http.token}")
+            text = await tab.wait_for("The sweep is running", "train/B failed: <b>no</b>")
+            assert "1 started, 2 waiting" in text
+            await picture(tab, tmp_path, "report-live.png")
+            assert not (seen := await tab.evaluate(LOOK))["nameless"]
+            assert not seen["faint"]
+            await tab.evaluate(CHOOSE % ["against", "epochs"])
+            await tab.evaluate("scrollTo(0, 700)")
+            missing = replace(report, missing=["A run that has just failed."])
+            write_state(tmp_path, 200, time.time())
+            pages["html"] = render(missing, live=True)
+            await tab.wait_for("A run that has just failed.")
+            assert "epochs of 80,000" in await tab.evaluate(AXIS)
+            assert abs(await tab.evaluate("scrollY") - 700) < 150
+            assert await tab.evaluate(DRAWN) >= 3
+            await tab.evaluate("document.getElementById('stop-button').click()")
+            await tab.wait_for("told to save its runs and stop")
+            assert (tmp_path / "tiny" / "stop.json").exists()
+            assert not tab.errors
+            assert all(url.startswith(address) for url in tab.requests)
+
+    try:
+        asyncio.run(use())
+    finally:
+        http.shutdown()
+        http.server_close()
+        live.close()
