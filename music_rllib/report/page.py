@@ -80,6 +80,9 @@ def render(report: Report, *, live: bool = False) -> str:
     sweep = report.sweep
     data = chart_data(sweep, report.drawings)
     numbers = {stage["name"]: number for number, stage in enumerate(data["stages"])}
+    said = _said(report)
+    # What is claimed is to be seen at once; how it was counted stands below in small letters.
+    claims = next((i for i, line in enumerate(said) if line.startswith("Counted:")), len(said))
     return document(
         data,
         live=live,
@@ -87,7 +90,8 @@ def render(report: Report, *, live: bool = False) -> str:
         facts=_facts(report),
         missing=report.missing,
         asked=_asked(report),
-        said=_said(report),
+        said=said[:claims],
+        about=said[claims:],
         large=_large(report, numbers),
         groups=list(_groups(report, numbers)),
         differences=[table for table in report.differences if table.rows],
