@@ -659,7 +659,8 @@ def test_figures_of_an_earlier_report_go_and_the_same_sweep_is_the_same_file(
         write_report(report_on(compared({"1": [0.5]})), tmp_path / name)
         figures = sorted((tmp_path / name / "figures").iterdir())
         assert [path.name for path in figures] == [
-            f"finetune-success-rate{ending}"
+            f"{figure}{ending}"
+            for figure in ("finetune-success-rate", "overview")
             for ending in ("-column.pdf", "-column.svg", ".pdf", ".png", ".svg")
         ]
         made.append([path.read_bytes() for path in figures])
