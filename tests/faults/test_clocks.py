@@ -55,9 +55,9 @@ def clock(program: Program, tmp_path: Path) -> Clock:
 def test_an_hour_ahead_and_then_an_hour_back(
     program: Program, clock: Clock, unbroken: Path, tmp_path: Path
 ) -> None:
-    process = sweeps.start_until(program, "pretrain/Point/seed0: 8")
+    process = sweeps.start_until(program, "pretrain/seed0: 8")
     clock.set(HOUR)
-    sweeps.read_until(process, "finetune/Point/tac.entropic_index=1/seed0: 8")
+    sweeps.read_until(process, "finetune/q=1/seed0: 8")
     clock.set(-HOUR)
     output, errors = process.communicate(timeout=sweeps.PATIENCE)
     assert process.returncode == 0, output + errors
@@ -69,13 +69,13 @@ def test_killed_an_hour_ahead_and_continued_in_time(
     program: Program, clock: Clock, unbroken: Path, tmp_path: Path
 ) -> None:
     """What the dead ones hold in an hour's time keeps nobody waiting."""
-    process = sweeps.start_until(program, "pretrain/Point/seed0: 8")
+    process = sweeps.start_until(program, "pretrain/seed0: 8")
     clock.set(HOUR)
-    sweeps.read_until(process, "pretrain/Point/seed0: finished")
+    sweeps.read_until(process, "pretrain/seed0: finished")
     for worker in sweeps.workers(process):
         worker.send_signal(signal.SIGKILL)
     sweeps.kill(process)
     clock.set(0)
     output = sweeps.finish(program)
-    assert "pretrain/Point/seed0: finished earlier, reused" in output
+    assert "pretrain/seed0: finished earlier, reused" in output
     comparison.same(unbroken, tmp_path / "results")

@@ -56,7 +56,7 @@ def test_the_raylet_of_a_second_node_is_killed(
 ) -> None:
     address, raylet = two_nodes
     program.environment["RAY_ADDRESS"] = address
-    process = sweeps.start_until(program, "finetune/Point/tac.entropic_index=2/seed0: started")
+    process = sweeps.start_until(program, "finetune/q=2/seed0: started")
     os.kill(raylet, signal.SIGKILL)
     output, errors = process.communicate(timeout=sweeps.PATIENCE)
     assert process.returncode == 0, output + errors

@@ -34,7 +34,7 @@ def check_end(program: Program, output: str) -> None:
 def test_a_local_ray_that_dies_ends_the_driver_in_good_order(
     name: str, program: Program, unbroken: Path
 ) -> None:
-    process = sweeps.start_until(program, "pretrain/Point/seed0: started")
+    process = sweeps.start_until(program, "pretrain/seed0: started")
     pid = daemon(process.pid, name)
     os.kill(pid, signal.SIGKILL)
     output, errors = process.communicate(timeout=sweeps.PATIENCE)
@@ -54,7 +54,7 @@ def test_a_cluster_whose_head_dies_ends_the_driver_in_good_order(
         "RAY_ADDRESS": address,
         "RAY_gcs_rpc_server_reconnect_timeout_s": "20",
     }
-    process = sweeps.start_until(program, "pretrain/Point/seed0: started")
+    process = sweeps.start_until(program, "pretrain/seed0: started")
     head = psutil.Process(raylet).parent()
     assert head is not None
     os.kill(daemon(head.pid, "gcs_server"), signal.SIGKILL)

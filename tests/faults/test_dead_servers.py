@@ -45,7 +45,7 @@ def test_a_server_that_is_away_for_a_minute(
 ) -> None:
     document = sweeps.document(mlflow={"tracking_uri": server.uri})
     program.write(document)
-    process = sweeps.start_until(program, "pretrain/Point/seed0: started")
+    process = sweeps.start_until(program, "pretrain/seed0: started")
     server.signal(signal.SIGKILL)
     time.sleep(60.0)
     server.start()
@@ -59,7 +59,7 @@ def test_a_server_that_is_away_for_a_minute(
 
 def test_a_server_that_stays_away(program: Program, unbroken: Path, server: Server) -> None:
     program.write(sweeps.document(mlflow={"tracking_uri": server.uri}))
-    process = sweeps.start_until(program, "pretrain/Point/seed0: started")
+    process = sweeps.start_until(program, "pretrain/seed0: started")
     server.signal(signal.SIGKILL)
     output, _ = process.communicate(timeout=sweeps.PATIENCE)
     assert process.returncode == 0, output
@@ -75,7 +75,7 @@ def test_a_server_that_stays_away(program: Program, unbroken: Path, server: Serv
 def test_a_server_that_answers_500(program: Program, unbroken: Path, server: Server) -> None:
     """To everything, from the first run on; what it is to get follows when it is well again."""
     program.write(sweeps.document(mlflow={"tracking_uri": server.uri}))
-    process = sweeps.start_until(program, "pretrain/Point/seed0: started")
+    process = sweeps.start_until(program, "pretrain/seed0: started")
     server.signal(signal.SIGKILL)
     with refusing(500, server.port):
         output, errors = process.communicate(timeout=sweeps.PATIENCE)
@@ -99,7 +99,7 @@ def test_a_password_that_is_changed(
         "MLFLOW_TRACKING_PASSWORD": PASSWORD,
     }
     program.write(sweeps.document(mlflow={"tracking_uri": mlflow_server}))
-    process = sweeps.start_until(program, "pretrain/Point/seed0: started")
+    process = sweeps.start_until(program, "pretrain/seed0: started")
     changed = requests.patch(
         f"{mlflow_server}/api/2.0/mlflow/users/update-password",
         json={"username": USER, "password": PASSWORD[::-1], "current_password": PASSWORD},

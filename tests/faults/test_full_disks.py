@@ -111,11 +111,11 @@ def test_a_disk_that_fills_up_during_a_sweep(
     """The runs fail and say why; with room again, the same command ends with the same numbers."""
     disk = small_disk("64m")
     program.write(sweeps.document(storage=str(disk / "results")))
-    process = sweeps.start_until(program, "pretrain/Point/seed0: 4", "pretrain/Point/seed0: 8")
+    process = sweeps.start_until(program, "pretrain/seed0: 4", "pretrain/seed0: 8")
     ballast = fill(disk)
     output, errors = process.communicate(timeout=sweeps.PATIENCE)
     assert process.returncode == 1, output + errors
-    assert "pretrain/Point/seed0: FAILED: StorageError: " in output
+    assert "pretrain/seed0: FAILED: StorageError: " in output
     assert f"{disk}/results" in output
     assert "must be writable: No space left on device" in output
     ballast.unlink()
@@ -129,7 +129,7 @@ def test_a_full_disk_below_mlflow(program: Program, unbroken: Path, small_disk: 
     disk = small_disk("8m")
     uri = f"sqlite:///{disk}/mlflow.db"
     program.write(sweeps.document(mlflow={"tracking_uri": uri}))
-    process = sweeps.start_until(program, "pretrain/Point/seed0: started")
+    process = sweeps.start_until(program, "pretrain/seed0: started")
     ballast = fill(disk)
     output, errors = process.communicate(timeout=sweeps.PATIENCE)
     assert process.returncode == 0, output + errors

@@ -21,9 +21,9 @@ def test_a_killed_worker_then_sigterm_then_a_killed_driver(
     program: Program, unbroken: Path
 ) -> None:
     """In pretraining, after the handoff, and after the resume."""
-    process = sweeps.start_until(program, "pretrain/Point/seed0: started")
+    process = sweeps.start_until(program, "pretrain/seed0: started")
     sweeps.kill_a_worker(process)
-    output = sweeps.read_until(process, ": FAILED", "finetune/Point/tac.entropic_index=1/seed0: s")
+    output = sweeps.read_until(process, ": FAILED", "finetune/q=1/seed0: s")
     assert "The worker process died" in output
     assert f"Another worker goes on from the last checkpoint (1 of {RESTARTS} times)." in output
     process.send_signal(signal.SIGTERM)
@@ -34,13 +34,13 @@ def test_a_killed_worker_then_sigterm_then_a_killed_driver(
     process = sweeps.start_until(program, "finetune", "Results of")
     sweeps.kill(process)
     output = sweeps.finish(program)
-    assert "pretrain/Point/seed0: finished earlier, reused" in output
+    assert "pretrain/seed0: finished earlier, reused" in output
     comparison.same(unbroken, program.folder / "results")
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("sign", ["starting a local Ray", "pretrain/Point/seed0: ", "finetune/"])
+@pytest.mark.parametrize("sign", ["starting a local Ray", "pretrain/seed0: ", "finetune/"])
 def test_told_to_stop_in_each_stage(
     number: signal.Signals, sign: str, program: Program, unbroken: Path
 ) -> None:
@@ -65,7 +65,7 @@ def test_a_signal_to_the_whole_process_group_costs_an_interval_and_no_number(
     program: Program, unbroken: Path
 ) -> None:
     """As `timeout` and Slurm send it: Ray ends as well, before anything can be saved."""
-    process = sweeps.start_until(program, "pretrain/Point/seed0: started")
+    process = sweeps.start_until(program, "pretrain/seed0: started")
     time.sleep(1.0)
     os.killpg(process.pid, signal.SIGTERM)
     output, errors = process.communicate(timeout=sweeps.PATIENCE)
@@ -78,7 +78,7 @@ def test_a_signal_to_the_whole_process_group_costs_an_interval_and_no_number(
 
 @pytest.mark.thorough
 def test_a_second_signal_ends_it_at_once(program: Program, unbroken: Path) -> None:
-    process = sweeps.start_until(program, "pretrain/Point/seed0: started")
+    process = sweeps.start_until(program, "pretrain/seed0: started")
     process.send_signal(signal.SIGINT)
     sweeps.read_until(process, "stopping, this takes a few seconds")
     process.send_signal(signal.SIGINT)
@@ -96,11 +96,11 @@ def test_a_run_whose_worker_dies_again_and_again_fails_with_the_cause(
     document["defaults"]["env_steps"] = 200_000
     document["stages"] = document["stages"][:1]
     program.write(document)
-    process = sweeps.start_until(program, "pretrain/Point/seed0: started")
+    process = sweeps.start_until(program, "pretrain/seed0: started")
     for attempt in range(RESTARTS + 1):
         sweeps.kill_a_worker(process)
         last = "The same command again continues from the last checkpoint"
-        sign = last if attempt == RESTARTS else "pretrain/Point/seed0: started"
+        sign = last if attempt == RESTARTS else "pretrain/seed0: started"
         output = sweeps.read_until(process, sign)
     assert ": FAILED: The worker process died" in output
     assert last in output

@@ -58,9 +58,9 @@ def test_a_locked_mlflow_holds_no_run_up_and_has_each_step_once(
     program: Program, unbroken: Path
 ) -> None:
     results = program.folder / "results"
-    process = sweeps.start_until(program, "pretrain/Point/seed0: started")
+    process = sweeps.start_until(program, "pretrain/seed0: started")
     with locked(results / "mlflow.db"):
-        sweeps.read_until(process, "pretrain/Point/seed0: finished")
+        sweeps.read_until(process, "pretrain/seed0: finished")
         time.sleep(10.0)
     output, errors = process.communicate(timeout=sweeps.PATIENCE)
     assert process.returncode == 0, output + errors

@@ -51,16 +51,16 @@ def let_expire(*leases: Path) -> None:
 def test_a_suspended_sweep_waits_for_the_one_that_took_its_runs_over(
     program: Program, other: sweeps.OwnProgram, unbroken: Path, tmp_path: Path
 ) -> None:
-    process = sweeps.start_until(program, "pretrain/Point/seed0: started")
+    process = sweeps.start_until(program, "pretrain/seed0: started")
     (lease,) = wait_for_lease(tmp_path / "results")
     signal_all(process, signal.SIGSTOP)
     let_expire(lease)
     second = other.start("--name", "second")
-    sweeps.read_until(second, "pretrain/Point/seed0: ")
+    sweeps.read_until(second, "pretrain/seed0: ")
     signal_all(process, signal.SIGCONT)
     output, errors = process.communicate(timeout=sweeps.PATIENCE)
     assert process.returncode == 0, output + errors
-    assert "pretrain/Point/seed0: was taken over while this process was suspended" in output
+    assert "pretrain/seed0: was taken over while this process was suspended" in output
     output, errors = second.communicate(timeout=sweeps.PATIENCE)
     assert second.returncode == 0, output + errors
     comparison.same(unbroken, tmp_path / "results")
@@ -72,7 +72,7 @@ def test_a_suspended_driver_goes_on_where_nobody_drives_its_sweep(
     program: Program, other: sweeps.OwnProgram, unbroken: Path, tmp_path: Path
 ) -> None:
     """A second one finds its lease expired, and is refused by what it keeps for MLflow."""
-    process = sweeps.start_until(program, "pretrain/Point/seed0: started")
+    process = sweeps.start_until(program, "pretrain/seed0: started")
     wait_for_lease(tmp_path / "results")
     signal_all(process, signal.SIGSTOP)
     let_expire(tmp_path / "results" / "points" / "driver.json")
