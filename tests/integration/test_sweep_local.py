@@ -28,7 +28,8 @@ Runs = Callable[[], dict[str, Any]]
 
 EXPECTED = re.compile(
     r"\[ *\d+:\d\d\] (pretrain/|finetune/|starting a local Ray$|best so far: finetune )"
-    r"|(stage|run|pretrain|finetune)[ :/]|  |Sweep |Results |Storage: |3 runs, |Compare in MLflow: |Open MLflow's pages with: "
+    r"|(stage|run|pretrain|finetune)[ :/]|  |Sweep |Results |Storage: |3 runs, |"
+    r"Compare in MLflow: |Open MLflow's pages with: "
 )
 """Lines of a sweep in which nothing goes wrong."""
 
