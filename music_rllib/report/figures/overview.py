@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
@@ -83,6 +84,11 @@ def _panel(
 
     def draw(axes: Axes) -> None:
         panel.draw(axes)
+        if metric not in names.EVAL_RATES:  # bands of two seeds may be many times as wide
+            values = np.concatenate([one.values.ravel() for one in found])
+            low, high = float(np.nanmin(values)), float(np.nanmax(values))
+            room = 0.06 * (high - low or 1.0)
+            axes.set_ylim(low - room, high + room)
         handles = [
             Line2D(
                 [], [], color=style.colour, marker=style.marker, linestyle=style.line, label=label
