@@ -40,7 +40,7 @@ from music_rllib.results.archive.folder import read_archive
 from music_rllib.results.conditions import find_stages
 from music_rllib.results.data import ReportError
 from music_rllib.store.handoff import HandoffError
-from music_rllib.store.object_folder import SealedFolders, StorageError, open_storage
+from music_rllib.store.object_folder import ObjectFolders, StorageError, open_storage
 from music_rllib.store.state_io import StateError, read_state, write_state
 from tests.hostile_files import PENDULUM, seal_policy, write_export, write_sweep
 
@@ -250,7 +250,7 @@ def sealed_policy(rng: random.Random, sound: Path, folder: Path) -> Callable[[],
         _seal_again(folder)
 
     def read() -> None:
-        storage = SealedFolders(*open_storage(str(folder)))
+        storage = ObjectFolders(*open_storage(str(folder)))
         for name in storage.names():
             storage.fetch(name, folder / "copy")
         policy = load_policy(folder / "node")

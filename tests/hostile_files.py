@@ -33,7 +33,7 @@ from music_rllib.policy import load_policy
 from music_rllib.results.archive.folder import Format, write_archive
 from music_rllib.results.data import Points, RunRecord, Sweep, columns
 from music_rllib.store.handoff import Spaces, write_handoff
-from music_rllib.store.object_folder import SealedFolders, open_storage
+from music_rllib.store.object_folder import ObjectFolders, open_storage
 
 INPUTS = 3
 SPACES = Spaces(observation_size=INPUTS, goal_size=0, action_low=(-2.0,), action_high=(2.0,))
@@ -64,7 +64,7 @@ def write_policy(folder: Path, task: Task, spaces: Spaces | None = SPACES) -> Pa
 
 
 def seal_policy(storage: Path, task: Task) -> Path:
-    with SealedFolders(*open_storage(str(storage))).sealing("node", {}) as folder:
+    with ObjectFolders(*open_storage(str(storage))).sealing("node", {}) as folder:
         write_policy(folder, task)
     return storage / "node"
 

@@ -18,7 +18,7 @@ from music_rllib.config.load import load_sweep
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.experiment.plan import Node, make_plan
 from music_rllib.experiment.session import Sweep, open_sweep
-from music_rllib.search.controller import Campaign
+from music_rllib.search.controller import SearchController
 from music_rllib.search.summary import open_searches, outcome
 from music_rllib.store.paths import sweep_folder
 from music_rllib.store.run_record import HISTORY, Report, RunResult, last_values, to_json_lines
@@ -77,13 +77,13 @@ class Driver:
         self._time = time.time()  # as another driver's clock, which judges whether this one lives
         self.computed: list[str] = []
         self.pruned: dict[str, str] = {}
-        self.campaign = Campaign(
+        self.controller = SearchController(
             self.sweep,
             open_searches(self.sweep),
             pruned=lambda node, reason: self.pruned.__setitem__(node.label, reason),
             now=self._clock,
         )
-        self.campaign.recall()
+        self.controller.recall()
         self._formula = formula
         self._rng = random.Random(seed)
         self._running: list[tuple[Node, int | None]] = []
@@ -94,8 +94,8 @@ class Driver:
 
     def play(self, stop_after: int | None = None, slots: int = 2) -> None:
         """Go on to the end, or until so many pieces of runs have been computed."""
-        board = self.sweep.board
-        searcher = DagSearcher(board, lambda node: {"key": node.key}, self.campaign.advance)
+        scheduler = self.sweep.scheduler
+        searcher = DagSearcher(scheduler, lambda node: {"key": node.key}, self.controller.advance)
         running = self._running
         while stop_after is None or len(self.computed) < stop_after:
             suggestion = None
@@ -104,8 +104,8 @@ class Driver:
             if suggestion == Searcher.FINISHED and not running:
                 return
             if isinstance(suggestion, dict):
-                node = board.node(suggestion["key"])
-                running.append((node, board.until(node.key)))
+                node = scheduler.node(suggestion["key"])
+                running.append((node, scheduler.until(node.key)))
             elif running:
                 self._compute(*running.pop(self._rng.randrange(len(running))))
             else:
@@ -126,21 +126,21 @@ class Driver:
             )
             for steps in range(1000, (until or budget) + 1, 1000)
         ]
-        self.campaign.reported(node, reports)
+        self.controller.reported(node, reports)
         if until is not None:
-            self.sweep.board.pause(node.key, until)
+            self.sweep.scheduler.pause(node.key, until)
             return
         publish(self.sweep, node, reports)
-        self.sweep.board.finish(node.key)
+        self.sweep.scheduler.finish(node.key)
 
     def trials(self, arm: int = 0) -> list[dict[str, Any]]:
         """As plain data, with plain numbers."""
-        (found,) = outcome(self.campaign)
+        (found,) = outcome(self.controller)
         trials: list[dict[str, Any]] = json.loads(json.dumps(found["arms"][arm]["trials"]))
         return trials
 
     def outcome(self) -> dict[str, Any]:
-        (found,) = outcome(self.campaign)
+        (found,) = outcome(self.controller)
         return found
 
 

@@ -12,8 +12,8 @@ from pydantic.json_schema import GenerateJsonSchema
 from pydantic_core import core_schema
 
 from music_rllib.authoring.docstrings import docstrings
-from music_rllib.config.layers import LAYER_KEYS, all_settings
-from music_rllib.config.presets import shipped_presets
+from music_rllib.config.reading.layers import LAYER_KEYS, all_settings
+from music_rllib.config.reading.presets import shipped_presets
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.schema import Header, InitFrom, StageHeader
 from music_rllib.envs.tasks import BUILT_IN_TASKS, Task

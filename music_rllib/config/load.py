@@ -12,32 +12,32 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 from pydantic import ValidationError
 
 from music_rllib.config.analysis import check_analysis
-from music_rllib.config.layers import (
-    LAYER_KEYS,
-    SECTIONS,
-    all_settings,
-    for_a_grid,
-    known_settings,
-)
-from music_rllib.config.overrides import Override, lay_overrides, parse_overrides
-from music_rllib.config.presets import with_preset
 from music_rllib.config.problems import (
     ConfigError,
     Findings,
     Problem,
     from_json,
     in_words,
-    lookup,
     shown,
     unknown,
 )
 from music_rllib.config.problems import Path as KeyPath
+from music_rllib.config.reading.layers import (
+    LAYER_KEYS,
+    SECTIONS,
+    all_settings,
+    for_a_grid,
+    known_settings,
+)
+from music_rllib.config.reading.overrides import Override, lay_overrides, parse_overrides
+from music_rllib.config.reading.presets import with_preset
+from music_rllib.config.reading.problem_lines import problem_lines
+from music_rllib.config.reading.yaml_file import YamlFile, read_yaml
 from music_rllib.config.resolve import resolve_stage
 from music_rllib.config.run_settings import Evaluation, RunSettings, Variant
 from music_rllib.config.schema import (
@@ -52,7 +52,6 @@ from music_rllib.config.schema import (
     SweepConfig,
 )
 from music_rllib.config.search.settings import FINAL_SEED
-from music_rllib.config.yaml_file import YamlFile, read_yaml
 from music_rllib.envs.tasks import (
     BUILT_IN_TASKS,
     Task,
@@ -119,7 +118,7 @@ def load_sweep(
     findings = Findings()
     config = _resolve(file, document, findings)
     if config is None:
-        raise ConfigError(_lines(findings.problems, file, document, options, origins))
+        raise ConfigError(problem_lines(findings.problems, file, document, options, origins))
     return replace(config, arguments=tuple(overrides))
 
 
@@ -149,7 +148,7 @@ def declared_tasks(path: str | Path) -> tuple[Task, ...]:
     file, findings = read_yaml(Path(path)), Findings()
     registry = _registry(file.data, findings)
     if findings.problems:
-        raise ConfigError(_lines(findings.problems, file, file.data, {}))
+        raise ConfigError(problem_lines(findings.problems, file, file.data, {}))
     return tuple(task for name, task in registry.items() if name not in BUILT_IN_TASKS)
 
 
@@ -183,7 +182,7 @@ def _preset_mistakes(preset: YamlFile) -> list[str]:
     findings = Findings()
     _defaults({"defaults": preset.data}, findings)
     problems = [Problem(problem.path[1:], problem.rule) for problem in findings.problems]
-    return _lines(problems, preset, preset.data, {})
+    return problem_lines(problems, preset, preset.data, {})
 
 
 def _resolve(file: YamlFile, document: dict[str, Any], findings: Findings) -> SweepConfig | None:
@@ -340,70 +339,3 @@ def _raw_stages(document: dict[str, Any], findings: Findings) -> list[tuple[int,
         if not isinstance(stage, dict):
             findings.add(("stages", index), f"must be a mapping, got {shown(stage)}")
     return [(index, stage) for index, stage in enumerate(raw) if isinstance(stage, dict)]
-
-
-def _lines(
-    problems: Iterable[Problem],
-    file: YamlFile,
-    document: Any,
-    options: Mapping[str, Any],
-    origins: Mapping[KeyPath, str] = MappingProxyType({}),
-) -> list[str]:
-    """One line per different mistake, in the order of the file, those of the command line first."""
-
-    def line(problem: Problem) -> str:
-        if problem.path and problem.path[0] in options:
-            return f"--{problem.path[0]} {problem.rule}"
-        place, key = file.place(problem.path), _dotted(problem.path, document)
-        for length in range(len(problem.path), 0, -1):
-            if problem.path[:length] in origins:
-                place, key = "command line", origins[problem.path[:length]]
-                key += "".join(
-                    f"[{part}]" if isinstance(part, int) else f".{part}"
-                    for part in problem.path[length:]
-                )
-                break
-        else:
-            inside = (path[: len(problem.path)] for path in origins)
-            if problem.path not in file.lines and problem.path in inside:
-                place = "command line"
-        separator = " " if problem.rule.startswith(("must ", "is ", "has ", "needs ")) else ": "
-        return f"{place}: {key}{separator if key else ''}{problem.rule}"
-
-    in_order = sorted(_merged(problems), key=lambda problem: file.line(problem.path) or 0)
-    return list(dict.fromkeys(line(problem) for problem in in_order))
-
-
-def _merged(problems: Iterable[Problem]) -> list[Problem]:
-    """The values of one list in a grid that break the same rule are one mistake."""
-    groups: dict[tuple[KeyPath, str], list[Problem]] = {}
-    for problem in dict.fromkeys(problems):
-        path, rule = problem.path, problem.rule
-        if len(path) > 3 and path[2] == "grid" and isinstance(path[-1], int):
-            path, rule = path[:-1], rule.partition(", got ")[0]
-        groups.setdefault((path, rule), []).append(problem)
-    return [
-        group[0] if len(group) == 1 else Problem(path, rule + _got(group))
-        for (path, rule), group in groups.items()
-    ]
-
-
-def _got(group: Iterable[Problem]) -> str:
-    values = ", ".join(problem.rule.partition(", got ")[2] for problem in group)
-    return f", got {values}" if values.strip(", ") else ""
-
-
-def _dotted(path: KeyPath, document: Any) -> str:
-    """`stages.finetune.tac.lr`: stages by name, positions in other lists in brackets."""
-    text = ""
-    for position, part in enumerate(path):
-        if isinstance(part, str):
-            text += f".{part}" if text else part
-            continue
-        try:
-            name = lookup(document, (*path[: position + 1], "name"))
-        except LookupError:
-            name = None
-        by_name = path[0] == "stages" and position == 1 and isinstance(name, str)
-        text += f".{name}" if by_name else f"[{part}]"
-    return text

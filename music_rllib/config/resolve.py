@@ -10,13 +10,6 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from music_rllib.config.layers import (
-    LAYER_KEYS,
-    all_settings,
-    for_a_grid,
-    known_settings,
-    merge,
-)
 from music_rllib.config.problems import (
     ConfigError,
     Findings,
@@ -26,6 +19,13 @@ from music_rllib.config.problems import (
     unknown,
 )
 from music_rllib.config.problems import Path as KeyPath
+from music_rllib.config.reading.layers import (
+    LAYER_KEYS,
+    all_settings,
+    for_a_grid,
+    known_settings,
+    merge,
+)
 from music_rllib.config.run_settings import VARIANTS, RunSettings, Variant, handed_over
 from music_rllib.config.schema import (
     Checkpoint,

@@ -16,11 +16,11 @@ from music_rllib.experiment.session import Sweep, open_sweep
 from music_rllib.redaction import redact
 from music_rllib.store.paths import check_answers, resolve_storage, sweep_folder
 
-__all__ = ["Found", "find_sweep"]
+__all__ = ["SweepLocation", "find_sweep"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Found:
+class SweepLocation:
     """A sweep that has been started at some time."""
 
     storage: str
@@ -63,7 +63,7 @@ class Found:
         return f"{redact(self.storage)}/{self.name}"
 
 
-def find_sweep(place: str, storage: str | None) -> Found:
+def find_sweep(place: str, storage: str | None) -> SweepLocation:
     """The sweep that a user means.
 
     Raises:
@@ -80,19 +80,19 @@ def find_sweep(place: str, storage: str | None) -> Found:
     return found
 
 
-def _found(place: str, storage: str | None) -> Found:
+def _found(place: str, storage: str | None) -> SweepLocation:
     if not place or storage == "":
         raise BadInputError(f"{'--storage' if place else 'SWEEP'} must not be empty, got ''")
     if place.endswith((".yaml", ".yml")):
         config = load_sweep(place, storage=storage)
-        return Found(storage=resolve_storage(config.storage)[0], name=config.name)
+        return SweepLocation(storage=resolve_storage(config.storage)[0], name=config.name)
     place = place.rstrip("/")
     if storage is None and "://" in place:
         above, _, name = place.rpartition("/")
-        return Found(storage=above, name=name)
+        return SweepLocation(storage=above, name=name)
     if storage is None and Path(place).expanduser().is_dir():
         folder = Path(place).expanduser().absolute()
-        return Found(storage=str(folder.parent), name=folder.name)
+        return SweepLocation(storage=str(folder.parent), name=folder.name)
     if storage is None and "/" in place:
         folder = Path(place).expanduser().absolute()
         others = ", ".join(_others(str(folder.parent))) or "none"
@@ -100,7 +100,7 @@ def _found(place: str, storage: str | None) -> Found:
             f"SWEEP must be the folder of a sweep, a sweep's name or its YAML file, got {place}: "
             f"there is no folder {folder} (sweeps beside it: {others})"
         )
-    return Found(storage=resolve_storage(storage or "results")[0], name=place)
+    return SweepLocation(storage=resolve_storage(storage or "results")[0], name=place)
 
 
 def _others(storage: str) -> list[str]:
@@ -108,7 +108,7 @@ def _others(storage: str) -> list[str]:
     return sorted(other.name for other in sweeps_in(storage))
 
 
-def sweeps_in(storage: str) -> list[Found]:
+def sweeps_in(storage: str) -> list[SweepLocation]:
     """Every sweep in a storage that has been planned."""
     import pyarrow.fs as pafs
 
@@ -120,7 +120,7 @@ def sweeps_in(storage: str) -> list[Found]:
     plans = [f"{root}/{name}/{sweep_files.PLAN}" for name in names]
     found = filesystem.get_file_info(plans) if plans else []
     return [
-        Found(storage=storage, name=name)
+        SweepLocation(storage=storage, name=name)
         for name, plan in zip(names, found, strict=True)
         if plan.is_file
     ]

@@ -7,7 +7,7 @@ from enum import StrEnum
 
 from music_rllib.experiment.plan import Node, Plan
 
-__all__ = ["Board", "Status"]
+__all__ = ["Scheduler", "Status"]
 
 
 class Status(StrEnum):
@@ -32,7 +32,7 @@ class Status(StrEnum):
 _DONE = frozenset({Status.FINISHED, Status.REUSED})
 
 
-class Board:
+class Scheduler:
     """The nodes of a plan and their states."""
 
     def __init__(self, plan: Plan, finished: Collection[str]) -> None:
@@ -52,7 +52,7 @@ class Board:
         return self._status[key]
 
     def knows(self, key: str) -> bool:
-        """Whether the node is on the board."""
+        """Whether the node is in the scheduler."""
         return key in self._nodes
 
     def node(self, key: str) -> Node:
@@ -93,7 +93,7 @@ class Board:
         """The search asks for a node, or for more of it.
 
         Args:
-            node: It, and what it starts from must be on the board already.
+            node: It, and what it starts from must be in the scheduler already.
             until: As far as so many environment steps; None: to its end.
             finished: Whether it is in the store; of importance for a node that is new here.
         """

@@ -11,7 +11,7 @@ from typing import Any
 
 from music_rllib.config.schema import SweepConfig
 from music_rllib.experiment.plan import Plan
-from music_rllib.experiment.scheduler import Board, Status
+from music_rllib.experiment.scheduler import Scheduler, Status
 from music_rllib.experiment.sweep_files import CONFIG, PLAN, as_json, keep, read
 from music_rllib.redaction import redact, without_secrets
 from music_rllib.store.node_store import NodeStore, damage_in_words
@@ -32,12 +32,12 @@ class Sweep:
     store: NodeStore
     folder: Path
     """The sweep's own files, on this machine."""
-    board: Board
+    scheduler: Scheduler
 
     @property
     def finished(self) -> set[str]:
         """Keys of the nodes that have a result."""
-        return {node.key for node in self.board.having(Status.FINISHED, Status.REUSED)}
+        return {node.key for node in self.scheduler.having(Status.FINISHED, Status.REUSED)}
 
     def results(self) -> dict[str, RunResult]:
         """Node key to result, for the finished ones."""
@@ -80,7 +80,7 @@ def open_sweep(
         storage=storage,
         store=store,
         folder=folder,
-        board=Board(plan, finished),
+        scheduler=Scheduler(plan, finished),
     )
 
 

@@ -13,7 +13,7 @@ from music_rllib.config.load import declared_tasks
 from music_rllib.envs.tasks import Task
 from music_rllib.labels import is_meant
 from music_rllib.policy.policy import PolicyError
-from music_rllib.store.object_folder import SealedFolders, open_storage
+from music_rllib.store.object_folder import ObjectFolders, open_storage
 
 __all__ = ["find_policy", "named_environment"]
 
@@ -41,7 +41,7 @@ def find_policy(wanted: str, storage: str) -> str:
     labels: dict[str, list[str]] = {}
     for key, label in _labels(filesystem, root):
         labels.setdefault(key, []).append(label)  # sweeps that share a run call it differently
-    nodes = SealedFolders(filesystem, f"{root}/nodes")
+    nodes = ObjectFolders(filesystem, f"{root}/nodes")
     finished = nodes.names()
     unfinished = [key for key in _folders(filesystem, f"{root}/work") if key not in finished]
     keys = _matching(wanted, [*finished, *unfinished], labels)
@@ -61,7 +61,7 @@ def find_policy(wanted: str, storage: str) -> str:
     prefix = storage.rstrip("/")
     if keys[0] in finished:
         return f"{prefix}/nodes/{keys[0]}"
-    checkpoints = SealedFolders(filesystem, f"{root}/work/{keys[0]}").names()
+    checkpoints = ObjectFolders(filesystem, f"{root}/work/{keys[0]}").names()
     if not checkpoints:
         raise PolicyError(f"{wanted!r} must have a checkpoint, it has none in {storage} yet")
     return f"{prefix}/work/{keys[0]}/{checkpoints[-1]}"

@@ -31,7 +31,7 @@ from music_rllib.store.handoff import (
     open_handoff,
     read_handoff,
 )
-from music_rllib.store.object_folder import MANIFEST, SealedFolders, StorageError, open_storage
+from music_rllib.store.object_folder import MANIFEST, ObjectFolders, StorageError, open_storage
 
 __all__ = [
     "RUN_FILE",
@@ -271,7 +271,7 @@ def _local_copy(place: str) -> Iterator[Path]:
     """A sealed folder's verified copy; another local folder as it is."""
     filesystem, root = open_storage(place)
     above, _, name = root.rpartition("/")
-    sealed = SealedFolders(filesystem, above)
+    sealed = ObjectFolders(filesystem, above)
     if not sealed.exists(name):
         if isinstance(filesystem, pafs.LocalFileSystem):
             yield Path(root)

@@ -16,7 +16,7 @@ from music_rllib.command_line import add_command, called_as, new_app, run_app
 from music_rllib.errors import FAILED
 
 if TYPE_CHECKING:
-    from music_rllib.report.location import Found
+    from music_rllib.report.location import ReportSource
     from music_rllib.report.page import Report
 
 __all__ = ["EXAMPLES", "app", "main", "report"]
@@ -282,7 +282,7 @@ def _serve(
     serve(make_server(page, sweep, folder, port), page, typer.echo)
 
 
-def _attach(found: Found, folder: Path, made: Report) -> None:
+def _attach(found: ReportSource, folder: Path, made: Report) -> None:
     from music_rllib.redaction import for_people
     from music_rllib.report.tables import note
     from music_rllib.results.data import ReportError

@@ -14,11 +14,11 @@ from music_rllib.store.object_folder import StorageError
 from music_rllib.tracking.spool import has_undelivered
 from music_rllib.tracking.store import TrackingStore, local_folder, resolve_store
 
-__all__ = ["Found", "find_sweep"]
+__all__ = ["ReportSource", "find_sweep"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Found:
+class ReportSource:
     """A sweep and where it was found."""
 
     sweep: Sweep
@@ -38,7 +38,7 @@ def find_sweep(
     storage: str = "results",
     tracking_uri: str | None = None,
     metrics: Collection[str] | None = None,
-) -> Found:
+) -> ReportSource:
     """Read the sweep that `place` names.
 
     Args:
@@ -53,7 +53,7 @@ def find_sweep(
     """
     folder = Path(place).expanduser()
     if is_archive(folder):
-        return Found(sweep=read_archive(folder), folder=folder, store=None)
+        return ReportSource(sweep=read_archive(folder), folder=folder, store=None)
     # Loads MLflow, which an exported sweep does not need.
     from music_rllib.tracking.session import SweepRecord, tracking_folder
 
@@ -66,14 +66,14 @@ def find_sweep(
         store = resolve_store(tracking_uri, storage)
         name = Path(place).name
         sweep = read_mlflow(store, name, metrics=metrics)
-        return Found(sweep=sweep, folder=folder, store=store)
+        return ReportSource(sweep=sweep, folder=folder, store=store)
     place = record.resolve_storage(folder.absolute())
     store = resolve_store(tracking_uri or record.tracking_uri, place)
     sweep = read_mlflow(store, record.sweep_name, sweep_id=record.sweep_id, metrics=metrics)
     spools = tracking_folder(folder)
     waiting = [spools / "parent", *(spools / "runs").glob("*")]
     undelivered = sum(map(has_undelivered, waiting))
-    return Found(
+    return ReportSource(
         sweep=sweep,
         folder=folder,
         store=store,

@@ -9,12 +9,12 @@ from music_rllib.report.pieces import TextTable
 
 __all__ = ["search_in_words", "search_tables"]
 
-Found = Mapping[str, Any]
+Entry = Mapping[str, Any]
 """One search, one of its arms, trials or ranked settings, as in `search.json`."""
 DASH = "–"
 
 
-def search_in_words(search: Found) -> str:
+def search_in_words(search: Entry) -> str:
     """How it searched, in a sentence."""
     trials = [trial for arm in search["arms"] for trial in arm["trials"]]
     counts = ", ".join(
@@ -26,7 +26,7 @@ def search_in_words(search: Found) -> str:
     return f"{search['mode'].capitalize()} ({search['sampler']}): {aims}; trials: {counts}."
 
 
-def search_tables(search: Found) -> Iterator[TextTable]:
+def search_tables(search: Entry) -> Iterator[TextTable]:
     """The ranking on fresh seeds, what each setting matters, and every trial."""
     settings = _settings(search)
     aims = [one["name"] for one in search["objectives"]]
@@ -54,7 +54,7 @@ def search_tables(search: Found) -> Iterator[TextTable]:
     )
 
 
-def _ranking(ranking: Sequence[Found], settings: Sequence[str], aims: Sequence[str]) -> TextTable:
+def _ranking(ranking: Sequence[Entry], settings: Sequence[str], aims: Sequence[str]) -> TextTable:
     return TextTable(
         title="Ranking on fresh seeds",
         note="Settings trained again with seeds that the search has not seen, so that no choice "
@@ -77,7 +77,7 @@ def _ranking(ranking: Sequence[Found], settings: Sequence[str], aims: Sequence[s
     )
 
 
-def _importance(arm: Found) -> TextTable:
+def _importance(arm: Entry) -> TextTable:
     values = ", ".join(f"{name} = {_text(value)}" for name, value in arm["values"].items())
     return TextTable(
         title=f"Importance of the settings{values and f' at {values}'}",
@@ -87,7 +87,7 @@ def _importance(arm: Found) -> TextTable:
     )
 
 
-def _of_seeds(row: Found) -> tuple[str, str, str]:
+def _of_seeds(row: Entry) -> tuple[str, str, str]:
     if "failure" in row:
         return "", "", f"failed: {row['failure']}"
     better = row.get("best_is_better_with")
@@ -99,7 +99,7 @@ def _of_seeds(row: Found) -> tuple[str, str, str]:
     )
 
 
-def _settings(search: Found) -> list[str]:
+def _settings(search: Entry) -> list[str]:
     return list(
         dict.fromkeys(
             name for arm in search["arms"] for trial in arm["trials"] for name in trial["values"]

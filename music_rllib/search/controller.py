@@ -25,7 +25,7 @@ from music_rllib.search.warm_start import SCORES, VALUES
 from music_rllib.store.object_folder import DamagedError
 from music_rllib.store.run_record import Report
 
-__all__ = ["Campaign"]
+__all__ = ["SearchController"]
 
 POLL_SECONDS = 1.0
 """Between two looks at what other drivers have done."""
@@ -33,8 +33,8 @@ POLL_SECONDS = 1.0
 Array = NDArray[np.float64]
 
 
-class Campaign(Listener):
-    """Keeps the board filled with what the searches want next, and judges what is finished."""
+class SearchController(Listener):
+    """Keeps the scheduler filled with what the searches want next, and judges what is finished."""
 
     def __init__(
         self,
@@ -49,7 +49,7 @@ class Campaign(Listener):
         """Search in `sweep`.
 
         Args:
-            sweep: Its plan and board grow.
+            sweep: Its plan and scheduler grow.
             searches: What to do.
             reused: Told of nodes that are in the store already.
             pruned: Told of nodes that aren't computed any further, and why.
@@ -58,7 +58,7 @@ class Campaign(Listener):
         """
         self.searches = list(searches)
         self._sweep = sweep
-        self._board, self._plan, self._store = sweep.board, sweep.plan, sweep.store
+        self._scheduler, self._plan, self._store = sweep.scheduler, sweep.plan, sweep.store
         self._reused, self._pruned, self._say, self._now = reused, pruned, say, now
         self._heard: dict[str, dict[int, Report]] = {}
         self._seen = -1
@@ -104,10 +104,10 @@ class Campaign(Listener):
         for run in runs:
             node = self._plan.node(run.key)
             for one in (self._source_of(node), node):
-                if one is None or self._board.knows(one.key):
+                if one is None or self._scheduler.knows(one.key):
                     continue
                 finished = self._store.is_finished(one.key)
-                self._board.recall(one, finished=finished)
+                self._scheduler.recall(one, finished=finished)
                 if finished:
                     self._reused(one)
 
@@ -130,13 +130,13 @@ class Campaign(Listener):
         return self._plan.node(node.input.key)
 
     def advance(self) -> bool:
-        """Judge what can be judged and put what is wanted next on the board.
+        """Judge what can be judged and put what is wanted next in the scheduler.
 
         Returns:
             Whether more may be wanted later.
         """
         now = self._now()
-        if self._seen == self._board.changes and now - self._polled < POLL_SECONDS:
+        if self._seen == self._scheduler.changes and now - self._polled < POLL_SECONDS:
             return self._more
         self._polled = now
         try:
@@ -149,7 +149,7 @@ class Campaign(Listener):
             self._lost = True
             return True
         self._lost = False
-        self._seen = self._board.changes
+        self._seen = self._scheduler.changes
         self._more = not self.over
         return self._more
 
@@ -158,9 +158,9 @@ class Campaign(Listener):
             for arm in search.arms:
                 arm.study.refresh()
         while True:
-            before = self._board.changes
+            before = self._scheduler.changes
             moved = [self._advance(search) for search in self.searches]
-            if not any(moved) and before == self._board.changes:
+            if not any(moved) and before == self._scheduler.changes:
                 break
 
     @property
@@ -189,7 +189,7 @@ class Campaign(Listener):
             for active in list(arm.active.values()):
                 moved |= self._judge(search, arm, active)
             # Only what this driver has room for: the rest is for others.
-            while self._board.next_ready() is None:
+            while self._scheduler.next_ready() is None:
                 trial = arm.study.claim()
                 if trial is None:
                     break
@@ -232,16 +232,16 @@ class Campaign(Listener):
         self._want_node(node, until if until is None or until < node.run.env_steps else None)
 
     def _want_node(self, node: Node, until: int | None) -> None:
-        new = not self._board.knows(node.key)
+        new = not self._scheduler.knows(node.key)
         # One that is damaged is handed out: the worker that finds it there says what is wrong.
         finished = new and self._store.is_sound(node.key)
-        self._board.want(node, until, finished=finished)
+        self._scheduler.want(node, until, finished=finished)
         if finished:
             self._reused(node)
 
     def _judge(self, search: Search, arm: Arm, active: Active) -> bool:
         """Whether all that the rung takes is there, and so something came of it."""
-        states = {run.key: self._board[run.key] for run in active.runs}
+        states = {run.key: self._scheduler[run.key] for run in active.runs}
         lost = [run for run in active.runs if states[run.key] in _LOST]
         if lost:
             why = f"{lost[0].label} {states[lost[0].key]}"
@@ -293,7 +293,7 @@ class Campaign(Listener):
         return [np.asarray(numbers).reshape(-1, tasks) for numbers in found]
 
     def _history(self, key: str) -> list[Report]:
-        if self._board[key] in _FINISHED:
+        if self._scheduler[key] in _FINISHED:
             return self._store.history(key)
         return [report for _, report in sorted(self._heard.get(key, {}).items())]
 
@@ -350,7 +350,7 @@ class Campaign(Listener):
             if run.key in wanted:
                 continue
             self._heard.pop(run.key, None)
-            if self._board.withdraw(run.key):
+            if self._scheduler.withdraw(run.key):
                 self._pruned(self._plan.node(run.key), reason)
 
     # -- the final ranking -------------------------------------------------------------------
@@ -384,7 +384,7 @@ class Campaign(Listener):
     def _read_final(self, search: Search, finalist: Finalist) -> bool:
         if finalist.scores is not None or finalist.failure:
             return False
-        states = [self._board[run.key] for run in finalist.runs]
+        states = [self._scheduler[run.key] for run in finalist.runs]
         if any(state in _LOST for state in states):
             finalist.failure = "a run on fresh seeds failed"
         elif all(state in _FINISHED for state in states):

@@ -17,7 +17,7 @@ from music_rllib.experiment.plan import node_key
 from music_rllib.experiment.session import Sweep
 from music_rllib.redaction import redact
 from music_rllib.results.statistics import improvement
-from music_rllib.search.controller import Campaign
+from music_rllib.search.controller import SearchController
 from music_rllib.search.objective import aggregate, interval
 from music_rllib.search.storage import (
     DATABASE_ERRORS,
@@ -169,18 +169,18 @@ def _determined_by(sweep: Sweep, stage: Stage) -> dict[str, Any]:
 # --- what came of them -------------------------------------------------------------------------
 
 
-def outcome(campaign: Campaign, *, thorough: bool = True) -> list[dict[str, Any]]:
+def outcome(controller: SearchController, *, thorough: bool = True) -> list[dict[str, Any]]:
     """The searches' state as plain data, for files, tables and MLflow.
 
     Args:
-        campaign: It.
+        controller: It.
         thorough: With intervals and importance, which take a while.
 
     Returns:
         Nothing where the database does not answer: what counts is in the node store.
     """
     try:
-        return [_search(search, thorough) for search in campaign.searches]
+        return [_search(search, thorough) for search in controller.searches]
     except DATABASE_ERRORS:
         return []
 

@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 import pyarrow.fs as pafs
 
 from music_rllib.store.lease import LeaseFile
-from music_rllib.store.object_folder import DamagedError, Manifest, SealedFolders, open_storage
+from music_rllib.store.object_folder import DamagedError, Manifest, ObjectFolders, open_storage
 from music_rllib.store.run_record import (
     HISTORY,
     Report,
@@ -66,7 +66,7 @@ class NodeStore:
         """
         self.uri = uri
         self._fs, self._root = open_storage(uri)
-        self._nodes = SealedFolders(self._fs, f"{self._root}/nodes")
+        self._nodes = ObjectFolders(self._fs, f"{self._root}/nodes")
         self._local = isinstance(self._fs, pafs.LocalFileSystem)
         self._verified = Verified(Path(self._root, VERIFIED))
 
@@ -230,8 +230,8 @@ class WorkFolder:
         """Look at `root`; keep the newest `keep` checkpoints, and the parts that they need."""
         self.root = root
         self.lease = LeaseFile(filesystem, f"{root}/{LEASE}")
-        self._checkpoints = SealedFolders(filesystem, root)
-        self._parts = SealedFolders(filesystem, f"{root}/parts")
+        self._checkpoints = ObjectFolders(filesystem, root)
+        self._parts = ObjectFolders(filesystem, f"{root}/parts")
         self._keep = keep
         self._fs = filesystem
         self._local = isinstance(filesystem, pafs.LocalFileSystem)
@@ -345,7 +345,7 @@ class Saved(NamedTuple):
 class Draft:
     """A checkpoint that is being written."""
 
-    def __init__(self, folder: Path, parts: SealedFolders) -> None:
+    def __init__(self, folder: Path, parts: ObjectFolders) -> None:
         """Let `folder` be filled, and parts be added to `parts`."""
         self.folder = folder
         self.needs: list[str] = []

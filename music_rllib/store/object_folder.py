@@ -26,7 +26,7 @@ from music_rllib.errors import BadInputError
 from music_rllib.limits import MOST_JSON_BYTES, open_regular, read_json
 from music_rllib.store.files import sync_folder, write_atomically
 
-__all__ = ["DamagedError", "Manifest", "SealedFolders", "StorageError", "open_storage"]
+__all__ = ["DamagedError", "Manifest", "ObjectFolders", "StorageError", "open_storage"]
 
 MANIFEST = "manifest.json"
 _CHUNK = 1 << 20
@@ -100,7 +100,7 @@ def open_storage(uri: str) -> tuple[pafs.FileSystem, str]:
     return filesystem, root.rstrip("/")
 
 
-class SealedFolders:
+class ObjectFolders:
     """The sealed folders below one place."""
 
     def __init__(self, filesystem: pafs.FileSystem, root: str) -> None:

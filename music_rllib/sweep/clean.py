@@ -11,7 +11,7 @@ import pyarrow.fs as pafs
 
 from music_rllib.errors import BadInputError
 from music_rllib.experiment import sweep_files
-from music_rllib.experiment.location import Found, sweeps_in
+from music_rllib.experiment.location import SweepLocation, sweeps_in
 from music_rllib.redaction import redact
 from music_rllib.store.object_folder import open_storage
 from music_rllib.store.paths import sweep_folder
@@ -38,7 +38,7 @@ class Cleaning:
         return [*self.going, *self.going_here]
 
 
-def what_can_go(found: Found, *, unfinished: bool, everything: bool) -> Cleaning:
+def what_can_go(found: SweepLocation, *, unfinished: bool, everything: bool) -> Cleaning:
     """Folders that can be deleted, with the reason.
 
     Args:
@@ -84,7 +84,7 @@ def what_can_go(found: Found, *, unfinished: bool, everything: bool) -> Cleaning
     return cleaning
 
 
-def _add_own_files(found: Found, root: str, cleaning: Cleaning) -> None:
+def _add_own_files(found: SweepLocation, root: str, cleaning: Cleaning) -> None:
     cleaning.going.append({"path": f"{root}/{found.name}", "what": "the sweep's own files"})
     here = sweep_folder(found.storage, found.name)
     if sweep_files.is_remote(found.storage) and here.is_dir():
@@ -96,7 +96,7 @@ def _add_own_files(found: Found, root: str, cleaning: Cleaning) -> None:
         cleaning.kept.append({"path": redact(storage), "what": what})
 
 
-def _users(found: Found, nodes: Iterable[Mapping[str, Any]]) -> dict[str, list[str]]:
+def _users(found: SweepLocation, nodes: Iterable[Mapping[str, Any]]) -> dict[str, list[str]]:
     """Key to the names of other sweeps that have the node, or whose searches count on it.
 
     Raises:
@@ -123,7 +123,7 @@ def _users(found: Found, nodes: Iterable[Mapping[str, Any]]) -> dict[str, list[s
     return users
 
 
-def _studies(found: Found) -> dict[tuple[str, str], str]:
+def _studies(found: SweepLocation) -> dict[tuple[str, str], str]:
     """Database and name of each study that other sweeps may use too, to its stage."""
     studies = {}
     for stage in (found.read(sweep_files.CONFIG) or {"stages": []})["stages"]:
@@ -150,7 +150,7 @@ def _is_there(filesystem: pafs.FileSystem, path: str) -> bool:
     return bool(filesystem.get_file_info(path).type != pafs.FileType.NotFound)
 
 
-def delete(found: Found, cleaning: Cleaning) -> None:
+def delete(found: SweepLocation, cleaning: Cleaning) -> None:
     """Delete folders, a node's manifest first: half a node is none."""
     filesystem, _ = open_storage(found.storage)
     places = [(filesystem, item) for item in cleaning.going]

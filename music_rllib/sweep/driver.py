@@ -21,10 +21,10 @@ from music_rllib.experiment import sweep_files
 from music_rllib.experiment.changes import changes_since, check_begun, keep_settings
 from music_rllib.experiment.demand import check_demand
 from music_rllib.experiment.listener import Listener
-from music_rllib.experiment.plan import Node, make_plan
+from music_rllib.experiment.plan import make_plan
 from music_rllib.experiment.scheduler import Status
 from music_rllib.experiment.session import Sweep, keep_record, open_sweep
-from music_rllib.experiment.sweep_files import SEARCH, as_json, keep
+from music_rllib.experiment.sweep_files import as_json
 from music_rllib.redaction import redact
 from music_rllib.results.claims.plan import PlanVersion, as_document
 from music_rllib.results.claims.record import PLANS_TO_READ, record_plan
@@ -33,16 +33,17 @@ from music_rllib.runtime.ending import try_for
 from music_rllib.runtime.machine import (
     check_cpus,
     check_memory_and_gpus,
-    check_reachable,
     cluster_address,
 )
 from music_rllib.runtime.signals import early
 from music_rllib.store.paths import check_storage, resolve_storage, sweep_folder
-from music_rllib.sweep.driver_lock import driving
-from music_rllib.sweep.listeners.state_file import Beacon
+from music_rllib.sweep.driver_lock import hold_driver_lock
+from music_rllib.sweep.listeners.state_file import StateFile
 from music_rllib.sweep.preflight import (
     check_environments,
     check_hardware,
+    check_ray,
+    check_searches,
     import_checkpoints,
     verify_inputs,
 )
@@ -52,9 +53,9 @@ from music_rllib.sweep.views.plan_json import plan_answer
 from music_rllib.sweep.views.tables import plan_view, results_table, search_views
 
 if TYPE_CHECKING:
-    from music_rllib.experiment.location import Found
-    from music_rllib.search.controller import Campaign
-    from music_rllib.sweep.listeners.mlflow import Logbook
+    from music_rllib.experiment.location import SweepLocation
+    from music_rllib.search.controller import SearchController
+    from music_rllib.sweep.listeners.mlflow import MlflowListener
     from music_rllib.sweep.listeners.screen import Display
     from music_rllib.tracking.tracker import Tracker
 
@@ -136,7 +137,7 @@ def _code_of(console: Console, stopped: KeyboardInterrupt | SystemExit) -> int:
 
 def resume_sweep(
     console: Console,
-    found: Found,
+    found: SweepLocation,
     *,
     seeds: str | None = None,
     accept_changes: bool = False,
@@ -181,7 +182,7 @@ def _sweep(
     changes = changes_since(opened)
     if changes is not None and not accept_changes:
         raise BadInputError(str(changes))
-    with driving(opened, lambda text: console.print(Text(text), soft_wrap=True)), early:
+    with hold_driver_lock(opened, lambda text: console.print(Text(text), soft_wrap=True)), early:
         code = _drive(console, opened)
     answer(sweep_files.read(opened.storage, f"{config.name}/{sweep_files.STATE}") or {})
     return code
@@ -196,7 +197,7 @@ def _show(
 ) -> int:
     """Check everything and show the plan, and if asked what it takes."""
     opened = _open(console, config)
-    _check_searches(opened)
+    check_searches(opened)
     changes = changes_since(opened)
     if changes is not None:
         console.print(Text(str(changes), style="yellow"), soft_wrap=True)
@@ -219,9 +220,9 @@ def _drive(console: Console, opened: Sweep) -> int:
     give_back_freed_memory()
     # All that may refuse it comes before it is recorded as a sweep that was begun.
     import_checkpoints(opened.plan, opened.store)
-    verify_inputs(opened.board, opened.store)
-    _check_searches(opened)
-    _check_ray(console, opened)
+    verify_inputs(opened.scheduler, opened.store)
+    check_searches(opened)
+    check_ray(console, opened)
     tracker = _open_tracker(opened)
     with tracker:
         keep_record(opened)
@@ -246,28 +247,6 @@ def _record_plan(console: Console, opened: Sweep) -> Sequence[PlanVersion]:
             soft_wrap=True,
         )
     return versions
-
-
-def _check_searches(opened: Sweep) -> None:
-    if opened.plan.searched:
-        from music_rllib.search.summary import check_studies
-
-        check_studies(opened)
-
-
-def _check_ray(console: Console, opened: Sweep) -> None:
-    """Look whether Ray is there and can hold a run, unless nothing is left to compute."""
-    begun = (opened.folder / sweep_files.CONFIG).is_file()
-    if opened.board.complete and (begun or not opened.plan.searched):
-        return
-    if (address := cluster_address()) is not None:
-        check_reachable(address)
-    from music_rllib.runtime.ray_cluster import check_fits
-
-    if remark := check_fits(opened.config.resources):
-        console.print(Text(remark, style="yellow"), soft_wrap=True)
-    early.install()  # Ray has set a handler of its own
-    early.check()
 
 
 def _open(console: Console, config: SweepConfig, *, retrain_damaged: bool = False) -> Sweep:
@@ -316,25 +295,32 @@ def _open_tracker(opened: Sweep) -> Tracker:
 
 
 def _compute_and_report(console: Console, opened: Sweep, tracker: Tracker) -> int:
-    from music_rllib.sweep.listeners.mlflow import Logbook
+    from music_rllib.sweep.listeners.mlflow import MlflowListener
     from music_rllib.sweep.listeners.screen import Display
 
-    with Display(console, opened.plan, opened.board) as display, Beacon(opened) as beacon:
-        logbook = Logbook(tracker, lambda text: display.say(text, "yellow"), opened.store)
-        display.headline = beacon.headline
-        _take_over(opened, display, logbook)
-        campaign = _open_campaign(opened, display, logbook, beacon)
-        stopped_by = _compute(opened, display, logbook, beacon, campaign)
-        failed = bool(opened.board.having(Status.FAILED, Status.SKIPPED)) or (
-            stopped_by is None and not opened.board.complete
+    with (
+        Display(console, opened.plan, opened.scheduler) as display,
+        StateFile(opened) as state_file,
+    ):
+        mlflow_log = MlflowListener(tracker, lambda text: display.say(text, "yellow"), opened.store)
+        display.headline = state_file.headline
+        _take_over(opened, display, mlflow_log)
+        controller = None
+        if opened.plan.searched:
+            from music_rllib.sweep.searches import begin_searches, end_searches
+
+            controller = begin_searches(opened, display, mlflow_log, state_file)
+        stopped_by = _compute(opened, display, mlflow_log, state_file, controller)
+        failed = bool(opened.scheduler.having(Status.FAILED, Status.SKIPPED)) or (
+            stopped_by is None and not opened.scheduler.complete
         )
-        searches = [] if campaign is None else _close_campaign(opened, campaign, tracker)
-        beacon.end("stopped" if stopped_by else "failed" if failed else "finished")
+        searches = [] if controller is None else end_searches(opened, controller, tracker)
+        state_file.end("stopped" if stopped_by else "failed" if failed else "finished")
     tracker.close("KILLED" if stopped_by else "FAILED" if failed else "FINISHED")
     results = results_table(
         opened.plan,
-        opened.board.__getitem__,
-        beacon.reached() | opened.results(),
+        opened.scheduler.__getitem__,
+        state_file.reached() | opened.results(),
         tracker.run_id,
         console.width,
     )
@@ -357,80 +343,39 @@ def _compute_and_report(console: Console, opened: Sweep, tracker: Tracker) -> in
     return FAILED if failed else 0
 
 
-def _take_over(opened: Sweep, display: Display, logbook: Logbook) -> None:
+def _take_over(opened: Sweep, display: Display, mlflow_log: MlflowListener) -> None:
     """Say which runs are reused, and give MLflow those that it doesn't have."""
-    reused = opened.board.having(Status.REUSED)
+    reused = opened.scheduler.having(Status.REUSED)
     for node in reused[:NAMED]:
         display.say(f"{display.short(node.label)}: finished earlier, reused")
     if len(reused) > NAMED:
         display.say(f"{len(reused) - NAMED} more: finished earlier, reused")
     for node in reused:
-        logbook.reused(node, opened.store)
-
-
-def _open_campaign(
-    opened: Sweep, display: Display, logbook: Logbook, beacon: Beacon
-) -> Campaign | None:
-    """The sweep's searches, if it has any, as far as earlier results lead."""
-    if not opened.plan.searched:
-        return None
-    from music_rllib.search.controller import Campaign
-    from music_rllib.search.summary import learnings, open_searches, outcome
-
-    def reused(node: Node) -> None:
-        logbook.reused(node, opened.store)
-        beacon.reused(node)
-
-    searches = open_searches(opened)
-    for line in learnings(searches):
-        display.say(line)
-    campaign = Campaign(
-        opened,
-        searches,
-        reused=reused,
-        pruned=logbook.pruned,
-        say=display.say,
-    )
-    beacon.searches = lambda: outcome(campaign, thorough=False)
-    campaign.recall()
-    campaign.advance()
-    return campaign
-
-
-def _close_campaign(opened: Sweep, campaign: Campaign, tracker: Tracker) -> list[dict[str, Any]]:
-    """Keep what came of the searches, in the sweep's folder and in MLflow."""
-    from music_rllib.search.summary import outcome
-
-    campaign.stop()
-    found = outcome(campaign)
-    if not found:
-        return found
-    text = as_json(found)
-    tracker.put_sweep_artefact(names.ARTEFACT_SEARCH, text)
-    keep(opened, SEARCH, text)
-    return found
+        mlflow_log.reused(node, opened.store)
 
 
 def _compute(
     opened: Sweep,
     display: Display,
-    logbook: Logbook,
-    beacon: Beacon,
-    campaign: Campaign | None,
+    mlflow_log: MlflowListener,
+    state_file: StateFile,
+    controller: SearchController | None,
 ) -> int | None:
     """Compute what is left, if anything; the signal that stopped it."""
-    if opened.board.complete and (campaign is None or campaign.over):
+    if opened.scheduler.complete and (controller is None or controller.over):
         return None
-    from music_rllib.sweep.listeners.prometheus import Gauges
+    from music_rllib.sweep.listeners.prometheus import PrometheusListener
     from music_rllib.sweep.tune.runner import compute
 
     address = cluster_address()
     display.say("starting a local Ray" if address is None else f"connecting to Ray at {address}")
 
-    gauges = Gauges(opened.config.name, opened.board, logbook.backlog, opened.folder)
-    listeners: list[Listener] = [logbook, display, beacon, gauges]
-    if campaign is not None:
-        listeners.append(campaign)
+    gauges = PrometheusListener(
+        opened.config.name, opened.scheduler, mlflow_log.backlog, opened.folder
+    )
+    listeners: list[Listener] = [mlflow_log, display, state_file, gauges]
+    if controller is not None:
+        listeners.append(controller)
 
     def on_stop() -> None:
         display.say("stopping, this takes a few seconds; Ctrl-C again stops at once", "yellow")
@@ -439,11 +384,13 @@ def _compute(
         told = "Ray was told to stop as well, so no more can be saved now"
         display.say(cause or told, "red" if cause else "yellow")
         outcome = "failed" if cause else "stopped"
-        try_for(LAST_SECONDS, lambda: beacon.end(outcome), lambda: logbook.end(killed=not cause))
+        try_for(
+            LAST_SECONDS, lambda: state_file.end(outcome), lambda: mlflow_log.end(killed=not cause)
+        )
         display.say(how_to_continue())
 
     try:
-        return compute(opened, listeners, on_stop, on_ray_gone, campaign).stopped_by
+        return compute(opened, listeners, on_stop, on_ray_gone, controller).stopped_by
     finally:
         gauges.close()
 

@@ -11,11 +11,11 @@ from music_rllib.runtime.ending import end_process
 from music_rllib.store.lease import HeldLease, Lease, LeaseFile
 from music_rllib.store.object_folder import StorageError, open_storage
 
-__all__ = ["driving"]
+__all__ = ["hold_driver_lock"]
 
 
 @contextlib.contextmanager
-def driving(sweep: Sweep, say: Callable[[str], None] = print) -> Iterator[None]:
+def hold_driver_lock(sweep: Sweep, say: Callable[[str], None] = print) -> Iterator[None]:
     """Be the one process that drives the sweep, on whatever machine, for this `with`.
 
     A process that was suspended, and finds that another one drives the sweep by now, ends at once:

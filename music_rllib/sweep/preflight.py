@@ -8,12 +8,19 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
+from rich.console import Console
+from rich.text import Text
+
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.envs.tasks import BUILT_IN_TASKS, Task, closest
 from music_rllib.errors import BadInputError
+from music_rllib.experiment import sweep_files
 from music_rllib.experiment.plan import Input, Plan
-from music_rllib.experiment.scheduler import Board, Status
+from music_rllib.experiment.scheduler import Scheduler, Status
+from music_rllib.experiment.session import Sweep
 from music_rllib.runtime.in_time import in_time
+from music_rllib.runtime.ray_address import check_reachable, cluster_address
+from music_rllib.runtime.signals import early
 from music_rllib.store.handoff import open_handoff, read_handoff
 from music_rllib.store.node_store import NodeStore
 
@@ -25,6 +32,8 @@ __all__ = [
     "TaskError",
     "check_environments",
     "check_hardware",
+    "check_ray",
+    "check_searches",
     "import_checkpoints",
     "verify_inputs",
 ]
@@ -177,14 +186,37 @@ def _import(source: Input, store: NodeStore) -> None:
         store.publish(source.key, Path(temporary))
 
 
-def verify_inputs(board: Board, store: NodeStore) -> None:
+def verify_inputs(scheduler: Scheduler, store: NodeStore) -> None:
     """Read what waiting nodes start from and an earlier sweep has left.
 
     Raises:
         DamagedError: A node isn't what its manifest says.
     """
-    waiting = board.having(Status.WAITING)
+    waiting = scheduler.having(Status.WAITING)
     wanted = dict.fromkeys(node.input.key for node in waiting if node.input)
     for key in wanted:
         if store.is_finished(key):
             store.verify(key)
+
+
+def check_searches(opened: Sweep) -> None:
+    """Look whether the searches' studies can be opened."""
+    if opened.plan.searched:
+        from music_rllib.search.summary import check_studies
+
+        check_studies(opened)
+
+
+def check_ray(console: Console, opened: Sweep) -> None:
+    """Look whether Ray is there and can hold a run, unless nothing is left to compute."""
+    begun = (opened.folder / sweep_files.CONFIG).is_file()
+    if opened.scheduler.complete and (begun or not opened.plan.searched):
+        return
+    if (address := cluster_address()) is not None:
+        check_reachable(address)
+    from music_rllib.runtime.ray_cluster import check_fits
+
+    if remark := check_fits(opened.config.resources):
+        console.print(Text(remark, style="yellow"), soft_wrap=True)
+    early.install()  # Ray has set a handler of its own
+    early.check()

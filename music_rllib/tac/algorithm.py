@@ -40,8 +40,8 @@ from music_rllib.replay.trajectories import Transitions
 from music_rllib.schedules import value_at
 from music_rllib.tac.config import TACConfig
 from music_rllib.tac.env_runner import SUCCESS_LAST, Episode, TrajectoryEnvRunner, seed_or_entropy
-from music_rllib.tac.normaliser import in_this_form
 from music_rllib.tac.rl_module import ESTIMATOR_MODULE
+from music_rllib.tac.weights import NetworkWeights, by_module, by_network
 
 __all__ = ["TAC"]
 
@@ -288,43 +288,18 @@ class TAC(Algorithm):
 
     # -- plain weights --------------------------------------------------------------------
 
-    def get_parts(self) -> dict[str, dict[str, NDArray[Any]]]:
+    def get_network_weights(self) -> NetworkWeights:
         """Plain arrays of each network: policy, critics, value, value_target, normaliser, ..."""
         state = self.learner_group.get_state(components="learner/rl_module")["learner"]["rl_module"]
-        parts: dict[str, dict[str, NDArray[Any]]] = {}
-        for name, array in state[DEFAULT_MODULE_ID].items():
-            part, _, rest = name.partition(".")
-            parts.setdefault(part, {})[rest or part] = np.asarray(array)
-        if ESTIMATOR_MODULE in state:
-            prefix = "estimator."
-            parts[ESTIMATOR_MODULE] = {
-                name.removeprefix(prefix): np.asarray(array)
-                for name, array in state[ESTIMATOR_MODULE].items()
-            }
-        return parts
+        return by_network(state)
 
-    def set_parts(self, parts: Mapping[str, Mapping[str, NDArray[Any]]]) -> None:
-        """Loads networks by name, as `get_parts` gives them; all others stay as they are.
+    def set_network_weights(self, weights: Mapping[str, Mapping[str, NDArray[Any]]]) -> None:
+        """Loads networks by name, as `get_network_weights` gives them; all others stay as they are.
 
         Raises:
             ValueError: an unknown network, or tensors that are missing, unknown or of other shape.
         """
-        own = self.get_parts()
-        if "normaliser" in parts:
-            parts = {**parts, "normaliser": in_this_form(parts["normaliser"])}
-        if ESTIMATOR_MODULE in parts and ESTIMATOR_MODULE in own:
-            # Those of before version 3 use all inputs raw.
-            raw = {"offset": np.zeros_like, "scale": np.ones_like}
-            defaults = {name: like(own[ESTIMATOR_MODULE][name]) for name, like in raw.items()}
-            parts = {**parts, ESTIMATOR_MODULE: {**defaults, **parts[ESTIMATOR_MODULE]}}
-        for part, arrays in parts.items():
-            _check_same_tensors(part, own.get(part), arrays)
-        modules: dict[str, dict[str, NDArray[Any]]] = {}
-        for part, arrays in parts.items():
-            module = ESTIMATOR_MODULE if part == ESTIMATOR_MODULE else DEFAULT_MODULE_ID
-            prefix = "estimator" if part == ESTIMATOR_MODULE else part
-            for name, array in arrays.items():
-                modules.setdefault(module, {})[f"{prefix}.{name}"] = array
+        modules = by_module(weights, self.get_network_weights())
         self.learner_group.foreach_learner(
             lambda learner: [learner.module[mid].set_state(state) for mid, state in modules.items()]
         )
@@ -399,20 +374,3 @@ class _ReplayComponent(Checkpointable):
 
     def get_ctor_args_and_kwargs(self) -> tuple[tuple[Any, ...], dict[str, Any]]:
         return (), {}
-
-
-def _check_same_tensors(
-    part: str,
-    own: Mapping[str, NDArray[Any]] | None,
-    given: Mapping[str, NDArray[Any]],
-) -> None:
-    if own is None:
-        raise ValueError(f"{part}: this algorithm has no such network")
-    if own.keys() != given.keys():
-        missing, unknown = sorted(own.keys() - given.keys()), sorted(given.keys() - own.keys())
-        raise ValueError(
-            f"{part}: tensors missing: {missing or 'none'}, unknown: {unknown or 'none'}"
-        )
-    for name, array in given.items():
-        if array.shape != own[name].shape:
-            raise ValueError(f"{part}.{name}: shape must be {own[name].shape}, got {array.shape}")

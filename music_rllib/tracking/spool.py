@@ -17,6 +17,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import re
 import shutil
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -77,6 +78,19 @@ class Delivered:
     run_id: str | None = None
     offset: int = 0
     records: int = 0
+
+
+_PART = r"(?!\.{1,2}(?:/|$))[\w.\-: ]+"
+_METRIC_NAME = re.compile(rf"{_PART}(?:/{_PART})*")
+
+
+def check_metric_name(name: str) -> None:
+    """Raises ValueError where MLflow would refuse the name."""
+    if len(name) > 250 or not _METRIC_NAME.fullmatch(name):
+        raise ValueError(
+            "a metric's name must have at most 250 letters, digits, '_', '-', '.', ':', spaces, "
+            f"and single slashes between them, got {name!r}"
+        )
 
 
 class Spool:

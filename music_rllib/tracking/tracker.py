@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import logging
-import re
 import shlex
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -28,16 +27,21 @@ from music_rllib.tracking.mlflow_client import first_line
 from music_rllib.tracking.provenance import provenance_tags
 from music_rllib.tracking.sender import Backlog
 from music_rllib.tracking.session import Session, SweepRecord, new_sweep_id, relative_storage
-from music_rllib.tracking.spool import Finish, Metrics, Record, Spool, Start, Status
+from music_rllib.tracking.spool import (
+    Finish,
+    Metrics,
+    Record,
+    Spool,
+    Start,
+    Status,
+    check_metric_name,
+)
 from music_rllib.tracking.store import check_reachable, local_folder, resolve_store, version
 
 logger = logging.getLogger(__name__)
 
 MAX_FAILURE_LENGTH = 1000
 """Characters of a failure's cause that are kept as a tag; the rest is in the run's log."""
-
-_PART = r"(?!\.{1,2}(?:/|$))[\w.\-: ]+"
-_METRIC_NAME = re.compile(rf"{_PART}(?:/{_PART})*")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -347,8 +351,7 @@ class Tracker:
         return [start, self._metrics(run.settings, 0, when)] if run.settings else [start]
 
     def _append(self, node_key: str, records: Iterable[Record]) -> None:
-        if node_key not in self._open:
-            self._open[node_key] = self._session.open_run(node_key)
+        self._open[node_key] = self._open.get(node_key) or self._session.open_run(node_key)
         self._open[node_key].append(records)
 
     def _started(self, node_key: str) -> Spool:
@@ -359,7 +362,7 @@ class Tracker:
     def _metrics(self, metrics: Mapping[str, float], env_steps: int, when: float) -> Metrics:
         for name in metrics:
             if name not in self._checked_names:
-                _check_metric_name(name)
+                check_metric_name(name)
                 self._checked_names.add(name)
         values = {name: _number(name, value) for name, value in metrics.items()}
         return Metrics(time=_milliseconds(when), step=int(env_steps), values=values)
@@ -370,14 +373,6 @@ def _default_folder(storage: str, sweep_name: str) -> Path:
     if folder is None:
         raise ValueError(f"sweep_folder must be given where storage is a bucket, got {storage}")
     return folder / sweep_name
-
-
-def _check_metric_name(name: str) -> None:
-    if len(name) > 250 or not _METRIC_NAME.fullmatch(name):
-        raise ValueError(
-            "a metric's name must have at most 250 letters, digits, '_', '-', '.', ':', spaces, "
-            f"and single slashes between them, got {name!r}"
-        )
 
 
 def _number(name: str, value: float) -> float:

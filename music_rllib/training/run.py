@@ -84,7 +84,7 @@ class TrainingRun:
 
     Args:
         run: the settings.
-        handoff: weights to start from, by module name (`TAC.set_parts`).
+        handoff: weights to start from, by module name (`TAC.set_network_weights`).
         gpus: more than 0: the networks train on a GPU.
 
     Raises:
@@ -107,7 +107,7 @@ class TrainingRun:
         if handoff:
             if "normaliser" in handoff:
                 handoff = {**handoff, "normaliser": for_another_run(handoff["normaliser"])}
-            self.algorithm.set_parts(handoff)
+            self.algorithm.set_network_weights(handoff)
         self._rounds: defaultdict[str, list[float]] = defaultdict(list)
         """What has been measured since the last report."""
         self._segments: list[Segment] = []
@@ -174,7 +174,7 @@ class TrainingRun:
 
     def modules(self) -> dict[str, dict[str, NDArray[Any]]]:
         """Plain weights of every network, by module name, as a handoff carries them."""
-        return self.algorithm.get_parts()
+        return self.algorithm.get_network_weights()
 
     @property
     def spaces(self) -> Spaces:

@@ -7,10 +7,10 @@ from collections.abc import Iterable
 
 from music_rllib.store.run_record import Report, last_values
 
-__all__ = ["Pace"]
+__all__ = ["Throughput"]
 
 
-class Pace:
+class Throughput:
     """What is known of one running run."""
 
     def __init__(self, budget: int, warm_up: int, now: float) -> None:

@@ -23,7 +23,7 @@ from music_rllib.store import lease as lease_module
 from music_rllib.store.lease import Lease, LeaseFile
 from music_rllib.store.object_folder import StorageError
 from music_rllib.store.run_record import RunResult
-from music_rllib.sweep.driver_lock import driving
+from music_rllib.sweep.driver_lock import hold_driver_lock
 
 RESULT = RunResult(label="l", env_steps=1200, seconds=1.0, metrics={})
 
@@ -137,7 +137,7 @@ def test_a_second_driver_is_refused_and_a_dead_one_does_not_count(
     theirs = Lease.of_this_process("sweep 'points'")
     assert file.acquire(theirs) is None
     match = rf"points must be used by one process at a time.*\(process {os.getpid()} on "
-    with pytest.raises(StorageError, match=match), driving(sweep):
+    with pytest.raises(StorageError, match=match), hold_driver_lock(sweep):
         pass
     file.release(theirs.owner)
 
@@ -147,7 +147,7 @@ def test_a_second_driver_is_refused_and_a_dead_one_does_not_count(
         os.kill(os.getpid(), signal.SIGKILL)
     os.waitpid(child, 0)
     assert file.read() is not None
-    with driving(sweep):
+    with hold_driver_lock(sweep):
         assert file.is_owned_by(str(getattr(file.read(), "owner", None)))
     assert file.read() is None
 
@@ -163,7 +163,7 @@ def test_a_driver_that_was_suspended_ends_where_another_one_has_its_sweep(
     said: list[str] = []
     monkeypatch.setattr("music_rllib.sweep.driver_lock.end_process", ended.append)
     theirs = Lease.of_this_process("sweep 'points'", 60.0)
-    with driving(sweep, said.append):
+    with hold_driver_lock(sweep, said.append):
         mine = file.read()
         assert mine is not None
         file.release(mine.owner)

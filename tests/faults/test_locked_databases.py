@@ -42,7 +42,7 @@ def test_a_locked_study_is_said_and_waited_for(
     whole = searched(tmp_path / "whole")
     driver = Driver(tmp_path / "locked", document({}))
     said: list[str] = []
-    driver.campaign._say = said.append
+    driver.controller._say = said.append
     driver.play(stop_after=3)
     (file,) = driver.sweep.folder.glob("*.db")
     with locked(file), pytest.raises(AssertionError, match="wait for ever"):

@@ -217,7 +217,7 @@ DRIVER = """
         assert time.monotonic() < patience, "the other driver never came"
         time.sleep(0.01)
     driver = Driver(folder, document(search), seed=int(sys.argv[3]))
-    while not driver.campaign.over:
+    while not driver.controller.over:
         try:
             driver.play(slots=2)
         except AssertionError as error:

@@ -34,7 +34,7 @@ from music_rllib.experiment.session import keep_record
 from music_rllib.search.summary import learnings, outcome
 from music_rllib.store.object_folder import StorageError
 from music_rllib.sweep import cli
-from music_rllib.sweep.listeners.state_file import Beacon
+from music_rllib.sweep.listeners.state_file import StateFile
 from tests.played_search import SPACE, Document, Driver, document, points, searched, success
 
 
@@ -113,9 +113,9 @@ def test_a_resumed_study_equals_the_unbroken_one(search: Document, tmp_path: Pat
         # A driver that is killed: it says nothing, and its trials are left as they are.
         driver = Driver(tmp_path / "broken", document(search), seed=attempt + 1)
         driver.play(stop_after=9)
-        if driver.campaign.over:
+        if driver.controller.over:
             break
-    assert driver.campaign.over
+    assert driver.controller.over
     assert attempt > 1
     assert driver.trials() == whole.trials()
 
@@ -221,7 +221,7 @@ def test_what_is_stopped_early_is_so_for_a_reason_and_costs_less(tmp_path: Path)
 def test_a_rung_at_the_very_end_is_no_rung(tmp_path: Path) -> None:
     rungs = [{"seeds": 1, "env_steps": 4000}, {"env_steps": 4000}]
     driver = searched(tmp_path, {"pruning": {"rungs": rungs, "warm_up": 1}})
-    (search,) = driver.campaign.searches
+    (search,) = driver.controller.searches
     assert [(rung.seeds, rung.env_steps) for rung in search.rungs] == [(1, None), (3, None)]
     assert "judged" in {trial["state"] for trial in driver.trials()}
 
@@ -295,14 +295,14 @@ def test_importance_names_what_matters(tmp_path: Path) -> None:
 def recorded(folder: Path, content: Document) -> Driver:
     """The sweep as a later driver finds it, and its files as a driver's end leaves them."""
     driver = Driver(folder, content)
-    driver.campaign.advance()
+    driver.controller.advance()
     keep_record(driver.sweep)
-    with Beacon(driver.sweep) as beacon:
-        beacon.searches = lambda: outcome(driver.campaign, thorough=False)
-        beacon.end("stopped")
-    if driver.campaign.over:
+    with StateFile(driver.sweep) as state_file:
+        state_file.searches = lambda: outcome(driver.controller, thorough=False)
+        state_file.end("stopped")
+    if driver.controller.over:
         sweep_files.keep(
-            driver.sweep, sweep_files.SEARCH, sweep_files.as_json(outcome(driver.campaign))
+            driver.sweep, sweep_files.SEARCH, sweep_files.as_json(outcome(driver.controller))
         )
     return driver
 
@@ -500,7 +500,7 @@ def test_a_warm_start_learns_from_every_value_of_a_comparison(tmp_path: Path) ->
         driver = searched(tmp_path, search, name=f"warm{count}", seeds=[0])
         (arm,) = driver.outcome()["arms"]
         assert arm["learnt_from"] == count
-        (line,) = learnings(driver.campaign.searches)
+        (line,) = learnings(driver.controller.searches)
         assert line.startswith(f"finetune: learnt from {count} of 4 trials of s/finetune/tac.")
 
 
@@ -510,7 +510,7 @@ def test_a_comparison_learns_for_each_value_from_trials_with_it(tmp_path: Path) 
     driver = searched(tmp_path, COMPARED | warm, name="warm", seeds=[0])
     theirs = before.outcome()["arms"]
     for number, arm in enumerate(driver.outcome()["arms"]):
-        prior = driver.campaign.searches[0].arms[number].study._open()[2]
+        prior = driver.controller.searches[0].arms[number].study._open()[2]
         assert [list(trial.values) for trial in prior] == [
             trial["objective"] for trial in theirs[number]["trials"]
         ]
@@ -574,7 +574,7 @@ def play_in_turns(*drivers: Driver) -> None:
                 driver.play(stop_after=len(driver.computed) + 2)
             except AssertionError:
                 continue  # it waits for what another one judges
-        if all(driver.campaign.over for driver in drivers):
+        if all(driver.controller.over for driver in drivers):
             return
     raise AssertionError("it does not end")
 
@@ -594,11 +594,11 @@ def test_two_sweeps_with_one_study_and_storage_know_all_of_it(
         keep_record(driver.sweep)
     play_in_turns(*drivers)
     for driver in drivers:
-        driver.campaign.stop()
+        driver.controller.stop()
         assert parts_computed(driver)
-        with Beacon(driver.sweep) as beacon:
-            beacon.searches = functools.partial(outcome, driver.campaign, thorough=False)
-            beacon.end("finished")
+        with StateFile(driver.sweep) as state_file:
+            state_file.searches = functools.partial(outcome, driver.controller, thorough=False)
+            state_file.end("finished")
         place = str(driver.sweep.folder)
         state = answered(capsys, "status", place)
         assert state["stages"][1]["trials"] == 8
@@ -633,11 +633,11 @@ def test_a_dead_drivers_trials_are_taken_over(tmp_path: Path) -> None:
     search = {"storage": f"sqlite:///{tmp_path}/shared.db", "study": "together"}
     dead = Driver(tmp_path, document(search))
     dead.play(stop_after=4)
-    study = dead.campaign.searches[0].arms[0].study
+    study = dead.controller.searches[0].arms[0].study
     held = [trial.number for trial in study.trials() if trial.state.name == "RUNNING"]
     assert held
     driver = Driver(tmp_path, document(search))
-    mine = driver.campaign.searches[0].arms[0].study
+    mine = driver.controller.searches[0].arms[0].study
     mine.release_the_dead()
     assert [t.number for t in mine.trials() if t.state.name == "RUNNING"] == held, "it is alive"
     later = 10_000_000_000.0
@@ -653,7 +653,7 @@ def test_a_driver_that_was_taken_for_dead_changes_nothing_any_more(tmp_path: Pat
     silent = Driver(tmp_path / "silent", document(search))
     silent.play(stop_after=5)
     other = Driver(tmp_path / "other", document(search))
-    other.campaign.searches[0].arms[0].study.release_the_dead(10_000_000_000.0)
+    other.controller.searches[0].arms[0].study.release_the_dead(10_000_000_000.0)
     other.play()
     before = other.trials()
     silent.play()
@@ -679,10 +679,10 @@ def test_a_database_that_comes_and_goes_costs_nothing(tmp_path: Path) -> None:
         (tmp_path / folder).mkdir()
     whole = searched(tmp_path / "whole")
     driver = Driver(tmp_path / "flaky", document({}))
-    study = driver.campaign.searches[0].arms[0].study
+    study = driver.controller.searches[0].arms[0].study
     sound, flaky = study._storage, Flaky(study._storage, 1)
     study._storage = flaky  # type: ignore[assignment]
-    while not driver.campaign.over:
+    while not driver.controller.over:
         try:
             driver.play(stop_after=len(driver.computed) + 1)
         except (AssertionError, StorageInternalError):
@@ -695,9 +695,9 @@ def test_a_database_that_comes_and_goes_costs_nothing(tmp_path: Path) -> None:
 def test_what_a_failed_run_takes_with_it(tmp_path: Path) -> None:
     driver = Driver(tmp_path, document({}))
     driver.play(stop_after=3)
-    node = next(n for n in driver.sweep.board.having(Status.WAITING) if n.part)
-    driver.sweep.board.start(node.key)
-    driver.sweep.board.fail(node.key)
+    node = next(n for n in driver.sweep.scheduler.having(Status.WAITING) if n.part)
+    driver.sweep.scheduler.start(node.key)
+    driver.sweep.scheduler.fail(node.key)
     driver.play()
     states = [trial["state"] for trial in driver.trials()]
     assert states.count("failed") == 1

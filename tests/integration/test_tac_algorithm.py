@@ -78,7 +78,7 @@ def fingerprint(algo: TAC, iterations: int) -> list[dict[str, float]]:
 
 
 def weight_sums(algo: TAC) -> dict[str, float]:
-    parts = algo.get_parts()
+    parts = algo.get_network_weights()
     return {
         f"{part}.{name}": float(np.sum(array, dtype=np.float64))
         for part, arrays in parts.items()

@@ -6,7 +6,7 @@ import subprocess
 import sys
 
 from music_rllib import names
-from music_rllib.tracking.tracker import _check_metric_name
+from music_rllib.tracking.spool import check_metric_name
 
 CONSTANTS = {
     key: value for key, value in vars(names).items() if key.isupper() and isinstance(value, str)
@@ -15,7 +15,7 @@ CONSTANTS = {
 
 def test_every_name_is_one_that_mlflow_accepts() -> None:
     for value in CONSTANTS.values():
-        _check_metric_name(value)
+        check_metric_name(value)
 
 
 def test_no_two_metrics_share_a_name() -> None:

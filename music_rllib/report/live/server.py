@@ -23,7 +23,7 @@ from urllib.parse import parse_qs, urlsplit
 
 from music_rllib.errors import BadInputError
 from music_rllib.experiment import sweep_files
-from music_rllib.experiment.location import Found
+from music_rllib.experiment.location import SweepLocation
 from music_rllib.report.live.state import Progress
 from music_rllib.results.data import ReportError
 from music_rllib.store.object_folder import StorageError
@@ -80,12 +80,12 @@ class LivePage:
                 self.html, self.version = html, self.version + 1
 
 
-def stop(found: Found) -> None:
+def stop(found: SweepLocation) -> None:
     """Ask the sweep to save its runs and end."""
     sweep_files.write(found.storage, f"{found.name}/{sweep_files.STOP}", '{"stop": true}')
 
 
-def resume(found: Found, folder: Path) -> Path:
+def resume(found: SweepLocation, folder: Path) -> Path:
     """Go on with the sweep in a process of its own, which outlives the page.
 
     Returns:
@@ -112,7 +112,7 @@ class Server(ThreadingHTTPServer):
     token: str
 
 
-def make_server(page: LivePage, found: Found, folder: Path, port: int) -> Server:
+def make_server(page: LivePage, found: SweepLocation, folder: Path, port: int) -> Server:
     """A server that is ready to serve, with a token of its own.
 
     Raises:
@@ -143,7 +143,7 @@ def serve(server: Server, page: LivePage, say: Callable[[str], None]) -> None:
 
 class _Handler(BaseHTTPRequestHandler):
     page: LivePage
-    found: Found
+    found: SweepLocation
     folder: Path
     token: str
     protocol_version = "HTTP/1.1"

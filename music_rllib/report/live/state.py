@@ -7,7 +7,7 @@ from typing import Any
 
 from music_rllib import names
 from music_rllib.experiment import sweep_files
-from music_rllib.experiment.location import Found
+from music_rllib.experiment.location import SweepLocation
 
 __all__ = ["Progress"]
 
@@ -20,7 +20,7 @@ SHOWN = 50
 class Progress:
     """What the page shows of a sweep's `state.json`."""
 
-    def __init__(self, found: Found) -> None:
+    def __init__(self, found: SweepLocation) -> None:
         self._found = found
         self._seen: deque[tuple[float, int]] = deque()
 

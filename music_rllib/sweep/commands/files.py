@@ -57,7 +57,7 @@ def presets(json: Json = False) -> int:
 
     By 'preset: NAME' in it.
     """
-    from music_rllib.config.presets import SHIPPED, shipped_presets
+    from music_rllib.config.reading.presets import SHIPPED, shipped_presets
 
     found = shipped_presets()
     if json:

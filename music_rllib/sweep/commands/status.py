@@ -12,7 +12,7 @@ from music_rllib.errors import FAILED, BadInputError
 from music_rllib.sweep.cli_helpers import Place, Storage
 
 if TYPE_CHECKING:
-    from music_rllib.experiment.location import Found
+    from music_rllib.experiment.location import SweepLocation
 
 __all__ = ["EXAMPLES", "state_of", "status"]
 
@@ -63,7 +63,7 @@ def status(
             state = state_of(found)
 
 
-def labels_of(found: Found) -> list[str]:
+def labels_of(found: SweepLocation) -> list[str]:
     """The labels of the sweep's runs, as far as they are known."""
     from music_rllib.experiment import sweep_files
 
@@ -74,7 +74,7 @@ def _code(state: dict[str, Any]) -> int:
     return FAILED if state.get("damaged") else 0
 
 
-def state_of(found: Found) -> dict[str, Any]:
+def state_of(found: SweepLocation) -> dict[str, Any]:
     """`state.json`, with what became of its driver and of its finished runs."""
     from music_rllib.experiment import sweep_files
     from music_rllib.store.node_store import NodeStore

@@ -20,10 +20,10 @@ from music_rllib.store.run_record import Report, RunResult
 from music_rllib.tracking.sender import Backlog
 from music_rllib.tracking.tracker import Point, Tracker
 
-__all__ = ["Logbook"]
+__all__ = ["MlflowListener"]
 
 
-class Logbook(Listener):
+class MlflowListener(Listener):
     """Passes on what happens to the tracker; where that can't keep it, training goes on."""
 
     def __init__(

@@ -18,12 +18,12 @@ from music_rllib import names
 from music_rllib.config.tac_settings import in_words
 from music_rllib.experiment.listener import Failure, Listener
 from music_rllib.experiment.plan import Node
-from music_rllib.experiment.scheduler import Board, Status
+from music_rllib.experiment.scheduler import Scheduler, Status
 from music_rllib.store.files import write_atomically
 from music_rllib.store.run_record import Report, RunResult
 from music_rllib.tracking.sender import Backlog
 
-__all__ = ["GAUGES", "TARGETS", "Gauges"]
+__all__ = ["GAUGES", "TARGETS", "PrometheusListener"]
 
 TARGETS = ".prometheus"
 """Folder beside the sweeps' own: NAME.json says where this Ray's metrics are. Prometheus' file_sd
@@ -63,20 +63,20 @@ GAUGES = {
 """Name, before Ray's `ray_`, to what it means."""
 
 
-class Gauges(Listener):
+class PrometheusListener(Listener):
     """Sets every gauge of a sweep every few seconds."""
 
     def __init__(
         self,
         sweep: str,
-        board: Board,
+        scheduler: Scheduler,
         backlog: Callable[[], Backlog],
         folder: Path,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
         """Say beside the sweep's `folder` where Prometheus finds them; `now` is in seconds."""
         self._sweep = sweep
-        self._board = board
+        self._scheduler = scheduler
         self._backlog = backlog
         self._targets = folder.parent / TARGETS / f"{folder.name}.json"
         self._now = now
@@ -158,7 +158,7 @@ class Gauges(Listener):
                 self._gauges[gauge].set(value, tags=tags)
         for status in Status:
             tags = {"sweep": self._sweep, "state": status.value}
-            self._gauges["music_runs"].set(len(self._board.having(status)), tags=tags)
+            self._gauges["music_runs"].set(len(self._scheduler.having(status)), tags=tags)
         backlog, tags = self._backlog(), {"sweep": self._sweep}
         self._gauges["music_undelivered_records"].set(backlog.records, tags=tags)
         self._gauges["music_undelivered_artefacts"].set(backlog.artefacts, tags=tags)

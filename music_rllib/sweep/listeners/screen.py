@@ -14,12 +14,12 @@ from rich.text import Text
 from music_rllib import names
 from music_rllib.experiment.listener import Failure, Listener
 from music_rllib.experiment.plan import Node, Plan
-from music_rllib.experiment.scheduler import Board, Status
+from music_rllib.experiment.scheduler import Scheduler, Status
 from music_rllib.labels import ShortLabels
 from music_rllib.store.run_record import Report, RunResult
 from music_rllib.sweep.views.tables import ROOMY, new_table
 from music_rllib.sweep.views.text import clock, evaluated_in_words, measured, percent
-from music_rllib.training.throughput import Pace
+from music_rllib.training.throughput import Throughput
 
 __all__ = ["Display"]
 
@@ -35,13 +35,13 @@ class Display(Listener):
         self,
         console: Console,
         plan: Plan,
-        board: Board,
+        scheduler: Scheduler,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
         """Show on `console`; `now` is a clock in seconds."""
         self._console = console
         self._plan = plan
-        self._board = board
+        self._scheduler = scheduler
         self._now = now
         self._began = now()
         self.short = ShortLabels(
@@ -54,7 +54,7 @@ class Display(Listener):
         self._best: str | None = None
         self._ended: dict[str, int] = {}
         """Environment steps that runs had spent which were interrupted, stopped early or failed."""
-        self._running: dict[str, tuple[Node, Pace]] = {}
+        self._running: dict[str, tuple[Node, Throughput]] = {}
         self._said: dict[str, float] = {}
         self._refreshed = self._headed = self._began
         self._live = (
@@ -87,8 +87,8 @@ class Display(Listener):
         self._running[node.key] = (node, self._new_pace(node))
         self.say(f"{self.short(node.label)}: started")
 
-    def _new_pace(self, node: Node) -> Pace:
-        return Pace(node.run.env_steps, node.run.tac.random_steps, self._now())
+    def _new_pace(self, node: Node) -> Throughput:
+        return Throughput(node.run.env_steps, node.run.tac.random_steps, self._now())
 
     def reported(self, node: Node, reports: list[Report]) -> None:
         _, pace = self._running.setdefault(node.key, (node, self._new_pace(node)))
@@ -100,7 +100,7 @@ class Display(Listener):
             self.say(f"{self.short(node.label)}: {self._progress_in_words(node, pace)}")
 
     @staticmethod
-    def _is_over(node: Node, pace: Pace) -> bool:
+    def _is_over(node: Node, pace: Throughput) -> bool:
         return pace.env_steps >= node.run.env_steps  # `finished` says it better
 
     def noted(self, node: Node, text: str) -> None:
@@ -177,7 +177,7 @@ class Display(Listener):
 
     def _summary(self) -> str:
         """`1 of 4 runs done, 8,000 of 24,000 env steps, 1:02 passed, about 2:10 left`."""
-        done = self._board.having(Status.FINISHED, Status.REUSED)
+        done = self._scheduler.having(Status.FINISHED, Status.REUSED)
         steps = sum(node.run.env_steps for node in done)
         steps += sum(pace.env_steps for _, pace in self._running.values())
         steps += sum(self._ended.values())
@@ -195,11 +195,11 @@ class Display(Listener):
         rates = [rate for pace in paces if (rate := pace.steps_per_second) is not None]
         if not rates or len(rates) < len(paces):
             return None
-        to_do = self._board.having(Status.WAITING, Status.STARTED)
+        to_do = self._scheduler.having(Status.WAITING, Status.STARTED)
         steps = sum(node.run.env_steps for node in to_do) - sum(pace.env_steps for pace in paces)
         return max(steps / sum(rates), *(pace.seconds_left(self._now()) or 0.0 for pace in paces))
 
-    def _progress_in_words(self, node: Node, pace: Pace) -> str:
+    def _progress_in_words(self, node: Node, pace: Throughput) -> str:
         parts = [f"{pace.env_steps:,} of {pace.budget:,} env steps"]
         rate, left = pace.steps_per_second, pace.seconds_left(self._now())
         if rate is not None:

@@ -29,14 +29,14 @@ from music_rllib.store.lease import process_start, this_machine
 from music_rllib.store.object_folder import StorageError
 from music_rllib.store.run_record import Report, RunResult, last_values
 
-__all__ = ["Beacon"]
+__all__ = ["StateFile"]
 
 LOCAL_SECONDS, REMOTE_SECONDS = 2.0, 15.0
 """Between two signs of life."""
 SHOWN_FAILURES = 20
 
 
-class Beacon(Listener):
+class StateFile(Listener):
     """Writes how far the sweep is, and looks whether it is told to stop."""
 
     def __init__(
@@ -67,12 +67,12 @@ class Beacon(Listener):
         self._due = 0.0
         self._planned = -1
         self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._speak, name="beacon", daemon=True)
+        self._thread = threading.Thread(target=self._speak, name="state_file", daemon=True)
         self._interval = REMOTE_SECONDS if sweep_files.is_remote(sweep.storage) else LOCAL_SECONDS
 
     def __enter__(self) -> Self:
         sweep_files.remove(self._sweep.storage, f"{self._sweep.config.name}/{sweep_files.STOP}")
-        for node in self._sweep.board.having(Status.REUSED):
+        for node in self._sweep.scheduler.having(Status.REUSED):
             result = self._sweep.store.result(node.key)
             if result is not None:
                 self._results[node.key] = result
@@ -163,7 +163,7 @@ class Beacon(Listener):
     # -- speaking ----------------------------------------------------------------------------
 
     def update(self) -> None:
-        """Describe the sweep anew; only from the driver's loop, as the board may change."""
+        """Describe the sweep anew; only from the driver's loop, as the scheduler may change."""
         self._state = self._describe()
 
     def _describe(self) -> dict[str, Any]:
@@ -172,7 +172,9 @@ class Beacon(Listener):
         steps_done = steps_left = 0
         running = []
         for node in sweep.plan.nodes:
-            status = sweep.board[node.key] if sweep.board.knows(node.key) else Status.WAITING
+            status = (
+                sweep.scheduler[node.key] if sweep.scheduler.knows(node.key) else Status.WAITING
+            )
             counts.setdefault(node.stage, Counter())[str(status)] += 1
             if status in (Status.FINISHED, Status.REUSED):
                 steps_done += node.run.env_steps
@@ -210,7 +212,7 @@ class Beacon(Listener):
             "running": running,
             "best": best_so_far(self._at_the_task(), sweep.plan, self._results, searches),
             "searches": searches,
-            "pruned": [node.key for node in sweep.board.having(Status.PRUNED)],
+            "pruned": [node.key for node in sweep.scheduler.having(Status.PRUNED)],
             "failures": self._failures[-SHOWN_FAILURES:],
         }
 

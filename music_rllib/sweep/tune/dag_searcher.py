@@ -8,7 +8,7 @@ from typing import Any
 from ray.tune.search import Searcher
 
 from music_rllib.experiment.plan import Node
-from music_rllib.experiment.scheduler import Board
+from music_rllib.experiment.scheduler import Scheduler
 
 __all__ = ["DagSearcher"]
 
@@ -26,21 +26,21 @@ class DagSearcher(Searcher):
 
     def __init__(
         self,
-        board: Board,
+        scheduler: Scheduler,
         config_of: Callable[[Node], dict[str, Any]],
         advance: Callable[[], bool] = lambda: False,
         stopped: Callable[[], bool] = lambda: False,
     ) -> None:
-        """Hand out the nodes on `board`.
+        """Hand out the nodes in `scheduler`.
 
         Args:
-            board: Where they are.
+            scheduler: Where they are.
             config_of: Makes a Tune config of a node.
-            advance: Lets a search put more on the board; whether more may come later.
+            advance: Lets a search put more in the scheduler; whether more may come later.
             stopped: Whether nothing more is to be handed out.
         """
         super().__init__()
-        self._board = board
+        self._scheduler = scheduler
         self._config_of = config_of
         self._advance = advance
         self._stopped = stopped
@@ -50,11 +50,11 @@ class DagSearcher(Searcher):
         if self._stopped():
             return str(Searcher.FINISHED)
         more = self._advance()
-        node = self._board.next_ready()
+        node = self._scheduler.next_ready()
         if node is None:
-            done = self._board.all_handed_out and not more
+            done = self._scheduler.all_handed_out and not more
             return str(Searcher.FINISHED) if done else None
-        self._board.start(node.key)
+        self._scheduler.start(node.key)
         return self._config_of(node)
 
     def on_trial_complete(

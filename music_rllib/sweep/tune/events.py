@@ -14,7 +14,7 @@ from ray.tune.experiment import Trial
 
 from music_rllib.experiment.listener import Failure, Listener
 from music_rllib.experiment.plan import Node
-from music_rllib.experiment.scheduler import Board
+from music_rllib.experiment.scheduler import Scheduler
 from music_rllib.redaction import redact
 from music_rllib.store.node_store import NodeStore
 from music_rllib.store.object_folder import DamagedError
@@ -39,13 +39,13 @@ _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 
 
 class TuneEvents(Callback):
-    """Moves nodes on the board as Tune's trials go, and tells the listeners."""
+    """Moves nodes in the scheduler as Tune's trials go, and tells the listeners."""
 
     def __init__(
-        self, board: Board, store: NodeStore, listeners: Iterable[Listener], failures: Path
+        self, scheduler: Scheduler, store: NodeStore, listeners: Iterable[Listener], failures: Path
     ) -> None:
         """Write tracebacks into the folder `failures`."""
-        self._board = board
+        self._scheduler = scheduler
         self._store = store
         self._listeners = list(listeners)
         self._failures = failures
@@ -98,7 +98,7 @@ class TuneEvents(Callback):
             self._fail(node, cause, trial.last_result[TRACEBACK])
             return
         if (reached := trial.last_result.get(PAUSED)) is not None:
-            self._board.pause(node.key, reached)
+            self._scheduler.pause(node.key, reached)
             for listener in self._listeners:
                 listener.paused(node)
             return
@@ -108,7 +108,7 @@ class TuneEvents(Callback):
             self._fail(node, str(error), str(error))
             return
         assert result is not None, "a run publishes its result"
-        self._board.finish(node.key)
+        self._scheduler.finish(node.key)
         for listener in self._listeners:
             listener.finished(node, result)
 
@@ -146,14 +146,14 @@ class TuneEvents(Callback):
             log.write_text(f"{node.label} (node {node.key})\n\n{text}\n", encoding="utf-8")
         except OSError as error:  # perhaps the very reason of the failure: the others go on
             cause += f"\n(the traceback could not be kept: {error})"
-        dependants = self._board.fail(node.key)
+        dependants = self._scheduler.fail(node.key)
         for listener in self._listeners:
             listener.failed(node, Failure(cause, log))
             for dependant in dependants:
                 listener.skipped(dependant, node)
 
     def _node(self, trial: Trial) -> Node:
-        return self._board.node(NodeJob.from_tune(trial.config).key)
+        return self._scheduler.node(NodeJob.from_tune(trial.config).key)
 
 
 def _error_of(trial: Trial) -> BaseException | None:

@@ -26,7 +26,7 @@ from music_rllib.training.job import NodeJob
 from music_rllib.training.worker import RunTrainable
 
 if TYPE_CHECKING:
-    from music_rllib.search.controller import Campaign
+    from music_rllib.search.controller import SearchController
 
 __all__ = ["Outcome", "compute"]
 
@@ -44,17 +44,17 @@ def compute(
     listeners: Sequence[Listener],
     on_stop: Callable[[], None],
     on_ray_gone: Callable[[str | None], None],
-    campaign: Campaign | None = None,
+    controller: SearchController | None = None,
 ) -> Outcome:
     """Compute the waiting nodes, and those that searches ask for.
 
     Args:
-        sweep: Its board says afterwards what became of each node.
+        sweep: Its scheduler says afterwards what became of each node.
         listeners: Are told what happens.
         on_stop: Called, in a signal handler, when the user asks to stop.
         on_ray_gone: Called, in a thread, before the process ends because Ray has: with the cause,
             or None where the user's signal has ended that as well.
-        campaign: The searches; None where there are none.
+        controller: The searches; None where there are none.
 
     Raises:
         ClusterError: Ray can't be reached or can't hold a run.
@@ -62,22 +62,22 @@ def compute(
     resources = sweep.config.resources
     grace = sweep.config.checkpoints.grace_seconds
     stopping = StopSignals(on_stop, grace, on_ray_gone=on_ray_gone)
-    events = TuneEvents(sweep.board, sweep.store, listeners, sweep.folder / "failures")
+    events = TuneEvents(sweep.scheduler, sweep.store, listeners, sweep.folder / "failures")
     searcher = DagSearcher(
-        sweep.board,
+        sweep.scheduler,
         lambda node: NodeJob.of(
             node,
             sweep.storage,
             resources.cpus_per_run,
             gpus=resources.gpus_per_run,
             memory=int(resources.bundle.get("memory", 0)),
-            until=sweep.board.until(node.key),
+            until=sweep.scheduler.until(node.key),
             checkpoints=sweep.config.checkpoints,
             sweep=sweep.plan.name,
             stop_key=stopping.flag.key,
             hang_minutes=resources.hang_minutes,
         ).to_tune(),
-        **({} if campaign is None else {"advance": campaign.advance}),
+        **({} if controller is None else {"advance": controller.advance}),
         stopped=lambda: stopping.received is not None,
     )
     with (
@@ -94,7 +94,7 @@ def compute(
             tune_config=tune.TuneConfig(
                 search_alg=searcher,
                 # As many as the searcher says; -1 is without an end.
-                num_samples=-1 if campaign else len(sweep.board.having(Status.WAITING)),
+                num_samples=-1 if controller else len(sweep.scheduler.having(Status.WAITING)),
                 trial_name_creator=_trial_name,
                 trial_dirname_creator=_trial_name,
             ),
@@ -110,7 +110,7 @@ def compute(
             ),
         )
         tuner.fit()
-    done = sweep.board.complete and (campaign is None or campaign.over)
+    done = sweep.scheduler.complete and (controller is None or controller.over)
     return Outcome(stopped_by=None if done else stopping.received)
 
 

@@ -10,7 +10,7 @@ from ray.tune.search import Searcher
 
 from music_rllib.config.load import load_sweep
 from music_rllib.experiment.plan import Plan, make_plan
-from music_rllib.experiment.scheduler import Board, Status
+from music_rllib.experiment.scheduler import Scheduler, Status
 from music_rllib.sweep.tune.dag_searcher import DagSearcher
 
 
@@ -38,57 +38,57 @@ def plan(tmp_path: Path) -> Plan:
 
 
 def test_nodes_wait_for_their_inputs(plan: Plan) -> None:
-    board = Board(plan, finished=())
-    first, second = board.next_ready(), None
+    scheduler = Scheduler(plan, finished=())
+    first, second = scheduler.next_ready(), None
     assert first is not None
-    board.start(first.key)
-    second = board.next_ready()
+    scheduler.start(first.key)
+    second = scheduler.next_ready()
     assert second is not None
     assert [first.label, second.label] == ["a/FetchPush/seed0", "a/FetchPush/seed1"]
-    board.start(second.key)
-    assert board.next_ready() is None
-    assert not board.all_handed_out
-    board.finish(second.key)
-    third = board.next_ready()
+    scheduler.start(second.key)
+    assert scheduler.next_ready() is None
+    assert not scheduler.all_handed_out
+    scheduler.finish(second.key)
+    third = scheduler.next_ready()
     assert third is not None
     assert third.label == "b/FetchPush/tac.entropic_index=1/seed1"
 
 
 def test_one_after_the_other_a_seed_is_done_before_the_next(plan: Plan) -> None:
-    board = Board(plan, finished=())
+    scheduler = Scheduler(plan, finished=())
     order = []
-    while (ready := board.next_ready()) is not None:
-        board.start(ready.key)
-        board.finish(ready.key)
+    while (ready := scheduler.next_ready()) is not None:
+        scheduler.start(ready.key)
+        scheduler.finish(ready.key)
         order.append((ready.run.seed, ready.stage))
     assert order == [(seed, stage) for seed in (0, 1) for stage in "abbbccc"]
 
 
 def test_finished_nodes_are_reused(plan: Plan) -> None:
     keys = [node.key for node in plan.nodes]
-    board = Board(plan, finished=keys)
-    assert board.complete
-    assert board.having(Status.REUSED) == list(plan.nodes)
-    board = Board(plan, finished=keys[:2])
-    ready = board.next_ready()
+    scheduler = Scheduler(plan, finished=keys)
+    assert scheduler.complete
+    assert scheduler.having(Status.REUSED) == list(plan.nodes)
+    scheduler = Scheduler(plan, finished=keys[:2])
+    ready = scheduler.next_ready()
     assert ready is not None
     assert ready.stage == "b"
 
 
 def test_a_failure_skips_all_that_depend_on_it_and_nothing_else(plan: Plan) -> None:
-    board = Board(plan, finished=())
+    scheduler = Scheduler(plan, finished=())
     for node in plan.nodes[:2]:
-        board.start(node.key)
-    skipped = board.fail(plan.nodes[0].key)
+        scheduler.start(node.key)
+    skipped = scheduler.fail(plan.nodes[0].key)
     assert {node.run.seed for node in skipped} == {0}
     assert len(skipped) == 6
-    board.finish(plan.nodes[1].key)
-    while (ready := board.next_ready()) is not None:
-        board.start(ready.key)
-        board.finish(ready.key)
-    assert board.complete
-    assert len(board.having(Status.FINISHED)) == 7
-    assert len(board.having(Status.SKIPPED)) == 6
+    scheduler.finish(plan.nodes[1].key)
+    while (ready := scheduler.next_ready()) is not None:
+        scheduler.start(ready.key)
+        scheduler.finish(ready.key)
+    assert scheduler.complete
+    assert len(scheduler.having(Status.FINISHED)) == 7
+    assert len(scheduler.having(Status.SKIPPED)) == 6
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -97,8 +97,8 @@ def test_in_any_order_of_events_every_node_is_handed_out_once_after_its_input(
 ) -> None:
     """Plays Tune: asks the searcher, completes or fails running nodes in random order."""
     rng = random.Random(seed)
-    board = Board(plan, finished=())
-    searcher = DagSearcher(board, lambda node: {"key": node.key})
+    scheduler = Scheduler(plan, finished=())
+    searcher = DagSearcher(scheduler, lambda node: {"key": node.key})
     running: list[str] = []
     handed_out: list[str] = []
     while True:
@@ -114,17 +114,17 @@ def test_in_any_order_of_events_every_node_is_handed_out_once_after_its_input(
         if running and (suggestion is None or rng.random() < 0.5):
             key = running.pop(rng.randrange(len(running)))
             if rng.random() < 0.2:
-                board.fail(key)
+                scheduler.fail(key)
             else:
-                board.finish(key)
+                scheduler.finish(key)
     for key in running:
-        board.finish(key)
-    assert board.complete
+        scheduler.finish(key)
+    assert scheduler.complete
     assert len(set(handed_out)) == len(handed_out)
-    skipped = {node.key for node in board.having(Status.SKIPPED)}
+    skipped = {node.key for node in scheduler.having(Status.SKIPPED)}
     assert skipped | set(handed_out) == {node.key for node in plan.nodes}
     for key in handed_out:
-        source = board.node(key).input
+        source = scheduler.node(key).input
         if source is not None:
-            assert board[source.key] is Status.FINISHED
+            assert scheduler[source.key] is Status.FINISHED
             assert handed_out.index(source.key) < handed_out.index(key)

@@ -16,7 +16,7 @@ from music_rllib.policy import Policy, PolicyError, load_policy
 from music_rllib.policy.rollout import open_task
 from music_rllib.store.handoff import HandoffError
 from music_rllib.store.handoff import read_handoff as read_handoff_of
-from music_rllib.store.object_folder import DamagedError, SealedFolders, open_storage
+from music_rllib.store.object_folder import DamagedError, ObjectFolders, open_storage
 from music_rllib.sweep.cli import main as sweep_main
 from tests.hostile_files import INPUTS, PENDULUM, STRANGE, seal_policy, write_policy
 
@@ -135,12 +135,12 @@ def test_only_a_regular_file_is_a_manifest(tmp_path: Path, kind: str) -> None:
     (node / "manifest.json").unlink()
     STRANGE[kind](node / "manifest.json")
     with pytest.raises(DamagedError, match=r"manifest\.json must be"):
-        SealedFolders(*open_storage(str(tmp_path))).manifest("node")
+        ObjectFolders(*open_storage(str(tmp_path))).manifest("node")
 
 
 @pytest.mark.parametrize("kind", STRANGE)
 def test_a_checkpoint_s_other_files_are_not_even_looked_at(tmp_path: Path, kind: str) -> None:
-    storage = SealedFolders(*open_storage(str(tmp_path)))
+    storage = ObjectFolders(*open_storage(str(tmp_path)))
     with storage.sealing("node", {}) as folder:
         write_policy(folder, PENDULUM)
         (folder / "state.safetensors").write_bytes(b"much")

@@ -14,7 +14,7 @@ from urllib.request import Request, urlopen
 import pytest
 
 from music_rllib.experiment import sweep_files
-from music_rllib.experiment.location import Found
+from music_rllib.experiment.location import SweepLocation
 from music_rllib.report.live import server
 from music_rllib.report.live.state import Progress
 from music_rllib.store.lease import this_machine
@@ -48,12 +48,12 @@ def write_state(folder: Path, done: int, heartbeat: float, **driver: Any) -> Non
 
 
 @pytest.fixture
-def found(tmp_path: Path) -> Found:
-    return Found(storage=str(tmp_path), name="tiny")
+def found(tmp_path: Path) -> SweepLocation:
+    return SweepLocation(storage=str(tmp_path), name="tiny")
 
 
 def test_speed_and_the_time_left_are_those_of_the_last_minutes(
-    found: Found, tmp_path: Path
+    found: SweepLocation, tmp_path: Path
 ) -> None:
     progress, now = Progress(found), time.time()
     assert progress.read() == {"sweep": "tiny", "state": "not started"}
@@ -74,7 +74,7 @@ def test_speed_and_the_time_left_are_those_of_the_last_minutes(
 
 @pytest.fixture
 def served(
-    found: Found, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    found: SweepLocation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[tuple[str, str]]:
     """The address without its token, and the token."""
     monkeypatch.setattr(server, "LEAST_PAUSE", 0.05)

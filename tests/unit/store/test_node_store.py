@@ -16,7 +16,7 @@ from fsspec.implementations.memory import MemoryFileSystem  # type: ignore[impor
 from music_rllib.store import object_folder, verified
 from music_rllib.store.files import canonical_json, write_atomically
 from music_rllib.store.node_store import NodeStore
-from music_rllib.store.object_folder import DamagedError, SealedFolders, StorageError, open_storage
+from music_rllib.store.object_folder import DamagedError, ObjectFolders, StorageError, open_storage
 from music_rllib.store.run_record import (
     HISTORY,
     Report,
@@ -107,7 +107,7 @@ def test_an_interrupted_publication_leaves_nothing(
         raise KeyboardInterrupt
 
     for step in ("_rename", "_upload"):
-        monkeypatch.setattr(SealedFolders, step, interrupted)
+        monkeypatch.setattr(ObjectFolders, step, interrupted)
     with pytest.raises(KeyboardInterrupt):
         store.publish(KEY, produced, RESULT)
     monkeypatch.undo()
@@ -163,13 +163,13 @@ def test_what_was_sound_is_not_read_again_and_damage_since_is_found(
     tmp_path: Path, produced: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read: list[str] = []
-    check = SealedFolders.check
+    check = ObjectFolders.check
 
-    def counting(folders: SealedFolders, name: str) -> None:
+    def counting(folders: ObjectFolders, name: str) -> None:
         read.append(name)
         check(folders, name)
 
-    monkeypatch.setattr(SealedFolders, "check", counting)
+    monkeypatch.setattr(ObjectFolders, "check", counting)
     # The times of the last change of a file's attributes can't be set: they count as old here.
     monkeypatch.setattr(verified, "SETTLED_SECONDS", 0.0)
     keys = [f"{number:020d}" for number in range(3)]

@@ -37,7 +37,7 @@ from music_rllib.store.object_folder import DamagedError
 from music_rllib.store.paths import sweep_folder
 from music_rllib.store.run_record import HISTORY, Report, RunResult, to_json_lines
 from music_rllib.sweep import clean, cli
-from music_rllib.sweep.listeners.state_file import Beacon
+from music_rllib.sweep.listeners.state_file import StateFile
 
 SWEEP: dict[str, Any] = {
     "name": "mine",
@@ -107,7 +107,7 @@ def opened(storage: str, tmp_path: Path, **changes: Any) -> Sweep:
 
 def finish(
     sweep: Sweep,
-    beacon: Beacon,
+    state_file: StateFile,
     node: Node,
     value: float,
     folder: Path,
@@ -123,10 +123,10 @@ def finish(
     (folder / "handoff/handoff.json").write_text("{}")
     result = RunResult(label=node.label, env_steps=4000, seconds=1.0, metrics=metrics)
     sweep.store.publish(node.key, folder, result)
-    sweep.board.start(node.key)
-    beacon.reported(node, [report])
-    sweep.board.finish(node.key)
-    beacon.finished(node, result)
+    sweep.scheduler.start(node.key)
+    state_file.reported(node, [report])
+    sweep.scheduler.finish(node.key)
+    state_file.finished(node, result)
 
 
 HEIGHTS = {1.0: 0.2, 1.5: 0.8, 2.0: 0.3}
@@ -134,11 +134,11 @@ HEIGHTS = {1.0: 0.2, 1.5: 0.8, 2.0: 0.3}
 
 def played(storage: str, tmp_path: Path, runs: int = 9, seeds: int = 3) -> Sweep:
     sweep = opened(storage, tmp_path, seeds=list(range(seeds)))
-    with Beacon(sweep) as beacon:
+    with StateFile(sweep) as state_file:
         for node in list(sweep.plan.nodes)[:runs]:
             height = HEIGHTS[float(node.run.tac.entropic_index)]  # type: ignore[arg-type]
-            finish(sweep, beacon, node, height + 0.02 * node.run.seed, tmp_path / "made")
-        beacon.end("finished" if runs == 9 else "stopped")
+            finish(sweep, state_file, node, height + 0.02 * node.run.seed, tmp_path / "made")
+        state_file.end("finished" if runs == 9 else "stopped")
     return sweep
 
 
@@ -209,13 +209,13 @@ def test_compare_and_the_report_say_the_same_of_the_same_sweep(
     tasks, seeds = ["FetchPush", "FetchSlide"], list(range(6))
     sweep = opened(storage, tmp_path, tasks=tasks, seeds=seeds)
     unfinished = {(1.5, "FetchSlide", 5), (1.5, "FetchPush", 2), (2.0, "FetchPush", 0)}
-    with Beacon(sweep) as beacon:
+    with StateFile(sweep) as state_file:
         for node in sweep.plan.nodes:
             q, task = float(node.run.tac.entropic_index), node.run.task.name  # type: ignore[arg-type]
             if (q, task, node.run.seed) not in unfinished:
                 height = HEIGHTS[q] + 0.15 * (task == "FetchPush") + 0.01 * node.run.seed
-                finish(sweep, beacon, node, height, tmp_path / "made")
-        beacon.end("stopped")
+                finish(sweep, state_file, node, height, tmp_path / "made")
+        state_file.end("stopped")
     groups = program("compare", f"{storage}/mine", "--json").document["groups"]
     (analysis,) = analyse(as_logged(sweep))
     assert [group["tasks"] for group in groups] == ["all tasks", *tasks]
@@ -298,15 +298,15 @@ def test_a_condition_with_all_its_runs_is_better_than_a_lucky_one(
     sweep = opened(storage, tmp_path)
     heights = {1.0: 0.2, 1.5: 0.3, 2.0: 0.99}
 
-    def play(beacon: Beacon, *cells: tuple[float, int]) -> None:
+    def play(state_file: StateFile, *cells: tuple[float, int]) -> None:
         for node in sweep.plan.nodes:
             q = float(node.run.tac.entropic_index)  # type: ignore[arg-type]
             if (q, node.run.seed) in cells:
-                finish(sweep, beacon, node, heights[q], tmp_path / "made")
+                finish(sweep, state_file, node, heights[q], tmp_path / "made")
 
-    with Beacon(sweep) as beacon:
-        play(beacon, (2.0, 0))
-        beacon.end("stopped")
+    with StateFile(sweep) as state_file:
+        play(state_file, (2.0, 0))
+        state_file.end("stopped")
     assert (
         "1 of 3 runs (no condition has all of its runs yet)"
         in program("status", f"{storage}/mine").output
@@ -314,10 +314,10 @@ def test_a_condition_with_all_its_runs_is_better_than_a_lucky_one(
     lucky = program("best", f"{storage}/mine", "--output", "lucky", "--json").document
     assert lucky["values"] == {"tac.entropic_index": 2.0}
     assert "over 1 runs, of 3 planned: no condition has all of its runs" in lucky["why"]
-    with Beacon(sweep) as beacon:
-        beacon.reused(next(n for n in sweep.plan.nodes if n.key in sweep.finished))
-        play(beacon, (1.0, 0), (1.5, 0), (1.5, 1), (1.5, 2))
-        beacon.end("stopped")
+    with StateFile(sweep) as state_file:
+        state_file.reused(next(n for n in sweep.plan.nodes if n.key in sweep.finished))
+        play(state_file, (1.0, 0), (1.5, 0), (1.5, 1), (1.5, 2))
+        state_file.end("stopped")
     whole = program("best", f"{storage}/mine", "--output", "whole", "--json").document
     assert whole["values"] == {"tac.entropic_index": 1.5}
     state = program("status", f"{storage}/mine", "--json").document
@@ -329,11 +329,11 @@ def test_tasks_without_success_are_judged_by_their_return(
 ) -> None:
     task = {"env_id": "Reacher-v5", "horizon": 50, "success_key": None}
     sweep = opened(storage, tmp_path, environments={"Reacher": task}, tasks=["Reacher"])
-    with Beacon(sweep) as beacon:
+    with StateFile(sweep) as state_file:
         for node in list(sweep.plan.nodes):
             height = -HEIGHTS[float(node.run.tac.entropic_index)]  # type: ignore[arg-type]
-            finish(sweep, beacon, node, height, tmp_path / "made", names.EVAL_RETURN)
-        beacon.end("finished")
+            finish(sweep, state_file, node, height, tmp_path / "made", names.EVAL_RETURN)
+        state_file.end("finished")
     place = f"{storage}/mine"
     document = program("compare", place, "--json").document
     assert document["metric"] == names.EVAL_RETURN
@@ -411,17 +411,17 @@ def test_clean_is_refused_while_a_sweep_runs_that_shares_runs(
 ) -> None:
     played(storage, tmp_path)
     apart = opened(storage, tmp_path, name="apart", seeds=[7])
-    with Beacon(apart) as beacon:
+    with StateFile(apart) as state_file:
         assert program("clean", f"{storage}/mine").code == 0
-        beacon.end("stopped")
+        state_file.end("stopped")
     other = opened(storage, tmp_path, name="other", seeds=[0])
-    with Beacon(other) as beacon:
+    with StateFile(other) as state_file:
         refused = program("clean", f"{storage}/mine", "--all", "--yes")
         assert (refused.code, "mine shares 3 with other: stop that first" in refused.errors) == (
             2,
             True,
         )
-        beacon.end("stopped")
+        state_file.end("stopped")
     assert program("clean", f"{storage}/mine").code == 0
 
 
@@ -457,14 +457,14 @@ def test_stop_reaches_the_driver(
     before = signal.signal(signal.SIGINT, lambda *_: received.set())
     try:
         sweep = opened(storage, tmp_path)
-        with Beacon(sweep) as beacon:
+        with StateFile(sweep) as state_file:
             assert sweep_files.is_alive(sweep_files.read(storage, "mine/state.json"))
             refused = program("clean", f"{storage}/mine")
             assert (refused.code, "must not be running" in refused.errors) == (2, True)
             asked = program("stop", f"{storage}/mine", "--wait", "0")
             assert (asked.code, "was told to stop" in asked.output) == (0, True)
             assert received.wait(60)
-            beacon.end("stopped")
+            state_file.end("stopped")
     finally:
         signal.signal(signal.SIGINT, before)
     again = program("stop", f"{storage}/mine", "--json").document
@@ -475,20 +475,20 @@ def test_a_driver_that_was_killed_is_interrupted(
     storage: str, tmp_path: Path, program: Program
 ) -> None:
     sweep = opened(storage, tmp_path)
-    with Beacon(sweep) as beacon:
+    with StateFile(sweep) as state_file:
         pass
     state = sweep_files.read(storage, "mine/state.json")
     state["driver"] |= {"ended": None, "outcome": "running", "pid": 2**22 + 1}
     sweep_files.keep(sweep, sweep_files.STATE, sweep_files.as_json(state))
-    assert beacon is not None
+    assert state_file is not None
     assert program("status", f"{storage}/mine", "--json").document["state"] == "interrupted"
 
 
 def test_nothing_runs_after_a_crash(storage: str, tmp_path: Path, program: Program) -> None:
     sweep = opened(storage, tmp_path)
     node = sweep.plan.nodes[0]
-    with contextlib.suppress(RuntimeError), Beacon(sweep):
-        sweep.board.start(node.key)
+    with contextlib.suppress(RuntimeError), StateFile(sweep):
+        sweep.scheduler.start(node.key)
         raise RuntimeError("out of luck")
     state = program("status", f"{storage}/mine", "--json").document
     assert (state["state"], state["running"]) == ("failed", [])
@@ -592,7 +592,7 @@ def test_a_damaged_run_is_named_by_every_command_and_trained_again_when_asked(
     removed: list[str] = []
     again = open_sweep(sweep.config, sweep.plan, storage, sweep.folder, removed.append)
     assert [line.split(":")[0] for line in removed] == [bad.label]
-    assert again.board.next_ready() == bad
+    assert again.scheduler.next_ready() == bad
     assert len(again.finished) == 8
     assert program("plan", file, "--storage", storage).code == 0
     assert program("status", place).code == 0
@@ -607,8 +607,8 @@ def test_what_a_search_has_asked_for_before_is_verified_too(tmp_path: Path) -> N
     sweep.plan.add_trial("train", 0, {"tac.lr": 1e-3}, [0], "trial0")
     keep_record(sweep)
     (node,) = sweep.plan.nodes
-    with contextlib.suppress(KeyError):  # the board doesn't know it, which is enough here
-        finish(sweep, Beacon(sweep), node, 0.5, tmp_path / "made")
+    with contextlib.suppress(KeyError):  # the scheduler doesn't know it, which is enough here
+        finish(sweep, StateFile(sweep), node, 0.5, tmp_path / "made")
     (tmp_path / "results/nodes" / node.key / "handoff/handoff.json").write_text("{ }")
     with pytest.raises(DamagedError, match=rf"{node.label}: .*handoff\.json must have 2 bytes"):
         opened(storage, tmp_path, stages=stages, seeds=[0])

@@ -11,9 +11,9 @@ import yaml
 from music_rllib import names
 from music_rllib.config.load import load_sweep
 from music_rllib.experiment.plan import Plan, make_plan
-from music_rllib.experiment.scheduler import Board
+from music_rllib.experiment.scheduler import Scheduler
 from music_rllib.store.run_record import Report, RunResult
-from music_rllib.sweep.listeners.prometheus import Gauges
+from music_rllib.sweep.listeners.prometheus import PrometheusListener
 from music_rllib.tracking.sender import Backlog
 
 KEPT = 3
@@ -62,7 +62,9 @@ def test_what_is_exported_does_not_grow_with_the_runs_that_ended(
         return Backlog(records=0, artefacts=0, error=None)
 
     now = iter(range(0, 1000, 10))
-    gauges = Gauges("s", Board(plan, set()), backlog, tmp_path / "s", now=lambda: next(now))
+    gauges = PrometheusListener(
+        "s", Scheduler(plan, set()), backlog, tmp_path / "s", now=lambda: next(now)
+    )
     slow, *others = plan.nodes
     paused = others.pop()
     for node in (slow, paused, *others):

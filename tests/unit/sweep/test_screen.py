@@ -16,7 +16,7 @@ from music_rllib.config.schema import SweepConfig
 from music_rllib.config.tac_settings import LearnedAlpha, in_words
 from music_rllib.experiment.listener import Failure
 from music_rllib.experiment.plan import Plan, make_plan
-from music_rllib.experiment.scheduler import Board
+from music_rllib.experiment.scheduler import Scheduler
 from music_rllib.report.figures.palette import colour_of
 from music_rllib.schedules import Linear, Piecewise
 from music_rllib.store.paths import resolve_storage, sweep_folder
@@ -25,7 +25,7 @@ from music_rllib.sweep.listeners.screen import Display
 from music_rllib.sweep.views.alpha import adaptive_rows, adaptive_text, alpha_rows, alpha_table
 from music_rllib.sweep.views.tables import plan_view, results_table
 from music_rllib.sweep.views.text import clock, percent
-from music_rllib.training.throughput import Pace
+from music_rllib.training.throughput import Throughput
 
 DOCUMENT: dict[str, Any] = {
     "name": "s",
@@ -132,16 +132,16 @@ def test_the_plan_says_what_follows_what_is_measured(tmp_path: Path) -> None:
 
 
 def test_results_have_a_row_per_run_whatever_became_of_it(plan: Plan) -> None:
-    board = Board(plan, finished=[plan.nodes[1].key])
-    board.start(plan.nodes[0].key)
-    board.fail(plan.nodes[0].key)
-    board.start(plan.nodes[3].key)
+    scheduler = Scheduler(plan, finished=[plan.nodes[1].key])
+    scheduler.start(plan.nodes[0].key)
+    scheduler.fail(plan.nodes[0].key)
+    scheduler.start(plan.nodes[3].key)
     metrics = {names.EVAL_SUCCESS: 0.25, names.EVAL_SUCCESS_ANY: 0.5, names.MI_REWARD: -0.5}
     metrics |= {names.SHANNON_ENTROPY: 0.29, names.ENTROPY: -0.121}
     result = RunResult(label="x", env_steps=2000, seconds=125, metrics=metrics)
     console, text = screen()
     runs = {plan.nodes[1].key: "0123456789abcdef"}
-    given = (plan, board.__getitem__, {plan.nodes[1].key: result}, runs.get)
+    given = (plan, scheduler.__getitem__, {plan.nodes[1].key: result}, runs.get)
     console.print(results_table(*given))
     rows = [line.split() for line in text.getvalue().splitlines()[3:]]
     assert rows[1] == [
@@ -168,7 +168,9 @@ class Clock:
         return self.now
 
 
-def play(display: Display, plan: Plan, board: Board, time: Clock) -> Callable[[float], None]:
+def play(
+    display: Display, plan: Plan, scheduler: Scheduler, time: Clock
+) -> Callable[[float], None]:
     """One run that ends, one that fails."""
     good, bad = plan.nodes[:2]
 
@@ -177,14 +179,14 @@ def play(display: Display, plan: Plan, board: Board, time: Clock) -> Callable[[f
         display.tick()
 
     for node in (good, bad):
-        board.start(node.key)
+        scheduler.start(node.key)
         display.started(node)
     wait(10)
     display.reported(
         good, [report(1000, 10.0, **{names.EVAL_EPISODES: 5, names.EVAL_SUCCESS: 0.2})]
     )
     wait(1)
-    board.fail(bad.key)
+    scheduler.fail(bad.key)
     display.failed(bad, Failure("RuntimeError: the gripper fell off", Path("/logs/bad.txt")))
     display.skipped(plan.nodes[3], bad)
     wait(1)
@@ -193,11 +195,11 @@ def play(display: Display, plan: Plan, board: Board, time: Clock) -> Callable[[f
 
 def test_without_a_terminal_there_are_plain_lines(plan: Plan) -> None:
     console, text = screen()
-    board, time = Board(plan, finished=()), Clock()
-    with Display(console, plan, board, time) as display:
-        wait = play(display, plan, board, time)
+    scheduler, time = Scheduler(plan, finished=()), Clock()
+    with Display(console, plan, scheduler, time) as display:
+        wait = play(display, plan, scheduler, time)
         wait(8)
-        board.finish(plan.nodes[0].key)
+        scheduler.finish(plan.nodes[0].key)
         metrics = {names.EVAL_SUCCESS: 0.4, names.EVAL_SUCCESS_ANY: 0.6}
         result = RunResult(label="x", env_steps=2000, seconds=20.4, metrics=metrics)
         display.reported(plan.nodes[0], [report(2000, 20.4, **metrics)])
@@ -216,9 +218,9 @@ def test_without_a_terminal_there_are_plain_lines(plan: Plan) -> None:
 
 def test_a_run_without_evaluations_is_heard_of_now_and_then(plan: Plan) -> None:
     console, text = screen()
-    board, time = Board(plan, finished=()), Clock()
-    with Display(console, plan, board, time) as display:
-        board.start(plan.nodes[0].key)
+    scheduler, time = Scheduler(plan, finished=()), Clock()
+    with Display(console, plan, scheduler, time) as display:
+        scheduler.start(plan.nodes[0].key)
         display.started(plan.nodes[0])
         for second in range(1, 100):
             time.now += 1
@@ -230,9 +232,9 @@ def test_a_run_without_evaluations_is_heard_of_now_and_then(plan: Plan) -> None:
 
 def test_a_terminal_shows_a_live_table(plan: Plan) -> None:
     console, text = screen(terminal=True)
-    board, time = Board(plan, finished=()), Clock()
-    with Display(console, plan, board, time) as display:
-        play(display, plan, board, time)
+    scheduler, time = Scheduler(plan, finished=()), Clock()
+    with Display(console, plan, scheduler, time) as display:
+        play(display, plan, scheduler, time)
         shown = text.getvalue()
     assert "1,000 / 2,000" in shown
     assert "100" in shown
@@ -254,7 +256,7 @@ def test_tasks_without_success_are_shown_by_their_return(tmp_path: Path) -> None
     success = {names.EVAL_SUCCESS: 0.5, names.EVAL_RETURN: -20.0}
     for terminal in (False, True):
         console, text = screen(terminal=terminal)
-        with Display(console, plan, Board(plan, finished=()), time := Clock()) as display:
+        with Display(console, plan, Scheduler(plan, finished=()), time := Clock()) as display:
             display.started(plan.nodes[0])
             time.now += 10
             display.reported(plan.nodes[0], [report(1000, 10.0, **metrics)])
@@ -262,7 +264,7 @@ def test_tasks_without_success_are_shown_by_their_return(tmp_path: Path) -> None
         assert "return -5.25" in text.getvalue()
         assert "success" not in text.getvalue()
     console, text = screen()
-    with Display(console, plan, Board(plan, finished=())) as display:
+    with Display(console, plan, Scheduler(plan, finished=())) as display:
         result = RunResult(label="x", env_steps=2000, seconds=20, metrics=metrics)
         display.finished(plan.nodes[0], result)
     assert "finished, return -5.25, 2,000 env steps" in text.getvalue()
@@ -274,7 +276,7 @@ def test_tasks_without_success_are_shown_by_their_return(tmp_path: Path) -> None
         for node, found in zip(plan.nodes, (metrics, success), strict=True)
     }
     console, text = screen()
-    finished = Board(plan, finished=list(results))
+    finished = Scheduler(plan, finished=list(results))
     console.print(results_table(plan, finished.__getitem__, results, lambda _: None))
     rows = [line.split()[1:-4] for line in text.getvalue().splitlines()[3:]]
     assert rows == [["-", "-", "-5.25"], ["50", "%", "-", "-20"]]
@@ -298,12 +300,12 @@ def test_no_cell_is_cut(tmp_path: Path, width: int) -> None:
     plan = make_plan(config)
     metrics = {names.EVAL_RETURN: -1234.5, names.EVAL_SUCCESS: 0.25, names.EVAL_SUCCESS_ANY: 0.5}
     result = RunResult(label="x", env_steps=1_000_000, seconds=40_000, metrics=metrics)
-    board = Board(plan, finished=[plan.nodes[0].key])
+    scheduler = Scheduler(plan, finished=[plan.nodes[0].key])
     text = io.StringIO()
     console = Console(file=text, width=width, highlight=False, force_terminal=True)
-    with Display(console, plan, board, time := Clock()) as display:
+    with Display(console, plan, scheduler, time := Clock()) as display:
         for node in plan.nodes[1:4]:
-            board.start(node.key)
+            scheduler.start(node.key)
             display.started(node)
         time.now += 10
         for node in plan.nodes[1:4]:
@@ -311,7 +313,7 @@ def test_no_cell_is_cut(tmp_path: Path, width: int) -> None:
         console.print(display._view())
     console.print(plan_view(config, plan, set()))
     results = {node.key: result for node in plan.nodes[:3]}
-    console.print(results_table(plan, board.__getitem__, results, lambda _: None, width))
+    console.print(results_table(plan, scheduler.__getitem__, results, lambda _: None, width))
     shown = text.getvalue()
     assert "…" not in shown
     for word in ("25 %", "-1234", "interrupted", "1,000,000", "seed1"):
@@ -320,16 +322,16 @@ def test_no_cell_is_cut(tmp_path: Path, width: int) -> None:
 
 def test_what_a_failed_run_has_spent_stays_spent(plan: Plan) -> None:
     console, _ = screen(terminal=True)
-    board, time = Board(plan, finished=()), Clock()
-    with Display(console, plan, board, time) as display:
-        play(display, plan, board, time)
-        board.fail(plan.nodes[0].key)
+    scheduler, time = Scheduler(plan, finished=()), Clock()
+    with Display(console, plan, scheduler, time) as display:
+        play(display, plan, scheduler, time)
+        scheduler.fail(plan.nodes[0].key)
         display.failed(plan.nodes[0], Failure("RuntimeError: it broke", Path("/logs/x.txt")))
         assert display._summary().startswith("0 of 6 runs done, 1,000 of 24,000 env steps")
 
 
 def test_pace_is_that_of_the_last_reports() -> None:
-    pace = Pace(10_000, warm_up=0, now=0.0)
+    pace = Throughput(10_000, warm_up=0, now=0.0)
     assert pace.steps_per_second is None
     assert pace.seconds_left(5.0) is None
     pace.hear([report(1000, 20.0)], now=20.0)
@@ -343,7 +345,7 @@ def test_pace_is_that_of_the_last_reports() -> None:
 
 
 def test_random_steps_say_nothing_about_the_pace_of_learning() -> None:
-    pace = Pace(3000, warm_up=1000, now=0.0)
+    pace = Throughput(3000, warm_up=1000, now=0.0)
     pace.hear([report(500, 0.5), report(1000, 1.0)], now=1.0)
     assert pace.steps_per_second is None
     pace.hear([report(1500, 11.0)], now=11.0)

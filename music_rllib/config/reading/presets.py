@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import music_rllib
-from music_rllib.config.layers import SECTIONS
 from music_rllib.config.problems import ConfigError, shown
-from music_rllib.config.yaml_file import YamlFile, read_yaml
+from music_rllib.config.reading.layers import SECTIONS
+from music_rllib.config.reading.yaml_file import YamlFile, read_yaml
 from music_rllib.envs.tasks import closest
 
 __all__ = ["SHIPPED", "shipped_presets", "with_preset"]

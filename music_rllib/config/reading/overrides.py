@@ -12,10 +12,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path as FilePath
 from typing import Any, NamedTuple
 
-from music_rllib.config.layers import LAYER_KEYS, SECTIONS, all_settings
 from music_rllib.config.problems import ConfigError, Path, shown, unknown
+from music_rllib.config.reading.layers import LAYER_KEYS, SECTIONS, all_settings
+from music_rllib.config.reading.yaml_file import read_value
 from music_rllib.config.schema import Header, StageHeader
-from music_rllib.config.yaml_file import read_value
 
 __all__ = ["Override", "lay_overrides", "parse_overrides"]
 

@@ -1,0 +1,80 @@
+"""The Learner's modules as plain arrays by network, and back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from ray.rllib.core import DEFAULT_MODULE_ID
+
+from music_rllib.tac.normaliser import in_this_form
+from music_rllib.tac.rl_module import ESTIMATOR_MODULE
+
+__all__ = ["NetworkWeights", "by_module", "by_network"]
+
+NetworkWeights = dict[str, dict[str, NDArray[Any]]]
+"""Network name to array name to array."""
+
+
+def by_network(state: Mapping[str, Mapping[str, Any]]) -> NetworkWeights:
+    """The states of the Learner's modules as arrays of each network."""
+    found: NetworkWeights = {}
+    for name, array in state[DEFAULT_MODULE_ID].items():
+        network, _, rest = name.partition(".")
+        found.setdefault(network, {})[rest or network] = np.asarray(array)
+    if ESTIMATOR_MODULE in state:
+        found[ESTIMATOR_MODULE] = {
+            name.removeprefix("estimator."): np.asarray(array)
+            for name, array in state[ESTIMATOR_MODULE].items()
+        }
+    return found
+
+
+def by_module(
+    weights: Mapping[str, Mapping[str, NDArray[Any]]], own: NetworkWeights
+) -> dict[str, dict[str, NDArray[Any]]]:
+    """States for the Learner's modules.
+
+    Args:
+        weights: of some networks, of this version or an earlier one.
+        own: of all networks that there are.
+
+    Raises:
+        ValueError: an unknown network, or tensors that are missing, unknown or of other shape.
+    """
+    if "normaliser" in weights:
+        weights = {**weights, "normaliser": in_this_form(weights["normaliser"])}
+    if ESTIMATOR_MODULE in weights and ESTIMATOR_MODULE in own:
+        # Those of before version 3 use all inputs raw.
+        raw = {"offset": np.zeros_like, "scale": np.ones_like}
+        defaults = {name: like(own[ESTIMATOR_MODULE][name]) for name, like in raw.items()}
+        weights = {**weights, ESTIMATOR_MODULE: {**defaults, **weights[ESTIMATOR_MODULE]}}
+    modules: dict[str, dict[str, NDArray[Any]]] = {}
+    for network, arrays in weights.items():
+        _check_same_tensors(network, own.get(network), arrays)
+        module = ESTIMATOR_MODULE if network == ESTIMATOR_MODULE else DEFAULT_MODULE_ID
+        prefix = "estimator" if network == ESTIMATOR_MODULE else network
+        for name, array in arrays.items():
+            modules.setdefault(module, {})[f"{prefix}.{name}"] = array
+    return modules
+
+
+def _check_same_tensors(
+    network: str,
+    own: Mapping[str, NDArray[Any]] | None,
+    given: Mapping[str, NDArray[Any]],
+) -> None:
+    if own is None:
+        raise ValueError(f"{network}: this algorithm has no such network")
+    if own.keys() != given.keys():
+        missing, unknown = sorted(own.keys() - given.keys()), sorted(given.keys() - own.keys())
+        raise ValueError(
+            f"{network}: tensors missing: {missing or 'none'}, unknown: {unknown or 'none'}"
+        )
+    for name, array in given.items():
+        if array.shape != own[name].shape:
+            raise ValueError(
+                f"{network}.{name}: shape must be {own[name].shape}, got {array.shape}"
+            )
