@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from music_rllib.experiment.location import Found
+from music_rllib.experiment.location import SweepLocation
 from music_rllib.report.build import build_report
 from music_rllib.report.live import server
 from music_rllib.report.live.state import Progress
@@ -200,9 +200,9 @@ def test_the_live_page_takes_up_what_is_new_and_leaves_the_reader_where_he_is(
     write_state(tmp_path, 100, time.time())
     pages = {"html": render(report, live=True)}
     live = server.LivePage(
-        lambda: pages["html"], Progress(Found(storage=str(tmp_path), name="tiny"))
+        lambda: pages["html"], Progress(SweepLocation(storage=str(tmp_path), name="tiny"))
     )
-    http = server.make_server(live, Found(storage=str(tmp_path), name="tiny"), tmp_path, 0)
+    http = server.make_server(live, SweepLocation(storage=str(tmp_path), name="tiny"), tmp_path, 0)
     threading.Thread(target=http.serve_forever, daemon=True).start()
     address = f"http://127.0.0.1:{http.server_port}/"
 
