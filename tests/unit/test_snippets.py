@@ -103,7 +103,6 @@ def parse(command: Any, name: str, words: list[str]) -> None:
 
 
 def application(module: str) -> Any:
-    pytest.importorskip("music_rllib.program", reason="commands are on Typer with it")
     return typer.main.get_command(importlib.import_module(module).app)
 
 
