@@ -46,6 +46,7 @@ operations
 :hidden:
 :caption: Reference
 algorithms
+architecture
 api
 reliability
 performance

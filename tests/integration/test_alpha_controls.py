@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from ray.rllib.core import DEFAULT_MODULE_ID
 from ray.rllib.policy.sample_batch import MultiAgentBatch, SampleBatch
 
@@ -62,7 +63,7 @@ def test_a_learned_alpha_reaches_a_width() -> None:
     built = learner(entropic_index=2.0, bootstrap="critics", alpha=alpha)
     learn(built, 600)
     policy = built.module[DEFAULT_MODULE_ID].unwrapped()
-    _, log_std = policy.policy_parameters(policy.normaliser(built._tensor([np.ones((1, 1), "f")])))
+    _, log_std = policy.policy_parameters(policy.normaliser(torch.ones(1, 1)))
     assert float(log_std.detach().mean().exp()) == pytest.approx(0.2, rel=0.1)
 
 

@@ -27,7 +27,9 @@ def test_a_group_is_measured_printed_and_written(tmp_path: Path) -> None:
     values = {row["what"]: row for row in document["rows"]}
     hindsight = values["HER, 20,000 trajectories: a minibatch"]
     assert hindsight["target"] == "<= 0.25"
-    assert hindsight["value"] > values["uniform, 20,000 trajectories"]["value"] > 0
+    # Which of them takes longer is for a benchmark, on a machine that does nothing else.
+    assert hindsight["value"] > 0
+    assert values["uniform, 20,000 trajectories"]["value"] > 0
     assert "load_average_before" in document["machine"]
     table = (tmp_path / "bench" / "bench.md").read_text()
     assert all(f"| {what} |" in table for what in values)

@@ -478,7 +478,8 @@ def test_a_newcomers_screen_stays_clean(fresh_store: FreshStore) -> None:
 
 DRIVER = """
 import sys, time
-from music_rllib.tracking import Tracker, RunInfo, names
+from music_rllib import names
+from music_rllib.tracking import Tracker, RunInfo
 tracker = Tracker(sweep_name="smoke", storage=sys.argv[1], config={"name": "smoke", "seeds": [0]})
 tracker.start(RunInfo(node_key="a", name="finetune/a", config={"seed": 0}))
 for step in range(1, 10_000):

@@ -22,6 +22,8 @@ import ray
 import requests
 import yaml
 
+from music_rllib.runtime.quiet import LOCAL_RAY_BEYOND_LOOPBACK
+
 pytestmark = pytest.mark.integration
 
 REPOSITORY = Path(__file__).parents[2]
@@ -74,13 +76,18 @@ def ray_start(
         )
 
 
+def without_loopback_only() -> dict[str, str]:
+    """The environment without what a sweep in this process has set for its local Ray."""
+    return {k: v for k, v in os.environ.items() if k != LOCAL_RAY_BEYOND_LOOPBACK}
+
+
 @contextlib.contextmanager
 def head_node(home: Path, cpus: int, workers: Sequence[int] = ()) -> Iterator[Head]:
     """A head that asks for a token, and further nodes, all with this home folder."""
     port, dashboard = free_ports(2)
     # Not pytest's folder: Ray's sockets need a short path.
     folder = Path(tempfile.mkdtemp(prefix="ray"))
-    environment = os.environ | {
+    environment = without_loopback_only() | {
         "PATH": f"{BIN}{os.pathsep}{os.environ['PATH']}",
         "HOME": str(home),
         "PYTHONPATH": str(ENVIRONMENTS),
@@ -240,7 +247,7 @@ def growing_head(folder: Path, home: Path) -> Iterator[Head]:
     empty = ("auth", "docker", "file_mounts")
     config |= {key: {} for key in empty} | {key: [] for key in COMMANDS}
     (folder / "autoscaling.json").write_text(json.dumps(config))
-    environment = os.environ | {
+    environment = without_loopback_only() | {
         "PATH": f"{BIN}{os.pathsep}{os.environ['PATH']}",
         "HOME": str(home),
         "PYTHONPATH": str(ENVIRONMENTS),

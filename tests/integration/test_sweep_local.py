@@ -29,7 +29,7 @@ Runs = Callable[[], dict[str, Any]]
 EXPECTED = re.compile(
     r"\[ *\d+:\d\d\] (pretrain/|finetune/|starting a local Ray$|best so far: finetune )"
     r"|(stage|run|pretrain|finetune)[ :/]|  |Sweep |Results |Storage: |3 runs, |"
-    r"Compare in MLflow: |Open MLflow's pages with: "
+    r"Compare in MLflow: |Open MLflow's pages with: |A wider screen also shows: "
 )
 """Lines of a sweep in which nothing goes wrong."""
 

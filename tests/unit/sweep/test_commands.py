@@ -167,9 +167,14 @@ def test_status_and_compare(storage: str, tmp_path: Path, program: Program) -> N
     text = program("compare", place).output
     assert "0.8 0.82 0.84" in text
     assert "Entropy of the policies at the end on FetchPush" in text
-    assert "3 runs, entropy -0.32 nats" in program("status", place).output
+    assert "3 runs, entropy -0.32 nats" in in_one_line(program("status", place).output)
     bad = program("compare", place, "--metric", "nonsense")
     assert (bad.code, "--metric must be one of" in bad.errors) == (2, True)
+
+
+def in_one_line(text: str) -> str:
+    """Without the screen's line breaks."""
+    return " ".join(text.split())
 
 
 def as_logged(sweep: Sweep) -> Logged:
@@ -307,10 +312,8 @@ def test_a_condition_with_all_its_runs_is_better_than_a_lucky_one(
     with StateFile(sweep) as state_file:
         play(state_file, (2.0, 0))
         state_file.end("stopped")
-    assert (
-        "1 of 3 runs (no condition has all of its runs yet)"
-        in program("status", f"{storage}/mine").output
-    )
+    said = in_one_line(program("status", f"{storage}/mine").output)
+    assert "1 of 3 runs (no condition has all of its runs yet)" in said
     lucky = program("best", f"{storage}/mine", "--output", "lucky", "--json").document
     assert lucky["values"] == {"tac.entropic_index": 2.0}
     assert "over 1 runs, of 3 planned: no condition has all of its runs" in lucky["why"]
