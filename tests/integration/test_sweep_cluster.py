@@ -376,7 +376,7 @@ class Site:
         done = self.jobs.submit(head, "last")
         assert done.returncode == 0, done.stdout + done.stderr
         assert "continues at" in done.stdout
-        assert "pretrain/seed0: finished" in done.stdout
+        assert "] seed0: finished" in done.stdout
         assert f"using {self.storage}. Give an absolute path" in done.stdout
         assert request(head, "/api/jobs/last")["driver_exit_code"] == 0
         assert len(list((self.storage / "nodes").iterdir())) == 1
