@@ -125,7 +125,7 @@ def test_accepted_changes_are_trained(sweep_program: Any, sweep_document: dict[s
     sweep_program.write(sweep_document)
     code, output, errors = sweep_program.run("--accept-changes")
     assert code == 0, output + errors
-    assert "pretrain/seed0: finished" in output
+    assert "] seed0: finished" in output
     assert len(list((sweep_program.folder / "results" / "nodes").iterdir())) == 2
 
 
