@@ -147,11 +147,11 @@ def test_a_run_whose_environment_hangs_fails_and_the_others_finish(
     code, output, errors = program.run(timeout=sweeps.PATIENCE)
     assert code == 1, output + errors
     assert (
-        "pretrain/Hanging/seed0: FAILED: HangError: environment point_env:Hanging-v0 has not "
+        "] Hanging/seed0: FAILED: HangError: environment point_env:Hanging-v0 has not "
         "returned from step() for 6 s (resources.hang_minutes)"
     ) in output
     assert f'it hangs at File "{ENVIRONMENTS}/point_env.py", line ' in output
-    assert "pretrain/Point/seed0: finished" in output
+    assert "] Point/seed0: finished" in output
     (log,) = (program.folder / "results" / "points" / "failures").glob("*Hanging*.txt")
     assert "env_runner.py" in log.read_text()
     assert "most recent call first" in log.read_text()
