@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
+import time
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -30,6 +31,15 @@ def status(request: pytest.FixtureRequest) -> int:
     return int(request.param)
 
 
+def _once_free(port: int, handler: type[BaseHTTPRequestHandler]) -> ThreadingHTTPServer:
+    """A server, as soon as the workers of the one that was killed have let go of the port."""
+    for _ in range(300):
+        with contextlib.suppress(OSError):
+            return ThreadingHTTPServer(("127.0.0.1", port), handler)
+        time.sleep(0.1)
+    raise TimeoutError(f"port {port} stays in use")
+
+
 @contextlib.contextmanager
 def refusing(status: int, port: int = 0) -> Iterator[int]:
     """A server that is in health, and refuses everything else; its port."""
@@ -47,7 +57,7 @@ def refusing(status: int, port: int = 0) -> Iterator[int]:
         def log_message(self, *_: Any) -> None:
             pass
 
-    with ThreadingHTTPServer(("127.0.0.1", port), Refusing) as server:
+    with _once_free(port, Refusing) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         yield server.server_address[1]
         server.shutdown()
