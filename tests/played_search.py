@@ -19,7 +19,8 @@ from music_rllib.config.run_settings import RunSettings
 from music_rllib.experiment.plan import Node, make_plan
 from music_rllib.experiment.session import Sweep, open_sweep
 from music_rllib.search.controller import SearchController
-from music_rllib.search.summary import open_searches, outcome
+from music_rllib.search.opening import open_searches
+from music_rllib.search.summary import outcome
 from music_rllib.store.paths import sweep_folder
 from music_rllib.store.run_record import HISTORY, Report, RunResult, last_values, to_json_lines
 from music_rllib.sweep.tune.dag_searcher import DagSearcher

@@ -8,7 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+
+from music_rllib.replay.trajectories import Rows
 
 __all__ = ["MOST_OF_ONE_EPISODE", "Places"]
 
@@ -16,8 +17,6 @@ MOST_OF_ONE_EPISODE = 0.4
 """Share of a minibatch that `hindsight_episodes: moved` may take from one episode, on average. Less
 would last longer: with a tenth, until eight have moved, a run from scratch that was compared
 learned FetchPush later (docs/results.md)."""
-
-Rows = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,8 @@ from music_rllib.experiment.session import Sweep
 from music_rllib.redaction import redact
 from music_rllib.search.objective import aggregate, prune, score
 from music_rllib.search.storage import DATABASE_ERRORS
+from music_rllib.search.study_record import SCORES, VALUES
 from music_rllib.search.trials import Active, Arm, Finalist, Search, in_words, ranked, up_to
-from music_rllib.search.warm_start import SCORES, VALUES
 from music_rllib.store.object_folder import DamagedError
 from music_rllib.store.run_record import Report
 

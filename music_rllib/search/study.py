@@ -27,7 +27,7 @@ from music_rllib.config.search.settings import SearchSettings
 from music_rllib.experiment.plan import short
 from music_rllib.search.sampler import Proposal, Proposer
 from music_rllib.search.storage import studies_of
-from music_rllib.search.warm_start import (
+from music_rllib.search.study_record import (
     ARM,
     BASE,
     FINGERPRINT,
@@ -44,8 +44,8 @@ from music_rllib.search.warm_start import (
     as_data,
     fits,
     from_data,
-    warm_start,
 )
+from music_rllib.search.warm_start import warm_start
 from music_rllib.store.files import content_key
 
 __all__ = ["Study"]

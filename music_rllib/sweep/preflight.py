@@ -202,7 +202,7 @@ def verify_inputs(scheduler: Scheduler, store: NodeStore) -> None:
 def check_searches(opened: Sweep) -> None:
     """Look whether the searches' studies can be opened."""
     if opened.plan.searched:
-        from music_rllib.search.summary import check_studies
+        from music_rllib.search.opening import check_studies
 
         check_studies(opened)
 

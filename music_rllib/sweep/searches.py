@@ -9,7 +9,8 @@ from music_rllib.experiment.plan import Node
 from music_rllib.experiment.session import Sweep
 from music_rllib.experiment.sweep_files import SEARCH, as_json, keep
 from music_rllib.search.controller import SearchController
-from music_rllib.search.summary import learnings, open_searches, outcome
+from music_rllib.search.opening import learnings, open_searches
+from music_rllib.search.summary import outcome
 from music_rllib.sweep.listeners.mlflow import MlflowListener
 from music_rllib.sweep.listeners.screen import Display
 from music_rllib.sweep.listeners.state_file import StateFile

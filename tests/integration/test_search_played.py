@@ -31,7 +31,8 @@ from music_rllib.config.tac_settings import LearnedAlpha
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.scheduler import Status
 from music_rllib.experiment.session import keep_record
-from music_rllib.search.summary import learnings, outcome
+from music_rllib.search.opening import learnings
+from music_rllib.search.summary import outcome
 from music_rllib.store.object_folder import StorageError
 from music_rllib.sweep import cli
 from music_rllib.sweep.listeners.state_file import StateFile

@@ -84,24 +84,24 @@ class Display(Listener):
 
     def started(self, node: Node) -> None:
         self._ended.pop(node.key, None)
-        self._running[node.key] = (node, self._new_pace(node))
+        self._running[node.key] = (node, self._new_throughput(node))
         self.say(f"{self.short(node.label)}: started")
 
-    def _new_pace(self, node: Node) -> Throughput:
+    def _new_throughput(self, node: Node) -> Throughput:
         return Throughput(node.run.env_steps, node.run.tac.random_steps, self._now())
 
     def reported(self, node: Node, reports: list[Report]) -> None:
-        _, pace = self._running.setdefault(node.key, (node, self._new_pace(node)))
-        pace.hear(reports, self._now())
+        _, throughput = self._running.setdefault(node.key, (node, self._new_throughput(node)))
+        throughput.hear(reports, self._now())
         evaluated = any(names.EVAL_EPISODES in report.metrics for report in reports)
         quiet = self._now() - self._said.get(node.key, self._began) >= QUIET_SECONDS
-        if self._live is None and (evaluated or quiet) and not self._is_over(node, pace):
+        if self._live is None and (evaluated or quiet) and not self._is_over(node, throughput):
             self._said[node.key] = self._now()
-            self.say(f"{self.short(node.label)}: {self._progress_in_words(node, pace)}")
+            self.say(f"{self.short(node.label)}: {self._progress_in_words(node, throughput)}")
 
     @staticmethod
-    def _is_over(node: Node, pace: Throughput) -> bool:
-        return pace.env_steps >= node.run.env_steps  # `finished` says it better
+    def _is_over(node: Node, throughput: Throughput) -> bool:
+        return throughput.env_steps >= node.run.env_steps  # `finished` says it better
 
     def noted(self, node: Node, text: str) -> None:
         self.say(f"{self.short(node.label)}: {text}")
@@ -158,17 +158,17 @@ class Display(Listener):
         table = new_table("", ["running"], ["env steps"])
         for name in ["steps/s"] * (width >= ROOMY) + ["left", "evaluated"]:
             table.add_column(name, justify="right", overflow="fold")
-        for node, pace in self._running.values():
-            rate, metric = pace.steps_per_second, node.run.task.primary_metric
-            done = f"{pace.env_steps:,} / {pace.budget:,}"
+        for node, throughput in self._running.values():
+            rate, metric = throughput.steps_per_second, node.run.task.primary_metric
+            done = f"{throughput.env_steps:,} / {throughput.budget:,}"
             if width < ROOMY:
-                done = percent(pace.env_steps / pace.budget)
-            value = measured(metric, pace.metrics.get(metric))
+                done = percent(throughput.env_steps / throughput.budget)
+            value = measured(metric, throughput.metrics.get(metric))
             table.add_row(
                 self.short(node.label),
-                done if pace.env_steps else "preparing",
+                done if throughput.env_steps else "preparing",
                 *["-" if rate is None else f"{rate:.0f}"] * (width >= ROOMY),
-                clock(pace.seconds_left(self._now())),
+                clock(throughput.seconds_left(self._now())),
                 "-" if value == "-" else f"{names.word_of(metric)} {value}",
             )
         lines, best = self.headline()
@@ -179,7 +179,7 @@ class Display(Listener):
         """`1 of 4 runs done, 8,000 of 24,000 env steps, 1:02 passed, about 2:10 left`."""
         done = self._scheduler.having(Status.FINISHED, Status.REUSED)
         steps = sum(node.run.env_steps for node in done)
-        steps += sum(pace.env_steps for _, pace in self._running.values())
+        steps += sum(throughput.env_steps for _, throughput in self._running.values())
         steps += sum(self._ended.values())
         text = (
             f"{len(done)} of {len(self._plan.nodes)} runs done, "
@@ -191,19 +191,20 @@ class Display(Listener):
 
     def _seconds_left(self) -> float | None:
         """As if what waits went as fast as what runs, and never waited for each other."""
-        paces = [pace for _, pace in self._running.values()]
-        rates = [rate for pace in paces if (rate := pace.steps_per_second) is not None]
-        if not rates or len(rates) < len(paces):
+        running = [throughput for _, throughput in self._running.values()]
+        rates = [rate for one in running if (rate := one.steps_per_second) is not None]
+        if not rates or len(rates) < len(running):
             return None
         to_do = self._scheduler.having(Status.WAITING, Status.STARTED)
-        steps = sum(node.run.env_steps for node in to_do) - sum(pace.env_steps for pace in paces)
-        return max(steps / sum(rates), *(pace.seconds_left(self._now()) or 0.0 for pace in paces))
+        steps = sum(node.run.env_steps for node in to_do) - sum(one.env_steps for one in running)
+        left = [one.seconds_left(self._now()) or 0.0 for one in running]
+        return max(steps / sum(rates), *left)
 
-    def _progress_in_words(self, node: Node, pace: Throughput) -> str:
-        parts = [f"{pace.env_steps:,} of {pace.budget:,} env steps"]
-        rate, left = pace.steps_per_second, pace.seconds_left(self._now())
+    def _progress_in_words(self, node: Node, throughput: Throughput) -> str:
+        parts = [f"{throughput.env_steps:,} of {throughput.budget:,} env steps"]
+        rate, left = throughput.steps_per_second, throughput.seconds_left(self._now())
         if rate is not None:
             parts += [f"{rate:.0f} steps/s", f"{clock(left)} left"]
-        if node.run.task.primary_metric in pace.metrics:
-            parts.append(evaluated_in_words(node.run.task, pace.metrics))
+        if node.run.task.primary_metric in throughput.metrics:
+            parts.append(evaluated_in_words(node.run.task, throughput.metrics))
         return ", ".join(parts)

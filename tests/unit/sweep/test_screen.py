@@ -331,26 +331,26 @@ def test_what_a_failed_run_has_spent_stays_spent(plan: Plan) -> None:
 
 
 def test_pace_is_that_of_the_last_reports() -> None:
-    pace = Throughput(10_000, warm_up=0, now=0.0)
-    assert pace.steps_per_second is None
-    assert pace.seconds_left(5.0) is None
-    pace.hear([report(1000, 20.0)], now=20.0)
-    assert pace.steps_per_second == pytest.approx(50)
-    pace.hear([report(1000 + 1000 * i, 20.0 + 10 * i) for i in range(1, 7)], now=80.0)
-    assert pace.steps_per_second == pytest.approx(100)
-    assert pace.env_steps == 7000
-    assert pace.seconds_left(80.0) == pytest.approx(30)
-    assert pace.seconds_left(85.0) == pytest.approx(25)
-    assert pace.seconds_left(1000.0) == 0.0
+    throughput = Throughput(10_000, warm_up=0, now=0.0)
+    assert throughput.steps_per_second is None
+    assert throughput.seconds_left(5.0) is None
+    throughput.hear([report(1000, 20.0)], now=20.0)
+    assert throughput.steps_per_second == pytest.approx(50)
+    throughput.hear([report(1000 + 1000 * i, 20.0 + 10 * i) for i in range(1, 7)], now=80.0)
+    assert throughput.steps_per_second == pytest.approx(100)
+    assert throughput.env_steps == 7000
+    assert throughput.seconds_left(80.0) == pytest.approx(30)
+    assert throughput.seconds_left(85.0) == pytest.approx(25)
+    assert throughput.seconds_left(1000.0) == 0.0
 
 
 def test_random_steps_say_nothing_about_the_pace_of_learning() -> None:
-    pace = Throughput(3000, warm_up=1000, now=0.0)
-    pace.hear([report(500, 0.5), report(1000, 1.0)], now=1.0)
-    assert pace.steps_per_second is None
-    pace.hear([report(1500, 11.0)], now=11.0)
-    assert pace.steps_per_second == pytest.approx(50)
-    assert pace.seconds_left(11.0) == pytest.approx(30)
+    throughput = Throughput(3000, warm_up=1000, now=0.0)
+    throughput.hear([report(500, 0.5), report(1000, 1.0)], now=1.0)
+    assert throughput.steps_per_second is None
+    throughput.hear([report(1500, 11.0)], now=11.0)
+    assert throughput.steps_per_second == pytest.approx(50)
+    assert throughput.seconds_left(11.0) == pytest.approx(30)
 
 
 @pytest.mark.parametrize(

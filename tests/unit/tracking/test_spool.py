@@ -157,7 +157,6 @@ def test_an_unwritable_folder_is_named(tmp_path: Path) -> None:
         Spool(tmp_path / "file" / "run")
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 def test_a_full_disk_is_named_and_the_spool_stays_whole(tmp_path: Path) -> None:
     spool = Spool(tmp_path)
     spool.append([START, metrics(1)])
