@@ -32,7 +32,8 @@ __all__ = [
 ]
 
 RESERVED_NAMES = frozenset(
-    {"nodes", "work", "verified.json", "mlartifacts", "mlflow.db", "mlflow.db.lock"}
+    {"nodes", "work", "continuations", "verified.json"}
+    | {"mlartifacts", "mlflow.db", "mlflow.db.lock"}
 )
 """Entries of a storage folder that are no sweeps."""
 
@@ -85,7 +86,7 @@ class Resources(_Strict):
 
 
 class Checkpoints(_Strict):
-    """What is kept of runs that aren't finished; no run's result depends on it."""
+    """What is kept of runs besides their results; no run's result depends on it."""
 
     keep: int = Field(2, gt=0)
     """Checkpoints of a run that are kept; older ones serve where the newest is damaged."""
@@ -93,6 +94,9 @@ class Checkpoints(_Strict):
     """A run is saved at each evaluation, and when the last time is so long ago."""
     grace_seconds: float = Field(30.0, ge=0)
     """How long a sweep that is told to stop waits for its runs to be saved."""
+    finished_mb: float = Field(256.0, ge=0)
+    """A finished run keeps its last checkpoint where its replay takes at most so many megabytes, so
+    that the same run with more `env_steps` goes on from there; 0: none is kept."""
 
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=80)]

@@ -9,17 +9,20 @@ from dataclasses import dataclass
 from typing import Any
 
 from music_rllib.config.schema import SweepConfig
+from music_rllib.experiment.continuation import budget_settings, continued_from
 from music_rllib.experiment.plan import Node
 from music_rllib.experiment.session import Sweep
+from music_rllib.labels import ShortLabels
 from music_rllib.store.files import write_atomically
-from music_rllib.store.node_store import NodeStore
+from music_rllib.store.node_store import NodeStore, steps_of
 from music_rllib.store.object_folder import StorageError
 from music_rllib.store.paths import resolve_storage, sweep_folder
 from music_rllib.version import ALGORITHM_VERSION
 
-__all__ = ["Changes", "changes_since", "check_begun", "keep_settings"]
+__all__ = ["Changes", "changes_since", "check_begun", "keep_settings", "longer"]
 
 FILE = "settings.json"
+FINISHED = "is finished"
 SHOWN = 10
 """Lines of each list that are shown."""
 
@@ -102,15 +105,21 @@ def changes_since(sweep: Sweep) -> Changes | None:
     except (OSError, ValueError, KeyError, TypeError):
         return None  # the first time, or nothing that tells
     keys = {node.key for node in sweep.plan.nodes}
+    short = ShortLabels.of(node.label for node in sweep.plan.nodes)
     what: Counter[str] = Counter()
     lost = []
     for node in sweep.plan.nodes:
         was = runs.get(node.label)
         if was is None or was["key"] == node.key or was["key"] in keys:
             continue
-        what.update(_differences(was["settings"], node.run.model_dump(mode="json")))
+        differences = list(_differences(was["settings"], node.run.model_dump(mode="json")))
+        extends = _extends(was, node) and len(differences) == 1
+        if extends and continued_from(sweep.store, node) is not None:
+            continue
+        what.update(differences)
         if (has := _what_there_is(sweep.store, was["key"])) is not None:
-            lost.append(f"{node.label}: {has}")
+            why = _why_not_longer(node) if extends and has == FINISHED else ""
+            lost.append(f"{short(node.label)}: {has}{why}")
     if not lost:
         return None
     lines = [f"{line} ({count} run{'s' * (count > 1)})" for line, count in what.items()]
@@ -121,13 +130,40 @@ def changes_since(sweep: Sweep) -> Changes | None:
     )
 
 
+def longer(sweep: Sweep) -> list[str]:
+    """A line about runs that go on where finished ones with fewer `env_steps` have ended."""
+    if not sweep.store.has_continuations():
+        return []
+    left = [node for node in sweep.plan.nodes if node.key not in sweep.finished]
+    found = [steps for node in left if (steps := continued_from(sweep.store, node)) is not None]
+    if not found:
+        return []
+    runs = "1 run goes" if len(found) == 1 else f"{len(found)} runs go"
+    return [
+        f"{runs} on from the end of a finished one with fewer env_steps: {sum(found):,} env "
+        "steps less to train."
+    ]
+
+
+def _extends(was: Mapping[str, Any], node: Node) -> bool:
+    source = node.input.key if node.input else None
+    return bool(was["source"] == source and was["settings"]["env_steps"] < node.run.env_steps)
+
+
+def _why_not_longer(node: Node) -> str:
+    """Why a run with more `env_steps` doesn't go on where the shorter one has ended."""
+    if settings := budget_settings(node.run):
+        return f"; {' and '.join(settings)} would have had other values with the new env_steps"
+    return "; it has kept no checkpoint of its end (checkpoints.finished_mb)"
+
+
 def _what_there_is(store: NodeStore, key: str) -> str | None:
     if store.is_finished(key):
-        return "is finished"
+        return FINISHED
     checkpoints = store.work_folder(key).names()
     if not checkpoints:
         return None
-    return f"is at {int(checkpoints[-1].split('-')[0]):,} env steps"
+    return f"is at {steps_of(checkpoints[-1]):,} env steps"
 
 
 def _differences(before: Any, after: Any, place: str = "") -> Iterator[str]:

@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from music_rllib.config.schema import SweepConfig
+from music_rllib.experiment.continuation import continuation_key
 from music_rllib.experiment.plan import Plan
 from music_rllib.experiment.scheduler import Scheduler, Status
 from music_rllib.experiment.sweep_files import CONFIG, PLAN, as_json, keep, read
+from music_rllib.labels import ShortLabels
 from music_rllib.redaction import redact, without_secrets
 from music_rllib.store.node_store import NodeStore, damage_in_words
 from music_rllib.store.object_folder import DamagedError, StorageError
@@ -91,7 +93,8 @@ def _labels(config: SweepConfig, plan: Plan, storage: str) -> dict[str, str]:
         for source in plan.imports
         if source.checkpoint
     }
-    labels |= {node.key: node.label for node in plan.nodes}
+    short = ShortLabels.of(node.label for node in plan.nodes)
+    labels |= {node.key: short(node.label) for node in plan.nodes}
     if plan.searched:
         with contextlib.suppress(StorageError):  # the sweep writes it anew
             known = read(storage, f"{config.name}/{PLAN}") or {"nodes": []}
@@ -107,6 +110,7 @@ def plan_document(sweep: Sweep) -> dict[str, Any]:
             "label": node.label,
             "input": node.input.key if node.input else None,
             "env_steps": node.run.env_steps,
+            "continuation": continuation_key(node.run, node.input.key if node.input else None),
         }
         for node in sweep.plan.nodes
     ]

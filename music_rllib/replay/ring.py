@@ -65,6 +65,11 @@ class TrajectoryRing:
         """Bytes of the ring when full."""
         return self._steps.nbytes
 
+    @property
+    def used_nbytes(self) -> int:
+        """Bytes of the ring that hold trajectories."""
+        return self._used * self._steps.shape[1] * self._steps.itemsize
+
     def _store(self, trajectory: Trajectory) -> int:
         """Writes a trajectory in place of the oldest ones; its first row."""
         steps = len(trajectory)

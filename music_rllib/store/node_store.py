@@ -6,6 +6,7 @@ Below one storage folder or bucket, shared by all sweeps in it::
     work/<key>/<n>/   checkpoints of a run that isn't finished, each with its manifest
     work/<key>/parts/ what checkpoints share, such as old trajectories
     work/<key>/lease.json   who is computing the run, and until when that holds
+    continuations/<key>/<n>/   where a finished run ended, for one with a larger budget
     verified.json     on a disk: finished runs that have been read through
 
 The store, not Tune's snapshot, says what is finished.
@@ -36,6 +37,7 @@ from music_rllib.store.run_record import (
 from music_rllib.store.verified import Verified, fingerprint
 
 __all__ = [
+    "CONTINUATIONS",
     "KEEP",
     "TRAIN_AGAIN",
     "Draft",
@@ -43,6 +45,7 @@ __all__ = [
     "Saved",
     "WorkFolder",
     "damage_in_words",
+    "steps_of",
 ]
 
 FORMAT = "music_rllib checkpoint 2"
@@ -51,6 +54,7 @@ KEEP = 2
 LEASE = "lease.json"
 SHOWN = 10
 """Damaged runs that are named."""
+CONTINUATIONS = "continuations"
 VERIFIED = "verified.json"
 TRAIN_AGAIN = "'run' and 'resume' train what is damaged again with --retrain-damaged"
 
@@ -202,6 +206,15 @@ class NodeStore:
         """Where a run that isn't finished keeps its newest `keep` checkpoints."""
         return WorkFolder(self._fs, f"{self._root}/work/{key}", keep)
 
+    def has_continuations(self) -> bool:
+        """Whether any run has left its end to a longer one."""
+        selector = pafs.FileSelector(f"{self._root}/{CONTINUATIONS}", allow_not_found=True)
+        return bool(self._fs.get_file_info(selector))
+
+    def continuation(self, key: str) -> WorkFolder:
+        """Where runs that differ in their budget alone leave the last checkpoint of the longest."""
+        return WorkFolder(self._fs, f"{self._root}/{CONTINUATIONS}/{key}", keep=1)
+
 
 def _same(one: Mapping[str, float], other: Mapping[str, float]) -> bool:
     """Also where both have a NaN, which equals nothing."""
@@ -265,13 +278,18 @@ class WorkFolder:
             self._parts.remove(name)
 
     @contextlib.contextmanager
-    def newest(self, warn: Callable[[str], None] = warnings.warn) -> Iterator[Saved | None]:
+    def newest(
+        self, warn: Callable[[str], None] = warnings.warn, most: int | None = None
+    ) -> Iterator[Saved | None]:
         """A verified local copy of the newest sound checkpoint, or None, for this `with`.
 
         Args:
             warn: Is told about each damaged checkpoint that is skipped.
+            most: Only those of at most so many environment steps.
         """
         for name in reversed(self._checkpoints.names()):
+            if most is not None and steps_of(name) > most:
+                continue
             with TemporaryDirectory() as above:
                 try:
                     saved = self._fetch(name, Path(above))
@@ -327,6 +345,11 @@ class WorkFolder:
         """Delete all checkpoints: the run is finished."""
         self._parts.remove_all()
         self._checkpoints.remove_all()
+
+
+def steps_of(checkpoint: str) -> int:
+    """Environment steps of a checkpoint, by its name."""
+    return int(checkpoint.split("-")[0])
 
 
 def _needs(manifest: Manifest) -> list[str]:

@@ -13,6 +13,7 @@ from music_rllib.errors import BadInputError
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.location import SweepLocation, sweeps_in
 from music_rllib.redaction import redact
+from music_rllib.store.node_store import CONTINUATIONS
 from music_rllib.store.object_folder import open_storage
 from music_rllib.store.paths import sweep_folder
 
@@ -77,6 +78,10 @@ def what_can_go(found: SweepLocation, *, unfinished: bool, everything: bool) -> 
             if why != "interrupted" or unfinished:
                 what = f"checkpoints of {label}: {why}"
                 cleaning.going.append({"path": f"{root}/work/{key}", "what": what})
+        longer = f"{root}/{CONTINUATIONS}/{node['continuation']}" if "continuation" in node else ""
+        if finished and longer and _is_there(filesystem, longer):
+            what = f"last checkpoint of {label}: kept for a run with more env_steps"
+            cleaning.going.append({"path": longer, "what": what})
         if everything and finished:
             cleaning.going.append({"path": f"{root}/nodes/{key}", "what": f"result of {label}"})
     if everything:

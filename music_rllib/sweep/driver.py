@@ -18,7 +18,7 @@ from music_rllib.config.remarks import remarks
 from music_rllib.config.schema import SweepConfig
 from music_rllib.errors import FAILED, BadInputError
 from music_rllib.experiment import sweep_files
-from music_rllib.experiment.changes import changes_since, check_begun, keep_settings
+from music_rllib.experiment.changes import changes_since, check_begun, keep_settings, longer
 from music_rllib.experiment.demand import check_demand
 from music_rllib.experiment.listener import Listener
 from music_rllib.experiment.plan import make_plan
@@ -274,7 +274,7 @@ def _open(console: Console, config: SweepConfig, *, retrain_damaged: bool = Fals
     for row in adaptive_rows(plan):
         console.print(Text(adaptive_text(row)), soft_wrap=True)
     console.print(Text(f"Storage: {redact(storage)}"), soft_wrap=True)
-    for line in filter(None, (remark, *remarks(config), *check_demand(opened))):
+    for line in filter(None, (remark, *remarks(config), *check_demand(opened), *longer(opened))):
         console.print(Text(line, style="yellow"), soft_wrap=True)
     return opened
 

@@ -15,6 +15,7 @@ from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, EPISODE_RETURN_MEAN, LEA
 
 from music_rllib import names
 from music_rllib.config.run_settings import RunSettings
+from music_rllib.experiment.continuation import REPORT_INTERVAL
 from music_rllib.intrinsic.music import HELD_OUT_STEPS
 from music_rllib.replay.segments import Segment, load_segments, new_segments
 from music_rllib.store.handoff import Spaces
@@ -26,9 +27,6 @@ from music_rllib.tac.env_runner import DISPLACEMENT, MOVED, SUCCESS_ANY, SUCCESS
 from music_rllib.tac.normaliser import for_another_run
 
 __all__ = ["Paused", "TrainingRun", "algorithm_config"]
-
-REPORT_INTERVAL = 1_000
-"""Environment steps between two reports, where evaluations are not more frequent."""
 
 _NEVER = 10**9
 _TRAJECTORIES = "trajectories.safetensors"
@@ -224,6 +222,21 @@ class TrainingRun:
             lambda name: read_arrays(saved.parts[name] / _TRAJECTORIES),
         )
         self._rounds = defaultdict(list, state["rounds"])
+
+    def save_alone(self, draft: Draft) -> None:
+        """As `save`, with all trajectories: a checkpoint that shares nothing with earlier ones."""
+        self._segments = []
+        self.save(draft)
+
+    def restore_foreign(self, saved: Saved) -> None:
+        """As `restore`, from another run's checkpoint: the next `save` writes all trajectories."""
+        self.restore(saved)
+        self._segments = []
+
+    @property
+    def replay_mb(self) -> float:
+        """Megabytes that the trajectories in the replay take."""
+        return self.algorithm.replay.used_nbytes / 2**20
 
     def close(self) -> None:
         """Releases environments and networks."""

@@ -14,10 +14,15 @@ from ray.tune import PlacementGroupFactory, Trainable
 
 from music_rllib import names
 from music_rllib.config.run_settings import handed_over
+from music_rllib.experiment.continuation import (
+    budget_settings,
+    continuation_key,
+    is_continuable,
+)
 from music_rllib.redaction import redact
 from music_rllib.store.handoff import Weights, read_handoff, write_handoff
 from music_rllib.store.lease import HeldLease, Lease, LeaseLostError
-from music_rllib.store.node_store import NodeStore, WorkFolder
+from music_rllib.store.node_store import NodeStore, Saved, WorkFolder, steps_of
 from music_rllib.store.object_folder import StorageError
 from music_rllib.store.run_record import (
     HISTORY,
@@ -193,11 +198,49 @@ class RunTrainable(Trainable):
         with self._work(store).newest(self._notes.append) as saved:
             if saved is not None:
                 training.restore(saved)
-                self._history = from_json_lines((saved.folder / HISTORY).read_bytes())
-                self._seconds_before = float((saved.folder / SECONDS).read_text())
-                self._notes.append(f"continues at {training.env_steps:,} env steps")
+                self._take_over(saved, training)
+        if saved is None:
+            self._continue_shorter(training, store)
         self._began = self._saved = time.monotonic()
         return training
+
+    def _take_over(self, saved: Saved, training: TrainingRun, of: str = "") -> None:
+        self._history = from_json_lines((saved.folder / HISTORY).read_bytes())
+        self._seconds_before = float((saved.folder / SECONDS).read_text())
+        self._notes.append(f"continues {of}at {training.env_steps:,} env steps")
+
+    def _continue_shorter(self, training: TrainingRun, store: NodeStore) -> None:
+        """Go on from the end of a run with a smaller budget, where there is one."""
+        if budget_settings(self._job.run):
+            return
+        kept = store.continuation(self._continuation)
+        with kept.newest(self._notes.append, most=self._job.run.env_steps - 1) as saved:
+            if saved is not None:
+                training.restore_foreign(saved)
+                self._take_over(saved, training, "a finished run with fewer env_steps, ")
+
+    @property
+    def _continuation(self) -> str:
+        return continuation_key(self._job.run, self._job.source_key)
+
+    def _keep_for_longer(self, training: TrainingRun, store: NodeStore) -> None:
+        """Leave the run's end to one with a larger budget. Without it nothing is wrong."""
+        if (
+            not is_continuable(self._job.run)
+            or training.replay_mb > self._job.checkpoints.finished_mb
+            or not self._job.checkpoints.finished_mb
+        ):
+            return
+        kept = store.continuation(self._continuation)
+        if any(steps_of(name) >= training.env_steps for name in kept.names()):
+            return
+        try:
+            with kept.new_checkpoint(training.env_steps) as draft:
+                training.save_alone(draft)
+                (draft.folder / SECONDS).write_text(repr(self._seconds))
+                (draft.folder / HISTORY).write_bytes(to_json_lines(self._history))
+        except StorageError as error:
+            self._notes.append(f"keeps no checkpoint for longer training: {error}")
 
     def _have_watched(self, store: NodeStore) -> None:
         """Be ended where the environment hangs; and say so, if the worker before this one was.
@@ -251,6 +294,8 @@ class RunTrainable(Trainable):
         )
         if training.finished:
             self._publish(training, store)
+            self._keep_for_longer(training, store)
+            self._clear(store)
         elif names.EVAL_EPISODES in metrics or self._is_late():
             self._checkpoint(training, store)
         return training.finished
@@ -299,7 +344,6 @@ class RunTrainable(Trainable):
                 metrics=last_values(self._history),
             )
             store.publish(self._job.key, folder, result)
-        self._clear(store)
 
     def _clear(self, store: NodeStore) -> None:
         """Delete checkpoints and lease of a run that is finished. Only for the lease's holder."""

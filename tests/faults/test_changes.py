@@ -16,7 +16,8 @@ import yaml
 from music_rllib.config.load import load_sweep
 from music_rllib.config.schema import SweepConfig
 from music_rllib.experiment import changes as changes_module
-from music_rllib.experiment.changes import changes_since, keep_settings
+from music_rllib.experiment.changes import changes_since, keep_settings, longer
+from music_rllib.experiment.continuation import continuation_key
 from music_rllib.experiment.plan import make_plan
 from music_rllib.experiment.session import Sweep, open_sweep
 from music_rllib.store import lease as lease_module
@@ -51,6 +52,7 @@ def test_what_changed_and_what_it_leaves_behind(
     keep_settings(first)
     finish(first, tmp_path, "pretrain/Point/seed0")
     begun = next(node for node in first.plan.nodes if node.label.startswith("finetune"))
+    begun_values = begun.label.split("/")[2].replace("tac.entropic_index", "q")
     with first.store.work_folder(begun.key).new_checkpoint(800):
         pass
     assert changes_since(opened(tmp_path, sweep_document)) is None, "nothing has changed"
@@ -64,13 +66,54 @@ def test_what_changed_and_what_it_leaves_behind(
     assert changes is not None
     assert changes.what == ("tac.lr: 0.001 -> 0.01 (3 runs)",)
     assert set(changes.lost) == {
-        "pretrain/Point/seed0: is finished",
-        f"{begun.label}: is at 800 env steps",
+        "pretrain/seed0: is finished",
+        f"finetune/{begun_values}/seed0: is at 800 env steps",
     }
     text = str(changes)
     assert text.startswith("the configuration of sweep 'points' has changed")
     assert "--accept-changes" in text
     assert "--name NEW" in text
+
+
+def test_more_env_steps_are_no_change_where_finished_runs_can_be_gone_on_from(
+    tmp_path: Path, sweep_document: dict[str, Any]
+) -> None:
+    sweep_document["stages"] = sweep_document["stages"][:1]
+    first = opened(tmp_path, sweep_document)
+    keep_settings(first)
+    finish(first, tmp_path, "pretrain/Point/seed0")
+    assert longer(first) == []
+    sweep_document["defaults"]["env_steps"] = 2000
+    changes = changes_since(opened(tmp_path, sweep_document))
+    assert changes is not None
+    assert changes.what == ("env_steps: 1200 -> 2000 (1 run)",)
+    assert changes.lost == (
+        "seed0: is finished; it has kept no checkpoint of its end (checkpoints.finished_mb)",
+    )
+
+    (node,) = first.plan.nodes
+    with first.store.continuation(continuation_key(node.run, None)).new_checkpoint(1200):
+        pass
+    sweep = opened(tmp_path, sweep_document)
+    assert changes_since(sweep) is None
+    assert longer(sweep) == [
+        "1 run goes on from the end of a finished one with fewer env_steps: 1,200 env steps less "
+        "to train."
+    ]
+
+    # With a schedule over the budget it can't: everything before would have been otherwise.
+    q = {"schedule": "linear", "start": 2.0, "end": 1.0}
+    sweep_document["defaults"] |= {"env_steps": 1200}
+    sweep_document["defaults"]["tac"]["entropic_index"] = q
+    linear = opened(tmp_path, sweep_document)
+    keep_settings(linear)
+    finish(linear, tmp_path, "pretrain/Point/seed0")
+    sweep_document["defaults"]["env_steps"] = 2000
+    changes = changes_since(opened(tmp_path, sweep_document))
+    assert changes is not None
+    assert changes.lost == (
+        "seed0: is finished; tac.entropic_index would have had other values with the new env_steps",
+    )
 
 
 def test_a_new_version_of_the_algorithm_is_named(

@@ -46,8 +46,8 @@ def clean(
 ) -> int:
     """List, or delete with --yes, what nobody needs.
 
-    By default these are the checkpoints of runs that a search stopped early, since an interrupted
-    run may go on from its own.
+    By default these are the checkpoints of runs that a search stopped early, and those that
+    finished runs keep for longer training. An interrupted run may go on from its own.
     """
     from music_rllib.experiment.location import find_sweep
     from music_rllib.sweep.clean import delete, what_can_go

@@ -26,6 +26,7 @@ from music_rllib.experiment.scheduler import Status
 from music_rllib.experiment.session import Sweep, plan_document
 from music_rllib.search.ranking import best_in_words, best_so_far
 from music_rllib.store.lease import process_start, this_machine
+from music_rllib.store.node_store import steps_of
 from music_rllib.store.object_folder import StorageError
 from music_rllib.store.run_record import Report, RunResult, last_values
 
@@ -263,7 +264,7 @@ def _checkpointed(sweep: Sweep) -> dict[str, int]:
     begun = sweep.store.begun()
     nodes = (node for node in sweep.plan.nodes if node.key in begun)
     return {
-        node.key: int(checkpoints[-1].split("-")[0])
+        node.key: steps_of(checkpoints[-1])
         for node in nodes
         if (checkpoints := sweep.store.work_folder(node.key).names())
     }

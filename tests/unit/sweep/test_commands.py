@@ -566,6 +566,7 @@ def test_a_damaged_run_is_named_by_every_command_and_trained_again_when_asked(
 ) -> None:
     sweep = played(storage, tmp_path)
     good, bad = sweep.plan.nodes[0], sweep.plan.nodes[4]
+    label = ShortLabels.of(node.label for node in sweep.plan.nodes)
     history = next(file for file in sweep.store._nodes.files(bad.key) if file.endswith(HISTORY))
     with sweep.store._fs.open_output_stream(history) as sink:
         sink.write(b"")
@@ -581,20 +582,19 @@ def test_a_damaged_run_is_named_by_every_command_and_trained_again_when_asked(
         said = program(*arguments)
         assert said.code == 2, arguments
         assert "1 finished run is damaged" in said.errors
-        assert f"{bad.label}: {history} must have " in said.errors
+        assert f"{label(bad.label)}: {history} must have " in said.errors
         assert "--retrain-damaged" in said.errors
-        assert good.label not in said.errors
+        assert label(good.label) not in said.errors
     said = program("status", place, "--json")
     assert said.code == 1
     (damaged,) = json.loads(said.output)["damaged"]
     assert damaged["run"] == bad.label
     said = program("status", place)
-    label = ShortLabels.of(node.label for node in sweep.plan.nodes)
     assert (said.code, f"DAMAGED {label(bad.label)}: " in said.output) == (1, True)
 
     removed: list[str] = []
     again = open_sweep(sweep.config, sweep.plan, storage, sweep.folder, removed.append)
-    assert [line.split(":")[0] for line in removed] == [bad.label]
+    assert [line.split(":")[0] for line in removed] == [label(bad.label)]
     assert again.scheduler.next_ready() == bad
     assert len(again.finished) == 8
     assert program("plan", file, "--storage", storage).code == 0
