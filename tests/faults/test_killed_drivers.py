@@ -82,8 +82,9 @@ def test_a_second_signal_ends_it_at_once(program: Program, unbroken: Path) -> No
     process.send_signal(signal.SIGINT)
     sweeps.read_until(process, "stopping, this takes a few seconds")
     process.send_signal(signal.SIGINT)
-    process.communicate(timeout=sweeps.PATIENCE)
+    _, errors = process.communicate(timeout=sweeps.PATIENCE)
     assert process.returncode == 128 + signal.SIGINT
+    assert "At once: Stopped. Finished runs and the last checkpoints are kept; continue " in errors
     sweeps.finish(program)
     comparison.same(unbroken, program.folder / "results")
 

@@ -33,7 +33,9 @@ def write_table(table: pa.Table, file: Path) -> None:
     if file.suffix == ".csv":
         csv.write_csv(table, file)
     else:
-        parquet.write_table(table, file, compression="zstd")
+        with parquet.ParquetWriter(file, table.schema, compression="zstd") as writer:
+            if table.num_rows:  # a group without rows says that its pages lie at the file's start
+                writer.write_table(table)
 
 
 def read_table(file: Path, kinds: Mapping[str, pa.DataType]) -> pa.Table:

@@ -6,14 +6,14 @@ import ast
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import matplotlib as mpl
 import pandas as pd
 import pytest
 
 from music_rllib import load_sweep, names
-from music_rllib.results.archive.folder import read_archive, write_archive
+from music_rllib.results.archive.folder import Format, read_archive, write_archive
 from music_rllib.results.frames.tables import frames_of
 
 DOCS = Path(__file__).parents[3] / "docs"
@@ -47,6 +47,15 @@ def test_an_export_as_csv_gives_the_same_frames(tmp_path: Path) -> None:
     first, second = load_sweep(EXPORT), load_sweep(tmp_path / "csv")
     for name in ("runs", "curves", "conditions"):
         pd.testing.assert_frame_equal(getattr(first, name), getattr(second, name))
+
+
+@pytest.mark.parametrize("file_format", get_args(Format))
+def test_an_export_of_a_sweep_without_runs_is_read_again(
+    tmp_path: Path, file_format: Format
+) -> None:
+    write_archive(replace(read_archive(EXPORT), runs=[], history={}), tmp_path, file_format)
+    again = read_archive(tmp_path)
+    assert (list(again.runs), dict(again.history)) == ([], {})
 
 
 def test_a_sweep_without_runs_has_empty_frames_of_the_same_types() -> None:
