@@ -7,6 +7,7 @@ large sweep. Where the store is a database, the values are read from its `metric
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import tempfile
@@ -16,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from filelock import FileLock
 
 from music_rllib import names
 from music_rllib.limits import MOST_JSON_BYTES, read_json, read_regular
@@ -32,6 +34,7 @@ __all__ = ["attach", "download_policy", "read_mlflow"]
 
 RUNS_PER_PAGE = 1000
 REQUESTS_AT_ONCE = 8
+TABLES_SECONDS = 60.0
 _LARGEST = float(np.finfo(np.float64).max)
 """What MLflow's databases hold in place of infinity."""
 
@@ -144,6 +147,10 @@ def _open(store: TrackingStore) -> MlflowClient:
         logging.getLogger(chatty).setLevel(logging.WARNING)
     from mlflow import MlflowClient
 
+    if file is not None and (lock := Path(f"{file}.lock")).exists():
+        # A sweep that begins may be making the tables, and two at a time crash MLflow's migration.
+        with contextlib.suppress(OSError), FileLock(lock, timeout=TABLES_SECONDS):
+            return MlflowClient(store.uri)
     return MlflowClient(store.uri)
 
 

@@ -30,7 +30,7 @@ from music_rllib.report.build import PAGE
 from music_rllib.report.cli import app
 from music_rllib.report.location import find_sweep
 from music_rllib.results.archive.folder import Format, read_archive
-from music_rllib.results.data import Sweep
+from music_rllib.results.data import ReportError, Sweep
 from music_rllib.results.from_mlflow import read_mlflow
 from music_rllib.tracking import Tracker, resolve_store
 
@@ -262,6 +262,21 @@ def test_the_report_is_attached_to_the_sweep_s_run(sweep_folder: Path, page: Pat
     kept = sweep_folder.parent / "mlartifacts" / "tiny" / sweep.run_id / "artifacts" / "report"
     assert (kept / PAGE).read_bytes() == page.read_bytes()
     assert (kept / "figures" / "finetune-success-rate.svg").is_file()
+
+
+def test_a_report_on_a_database_that_is_being_made_waits_for_its_tables(tmp_path: Path) -> None:
+    """Two that make MLflow's tables at a time crash each other, the sweep too."""
+    store = resolve_store(None, str(tmp_path))
+    make = "import sys; from music_rllib.tracking import Tracker; "
+    make += "Tracker(sweep_name='s', storage=sys.argv[1], config={}).__enter__().close('FINISHED')"
+    command = [sys.executable, "-c", make, str(tmp_path)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as sweep:
+        while not (tmp_path / "mlflow.db").exists():
+            assert sweep.poll() is None
+        with pytest.raises(ReportError, match="must be a sweep in MLflow"):
+            read_mlflow(store, "none")
+        _, errors = sweep.communicate(timeout=120)
+        assert (sweep.returncode, "Traceback" in errors) == (0, False)
 
 
 def test_there_is_no_such_sweep(sweep_folder: Path, tmp_path: Path) -> None:
