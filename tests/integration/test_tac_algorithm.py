@@ -19,6 +19,7 @@ from music_rllib.replay.settings import ReplaySettings
 from music_rllib.replay.trajectories import Trajectory
 from music_rllib.tac.algorithm import TAC
 from music_rllib.tac.kernels.precision import PrecisionError, has_bf16
+from tests.unit.test_snippets import ROOT, blocks
 
 pytestmark = pytest.mark.usefixtures("local_ray")
 
@@ -29,6 +30,15 @@ SMALL: dict[str, Any] = {
     "random_steps": 100,
     "replay_ratio": 0.2,
 }
+
+
+def test_the_program_in_the_readme_trains(capsys: pytest.CaptureFixture[str]) -> None:
+    (program,) = blocks(ROOT / "README.md", "python")
+    variables: dict[str, Any] = {}
+    exec(program, variables)
+    assert variables["algo"].env_steps > 0
+    assert "num_env_steps_sampled_lifetime" in capsys.readouterr().out
+    variables["algo"].stop()
 
 
 def build(
