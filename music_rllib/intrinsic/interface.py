@@ -30,6 +30,10 @@ class IntrinsicReward(Protocol):
         """Whether there is a reward; without one `draw` and `total` may still be called."""
 
     @property
+    def learning_rate(self) -> float | None:
+        """Of its networks; None where they stay as they are."""
+
+    @property
     def trajectories(self) -> int:
         """N that one update learns from."""
 

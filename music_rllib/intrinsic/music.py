@@ -60,6 +60,10 @@ class Music:
         return self._estimator is not None
 
     @property
+    def learning_rate(self) -> float | None:
+        return self._settings.lr if self._settings.estimator == "trained" else None
+
+    @property
     def trajectories(self) -> int:
         return self._settings.batch_trajectories
 

@@ -52,7 +52,7 @@ History = Mapping[str, Column]
 
 
 class Points(NamedTuple):
-    """Everything that one run logged, `[points]` each, sorted by metric, step and time."""
+    """Everything that one run logged, `[points]` each, sorted by metric and step."""
 
     metrics: Sequence[str]
     steps: Sequence[int]
@@ -71,15 +71,18 @@ def columns(runs: Iterable[Points]) -> dict[str, Column]:
         values = np.asarray(points.values, dtype=np.float64)
         begin = 0
         for metric, count in Counter(points.metrics).items():
-            part = slice(begin, begin + count)
+            part = np.arange(begin, begin + count)
             begin += count
             last = np.append(np.diff(steps[part]) != 0, True)
+            if not last.all():
+                part = part[np.lexsort((times[part], steps[part]))]
+            chosen = part[last]
             parts.setdefault(metric, []).append(
                 Column(
-                    run=np.full(int(last.sum()), position, dtype=np.int64),
-                    step=steps[part][last],
-                    value=values[part][last],
-                    time=times[part][last],
+                    run=np.full(len(chosen), position, dtype=np.int64),
+                    step=steps[chosen],
+                    value=values[chosen],
+                    time=times[chosen],
                 )
             )
     return {metric: joined(found) for metric, found in parts.items()}

@@ -247,7 +247,7 @@ def _from_database(
 
     table = sql.table("metrics", *(sql.column(name) for name in _COLUMNS))
     run, metric, step, time, value, is_nan = table.c
-    chosen = sql.select(metric, step, time, value, is_nan).order_by(metric, step, time)
+    chosen = sql.select(metric, step, time, value, is_nan).order_by(metric, step)
     if metrics is not None:
         chosen = chosen.where(metric.in_(sorted(metrics)))
     engine = sql.create_engine(store.uri)
@@ -267,7 +267,7 @@ _COLUMNS = ("run_uuid", "key", "step", "timestamp", "value", "is_nan")
 
 
 def _points(rows: Sequence[Sequence[Any]]) -> Points:
-    """(metric, step, time, value, is NaN) rows, sorted by the first three."""
+    """(metric, step, time, value, is NaN) rows, sorted by the first two."""
     if not rows:
         return Points((), (), (), ())
     metrics, steps, times, stored, is_nan = zip(*rows, strict=True)

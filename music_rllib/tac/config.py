@@ -16,11 +16,14 @@ from ray.tune.search.sample import Domain
 from music_rllib.config.returns import Range, cut_off
 from music_rllib.config.tac_settings import TACSettings
 from music_rllib.envs.tasks import BUILT_IN_TASKS, Indices, check_split
+from music_rllib.intrinsic.interface import IntrinsicReward
+from music_rllib.intrinsic.music import Music
 from music_rllib.intrinsic.settings import MusicSettings
 from music_rllib.replay.settings import ReplaySettings
 from music_rllib.runtime.quiet import quiet_third_parties
 from music_rllib.schedules import Linear, Measured, check_measurable
 from music_rllib.tac.rl_module import ESTIMATOR_MODULE, EstimatorModule, TACModule
+from music_rllib.tac.scheduled import ScheduledSettings
 
 __all__ = ["TACConfig"]
 
@@ -290,6 +293,20 @@ class TACConfig(AlgorithmConfig):
             )
             spec.add_modules({ESTIMATOR_MODULE: estimator})
         return spec
+
+    def intrinsic_reward(self, networks: Any) -> IntrinsicReward:
+        """The reward that the Learner adds; a subclass may give another one.
+
+        Args:
+            networks: the module `ESTIMATOR_MODULE`, None where there is none.
+        """
+        return Music(self.music_settings(), networks)
+
+    def scheduled(self, actions: int) -> ScheduledSettings:
+        """Settings that change over the run, for so many action dimensions."""
+        return ScheduledSettings(
+            self.tac_settings(), self.music_settings(), self.total_env_steps or 0, actions
+        )
 
     def get_default_learner_class(self) -> type:
         from music_rllib.tac.learner import TACLearner

@@ -14,6 +14,7 @@ one step of every network.
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,6 @@ from torch import Tensor
 from music_rllib import names
 from music_rllib.config.tac_settings import LearnedAlpha, TACSettings
 from music_rllib.intrinsic.interface import IntrinsicReward
-from music_rllib.intrinsic.music import Music
 from music_rllib.replay.trajectories import Trajectory
 from music_rllib.runtime.allocator import keep_freed_memory
 from music_rllib.runtime.quiet import quiet_third_parties
@@ -65,7 +65,6 @@ class TACLearner(TorchLearner):
         quiet_third_parties()  # a remote Learner is a process of its own
         keep_freed_memory()
         self._settings: TACSettings = self.config.tac_settings()
-        self._music = self.config.music_settings()
         # A driver-side algorithm would otherwise use every core for 256-row products, and with
         # another trial beside it run twenty times slower; the sums would also change.
         torch.set_num_threads(self.config.torch_threads)
@@ -75,19 +74,11 @@ class TACLearner(TorchLearner):
         seed = self.config.seed if self.config.seed is not None else torch.seed()
         self._generator = torch.Generator(device=self._device).manual_seed(seed + 7919)
         self._grad_updates = 0
-        has_one = ESTIMATOR_MODULE in self.module
-        estimator = self.module[ESTIMATOR_MODULE].unwrapped() if has_one else None
-        self._intrinsic: IntrinsicReward = Music(self._music, estimator)
         self._losses: dict[str, Tensor] = {}
         self._observed: dict[str, Tensor] = {}
         self._names_of_losses: list[str] = []
         self._td_errors: Tensor | None = None
-        self._now = ScheduledSettings(
-            self._settings,
-            self._music,
-            self.config.total_env_steps or 0,
-            self._policy_module.action_size,
-        )
+        self._now: ScheduledSettings = self.config.scheduled(self._policy_module.action_size)
         self._objective = Objective(self._settings, self._policy_module, self._now)
         pairs = self._policy_module.get_target_network_pairs()
         self._online: list[Tensor] = [p for online, _ in pairs for p in online.parameters()]
@@ -98,6 +89,12 @@ class TACLearner(TorchLearner):
             self._captured = CapturedUpdate(self._step, CudaRecorder(self._device))
         standard = not on_gpu and plain and self._is_standard
         self._direct = DirectUpdate(self._policy_module) if standard else None
+
+    @cached_property
+    def _intrinsic(self) -> IntrinsicReward:
+        has_one = ESTIMATOR_MODULE in self.module
+        networks = self.module[ESTIMATOR_MODULE].unwrapped() if has_one else None
+        return self.config.intrinsic_reward(networks)  # type: ignore[no-any-return]
 
     @property
     def _keeps_gradients_to_itself(self) -> bool:
@@ -121,8 +118,8 @@ class TACLearner(TorchLearner):
         log_alpha = named.pop("log_alpha", None)
         weights = [p for p in named.values() if p.requires_grad]
         if module_id == ESTIMATOR_MODULE:
-            if self._music.estimator == "trained":
-                self._register(module_id, "estimator", weights, self._music.lr)
+            if (lr := self._intrinsic.learning_rate) is not None:
+                self._register(module_id, "estimator", weights, lr)
             return
         self._register(module_id, "networks", weights, self._settings.lr)
         if log_alpha is not None:

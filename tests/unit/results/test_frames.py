@@ -14,6 +14,7 @@ import pytest
 
 from music_rllib import load_sweep, names
 from music_rllib.results.archive.folder import Format, read_archive, write_archive
+from music_rllib.results.data import Points, columns
 from music_rllib.results.frames.tables import frames_of
 
 DOCS = Path(__file__).parents[3] / "docs"
@@ -83,3 +84,13 @@ def test_the_notebook_still_says_what_it_shows(monkeypatch: pytest.MonkeyPatch) 
         value = eval(compile(ast.Expression(last.value), "cell", "eval"), namespace)
         shown = ["".join(output["data"]["text/plain"]) for output in cell["outputs"]]
         assert shown in ([repr(value)], ["<Figure>"])
+
+
+def test_of_several_values_at_a_step_the_one_logged_last_counts() -> None:
+    """In whatever order a database gives them."""
+    points = Points(
+        ("loss", "loss", "loss", "success"), (10, 20, 20, 20), (1, 9, 5, 3), (0.1, 0.2, 0.3, 0.4)
+    )
+    loss = columns([points])["loss"]
+    assert (loss.step.tolist(), loss.value.tolist()) == ([10, 20], [0.1, 0.2])
+    assert columns([points])["success"].value.tolist() == [0.4]
