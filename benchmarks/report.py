@@ -98,6 +98,8 @@ def make_sweep(storage: Path) -> Path:
         for node in nodes:
             tracker.start(run_info(node))
             tracker.finish(node.key, "FINISHED")
+    deliver = [sys.executable, "-m", "music_rllib.tracking", "deliver", str(storage / "large")]
+    subprocess.run([*deliver, "--timeout", "600"], check=True, capture_output=True)
     rng, now = np.random.default_rng(0), int(time.time() * 1000)
     with closing(sqlite3.connect(storage / "mlflow.db")) as database, database:
         runs = [

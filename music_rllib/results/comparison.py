@@ -29,6 +29,8 @@ _AVERAGED = {*names.EVAL_RATES, *names.ENTROPIES}
 """Over tasks: metrics that have the same unit on each."""
 SHOW_SEEDS_BELOW = 10
 """So few are shown one by one."""
+NAMED = 3
+"""Rivals in a sentence, where there are many."""
 
 
 class Labelled(Protocol):
@@ -228,10 +230,8 @@ def _ranking(scope: Scope[C], where: str, maximised: bool) -> str:
     for pair in undecided:
         rival = pair.second if pair.first is best else pair.first
         gap = st.difference(best.estimate, rival.estimate)
-        ends = interval_text(gap)
-        gaps.append(
-            f"{rival.condition.label} ({number(gap.value)}, {ends}; {p_text(pair.p_value)})"
-        )
+        text = f"{rival.condition.label} ({number(gap.value)}, {interval_text(gap)}; "
+        gaps.append((abs(gap.value), f"{text}{p_text(pair.p_value)})"))
     lead = f"{_said(best)} is {_direction(maximised)}"
     if level:
         lead = f"{_names([best, *level])} are level at {number(best.value)}"
@@ -239,7 +239,15 @@ def _ranking(scope: Scope[C], where: str, maximised: bool) -> str:
         return f"No winner {where}: {lead}."
     most = sorted(final.seeds for final in scope.compared)[-2:]
     few = "from so few seeds " if _least_p(scope, *most) >= SIGNIFICANCE else ""
-    return f"No winner {where}: {lead}, but {few}the gap to {_and(gaps)} may be chance."
+    return f"No winner {where}: {lead}, but {few}the gap to {_and(_nearest(gaps))} may be chance."
+
+
+def _nearest(gaps: Sequence[tuple[float, str]]) -> list[str]:
+    """All texts of gaps, or of many those of the smallest and how many more there are."""
+    if len(gaps) <= NAMED + 1:
+        return [text for _, text in gaps]
+    nearest = sorted(range(len(gaps)), key=lambda position: gaps[position][0])[:NAMED]
+    return [*(gaps[position][1] for position in sorted(nearest)), f"{len(gaps) - NAMED} others"]
 
 
 def _agrees(pair: Comparison[C], best: Final[C], maximised: bool) -> bool:

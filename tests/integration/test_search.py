@@ -150,7 +150,10 @@ def check_commands(program: Any) -> None:
     assert code == 0, errors
     chosen = json.loads(output)
     assert chosen["on_fresh_seeds"]
-    code, output, errors = command(program, "evaluate", "out", "--episodes", "2", "--json")
+    play = ("evaluate", "out", "--episodes", "2", "--json")
+    code, _, errors = command(program, *play)
+    assert (code, "a file doesn't choose what is imported" in errors) == (2, True)
+    code, output, errors = command(program, *play, "--env", "sweep.yaml")
     assert code == 0, errors
     played = json.loads(output)
     assert (played["task"], played["node_key"]) == ("Point", chosen["policies"][0]["node"])
