@@ -12,6 +12,7 @@ import pytest
 from music_rllib import names
 from music_rllib.config.load import load_sweep
 from music_rllib.envs.tasks import BUILT_IN_TASKS
+from music_rllib.results.claims.plan import analysis_plan
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -113,3 +114,17 @@ def test_every_page_is_on_the_documentation_site() -> None:
     contents = (ROOT / "docs" / "conf.py").read_text().split("CONTENTS = ")[1].split()
     pages = {path.stem for path in (ROOT / "docs").glob("*.md")} - {"search"}
     assert pages | {"searching", "changelog"} <= set(contents)
+
+
+@pytest.mark.parametrize(
+    "study", ["q_entropy_factorial", "claims_push", "claims_pick_and_place", "claims_slide"]
+)
+def test_the_plan_of_the_claims_is_that_of_their_sweeps(study: str) -> None:
+    plan = analysis_plan(load_sweep(ROOT / "tune_configs" / f"{study}.yaml"))
+    assert plan is not None
+    (row,) = [
+        line
+        for line in (ROOT / "docs/results/plan.md").read_text(encoding="utf-8").splitlines()
+        if line.startswith(f"| [`{study}.yaml`]")
+    ]
+    assert f"`{plan.hash[:20]}`" in row
