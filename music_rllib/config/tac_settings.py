@@ -179,55 +179,68 @@ class TACSettings(_Frozen):
     """Settings of the Tsallis actor-critic (paper III-B, Fig. 3)."""
 
     entropic_index: Annotated[AdaptiveSchedule, bounded("> 0", lambda q: q > 0)] = 1.0
-    """q of ln_q. 1 is SAC, 2 the sparse Tsallis entropy."""
+    """q of ln_q. 1 is SAC, 2 the sparse Tsallis entropy. At one `alpha` a larger q keeps policies
+    broader, since its pressure grows as they narrow."""
     alpha: Alpha = 0.2
     """Entropy coefficient: a constant, a schedule, `{learned: true, ...}`, or, to compare q at
-    equal pressure, `{value: ..., matched_width: ...}` (docs/comparing_q.md)."""
+    equal pressure, `{value: ..., matched_width: ...}` (docs/comparing_q.md). Higher values explore
+    longer, and slow the end of learning."""
     entropy_form: Literal["per_dimension", "joint"] = "per_dimension"
-    """ln_q summed over action dimensions (the TAC authors), or of the joint density (the paper)."""
+    """ln_q summed over action dimensions (the TAC authors), or of the joint density (the paper),
+    whose pressure on a narrow policy grows with their number where q > 1."""
     policy: Literal["stochastic", "deterministic"] = "stochastic"
     """Squashed Gaussian, or tanh(mean) only: with `bootstrap: critics` that is DDPG."""
     bootstrap: Literal["value", "critics"] = "value"
     """What follows a transition is worth: the averaged value network (the paper), or averaged
     critics at the policy's next action (SAC with twin targets; with one critic, DDPG)."""
     policy_critic: Literal["first", "min"] = "min"
-    """Which critic the policy improves on: Q1 (the TAC authors) or min(Q1, Q2) (SAC practice)."""
+    """Which critic the policy improves on: Q1 (the TAC authors) or min(Q1, Q2) (SAC practice),
+    which is less drawn to what one of them overrates."""
     hidden_sizes: tuple[Annotated[int, Field(gt=0)], ...] = Field((256, 256, 256), min_length=1)
-    """Hidden layers (ReLU) of policy, value and critics."""
+    """Hidden layers (ReLU) of policy, value and critics. 3 x 256 takes three times as long as
+    3 x 128."""
     log_std_bounds: tuple[float, float] = (-20.0, 2.0)
-    """Range of the policy's log standard deviation."""
+    """Range of the policy's log standard deviation. A higher lower end keeps noise in the actions
+    until the end."""
     log_std_form: Literal["clamp", "tanh"] = "clamp"
     """How it gets there: cut off at the bounds, so that it begins near 0; or tanh, scaled to them,
     so that it begins in their middle (TAC-2020: [-20, 2], original MUSIC's SAC: [-5, 2])."""
     lr: float = Field(1e-3, gt=0)
-    """Adam's step size for policy, value and critics."""
+    """Adam's step size for policy, value and critics. Larger learns sooner, or not at all."""
     gamma: float = Field(0.99, ge=0, lt=1)
-    """Discount."""
+    """Discount. The agent looks about 1 / (1 - gamma) steps ahead."""
     tau: float = Field(0.005, gt=0, le=1)
-    """Moving-average ratio of the target networks."""
+    """Moving-average ratio of the target networks. Larger passes values on sooner, and less
+    steadily."""
     target_update_interval: int = Field(1, gt=0)
     """Gradient updates between two moves of the target networks."""
     target_bounds: tuple[float, float] | None = None
-    """Critic targets are clipped to this range (original MUSIC: plus/minus 4/(1-gamma))."""
+    """Critic targets are clipped to this range (original MUSIC: plus/minus 4/(1-gamma)). Values
+    can't run away then; too narrow a range cuts off true ones, of which a sweep warns."""
     batch_size: int = Field(256, gt=0)
-    """Transitions per update."""
+    """Transitions per update. More: less noise in each, and longer ones."""
     replay_ratio: float = Field(1.0, gt=0)
-    """Gradient updates per environment step."""
+    """Gradient updates per environment step. More learns more from each step, and takes longer:
+    updates are most of a run's time."""
     precision: Literal["float32", "bf16"] = "float32"
     """Of the hidden layers' products while learning; weights, outputs and acting stay float32.
     `bf16` is refused on hardware without it."""
     random_steps: int = Field(1_000, ge=0)
-    """First environment steps: uniformly random actions, and no updates before they are over."""
+    """First environment steps: uniformly random actions, and no updates before they are over. More
+    has seen more when learning begins, later."""
     normalise_observations: bool = True
-    """Running mean and standard deviation of observations and goals in front of every network."""
+    """Running mean and standard deviation of observations and goals in front of every network, so
+    that inputs of small numbers (metres, here) count as much as large ones."""
     observation_clip: float = Field(5.0, gt=0)
     """Normalised observations are clipped to plus/minus this."""
     normaliser_epsilon: float = Field(1e-2, gt=0)
-    """Smallest standard deviation that the normaliser divides by."""
+    """Smallest standard deviation that the normaliser divides by. Larger leaves what hardly varies
+    small; smaller blows its noise up."""
     behaviour: Behaviour = "policy"
     """Acting during training: sample the policy, or the original MUSIC's noise."""
     action_l2: float = Field(0.0, ge=0)
-    """Weight of the policy's mean squared action, in [-1, 1], in its loss (original MUSIC: 1.0)."""
+    """Weight of the policy's mean squared action, in [-1, 1], in its loss (original MUSIC: 1.0).
+    Higher: gentler actions, which may be too gentle to push with."""
     max_episode_steps: int | None = Field(None, gt=0)
     """Truncate episodes here; needed where the environment has no time limit of its own."""
 
