@@ -58,6 +58,7 @@ def build_report(
     video_seed: int | None = None,
     environments: Sequence[Task] = (),
     beside: tuple[Sweep, Sweep] | None = None,
+    live: bool = False,
 ) -> Report:
     """Compute and arrange everything.
 
@@ -71,6 +72,7 @@ def build_report(
         video_seed: of the filmed episodes; None: no videos.
         environments: of tasks that may be made for videos, beside the known ones.
         beside: the two that `sweep` puts side by side.
+        live: the sweep is running, and the page says how far it is.
     """
     analyses = analyse(sweep)
     drawings = [d for analysis in analyses for d in stage_drawings(sweep, analysis)]
@@ -86,7 +88,7 @@ def build_report(
         drawings=drawings,
         pictures=draw_inline(drawings),
         differences=() if beside is None else difference_tables(*beside, analyses),
-        missing=missing(sweep, analyses, undelivered) + ([damaged] if damaged else []),
+        missing=missing(sweep, analyses, undelivered, live=live) + ([damaged] if damaged else []),
         difference=difference,
         command=command,
         films=None

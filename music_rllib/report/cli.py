@@ -269,16 +269,21 @@ def _serve(
     from music_rllib.store.paths import sweep_folder
 
     sweep = location.find_sweep(place, None if Path(place).exists() else storage)
+    progress = Progress(sweep)
 
     def make() -> str:
         found = find_sweep(place, storage=storage, tracking_uri=tracking_uri, metrics=WANTED)
         made = build_report(
-            found.sweep, difference=difference, undelivered=found.undelivered, command=_command()
+            found.sweep,
+            difference=difference,
+            undelivered=found.undelivered,
+            command=_command(),
+            live=progress.is_running(),
         )
         return render(made, live=True)
 
     folder = sweep_folder(sweep.storage, sweep.name)
-    page = LivePage(make, Progress(sweep))
+    page = LivePage(make, progress)
     serve(make_server(page, sweep, folder, port), page, typer.echo)
 
 

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from music_rllib import names
+from music_rllib.labels import ShortLabels
 from music_rllib.results.analysis import StageAnalysis
 from music_rllib.results.data import Sweep
 
@@ -15,15 +16,19 @@ __all__ = ["missing", "planned_runs"]
 
 SHOWN = 5
 _STATES = {
-    "RUNNING": "still running (or was killed without a word)",
+    "RUNNING": "still running (or killed without a word)",
     "SCHEDULED": "waiting to begin",
     "KILLED": "stopped before the end; the same command continues",
     "FAILED": "failed; see below",
 }
 
 
-def missing(sweep: Sweep, analyses: Sequence[StageAnalysis], undelivered: int) -> list[str]:
-    """One sentence for each thing that is missing."""
+def missing(
+    sweep: Sweep, analyses: Sequence[StageAnalysis], undelivered: int, *, live: bool = False
+) -> list[str]:
+    """One sentence for each thing that is missing; nothing of what a `live` sweep has yet to do."""
+    if live:
+        return _missing_evidence(sweep, analyses)
     return [
         *_missing_runs(sweep),
         *_missing_evidence(sweep, analyses),
@@ -60,7 +65,8 @@ def _missing_runs(sweep: Sweep) -> list[str]:
     known = {run.name for run in sweep.runs}
     waiting = [name for name in planned or () if name not in known]
     if waiting:
-        notes.append(f"{_runs(len(waiting))} not begun: {_some(waiting)}.")
+        short = ShortLabels.of(planned or ())
+        notes.append(f"{_runs(len(waiting))} not begun: {_some([*map(short, waiting)])}.")
     states = Counter(run.status for run in sweep.runs)
     notes += [f"{_runs(states[s])} {words}." for s, words in _STATES.items() if states[s]]
     return notes

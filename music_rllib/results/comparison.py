@@ -231,7 +231,7 @@ def _ranking(scope: Scope[C], where: str, maximised: bool) -> str:
         rival = pair.second if pair.first is best else pair.first
         gap = st.difference(best.estimate, rival.estimate)
         text = f"{rival.condition.label} ({number(gap.value)}, {interval_text(gap)}; "
-        gaps.append((abs(gap.value), f"{text}{p_text(pair.p_value)})"))
+        gaps.append((abs(float(gap.value)), f"{text}{p_text(pair.p_value)})"))
     lead = f"{_said(best)} is {_direction(maximised)}"
     if level:
         lead = f"{_names([best, *level])} are level at {number(best.value)}"

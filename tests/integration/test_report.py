@@ -168,7 +168,7 @@ def page(sweep_folder: Path) -> Path:
     picture = path.parent / "figures" / "overview.png"
     assert done.stdout.splitlines()[-2:] == [f"Report: {path}", f"Picture: {picture}"]
     assert picture.is_file()
-    assert "missing: 1 run not begun: finetune/FetchPush/" in done.stdout
+    assert "missing: 1 run not begun: finetune/" in done.stdout
     assert "finetune: No winner on FetchPush" in done.stdout
     return path
 

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections import deque
+from functools import cached_property
 from typing import Any
 
 from music_rllib import names
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.location import SweepLocation
+from music_rllib.labels import ShortLabels
+from music_rllib.store.object_folder import StorageError
 
 __all__ = ["Progress"]
 
@@ -49,19 +52,33 @@ class Progress:
             "stages": [{"name": one["name"], "runs": one["runs"]} for one in state["stages"]],
             "running": [
                 {
-                    "run": one["run"],
+                    "run": self._short(one["run"]),
                     "done": one["env_steps"],
                     "budget": one["budget"],
                     "metric": names.word_of(one["metric"]),
                     "value": one["value"],
                 }
                 for one in state["running"][:SHOWN]
-                if running
+                if running and one["env_steps"]  # others may be queued behind them
             ],
             "failures": [
-                {"run": one["run"], "cause": one["cause"]} for one in state["failures"][-SHOWN:]
+                {"run": self._short(one["run"]), "cause": one["cause"]}
+                for one in state["failures"][-SHOWN:]
             ],
         }
+
+    def is_running(self) -> bool:
+        """Whether its driver is alive, as far as that can be told."""
+        try:
+            return bool(self.read()["state"] == "running")
+        except StorageError:
+            return False
+
+    @cached_property
+    def _short(self) -> ShortLabels:
+        config = self._found.read(sweep_files.CONFIG) or {"tasks": [], "stages": []}
+        tasks = {*config["tasks"]}.union(*(stage.get("tasks") or () for stage in config["stages"]))
+        return ShortLabels((stage["name"] for stage in config["stages"]), tasks)
 
     def _speed(self, now: float, done: int) -> float | None:
         """Environment steps per second, of all runs together; None until there are some."""

@@ -19,7 +19,9 @@ from music_rllib.report.live import server
 from music_rllib.report.live.state import Progress
 from music_rllib.store.lease import this_machine
 
-RUNNING = {"run": "train/A", "env_steps": 40, "budget": 100, "metric": "m", "value": None}
+RUNNING = {"run": "train/A/seed0", "env_steps": 40, "budget": 100, "metric": "m", "value": None}
+QUEUED = {**RUNNING, "run": "train/A/seed1", "env_steps": 0}
+CONFIG = {"tasks": ["A"], "stages": [{"name": "train", "tasks": None}]}
 
 
 def write_state(folder: Path, done: int, heartbeat: float, **driver: Any) -> None:
@@ -38,12 +40,13 @@ def write_state(folder: Path, done: int, heartbeat: float, **driver: Any) -> Non
         },
         "stages": [{"name": "train", "runs": {"started": 1, "waiting": 2}}],
         "env_steps": {"done": done, "left": 300 - done},
-        "running": [RUNNING],
+        "running": [RUNNING, QUEUED],
         "best": None,
         "searches": [],
         "failures": [{"run": "train/B", "cause": "<b>no</b>", "log": "x"}],
     }
     (folder / "tiny").mkdir(exist_ok=True)
+    (folder / "tiny" / sweep_files.CONFIG).write_text(json.dumps(CONFIG))
     (folder / "tiny" / sweep_files.STATE).write_text(json.dumps(state))
 
 
@@ -63,7 +66,7 @@ def test_speed_and_the_time_left_are_those_of_the_last_minutes(
     seen = progress.read()
     assert (seen["state"], seen["done"], seen["left"]) == ("running", 200, 100)
     assert (seen["speed"], seen["seconds_left"]) == pytest.approx((10.0, 10.0))
-    assert seen["running"][0]["run"] == "train/A"
+    assert [run["run"] for run in seen["running"]] == ["seed0"], "in short, and none that waits"
     # A driver that has been silent for long does not run, whatever it said last.
     write_state(tmp_path, 200, now - 1000)
     seen = progress.read()
