@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 
-__all__ = ["SYMBOLS", "ShortLabels", "is_meant"]
+__all__ = ["SYMBOLS", "ShortLabels", "is_meant", "symbol"]
 
 SYMBOLS = {"q": "entropic_index", "weight": "mi_reward_weight"}
 """What papers, tables and labels call a setting to its name."""
@@ -38,6 +38,11 @@ class ShortLabels:
             return label
         kept = [stage] * (len(self._stages) > 1) + [task] * (len(self._tasks) > 1)
         return "/".join((*kept, _NAME.sub(_symbol, rest)))
+
+
+def symbol(setting: str) -> str:
+    """A setting as labels call it: `q` for `tac.entropic_index`, `alpha` for `tac.alpha`."""
+    return _NAME.sub(_symbol, f"{setting}=").removesuffix("=")
 
 
 def _symbol(found: re.Match[str]) -> str:

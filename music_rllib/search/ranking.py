@@ -17,6 +17,7 @@ from music_rllib import names
 from music_rllib.config.schema import Stage
 from music_rllib.config.search.settings import SearchSettings
 from music_rllib.experiment.plan import Plan, short
+from music_rllib.labels import symbol
 from music_rllib.results.comparison import with_interval
 from music_rllib.results.from_store import Condition, conditions, entropies
 from music_rllib.search.objective import interval
@@ -178,7 +179,7 @@ def _best_trial(
 
 def best_in_words(best: Mapping[str, Any]) -> str:
     """`best_so_far` in a line."""
-    values = ", ".join(f"{name} = {short(value)}" for name, value in best["values"].items())
+    values = ", ".join(f"{symbol(name)} = {short(value)}" for name, value in best["values"].items())
     number = with_interval(best["value"], best["interval"])
     runs, planned = best["runs"], best.get("planned", best["runs"])
     text = f"{best['stage']} {values}".rstrip() + f": {best.get('by', 'success')} {number}, "

@@ -160,7 +160,7 @@ def test_a_task_without_success_shows_its_return_from_the_first_line_to_the_repo
     table = (tmp_path / "results/points/report/tables/final.csv").read_text()
     assert table.count(f"train,Point,{names.EVAL_RETURN},q = ") == 2
     for command, words in (
-        ("status", "Best so far: train tac.entropic_index = "),
+        ("status", "Best so far: train q = "),
         ("compare", f"{names.EVAL_RETURN} of train on Point"),
     ):
         said = subprocess.run(

@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 
-from music_rllib.labels import ShortLabels, is_meant
+from music_rllib.labels import ShortLabels, is_meant, symbol
 
 LABEL = "finetune/FetchPush/pretrain:tac.alpha=0.1,tac.entropic_index=1.5,tac.tau=0.05/seed0"
 
@@ -51,3 +51,9 @@ def test_what_is_no_label_of_the_sweep_stays() -> None:
     assert short("a/FetchPush/trial7/tac.entropic_index={schedule:linear,start:1,end:2}/seed0") == (
         "trial7/q={schedule:linear,start:1,end:2}/seed0"
     )
+
+
+def test_settings_have_the_names_that_labels_give_them() -> None:
+    named = {"tac.entropic_index": "q", "tac.alpha": "alpha", "env_steps": "env_steps"}
+    named |= {"pretrain:tac.entropic_index": "pretrain:q", "music.mi_reward_weight": "weight"}
+    assert {setting: symbol(setting) for setting in named} == named

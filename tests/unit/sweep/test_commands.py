@@ -152,7 +152,7 @@ def test_status_and_compare(storage: str, tmp_path: Path, program: Program) -> N
     assert state["best"]["values"] == {"tac.entropic_index": 1.5}
     shown = program("status", "mine", "--storage", storage).output
     assert "Sweep mine: finished" in shown
-    assert "Best so far: train tac.entropic_index = 1.5: success 0.82 [" in shown
+    assert "Best so far: train q = 1.5: success 0.82 [" in shown
     (group,) = program("compare", place, "--json").document["groups"]
     first, *others = group["conditions"]
     assert first["values"] == {"tac.entropic_index": 1.5}
@@ -347,7 +347,7 @@ def test_tasks_without_success_are_judged_by_their_return(
     assert chosen["success_rate"] is None
     assert "first by return" in chosen["why"]
     shown = program("status", place).output
-    assert "Best so far: train tac.entropic_index = 1: return -0.2" in shown
+    assert "Best so far: train q = 1: return -0.2" in shown
 
 
 def test_clean_lists_and_deletes_what_no_other_sweep_has(
