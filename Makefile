@@ -81,12 +81,8 @@ results: venv  ## rebuild docs/results.md and its figures from docs/results/data
 	@$(BIN)/python docs/generate_results.py
 
 docs: venv  ## build the documentation site in build/docs, with search; open its index.html
-	@$(BIN)/python -m pip install -qq -c constraints.txt -e '.[docs]'
-	@rm -rf build/docs build/docs-source && mkdir -p build && cp -r docs build/docs-source
-	@cp README.md build/docs-source/index.md
-	@cp CHANGELOG.md build/docs-source/changelog.md
-	@cp docs/search.md build/docs-source/searching.md
-	@$(BIN)/python -m sphinx -q -W -c docs -d build/doctrees build/docs-source build/docs
+	@rm -rf build/docs
+	@$(BIN)/python docs/build_site.py build/docs
 	@echo "open build/docs/index.html"
 
 clean:  ## remove caches and build output (keeps .venv and results)

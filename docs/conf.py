@@ -1,6 +1,6 @@
 """The documentation site: `make docs`. It opens from disk, with its search, and fetches nothing.
 
-Its pages are copies of docs/ and of what `PAGES` adds, as build/docs-source.
+Its pages are copies of docs/ and of what `PAGES` adds, made by build_site.py.
 """
 
 from __future__ import annotations
