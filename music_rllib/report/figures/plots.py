@@ -53,6 +53,8 @@ SAME = 0.008
 _DASH = 2.5
 """Of lines that cover others, in line widths."""
 _MOST_RANKS = 9
+_CROWDED = 10
+"""Lines of which nobody can tell any more how many cover each other: they are solid or dashed."""
 _LABEL = 46
 """Letters of a label in one line of a panel."""
 TARGET = 0.85
@@ -231,7 +233,7 @@ def _ranks(curves: Sequence[Curve], metric: Metric) -> list[Array]:
                 curve.steps, other.steps, other.estimate.value, left=np.nan, right=np.nan
             )
             rank += np.abs(there - curve.estimate.value) <= SAME * height
-        ranks.append(np.minimum(rank, _MOST_RANKS))
+        ranks.append(np.minimum(rank, _MOST_RANKS if len(curves) <= _CROWDED else 1))
     return ranks
 
 
