@@ -38,15 +38,13 @@ class Changes:
     """Runs that have something which the changed sweep has no use for, and what."""
 
     def __str__(self) -> str:
-        one = len(self.lost) == 1
-        runs, have = ("1 run", "it has") if one else (f"{len(self.lost)} runs", "they have")
         return "\n".join(
             (
                 f"the configuration of sweep {self.name!r} has changed since it was last run:",
                 *_indented(self.what),
-                f"{runs} would be trained anew, and not use what {have}:",
+                f"{len(self.lost)} runs would be trained anew, and not use what they have:",
                 *_indented(self.lost),
-                "Choose: --accept-changes does that (the old results stay in the storage), "
+                "Choose: --accept-changes trains them anew (the old results stay in the storage), "
                 "--name NEW keeps both sweeps, the old configuration uses what is there.",
             )
         )

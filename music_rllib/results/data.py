@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from itertools import accumulate
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,7 +22,6 @@ __all__ = [
     "ReportError",
     "RunRecord",
     "Sweep",
-    "behind_each_other",
     "columns",
     "joined",
 ]
@@ -88,17 +86,6 @@ def columns(runs: Iterable[Points]) -> dict[str, Column]:
                 )
             )
     return {metric: joined(found) for metric, found in parts.items()}
-
-
-def behind_each_other(
-    parts: Sequence[Mapping[str, Column]], runs: Sequence[int]
-) -> dict[str, Column]:
-    """Columns of all runs, from those of so many runs each."""
-    found: dict[str, list[Column]] = {}
-    for part, before in zip(parts, accumulate(runs, initial=0), strict=False):
-        for metric, column in part.items():
-            found.setdefault(metric, []).append(replace(column, run=column.run + before))
-    return {metric: joined(those) for metric, those in found.items()}
 
 
 def joined(parts: Sequence[Column]) -> Column:

@@ -16,22 +16,13 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import joblib
 import numpy as np
 from filelock import FileLock
 
 from music_rllib import names
 from music_rllib.limits import MOST_JSON_BYTES, read_json, read_regular
 from music_rllib.results.claims.plan import checked_plans
-from music_rllib.results.data import (
-    Column,
-    Points,
-    ReportError,
-    RunRecord,
-    Sweep,
-    behind_each_other,
-    columns,
-)
+from music_rllib.results.data import Column, Points, ReportError, RunRecord, Sweep, columns
 from music_rllib.results.searches import checked_searches
 from music_rllib.tracking.store import TrackingStore, check_reachable
 
@@ -43,8 +34,6 @@ __all__ = ["attach", "download_policy", "read_mlflow"]
 
 RUNS_PER_PAGE = 1000
 REQUESTS_AT_ONCE = 8
-RUNS_OF_A_PROCESS = 100
-"""Read from a database; with fewer, starting a process takes longer than it saves."""
 TABLES_SECONDS = 60.0
 _LARGEST = float(np.finfo(np.float64).max)
 """What MLflow's databases hold in place of infinity."""
@@ -247,22 +236,11 @@ def _history(
 ) -> dict[str, Column]:
     if store.is_server:
         return columns(_from_server(client, runs, metrics))
-    processes = max(1, min(len(os.sched_getaffinity(0)), len(runs) // RUNS_OF_A_PROCESS))
-    ids = np.array_split([run.info.run_id for run in runs], processes)
-    parts = joblib.Parallel(n_jobs=processes)(
-        joblib.delayed(_columns_of)(store.uri, some.tolist(), metrics) for some in ids
-    )
-    return behind_each_other(parts, [len(some) for some in ids])
-
-
-def _columns_of(
-    uri: str, run_ids: Sequence[str], metrics: Collection[str] | None
-) -> dict[str, Column]:
-    return columns(_from_database(uri, run_ids, metrics))
+    return columns(_from_database(store, [run.info.run_id for run in runs], metrics))
 
 
 def _from_database(
-    uri: str, run_ids: Sequence[str], metrics: Collection[str] | None
+    store: TrackingStore, run_ids: Sequence[str], metrics: Collection[str] | None
 ) -> Iterator[Points]:
     """One query per run, which the table's index answers in this order."""
     import sqlalchemy as sql
@@ -272,7 +250,7 @@ def _from_database(
     chosen = sql.select(metric, step, time, value, is_nan).order_by(metric, step)
     if metrics is not None:
         chosen = chosen.where(metric.in_(sorted(metrics)))
-    engine = sql.create_engine(uri)
+    engine = sql.create_engine(store.uri)
     try:
         with engine.connect() as connection:
             # The driver's own cursor: SQLAlchemy's row objects take twice as long.

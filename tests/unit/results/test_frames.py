@@ -14,7 +14,7 @@ import pytest
 
 from music_rllib import load_sweep, names
 from music_rllib.results.archive.folder import Format, read_archive, write_archive
-from music_rllib.results.data import Points, behind_each_other, columns
+from music_rllib.results.data import Points, columns
 from music_rllib.results.frames.tables import frames_of
 
 DOCS = Path(__file__).parents[3] / "docs"
@@ -94,18 +94,3 @@ def test_of_several_values_at_a_step_the_one_logged_last_counts() -> None:
     loss = columns([points])["loss"]
     assert (loss.step.tolist(), loss.value.tolist()) == ([10, 20], [0.1, 0.2])
     assert columns([points])["success"].value.tolist() == [0.4]
-
-
-def test_runs_that_are_read_in_parts_are_those_that_are_read_at_once() -> None:
-    """A metric may be missing in a part."""
-    runs = [
-        Points(("loss", "loss"), (10, 20), (1, 2), (0.1, 0.2)),
-        Points(("success",), (10,), (3,), (0.5,)),
-        Points(("loss",), (30,), (4,), (0.3,)),
-    ]
-    whole = columns(runs)
-    parts = behind_each_other([columns(runs[:1]), columns([]), columns(runs[1:])], [1, 0, 2])
-    assert parts.keys() == whole.keys()
-    for metric, column in whole.items():
-        for part in ("run", "step", "value", "time"):
-            assert getattr(parts[metric], part).tolist() == getattr(column, part).tolist()
