@@ -38,13 +38,15 @@ class Changes:
     """Runs that have something which the changed sweep has no use for, and what."""
 
     def __str__(self) -> str:
+        one = len(self.lost) == 1
+        runs, have = ("1 run", "it has") if one else (f"{len(self.lost)} runs", "they have")
         return "\n".join(
             (
                 f"the configuration of sweep {self.name!r} has changed since it was last run:",
                 *_indented(self.what),
-                f"{len(self.lost)} runs would be trained anew, and not use what they have:",
+                f"{runs} would be trained anew, and not use what {have}:",
                 *_indented(self.lost),
-                "Choose: --accept-changes trains them anew (the old results stay in the storage), "
+                "Choose: --accept-changes does that (the old results stay in the storage), "
                 "--name NEW keeps both sweeps, the old configuration uses what is there.",
             )
         )
