@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from rich.console import Group, RenderableType
@@ -11,6 +11,7 @@ from rich.text import Text
 
 from music_rllib import names
 from music_rllib.experiment.plan import short
+from music_rllib.labels import symbol
 from music_rllib.results.comparison import with_interval
 from music_rllib.sweep.views.tables import new_table, seeds_in_words
 from music_rllib.sweep.views.text import percent
@@ -77,7 +78,7 @@ def _table(document: Mapping[str, Any], group: Mapping[str, Any]) -> Table:
     table = new_table(title)
     settings = dict.fromkeys(name for row in rows for name in row["values"])
     for name in (
-        *map(_broken, settings),
+        *_heads(settings),
         "mean, 95 %",
         "each seed",
         "runs",
@@ -118,7 +119,7 @@ def _task(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return ["task"] if len({row["task"] for row in rows}) > 1 else []
 
 
-def _broken(setting: str) -> str:
-    """The head of a column: `tac.` above `entropic_index`."""
-    section, dot, name = setting.rpartition(".")
-    return f"{section}{dot}\n{name}" if dot else name
+def _heads(settings: Iterable[str]) -> list[str]:
+    """Columns' heads, as labels call the settings, or whole where that would be ambiguous."""
+    brief = [symbol(name) for name in settings]
+    return brief if len(set(brief)) == len(brief) else list(settings)
