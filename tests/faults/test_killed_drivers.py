@@ -97,11 +97,11 @@ def test_a_run_whose_worker_dies_again_and_again_fails_with_the_cause(
     document["defaults"]["env_steps"] = 200_000
     document["stages"] = document["stages"][:1]
     program.write(document)
-    process = sweeps.start_until(program, "pretrain/seed0: started")
+    process = sweeps.start_until(program, "] seed0: started")
     for attempt in range(RESTARTS + 1):
         sweeps.kill_a_worker(process)
         last = "The same command again continues from the last checkpoint"
-        sign = last if attempt == RESTARTS else "pretrain/seed0: started"
+        sign = last if attempt == RESTARTS else "] seed0: started"
         output = sweeps.read_until(process, sign)
     assert ": FAILED: The worker process died" in output
     assert last in output
