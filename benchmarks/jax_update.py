@@ -60,10 +60,12 @@ def jax_updates(
     step = _update(actions, q, alpha)
     run = jax.jit(lambda state, data: jax.lax.scan(step, state, data), donate_argnums=0)
 
+    wait: Any = jax.block_until_ready
+
     def turn() -> None:
         nonlocal state
         state, losses = run(state, minibatches)
-        jax.block_until_ready(losses)
+        wait(losses)
 
     return turn
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from typing import Any
 
+import numpy as np
 import torch
 
 from benchmarks.measure import Row, Taken, compared, interleaved, middle, ratio_row
@@ -15,7 +16,6 @@ from benchmarks.runs import fill
 from music_rllib import TACConfig
 from music_rllib.tac.algorithm import TAC
 from music_rllib.tac.kernels.precision import cpu_flags, has_bf16
-from music_rllib.tac.kernels.products import has_onednn, onednn_product
 
 __all__ = ["rows"]
 
@@ -110,10 +110,12 @@ Turn = Callable[[], None]
 def floors(width: int) -> dict[str, Turn]:
     """Turns of matrix products with the FLOPs of `UPDATES` updates, by library and rows."""
     libraries: dict[str, Callable[[torch.Tensor, torch.Tensor, torch.Tensor], Any]] = {
-        "torch.mm": lambda left, right, out: torch.mm(left, right, out=out)
+        "torch.mm": lambda left, right, out: torch.mm(left, right, out=out),
+        "OpenBLAS": lambda left, right, out: np.matmul(left.numpy(), right.numpy(), out.numpy()),
     }
-    if has_onednn():
-        libraries["oneDNN"] = lambda left, right, out: onednn_product(left, right.t())
+    if torch.backends.mkldnn.is_available():
+        onednn = torch.ops.mkldnn._linear_pointwise.default
+        libraries["oneDNN"] = lambda left, right, out: onednn(left, right, None, "none", [], "")
     whole = UPDATES * flops(INPUTS, ACTIONS, (width,) * 3, BATCH)
     return {
         f"{name}, {rows} x {width} x {width}": _products(multiply, rows, width, whole)

@@ -6,14 +6,16 @@ surrounding state. States are raw observations, as in the original, unless they 
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
+import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from music_rllib.functional.mutual_information import donsker_varadhan, shuffle_time
+from music_rllib.intrinsic.compiled import bounds, mean_bound
 
 __all__ = ["MutualInformationEstimator", "intrinsic_reward"]
 
@@ -34,6 +36,8 @@ class MutualInformationEstimator(nn.Module):
     """[X + Y] taken from the inputs; 0 for what is used raw."""
     scale: Tensor
     """[X + Y] multiplies what is left; 1 for what is used raw."""
+    compiled = True
+    """Whether bounds on a CPU are computed by compiled code."""
 
     def __init__(self, agent_size: int, surrounding_size: int, hidden_size: int = 128) -> None:
         super().__init__()
@@ -61,14 +65,18 @@ class MutualInformationEstimator(nn.Module):
 
     def forward(self, agent: Tensor, surrounding: Tensor) -> Tensor:
         """[..., X], [..., Y] -> [...] statistics."""
-        pairs = torch.cat([agent, surrounding], -1)
-        if not self._raw:
-            pairs = (pairs - self.offset) * self.scale
-        weight = torch.cat([self.agent.weight, self.surrounding.weight], 1)
-        statistics: Tensor = _Statistic.apply(  # type: ignore[no-untyped-call]
-            pairs.flatten(0, -2), weight, self.agent.bias, self.output.weight, self.output.bias
+        agent, surrounding = self._scaled(agent, surrounding)
+        hidden = torch.relu(self.agent(agent) + self.surrounding(surrounding))
+        return torch.tanh(self.output(hidden)).squeeze(-1)
+
+    def _scaled(self, agent: Tensor, surrounding: Tensor) -> tuple[Tensor, Tensor]:
+        if self._raw:
+            return agent, surrounding
+        size = agent.shape[-1]
+        return (
+            (agent - self.offset[:size]) * self.scale[:size],
+            (surrounding - self.offset[size:]) * self.scale[size:],
         )
-        return statistics.view(pairs.shape[:-1])
 
     def bound(
         self,
@@ -87,15 +95,37 @@ class MutualInformationEstimator(nn.Module):
         Returns:
             [N]
         """
-        return self._bound(agent, surrounding, shuffle_time(surrounding, permutations), inside)
+        if self._compiles(agent) and not torch.is_grad_enabled():
+            return torch.from_numpy(bounds(*self._arrays(agent, surrounding, permutations, inside)))
+        shuffled = shuffle_time(surrounding, permutations)
+        return donsker_varadhan(self(agent, surrounding), self(agent, shuffled), inside)
 
-    def _bound(
-        self, agent: Tensor, surrounding: Tensor, shuffled: Tensor, inside: Tensor | None = None
+    def mean_bound(
+        self,
+        agent: Tensor,
+        surrounding: Tensor,
+        permutations: Tensor,
+        inside: Tensor | None = None,
     ) -> Tensor:
-        """[N, T, X], [N, T, Y] twice -> [N]."""
-        both = torch.stack([surrounding, shuffled])
-        joint, marginals = self(agent.expand(2, *agent.shape), both)
-        return donsker_varadhan(joint, marginals, inside)
+        """[] the mean of `bound`, to be learned from."""
+        if not self._compiles(agent):
+            return self.bound(agent, surrounding, permutations, inside).mean()
+        arrays = self._arrays(agent, surrounding, permutations, inside)
+        mean: Tensor = _MeanBound.apply(arrays, *self.parameters())  # type: ignore[no-untyped-call]
+        return mean
+
+    def _compiles(self, agent: Tensor) -> bool:
+        return self.compiled and agent.device.type == "cpu"
+
+    def _arrays(
+        self, agent: Tensor, surrounding: Tensor, permutations: Tensor, inside: Tensor | None
+    ) -> tuple[Any, ...]:
+        """What compiled code takes."""
+        agent, surrounding = self._scaled(agent, surrounding)
+        frames = np.full(*agent.shape[:2]) if inside is None else inside.sum(-1).numpy()
+        tensors = (agent, surrounding, permutations)
+        data = (np.ascontiguousarray(tensor.numpy()) for tensor in tensors)
+        return (*data, frames, *(parameter.detach().numpy() for parameter in self.parameters()))
 
     def transition_bound(
         self, agent: Tensor, surrounding: Tensor, *, swapped: bool = True
@@ -110,40 +140,30 @@ class MutualInformationEstimator(nn.Module):
         Returns:
             [B]
         """
-        other = surrounding.flip(1) if swapped else surrounding
-        return self._bound(agent, surrounding, other)
+        others = _two_frames(len(agent), swapped).to(agent.device)
+        return self.bound(agent, surrounding, others)
 
 
-class _Statistic(torch.autograd.Function):
-    """tanh(w . relu(W i + b) + c) of rows i; can be differentiated once.
+@functools.lru_cache(maxsize=8)
+def _two_frames(rows: int, swapped: bool) -> Tensor:
+    """[B, 2] of two frames each the other one, or itself."""
+    return torch.tensor([1, 0] if swapped else [0, 1]).repeat(rows, 1)
 
-    With one output the gradient of W is, by the slope g of a row's statistic and the units m that
-    are on, w * sum(m x g i): of [R, H] matrices only m is made, where layer by layer it took five.
 
-    Shape legend: R rows, I inputs, H hidden units.
-    """
+class _MeanBound(torch.autograd.Function):
+    """`compiled.mean_bound`, to be differentiated once, by the estimator's parameters."""
 
     @staticmethod
-    def forward(
-        ctx: Any, rows: Tensor, weight: Tensor, bias: Tensor, output: Tensor, offset: Tensor
-    ) -> Tensor:
-        """[R, I], [H, I], [H], [1, H], [1] -> [R]."""
-        hidden = torch.relu_(F.linear(rows, weight, bias))
-        statistics = torch.tanh(torch.addmv(offset, hidden, output[0]))
-        ctx.save_for_backward(rows, weight, output, hidden, statistics)
-        return statistics
+    def forward(ctx: Any, arrays: tuple[Any, ...], *parameters: Tensor) -> Tensor:
+        """The estimator's, in its order: weight and bias of the agent's half, and so on."""
+        mean, *gradients = map(torch.from_numpy, mean_bound(*arrays))
+        ctx.gradients = gradients
+        return mean.squeeze(0)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        rows, weight, output, hidden, statistics = ctx.saved_tensors
-        slope = gradient * (1.0 - statistics.square())
-        on = hidden.sign()
-        weighted = torch.cat([rows * slope.unsqueeze(1), slope.unsqueeze(1)], 1)
-        of_first = (weighted.t() @ on) * output
-        of_rows = (slope.unsqueeze(1) * on * output) @ weight if ctx.needs_input_grad[0] else None
-        of_output = slope.unsqueeze(0) @ hidden
-        return of_rows, of_first[:-1].t(), of_first[-1], of_output, slope.sum().unsqueeze(0)
+    def backward(ctx: Any, of_mean: Tensor) -> tuple[Tensor | None, ...]:
+        return None, *(gradient * of_mean for gradient in ctx.gradients)
 
 
 def intrinsic_reward(bound: Tensor, scale: float) -> Tensor:

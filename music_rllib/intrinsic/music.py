@@ -36,6 +36,11 @@ class Estimator(Protocol):
     def bound(self, observations: Tensor, permutations: Tensor, inside: Tensor | None) -> Tensor:
         """[N, T, D], [N, T] permutations and padding -> [N] nats."""
 
+    def mean_bound(
+        self, observations: Tensor, permutations: Tensor, inside: Tensor | None
+    ) -> Tensor:
+        """[] the mean of `bound`, to be learned from."""
+
     def transition_bounds(self, observations: Tensor) -> Tensor:
         """[T, D] -> [T - 1] nats."""
 
@@ -109,7 +114,7 @@ class Music:
     def loss(self, trajectories: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
         """Less the mean bound, in nats."""
         permutations, inside = trajectories["permutations"], trajectories.get("inside")
-        bound = self._present().bound(trajectories["obs"], permutations, inside).mean()
+        bound = self._present().mean_bound(trajectories["obs"], permutations, inside)
         return -bound, {names.MI_BOUND: bound.detach()}
 
     def observe(

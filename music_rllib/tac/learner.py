@@ -39,6 +39,7 @@ from music_rllib.schedules import Quantity
 from music_rllib.tac import diagnostics
 from music_rllib.tac.fresh_episodes import FreshEpisodes, critic_bias
 from music_rllib.tac.kernels.adam import FusedAdam
+from music_rllib.tac.kernels.blas import use_threads
 from music_rllib.tac.kernels.cuda_graphs import CapturedUpdate, CudaRecorder, UpdateConstants
 from music_rllib.tac.kernels.forward import TACForward
 from music_rllib.tac.kernels.precision import check_precision
@@ -68,6 +69,7 @@ class TACLearner(TorchLearner):
         # A driver-side algorithm would otherwise use every core for 256-row products, and with
         # another trial beside it run twenty times slower; the sums would also change.
         torch.set_num_threads(self.config.torch_threads)
+        use_threads(self.config.torch_threads)
         self._adam: dict[str, FusedAdam] = {}
         super().build()
         check_precision(self._settings.precision, self._device)
@@ -167,7 +169,7 @@ class TACLearner(TorchLearner):
             batch = training_data.batch
         assert batch is not None
         self._weights_seq_no += 1
-        if self._direct is not None and not self._direct.flat.is_in_use:
+        if self._direct is not None and not self._direct.is_in_use:
             self._direct = DirectUpdate(self._policy_module)
         history: list[Mapping[str, Tensor]] = []
         step = self._captured or self._step
@@ -184,7 +186,10 @@ class TACLearner(TorchLearner):
 
     @torch.no_grad()  # else the targets keep a graph of all their averages
     def _average(self) -> None:
-        torch._foreach_lerp_(self._targets, self._online, self._settings.tau)
+        if self._direct is None:
+            torch._foreach_lerp_(self._targets, self._online, self._settings.tau)
+        else:
+            self._direct.average(self._settings.tau)
 
     def postprocess_gradients(self, gradients_dict: ParamDict) -> ParamDict:
         """RLlib sorts them by module and optimizer first; for nothing where nothing is clipped."""
@@ -288,20 +293,15 @@ class TACLearner(TorchLearner):
     def _update_directly(self, direct: DirectUpdate, minibatch: Minibatch) -> None:
         """RLlib's `_update` without its detours and, for the policy's module, without autograd."""
         batch = minibatch[DEFAULT_MODULE_ID]
-        forward = direct.forward(batch)
-        with torch.no_grad():
-            loss = self._losses_of(forward, batch)
-        direct.backward(
-            forward,
-            batch,
-            target=loss.target,
-            value_target=loss.value_target,
-            entropic_index=self._now.entropic_index,
-            alpha=self._objective.alpha,
-        )
+        learned = direct.learn(batch, self._now.entropic_index, float(self._objective.alpha))
+        self._losses |= learned.losses
+        self._observed |= learned.observed
         self._adam["networks"].step_flat(direct.flat)
         if "alpha" in self._adam:
-            self._policy_module.log_alpha.grad = loss.excess_entropy
+            seen = learned.observed
+            self._policy_module.log_alpha.grad = self._objective.excess_entropy(
+                seen["log_density"], seen["log_std"], learned.ln_q_pi
+            )
             self._adam["alpha"].step()
         if "estimator" in self._adam:
             self._adam["estimator"].zero_grad()

@@ -25,17 +25,13 @@ __all__ = ["Losses", "Objective"]
 
 
 class Losses(NamedTuple):
-    """The losses of a minibatch, and what their derivatives are made of."""
+    """The losses of a minibatch."""
 
     total: Tensor
     named: dict[str, Tensor]
     """[] each, by the metric's name."""
     target: Tensor
     """[B] of the critics."""
-    value_target: Tensor
-    """[B] of the value network, where there is one."""
-    excess_entropy: Tensor
-    """[] entropy of the policy less its target, the derivative by a learned log alpha."""
 
 
 class Objective:
@@ -100,27 +96,38 @@ class Objective:
         if settings.action_l2 > 0:
             policy = policy + settings.action_l2 * forward.action.square().mean()
         total, named = critic + policy, {}
-        value_target = actor_critic.value_target(forward.q_of_policy, ln_q_pi, alpha)
         if forward.value is not None:
+            value_target = actor_critic.value_target(forward.q_of_policy, ln_q_pi, alpha)
             value = actor_critic.value_loss(forward.value, value_target)
             total, named[names.VALUE_LOSS] = total + value, value.detach()
-        excess = self._excess_entropy(forward, ln_q_pi)
         if isinstance(settings.alpha, LearnedAlpha):
+            assert forward.log_density is not None
+            assert forward.log_std is not None
+            excess = self.excess_entropy(
+                forward.log_density.detach(), forward.log_std.detach(), ln_q_pi.detach()
+            )
             total = total + actor_critic.alpha_loss(self._module.log_alpha, excess)
         named |= {names.CRITIC_LOSS: critic.detach(), names.POLICY_LOSS: policy.detach()}
-        return Losses(total, named, target, value_target, excess)
+        return Losses(total, named, target)
 
-    def _excess_entropy(self, forward: TACForward, ln_q_pi: Tensor) -> Tensor:
-        """[] how much too random the policy is for a learned alpha, in its target's own measure."""
+    def excess_entropy(self, log_density: Tensor, log_std: Tensor, ln_q_pi: Tensor) -> Tensor:
+        """How much too random the policy is for a learned alpha, in its target's own measure.
+
+        Args:
+            log_density: [B, A]
+            log_std: [B, A]
+            ln_q_pi: [B]
+
+        Returns:
+            [] the derivative by log alpha.
+        """
         alpha = self._settings.alpha
-        if not isinstance(alpha, LearnedAlpha) or forward.log_density is None:
-            return self._no_entropy
+        assert isinstance(alpha, LearnedAlpha)
         if alpha.target_shannon is not None:
-            return -forward.log_density.detach().sum(-1).mean() - alpha.target_shannon
+            return -log_density.sum(-1).mean() - alpha.target_shannon
         if alpha.target_width is not None:
-            assert forward.log_std is not None
-            return forward.log_std.detach().mean() - math.log(alpha.target_width)
-        return -ln_q_pi.mean().detach() - self._target_entropy
+            return log_std.mean() - math.log(alpha.target_width)
+        return -ln_q_pi.mean() - self._target_entropy
 
     def _entropy_for(self, alpha: LearnedAlpha) -> float:
         """The target in units of S_q; `auto` follows q."""

@@ -220,6 +220,12 @@ class EstimatorModule(TorchRLModule, SelfSupervisedLossAPI):
         """[N, T, D] trajectories, [N, T] permutations and padding -> [N] bounds in nats."""
         return self.estimator.bound(*self.split(observations), permutations, inside)
 
+    def mean_bound(
+        self, observations: Tensor, permutations: Tensor, inside: Tensor | None = None
+    ) -> Tensor:
+        """[] the mean of `bound`, to be learned from."""
+        return self.estimator.mean_bound(*self.split(observations), permutations, inside)
+
     def transition_bounds(self, observations: Tensor, *, swapped: bool = True) -> Tensor:
         """[T, D] states of one trajectory -> [T-1] bounds of its transitions, in nats."""
         frames = torch.stack([observations[:-1], observations[1:]], dim=1)

@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
+from music_rllib.intrinsic.estimator import MutualInformationEstimator
 from music_rllib.tac.algorithm import TAC
 from music_rllib.tac.kernels.cuda_graphs import CapturedUpdate, CudaRecorder, Replay
 from music_rllib.tac.learner import TACLearner
@@ -38,6 +39,7 @@ pytestmark = pytest.mark.usefixtures("local_ray")
 def with_autograd(monkeypatch: pytest.MonkeyPatch) -> None:
     """As on a GPU: the update without autograd is the CPU's own."""
     monkeypatch.setattr(TACLearner, "_is_standard", False)
+    monkeypatch.setattr(MutualInformationEstimator, "compiled", False)
 
 
 Function = Callable[[], Mapping[Any, Tensor]]

@@ -1,5 +1,6 @@
-"""One gradient update on a CPU without autograd: kept buffers, derivatives in closed form.
+"""Gradient updates faster than autograd's.
 
-`update` is the update, `derivatives` its mathematics, `network` a perceptron on kept buffers,
-`products` the choice of the library that multiplies matrices, `flat` parameters in one tensor.
+`compiled` is the update on a CPU, its mathematics included, `update` what hands a module's networks
+to it, `blas` the library that multiplies matrices there, `flat` parameters in one tensor, `adam`
+their optimizer; `cuda_graphs` are updates on a GPU.
 """

@@ -45,6 +45,15 @@ class FlatParameters:
         start, shape = self._places[self._indices[id(parameter)]]
         return self.gradients[start : start + shape.numel()].view(shape)
 
+    def start(self, parameter: Tensor) -> int:
+        """Where the values of a parameter begin."""
+        return self._places[self._indices[id(parameter)]][0]
+
+    def part(self, parameters: Sequence[Tensor]) -> Tensor:
+        """The values of parameters that lie behind each other, what is between them included."""
+        last = parameters[-1]
+        return self.values[self.start(parameters[0]) : self.start(last) + last.numel()]
+
     @property
     def is_in_use(self) -> bool:
         """Whether the parameters are still these views; converting the module replaces them."""

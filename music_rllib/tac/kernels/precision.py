@@ -10,7 +10,6 @@ import torch
 __all__ = [
     "PrecisionError",
     "check_precision",
-    "cpu_family",
     "cpu_flags",
     "cpu_vendor",
     "has_bf16",
@@ -61,11 +60,6 @@ def cpu_flags() -> frozenset[str]:
 def cpu_vendor() -> str:
     """As /proc/cpuinfo has it, `GenuineIntel` or `AuthenticAMD`; empty where it does not."""
     return _cpu_description().get("vendor_id", "")
-
-
-def cpu_family() -> int:
-    """As /proc/cpuinfo has it, 25 of AMD's Zen 3 and 4, 26 of Zen 5; 0 where it does not."""
-    return int(_cpu_description().get("cpu family", 0))
 
 
 @functools.cache

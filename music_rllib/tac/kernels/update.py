@@ -1,183 +1,187 @@
-"""TAC's gradient update without autograd.
+"""TAC's gradient update without autograd: a module's networks as compiled code takes them.
 
-The same numbers as autograd's to rounding, in about two thirds of its time: no graph, no new
-matrices, both minibatches of the critics in one pass, no gradients that nothing needs.
+The same numbers as autograd's to rounding, in about half of its time.
 
-Shape legend: B batch, I network inputs, A action dimensions, C critics.
+Shape legend: B batch, I network inputs, A action dimensions, C critics, S parameters.
 """
 
 from __future__ import annotations
 
-import functools
+import math
 from collections.abc import Mapping
+from typing import NamedTuple
 
+import numpy as np
 import torch
 from ray.rllib.core.columns import Columns
-from torch import Tensor
+from torch import Tensor, nn
 
-from music_rllib.functional.squashed_gaussian import deterministic_action
-from music_rllib.tac.kernels import derivatives
+from music_rllib import names
+from music_rllib.tac.kernels.compiled import Batch, Networks, learn
+from music_rllib.tac.kernels.distribution import Rule
 from music_rllib.tac.kernels.flat import FlatParameters
-from music_rllib.tac.kernels.forward import Bootstrap, TACForward
-from music_rllib.tac.kernels.mlp import Network, Scratch, critics, perceptron
-from music_rllib.tac.kernels.products import Products, products
-from music_rllib.tac.rl_module import TACModule, choose_action
+from music_rllib.tac.kernels.perceptron import Network
+from music_rllib.tac.networks import Critics, Perceptron
+from music_rllib.tac.normaliser import RunningNormaliser
+from music_rllib.tac.rl_module import TACModule
 
-__all__ = ["DirectUpdate"]
+__all__ = ["DirectUpdate", "Learned"]
+
+
+class Learned(NamedTuple):
+    """What a minibatch's update is measured by."""
+
+    losses: dict[str, Tensor]
+    """[] each, by the metric's name."""
+    observed: dict[str, Tensor]
+    """As `diagnostics.of_updates` takes it, of one update."""
+    ln_q_pi: Tensor
+    """[B]"""
 
 
 class DirectUpdate:
-    """A forward pass over one minibatch, and the gradients of TAC's losses in `flat.gradients`.
+    """The gradients of TAC's losses over a minibatch, in `flat.gradients`.
 
     Args:
         module: on a CPU, of one type of floats. Its trained parameters, but for log alpha, become
-            views of one tensor.
-        by: the library that multiplies; None for the machine's.
+            views of one tensor, and those of its averaged networks of another.
     """
 
-    def __init__(self, module: TACModule, by: Products | None = None) -> None:
-        self._module, self._settings = module, module.settings
+    def __init__(self, module: TACModule) -> None:
+        self._module = module
         named = module.named_parameters()
         trained = [p for name, p in named if p.requires_grad and name != "log_alpha"]
         self.flat = FlatParameters(trained)
-        by, scratch = by or products(), Scratch()
-        self._policy = perceptron(module.policy, self.flat, by, scratch)
-        self._critics = critics(module.critics, self.flat, by, scratch)
-        if self._settings.bootstrap == "value":
-            self._value = perceptron(module.value, self.flat, by, scratch)
-            self._value_target = perceptron(module.value_target, None, by, scratch)
-        else:
-            self._critics_target = critics(module.critics_target, None, by, scratch)
-        if module.deterministic:
-            self._policy_target = perceptron(module.policy_target, None, by, scratch)
+        pairs = module.get_target_network_pairs()
+        self._averaged = FlatParameters([p for _, target in pairs for p in target.parameters()])
+        self._online = [self.flat.part(list(online.parameters())) for online, _ in pairs]
+        self._targets = [self._averaged.part(list(target.parameters())) for _, target in pairs]
+        self._networks: dict[int, Networks] = {}
+        self._rule = self._rule_of(module)
 
-    # -- forwards -------------------------------------------------------------------------
+    @property
+    def is_in_use(self) -> bool:
+        """Whether the parameters are still these; converting the module replaces them."""
+        return self.flat.is_in_use and self._averaged.is_in_use
 
-    @torch.no_grad()
-    def forward(self, batch: Mapping[str, Tensor]) -> TACForward:
-        """What `TACModule.forward_train` gives; `batch` is documented at `TACLearner`."""
-        inputs = self._module.normaliser(batch[Columns.OBS])
-        next_inputs = self._module.normaliser(batch[Columns.NEXT_OBS])
-        has_value = self._settings.bootstrap == "value"
-        if has_value or self._module.deterministic:
-            outputs = self._policy.forward(inputs)
-            following = self._value_of(next_inputs) if has_value else self._averaged(next_inputs)
-        else:  # both in one pass
-            both = self._policy.forward(torch.cat([inputs, next_inputs]))
-            outputs, of_next = both.split(len(inputs))
-            mean, log_std = self._module.distribution(of_next)
-            action, log_density = choose_action(mean, log_std, batch["next_noise"])
-            following = Bootstrap(self._lowest_target(next_inputs, action), log_density)
-        mean, log_std = self._module.distribution(outputs)
-        action, log_density = choose_action(mean, log_std, batch.get("noise"))
-        self._outputs = outputs
-        q_values, q_of_policy = self._ask_critics(inputs, batch[Columns.ACTIONS], action)
-        return TACForward(
-            action=action,
-            log_density=log_density,
-            log_std=log_std,
-            q_values=q_values,
-            q_of_policy=q_of_policy,
-            value=self._value.forward(inputs).squeeze(-1) if has_value else None,
-            next=following,
-        )
-
-    def _value_of(self, next_inputs: Tensor) -> Bootstrap:
-        return Bootstrap(self._value_target.forward(next_inputs).squeeze(-1))
-
-    def _averaged(self, next_inputs: Tensor) -> Bootstrap:
-        """DDPG's: the averaged critic at the averaged policy's action."""
-        action = deterministic_action(self._policy_target.forward(next_inputs))
-        return Bootstrap(self._lowest_target(next_inputs, action))
-
-    def _lowest_target(self, inputs: Tensor, action: Tensor) -> Tensor:
-        """[B, I], [B, A] -> [B]."""
-        return _values(self._critics_target, torch.cat([inputs, action], -1)).amin(0)
-
-    def _ask_critics(self, inputs: Tensor, learned: Tensor, asked: Tensor) -> tuple[Tensor, Tensor]:
-        """[C, B] at the minibatch's actions and at the policy's."""
-        states = torch.cat([inputs, inputs])
-        values = _values(self._critics, torch.cat([states, torch.cat([learned, asked])], -1))
-        first, second = values.split(len(inputs), dim=1)
-        return first, second
-
-    # -- backwards ------------------------------------------------------------------------
-
-    @torch.no_grad()
-    def backward(
-        self,
-        forward: TACForward,
-        batch: Mapping[str, Tensor],
-        *,
-        target: Tensor,
-        value_target: Tensor | None,
-        entropic_index: float,
-        alpha: Tensor | float,
-    ) -> None:
+    def learn(self, batch: Mapping[str, Tensor], entropic_index: float, alpha: float) -> Learned:
         """Writes the gradients of all losses.
 
         Args:
-            forward: of the last call of `forward`.
-            target: [B] of the critics.
-            value_target: [B] of the value network; None without one.
+            batch: documented at `TACLearner`.
             entropic_index: q.
             alpha: entropy coefficient.
+
         """
-        of_action = self._through_critics(forward, target, batch.get("weights"))
-        of_outputs = self._through_distribution(forward, batch, of_action, entropic_index, alpha)
-        self._policy.backward(of_outputs, learned=len(of_outputs))
-        if forward.value is not None:
-            assert value_target is not None
-            of_value = derivatives.of_value_loss(forward.value, value_target)
-            self._value.backward(of_value.unsqueeze(1), learned=len(of_value))
+        actions = batch[Columns.ACTIONS]
+        nothing, none = actions[:0], batch[Columns.REWARDS][:0]
+        taken = (
+            batch[Columns.OBS], actions, batch[Columns.REWARDS], batch["discounts"],
+            batch[Columns.NEXT_OBS], batch.get("noise", nothing), batch.get("next_noise", nothing),
+            batch.get("weights", none),
+        )  # fmt: skip
+        rows = len(actions)
+        if rows not in self._networks:
+            self._networks[rows] = self._networks_for(rows)
+        arrays = Batch(*(values.numpy() for values in taken))
+        found = learn(self._networks[rows], arrays, self._rule, entropic_index, alpha)
+        return self._learned(*map(torch.from_numpy, found))
 
-    def _through_critics(
-        self, forward: TACForward, target: Tensor, weights: Tensor | None
-    ) -> Tensor:
-        """[B, A]: of the policy's loss by its actions, the entropy left out."""
-        of_learned = derivatives.of_critic_loss(forward.q_values, target, weights)
-        counts = derivatives.of_policy_value(forward.q_of_policy, self._settings.policy_critic)
-        of_values = torch.cat([of_learned, counts.div_(-len(target))], 1).unsqueeze(-1)
-        rows, actions = len(target), slice(self._module.input_size, None)
-        of_actions = [
-            critic.of_inputs(critic.backward(of_value, learned=rows)[rows:], actions)
-            for critic, of_value in zip(self._critics, of_values, strict=True)
-        ]
-        return functools.reduce(torch.add, of_actions)
+    def _learned(
+        self, losses: Tensor, q_values: Tensor, targets: Tensor, log_density: Tensor,
+        log_std: Tensor, ln_q_pi: Tensor,
+    ) -> Learned:  # fmt: skip
+        critics, policy, value = losses.unbind()
+        named = {names.CRITIC_LOSS: critics, names.POLICY_LOSS: policy}
+        if self._rule.has_value:
+            named[names.VALUE_LOSS] = value
+        observed = {"q_values": q_values, "targets": targets}
+        if self._rule.stochastic:
+            observed |= {"log_density": log_density, "log_std": log_std}
+        return Learned(named, observed, ln_q_pi)
 
-    def _through_distribution(
-        self,
-        forward: TACForward,
-        batch: Mapping[str, Tensor],
-        of_action: Tensor,
-        q: float,
-        alpha: Tensor | float,
-    ) -> Tensor:
-        """[B, A or 2 A]: of the policy's loss by the outputs of its network."""
-        settings, action = self._settings, forward.action
-        if settings.action_l2 > 0:
-            of_action = of_action + derivatives.of_mean_square(action, settings.action_l2)
-        if forward.log_density is None or forward.log_std is None:
-            return derivatives.through_tanh(of_action, action)
-        slope = derivatives.of_ln_q(forward.log_density, q, settings.entropy_form)
-        of_mean, of_log_std = derivatives.of_squashed_sample(
-            of_action,
-            slope * (alpha / len(action)),
-            action,
-            forward.log_std.exp() * batch["noise"],
+    @torch.no_grad()
+    def average(self, tau: float) -> None:
+        """Moves the averaged networks by the share `tau` towards those that are trained."""
+        for target, online in zip(self._targets, self._online, strict=True):
+            target.lerp_(online, tau)
+
+    # -- as compiled code takes it --------------------------------------------------------
+
+    def _networks_for(self, rows: int) -> Networks:
+        module = self._module
+        policy = _perceptron(module.policy, self.flat, 2 * rows)
+        critics = _critics(module.critics, self.flat, 2 * rows)
+        value = value_target = policy_target = policy
+        critics_target = critics
+        if module.settings.bootstrap == "value":
+            value = _perceptron(module.value, self.flat, rows)
+            value_target = _perceptron(module.value_target, self._averaged, rows)
+        else:
+            critics_target = _critics(module.critics_target, self._averaged, rows)
+        if module.deterministic:
+            policy_target = _perceptron(module.policy_target, self._averaged, rows)
+        widest = max(module.settings.hidden_sizes)
+        scratch = self.flat.values.new_empty(2, 2 * rows * widest).numpy()
+        return Networks(
+            policy, critics, value, value_target, critics_target, policy_target, scratch
         )
-        of_raw = self._through_bounds(of_log_std, forward.log_std)
-        return torch.cat([of_mean, of_raw], 1)
 
-    def _through_bounds(self, of_log_std: Tensor, log_std: Tensor) -> Tensor:
-        """[B, A]: by the network's outputs, given that by the ln sigma made of them."""
-        settings = self._settings
-        if settings.log_std_form == "tanh":
-            return derivatives.through_scaled_tanh(of_log_std, log_std, settings.log_std_bounds)
-        raw = self._outputs[:, log_std.shape[1] :]
-        return derivatives.through_clamp(of_log_std, raw, log_std)
+    def _rule_of(self, module: TACModule) -> Rule:
+        settings, normaliser = module.settings, module.normaliser
+        mean, clip = torch.zeros(module.input_size), math.inf
+        inverse_std = torch.ones_like(mean)
+        if isinstance(normaliser, RunningNormaliser):  # it writes these in place
+            mean, inverse_std, clip = normaliser.mean, normaliser.inverse_std, normaliser.clip
+        low, high = settings.target_bounds or (-math.inf, math.inf)
+        return Rule(
+            mean=mean.numpy(),
+            inverse_std=inverse_std.numpy(),
+            clip=clip,
+            gamma=settings.gamma,
+            target_low=low,
+            target_high=high,
+            log_std_low=settings.log_std_bounds[0],
+            log_std_high=settings.log_std_bounds[1],
+            by_tanh=settings.log_std_form == "tanh",
+            action_l2=settings.action_l2,
+            joint=settings.entropy_form == "joint",
+            first_critic=settings.policy_critic == "first",
+            has_value=settings.bootstrap == "value",
+            stochastic=not module.deterministic,
+        )
 
 
-def _values(networks: list[Network], pairs: Tensor) -> Tensor:
-    """[R, I + A] -> [C, R]."""
-    return torch.cat([network.forward(pairs) for network in networks], 1).t()
+def _perceptron(network: Perceptron, flat: FlatParameters, rows: int) -> Network:
+    layers = [layer for layer in network if isinstance(layer, nn.Linear)]
+    weights = [flat.start(layer.weight) for layer in layers]
+    biases = [flat.start(layer.bias) for layer in layers]
+    sizes = [layers[0].in_features, *(layer.out_features for layer in layers)]
+    return _network(flat, sizes, weights, biases, rows, by_outputs=True)
+
+
+def _critics(network: Critics, flat: FlatParameters, rows: int) -> tuple[Network, ...]:
+    """Each critic by itself, on the parameters of all."""
+    sizes = [network.weights[0].shape[1], *(weight.shape[2] for weight in network.weights)]
+
+    def critic(c: int) -> Network:
+        weights = [flat.start(weight) + c * weight[c].numel() for weight in network.weights]
+        biases = [flat.start(bias) + c * bias[c].numel() for bias in network.biases]
+        return _network(flat, sizes, weights, biases, rows, by_outputs=False)
+
+    return tuple(critic(c) for c in range(network.count))
+
+
+def _network(
+    flat: FlatParameters, sizes: list[int], weights: list[int], biases: list[int], rows: int,
+    *, by_outputs: bool,
+) -> Network:  # fmt: skip
+    return Network(
+        values=flat.values.numpy(),
+        gradients=flat.gradients.numpy(),
+        sizes=np.array(sizes),
+        weights=np.array(weights),
+        biases=np.array(biases),
+        by_outputs=by_outputs,
+        kept=flat.values.new_empty(rows * sum(sizes[1:])).numpy(),
+    )

@@ -1,0 +1,306 @@
+"""TAC's losses and their gradients over one minibatch, as one compiled function.
+
+No autograd, no new matrices, both minibatches of the critics in one pass, no gradients that nothing
+needs. Each derivative stands beside the formula that it is of; the losses that autograd has are in
+`music_rllib.functional`, and a test holds both against each other.
+
+Shape legend: B batch, R rows, I network inputs, A action dimensions, C critics.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+
+from music_rllib.tac.kernels.blas import multiply
+from music_rllib.tac.kernels.distribution import (
+    Rule,
+    Sample,
+    ln_q_of_policy,
+    sampled,
+    through_distribution,
+)
+from music_rllib.tac.kernels.perceptron import (
+    Array,
+    Network,
+    backward,
+    compiled,
+    forward,
+    layer_outputs,
+    layer_weights,
+)
+
+__all__ = ["Batch", "Learned", "Networks", "learn"]
+
+
+class Networks(NamedTuple):
+    """Those of a module; where it lacks one, another stands in its place, unused."""
+
+    policy: Network
+    critics: tuple[Network, ...]
+    value: Network
+    value_target: Network
+    critics_target: tuple[Network, ...]
+    policy_target: Network
+    scratch: Array
+    """[2, R * O] for the gradients between layers, by the most rows and the widest layer."""
+
+
+class Batch(NamedTuple):
+    """What is learned from; what there is none of has no rows."""
+
+    observations: Array
+    """[B, I]"""
+    actions: Array
+    """[B, A]"""
+    rewards: Array
+    """[B]"""
+    discounts: Array
+    """[B]"""
+    next_observations: Array
+    """[B, I]"""
+    noise: Array
+    """[B, A]"""
+    next_noise: Array
+    """[B, A]"""
+    weights: Array
+    """[B]"""
+
+
+class Learned(NamedTuple):
+    """What an update is measured by."""
+
+    losses: Array
+    """[3] of critics, policy and value network."""
+    q_values: Array
+    """[C, B] at the minibatch's actions."""
+    target: Array
+    """[B] of the critics."""
+    log_density: Array
+    """[B, A] of the policy's actions; empty for a deterministic one."""
+    log_std: Array
+    """[B, A]; likewise."""
+    ln_q_pi: Array
+    """[B]"""
+
+
+@compiled
+def _normalised(observations: Array, following: Array, rule: Rule) -> Array:
+    """(x - mean) / std, clipped: twice [B, I] -> [2 B, I]."""
+    rows, size = observations.shape
+    states = np.empty((2 * rows, size), observations.dtype)
+    clip = observations.dtype.type(rule.clip)
+    for r in range(2 * rows):
+        row = observations[r] if r < rows else following[r - rows]
+        for i in range(size):
+            value = (row[i] - rule.mean[i]) * rule.inverse_std[i]
+            states[r, i] = min(max(value, -clip), clip)
+    return states
+
+
+@compiled
+def _pairs(states: Array, actions: Array, others: Array) -> Array:
+    """States [B, I] beside actions [B, A], and again beside others, if there are any."""
+    rows, size = states.shape
+    pairs = np.empty((len(actions) + len(others), size + actions.shape[1]), states.dtype)
+    for r in range(len(pairs)):
+        state = states[r % rows]
+        action = actions[r] if r < rows else others[r - rows]
+        for i in range(size):
+            pairs[r, i] = state[i]
+        for a in range(len(action)):
+            pairs[r, size + a] = action[a]
+    return pairs
+
+
+@compiled
+def _ask_critics(critics: tuple[Network, ...], pairs: Array) -> Array:
+    """[R, I + A] -> [C, R]."""
+    values = np.empty((len(critics), len(pairs)), pairs.dtype)
+    for c in range(len(critics)):
+        outputs = forward(critics[c], pairs)
+        for r in range(len(pairs)):
+            values[c, r] = outputs[r, 0]
+    return values
+
+
+@compiled
+def _smallest(values: Array, first: int) -> Array:
+    """[C, R] -> [R - first] the smallest critic's, from a row on."""
+    smallest = values[0, first:].copy()
+    for c in range(1, len(values)):
+        for r in range(len(smallest)):
+            smallest[r] = min(smallest[r], values[c, first + r])
+    return smallest
+
+
+@compiled
+def _critic_target(
+    networks: Networks, batch: Batch, rule: Rule, following: Array, next_outputs: Array,
+    q: float, alpha: float,
+) -> Array:  # fmt: skip
+    """[B] r + gamma d V(s'), clipped (paper eq. 9, with the mask that it leaves out)."""
+    rows = len(following)
+    if rule.has_value:
+        values = forward(networks.value_target, following).copy().reshape(rows)
+    else:
+        if not rule.stochastic:
+            next_outputs = forward(networks.policy_target, following)
+        sample = sampled(next_outputs, batch.next_noise, rule)
+        pairs = _pairs(following, sample.action, sample.action[:0])
+        values = _smallest(_ask_critics(networks.critics_target, pairs), 0)
+        ln_q_pi = ln_q_of_policy(sample.log_density, q, rule.joint)[0]
+        for r in range(len(ln_q_pi)):
+            values[r] -= alpha * ln_q_pi[r]
+    for r in range(rows):
+        target = batch.rewards[r] + rule.gamma * batch.discounts[r] * values[r]
+        values[r] = min(max(target, rule.target_low), rule.target_high)
+    return values
+
+
+@compiled
+def _of_critics(
+    values: Array, target: Array, smallest: Array, weights: Array, first_critic: bool
+) -> tuple[Array, float]:
+    """Derivatives by the critics' values [C, 2 B] of critic and policy losses; the critics' loss.
+
+    Of 1/2 mean w (Q - y)^2 it is w (Q - y) / B (paper eq. 9); of mean -Q, -1/B (eq. 10). Of `min`
+    the smallest critic has it all; equal ones share it, as autograd's `amin` has it.
+    """
+    count, rows = len(values), len(target)
+    gradient, loss = np.zeros_like(values), 0.0
+    for r in range(rows):
+        weight = weights[r] if len(weights) > 0 else 1.0
+        sharing = 0
+        for c in range(count):
+            error = float(values[c, r]) - float(target[r])
+            loss += 0.5 * weight * error * error / rows
+            gradient[c, r] = weight * error / rows
+            sharing += values[c, rows + r] == smallest[r]
+        for c in range(count):
+            if first_critic:
+                gradient[c, rows + r] = -1.0 / rows if c == 0 else 0.0
+            elif values[c, rows + r] == smallest[r]:
+                gradient[c, rows + r] = -1.0 / (rows * sharing)
+    return gradient, loss
+
+
+@compiled
+def _asked(networks: Networks, pairs: Array, of_values: Array, action: Array) -> Array:
+    """[B, A]: by the policy's actions, through the critics, whose gradients are written."""
+    rows, size = action.shape
+    inputs = pairs.shape[1] - size
+    of_action, part = np.zeros_like(action), np.empty_like(action)
+    for c in range(len(networks.critics)):
+        critic = networks.critics[c]
+        of_value = of_values[c].reshape((2 * rows, 1))
+        of_hidden = backward(critic, pairs, of_value, rows, networks.scratch)
+        weights = layer_weights(critic, critic.values, 0)[inputs:]
+        multiply(of_hidden[rows:], False, weights, True, part)
+        for r in range(rows):
+            for a in range(size):
+                of_action[r, a] += part[r, a]
+    return of_action
+
+
+@compiled
+def _learn_policy(
+    networks: Networks, rule: Rule, entered: Array, sample: Sample, of_action: Array,
+    slopes: Array, alpha: float,
+) -> None:  # fmt: skip
+    """Gradients of mean (alpha ln_q pi - Q) + w mean a^2 (paper eq. 10), -Q's given.
+
+    alpha slope / B by ln p, and 2 w a / (B A) by the actions.
+    """
+    rows, size = of_action.shape
+    for r in range(rows):
+        for a in range(size):
+            of_action[r, a] += 2.0 * rule.action_l2 / (rows * size) * sample.action[r, a]
+    for r in range(len(slopes)):
+        for a in range(slopes.shape[1]):
+            slopes[r, a] *= alpha / rows
+    outputs = layer_outputs(networks.policy, len(networks.policy.sizes) - 2, len(entered))[:rows]
+    of_outputs = through_distribution(of_action, slopes, sample, outputs, rule)
+    backward(networks.policy, entered, of_outputs, rows, networks.scratch)
+
+
+@compiled
+def _policy_loss(
+    sample: Sample, ln_q_pi: Array, improved: Array, rule: Rule, alpha: float
+) -> float:
+    """The mean of alpha ln_q pi - Q + w a^2 (paper eq. 10)."""
+    rows, size = sample.action.shape
+    loss = 0.0
+    for r in range(rows):
+        loss += (alpha * ln_q_pi[r] - improved[r]) / rows
+        for a in range(size):
+            loss += rule.action_l2 * sample.action[r, a] ** 2 / (rows * size)
+    return loss
+
+
+@compiled
+def _learn_value(
+    networks: Networks, states: Array, smallest: Array, ln_q_pi: Array, alpha: float
+) -> float:
+    """1/2 mean (V - (min Q - alpha ln_q pi))^2 (paper eq. 8), whose derivative is the error / B."""
+    rows, loss = len(states), 0.0
+    values = forward(networks.value, states)
+    gradient = np.empty_like(values)
+    for r in range(rows):
+        error = values[r, 0] - (smallest[r] - alpha * ln_q_pi[r])
+        loss += 0.5 * error * error / rows
+        gradient[r, 0] = error / rows
+    backward(networks.value, states, gradient, rows, networks.scratch)
+    return loss
+
+
+def _compiled_for(sources: str) -> Any:
+    """`learn`, kept on disk: numba looks it up by this file's age and by what it encloses."""
+
+    @njit(cache=True, nogil=True, error_model="numpy")
+    def learn(networks: Networks, batch: Batch, rule: Rule, q: float, alpha: float) -> Learned:
+        """All losses of a minibatch (paper III-B), their gradients into the networks'."""
+        sources  # noqa: B018
+        rows = len(batch.actions)
+        states = _normalised(batch.observations, batch.next_observations, rule)
+        # Both in one pass, where the policy is asked for its next actions.
+        entered = states if rule.stochastic and not rule.has_value else states[:rows]
+        outputs = forward(networks.policy, entered)
+        sample = sampled(outputs[:rows], batch.noise, rule)
+        ln_q_pi, slopes = ln_q_of_policy(sample.log_density, q, rule.joint)
+        target = _critic_target(networks, batch, rule, states[rows:], outputs[rows:], q, alpha)
+
+        pairs = _pairs(states[:rows], batch.actions, sample.action)
+        values = _ask_critics(networks.critics, pairs)
+        smallest = _smallest(values, rows)
+        losses = np.zeros(3, states.dtype)
+        of_values, losses[0] = _of_critics(
+            values, target, smallest, batch.weights, rule.first_critic
+        )
+        of_action = _asked(networks, pairs, of_values, sample.action)
+
+        improved = values[0, rows:] if rule.first_critic else smallest
+        losses[1] = _policy_loss(sample, ln_q_pi, improved, rule, alpha)
+        _learn_policy(networks, rule, entered, sample, of_action, slopes, alpha)
+        if rule.has_value:
+            losses[2] = _learn_value(networks, states[:rows], smallest, ln_q_pi, alpha)
+        return Learned(
+            losses, values[:, :rows].copy(), target, sample.log_density, sample.log_std, ln_q_pi
+        )
+
+    return learn
+
+
+def _sources() -> str:
+    """Changes with any file that `learn` is compiled of."""
+    files = (
+        Path(__file__).with_name(f"{name}.py") for name in ("blas", "distribution", "perceptron")
+    )
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
+
+
+learn = _compiled_for(_sources())
