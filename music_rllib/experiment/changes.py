@@ -91,7 +91,7 @@ def check_begun(config: SweepConfig) -> None:
 def _settings(node: Node) -> dict[str, Any]:
     return {
         "settings": node.run.model_dump(mode="json"),
-        "source": node.input.key if node.input else None,
+        "source": node.source_key,
     }
 
 
@@ -148,7 +148,7 @@ def longer(sweep: Sweep) -> list[str]:
 
 
 def _extends(was: Mapping[str, Any], node: Node) -> bool:
-    source = node.input.key if node.input else None
+    source = node.source_key
     return bool(was["source"] == source and was["settings"]["env_steps"] < node.run.env_steps)
 
 

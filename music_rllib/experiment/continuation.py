@@ -52,7 +52,7 @@ def is_continuable(run: RunSettings) -> bool:
 
 def continued_from(store: NodeStore, node: Node) -> int | None:
     """Environment steps of the shorter run from whose end `node` would go on; None: of none."""
-    key = continuation_key(node.run, node.input.key if node.input else None)
+    key = continuation_key(node.run, node.source_key)
     if budget_settings(node.run):
         return None
     steps = [steps_of(name) for name in store.continuation(key).names()]

@@ -73,6 +73,11 @@ class Node:
     values: Mapping[str, Any] = field(default_factory=dict, compare=False)
     """As those of the run."""
 
+    @property
+    def source_key(self) -> str | None:
+        """Of the node whose networks it starts from."""
+        return self.input.key if self.input else None
+
 
 class Plan:
     """All that a sweep asks for; searched stages get their runs as their trials are chosen."""

@@ -73,7 +73,7 @@ def run_info(node: Node) -> RunInfo:
             names.TAG_MI_REWARD_WEIGHT: in_words(weight),
             names.TAG_CONFIG_HASH: content_key(config),
             names.TAG_ALGORITHM: ALGORITHM_VERSION,
-            names.TAG_SOURCE_NODE: node.input.key if node.input else None,
+            names.TAG_SOURCE_NODE: node.source_key,
         },
         settings={
             names.SETTING_ENTROPIC_INDEX: _at_start(q, run),

@@ -108,9 +108,9 @@ def plan_document(sweep: Sweep) -> dict[str, Any]:
         {
             "key": node.key,
             "label": node.label,
-            "input": node.input.key if node.input else None,
+            "input": node.source_key,
             "env_steps": node.run.env_steps,
-            "continuation": continuation_key(node.run, node.input.key if node.input else None),
+            "continuation": continuation_key(node.run, node.source_key),
         }
         for node in sweep.plan.nodes
     ]

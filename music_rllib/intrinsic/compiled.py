@@ -10,20 +10,20 @@ both together, H hidden units.
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from music_rllib.compiling import compiled, kept_on_disk
 
 __all__ = ["bounds", "mean_bound"]
 
 Array = NDArray[Any]
 
-_inner = njit(error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
-"""Sums in any order, the same one in every run: else they are not vectorised."""
-_outer = njit(cache=True, nogil=True, error_model="numpy")
+_inner = functools.partial(compiled, any_order=True)
 
 
 @_inner
@@ -96,7 +96,7 @@ def _add_products(states: Array, n: int, frames: int, of_units: Array, columns: 
                 columns[i, h] += value * of_units[t, h]
 
 
-@_outer
+@kept_on_disk
 def bounds(
     agent: Array, surrounding: Array, others: Array, frames: Array, agent_weight: Array,
     agent_bias: Array, surrounding_weight: Array, output: Array, offset: Array,
@@ -136,7 +136,7 @@ def bounds(
     return found
 
 
-@_outer
+@kept_on_disk
 def mean_bound(
     agent: Array, surrounding: Array, others: Array, frames: Array, agent_weight: Array,
     agent_bias: Array, surrounding_weight: Array, output: Array, offset: Array,

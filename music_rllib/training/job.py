@@ -67,7 +67,7 @@ class NodeJob(BaseModel):
             key=node.key,
             label=node.label,
             run=node.run,
-            source_key=node.input.key if node.input else None,
+            source_key=node.source_key,
             source_task=node.input.task if node.input else None,
             storage=storage,
             cpus=cpus,

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
+from music_rllib.compiling import compiled, kept_on_disk
 from music_rllib.tac.kernels.blas import multiply
 from music_rllib.tac.kernels.distribution import (
     Rule,
@@ -28,7 +28,6 @@ from music_rllib.tac.kernels.perceptron import (
     Array,
     Network,
     backward,
-    compiled,
     forward,
     layer_outputs,
     layer_weights,
@@ -146,7 +145,7 @@ def _critic_target(
     """[B] r + gamma d V(s'), clipped (paper eq. 9, with the mask that it leaves out)."""
     rows = len(following)
     if rule.has_value:
-        values = forward(networks.value_target, following).copy().reshape(rows)
+        values: Array = forward(networks.value_target, following).copy().reshape(rows)
     else:
         if not rule.stochastic:
             next_outputs = forward(networks.policy_target, following)
@@ -261,7 +260,7 @@ def _learn_value(
 def _compiled_for(sources: str) -> Any:
     """`learn`, kept on disk: numba looks it up by this file's age and by what it encloses."""
 
-    @njit(cache=True, nogil=True, error_model="numpy")
+    @kept_on_disk
     def learn(networks: Networks, batch: Batch, rule: Rule, q: float, alpha: float) -> Learned:
         """All losses of a minibatch (paper III-B), their gradients into the networks'."""
         sources  # noqa: B018

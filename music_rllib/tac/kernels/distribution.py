@@ -14,8 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from music_rllib.compiling import compiled
 from music_rllib.functional.tsallis import MAX_EXPONENT
-from music_rllib.tac.kernels.perceptron import Array, compiled
+from music_rllib.tac.kernels.perceptron import Array
 
 __all__ = ["Rule", "Sample", "ln_q_of_policy", "sampled", "through_distribution"]
 

@@ -7,15 +7,14 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from numba import njit
 from numpy.typing import NDArray
 
+from music_rllib.compiling import compiled
 from music_rllib.tac.kernels.blas import multiply
 
-__all__ = ["Array", "Network", "backward", "compiled", "forward", "layer_outputs", "layer_weights"]
+__all__ = ["Array", "Network", "backward", "forward", "layer_outputs", "layer_weights"]
 
 Array = NDArray[Any]
-compiled = njit(error_model="numpy")
 # Loops in place of expressions of arrays: those take longer to compile, and make new arrays.
 
 
@@ -70,10 +69,8 @@ def forward(network: Network, inputs: Array) -> Array:
     rows = len(inputs)
     zero = network.values.dtype.type(0)
     for layer in range(last + 1):
-        weights, bias = (
-            layer_weights(network, network.values, layer),
-            _bias(network, network.values, layer),
-        )
+        weights = layer_weights(network, network.values, layer)
+        bias = _bias(network, network.values, layer)
         out = layer_outputs(network, layer, rows)
         multiply(inputs, False, weights, network.by_outputs, out)
         for r in range(rows):
