@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -15,28 +14,27 @@ from numba.core.caching import FunctionCache
 from music_rllib.compiling import compiled, kept_on_disk
 
 PROGRAM = """
-import numpy as np
-from music_rllib.intrinsic.compiled import bounds
-numbers = np.ones((1, 2, 1), np.float32)
-weight = np.ones((4, 1), np.float32)
-pairs = np.array([[1, 0]])
-given = (numbers, numbers, pairs, np.array([2]), weight, weight[:, 0].copy(), weight)
-found = bounds(*given, np.ones((1, 4), np.float32), np.zeros(1, np.float32))
-print(float(found[0]), sum(bounds.stats.cache_hits.values()))
+from music_rllib.compiling import kept_on_disk
+
+@kept_on_disk
+def twice(x):
+    return 2 * x
+
+print(twice(21), sum(twice.stats.cache_hits.values()))
 """
 
 
-def test_the_next_process_finds_what_was_compiled(tmp_path: Path) -> None:
-    def bound_and_hits() -> str:
-        return subprocess.run(
-            [sys.executable, "-c", PROGRAM],
-            env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)},
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout
+def test_the_next_process_finds_what_was_compiled_until_the_source_changes(tmp_path: Path) -> None:
+    program = tmp_path / "program.py"
 
-    assert [bound_and_hits() for _ in range(2)] == ["0.0 0\n", "0.0 1\n"]
+    def result_and_hits() -> str:
+        command = [sys.executable, str(program)]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+    program.write_text(PROGRAM)
+    assert [result_and_hits() for _ in range(2)] == ["42 0\n", "42 1\n"]
+    program.write_text(PROGRAM.replace("2 * x", "22 * x"))
+    assert result_and_hits() == "462 0\n"
 
 
 def test_where_nothing_can_be_written_each_process_compiles(
