@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from math import lcm
 
 import numpy as np
@@ -239,12 +240,18 @@ def improvement_p_value(x: Array, y: Array) -> float:
 
 def _doubled_u(values: Array, size: int) -> Array:
     """Chances of twice Mann and Whitney's U, `[2 m n + 1]`, of `size` values drawn by lot."""
-    ranks = (2 * stats.rankdata(values)).astype(int)  # ties have halves
-    ways = np.zeros((size + 1, ranks.sum() + 1))
+    ranks = np.sort(2 * stats.rankdata(values)).astype(int)  # ties have halves
+    return _chances(tuple(ranks.tolist()), size)
+
+
+@lru_cache(maxsize=256)
+def _chances(ranks: tuple[int, ...], size: int) -> Array:
+    """Of each sum of `size` of the doubled ranks, which are the same for all pairs without ties."""
+    ways = np.zeros((size + 1, sum(ranks) + 1))
     ways[0, 0] = 1
     for rank in ranks:
         ways[1:, rank:] += ways[:-1, :-rank]
-    least, rest = size * (size + 1), len(values) - size
+    least, rest = size * (size + 1), len(ranks) - size
     sums = ways[size, least : least + 2 * size * rest + 1]
     return np.asarray(sums / sums.sum())
 
