@@ -55,8 +55,8 @@ class Points(NamedTuple):
     """Everything that one run logged, `[points]` each, sorted by metric and step."""
 
     metrics: Sequence[str]
-    steps: Sequence[int]
-    times: Sequence[int]
+    steps: Sequence[int] | Ints
+    times: Sequence[int] | Ints
     values: Sequence[float] | Array
 
 
