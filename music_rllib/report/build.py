@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from concurrent.futures import Executor
 from pathlib import Path
 
 from music_rllib import names
 from music_rllib.envs.tasks import Task
 from music_rllib.report.figures.choice import Drawing, drawings_of_stages, stage_drawings
-from music_rllib.report.figures.draw import draw_files, draw_inline, files, stale_files
+from music_rllib.report.figures.draw import Figures, files, stale_files
 from music_rllib.report.figures.overview import overview
 from music_rllib.report.figures.plots import METRICS
 from music_rllib.report.limitations import missing
@@ -59,6 +60,7 @@ def build_report(
     environments: Sequence[Task] = (),
     beside: tuple[Sweep, Sweep] | None = None,
     live: bool = False,
+    processes: Executor | None = None,
 ) -> Report:
     """Compute and arrange everything.
 
@@ -73,20 +75,23 @@ def build_report(
         environments: of tasks that may be made for videos, beside the known ones.
         beside: the two that `sweep` puts side by side.
         live: the sweep is running, and the page says how far it is.
+        processes: that draw for the page and for files, from `drawing_processes`.
     """
+    figures = Figures(processes)
     analyses = analyse(sweep)
-    drawings = [d for analysis in analyses for d in stage_drawings(sweep, analysis)]
     stages = [analysis.stage for analysis in analyses]
-    drawings += drawings_of_stages(sweep, stages)
+    for analysis in analyses:
+        for drawing in stage_drawings(sweep, analysis):
+            figures.add(drawing)
     study = study_of(sweep)
-    drawings += study_drawings(study)
+    for drawing in (*drawings_of_stages(sweep, stages), *study_drawings(study)):
+        figures.add(drawing)
     return Report(
         sweep=sweep,
         analyses=analyses,
         together=analyse_stages(sweep, stages),
         study=study,
-        drawings=drawings,
-        pictures=draw_inline(drawings),
+        figures=figures,
         differences=() if beside is None else difference_tables(*beside, analyses),
         missing=missing(sweep, analyses, undelivered, live=live) + ([damaged] if damaged else []),
         difference=difference,
@@ -112,13 +117,15 @@ def write_report(report: Report, folder: Path) -> Path:
     try:
         for part in (figures, tables):
             part.mkdir(parents=True, exist_ok=True)
+        page = folder / PAGE
+        page.write_text(render(report), encoding="utf-8")
         here = [file.name for file in figures.iterdir()]
         for stale in stale_files({drawing.name for drawing in report.drawings}, here):
             (figures / stale).unlink()
         if panels := overview(report.sweep, [one.stage for one in report.analyses]):
             for ending, content in files(panels, []).items():
                 (figures / f"{PICTURE}{ending}").write_bytes(content)
-        for name, drawn in draw_files(report.drawings).items():
+        for name, drawn in report.figures.files():
             for ending, content in drawn.items():
                 (figures / f"{name}{ending}").write_bytes(content)
         if report.films is not None and report.films.films:
@@ -127,8 +134,6 @@ def write_report(report: Report, folder: Path) -> Path:
                 (folder / "videos" / film.name).write_bytes(film.data)
         for table in _tables(report):
             (tables / f"{table.name}.csv").write_text(table.to_csv(), encoding="utf-8")
-        page = folder / PAGE
-        page.write_text(render(report), encoding="utf-8")
     except OSError as error:
         raise ReportError(f"{folder} must be writable: {error}") from error
     return page

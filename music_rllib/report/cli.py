@@ -188,24 +188,28 @@ def _report(
     env: Path | None,
     attach: bool,
 ) -> int:
-    from music_rllib.config.load import declared_tasks
-    from music_rllib.redaction import for_people, redact
-    from music_rllib.report.build import PICTURE, WANTED, build_report, write_report
-    from music_rllib.report.location import find_sweep
-    from music_rllib.results.comparison import verdict
+    from music_rllib.report.figures.processes import drawing_processes
 
-    found = find_sweep(place, storage=storage, tracking_uri=tracking_uri, metrics=WANTED)
-    made = build_report(
-        found.sweep,
-        difference=difference,
-        undelivered=found.undelivered,
-        damaged=found.damaged,
-        store=found.store,
-        video_seed=seed if videos else None,
-        environments=() if env is None else declared_tasks(env),
-        command=_command(),
-    )
-    page = write_report(made, output or found.folder / "report")
+    with drawing_processes() as processes:
+        from music_rllib.config.load import declared_tasks
+        from music_rllib.redaction import for_people, redact
+        from music_rllib.report.build import PICTURE, WANTED, build_report, write_report
+        from music_rllib.report.location import find_sweep
+        from music_rllib.results.comparison import verdict
+
+        found = find_sweep(place, storage=storage, tracking_uri=tracking_uri, metrics=WANTED)
+        made = build_report(
+            found.sweep,
+            difference=difference,
+            undelivered=found.undelivered,
+            damaged=found.damaged,
+            store=found.store,
+            video_seed=seed if videos else None,
+            environments=() if env is None else declared_tasks(env),
+            command=_command(),
+            processes=processes,
+        )
+        page = write_report(made, output or found.folder / "report")
     for note in made.missing:
         typer.echo(f"missing: {for_people(note)}")
     for analysis in made.analyses:
@@ -237,23 +241,31 @@ def _beside(
     *,
     alone: bool,
 ) -> None:
-    from music_rllib.report.build import WANTED, build_report, write_report
-    from music_rllib.report.figures.choice import slug
-    from music_rllib.report.location import find_sweep
-    from music_rllib.report.side_by_side import side_by_side
+    from music_rllib.report.figures.processes import drawing_processes
     from music_rllib.results.data import ReportError
 
     if len(places) > 2 or alone:
         raise ReportError(
             "SWEEP must be one, or two to put side by side; --serve, --attach and --export take one"
         )
-    found = [
-        find_sweep(place, storage=storage, tracking_uri=tracking_uri, metrics=WANTED)
-        for place in places
-    ]
-    first, second = (one.sweep for one in found)
-    made = build_report(side_by_side(first, second), beside=(first, second), command=_command())
-    page = write_report(made, output or found[0].folder / f"report-beside-{slug(second.name)}")
+    with drawing_processes() as processes:
+        from music_rllib.report.build import WANTED, build_report, write_report
+        from music_rllib.report.figures.choice import slug
+        from music_rllib.report.location import find_sweep
+        from music_rllib.report.side_by_side import side_by_side
+
+        found = [
+            find_sweep(place, storage=storage, tracking_uri=tracking_uri, metrics=WANTED)
+            for place in places
+        ]
+        first, second = (one.sweep for one in found)
+        made = build_report(
+            side_by_side(first, second),
+            beside=(first, second),
+            command=_command(),
+            processes=processes,
+        )
+        page = write_report(made, output or found[0].folder / f"report-beside-{slug(second.name)}")
     typer.echo(f"Report: {page.absolute()}")
 
 

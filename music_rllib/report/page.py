@@ -20,6 +20,7 @@ from music_rllib.report.figures.choice import (
     Drawing,
     slug,
 )
+from music_rllib.report.figures.draw import Figures
 from music_rllib.report.figures.importance import FEWEST_RUNS, varied
 from music_rllib.report.pieces import Figure, Panels, TextTable, document
 from music_rllib.report.study import study_tables
@@ -56,9 +57,7 @@ class Report:
     """Stages against each other; None where there is nothing to compare."""
     study: Study
     """What is claimed, planned or not."""
-    drawings: Sequence[Drawing]
-    pictures: Mapping[str, Sequence[str]]
-    """An SVG element for each panel, by the drawings' names."""
+    figures: Figures
     missing: Sequence[str]
     difference: float
     """In success rate, which the reader would want to be able to see."""
@@ -68,6 +67,10 @@ class Report:
     """None where nobody asked for videos."""
     differences: Sequence[TextTable] = ()
     """Of two sweeps: what was set otherwise, and what came of it."""
+
+    @property
+    def drawings(self) -> Sequence[Drawing]:
+        return self.figures.drawings
 
 
 def render(report: Report, *, live: bool = False) -> str:
@@ -213,6 +216,7 @@ def _figure(
 ) -> Figure:
     if metric is None and drawings[0].metric is not None:
         metric = drawings[0].metric.name
+    pictures = report.figures.pictures
     return Figure(
         name=slug(title),
         title=title,
@@ -226,9 +230,7 @@ def _figure(
                 legend=drawing.legend,
                 panels=[
                     (f"{drawing.title}, {panel.title}", panel.title, svg)
-                    for panel, svg in zip(
-                        drawing.panels, report.pictures[drawing.name], strict=True
-                    )
+                    for panel, svg in zip(drawing.panels, pictures[drawing.name], strict=True)
                 ],
             )
             for drawing in drawings

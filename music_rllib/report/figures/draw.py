@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import io
 import math
-import os
 import re
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor
+from functools import cached_property, partial
 from typing import Any, TypeVar
 
 import joblib
@@ -22,14 +23,13 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from music_rllib.report.figures.choice import Drawing
+from music_rllib.report.figures.fonts import short_font
 from music_rllib.report.figures.plots import PANEL, Legend, Panel
 
-__all__ = ["draw_files", "draw_inline", "drawn_figure", "files", "stale_files"]
+__all__ = ["Figures", "drawn_figure", "files", "stale_files"]
 
 _Drawn = TypeVar("_Drawn")
 
-FEW = 8
-"""Drawings for which more processes would cost more than they save."""
 TEXT_WIDTH, COLUMN_WIDTH = 7.16, 3.5
 """Inches of a paper's two columns and of one."""
 COLUMN = "-column"
@@ -50,22 +50,40 @@ _FONT = ("DejaVu Sans", "Verdana", "sans-serif")
 _CONDITION = re.compile(r'<g id="condition-(\d+)-([^"]*)">')
 
 
-def draw_inline(drawings: Sequence[Drawing]) -> dict[str, tuple[str, ...]]:
-    """An SVG element for each panel, by the drawings' names."""
-    return _in_processes(_inline, drawings)
+class Figures:
+    """Drawings, as SVG elements for the page and as files.
 
+    With processes each is drawn from when it is added, without when it is asked for.
+    """
 
-def draw_files(drawings: Sequence[Drawing]) -> dict[str, dict[str, bytes]]:
-    """The files of each drawing, by the drawings' names; see :func:`files`."""
-    return _in_processes(_files, drawings)
+    def __init__(self, processes: Executor | None = None) -> None:
+        self.drawings: list[Drawing] = []
+        self._processes = processes
+        self._inline: list[Callable[[], tuple[str, ...]]] = []
+        self._files: list[Callable[[], dict[str, bytes]]] = []
 
+    def add(self, drawing: Drawing) -> None:
+        """Draw it, now or later."""
+        self.drawings.append(drawing)
+        self._inline.append(self._begun(_inline, drawing))
+        self._files.append(self._begun(_files, drawing))
 
-def _in_processes(
-    draw: Callable[[Drawing], _Drawn], drawings: Sequence[Drawing]
-) -> dict[str, _Drawn]:
-    processes = len(os.sched_getaffinity(0)) if len(drawings) > FEW else 1
-    drawn = joblib.Parallel(n_jobs=processes)(joblib.delayed(draw)(one) for one in drawings)
-    return {drawing.name: made for drawing, made in zip(drawings, drawn, strict=True)}
+    @cached_property
+    def pictures(self) -> dict[str, tuple[str, ...]]:
+        """An SVG element for each panel, by the drawings' names."""
+        return {one.name: made() for one, made in zip(self.drawings, self._inline, strict=True)}
+
+    def files(self) -> Iterator[tuple[str, dict[str, bytes]]]:
+        """Each drawing's name and its files; see :func:`files`."""
+        for one, made in zip(self.drawings, self._files, strict=True):
+            yield one.name, made()
+
+    def _begun(self, draw: Callable[[Drawing], _Drawn], drawing: Drawing) -> Callable[[], _Drawn]:
+        if self._processes is None:
+            return partial(draw, drawing)
+        # Panels are closures, which Python's own pickle does not take.
+        sent = joblib.wrap_non_picklable_objects(drawing, keep_wrapper=False)
+        return self._processes.submit(draw, sent).result
 
 
 def _inline(drawing: Drawing) -> tuple[str, ...]:
@@ -108,7 +126,8 @@ def files(panels: Sequence[Panel], legend: Legend) -> dict[str, bytes]:
     """
     made = {}
     outlines = {"svg.fonttype": "path", "pdf.fonttype": 42}
-    with mpl.rc_context(_settings(_PAPER_FONT, _ON_PAPER) | outlines):
+    fonts = {"font.family": [short_font(), "sans-serif"]}
+    with mpl.rc_context(_settings(_PAPER_FONT, _ON_PAPER) | outlines | fonts):
         for width, name, kinds in (
             (TEXT_WIDTH, "", ("svg", "pdf", "png")),
             (COLUMN_WIDTH, COLUMN, ("svg", "pdf")),

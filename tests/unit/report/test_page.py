@@ -17,9 +17,10 @@ import pytest
 from music_rllib import names
 from music_rllib.report.build import build_report, write_report
 from music_rllib.report.figures.choice import AGAINST_ENTROPY, INFLUENCE
-from music_rllib.report.figures.draw import TEXT_WIDTH, draw_files, draw_inline, drawn_figure
+from music_rllib.report.figures.draw import TEXT_WIDTH, Figures, drawn_figure, files
 from music_rllib.report.figures.importance import CHANCE, importances, varied
 from music_rllib.report.figures.palette import DARK, LIGHT, colour_of, marker_of
+from music_rllib.report.figures.processes import drawing_processes
 from music_rllib.report.limitations import planned_runs
 from music_rllib.report.page import Report, render
 from music_rllib.results.analysis import THRESHOLDS, analyse
@@ -501,7 +502,8 @@ def test_a_script_in_any_text_of_a_sweep_is_shown_as_text() -> None:
     labels = re.findall(r'<div role="img" aria-label="([^"]*)"', page)
     assert unescape(labels[0]) == f"Success rate, {SCRIPT}"
     of_each_kind = list({drawing.title: drawing for drawing in made.drawings}.values())
-    for drawn in draw_files(of_each_kind).values():
+    for drawing in of_each_kind:
+        drawn = files(drawing.panels, drawing.legend)
         elements = ElementTree.fromstring(drawn[".svg"]).iter()
         assert "script" not in {element.tag.rpartition("}")[2] for element in elements}
 
@@ -748,14 +750,21 @@ def test_one_varied_setting_gives_a_line_and_the_page_says_what_is_not_drawn() -
     assert "This stage varies q;" in only_q
 
 
-def test_many_figures_are_the_same_drawn_one_by_one_and_in_processes(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    drawings = report_on(compared({"1": [0.5, 0.6], "1.5": [0.6, 0.7]})).drawings
-    monkeypatch.setattr("music_rllib.report.figures.draw.FEW", 0)
-    together = draw_inline(drawings)
-    monkeypatch.setattr("music_rllib.report.figures.draw.FEW", len(drawings))
-    assert draw_inline(drawings) == together
+def test_figures_are_the_same_drawn_here_and_in_other_processes() -> None:
+    drawings = report_on(compared({"1": [0.5, 0.6], "1.5": [0.6, 0.7]})).drawings[:2]
+    with drawing_processes() as processes:
+        drawn = []
+        for figures in (Figures(), Figures(processes)):
+            for drawing in drawings:
+                figures.add(drawing)
+            drawn.append((figures.pictures, dict(figures.files())))
+    assert drawn[0] == drawn[1]
+
+
+def test_files_show_characters_that_their_short_font_has_not() -> None:
+    drawing = report_on(compared({"1": [0.5, 0.6]}, task="Ж")).drawings[0]
+    drawn = files(drawing.panels, drawing.legend)  # matplotlib warns where no font has it
+    assert drawn[".pdf"].count(b"/FontFile2") == 2
 
 
 # Colours ----------------------------------------------------------------------------------------
