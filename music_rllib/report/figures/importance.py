@@ -15,7 +15,13 @@ from matplotlib.ticker import LogFormatter
 
 from music_rllib import names
 from music_rllib.report.figures.palette import BARS, colour_of, style_of
-from music_rllib.report.figures.plots import RATE_LIMITS, Panel, labelled_rows, rules_behind_rows
+from music_rllib.report.figures.plots import (
+    RATE_LIMITS,
+    Panel,
+    labelled_rows,
+    row_label,
+    rules_behind_rows,
+)
 from music_rllib.results.analysis import StageAnalysis
 from music_rllib.results.comparison import Final, Scope
 from music_rllib.results.conditions import ENTROPIC_INDEX, SEEDS, Condition
@@ -274,7 +280,7 @@ def importance_panel(task: str, found: Sequence[Importance]) -> Panel:
         for row, (one, label) in enumerate(zip(ordered, labels, strict=True)):
             chance = one.setting == CHANCE
             axes.barh(row, one.share, color=BARS[chance], height=0.48, alpha=0.8)
-            axes.text(0.0, row - 0.28, f" {label}", va="bottom", fontsize="small")
+            row_label(axes, row - 0.28, label)
         axes.set_xlabel("share of the variance at the end")
 
     return Panel(title=task, draw=draw, height=height)

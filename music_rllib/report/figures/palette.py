@@ -43,8 +43,8 @@ _UNKNOWN = "#808080"
 BARS = ("#1f7fc4", "#808080")
 """Of settings, and of what is only chance."""
 _MARKERS = "osD^vPX"
-_ALIKE = 30.0
-"""Distance in RGB."""
+_ALIKE = 60.0
+"""Distance in RGB below which thin lines look the same: that of q = 1 and 1.1."""
 
 Line = Literal["solid", "dashed", "dashdot", "dotted"]
 _LINES: tuple[Line, ...] = get_args(Line)

@@ -37,6 +37,7 @@ __all__ = [
     "finals_panel",
     "labelled_rows",
     "profile_panel",
+    "row_label",
     "rules_behind_rows",
 ]
 
@@ -307,9 +308,20 @@ def _draw_final(
         ends = [float(estimate.lower), float(estimate.upper)]
         artists += axes.plot(ends, [row, row], color=colour, linewidth=5, alpha=0.35)
     artists += axes.plot(estimate.value, row, marker, color=colour, markersize=7)
-    left = axes.get_xlim()[0]
-    artists.append(axes.text(left, row - 0.2, f" {label}", va="bottom", fontsize="small"))
-    return artists
+    return [*artists, row_label(axes, row - 0.2, label)]
+
+
+def row_label(axes: Axes, height: float, label: str) -> Artist:
+    """A label above a row's marks, apart from the axis."""
+    return axes.annotate(
+        label,
+        (0.0, height),
+        xycoords=axes.get_yaxis_transform(),
+        xytext=(3.0, 0.0),
+        textcoords="offset points",
+        va="bottom",
+        fontsize="small",
+    )
 
 
 def belongs(artists: Sequence[Artist], condition: int, said: str) -> None:

@@ -767,6 +767,24 @@ def test_files_show_characters_that_their_short_font_has_not() -> None:
     assert drawn[".pdf"].count(b"/FontFile2") == 2
 
 
+def test_labels_of_rows_stand_beside_the_axis_in_a_browser_too() -> None:
+    """In an SVG a browser leaves out the spaces that a text begins with."""
+    long = {"1": [0.5, 0.6], "1.5 (" + 5 * "a schedule with many words, " + ")": [0.6, 0.7]}
+    pictures = report_on(compared(long)).figures.pictures
+    texts = re.findall(r"<text ([^>]*)>([^<]*)", pictures["finetune-final-success-rate"][0])
+    labels = [(place, text) for place, text in texts if "q = " in text or "words" in text]
+    assert len(labels) > 2
+    assert all(text == text.lstrip() for _, text in labels)
+    places = {re.findall(r'(?:x="|translate\()([\d.]+)', place)[0] for place, _ in labels}
+    assert len(places) == 1
+
+
+def test_conditions_of_almost_the_same_colour_have_other_lines() -> None:
+    drawing = report_on(compared({"1": [0.5, 0.6], "1.07177": [0.6, 0.7], "1.5": [0.6, 0.7]}))
+    lines = [style.line for _, style in drawing.drawings[0].legend]
+    assert lines == ["solid", "dashed", "solid"]
+
+
 # Colours ----------------------------------------------------------------------------------------
 
 COMPARED = ("0.5", "1", "1.5", "2", "3")
