@@ -117,7 +117,7 @@ def study_drawings(study: Study) -> Iterator[Drawing]:
     if study.stage is None:
         return
     shown = list(dict.fromkeys(mean.condition for mean in study.means))
-    siblings = study.stage.conditions
+    siblings = study.stage.compared
     legend = [(label_of(one), style_of(one, siblings)) for one in shown]
     if profiles := area_profile_panels(study):
         yield Drawing(

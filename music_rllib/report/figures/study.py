@@ -88,4 +88,4 @@ def _alpha(task: str, lines: Sequence[AlphaLine], study: Study) -> Panel:
 
 
 def _siblings(study: Study) -> tuple[Condition, ...]:
-    return study.stage.conditions if study.stage else ()
+    return study.stage.compared if study.stage else ()

@@ -785,6 +785,14 @@ def test_conditions_of_almost_the_same_colour_have_other_lines() -> None:
     assert lines == ["solid", "dashed", "solid"]
 
 
+def test_a_condition_of_a_search_looks_the_same_in_every_figure() -> None:
+    fresh = [(q, seed, "final1", 0.6) for q in ("1", "1.2", "1.4") for seed in (7, 8)]
+    drawings = report_on(searched(*TRIALS, ("1.15", 0, "trial3", 0.1), *fresh)).drawings
+    lines = {drawing.title: [style.line for _, style in drawing.legend] for drawing in drawings}
+    curves, areas = lines["Success rate"], lines["Performance profile of the area under the curve"]
+    assert curves == areas
+
+
 # Colours ----------------------------------------------------------------------------------------
 
 COMPARED = ("0.5", "1", "1.5", "2", "3")
