@@ -197,7 +197,13 @@ def _report(
         from music_rllib.report.location import find_sweep
         from music_rllib.results.comparison import verdict
 
-        found = find_sweep(place, storage=storage, tracking_uri=tracking_uri, metrics=WANTED)
+        found = find_sweep(
+            place,
+            storage=storage,
+            tracking_uri=tracking_uri,
+            metrics=WANTED,
+            processes=processes,
+        )
         made = build_report(
             found.sweep,
             difference=difference,

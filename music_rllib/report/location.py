@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,6 +39,7 @@ def find_sweep(
     storage: str = "results",
     tracking_uri: str | None = None,
     metrics: Collection[str] | None = None,
+    processes: Executor | None = None,
 ) -> ReportSource:
     """Read the sweep that `place` names.
 
@@ -46,6 +48,7 @@ def find_sweep(
         storage: where a name is looked for.
         tracking_uri: in place of the store that the sweep was logged to.
         metrics: which ones to read from MLflow; None for all.
+        processes: of which one may read, too.
 
     Raises:
         ReportError: where there is no such sweep.
@@ -69,7 +72,13 @@ def find_sweep(
         return ReportSource(sweep=sweep, folder=folder, store=store)
     place = record.resolve_storage(folder.absolute())
     store = resolve_store(tracking_uri or record.tracking_uri, place)
-    sweep = read_mlflow(store, record.sweep_name, sweep_id=record.sweep_id, metrics=metrics)
+    sweep = read_mlflow(
+        store,
+        record.sweep_name,
+        sweep_id=record.sweep_id,
+        metrics=metrics,
+        processes=processes,
+    )
     spools = tracking_folder(folder)
     waiting = [spools / "parent", *(spools / "runs").glob("*")]
     undelivered = sum(map(has_undelivered, waiting))

@@ -11,8 +11,9 @@ import contextlib
 import logging
 import os
 import tempfile
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +30,7 @@ from music_rllib.tracking.store import TrackingStore, check_reachable
 if TYPE_CHECKING:
     from mlflow import MlflowClient
     from mlflow.entities import Metric, Run
+    from sqlalchemy import Connection
 
 __all__ = ["attach", "download_policy", "read_mlflow"]
 
@@ -45,6 +47,7 @@ def read_mlflow(
     *,
     sweep_id: str | None = None,
     metrics: Collection[str] | None = None,
+    processes: Executor | None = None,
 ) -> Sweep:
     """Read the newest sweep of this name.
 
@@ -53,11 +56,13 @@ def read_mlflow(
         name: of the sweep, which is that of its experiment.
         sweep_id: tells sweeps of the same name apart; None for the one that began last.
         metrics: which ones to read; None for all.
+        processes: of which one reads the values while MLflow is loaded here.
 
     Raises:
         ReportError: where there is no such sweep.
         TrackingError: where the store does not answer.
     """
+    ahead = _begun(processes, store, sweep_id, metrics)
     client = _open(store)
     try:
         found = client.get_experiment_by_name(name)
@@ -78,7 +83,7 @@ def read_mlflow(
             tags=dict(parent.data.tags),
             config=_artefact(client, run_id, names.ARTEFACT_SWEEP_CONFIG),
             runs=runs,
-            history=_history(client, store, children, metrics),
+            history=_history(client, store, children, metrics, ahead),
             searches=checked_searches(
                 read_json(_artefact(client, run_id, names.ARTEFACT_SEARCH) or "[]")
             ),
@@ -233,36 +238,81 @@ def _history(
     store: TrackingStore,
     runs: Sequence[Run],
     metrics: Collection[str] | None,
+    ahead: Future[dict[str, Points]] | None,
 ) -> dict[str, Column]:
     if store.is_server:
         return columns(_from_server(client, runs, metrics))
-    return columns(_from_database(store, [run.info.run_id for run in runs], metrics))
+    known: dict[str, Points] = {}
+    if ahead is not None:
+        with contextlib.suppress(Exception):  # then it is read here, with a message if that fails
+            known = ahead.result()
+    run_ids = [run.info.run_id for run in runs]
+    with _database(store.uri) as connection:
+        return columns(
+            known[run] if run in known else _from_database(connection, run, metrics)
+            for run in run_ids
+        )
 
 
-def _from_database(
-    store: TrackingStore, run_ids: Sequence[str], metrics: Collection[str] | None
-) -> Iterator[Points]:
-    """One query per run, which the table's index answers in this order."""
+def _begun(
+    processes: Executor | None,
+    store: TrackingStore,
+    sweep_id: str | None,
+    metrics: Collection[str] | None,
+) -> Future[dict[str, Points]] | None:
+    """The values of a sweep that is known by its id, being read; None where they can't be."""
+    file = _sqlite_file(store)
+    absent = file is not None and not file.is_file()
+    if processes is None or sweep_id is None or store.is_server or absent:
+        return None
+    return processes.submit(_read_ahead, store.uri, sweep_id, metrics)
+
+
+def _read_ahead(uri: str, sweep_id: str, metrics: Collection[str] | None) -> dict[str, Points]:
+    """The values of all runs of a sweep, by the runs' ids."""
+    import sqlalchemy as sql
+
+    tags = sql.table("tags", *map(sql.column, ("run_uuid", "key", "value")))
+    run, sweep = tags.alias("run"), tags.alias("sweep")
+    runs = (
+        sql.select(run.c.run_uuid)
+        .join(sweep, sweep.c.run_uuid == run.c.value)
+        .where(run.c.key == names.TAG_PARENT_RUN)
+        .where(sweep.c.key == names.TAG_SWEEP_ID, sweep.c.value == sweep_id)
+    )
+    with _database(uri) as connection:
+        run_ids = connection.execute(runs).scalars().all()
+        return {one: _from_database(connection, one, metrics) for one in run_ids}
+
+
+@contextlib.contextmanager
+def _database(uri: str) -> Iterator[Connection]:
+    import sqlalchemy as sql
+
+    engine = sql.create_engine(uri)
+    try:
+        with engine.connect() as connection:
+            yield connection
+    finally:
+        engine.dispose()
+
+
+def _from_database(connection: Connection, run_id: str, metrics: Collection[str] | None) -> Points:
+    """Of one run, in an order that the table's index has."""
     import sqlalchemy as sql
 
     plain = ("run_uuid", "key", "step", "timestamp", "value")
     table = sql.table("metrics", *map(sql.column, plain), sql.column("is_nan", sql.Boolean))
     run, metric, step, time, value, is_nan = table.c
     known = sql.case((is_nan, sql.null()), else_=value)
-    chosen = sql.select(metric, step, time, known).order_by(metric, step)
+    chosen = sql.select(metric, step, time, known).where(run == run_id).order_by(metric, step)
     if metrics is not None:
         chosen = chosen.where(metric.in_(sorted(metrics)))
-    engine = sql.create_engine(store.uri)
-    try:
-        with engine.connect() as connection:
-            # The driver's own cursor: SQLAlchemy's row objects take twice as long.
-            cursor: Any = connection.connection.cursor()
-            for run_id in run_ids:
-                query = chosen.where(run == run_id)
-                cursor.execute(str(query.compile(engine, compile_kwargs={"literal_binds": True})))
-                yield _points(cursor)
-    finally:
-        engine.dispose()
+    # The driver's own cursor: SQLAlchemy's row objects take twice as long.
+    cursor: Any = connection.connection.cursor()
+    query = chosen.compile(connection.engine, compile_kwargs={"literal_binds": True})
+    cursor.execute(str(query))
+    return _points(cursor)
 
 
 _ROW = np.dtype([("metric", "O"), ("step", "i8"), ("time", "i8"), ("value", "f8")])
@@ -273,7 +323,10 @@ def _points(rows: Iterable[Sequence[Any]]) -> Points:
     found = np.fromiter(rows, dtype=_ROW)  # while they are read: lists of them take twice as long
     values = found["value"]
     values[np.abs(values) == _LARGEST] *= np.inf
-    return Points(found["metric"].tolist(), found["step"], found["time"], values)
+    counts = Counter(found["metric"].tolist())
+    # One string of each name: those of the rows are as many objects, which processes would send.
+    metrics = [metric for metric, count in counts.items() for _ in range(count)]
+    return Points(metrics, found["step"], found["time"], values)
 
 
 def _from_server(

@@ -120,9 +120,20 @@ class Page:
         await self._send("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
 
     async def evaluate(self, script: str) -> Any:
-        """The value of a JavaScript expression."""
-        reply = await self._send("Runtime.evaluate", expression=script, returnByValue=True)
+        """The value of a JavaScript expression, or of what it promises."""
+        options = {"returnByValue": True, "awaitPromise": True}
+        reply = await self._send("Runtime.evaluate", expression=script, **options)
         return reply["result"].get("value")
+
+    async def press(self, key: str) -> None:
+        """Press and release a key, such as `Tab`."""
+        codes = {"Tab": 9, "Enter": 13, "Space": 32}
+        named = {"key": " " if key == "Space" else key, "code": key}
+        for kind in ("keyDown", "keyUp"):
+            code = codes[key]
+            await self._send(
+                "Input.dispatchKeyEvent", type=kind, windowsVirtualKeyCode=code, **named
+            )
 
     async def text(self) -> str:
         """What is to be read on the page."""

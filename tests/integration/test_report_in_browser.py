@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import axe_core_python
 import pytest
 from PIL import Image
 
@@ -30,7 +31,13 @@ PICTURES = os.environ.get("MUSIC_RLLIB_PICTURES")
 """Folder in which the pictures are kept, such as docs/img."""
 
 LOOK = Path(__file__).with_name("look.js").read_text()
-"""Finds text that is cut or too faint, and controls without a name."""
+"""Finds text of figures that is cut or too faint, and controls without a name."""
+AXE = Path(axe_core_python.__file__).with_name("axe.min.js").read_text()
+"""Deque's checks of accessibility: contrast, names, roles, order of headings."""
+VIOLATIONS = """axe.run().then((found) => found.violations.map(
+  (one) => [one.id, one.nodes.slice(0, 3).map((node) => node.html.slice(0, 200))]))"""
+FOCUSED = """(({tagName, type, textContent, id}) => [tagName, type ?? "", textContent.trim(), id])(
+  document.activeElement)"""
 DRAWN = "document.querySelectorAll('.live .chart').length"
 CURVES = "document.querySelectorAll('#learning-curves .curve').length"
 CHOOSE = """(([label, value]) => {
@@ -95,6 +102,8 @@ def test_the_page_can_be_read_in_every_size_light_and_dark(
                 await drawn(tab, page)
                 await tab.evaluate("[...pending.keys()].forEach(drawNow)")
                 seen.append((width, await tab.evaluate(LOOK)))
+                await tab.evaluate(AXE)
+                assert await tab.evaluate(VIOLATIONS) == []
                 name = "-dark" if dark else "" if width == 1400 else f"-{width}"
                 await picture(tab, tmp_path, f"report{name}.png")
             assert not tab.errors
@@ -106,6 +115,34 @@ def test_the_page_can_be_read_in_every_size_light_and_dark(
         assert seen["charts"] >= 6
         for fault in ("faint", "cut", "small", "nameless", "twice"):
             assert not seen[fault], (width, fault)
+
+
+def test_every_control_is_reached_and_used_by_keyboard(
+    open_page: Callable[[], Page], page: Path
+) -> None:
+    async def use() -> None:
+        async with open_page() as tab:
+            await tab.view(1400, 1200)
+            await drawn(tab, page)
+            whole = await tab.evaluate(CURVES)
+            wanted = await tab.evaluate(
+                "[...document.querySelectorAll('#controls :is(select, input, button)')]"
+                ".filter((one) => one.checkVisibility()).length"
+            )
+            seen: list[list[str]] = []
+            for _ in range(200):
+                await tab.press("Tab")
+                seen.append(await tab.evaluate(FOCUSED))
+                if seen[-1][:2] == ["INPUT", "checkbox"] and whole == await tab.evaluate(CURVES):
+                    await tab.press("Space")
+                    await asyncio.sleep(0.3)
+                    assert await tab.evaluate(CURVES) < whole
+                if seen[-1][0] == "BODY":
+                    break
+            controls = [one for one in seen if one[0] in ("SELECT", "INPUT", "BUTTON")]
+            assert len(controls) >= wanted > 3
+
+    asyncio.run(use())
 
 
 def test_what_the_reader_chooses_is_drawn(open_page: Callable[[], Page], page: Path) -> None:

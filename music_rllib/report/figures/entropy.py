@@ -40,11 +40,12 @@ def entropy_panel(sweep: Sweep, task: str, styles: Mapping[Condition, Style]) ->
     def draw(axes: Axes) -> None:
         for number, (condition, pairs) in enumerate(points.items()):
             style = styles[condition]
-            marks = [
-                axes.plot(*pair, style.marker, color=style.colour, markersize=6, alpha=0.75, mew=0)
-                for pair in pairs
-            ]
-            belongs([mark for (mark,) in marks], number, condition.label)
+            entropies, scores = zip(*pairs, strict=True) if pairs else ((), ())
+            marks = axes.plot(
+                entropies, scores, style.marker,
+                color=style.colour, markersize=6, alpha=0.75, mew=0,
+            )  # fmt: skip
+            belongs(marks, number, condition.label)
         axes.set_xlabel("Shannon entropy at the end (nats)")
         axes.set_ylabel("final success rate" if is_rate else f"final {names.word_of(metric)}")
         if is_rate:

@@ -77,7 +77,7 @@ def marker_of(entropic_index: str) -> str:
 
 
 def style_of(condition: Condition, siblings: tuple[Condition, ...]) -> Style:
-    """Colour and marker by q; line, then marker, tell conditions of like colours apart."""
+    """Colour and marker by q; line and marker tell conditions of like colours apart."""
     return styles_of(siblings)[condition]
 
 
@@ -87,11 +87,13 @@ def styles_of(conditions: tuple[Condition, ...]) -> Mapping[Condition, Style]:
     styles: dict[Condition, Style] = {}
     for condition in conditions:
         colour, marker = colour_of(condition.entropic_index), marker_of(condition.entropic_index)
-        alike = sum(_alike(colour, style.colour) for style in styles.values())
-        turn, line = divmod(alike, len(_LINES))
-        if turn:
-            marker = _MARKERS[(_MARKERS.find(marker) + turn) % len(_MARKERS)]
-        styles[condition] = Style(colour=colour, marker=marker, line=_LINES[line])
+        alike = [style for style in styles.values() if _alike(colour, style.colour)]
+        line = _LINES[len(alike) % len(_LINES)]
+        first = _MARKERS.find(marker)
+        turned = (_MARKERS[(first + turn) % len(_MARKERS)] for turn in range(1, len(_MARKERS)))
+        taken = {style.marker for style in alike}
+        marker = next((one for one in (marker, *turned) if one not in taken), marker)
+        styles[condition] = Style(colour=colour, marker=marker, line=line)
     return styles
 
 

@@ -1,4 +1,4 @@
-"""Processes that draw a report's figures while its numbers are still being computed."""
+"""Processes that read a report's values and draw its figures while the rest is computed."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ _LOADED = (
     "matplotlib.backends.backend_pdf",
     "matplotlib.backends.backend_svg",
     "music_rllib.report.figures.draw",
+    "music_rllib.results.from_mlflow",
+    "sqlalchemy",
 )
 
 

@@ -262,7 +262,9 @@ def test_how_random_policies_are_stands_beside_what_they_ended_at() -> None:
     assert row == ["0.05 to 0.55", "–", "–"]
     (drawing,) = [one for one in report.drawings if one.title == AGAINST_ENTROPY]
     axes = drawn_figure(drawing.panels, drawing.legend, TEXT_WIDTH, 8.0).axes[0]
-    points = {tuple(np.asarray(line.get_xydata())[0].tolist()) for line in axes.lines}
+    points = {
+        tuple(point) for line in axes.lines for point in np.asarray(line.get_xydata()).tolist()
+    }
     assert points == set(zip(values, [0.5, 0.6, 0.7, 0.4, 0.5, 0.6], strict=True))
 
 
@@ -779,10 +781,12 @@ def test_labels_of_rows_stand_beside_the_axis_in_a_browser_too() -> None:
     assert len(places) == 1
 
 
-def test_conditions_of_almost_the_same_colour_have_other_lines() -> None:
+def test_conditions_of_almost_the_same_colour_have_other_lines_and_markers() -> None:
     drawing = report_on(compared({"1": [0.5, 0.6], "1.07177": [0.6, 0.7], "1.5": [0.6, 0.7]}))
     lines = [style.line for _, style in drawing.drawings[0].legend]
     assert lines == ["solid", "dashed", "solid"]
+    markers = [style.marker for _, style in drawing.drawings[0].legend]
+    assert len(set(markers)) == 3, "points have no lines"
 
 
 def test_a_condition_of_a_search_looks_the_same_in_every_figure() -> None:
