@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import resource
 import statistics
 import sys
@@ -91,6 +93,17 @@ def interleaved(turns: Mapping[str, Callable[[], object]], repeats: int) -> Turn
         for name, turn in turns.items():
             taken[name].append(taken_by(turn))
     return taken
+
+
+@contextlib.contextmanager
+def on_one_core() -> Iterator[None]:
+    """This process on one core: what would take more threads, XLA does, gets no others."""
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(cores)})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, cores)
 
 
 def told_turns(repeats: int) -> Iterator[int]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.measure import Row, Taken, compared, interleaved, middle, ratio_row
+from benchmarks.measure import Row, Taken, compared, interleaved, middle, on_one_core, ratio_row
 from benchmarks.raw_torch import RawUpdate
 from benchmarks.runs import fill
 from music_rllib import TACConfig
@@ -159,16 +159,8 @@ def flops(inputs: int, actions: int, hidden: Sequence[int], batch: int) -> int:
 
 def rows(repeats: int) -> Iterator[Row]:
     """Against bare torch, a JAX jit and the products at the best rate found, all in one run."""
-    turns = {name: updates(algorithm(**settings)) for name, settings in VARIANTS.items()}
-    turns["raw torch"] = raw_updates()
-    for width in SIZES.values():
-        turns |= floors(width)
-        if importlib.util.find_spec("jax") is not None:
-            turns[f"JAX {width}"] = _by_jax(width)
-    if has_bf16():
-        turns["raw torch, bf16"] = raw_updates(bf16=True)
-        turns["TAC, HER, bf16"] = updates(algorithm(hindsight_k=4.0, precision="bf16"))
-    taken = interleaved(turns, ROUNDS * repeats)
+    with on_one_core():  # before threads are made that would know nothing of it
+        taken = interleaved(_turns(), ROUNDS * repeats)
     for name in SIZES:
         yield from _against_the_best(name, taken)
     for name, (peer, limit) in PEERS.items():
@@ -183,6 +175,19 @@ def rows(repeats: int) -> Iterator[Row]:
         )  # fmt: skip
     if torch.cuda.is_available():
         yield from on_gpu(repeats)
+
+
+def _turns() -> dict[str, Turn]:
+    turns = {name: updates(algorithm(**settings)) for name, settings in VARIANTS.items()}
+    turns["raw torch"] = raw_updates()
+    for width in SIZES.values():
+        turns |= floors(width)
+        if importlib.util.find_spec("jax") is not None:
+            turns[f"JAX {width}"] = _by_jax(width)
+    if has_bf16():
+        turns["raw torch, bf16"] = raw_updates(bf16=True)
+        turns["TAC, HER, bf16"] = updates(algorithm(hindsight_k=4.0, precision="bf16"))
+    return turns
 
 
 def _against_the_best(name: str, taken: dict[str, list[Taken]]) -> Iterator[Row]:
