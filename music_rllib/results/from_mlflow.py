@@ -13,7 +13,7 @@ import os
 import tempfile
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -265,7 +265,10 @@ def _begun(
     absent = file is not None and not file.is_file()
     if processes is None or sweep_id is None or store.is_server or absent:
         return None
-    return processes.submit(_read_ahead, store.uri, sweep_id, metrics)
+    try:
+        return processes.submit(_read_ahead, store.uri, sweep_id, metrics)
+    except BrokenExecutor:
+        return None
 
 
 def _read_ahead(uri: str, sweep_id: str, metrics: Collection[str] | None) -> dict[str, Points]:

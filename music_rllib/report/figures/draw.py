@@ -12,7 +12,7 @@ import math
 import re
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor
+from concurrent.futures import BrokenExecutor, Executor
 from functools import cached_property, partial
 from typing import Any, TypeVar
 
@@ -83,7 +83,12 @@ class Figures:
             return partial(draw, drawing)
         # Panels are closures, which Python's own pickle does not take.
         sent = joblib.wrap_non_picklable_objects(drawing, keep_wrapper=False)
-        return self._processes.submit(draw, sent).result
+        here = partial(draw, drawing)
+        try:
+            begun = self._processes.submit(draw, sent)
+        except BrokenExecutor:  # a process was killed, by want of memory, say
+            return here
+        return lambda: here() if isinstance(begun.exception(), BrokenExecutor) else begun.result()
 
 
 def _inline(drawing: Drawing) -> tuple[str, ...]:

@@ -24,7 +24,7 @@ _LOADED = (
 
 @contextmanager
 def drawing_processes() -> Iterator[Executor | None]:
-    """As many as there are cores, and none for a single one.
+    """As many as there are cores; none for a single one, or where none can be started.
 
     What they need is loaded in the background from now on, once: all are copies of one process.
     """
@@ -34,7 +34,11 @@ def drawing_processes() -> Iterator[Executor | None]:
         return
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([*_LOADED])
-    forkserver.ensure_running()
+    try:
+        forkserver.ensure_running()
+    except OSError:
+        yield None
+        return
     with ProcessPoolExecutor(cores, context, _leave_interrupts_to_the_caller) as processes:
         yield processes
 

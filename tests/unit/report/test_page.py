@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -761,6 +762,20 @@ def test_figures_are_the_same_drawn_here_and_in_other_processes() -> None:
                 figures.add(drawing)
             drawn.append((figures.pictures, dict(figures.files())))
     assert drawn[0] == drawn[1]
+
+
+def test_figures_are_drawn_here_where_the_processes_were_killed() -> None:
+    drawings = report_on(compared({"1": [0.5, 0.6], "1.5": [0.6, 0.7]})).drawings
+    with drawing_processes() as processes:
+        assert processes is not None
+        early = Figures(processes)
+        early.add(drawings[0])
+        processes.submit(os._exit, 1).exception()
+        late = Figures(processes)
+        late.add(drawings[0])
+        for figures in (early, late):
+            assert figures.pictures[drawings[0].name]
+            assert dict(figures.files())[drawings[0].name][".pdf"]
 
 
 def test_files_show_characters_that_their_short_font_has_not() -> None:
