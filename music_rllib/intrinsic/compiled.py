@@ -168,8 +168,8 @@ def mean_bound(
             joint[t], apart[t] = _statistics(first, second, t, others[n, t], output, offset[0])
             together += joint[t]
             total += math.exp(apart[t])
-            for h in range(len(none)):
-                of_second[t, h] = none[h]
+            for h in range(len(agent_bias)):
+                of_second[t, h] = 0
         mean[0] += (together / last - math.log(total / last)) / count
         for t in range(last):
             slope = (1.0 - joint[t] ** 2) / (last * count)

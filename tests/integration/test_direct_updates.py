@@ -162,8 +162,10 @@ def test_products_are_numpys_however_matrices_lie(
         out = np.full((rows, columns), np.nan, dtype)
         first = np.ascontiguousarray(left.T if of_left else left, dtype)
         second = np.ascontiguousarray(right.T if of_right else right, dtype)
-        product(first, second, (of_left, of_right), out)
-        np.testing.assert_allclose(out, left @ right, rtol=1e-4, atol=1e-5)
+        for multiply in (product, product.py_func):
+            out.fill(np.nan)
+            multiply(first, second, (of_left, of_right), out)
+            np.testing.assert_allclose(out, left @ right, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.usefixtures("local_ray")

@@ -69,8 +69,11 @@ def _external(dtype: Any) -> Any:
 def multiply(
     left: Any, left_transposed: bool, right: Any, right_transposed: bool, out: Any
 ) -> None:
-    """Writes left @ right, either transposed, to out; their rows lie behind each other."""
-    raise NotImplementedError("for compiled code")
+    """Writes left @ right, either transposed, to out; their rows lie behind each other.
+
+    Compiled code calls BLAS in place of this.
+    """
+    np.matmul(left.T if left_transposed else left, right.T if right_transposed else right, out)
 
 
 @overload(multiply)

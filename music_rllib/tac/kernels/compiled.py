@@ -10,12 +10,16 @@ Shape legend: B batch, R rows, I network inputs, A action dimensions, C critics.
 from __future__ import annotations
 
 import hashlib
+import inspect
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from music_rllib import compiling
 from music_rllib.compiling import compiled, kept_on_disk
+from music_rllib.functional import tsallis
+from music_rllib.tac.kernels import blas, distribution, perceptron
 from music_rllib.tac.kernels.blas import multiply
 from music_rllib.tac.kernels.distribution import (
     Rule,
@@ -296,10 +300,8 @@ def _compiled_for(sources: str) -> Any:
 
 def _sources() -> str:
     """Changes with any file that `learn` is compiled of."""
-    files = (
-        Path(__file__).with_name(f"{name}.py") for name in ("blas", "distribution", "perceptron")
-    )
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
+    files = (inspect.getfile(one) for one in (blas, compiling, distribution, perceptron, tsallis))
+    return hashlib.sha256(b"".join(Path(file).read_bytes() for file in files)).hexdigest()
 
 
 learn = _compiled_for(_sources())
