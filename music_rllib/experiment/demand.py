@@ -132,7 +132,7 @@ def long_runs(runs: Iterable[tuple[str, RunSettings]]) -> Iterator[str]:
 def _seconds(run: RunSettings) -> Iterator[tuple[str, object, int]]:
     """Setting, value and the seconds that come with it."""
     evaluation = run.evaluation
-    evaluations = -(-run.env_steps // evaluation.interval)
+    evaluations = 1 - (-run.env_steps // evaluation.interval)
     yield "env_steps", run.env_steps, run.env_steps // STEPS_PER_SECOND
     played = evaluations * evaluation.episodes * run.task.horizon
     yield "evaluation.episodes", evaluation.episodes, played // STEPS_PER_SECOND

@@ -61,7 +61,7 @@ class Cost:
     @property
     def seconds(self) -> float:
         """Of one run, from its start to its end."""
-        evaluations = math.ceil(self.kind.env_steps / self.kind.settings.evaluation.interval)
+        evaluations = 1 + math.ceil(self.kind.env_steps / self.kind.settings.evaluation.interval)
         training = self.kind.env_steps / self.sample.steps_per_second
         return self.sample.start_seconds + training + evaluations * self.sample.evaluation_seconds
 

@@ -106,6 +106,8 @@ class TrainingRun:
             if "normaliser" in handoff:
                 handoff = {**handoff, "normaliser": for_another_run(handoff["normaliser"])}
             self.algorithm.set_network_weights(handoff)
+        self._begun = False
+        """Whether the policy has been evaluated as it was before any training."""
         self._rounds: defaultdict[str, list[float]] = defaultdict(list)
         """What has been measured since the last report."""
         self._segments: list[Segment] = []
@@ -124,7 +126,7 @@ class TrainingRun:
         return self.env_steps >= self.run.env_steps
 
     def advance(self, pause: Callable[[], bool] = lambda: False) -> dict[str, float]:
-        """Trains until the next report is due.
+        """Trains until the next report is due; the first one is an evaluation at step 0.
 
         Args:
             pause: asked often; where it says so, training pauses at once.
@@ -137,6 +139,9 @@ class TrainingRun:
             Paused: as it was asked to. `save` keeps what has been measured so far, so that the
                 report will be as if there had been no pause.
         """
+        if not self._begun:
+            self._begun = True
+            return self.evaluate() | self._counters() | self._system()
         interval = self.run.evaluation.interval
         evaluation_at = _next_multiple(self.env_steps, interval)
         report_at = _next_multiple(self.env_steps, min(interval, REPORT_INTERVAL))
@@ -202,6 +207,7 @@ class TrainingRun:
             "replay": replay.index(),
             "segments": [(segment.name, segment.first, segment.end) for segment in self._segments],
             "rounds": dict(self._rounds),
+            "begun": self._begun,
         }
         write_state(draft.folder, state)
 
@@ -222,6 +228,7 @@ class TrainingRun:
             lambda name: read_arrays(saved.parts[name] / _TRAJECTORIES),
         )
         self._rounds = defaultdict(list, state["rounds"])
+        self._begun = state.get("begun", True)  # older checkpoints are all of begun runs
 
     def save_alone(self, draft: Draft) -> None:
         """As `save`, with all trajectories: a checkpoint that shares nothing with earlier ones."""

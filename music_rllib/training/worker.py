@@ -296,7 +296,7 @@ class RunTrainable(Trainable):
             self._publish(training, store)
             self._keep_for_longer(training, store)
             self._clear(store)
-        elif names.EVAL_EPISODES in metrics or self._is_late():
+        elif training.env_steps and (names.EVAL_EPISODES in metrics or self._is_late()):
             self._checkpoint(training, store)
         return training.finished
 

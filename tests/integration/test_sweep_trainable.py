@@ -146,6 +146,7 @@ def test_music_f_begins_with_the_agent_that_it_was_handed(tmp_path: Path) -> Non
         for name, array in arrays.items():
             np.testing.assert_array_equal(found[module][name], array)
     begun.advance()
+    begun.advance()
     inputs = begun.algorithm.replay.packed(0)["frames"][:, :6]
     counts = begun.modules()["normaliser"]["count"]
     np.testing.assert_array_equal(counts - np.array([630.0] * 4 + [0.0] * 2), len(inputs))
@@ -155,12 +156,38 @@ def test_music_f_begins_with_the_agent_that_it_was_handed(tmp_path: Path) -> Non
 
 
 @pytest.mark.usefixtures("local_ray")
+def test_the_first_report_is_of_the_untrained_policy_and_changes_no_training() -> None:
+    def trained(*, looked_at: bool) -> tuple[list[dict[str, float]], Any]:
+        run = TrainingRun(settings("music-r"))
+        run._begun = not looked_at
+        reports = []
+        while not run.finished:
+            reports.append(run.advance())
+        run.close()
+        return reports, run.modules()["policy"]
+
+    reports, policy = trained(looked_at=True)
+    first, *rest = reports
+    assert first[names.ENV_STEPS] == first[names.GRAD_UPDATES] == 0
+    assert first[names.EVAL_EPISODES] == settings("music-r").evaluation.episodes
+    assert names.TRAIN_RETURN not in first
+    others, same_policy = trained(looked_at=False)
+    learned = names.LEARNER & rest[-1].keys()
+    assert learned
+    for report, other in zip(rest, others, strict=True):
+        assert {key: report.get(key) for key in learned} == {key: other.get(key) for key in learned}
+    for name, array in policy.items():
+        np.testing.assert_array_equal(array, same_policy[name])
+
+
+@pytest.mark.usefixtures("local_ray")
 def test_a_task_says_from_which_distance_on_something_has_moved() -> None:
     def weights(far: float | None, episodes: str) -> Any:
         task = POINT.model_copy(update={"moved_distance": far})
         replay = {"hindsight_k": 4.0, "hindsight_episodes": episodes}
         run = TrainingRun(settings("tac", task=task, replay=replay))
-        run.advance()
+        while not run.finished:
+            run.advance()
         run.close()
         return run.modules()["policy"]["0.weight"]
 
