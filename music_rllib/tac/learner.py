@@ -13,7 +13,8 @@ one step of every network.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+import functools
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -42,6 +43,7 @@ from music_rllib.tac.kernels.adam import FusedAdam
 from music_rllib.tac.kernels.blas import use_threads
 from music_rllib.tac.kernels.cuda_graphs import CapturedUpdate, CudaRecorder, UpdateConstants
 from music_rllib.tac.kernels.forward import TACForward
+from music_rllib.tac.kernels.minibatches import FlatMinibatch, Minibatch, Minibatches
 from music_rllib.tac.kernels.precision import check_precision
 from music_rllib.tac.kernels.update import DirectUpdate
 from music_rllib.tac.normaliser import RunningNormaliser
@@ -53,8 +55,6 @@ __all__ = ["GRAD_UPDATES", "TACLearner"]
 
 GRAD_UPDATES = "grad_updates"
 LOSSES = "losses"
-Minibatch = dict[ModuleID, dict[str, Tensor]]
-FlatMinibatch = Mapping[tuple[ModuleID, str], Tensor]
 
 
 class TACLearner(TorchLearner):
@@ -171,25 +171,41 @@ class TACLearner(TorchLearner):
         self._weights_seq_no += 1
         if self._direct is not None and not self._direct.is_in_use:
             self._direct = DirectUpdate(self._policy_module)
-        history: list[Mapping[str, Tensor]] = []
-        step = self._captured or self._step
-        for minibatch, constants in self._minibatches(self._convert_batch_type(batch)):
-            outputs = step(minibatch, constants)
-            self._grad_updates += 1
-            if self._grad_updates % self._settings.target_update_interval == 0:
-                self._average()
-            history.append(outputs)
-        if history:
-            self._log_history(history)
+        minibatches = self._minibatches(self._convert_batch_type(batch))
+        if minibatches.updates:
+            direct = self._direct is not None
+            learn = self._learn_directly if direct else self._learn_by_autograd
+            self._log_updates(learn(minibatches))
         self.after_gradient_based_update(timesteps=timesteps or {})
         return self.metrics.reduce()
 
+    def _learn_by_autograd(self, minibatches: Minibatches) -> dict[str, Tensor]:
+        history = []
+        step = self._captured or self._step
+        for one in minibatches.one_by_one():
+            history.append(step(one.flat, self._constants(one)))
+            self._grad_updates += 1
+            if self._grad_updates % self._settings.target_update_interval == 0:
+                self._average()
+        return {name: torch.stack([one[name] for one in history]) for name in history[0]}
+
+    def _learn_directly(self, minibatches: Minibatches) -> dict[str, Tensor]:
+        """Without autograd for the policy's module; all at once, where nothing else learns."""
+        alone = self._adam.keys() == {"networks"}
+        history = []
+        for some in (minibatches,) if alone else minibatches.one_by_one():
+            self._losses, self._observed = {}, {}
+            rewards = functools.partial(some.intrinsic_rewards, self._intrinsic)
+            self._update_directly(self._relabelled(some.columns, rewards))
+            self._grad_updates += some.updates
+            losses = torch.stack([loss.view(some.updates) for loss in self._losses.values()], 1)
+            history.append({LOSSES: losses, **self._observed})
+        self._names_of_losses = list(self._losses)
+        return {name: torch.cat([some[name] for some in history]) for name in history[0]}
+
     @torch.no_grad()  # else the targets keep a graph of all their averages
     def _average(self) -> None:
-        if self._direct is None:
-            torch._foreach_lerp_(self._targets, self._online, self._settings.tau)
-        else:
-            self._direct.average(self._settings.tau)
+        torch._foreach_lerp_(self._targets, self._online, self._settings.tau)
 
     def postprocess_gradients(self, gradients_dict: ParamDict) -> ParamDict:
         """RLlib sorts them by module and optimizer first; for nothing where nothing is clipped."""
@@ -198,53 +214,38 @@ class TACLearner(TorchLearner):
         return super().postprocess_gradients(gradients_dict)
 
     def _step(self, minibatch: FlatMinibatch, constants: UpdateConstants) -> dict[str, Tensor]:
-        """One update of every network but the targets; nothing in it waits for the device.
+        """One update by autograd of every network but the targets; nothing waits for the device.
 
         Returns:
-            `LOSSES` [M], in the order of `_names_of_losses`, and what is
-            diagnosed of it.
+            `LOSSES` [M], in the order of `_names_of_losses`, and what is diagnosed of it.
         """
         columns: Minibatch = {}
         for (module_id, name), values in minibatch.items():
             columns.setdefault(module_id, {})[name] = values
         self._losses, self._observed = {}, {}
-        relabelled = self._relabelled(columns, constants.drawn)
-        if self._direct is None:
-            self._update(relabelled)
-        else:
-            self._update_directly(self._direct, relabelled)
+        policy = columns[DEFAULT_MODULE_ID]
+        ends = (policy[Columns.OBS], policy[Columns.NEXT_OBS])
+        rewards = functools.partial(self._intrinsic.reward, *ends, constants.drawn)
+        self._update(self._relabelled(columns, rewards))
         self._names_of_losses = list(self._losses)
         return {LOSSES: torch.stack(list(self._losses.values())), **self._observed}
 
-    def _minibatches(
-        self, batch: MultiAgentBatch
-    ) -> Iterator[tuple[FlatMinibatch, UpdateConstants]]:
-        """Cuts the batch up; random numbers of all its updates are drawn here, in one go."""
+    def _minibatches(self, batch: MultiAgentBatch) -> Minibatches:
+        """With the random numbers of all updates, drawn in one go."""
         columns: Minibatch = {mid: dict(b) for mid, b in batch.policy_batches.items()}
-        rows = {DEFAULT_MODULE_ID: self._settings.batch_size}
         policy = columns[DEFAULT_MODULE_ID]
         policy |= self._policy_noise(policy[Columns.ACTIONS])
         updates = len(policy[Columns.ACTIONS]) // self._settings.batch_size
-        trajectories = columns.get(ESTIMATOR_MODULE)
-        if trajectories is not None:
-            rows[ESTIMATOR_MODULE] = self._intrinsic.trajectories
-        first = self._grad_updates == 0
+        trajectories, first = columns.get(ESTIMATOR_MODULE), self._grad_updates == 0
         drawn = self._intrinsic.draw(updates, trajectories, self._generator, first=first)
-        for k in range(updates):
-            minibatch = {
-                (mid, name): values[k * n : (k + 1) * n]
-                for mid, n in rows.items()
-                for name, values in columns[mid].items()
-            }
-            yield minibatch, self._constants(minibatch, drawn[k])
+        return Minibatches(columns, drawn)
 
-    def _constants(self, minibatch: FlatMinibatch, drawn: Hashable) -> UpdateConstants:
+    def _constants(self, minibatch: Minibatches) -> UpdateConstants:
         alpha = None if isinstance(self._settings.alpha, LearnedAlpha) else self._now.alpha
         shape = None
-        if (ESTIMATOR_MODULE, Columns.OBS) in minibatch:
-            frames = minibatch[ESTIMATOR_MODULE, Columns.OBS].shape[1]
-            shape = (frames, (ESTIMATOR_MODULE, "inside") in minibatch)
-        now = self._now
+        if (learned_from := minibatch.columns.get(ESTIMATOR_MODULE)) is not None:
+            shape = (learned_from[Columns.OBS].shape[1], "inside" in learned_from)
+        now, (drawn,) = self._now, minibatch.drawn
         return UpdateConstants(now.entropic_index, now.mi_reward_weight, alpha, drawn, shape)
 
     def _policy_noise(self, actions: Tensor) -> dict[str, Tensor]:
@@ -255,16 +256,14 @@ class TACLearner(TorchLearner):
         options = {"generator": self._generator, "device": self._device}
         return {name: torch.randn(actions.shape, **options) for name in wanted}
 
-    def _relabelled(self, minibatch: Minibatch, drawn: Hashable) -> Minibatch:
-        """The minibatch with the reward that is learned from: task and intrinsic, weighted."""
+    def _relabelled(self, minibatch: Minibatch, reward_of: Callable[[], Tensor]) -> Minibatch:
+        """With the reward that is learned from: the task's and the intrinsic one, weighted."""
         if not self._intrinsic.is_on:
             return minibatch
         policy = minibatch[DEFAULT_MODULE_ID]
-        states, followers = policy[Columns.OBS], policy[Columns.NEXT_OBS]
-        intrinsic = self._intrinsic.reward(states, followers, drawn)
-        self._observed["intrinsic"] = intrinsic
+        self._observed["intrinsic"] = intrinsic = reward_of()
         weight = self._now.mi_reward_weight
-        reward = self._intrinsic.total(policy[Columns.REWARDS], intrinsic, weight)
+        reward = self._intrinsic.total(policy[Columns.REWARDS], intrinsic.flatten(), weight)
         return {**minibatch, DEFAULT_MODULE_ID: {**policy, Columns.REWARDS: reward}}
 
     def compute_loss_for_module(
@@ -290,32 +289,32 @@ class TACLearner(TorchLearner):
         self._losses |= metrics
         return loss
 
-    def _update_directly(self, direct: DirectUpdate, minibatch: Minibatch) -> None:
-        """RLlib's `_update` without its detours and, for the policy's module, without autograd."""
-        batch = minibatch[DEFAULT_MODULE_ID]
-        learned = direct.learn(batch, self._now.entropic_index, float(self._objective.alpha))
+    def _update_directly(self, minibatches: Minibatch) -> None:
+        """RLlib's `_update` without its detours; several updates, where nothing else learns."""
+        assert self._direct is not None
+        q, alpha = self._now.entropic_index, float(self._objective.alpha)
+        policy = minibatches[DEFAULT_MODULE_ID]
+        learned = self._direct.learn(policy, self._adam["networks"], self._grad_updates, q, alpha)
         self._losses |= learned.losses
         self._observed |= learned.observed
-        self._adam["networks"].step_flat(direct.flat)
         if "alpha" in self._adam:
             seen = learned.observed
             self._policy_module.log_alpha.grad = self._objective.excess_entropy(
-                seen["log_density"], seen["log_std"], learned.ln_q_pi
+                seen["log_density"][0], seen["log_std"][0], learned.ln_q_pi[0]
             )
             self._adam["alpha"].step()
         if "estimator" in self._adam:
             self._adam["estimator"].zero_grad()
-            self.loss_of_trajectories(minibatch[ESTIMATOR_MODULE]).backward()
+            self.loss_of_trajectories(minibatches[ESTIMATOR_MODULE]).backward()
             self._adam["estimator"].step()
 
-    def _log_history(self, history: Sequence[Mapping[str, Tensor]]) -> None:
-        """Means of the updates' metrics; `history` has what `_step` returned of each."""
-        columns = {name: torch.stack([outputs[name] for outputs in history]) for name in history[0]}
-        losses_of_updates = dict(zip(self._names_of_losses, columns.pop(LOSSES).T, strict=True))
+    def _log_updates(self, outputs: Mapping[str, Tensor]) -> None:
+        """Means of the updates' metrics; `outputs` has what `_step` returns, of K updates."""
+        losses_of_updates = dict(zip(self._names_of_losses, outputs[LOSSES].T, strict=True))
         q, alpha = self._now.entropic_index, float(self._objective.alpha)
-        metrics = losses_of_updates | diagnostics.of_updates(columns, self._settings, q)
+        metrics = losses_of_updates | diagnostics.of_updates(outputs, self._settings, q)
         if self.config.replay_priority == "td_error":
-            self._td_errors = diagnostics.td_errors(columns)
+            self._td_errors = diagnostics.td_errors(outputs)
         keys, table = list(metrics), torch.stack([m.float() for m in metrics.values()], dim=1)
         # A NaN never leaves the networks again, so looking once a call is enough.
         diagnostics.check_finite(keys, table, self._grad_updates, q, alpha)

@@ -43,12 +43,12 @@ def both_gradients(
     losses = built._losses_of(module.forward_train(batch)["tac"], batch)
     grads = torch.autograd.grad(losses.total, list(trained.values()))
     direct = DirectUpdate(module)
-    learned = direct.learn(batch, built._now.entropic_index, float(built._objective.alpha))
+    learned = direct.gradients(batch, built._now.entropic_index, float(built._objective.alpha))
     for expected, found in ((losses.named, learned.losses), (built._observed, learned.observed)):
         assert expected.keys() == found.keys()
         for name, values in expected.items():
             atol = 1e-5 * float(values.detach().abs().max())
-            torch.testing.assert_close(found[name], values.detach(), rtol=0, atol=atol, msg=name)
+            torch.testing.assert_close(found[name][0], values.detach(), rtol=0, atol=atol, msg=name)
     ours = {name: direct.flat.gradient(parameter) for name, parameter in trained.items()}
     return dict(zip(trained, grads, strict=True)), ours
 
@@ -145,6 +145,36 @@ def test_critics_of_equal_value_share_the_policys_gradient() -> None:
         atol = 1e-9 * float(gradient.abs().max())
         same = found[name].reshape(gradient.shape)
         torch.testing.assert_close(same, gradient, rtol=0, atol=atol, msg=name)
+
+
+@pytest.mark.parametrize("backbone", list(BACKBONES))
+def test_updates_at_once_have_the_bits_of_one_by_one(backbone: str) -> None:
+    batches = [ready(**BACKBONES[backbone])[1] for _ in range(5)]
+    for k, batch in enumerate(batches):
+        batch["rewards"] += k
+    together = {name: torch.cat([b[name] for b in batches]).float() for name in batches[0]}
+
+    def learned(calls: list[int]) -> dict[str, Tensor]:
+        settings = {**BACKBONES[backbone], "tau": 0.1, "target_update_interval": 2}
+        built, _ = ready(**settings)
+        module = built.module[DEFAULT_MODULE_ID].unwrapped().float()
+        first = {name: p.detach().clone() for name, p in module.named_parameters()}
+        direct, done = DirectUpdate(module), 0
+        for updates in calls:
+            rows = slice(done * BATCH, (done + updates) * BATCH)
+            some = {name: values[rows] for name, values in together.items()}
+            found = direct.learn(some, built._adam["networks"], done, 1.5, 0.3)
+            assert {loss.shape for loss in found.losses.values()} == {(updates,)}
+            done += updates
+        after = {name: p.detach().clone() for name, p in module.named_parameters()}
+        assert not any(torch.equal(after[name], first[name]) for name in first)
+        return after
+
+    expected = learned([1, 1, 1, 1, 1])
+    for name, values in learned([5]).items():
+        assert torch.equal(values, expected[name]), name
+    for name, values in learned([2, 3]).items():
+        assert torch.equal(values, expected[name]), name
 
 
 @pytest.mark.parametrize(("rows", "inner", "columns"), [(256, 28, 128), (5, 3, 1), (1, 1, 7)])

@@ -74,11 +74,11 @@ def learns_to_move_and_measure(settings: RunSettings) -> bool:
         reports.append(run.advance())
     run.close()
     # Its first thousand steps are those of a random policy.
-    random_displacement = reports[0][names.TRAIN_DISPLACEMENT]
+    random_displacement = reports[1][names.TRAIN_DISPLACEMENT]
     late = reports[-4:]
     displacement = np.mean([report[names.TRAIN_DISPLACEMENT] for report in late])
     bound = np.mean([report[names.HELD_OUT_BOUND] for report in late])
-    untrained = reports[1][names.HELD_OUT_BOUND]
+    untrained = reports[2][names.HELD_OUT_BOUND]
     assert random_displacement < 0.05
     # Fourteen of sixteen such runs ended between 0.07 and 0.48 m and 0.012 and 0.28 nats, and two
     # at 0.01 m; untrained ones within 0.0002 nats.

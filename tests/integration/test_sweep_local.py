@@ -103,8 +103,8 @@ def check_mlflow(runs: dict[str, Any], folder: Path, found: list[list[str]]) -> 
         assert tags[names.TAG_ENTROPIC_INDEX] == str(q)
         assert run.data.metrics[names.SETTING_ENTROPIC_INDEX] == q
         assert run.data.params["tac.entropic_index"] == f"{q}.0"
-        assert metric_steps(folder, run) == [400, 800, 1200]
-        assert metric_steps(folder, run, names.EVAL_SUCCESS) == [400, 800, 1200]
+        assert metric_steps(folder, run) == [0, 400, 800, 1200]
+        assert metric_steps(folder, run, names.EVAL_SUCCESS) == [0, 400, 800, 1200]
     ids = [run.info.run_id[:8] for name, run in sorted(runs.items()) if name != "points"]
     assert sorted(ids) == sorted(row[-2] for row in found)
 
@@ -238,12 +238,12 @@ def test_stopped_killed_and_continued(
     assert int(continued.replace(",", "")) >= 2000
     assert [row[-1] for row in rows(output)] == ["finished"]
     assert metric_steps(tmp_path, mlflow_runs()["seed 0 Point pretrain"]) == list(
-        range(400, 4001, 400)
+        range(0, 4001, 400)
     )
     assert list((tmp_path / "results" / "work").iterdir()) == []
     (node,) = (tmp_path / "results" / "nodes").iterdir()
     history = [json.loads(line) for line in (node / "history.jsonl").read_text().splitlines()]
-    assert [report["env_steps"] for report in history] == list(range(400, 4001, 400))
+    assert [report["env_steps"] for report in history] == list(range(0, 4001, 400))
     seconds = [report["seconds"] for report in history]
     assert seconds == sorted(seconds)
 

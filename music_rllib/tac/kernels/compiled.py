@@ -1,10 +1,10 @@
-"""TAC's losses and their gradients over one minibatch, as one compiled function.
+"""TAC's updates as one compiled function: losses, their gradients, Adam, averaged networks.
 
 No autograd, no new matrices, both minibatches of the critics in one pass, no gradients that nothing
 needs. Each derivative stands beside the formula that it is of; the losses that autograd has are in
 `music_rllib.functional`, and a test holds both against each other.
 
-Shape legend: B batch, R rows, I network inputs, A action dimensions, C critics.
+Shape legend: K updates, B batch, R rows, I network inputs, A action dimensions, C critics.
 """
 
 from __future__ import annotations
@@ -15,11 +15,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from music_rllib import compiling
 from music_rllib.compiling import compiled, kept_on_disk
 from music_rllib.functional import tsallis
-from music_rllib.tac.kernels import blas, distribution, perceptron
+from music_rllib.tac.kernels import adam, blas, distribution, perceptron
+from music_rllib.tac.kernels.adam import Descent, descend
 from music_rllib.tac.kernels.blas import multiply
 from music_rllib.tac.kernels.distribution import (
     Rule,
@@ -37,7 +39,7 @@ from music_rllib.tac.kernels.perceptron import (
     layer_weights,
 )
 
-__all__ = ["Batch", "Learned", "Networks", "learn"]
+__all__ = ["Averages", "Batch", "Learned", "Networks", "learn"]
 
 
 class Networks(NamedTuple):
@@ -54,41 +56,59 @@ class Networks(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """What is learned from; what there is none of has no rows."""
+    """What is learned from, the minibatches of several updates behind each other.
+
+    What there is none of has no rows.
+    """
 
     observations: Array
-    """[B, I]"""
+    """[K*B, I]"""
     actions: Array
-    """[B, A]"""
+    """[K*B, A]"""
     rewards: Array
-    """[B]"""
+    """[K*B]"""
     discounts: Array
-    """[B]"""
+    """[K*B]"""
     next_observations: Array
-    """[B, I]"""
+    """[K*B, I]"""
     noise: Array
-    """[B, A]"""
+    """[K*B, A]"""
     next_noise: Array
-    """[B, A]"""
+    """[K*B, A]"""
     weights: Array
-    """[B]"""
+    """[K*B]"""
+
+
+class Averages(NamedTuple):
+    """Networks that follow those that are trained."""
+
+    values: Array
+    """[S] of them all."""
+    parts: NDArray[np.int64]
+    """[networks, 3]: where each begins among the trained parameters and in `values`, its size."""
+    tau: float
+    """The share that they move by."""
+    interval: int
+    """Updates from one movement to the next."""
+    done: int
+    """Updates before these."""
 
 
 class Learned(NamedTuple):
-    """What an update is measured by."""
+    """What updates are measured by."""
 
     losses: Array
-    """[3] of critics, policy and value network."""
+    """[K, 3] of critics, policy and value network."""
     q_values: Array
-    """[C, B] at the minibatch's actions."""
+    """[K, C, B] at the minibatch's actions."""
     target: Array
-    """[B] of the critics."""
+    """[K, B] of the critics."""
     log_density: Array
-    """[B, A] of the policy's actions; empty for a deterministic one."""
+    """[K, B, A] of the policy's actions; empty for a deterministic one."""
     log_std: Array
-    """[B, A]; likewise."""
+    """[K, B, A]; likewise."""
     ln_q_pi: Array
-    """[B]"""
+    """[K, B]"""
 
 
 @compiled
@@ -261,46 +281,108 @@ def _learn_value(
     return loss
 
 
+@compiled
+def _minibatch(batch: Batch, k: int, rows: int) -> Batch:
+    """Of update k."""
+    cut = slice(k * rows, (k + 1) * rows)
+    return Batch(
+        batch.observations[cut],
+        batch.actions[cut],
+        batch.rewards[cut],
+        batch.discounts[cut],
+        batch.next_observations[cut],
+        batch.noise[cut],
+        batch.next_noise[cut],
+        batch.weights[cut],
+    )
+
+
+@compiled
+def _nothing_learned(batch: Batch, rule: Rule, updates: int, rows: int, critics: int) -> Learned:
+    """What is to be filled in."""
+    size = batch.actions.shape[1] if rule.stochastic else 0
+    dtype = batch.rewards.dtype
+    return Learned(
+        np.zeros((updates, 3), dtype),
+        np.empty((updates, critics, rows), dtype),
+        np.empty((updates, rows), dtype),
+        np.empty((updates, rows, size), dtype),
+        np.empty((updates, rows, size), dtype),
+        np.empty((updates, rows), dtype),
+    )
+
+
+@compiled
+def _differentiate(
+    networks: Networks, batch: Batch, rule: Rule, q: float, alpha: float, learned: Learned, k: int
+) -> None:
+    """All losses of a minibatch (paper III-B), their gradients into the networks'."""
+    rows = len(batch.actions)
+    states = _normalised(batch.observations, batch.next_observations, rule)
+    # Both in one pass, where the policy is asked for its next actions.
+    entered = states if rule.stochastic and not rule.has_value else states[:rows]
+    outputs = forward(networks.policy, entered)
+    sample = sampled(outputs[:rows], batch.noise, rule)
+    ln_q_pi, slopes = ln_q_of_policy(sample.log_density, q, rule.joint)
+    target = _critic_target(networks, batch, rule, states[rows:], outputs[rows:], q, alpha)
+
+    pairs = _pairs(states[:rows], batch.actions, sample.action)
+    values = _ask_critics(networks.critics, pairs)
+    smallest = _smallest(values, rows)
+    losses = learned.losses[k]
+    of_values, losses[0] = _of_critics(values, target, smallest, batch.weights, rule.first_critic)
+    of_action = _asked(networks, pairs, of_values, sample.action)
+
+    improved = values[0, rows:] if rule.first_critic else smallest
+    losses[1] = _policy_loss(sample, ln_q_pi, improved, rule, alpha)
+    _learn_policy(networks, rule, entered, sample, of_action, slopes, alpha)
+    if rule.has_value:
+        losses[2] = _learn_value(networks, states[:rows], smallest, ln_q_pi, alpha)
+    learned.q_values[k] = values[:, :rows]
+    learned.target[k] = target
+    learned.log_density[k] = sample.log_density
+    learned.log_std[k] = sample.log_std
+    learned.ln_q_pi[k] = ln_q_pi
+
+
+@compiled
+def _average(averages: Averages, values: Array) -> None:
+    """Each followed network's parameters by `tau` of the way."""
+    tau = values.dtype.type(averages.tau)
+    for begin, to, size in averages.parts:
+        for i in range(size):
+            averages.values[to + i] += tau * (values[begin + i] - averages.values[to + i])
+
+
 def _compiled_for(sources: str) -> Any:
     """`learn`, kept on disk: numba looks it up by this file's age and by what it encloses."""
 
     @kept_on_disk
-    def learn(networks: Networks, batch: Batch, rule: Rule, q: float, alpha: float) -> Learned:
-        """All losses of a minibatch (paper III-B), their gradients into the networks'."""
+    def learn(
+        networks: Networks, batch: Batch, rule: Rule, descent: Descent, averages: Averages,
+        q: float, alpha: float, rows: int,
+    ) -> Learned:  # fmt: skip
+        """Updates one after the other, one for each `rows` of the batch.
+
+        The gradients of the last one stay; without parameters in `descent` nothing else happens.
+        """
         sources  # noqa: B018
-        rows = len(batch.actions)
-        states = _normalised(batch.observations, batch.next_observations, rule)
-        # Both in one pass, where the policy is asked for its next actions.
-        entered = states if rule.stochastic and not rule.has_value else states[:rows]
-        outputs = forward(networks.policy, entered)
-        sample = sampled(outputs[:rows], batch.noise, rule)
-        ln_q_pi, slopes = ln_q_of_policy(sample.log_density, q, rule.joint)
-        target = _critic_target(networks, batch, rule, states[rows:], outputs[rows:], q, alpha)
-
-        pairs = _pairs(states[:rows], batch.actions, sample.action)
-        values = _ask_critics(networks.critics, pairs)
-        smallest = _smallest(values, rows)
-        losses = np.zeros(3, states.dtype)
-        of_values, losses[0] = _of_critics(
-            values, target, smallest, batch.weights, rule.first_critic
-        )
-        of_action = _asked(networks, pairs, of_values, sample.action)
-
-        improved = values[0, rows:] if rule.first_critic else smallest
-        losses[1] = _policy_loss(sample, ln_q_pi, improved, rule, alpha)
-        _learn_policy(networks, rule, entered, sample, of_action, slopes, alpha)
-        if rule.has_value:
-            losses[2] = _learn_value(networks, states[:rows], smallest, ln_q_pi, alpha)
-        return Learned(
-            losses, values[:, :rows].copy(), target, sample.log_density, sample.log_std, ln_q_pi
-        )
+        updates = len(batch.actions) // rows
+        learned: Learned = _nothing_learned(batch, rule, updates, rows, len(networks.critics))
+        for k in range(updates):
+            _differentiate(networks, _minibatch(batch, k, rows), rule, q, alpha, learned, k)
+            descend(descent)
+            if (averages.done + k + 1) % averages.interval == 0:
+                _average(averages, descent.values)
+        return learned
 
     return learn
 
 
 def _sources() -> str:
     """Changes with any file that `learn` is compiled of."""
-    files = (inspect.getfile(one) for one in (blas, compiling, distribution, perceptron, tsallis))
+    modules = (adam, blas, compiling, distribution, perceptron, tsallis)
+    files = (inspect.getfile(module) for module in modules)
     return hashlib.sha256(b"".join(Path(file).read_bytes() for file in files)).hexdigest()
 
 

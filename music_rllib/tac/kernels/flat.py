@@ -49,10 +49,13 @@ class FlatParameters:
         """Where the values of a parameter begin."""
         return self._places[self._indices[id(parameter)]][0]
 
-    def part(self, parameters: Sequence[Tensor]) -> Tensor:
-        """The values of parameters that lie behind each other, what is between them included."""
-        last = parameters[-1]
-        return self.values[self.start(parameters[0]) : self.start(last) + last.numel()]
+    def extent(self, parameters: Sequence[Tensor]) -> tuple[int, int]:
+        """Where parameters that lie behind each other begin, and how many values they have.
+
+        What is between them is counted.
+        """
+        first, last = self.start(parameters[0]), self.start(parameters[-1])
+        return first, last + parameters[-1].numel() - first
 
     @property
     def is_in_use(self) -> bool:

@@ -1,8 +1,8 @@
-"""TAC's gradient update without autograd: a module's networks as compiled code takes them.
+"""TAC's gradient updates without autograd: a module's networks as compiled code takes them.
 
 The same numbers as autograd's to rounding, in about half of its time.
 
-Shape legend: B batch, I network inputs, A action dimensions, C critics, S parameters.
+Shape legend: K updates, B batch, I network inputs, A action dimensions, C critics, S parameters.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from ray.rllib.core.columns import Columns
 from torch import Tensor, nn
 
 from music_rllib import names
-from music_rllib.tac.kernels.compiled import Batch, Networks, learn
+from music_rllib.tac.kernels.adam import Descent, FusedAdam
+from music_rllib.tac.kernels.compiled import Averages, Batch, Networks, learn
 from music_rllib.tac.kernels.distribution import Rule
 from music_rllib.tac.kernels.flat import FlatParameters
 from music_rllib.tac.kernels.perceptron import Network
@@ -29,18 +30,18 @@ __all__ = ["DirectUpdate", "Learned"]
 
 
 class Learned(NamedTuple):
-    """What a minibatch's update is measured by."""
+    """What updates are measured by."""
 
     losses: dict[str, Tensor]
-    """[] each, by the metric's name."""
+    """[K] each, by the metric's name."""
     observed: dict[str, Tensor]
-    """As `diagnostics.of_updates` takes it, of one update."""
+    """As `diagnostics.of_updates` takes it."""
     ln_q_pi: Tensor
-    """[B]"""
+    """[K, B]"""
 
 
 class DirectUpdate:
-    """The gradients of TAC's losses over a minibatch, in `flat.gradients`.
+    """Updates of a module's networks from minibatches; gradients are left in `flat.gradients`.
 
     Args:
         module: on a CPU, of one type of floats. Its trained parameters, but for log alpha, become
@@ -52,10 +53,15 @@ class DirectUpdate:
         named = module.named_parameters()
         trained = [p for name, p in named if p.requires_grad and name != "log_alpha"]
         self.flat = FlatParameters(trained)
-        pairs = module.get_target_network_pairs()
-        self._averaged = FlatParameters([p for _, target in pairs for p in target.parameters()])
-        self._online = [self.flat.part(list(online.parameters())) for online, _ in pairs]
-        self._targets = [self._averaged.part(list(target.parameters())) for _, target in pairs]
+        pairs = [
+            (list(online.parameters()), list(target.parameters()))
+            for online, target in module.get_target_network_pairs()
+        ]
+        self._averaged = FlatParameters([p for _, target in pairs for p in target])
+        parts = [
+            (self.flat.start(online[0]), *self._averaged.extent(target)) for online, target in pairs
+        ]
+        self._parts = np.array(parts, np.int64).reshape(-1, 3)
         self._networks: dict[int, Networks] = {}
         self._rule = self._rule_of(module)
 
@@ -64,15 +70,49 @@ class DirectUpdate:
         """Whether the parameters are still these; converting the module replaces them."""
         return self.flat.is_in_use and self._averaged.is_in_use
 
-    def learn(self, batch: Mapping[str, Tensor], entropic_index: float, alpha: float) -> Learned:
-        """Writes the gradients of all losses.
+    def gradients(
+        self, batch: Mapping[str, Tensor], entropic_index: float, alpha: float
+    ) -> Learned:
+        """Writes the gradients of all losses of one minibatch, and changes no network.
 
         Args:
             batch: documented at `TACLearner`.
             entropic_index: q.
             alpha: entropy coefficient.
-
         """
+        empty = self.flat.values.numpy()[:0]
+        no_step = Descent(empty, empty, empty, empty, empty, 0.0, 0.0, 0.0, 0.0)
+        averages = Averages(empty, self._parts[:0], 0.0, 1, 0)
+        return self._called(
+            batch, no_step, averages, entropic_index, alpha, len(batch["discounts"])
+        )
+
+    def learn(
+        self, batch: Mapping[str, Tensor], optimizer: FusedAdam, done: int, entropic_index: float,
+        alpha: float,
+    ) -> Learned:  # fmt: skip
+        """K updates, with their steps of Adam and movements of the averaged networks.
+
+        Args:
+            batch: K minibatches behind each other, as documented at `TACLearner`.
+            optimizer: of the trained parameters.
+            done: updates before these.
+            entropic_index: q.
+            alpha: entropy coefficient.
+        """
+        settings = self._module.settings
+        averages = Averages(
+            self._averaged.values.numpy(), self._parts, settings.tau,
+            settings.target_update_interval, done,
+        )  # fmt: skip
+        descent = optimizer.descent(self.flat)
+        rows = settings.batch_size
+        return self._called(batch, descent, averages, entropic_index, alpha, rows)
+
+    def _called(
+        self, batch: Mapping[str, Tensor], descent: Descent, averages: Averages, q: float,
+        alpha: float, rows: int,
+    ) -> Learned:  # fmt: skip
         actions = batch[Columns.ACTIONS]
         nothing, none = actions[:0], batch[Columns.REWARDS][:0]
         taken = (
@@ -80,18 +120,18 @@ class DirectUpdate:
             batch[Columns.NEXT_OBS], batch.get("noise", nothing), batch.get("next_noise", nothing),
             batch.get("weights", none),
         )  # fmt: skip
-        rows = len(actions)
         if rows not in self._networks:
             self._networks[rows] = self._networks_for(rows)
         arrays = Batch(*(values.numpy() for values in taken))
-        found = learn(self._networks[rows], arrays, self._rule, entropic_index, alpha)
+        networks, rule = self._networks[rows], self._rule
+        found = learn(networks, arrays, rule, descent, averages, q, alpha, rows)
         return self._learned(*map(torch.from_numpy, found))
 
     def _learned(
         self, losses: Tensor, q_values: Tensor, targets: Tensor, log_density: Tensor,
         log_std: Tensor, ln_q_pi: Tensor,
     ) -> Learned:  # fmt: skip
-        critics, policy, value = losses.unbind()
+        critics, policy, value = losses.unbind(1)
         named = {names.CRITIC_LOSS: critics, names.POLICY_LOSS: policy}
         if self._rule.has_value:
             named[names.VALUE_LOSS] = value
@@ -99,12 +139,6 @@ class DirectUpdate:
         if self._rule.stochastic:
             observed |= {"log_density": log_density, "log_std": log_std}
         return Learned(named, observed, ln_q_pi)
-
-    @torch.no_grad()
-    def average(self, tau: float) -> None:
-        """Moves the averaged networks by the share `tau` towards those that are trained."""
-        for target, online in zip(self._targets, self._online, strict=True):
-            target.lerp_(online, tau)
 
     # -- as compiled code takes it --------------------------------------------------------
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from music_rllib.tac.kernels.adam import FusedAdam
+from music_rllib.tac.kernels.adam import FusedAdam, descend
 from music_rllib.tac.kernels.flat import FlatParameters
 
 SHAPES = [(7, 5), (5,), (2, 3, 4), ()]
@@ -138,7 +138,7 @@ def test_a_flat_step_has_the_numbers_and_the_state_of_adam(behind: int) -> None:
             a.grad = torch.randn(a.shape, generator=training.generator)
             flat.gradient(b).copy_(a.grad)
         training.adam.step()
-        training.fused.step_flat(flat)
+        descend(training.fused.descent(flat))
         theirs, ours = training.adam.state_dict()["state"], training.fused.state_dict()["state"]
         assert theirs.keys() == ours.keys()
         for i, (a, b) in enumerate(zip(training.theirs, training.ours, strict=True)):

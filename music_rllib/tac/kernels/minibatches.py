@@ -1,0 +1,71 @@
+"""The minibatches of the updates of a call, all of them or one by one.
+
+Shape legend: K updates, B transitions of a minibatch, N trajectories.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import torch
+from ray.rllib.core import DEFAULT_MODULE_ID
+from ray.rllib.core.columns import Columns
+from ray.rllib.utils.typing import ModuleID
+from torch import Tensor
+
+from music_rllib.intrinsic.interface import IntrinsicReward
+
+__all__ = ["FlatMinibatch", "Minibatch", "Minibatches"]
+
+Minibatch = dict[ModuleID, dict[str, Tensor]]
+"""Columns by module."""
+FlatMinibatch = Mapping[tuple[ModuleID, str], Tensor]
+
+
+class Minibatches(NamedTuple):
+    """Those of K updates, behind each other."""
+
+    columns: Minibatch
+    """[K*B, ...] transitions of the policy's module, [K*N, ...] of the estimator's."""
+    drawn: Sequence[Hashable]
+    """[K] by the intrinsic reward."""
+
+    @property
+    def updates(self) -> int:
+        """K."""
+        return len(self.drawn)
+
+    @property
+    def flat(self) -> FlatMinibatch:
+        """The columns by module and name."""
+        return {
+            (mid, name): v for mid, columns in self.columns.items() for name, v in columns.items()
+        }
+
+    def one_by_one(self) -> Iterator[Minibatches]:
+        """Those of each update."""
+        for k, drawn in enumerate(self.drawn):
+            columns = {
+                module: {name: self._of_update(k, values) for name, values in columns.items()}
+                for module, columns in self.columns.items()
+            }
+            yield Minibatches(columns, (drawn,))
+
+    def _of_update(self, k: int, values: Tensor) -> Tensor:
+        rows = len(values) // self.updates
+        return values[k * rows : (k + 1) * rows]
+
+    def intrinsic_rewards(self, reward: IntrinsicReward) -> Tensor:
+        """[K, B] of networks that stay as they are: those for which the same was drawn together."""
+        states, followers = (
+            self.columns[DEFAULT_MODULE_ID][name].unflatten(0, (self.updates, -1))
+            for name in (Columns.OBS, Columns.NEXT_OBS)
+        )
+        rewards: Tensor = states.new_empty(states.shape[:2])
+        for drawn in dict.fromkeys(self.drawn):
+            alike = torch.tensor([k for k, other in enumerate(self.drawn) if other == drawn])
+            before, after = (values[alike].flatten(0, 1) for values in (states, followers))
+            found = reward.reward(before, after, drawn)
+            rewards[alike] = found.unflatten(0, (len(alike), -1))
+        return rewards
