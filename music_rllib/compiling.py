@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
+import inspect
 import logging
 from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from numba import njit
 from numba.core.caching import FunctionCache
 
-__all__ = ["compiled", "kept_on_disk"]
+__all__ = ["compiled", "kept_on_disk", "sources_of"]
 
 logger = logging.getLogger(__name__)
 
@@ -41,6 +45,15 @@ def kept_on_disk(function: Function) -> Any:
             "compiled code is not kept, so that each run takes longer to start: %s", error
         )
     return dispatcher
+
+
+def sources_of(*modules: ModuleType) -> str:
+    """Changes with any of their files.
+
+    What a function encloses decides, beside its own file, whether what was kept of it still holds.
+    """
+    files = (Path(inspect.getfile(module)).read_bytes() for module in modules)
+    return hashlib.sha256(b"".join(files)).hexdigest()
 
 
 class _Cache(FunctionCache):

@@ -1,27 +1,59 @@
-"""The bound of MUSIC's estimator and its gradients, compiled, for a CPU.
+"""The bound of MUSIC's estimator and its training, compiled, for a CPU.
 
 Of a frame's agent and surrounding state each half's part of the hidden units is computed once,
 whichever halves are then paired, and no matrix of hidden units is kept. Sums are in float64: the
 bound of two frames is small, and the intrinsic reward 5,000 times it.
 
-Shape legend: N trajectories, T frames, X / Y features of the agent's and the surrounding state, I
-both together, H hidden units.
+Shape legend: K updates, N trajectories and B transitions of one, T frames, X / Y features of the
+agent's and the surrounding state, I both together, H hidden units.
 """
 
 from __future__ import annotations
 
 import functools
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from music_rllib.compiling import compiled, kept_on_disk
+from music_rllib import compiling
+from music_rllib.compiling import compiled, kept_on_disk, sources_of
+from music_rllib.optim import adam
+from music_rllib.optim.adam import Descent, descend
 
-__all__ = ["bounds", "mean_bound"]
+__all__ = ["Data", "Weights", "bounds", "learn"]
 
 Array = NDArray[Any]
+
+
+class Data(NamedTuple):
+    """Trajectories."""
+
+    agent: Array
+    """[N, T, X]"""
+    surrounding: Array
+    """[N, T, Y]"""
+    others: Array
+    """[N, T] of which frame the surroundings are, in pairs from the marginals."""
+    frames: Array
+    """[N] of each trajectory; what is behind them is padding."""
+
+
+class Weights(NamedTuple):
+    """The estimator's parameters, or what belongs to them, in their order."""
+
+    agent: Array
+    """[H, X]"""
+    bias: Array
+    """[H]"""
+    surrounding: Array
+    """[H, Y]"""
+    output: Array
+    """[1, H]"""
+    offset: Array
+    """[1]"""
+
 
 _inner = functools.partial(compiled, any_order=True)
 
@@ -96,97 +128,131 @@ def _add_products(states: Array, n: int, frames: int, of_units: Array, columns: 
                 columns[i, h] += value * of_units[t, h]
 
 
-@kept_on_disk
-def bounds(
-    agent: Array, surrounding: Array, others: Array, frames: Array, agent_weight: Array,
-    agent_bias: Array, surrounding_weight: Array, output: Array, offset: Array,
-) -> Array:  # fmt: skip
-    """Donsker-Varadhan bounds, as `functional.mutual_information` has them.
-
-    Args:
-        agent: [N, T, X]
-        surrounding: [N, T, Y]
-        others: [N, T] of which frame the surroundings are, in pairs from the marginals.
-        frames: [N] of each trajectory; what is behind them is padding.
-        agent_weight: [H, X], the first of the estimator's parameters, which follow in their order.
-        agent_bias: [H]
-        surrounding_weight: [H, Y]
-        output: [1, H]
-        offset: [1]
-
-    Returns:
-        [N] in nats.
-    """
-    count, length = others.shape
-    found = np.empty(count, agent.dtype)
-    first = np.empty((length, len(agent_bias)), agent.dtype)
-    second, none = np.empty_like(first), np.zeros_like(agent_bias)
-    agent_columns = _transposed(agent_weight)
-    surrounding_columns = _transposed(surrounding_weight)
-    for n in range(count):
+@_inner
+def _bounds(
+    agent: Array, surrounding: Array, others: Array, frames: Array, weights: Weights, found: Array
+) -> None:
+    length = others.shape[1]
+    first = np.empty((length, len(weights.bias)), agent.dtype)
+    second, none = np.empty_like(first), np.zeros_like(weights.bias)
+    agent_columns = _transposed(weights.agent)
+    surrounding_columns = _transposed(weights.surrounding)
+    for n in range(len(others)):
         last = frames[n]
-        _half(agent, n, last, agent_columns, agent_bias, first)
+        _half(agent, n, last, agent_columns, weights.bias, first)
         _half(surrounding, n, last, surrounding_columns, none, second)
         joint, marginals = 0.0, 0.0
         for t in range(last):
-            together, apart = _statistics(first, second, t, others[n, t], output, offset[0])
+            together, apart = _statistics(
+                first, second, t, others[n, t], weights.output, weights.offset[0]
+            )
             joint += together
             marginals += math.exp(apart)
         found[n] = joint / last - math.log(marginals / last)
-    return found
 
 
-@kept_on_disk
-def mean_bound(
-    agent: Array, surrounding: Array, others: Array, frames: Array, agent_weight: Array,
-    agent_bias: Array, surrounding_weight: Array, output: Array, offset: Array,
-) -> tuple[Array, Array, Array, Array, Array, Array]:  # fmt: skip
-    """The mean of `bounds` [1], and its derivatives by the estimator's parameters.
+@_inner
+def _differentiate(
+    agent: Array, surrounding: Array, others: Array, frames: Array, weights: Weights, by: Weights
+) -> float:
+    """The mean of `bounds`; the derivatives of its negative, `by` each parameter, are written.
 
     A bound's derivative by a joint statistic is 1/T, by one of the marginals -exp(s) / sum exp(s);
     a statistic's by its argument 1 - s^2.
     """
     count, length = others.shape
-    first = np.empty((length, len(agent_bias)), agent.dtype)
+    first = np.empty((length, len(weights.bias)), agent.dtype)
     second, of_first, of_second = np.empty_like(first), np.empty_like(first), np.empty_like(first)
     joint, apart = np.empty(length), np.empty(length)
-    agent_columns = _transposed(agent_weight)
-    surrounding_columns = _transposed(surrounding_weight)
+    agent_columns = _transposed(weights.agent)
+    surrounding_columns = _transposed(weights.surrounding)
     of_agent, of_surrounding = np.zeros_like(agent_columns), np.zeros_like(surrounding_columns)
-    of_bias, of_output, none = (
-        np.zeros_like(agent_bias),
-        np.zeros_like(output),
-        np.zeros_like(agent_bias),
-    )
-    mean, of_offset = np.zeros_like(offset), np.zeros_like(offset)
+    none, output = np.zeros_like(weights.bias), weights.output
+    by.bias[:], by.output[:], by.offset[:] = 0, 0, 0
+    mean = 0.0
     for n in range(count):
         last = frames[n]
-        _half(agent, n, last, agent_columns, agent_bias, first)
+        _half(agent, n, last, agent_columns, weights.bias, first)
         _half(surrounding, n, last, surrounding_columns, none, second)
         together, total = 0.0, 0.0
         for t in range(last):
-            joint[t], apart[t] = _statistics(first, second, t, others[n, t], output, offset[0])
+            joint[t], apart[t] = _statistics(
+                first, second, t, others[n, t], output, weights.offset[0]
+            )
             together += joint[t]
             total += math.exp(apart[t])
-            for h in range(len(agent_bias)):
+            for h in range(len(by.bias)):
                 of_second[t, h] = 0
-        mean[0] += (together / last - math.log(total / last)) / count
+        mean += (together / last - math.log(total / last)) / count
         for t in range(last):
-            slope = (1.0 - joint[t] ** 2) / (last * count)
-            other_slope = -math.exp(apart[t]) * (1.0 - apart[t] ** 2) / (total * count)
+            slope = -(1.0 - joint[t] ** 2) / (last * count)
+            other_slope = math.exp(apart[t]) * (1.0 - apart[t] ** 2) / (total * count)
             _add_pairs(
-                first, second, t, others[n, t], slope, other_slope, of_first, of_second, of_output
+                first, second, t, others[n, t], slope, other_slope, of_first, of_second, by.output
             )
-            of_offset[0] += slope + other_slope
+            by.offset[0] += slope + other_slope
         _add_products(agent, n, last, of_first, of_agent)
         _add_products(surrounding, n, last, of_second, of_surrounding)
         for t in range(last):
-            for h in range(len(of_bias)):
-                of_bias[h] += of_first[t, h]
-    for h in range(len(of_bias)):
-        of_bias[h] *= output[0, h]
+            for h in range(len(by.bias)):
+                by.bias[h] += of_first[t, h]
+    for h in range(len(by.bias)):
+        by.bias[h] *= output[0, h]
         for x in range(len(of_agent)):
-            of_agent[x, h] *= output[0, h]
+            by.agent[h, x] = of_agent[x, h] * output[0, h]
         for y in range(len(of_surrounding)):
-            of_surrounding[y, h] *= output[0, h]
-    return mean, of_agent.T.copy(), of_bias, of_surrounding.T.copy(), of_output, of_offset
+            by.surrounding[h, y] = of_surrounding[y, h] * output[0, h]
+    return mean
+
+
+@kept_on_disk
+def bounds(data: Data, weights: Weights) -> Array:
+    """[N] Donsker-Varadhan bounds in nats, as `functional.mutual_information` has them."""
+    found = np.empty(len(data.others), data.agent.dtype)
+    _bounds(data.agent, data.surrounding, data.others, data.frames, weights, found)
+    return found
+
+
+def _compiled_for(sources: str) -> Any:
+    """`learn`, kept on disk until one of the files changes that it is compiled of."""
+
+    @kept_on_disk
+    def learn(
+        transitions: Data, trajectories: Data, weights: Weights, by: Weights, descent: Descent,
+        updates: int,
+    ) -> tuple[Array, Array]:  # fmt: skip
+        """Updates one after the other, each of its part of the data.
+
+        Args:
+            transitions: [K*B] pairs of frames, of which each update takes the bounds first.
+            trajectories: [K*N] that it then learns from, the minibatches behind each other.
+            weights: in `descent.values`.
+            by: in `descent.gradients`.
+            descent: Adam's step.
+            updates: K.
+
+        Returns:
+            [K*B] bounds of the transitions, and [K] mean bounds of the trajectories.
+        """
+        sources  # noqa: B018
+        found = np.empty(len(transitions.others), transitions.agent.dtype)
+        means = np.empty(updates, transitions.agent.dtype)
+        rows, count = len(found) // updates, len(trajectories.others) // updates
+        for k in range(updates):
+            some = slice(k * rows, (k + 1) * rows)
+            _bounds(
+                transitions.agent[some], transitions.surrounding[some], transitions.others[some],
+                transitions.frames[some], weights, found[some],
+            )  # fmt: skip
+            some = slice(k * count, (k + 1) * count)
+            means[k] = _differentiate(
+                trajectories.agent[some], trajectories.surrounding[some],
+                trajectories.others[some], trajectories.frames[some], weights, by,
+            )  # fmt: skip
+            descend(descent)
+        return found, means
+
+    return learn
+
+
+learn = _compiled_for(sources_of(adam, compiling))

@@ -7,17 +7,20 @@ surrounding state. States are raw observations, as in the original, unless they 
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
 
 from music_rllib.functional.mutual_information import donsker_varadhan, shuffle_time
-from music_rllib.intrinsic.compiled import bounds, mean_bound
+from music_rllib.intrinsic.compiled import Data, Weights, bounds, learn
+from music_rllib.optim.adam import FusedAdam
+from music_rllib.optim.flat import FlatParameters
 
-__all__ = ["MutualInformationEstimator", "intrinsic_reward"]
+__all__ = ["MutualInformationEstimator", "intrinsic_reward", "two_frames"]
 
 
 FAR = 10.0
@@ -37,7 +40,7 @@ class MutualInformationEstimator(nn.Module):
     scale: Tensor
     """[X + Y] multiplies what is left; 1 for what is used raw."""
     compiled = True
-    """Whether bounds on a CPU are computed by compiled code."""
+    """Whether bounds on a CPU that nobody differentiates are computed by compiled code."""
 
     def __init__(self, agent_size: int, surrounding_size: int, hidden_size: int = 128) -> None:
         super().__init__()
@@ -47,6 +50,7 @@ class MutualInformationEstimator(nn.Module):
         self.register_buffer("offset", torch.zeros(agent_size + surrounding_size))
         self.register_buffer("scale", torch.ones(agent_size + surrounding_size))
         self._raw = True
+        self._flat: FlatParameters | None = None
         hook = MutualInformationEstimator._see_whether_raw
         self.register_load_state_dict_post_hook(hook)  # type: ignore[no-untyped-call]
 
@@ -95,37 +99,47 @@ class MutualInformationEstimator(nn.Module):
         Returns:
             [N]
         """
-        if self._compiles(agent) and not torch.is_grad_enabled():
-            return torch.from_numpy(bounds(*self._arrays(agent, surrounding, permutations, inside)))
+        if self.compiled and agent.device.type == "cpu" and not torch.is_grad_enabled():
+            data = self.data(agent, surrounding, permutations, inside)
+            return torch.from_numpy(bounds(data, Weights(*self._arrays())))
         shuffled = shuffle_time(surrounding, permutations)
         return donsker_varadhan(self(agent, surrounding), self(agent, shuffled), inside)
 
-    def mean_bound(
-        self,
-        agent: Tensor,
-        surrounding: Tensor,
-        permutations: Tensor,
-        inside: Tensor | None = None,
-    ) -> Tensor:
-        """[] the mean of `bound`, to be learned from."""
-        if not self._compiles(agent):
-            return self.bound(agent, surrounding, permutations, inside).mean()
-        arrays = self._arrays(agent, surrounding, permutations, inside)
-        mean: Tensor = _MeanBound.apply(arrays, *self.parameters())  # type: ignore[no-untyped-call]
-        return mean
+    def learn(
+        self, pairs: Data, trajectories: Data, optimizer: FusedAdam, updates: int
+    ) -> tuple[Tensor, Tensor]:
+        """Updates on a CPU, each by the mean bound of its trajectories.
 
-    def _compiles(self, agent: Tensor) -> bool:
-        return self.compiled and agent.device.type == "cpu"
+        Args:
+            pairs: [K*B] of frames, of which each update takes the bounds first.
+            trajectories: [K*N]
+            optimizer: of this module's parameters.
+            updates: K.
 
-    def _arrays(
-        self, agent: Tensor, surrounding: Tensor, permutations: Tensor, inside: Tensor | None
-    ) -> tuple[Any, ...]:
-        """What compiled code takes."""
+        Returns:
+            [K*B] bounds of the pairs, and [K] of the trajectories, in nats.
+        """
+        if self._flat is None or not self._flat.is_in_use:
+            self._flat = FlatParameters(list(self.parameters()))
+        weights, by = (
+            Weights(*(view.numpy() for view in self._flat.views(flat)))
+            for flat in (self._flat.values, self._flat.gradients)
+        )
+        descent = optimizer.descent(self._flat)
+        found, means = learn(pairs, trajectories, weights, by, descent, updates)
+        return torch.from_numpy(found), torch.from_numpy(means)
+
+    def _arrays(self) -> Iterator[NDArray[Any]]:
+        return (parameter.detach().numpy() for parameter in self.parameters())
+
+    def data(
+        self, agent: Tensor, surrounding: Tensor, others: Tensor, inside: Tensor | None
+    ) -> Data:
+        """What compiled code takes; as `bound` documents it."""
         agent, surrounding = self._scaled(agent, surrounding)
         frames = np.full(*agent.shape[:2]) if inside is None else inside.sum(-1).numpy()
-        tensors = (agent, surrounding, permutations)
-        data = (np.ascontiguousarray(tensor.numpy()) for tensor in tensors)
-        return (*data, frames, *(parameter.detach().numpy() for parameter in self.parameters()))
+        whole = (np.ascontiguousarray(one.numpy()) for one in (agent, surrounding, others))
+        return Data._make((*whole, frames))
 
     def transition_bound(
         self, agent: Tensor, surrounding: Tensor, *, swapped: bool = True
@@ -140,30 +154,14 @@ class MutualInformationEstimator(nn.Module):
         Returns:
             [B]
         """
-        others = _two_frames(len(agent), swapped).to(agent.device)
+        others = two_frames(len(agent), swapped).to(agent.device)
         return self.bound(agent, surrounding, others)
 
 
 @functools.lru_cache(maxsize=8)
-def _two_frames(rows: int, swapped: bool) -> Tensor:
+def two_frames(rows: int, swapped: bool) -> Tensor:
     """[B, 2] of two frames each the other one, or itself."""
     return torch.tensor([1, 0] if swapped else [0, 1]).repeat(rows, 1)
-
-
-class _MeanBound(torch.autograd.Function):
-    """`compiled.mean_bound`, to be differentiated once, by the estimator's parameters."""
-
-    @staticmethod
-    def forward(ctx: Any, arrays: tuple[Any, ...], *parameters: Tensor) -> Tensor:
-        """The estimator's, in its order: weight and bias of the agent's half, and so on."""
-        mean, *gradients = map(torch.from_numpy, mean_bound(*arrays))
-        ctx.gradients = gradients
-        return mean.squeeze(0)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, of_mean: Tensor) -> tuple[Tensor | None, ...]:
-        return None, *(gradient * of_mean for gradient in ctx.gradients)
 
 
 def intrinsic_reward(bound: Tensor, scale: float) -> Tensor:

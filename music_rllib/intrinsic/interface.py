@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from music_rllib.optim.adam import FusedAdam
 from music_rllib.replay.trajectories import Trajectory
 
 __all__ = ["IntrinsicReward"]
@@ -67,6 +68,23 @@ class IntrinsicReward(Protocol):
 
     def loss(self, trajectories: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
         """[N, T, D] -> [] to be minimised by its networks, and metrics by name."""
+
+    def learn(
+        self, states: Tensor, followers: Tensor, drawn: Sequence[Hashable],
+        trajectories: Mapping[str, Tensor], optimizer: FusedAdam,
+    ) -> tuple[Tensor, dict[str, Tensor]]:  # fmt: skip
+        """K updates of its networks on a CPU, without autograd where it can.
+
+        Args:
+            states: [K, B, D]
+            followers: [K, B, D] the next ones.
+            drawn: K, as `draw` gave them.
+            trajectories: [K*N, T, D]
+            optimizer: of its networks.
+
+        Returns:
+            [K, B] rewards, each minibatch's before its update, and metrics by name, [K] each.
+        """
 
     def observe(
         self,

@@ -17,6 +17,7 @@ from music_rllib import names
 from music_rllib.functional.mutual_information import time_permutations
 from music_rllib.intrinsic.held_out import HeldOutBound
 from music_rllib.intrinsic.settings import MusicSettings
+from music_rllib.optim.adam import FusedAdam
 from music_rllib.replay.trajectories import Trajectory
 
 __all__ = ["HELD_OUT_STEPS", "Music"]
@@ -36,10 +37,11 @@ class Estimator(Protocol):
     def bound(self, observations: Tensor, permutations: Tensor, inside: Tensor | None) -> Tensor:
         """[N, T, D], [N, T] permutations and padding -> [N] nats."""
 
-    def mean_bound(
-        self, observations: Tensor, permutations: Tensor, inside: Tensor | None
-    ) -> Tensor:
-        """[] the mean of `bound`, to be learned from."""
+    def learn(
+        self, states: Tensor, followers: Tensor, swapped: Sequence[bool],
+        trajectories: Mapping[str, Tensor], optimizer: FusedAdam,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        """K updates, and the [K, B] rewards before each; [K] mean bounds."""
 
     def transition_bounds(self, observations: Tensor) -> Tensor:
         """[T, D] -> [T - 1] nats."""
@@ -114,8 +116,16 @@ class Music:
     def loss(self, trajectories: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
         """Less the mean bound, in nats."""
         permutations, inside = trajectories["permutations"], trajectories.get("inside")
-        bound = self._present().mean_bound(trajectories["obs"], permutations, inside)
+        bound = self._present().bound(trajectories["obs"], permutations, inside).mean()
         return -bound, {names.MI_BOUND: bound.detach()}
+
+    def learn(
+        self, states: Tensor, followers: Tensor, drawn: Sequence[Hashable],
+        trajectories: Mapping[str, Tensor], optimizer: FusedAdam,
+    ) -> tuple[Tensor, dict[str, Tensor]]:  # fmt: skip
+        swapped = [bool(one) for one in drawn]
+        rewards, bounds = self._present().learn(states, followers, swapped, trajectories, optimizer)
+        return rewards, {names.MI_BOUND: bounds}
 
     def observe(
         self,

@@ -33,13 +33,13 @@ from torch import Tensor
 from music_rllib import names
 from music_rllib.config.tac_settings import LearnedAlpha, TACSettings
 from music_rllib.intrinsic.interface import IntrinsicReward
+from music_rllib.optim.adam import FusedAdam
 from music_rllib.replay.trajectories import Trajectory
 from music_rllib.runtime.allocator import keep_freed_memory
 from music_rllib.runtime.quiet import quiet_third_parties
 from music_rllib.schedules import Quantity
 from music_rllib.tac import diagnostics
 from music_rllib.tac.fresh_episodes import FreshEpisodes, critic_bias
-from music_rllib.tac.kernels.adam import FusedAdam
 from music_rllib.tac.kernels.blas import use_threads
 from music_rllib.tac.kernels.cuda_graphs import CapturedUpdate, CudaRecorder, UpdateConstants
 from music_rllib.tac.kernels.forward import TACForward
@@ -190,12 +190,11 @@ class TACLearner(TorchLearner):
         return {name: torch.stack([one[name] for one in history]) for name in history[0]}
 
     def _learn_directly(self, minibatches: Minibatches) -> dict[str, Tensor]:
-        """Without autograd for the policy's module; all at once, where nothing else learns."""
-        alone = self._adam.keys() == {"networks"}
+        """Without autograd; all at once, unless alpha changes from one to the next."""
         history = []
-        for some in (minibatches,) if alone else minibatches.one_by_one():
+        for some in minibatches.one_by_one() if "alpha" in self._adam else (minibatches,):
             self._losses, self._observed = {}, {}
-            rewards = functools.partial(some.intrinsic_rewards, self._intrinsic)
+            rewards = functools.partial(self._learn_intrinsic, some)
             self._update_directly(self._relabelled(some.columns, rewards))
             self._grad_updates += some.updates
             losses = torch.stack([loss.view(some.updates) for loss in self._losses.values()], 1)
@@ -303,10 +302,18 @@ class TACLearner(TorchLearner):
                 seen["log_density"][0], seen["log_std"][0], learned.ln_q_pi[0]
             )
             self._adam["alpha"].step()
-        if "estimator" in self._adam:
-            self._adam["estimator"].zero_grad()
-            self.loss_of_trajectories(minibatches[ESTIMATOR_MODULE]).backward()
-            self._adam["estimator"].step()
+
+    def _learn_intrinsic(self, minibatches: Minibatches) -> Tensor:
+        """[K, B] rewards, each minibatch's as its networks are then; they depend on no other."""
+        if "estimator" not in self._adam:
+            return minibatches.intrinsic_rewards(self._intrinsic)
+        states, followers = minibatches.transitions
+        trajectories = minibatches.columns[ESTIMATOR_MODULE]
+        rewards, metrics = self._intrinsic.learn(
+            states, followers, minibatches.drawn, trajectories, self._adam["estimator"]
+        )
+        self._losses |= metrics
+        return rewards
 
     def _log_updates(self, outputs: Mapping[str, Tensor]) -> None:
         """Means of the updates' metrics; `outputs` has what `_step` returns, of K updates."""
@@ -320,11 +327,9 @@ class TACLearner(TorchLearner):
         diagnostics.check_finite(keys, table, self._grad_updates, q, alpha)
         log = self.metrics.log_value
         means = dict(zip(keys, table.mean(0).tolist(), strict=True))
-        for key, mean in {**means, **self._now.metrics()}.items():
-            log((DEFAULT_MODULE_ID, key), mean, window=1)
-        for key, value in self._intrinsic.metrics().items():
+        measured = {**means, **self._now.metrics(), **self._intrinsic.metrics(), names.ALPHA: alpha}
+        for key, value in measured.items():
             log((DEFAULT_MODULE_ID, key), value, window=1)
-        log((DEFAULT_MODULE_ID, names.ALPHA), alpha, window=1)
         log((ALL_MODULES, GRAD_UPDATES), self._grad_updates, window=1)
         if names.SHANNON_ENTROPY in means:
             self._now.observe("shannon_entropy", means[names.SHANNON_ENTROPY])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -20,7 +21,8 @@ from music_rllib.functional.squashed_gaussian import (
     sample_squashed,
     squashed_action,
 )
-from music_rllib.intrinsic.estimator import MutualInformationEstimator, intrinsic_reward
+from music_rllib.intrinsic.estimator import MutualInformationEstimator, intrinsic_reward, two_frames
+from music_rllib.optim.adam import FusedAdam
 from music_rllib.tac.kernels.forward import Bootstrap, TACForward
 from music_rllib.tac.networks import Critics, Perceptron
 from music_rllib.tac.normaliser import RunningNormaliser
@@ -220,11 +222,38 @@ class EstimatorModule(TorchRLModule, SelfSupervisedLossAPI):
         """[N, T, D] trajectories, [N, T] permutations and padding -> [N] bounds in nats."""
         return self.estimator.bound(*self.split(observations), permutations, inside)
 
-    def mean_bound(
-        self, observations: Tensor, permutations: Tensor, inside: Tensor | None = None
-    ) -> Tensor:
-        """[] the mean of `bound`, to be learned from."""
-        return self.estimator.mean_bound(*self.split(observations), permutations, inside)
+    @torch.no_grad()
+    def learn(
+        self, states: Tensor, followers: Tensor, swapped: Sequence[bool],
+        trajectories: Mapping[str, Tensor], optimizer: FusedAdam,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        """K updates on a CPU, by compiled code.
+
+        Args:
+            states: [K, B, D], of whose transitions each update takes the reward first.
+            followers: [K, B, D] the next states.
+            swapped: K, as `reward` takes it.
+            trajectories: [K*N, T, D] "obs", [K*N, T] "permutations" and padding "inside".
+            optimizer: of this module's parameters.
+
+        Returns:
+            [K, B] rewards in [-1, 0], and [K] mean bounds of the trajectories in nats.
+        """
+        updates, rows = states.shape[:2]
+        frames = torch.stack([states, followers], dim=2).flatten(0, 1)
+        others = torch.cat([two_frames(rows, one) for one in swapped])
+        of = self.estimator.data
+        found, means = self.estimator.learn(
+            of(*self.split(frames), others, None),
+            of(
+                *self.split(trajectories["obs"]),
+                trajectories["permutations"],
+                trajectories.get("inside"),
+            ),
+            optimizer,
+            updates,
+        )
+        return intrinsic_reward(found, self.reward_scale).view(updates, rows), means
 
     def transition_bounds(self, observations: Tensor, *, swapped: bool = True) -> Tensor:
         """[T, D] states of one trajectory -> [T-1] bounds of its transitions, in nats."""

@@ -9,19 +9,17 @@ Shape legend: K updates, B batch, R rows, I network inputs, A action dimensions,
 
 from __future__ import annotations
 
-import hashlib
-import inspect
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from music_rllib import compiling
-from music_rllib.compiling import compiled, kept_on_disk
+from music_rllib.compiling import compiled, kept_on_disk, sources_of
 from music_rllib.functional import tsallis
-from music_rllib.tac.kernels import adam, blas, distribution, perceptron
-from music_rllib.tac.kernels.adam import Descent, descend
+from music_rllib.optim import adam
+from music_rllib.optim.adam import Descent, descend
+from music_rllib.tac.kernels import blas, distribution, perceptron
 from music_rllib.tac.kernels.blas import multiply
 from music_rllib.tac.kernels.distribution import (
     Rule,
@@ -379,11 +377,4 @@ def _compiled_for(sources: str) -> Any:
     return learn
 
 
-def _sources() -> str:
-    """Changes with any file that `learn` is compiled of."""
-    modules = (adam, blas, compiling, distribution, perceptron, tsallis)
-    files = (inspect.getfile(module) for module in modules)
-    return hashlib.sha256(b"".join(Path(file).read_bytes() for file in files)).hexdigest()
-
-
-learn = _compiled_for(_sources())
+learn = _compiled_for(sources_of(adam, blas, compiling, distribution, perceptron, tsallis))

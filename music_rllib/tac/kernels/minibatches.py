@@ -56,12 +56,18 @@ class Minibatches(NamedTuple):
         rows = len(values) // self.updates
         return values[k * rows : (k + 1) * rows]
 
+    @property
+    def transitions(self) -> tuple[Tensor, Tensor]:
+        """States and the next ones, [K, B, I] each."""
+        policy = self.columns[DEFAULT_MODULE_ID]
+        shape = (self.updates, -1)
+        return (
+            policy[Columns.OBS].unflatten(0, shape), policy[Columns.NEXT_OBS].unflatten(0, shape)
+        )  # fmt: skip
+
     def intrinsic_rewards(self, reward: IntrinsicReward) -> Tensor:
         """[K, B] of networks that stay as they are: those for which the same was drawn together."""
-        states, followers = (
-            self.columns[DEFAULT_MODULE_ID][name].unflatten(0, (self.updates, -1))
-            for name in (Columns.OBS, Columns.NEXT_OBS)
-        )
+        states, followers = self.transitions
         rewards: Tensor = states.new_empty(states.shape[:2])
         for drawn in dict.fromkeys(self.drawn):
             alike = torch.tensor([k for k, other in enumerate(self.drawn) if other == drawn])

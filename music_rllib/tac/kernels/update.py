@@ -17,10 +17,10 @@ from ray.rllib.core.columns import Columns
 from torch import Tensor, nn
 
 from music_rllib import names
-from music_rllib.tac.kernels.adam import Descent, FusedAdam
+from music_rllib.optim.adam import Descent, FusedAdam
+from music_rllib.optim.flat import FlatParameters
 from music_rllib.tac.kernels.compiled import Averages, Batch, Networks, learn
 from music_rllib.tac.kernels.distribution import Rule
-from music_rllib.tac.kernels.flat import FlatParameters
 from music_rllib.tac.kernels.perceptron import Network
 from music_rllib.tac.networks import Critics, Perceptron
 from music_rllib.tac.normaliser import RunningNormaliser

@@ -1,5 +1,7 @@
 """Mutual-information oracles of algorithms: known values, invariances, the two-frame reward."""
 
+import copy
+
 import pytest
 import torch
 from torch import Tensor
@@ -10,7 +12,9 @@ from music_rllib.functional.mutual_information import (
     shuffle_time,
     time_permutations,
 )
+from music_rllib.intrinsic.compiled import Data
 from music_rllib.intrinsic.estimator import MutualInformationEstimator, intrinsic_reward
+from music_rllib.optim.adam import FusedAdam
 
 
 @pytest.mark.parametrize("rho, dims", [(0.5, 1), (0.9, 1), (0.5, 3)])
@@ -55,11 +59,18 @@ def test_transition_bound_is_the_bound_written_out() -> None:
     torch.testing.assert_close(estimator.transition_bound(x, y), joint - crossed.log())
 
 
-@pytest.mark.parametrize("compiled", [True, False])
-def test_bound_and_gradients_are_those_of_layer_by_layer(compiled: bool) -> None:
+def trained_by(
+    estimator: MutualInformationEstimator, pairs: Data, trajectories: Data, lr: float = 0.0
+) -> tuple[Tensor, Tensor, list[Tensor]]:
+    """Bounds of both after one update, and the gradients of the negative mean bound."""
+    found, means = estimator.learn(pairs, trajectories, FusedAdam(estimator.parameters(), lr), 1)
+    assert estimator._flat is not None
+    return found, means, [estimator._flat.gradient(p).clone() for p in estimator.parameters()]
+
+
+def test_bound_and_gradients_are_those_of_layer_by_layer() -> None:
     generator = torch.Generator().manual_seed(2)
     estimator = MutualInformationEstimator(3, 2, hidden_size=20).double()
-    estimator.compiled = compiled
     x, y = (torch.randn(4, 11, n, generator=generator).double() for n in (3, 2))
     permutations = time_permutations(4, 11, generator)
 
@@ -67,19 +78,43 @@ def test_bound_and_gradients_are_those_of_layer_by_layer(compiled: bool) -> None
         hidden = torch.relu(estimator.agent(agent) + estimator.surrounding(surrounding))
         return torch.tanh(estimator.output(hidden)).squeeze(-1)
 
-    def layer_by_layer(agent: Tensor, surrounding: Tensor) -> Tensor:
-        shuffled = shuffle_time(surrounding, permutations)
-        return donsker_varadhan(statistics(agent, surrounding), statistics(agent, shuffled))
-
-    def with_gradients(mean: Tensor) -> list[Tensor]:
-        return [mean, *torch.autograd.grad(mean, list(estimator.parameters()))]
-
-    ours = with_gradients(3 * estimator.mean_bound(x, y, permutations))
-    theirs = with_gradients(3 * layer_by_layer(x, y).mean())
-    for one, other in zip(ours, theirs, strict=True):
-        torch.testing.assert_close(one, other)
+    shuffled = shuffle_time(y, permutations)
+    expected = donsker_varadhan(statistics(x, y), statistics(x, shuffled))
+    gradients = torch.autograd.grad(-expected.mean(), list(estimator.parameters()))
+    torch.testing.assert_close(estimator.bound(x, y, permutations), expected)
     with torch.no_grad():
-        torch.testing.assert_close(estimator.bound(x, y, permutations), layer_by_layer(x, y))
+        torch.testing.assert_close(estimator.bound(x, y, permutations), expected)
+    data = estimator.data(x, y, permutations, None)
+    found, means, ours = trained_by(estimator, data, data)
+    torch.testing.assert_close(found, expected.detach())
+    torch.testing.assert_close(means, expected.detach().mean()[None])
+    for one, other in zip(ours, gradients, strict=True):
+        torch.testing.assert_close(one, other)
+
+
+def test_updates_are_those_of_adam_after_the_bounds_of_each() -> None:
+    torch.manual_seed(0)
+    ours = MutualInformationEstimator(2, 2, hidden_size=32)
+    theirs = copy.deepcopy(ours)
+    adam = torch.optim.Adam(theirs.parameters(), 1e-2)
+    x, y = correlated(200)
+    generator = torch.Generator().manual_seed(1)
+    shuffles = torch.cat([time_permutations(8, 200, generator) for _ in range(5)])
+    found, means = ours.learn(
+        ours.data(x.repeat(5, 1, 1), y.repeat(5, 1, 1), shuffles, None),
+        ours.data(x.repeat(5, 1, 1), y.repeat(5, 1, 1), shuffles, None),
+        FusedAdam(ours.parameters(), 1e-2),
+        5,
+    )
+    for k, permutations in enumerate(shuffles.unflatten(0, (5, 8))):
+        bound = theirs.bound(x, y, permutations)
+        torch.testing.assert_close(found.view(5, 8)[k], bound.detach(), rtol=1e-3, atol=1e-5)
+        torch.testing.assert_close(means[k], bound.detach().mean(), rtol=1e-3, atol=1e-5)
+        adam.zero_grad()
+        (-bound.mean()).backward()
+        adam.step()
+    for one, other in zip(ours.parameters(), theirs.parameters(), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-4)
 
 
 def test_resting_surroundings_earn_the_smallest_reward() -> None:
@@ -176,7 +211,7 @@ def test_bound_of_unequal_trajectories_is_that_of_each_by_itself() -> None:
     together = estimator.bound(x, y, permutations, INSIDE)
     with torch.no_grad():
         torch.testing.assert_close(estimator.bound(x, y, permutations, INSIDE), together)
-    mean = estimator.mean_bound(x, y, permutations, INSIDE)
+    data = estimator.data(x, y, permutations, INSIDE)
     alone = torch.stack(
         [
             estimator.bound(x[i : i + 1, :n], y[i : i + 1, :n], permutations[i : i + 1, :n])[0]
@@ -185,8 +220,8 @@ def test_bound_of_unequal_trajectories_is_that_of_each_by_itself() -> None:
     )
     torch.testing.assert_close(together, alone)
     parameters = list(estimator.parameters())
-    ours = torch.autograd.grad(mean * len(COUNTS), parameters)
-    for one, other in zip(ours, torch.autograd.grad(alone.sum(), parameters), strict=True):
+    expected = torch.autograd.grad(-alone.mean(), parameters)
+    for one, other in zip(trained_by(estimator, data, data)[2], expected, strict=True):
         torch.testing.assert_close(one, other)
     everything = torch.ones(4, 11, dtype=torch.bool)
     whole = time_permutations(4, 11, generator)

@@ -10,8 +10,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from music_rllib.tac.kernels.adam import FusedAdam, descend
-from music_rllib.tac.kernels.flat import FlatParameters
+from music_rllib.optim.adam import FusedAdam, descend
+from music_rllib.optim.flat import FlatParameters
 
 SHAPES = [(7, 5), (5,), (2, 3, 4), ()]
 STEPS = 6

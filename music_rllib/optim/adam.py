@@ -11,13 +11,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from music_rllib.compiling import compiled
-from music_rllib.tac.kernels.flat import FlatParameters
-from music_rllib.tac.kernels.perceptron import Array
+from music_rllib.optim.flat import FlatParameters
 
 __all__ = ["Descent", "FusedAdam", "descend"]
+
+Array = NDArray[Any]
 
 
 class Descent(NamedTuple):

@@ -1,0 +1,1 @@
+"""Adam, and parameters that lie behind each other for it."""
