@@ -28,7 +28,9 @@ def answer(sweep: Sweep, study: Study) -> list[str]:
     shown = [one for one in study.claims if one.task == ALL_TASKS] or list(study.claims)
     mark = bool(study.planned)  # otherwise the first line says it of all
     said += [f"{in_words(one)}{_after(one) if mark else ''}." for one in shown[:MOST_CLAIMS]]
-    if not shown:
+    if not shown and study.afterwards:
+        said.append("Nothing that was planned can be tested yet; what was not is in the table.")
+    elif not shown:
         only = study.means[0]
         said.append(
             f"Nothing is compared: {label_of(only.condition)} has {only.measure.words} of "

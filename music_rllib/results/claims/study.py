@@ -108,8 +108,12 @@ class Study:
 
     @property
     def claims(self) -> tuple[Claim, ...]:
-        """What answers the study's question: what was planned, or all there is."""
-        return self.planned or self.afterwards
+        """What answers the study's question: what was planned, or where nothing was, all there is.
+
+        Nothing, while nothing that was planned can be tested: the rest is no substitute for it.
+        """
+        waits = self.plan is not None and bool(self.plan.plan.hypotheses)
+        return self.planned if self.planned or waits else self.afterwards
 
 
 def study_of(

@@ -179,6 +179,19 @@ def test_what_was_planned_is_told_from_what_was_not(rng: np.random.Generator) ->
     assert "Control: α tuned for each q." in said
 
 
+def test_while_the_plan_waits_for_its_runs_nothing_else_is_its_answer(
+    rng: np.random.Generator,
+) -> None:
+    runs = study({"1": 0.2, "1.25": 0.4}, 8, rng)
+    sweep = sweep_of(runs, BEFORE)
+    found = study_of(sweep)
+    assert [(one.first, one.planned) for one in found.afterwards] == [("q = 1.25", False)]
+    said = " ".join(answer(sweep, found))
+    assert "Nothing that was planned can be tested yet" in said
+    assert "superior" not in said
+    assert "Not tested: q = 1.5 against q = 1: no run of q = 1.5 has begun" in said
+
+
 def test_a_plan_that_is_younger_than_a_result_is_none(rng: np.random.Generator) -> None:
     runs = study({"1": 0.2, "1.5": 0.4}, 8, rng)
     late = recorded(plan("q = 1.5 better than q = 1"), at=DONE)
