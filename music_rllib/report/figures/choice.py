@@ -27,6 +27,7 @@ from music_rllib.report.figures.plots import (
     profile_panel,
 )
 from music_rllib.results.analysis import Curve, StageAnalysis, curve
+from music_rllib.results.claims.study import MOST_CONDITIONS
 from music_rllib.results.comparison import SHOW_SEEDS_BELOW, Scope
 from music_rllib.results.conditions import Condition, Stage, side_by_side
 from music_rllib.results.data import Sweep
@@ -139,8 +140,10 @@ def _finals(stage: Stage, title: str, scopes: Sequence[Scope[Condition]]) -> Ite
         panels=tuple(finals_panel(scope, stage.conditions) for scope in scopes),
         legend=legend,
     )
-    if scopes[0].metric not in names.EVAL_RATES:
-        return
+    runs = [final.scores.shape[0] for scope in scopes for final in scope.finals]
+    readable = len(stage.conditions) <= MOST_CONDITIONS and max(runs) > 1
+    if scopes[0].metric not in names.EVAL_RATES or not readable:
+        return  # single runs' bands are as high as the figure, and those of many are one
     yield Drawing(
         stage=stage.name,
         title=PROFILES,
