@@ -7,7 +7,8 @@ The page's words are in docs/results/page.md. Where that says `{{ KIND NAME }}`,
 the sweep NAME: of all of its runs that any export in docs/results/data has, whichever sweep
 computed them, if tune_configs has a sweep of that name, and else of the export
 docs/results/data/NAME. KIND is `runs`, `success`, `stages`, `curves`, `races` or `effects`, with
-stages behind NAME if not all are meant, `metric`, with metrics, or `search`.
+stages behind NAME if not all are meant, `metric`, with metrics, `search`, or `factorial`: what a
+study of q and α says so far.
 
     python -m music_rllib.report results/NAME --export docs/results/data/NAME --add
 """
@@ -26,6 +27,7 @@ from music_rllib import names
 from music_rllib.config.load import load_sweep
 from music_rllib.experiment.plan import make_plan
 from music_rllib.report.figures.choice import (
+    AGAINST_ENTROPY,
     PRIMARY,
     Drawing,
     drawings_of_stages,
@@ -34,10 +36,13 @@ from music_rllib.report.figures.choice import (
 )
 from music_rllib.report.figures.draw import files
 from music_rllib.report.search_tables import search_in_words, search_tables
+from music_rllib.report.study import AGAINST_ALPHA, study_drawings
 from music_rllib.results import statistics as st
 from music_rllib.results.analysis import StageAnalysis, analyse
 from music_rllib.results.archive.folder import is_archive, read_archive
 from music_rllib.results.archive.merge import of_plan
+from music_rllib.results.claims.answer import answer
+from music_rllib.results.claims.study import Mean, Study, study_of
 from music_rllib.results.comparison import Final, each_seed, verdict
 from music_rllib.results.comparison import number as in_short
 from music_rllib.results.conditions import Condition, Stage, find_stages
@@ -92,6 +97,7 @@ def page(figures: dict[str, bytes]) -> str:
         "effects": effects_table,
         "metric": metric_table,
         "search": lambda sweep: search_text(sweep, figures),
+        "factorial": lambda sweep: factorial(sweep, figures),
     }
 
     def fill(match: re.Match[str]) -> str:
@@ -393,6 +399,59 @@ def last_value(sweep: Sweep, run: int | None, metric: str) -> float:
         return float("nan")
     value = sweep.final(run, metric)
     return float("nan") if value is None else value
+
+
+# -- every q at every alpha ----------------------------------------------------------------------
+
+
+def factorial(sweep: Sweep, figures: dict[str, bytes]) -> Iterator[str]:
+    """How far it is, its answer, performance against realised entropy and α, and each cell."""
+    study = study_of(sweep)
+    finished = sum(run.status == "FINISHED" for run in sweep.runs)
+    yield f"**{finished} of {planned_runs(sweep.name)} planned runs have finished.**"
+    yield ""
+    yield from (f"- {sentence}" for sentence in answer(sweep, study))
+    drawings = [d for found in analyse(sweep) for d in stage_drawings(sweep, found)]
+    for drawing in (*drawings, *study_drawings(study)):
+        if drawing.title in (AGAINST_ENTROPY, AGAINST_ALPHA):
+            yield ""
+            yield from figure(sweep, drawing, figures)
+    yield ""
+    yield from cells(sweep, study)
+    yield ""
+    yield provenance(sweep)
+
+
+def cells(sweep: Sweep, study: Study) -> Iterator[str]:
+    """A row for each α and a column for each q: area under the curve, entropy at the end, seeds."""
+    by_cell = {(mean.condition.entropic_index, alpha_of(sweep, mean)): mean for mean in study.means}
+    qs, alphas = (sorted({cell[i] for cell in by_cell}, key=float) for i in (0, 1))
+    yield _row("α", *(f"q = {q}" for q in qs))
+    yield _rule(1 + len(qs))
+    for alpha in alphas:
+        yield _row(alpha, *(cell_text(sweep, by_cell.get((q, alpha))) for q in qs))
+
+
+def alpha_of(sweep: Sweep, mean: Mean) -> str:
+    """Of a condition's runs."""
+    return sweep.runs[mean.condition.runs[0]].tags[names.TAG_ALPHA]
+
+
+def cell_text(sweep: Sweep, mean: Mean | None) -> str:
+    """`0.21 ± 0.03, 1.4 nats (5)`; the spread is the standard deviation over seeds."""
+    if mean is None or not mean.scores.by_seed:
+        return ""
+    scores = list(mean.scores.by_seed.values())
+    runs = [run for run in mean.condition.runs if sweep.runs[run].status == "FINISHED"]
+    entropy = np.mean([last_value(sweep, run, names.SHANNON_ENTROPY) for run in runs])
+    spread = f" ± {np.std(scores, ddof=1):.2f}" if len(scores) > 1 else ""
+    return f"{np.mean(scores):.2f}{spread}, {entropy:.1f} nats ({len(scores)})"
+
+
+def planned_runs(name: str) -> int:
+    """Of the sweep's file."""
+    (file,) = (f for f in CONFIGS.glob("**/*.yaml") if f"name: {name}\n" in f.read_text("utf-8"))
+    return len(make_plan(load_sweep(file)).nodes)
 
 
 # -- searches ------------------------------------------------------------------------------------

@@ -16,9 +16,10 @@ from music_rllib.results.claims.tables import claim_rows, mean_rows
 from music_rllib.results.comparison import SHOW_SEEDS_BELOW, interval_text, p_text
 from music_rllib.results.comparison import number as in_short
 
-__all__ = ["study_csv", "study_drawings", "study_tables"]
+__all__ = ["AGAINST_ALPHA", "study_csv", "study_drawings", "study_tables"]
 
 DASH = "–"
+AGAINST_ALPHA = "Area under the curve against α"
 
 
 def study_tables(study: Study) -> list[TextTable]:
@@ -131,7 +132,7 @@ def study_drawings(study: Study) -> Iterator[Drawing]:
         by_q = {one.entropic_index: style_of(one, siblings) for one in reversed(shown)}
         yield Drawing(
             stage=study.stage.name,
-            title="Area under the curve against α",
+            title=AGAINST_ALPHA,
             group=SETTINGS,
             caption="Mean over the seeds with its 95 % interval, a line for each q: what a "
             "comparison at one α would have found stands at that α.",
