@@ -6,7 +6,6 @@ sweep's folder (:mod:`music_rllib.tracking.spool`), and a thread delivers it.
 
 from __future__ import annotations
 
-import json
 import logging
 import shlex
 import time
@@ -17,18 +16,16 @@ from types import TracebackType
 from typing import Self
 from urllib.parse import urlencode
 
-import yaml
-
 from music_rllib import names
 from music_rllib.errors import TrackingError
 from music_rllib.experiment.run_info import RunInfo
-from music_rllib.redaction import flat_params, redact, without_secrets
+from music_rllib.redaction import flat_params
 from music_rllib.tracking.mlflow_client import first_line
 from music_rllib.tracking.provenance import provenance_tags
+from music_rllib.tracking.records import as_yaml, finish_of, milliseconds, number_of, texts
 from music_rllib.tracking.sender import Backlog
 from music_rllib.tracking.session import Session, SweepRecord, new_sweep_id, relative_storage
 from music_rllib.tracking.spool import (
-    Finish,
     Metrics,
     Record,
     Spool,
@@ -39,9 +36,6 @@ from music_rllib.tracking.spool import (
 from music_rllib.tracking.store import check_reachable, local_folder, resolve_store, version
 
 logger = logging.getLogger(__name__)
-
-MAX_FAILURE_LENGTH = 1000
-"""Characters of a failure's cause that are kept as a tag; the rest is in the run's log."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,6 +103,8 @@ class Tracker:
         self._session = Session(folder, store, record)
         self._sweep_tags = {names.TAG_SWEEP: sweep_name, names.TAG_SWEEP_ID: record.sweep_id}
         self._open: dict[str, Spool] = {}
+        self._settings: dict[str, list[Metrics]] = {}
+        """What is not logged yet of runs that have begun."""
         self._checked_names: set[str] = set()
         self._left: Backlog | None = None
         self._view: dict[str, str] = {}
@@ -139,8 +135,10 @@ class Tracker:
             ValueError: where a name or key is not one that MLflow accepts.
             TrackingError: where its spool cannot be written.
         """
-        self._append(run.node_key, self._opening(run, time.time()))
-        self._open[run.node_key].put_artefact(names.ARTEFACT_RUN_CONFIG, _yaml(run.config))
+        now = time.time()
+        self._append(run.node_key, [self._opening(run, now)])
+        self._settings[run.node_key] = self._settings_of(run, now)
+        self._open[run.node_key].put_artefact(names.ARTEFACT_RUN_CONFIG, as_yaml(run.config))
         self._session.wake(run.node_key)
 
     def log(
@@ -165,7 +163,8 @@ class Tracker:
         """
         self._started(node_key)
         when = time.time() if timestamp is None else timestamp
-        self._append(node_key, [self._metrics(metrics, env_steps, when)])
+        measured = self._metrics(metrics, env_steps, when)
+        self._append(node_key, [measured, *self._settings.pop(node_key, [])])
         self._session.wake(node_key)
 
     def finish(
@@ -191,7 +190,8 @@ class Tracker:
         spool = self._started(node_key)
         for name, file in (artefacts or {}).items():
             spool.put_artefact(name, file)
-        self._append(node_key, [_finish(status, time.time(), failure)])
+        settings = self._settings.pop(node_key, [])
+        self._append(node_key, [*settings, finish_of(status, time.time(), failure)])
         del self._open[node_key]
         self._session.wake(node_key)
 
@@ -213,12 +213,15 @@ class Tracker:
         points = sorted(history, key=lambda point: point.env_steps)
         first = min((point.timestamp for point in points), default=time.time())
         last = max((point.timestamp for point in points), default=first)
-        records = [
-            *self._opening(run, first, {names.TAG_REUSED: "true"}),
-            *(self._metrics(point.metrics, point.env_steps, point.timestamp) for point in points),
-            _finish("FINISHED", last, None),
+        measured = [self._metrics(p.metrics, p.env_steps, p.timestamp) for p in points]
+        records: list[Record] = [
+            self._opening(run, first, {names.TAG_REUSED: "true"}),
+            *measured[:1],
+            *self._settings_of(run, first),
+            *measured[1:],
+            finish_of("FINISHED", last, None),
         ]
-        spool.put_artefact(names.ARTEFACT_RUN_CONFIG, _yaml(run.config))
+        spool.put_artefact(names.ARTEFACT_RUN_CONFIG, as_yaml(run.config))
         for name, file in (artefacts or {}).items():
             spool.put_artefact(name, file)
         spool.append(records)
@@ -286,7 +289,7 @@ class Tracker:
             try:
                 for node_key in list(self._open):
                     self.finish(node_key, "KILLED")
-                self._session.parent.spool.append([_finish(status, time.time(), None)])
+                self._session.parent.spool.append([finish_of(status, time.time(), None)])
             except TrackingError as error:  # results are in the store: this must not hide them
                 self._unwritten = str(error)
             self._left = self._session.close(timeout)
@@ -329,26 +332,30 @@ class Tracker:
     ) -> None:
         self._session.begin(
             Start(
-                time=_milliseconds(time.time()),
+                time=milliseconds(time.time()),
                 name=sweep_name,
-                tags={**self._provenance, **self._sweep_tags, **_texts(tags)},
+                tags={**self._provenance, **self._sweep_tags, **texts(tags)},
                 params=flat_params(config),
             )
         )
-        self.put_sweep_artefact(names.ARTEFACT_SWEEP_CONFIG, _yaml(config))
+        self.put_sweep_artefact(names.ARTEFACT_SWEEP_CONFIG, as_yaml(config))
 
-    def _opening(
-        self, run: RunInfo, when: float, more: Mapping[str, str] | None = None
-    ) -> list[Record]:
-        tags = {**self._provenance, **self._sweep_tags, **_texts(run.tags), **(more or {})}
-        start = Start(
-            time=_milliseconds(when),
+    def _opening(self, run: RunInfo, when: float, more: Mapping[str, str] | None = None) -> Start:
+        tags = {**self._provenance, **self._sweep_tags, **texts(run.tags), **(more or {})}
+        return Start(
+            time=milliseconds(when),
             name=run.name,
             tags=tags,
             params=flat_params(run.config),
             source_node=run.source_node,
         )
-        return [start, self._metrics(run.settings, 0, when)] if run.settings else [start]
+
+    def _settings_of(self, run: RunInfo, when: float) -> list[Metrics]:
+        """To be logged behind the first measurement, which MLflow then has on its axes.
+
+        Its page that compares runs takes the metric that came first: q against q says nothing.
+        """
+        return [self._metrics(run.settings, 0, when)] if run.settings else []
 
     def _append(self, node_key: str, records: Iterable[Record]) -> None:
         self._open[node_key] = self._open.get(node_key) or self._session.open_run(node_key)
@@ -364,8 +371,8 @@ class Tracker:
             if name not in self._checked_names:
                 check_metric_name(name)
                 self._checked_names.add(name)
-        values = {name: _number(name, value) for name, value in metrics.items()}
-        return Metrics(time=_milliseconds(when), step=int(env_steps), values=values)
+        values = {name: number_of(name, value) for name, value in metrics.items()}
+        return Metrics(time=milliseconds(when), step=int(env_steps), values=values)
 
 
 def _default_folder(storage: str, sweep_name: str) -> Path:
@@ -373,28 +380,3 @@ def _default_folder(storage: str, sweep_name: str) -> Path:
     if folder is None:
         raise ValueError(f"sweep_folder must be given where storage is a bucket, got {storage}")
     return folder / sweep_name
-
-
-def _number(name: str, value: float) -> float:
-    try:
-        return float(value)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"metric {name} must be a number, got {value!r}") from error
-
-
-def _finish(status: Status, when: float, failure: str | None) -> Finish:
-    tags = {} if failure is None else {names.TAG_FAILURE: redact(failure)[:MAX_FAILURE_LENGTH]}
-    return Finish(time=_milliseconds(when), status=status, tags=tags)
-
-
-def _texts(tags: Mapping[str, object]) -> dict[str, str]:
-    return {key: redact(str(value)) for key, value in tags.items() if value is not None}
-
-
-def _yaml(settings: Mapping[str, object]) -> str:
-    plain = json.loads(json.dumps(without_secrets(settings), default=str))
-    return str(yaml.safe_dump(plain, sort_keys=False, allow_unicode=True))
-
-
-def _milliseconds(seconds: float) -> int:
-    return round(seconds * 1000)

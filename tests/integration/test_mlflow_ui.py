@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -193,7 +194,10 @@ async def _look(
         compared = quote(json.dumps(pair, separators=(",", ":")))
         experiments = quote(json.dumps([finished.experiment_id]))
         await page.go(f"{server}/#/compare-runs?runs={compared}&experiments={experiments}")
-        await page.wait_for("Comparing 2 Runs", "q=2 seed 0 Point", "tac.entropic_index")
+        text = await page.wait_for("Comparing 2 Runs", "q=2 seed 0 Point", "tac.entropic_index")
+        axes = re.search(r"Parameters:\s+(.*?)\s+Metrics:\s+(.*?)\s+Clear All", text, re.DOTALL)
+        assert axes
+        assert axes.groups() == ("tac.entropic_index", names.EVAL_SUCCESS), "not q against q"
         await page.go(f"{pages}/models")
         await page.wait_for("policy", "Ready", "q=2 seed 0 Point")
         errors = [e for e in page.errors if not any(words in e for words in HARMLESS)]
