@@ -23,7 +23,6 @@ __all__ = [
     "ln_q",
     "ln_q_of_log",
     "ln_q_of_policy",
-    "ln_q_slope",
     "uniform_entropy",
 ]
 
@@ -61,14 +60,6 @@ def ln_q_of_log(log_x: Tensor, q: float, *, max_exponent: float = math.inf) -> T
     beyond = torch.relu(exponent - max_exponent)
     value = torch.expm1(exponent.clamp(max=max_exponent)) + math.exp(max_exponent) * beyond
     return value / order
-
-
-def ln_q_slope(log_x: Tensor, q: float, *, max_exponent: float = MAX_EXPONENT) -> Tensor:
-    """[...] d ln_q x / d ln x = x^(q-1), given ln x; of the tangent where that continues ln_q."""
-    order = q - 1.0
-    if abs(order) < _SHANNON:
-        return torch.ones_like(log_x)
-    return (order * log_x).clamp_(max=max_exponent).exp_()
 
 
 def bound_active(log_x: Tensor, q: float, *, max_exponent: float = MAX_EXPONENT) -> Tensor:
