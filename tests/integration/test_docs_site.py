@@ -9,11 +9,26 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
+
 from tests.integration.devtools import Page
 
 ROOT = Path(__file__).parents[2]
 PICTURES = os.environ.get("MUSIC_RLLIB_PICTURES")
 """Folder in which the picture is kept, such as docs/img."""
+
+
+@pytest.mark.parametrize("page", ["configuration", "results"])
+def test_generated_pages_are_up_to_date(page: str) -> None:
+    script = ROOT / "docs" / f"generate_{page}.py"
+    done = subprocess.run(
+        [sys.executable, str(script), "--check"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_the_site_is_built_read_and_searched(

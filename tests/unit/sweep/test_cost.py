@@ -68,8 +68,8 @@ def costs(folder: Path) -> list[cost.Cost]:
 
 
 def test_the_time_is_training_evaluations_and_start(tmp_path: Path) -> None:
-    # 10,000 steps, and an evaluation every 5,000.
-    a_run = 100.0 + 2 * 3.0 + 5.0
+    # 10,000 steps, an evaluation every 5,000 and one before them.
+    a_run = 100.0 + 3 * 3.0 + 5.0
     document = cost.cost_document(costs(tmp_path), slots=4)
     assert document["seconds"] == pytest.approx(16 * a_run / 4)
     assert document["kinds"][0]["seconds"] == pytest.approx(4 * a_run)
