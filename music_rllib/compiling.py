@@ -13,7 +13,7 @@ from typing import Any
 from numba import njit
 from numba.core.caching import FunctionCache
 
-__all__ = ["compiled", "kept_on_disk", "sources_of"]
+__all__ = ["compiled", "is_kept", "kept_on_disk", "sources_of"]
 
 logger = logging.getLogger(__name__)
 
@@ -45,6 +45,14 @@ def kept_on_disk(function: Function) -> Any:
             "compiled code is not kept, so that each run takes longer to start: %s", error
         )
     return dispatcher
+
+
+def is_kept(function: Any) -> bool:
+    """Whether what `kept_on_disk` has made lies there already, compiled by an earlier process."""
+    cache = function._cache
+    if not isinstance(cache, _Cache):
+        return False
+    return any(Path(cache.cache_path).glob(f"{cache._impl.filename_base}.nbi"))
 
 
 def sources_of(*modules: ModuleType) -> str:

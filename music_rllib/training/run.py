@@ -14,6 +14,7 @@ from ray.rllib.core import DEFAULT_MODULE_ID
 from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, EPISODE_RETURN_MEAN, LEARNER_RESULTS
 
 from music_rllib import names
+from music_rllib.compiling import is_kept
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.experiment.continuation import REPORT_INTERVAL
 from music_rllib.intrinsic.music import HELD_OUT_STEPS
@@ -24,6 +25,7 @@ from music_rllib.store.state_io import read_arrays, read_state, write_arrays, wr
 from music_rllib.tac.algorithm import TAC
 from music_rllib.tac.config import TACConfig
 from music_rllib.tac.env_runner import DISPLACEMENT, MOVED, SUCCESS_ANY, SUCCESS_LAST
+from music_rllib.tac.kernels.compiled import learn
 from music_rllib.tac.normaliser import for_another_run
 
 __all__ = ["Paused", "TrainingRun", "algorithm_config"]
@@ -95,7 +97,7 @@ class TrainingRun:
         handoff: Mapping[str, Mapping[str, NDArray[Any]]] | None = None,
         gpus: float = 0.0,
     ) -> None:
-        self.run = run
+        self.run, self._gpus = run, gpus
         config = algorithm_config(run)
         if gpus:
             config.learners(num_gpus_per_learner=gpus)
@@ -124,6 +126,11 @@ class TrainingRun:
     def finished(self) -> bool:
         """Whether the budget is spent."""
         return self.env_steps >= self.run.env_steps
+
+    @property
+    def will_compile(self) -> bool:
+        """Whether its first update takes longer, as the first one on a machine does."""
+        return not self._gpus and self.run.tac.precision == "float32" and not is_kept(learn)
 
     def advance(self, pause: Callable[[], bool] = lambda: False) -> dict[str, float]:
         """Trains until the next report is due; the first one is an evaluation at step 0.

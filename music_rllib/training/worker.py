@@ -292,6 +292,8 @@ class RunTrainable(Trainable):
                 metrics=metrics,
             )
         )
+        if not training.env_steps and training.will_compile:
+            self._notes.append("compiles its updates first, once on a machine: some 20 seconds")
         if training.finished:
             self._publish(training, store)
             self._keep_for_longer(training, store)

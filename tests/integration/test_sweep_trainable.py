@@ -23,6 +23,7 @@ from music_rllib.policy import find_policy, load_policy
 from music_rllib.store.handoff import read_handoff
 from music_rllib.store.node_store import NodeStore
 from music_rllib.store.run_record import from_json_lines
+from music_rllib.training import run as run_module
 from music_rllib.training.job import NodeJob
 from music_rllib.training.run import TrainingRun, _means
 from music_rllib.training.worker import CAUSE, NOTES, REPORTS, RunTrainable
@@ -256,6 +257,16 @@ def test_a_nan_from_the_environment_is_named_and_the_last_checkpoint_stays(tmp_p
         assert again.env_steps == 200
         assert all(np.isfinite(a).all() for m in again.modules().values() for a in m.values())
         again.close()
+
+
+@pytest.mark.usefixtures("local_ray")
+@pytest.mark.parametrize(("kept", "notes"), [(True, 0), (False, 1)])
+def test_where_updates_are_compiled_first_that_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kept: bool, notes: int
+) -> None:
+    monkeypatch.setattr(run_module, "is_kept", lambda _: kept)
+    said = [note for result in compute(job(tmp_path, settings("tac"))) for note in result[NOTES]]
+    assert [note.startswith("compiles its updates first") for note in said] == [True] * notes
 
 
 @pytest.mark.usefixtures("local_ray")

@@ -11,16 +11,17 @@ import numpy as np
 import pytest
 from numba.core.caching import FunctionCache
 
-from music_rllib.compiling import compiled, kept_on_disk
+from music_rllib.compiling import compiled, is_kept, kept_on_disk
 
 PROGRAM = """
-from music_rllib.compiling import kept_on_disk
+from music_rllib.compiling import is_kept, kept_on_disk
 
 @kept_on_disk
 def twice(x):
     return 2 * x
 
-print(twice(21), sum(twice.stats.cache_hits.values()))
+before = is_kept(twice)
+print(twice(21), sum(twice.stats.cache_hits.values()), before, is_kept(twice))
 """
 
 
@@ -32,9 +33,9 @@ def test_the_next_process_finds_what_was_compiled_until_the_source_changes(tmp_p
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
     program.write_text(PROGRAM)
-    assert [result_and_hits() for _ in range(2)] == ["42 0\n", "42 1\n"]
+    assert [result_and_hits() for _ in range(2)] == ["42 0 False True\n", "42 1 True True\n"]
     program.write_text(PROGRAM.replace("2 * x", "22 * x"))
-    assert result_and_hits() == "462 0\n"
+    assert result_and_hits().startswith("462 0 ")
 
 
 def test_where_nothing_can_be_written_each_process_compiles(
@@ -44,7 +45,9 @@ def test_where_nothing_can_be_written_each_process_compiles(
         raise RuntimeError("no locator available")
 
     monkeypatch.setattr(FunctionCache, "__init__", nowhere)
-    assert kept_on_disk(lambda x: x + 1)(2) == 3
+    function = kept_on_disk(lambda x: x + 1)
+    assert function(2) == 3
+    assert not is_kept(function)
     assert "no locator available" in caplog.text
 
 
