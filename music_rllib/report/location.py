@@ -13,7 +13,13 @@ from music_rllib.results.from_mlflow import read_mlflow
 from music_rllib.store.node_store import NodeStore, damage_in_words
 from music_rllib.store.object_folder import StorageError
 from music_rllib.tracking.spool import has_undelivered
-from music_rllib.tracking.store import TrackingStore, local_folder, resolve_store
+from music_rllib.tracking.store import (
+    SweepRecord,
+    TrackingStore,
+    local_folder,
+    resolve_store,
+    tracking_folder,
+)
 
 __all__ = ["ReportSource", "find_sweep"]
 
@@ -57,9 +63,6 @@ def find_sweep(
     folder = Path(place).expanduser()
     if is_archive(folder):
         return ReportSource(sweep=read_archive(folder), folder=folder, store=None)
-    # Loads MLflow, which an exported sweep does not need.
-    from music_rllib.tracking.session import SweepRecord, tracking_folder
-
     record = SweepRecord.read(folder)
     parent = local_folder(storage)
     if record is None and parent is not None:

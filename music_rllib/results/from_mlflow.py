@@ -8,6 +8,7 @@ large sweep. Where the store is a database, the values are read from its `metric
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 import os
 import tempfile
@@ -24,6 +25,7 @@ from music_rllib import names
 from music_rllib.limits import MOST_JSON_BYTES, read_json, read_regular
 from music_rllib.results.claims.plan import checked_plans
 from music_rllib.results.data import Column, Points, ReportError, RunRecord, Sweep, columns
+from music_rllib.results.mlflow_tables import FoundRuns, read_tables
 from music_rllib.results.searches import checked_searches
 from music_rllib.tracking.store import TrackingStore, check_reachable
 
@@ -63,34 +65,27 @@ def read_mlflow(
         TrackingError: where the store does not answer.
     """
     ahead = _begun(processes, store, sweep_id, metrics)
-    client = _open(store)
+    file = _sqlite_file(store)
+    found = read_tables(file, name, sweep_id) if file is not None and file.is_file() else None
+    client = None if found is not None else _open(store)
     try:
-        found = client.get_experiment_by_name(name)
-        if found is None:
+        if client is None:
+            assert found is not None
+            history = _from_databases(store, [r.run_id for r in found.children], metrics, ahead)
+            return _sweep(store, name, found, history)
+        experiment = client.get_experiment_by_name(name)
+        if experiment is None:
             raise ReportError(_no_such_sweep(client, store, name))
-        experiment_id = str(found.experiment_id)
-        parent = _parent(client, experiment_id, name, sweep_id)
-        run_id = parent.info.run_id
-        children = _search(client, experiment_id, {names.TAG_PARENT_RUN: run_id})
-        runs = [_record(run) for run in children]
-        return Sweep(
-            name=name,
-            status=parent.info.status,
-            run_id=run_id,
-            experiment_id=experiment_id,
-            started=parent.info.start_time,
-            source=store.public_uri,
-            tags=dict(parent.data.tags),
-            config=_artefact(client, run_id, names.ARTEFACT_SWEEP_CONFIG),
-            runs=runs,
-            history=_history(client, store, children, metrics, ahead),
-            searches=checked_searches(
-                read_json(_artefact(client, run_id, names.ARTEFACT_SEARCH) or "[]")
-            ),
-            plans=checked_plans(
-                read_json(_artefact(client, run_id, names.ARTEFACT_ANALYSIS_PLAN) or "[]")
-            ),
-        )
+        experiment_id = str(experiment.experiment_id)
+        parent = _record(_parent(client, experiment_id, name, sweep_id))
+        runs = _search(client, experiment_id, {names.TAG_PARENT_RUN: parent.run_id})
+        if store.is_server:
+            history = columns(_from_server(client, runs, metrics))
+        else:
+            history = _from_databases(store, [r.info.run_id for r in runs], metrics, ahead)
+        artefact = functools.partial(_artefact, client, parent.run_id)
+        found = FoundRuns(experiment_id, parent, [_record(run) for run in runs], artefact)
+        return _sweep(store, name, found, history)
     except ReportError:
         raise
     except Exception as error:
@@ -98,6 +93,24 @@ def read_mlflow(
             f"MLflow at {store.public_uri} must answer questions about the sweep {name!r}, "
             f"it answered: {_first_line(error)}"
         ) from error
+
+
+def _sweep(store: TrackingStore, name: str, found: FoundRuns, history: dict[str, Column]) -> Sweep:
+    parent, artefact = found.parent, found.artefact
+    return Sweep(
+        name=name,
+        status=parent.status,
+        run_id=parent.run_id,
+        experiment_id=found.experiment_id,
+        started=parent.started,
+        source=store.public_uri,
+        tags=parent.tags,
+        config=artefact(names.ARTEFACT_SWEEP_CONFIG),
+        runs=found.children,
+        history=history,
+        searches=checked_searches(read_json(artefact(names.ARTEFACT_SEARCH) or "[]")),
+        plans=checked_plans(read_json(artefact(names.ARTEFACT_ANALYSIS_PLAN) or "[]")),
+    )
 
 
 def attach(store: TrackingStore, run_id: str, folder: Path, name: str, note: str) -> None:
@@ -233,20 +246,16 @@ def _artefact(client: MlflowClient, run_id: str, name: str) -> str | None:
             return None
 
 
-def _history(
-    client: MlflowClient,
+def _from_databases(
     store: TrackingStore,
-    runs: Sequence[Run],
+    run_ids: Sequence[str],
     metrics: Collection[str] | None,
     ahead: Future[dict[str, Points]] | None,
 ) -> dict[str, Column]:
-    if store.is_server:
-        return columns(_from_server(client, runs, metrics))
     known: dict[str, Points] = {}
     if ahead is not None:
         with contextlib.suppress(Exception):  # then it is read here, with a message if that fails
             known = ahead.result()
-    run_ids = [run.info.run_id for run in runs]
     with _database(store.uri) as connection:
         return columns(
             known[run] if run in known else _from_database(connection, run, metrics)

@@ -10,13 +10,10 @@ Below the sweep's folder::
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import uuid
-from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Self
 
 from filelock import FileLock, Timeout
 
@@ -27,58 +24,15 @@ from music_rllib.tracking.mlflow_client import Experiment, first_line
 from music_rllib.tracking.sender import Backlog, Sender
 from music_rllib.tracking.spool import Spool, Start, has_undelivered
 from music_rllib.tracking.store import (
+    SweepRecord,
     TrackingStore,
     check_reachable,
     local_folder,
     resolve_store,
+    tracking_folder,
 )
 
 _NODE_KEY = re.compile(r"[\w\-]+")
-
-
-@dataclass(frozen=True, kw_only=True)
-class SweepRecord:
-    """``sweep.json``: what a later process must know to continue or deliver this sweep."""
-
-    sweep_name: str
-    sweep_id: str
-    tracking_uri: str | None
-    """Without a password; None for the sqlite file in the storage."""
-    storage: str
-    """A bucket's URI, or the folder relative to the sweep's (both may be moved together)."""
-
-    @classmethod
-    def read(cls, sweep_folder: Path) -> Self | None:
-        """The record of the sweep in ``sweep_folder``; None where there is none.
-
-        Raises:
-            TrackingError: where there is one that cannot be read.
-        """
-        path = tracking_folder(sweep_folder) / "sweep.json"
-        try:
-            return cls(**json.loads(path.read_text(encoding="utf-8")))
-        except FileNotFoundError:
-            return None
-        except (OSError, ValueError, TypeError) as error:
-            raise TrackingError(f"{path} must hold a sweep's record, got: {error}") from error
-
-    def write(self, sweep_folder: Path) -> None:
-        """Keep the record with the sweep, whole or not at all."""
-        path = tracking_folder(sweep_folder) / "sweep.json"
-        temporary = path.with_name(".sweep.json")
-        temporary.write_text(json.dumps(asdict(self), indent=2) + "\n", encoding="utf-8")
-        temporary.replace(path)
-
-    def resolve_storage(self, sweep_folder: Path) -> str:
-        """The storage as it is now, after a possible move."""
-        if "://" in self.storage:
-            return self.storage
-        return str((sweep_folder / self.storage).resolve())
-
-
-def tracking_folder(sweep_folder: Path) -> Path:
-    """Where a sweep's spools are."""
-    return sweep_folder / "tracking"
 
 
 def relative_storage(storage: str, sweep_folder: Path) -> str:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 import shutil
 import socket
 import sys
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Self
 from urllib.parse import urlsplit
 
 from music_rllib.errors import TrackingError
@@ -59,6 +61,51 @@ class TrackingStore:
         if not self.is_server:
             return None
         return f"{self.pages}/#/experiments/{experiment_id}/runs/{run_id}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepRecord:
+    """``sweep.json``: what a later process must know to continue or deliver this sweep."""
+
+    sweep_name: str
+    sweep_id: str
+    tracking_uri: str | None
+    """Without a password; None for the sqlite file in the storage."""
+    storage: str
+    """A bucket's URI, or the folder relative to the sweep's (both may be moved together)."""
+
+    @classmethod
+    def read(cls, sweep_folder: Path) -> Self | None:
+        """The record of the sweep in ``sweep_folder``; None where there is none.
+
+        Raises:
+            TrackingError: where there is one that cannot be read.
+        """
+        path = tracking_folder(sweep_folder) / "sweep.json"
+        try:
+            return cls(**json.loads(path.read_text(encoding="utf-8")))
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, TypeError) as error:
+            raise TrackingError(f"{path} must hold a sweep's record, got: {error}") from error
+
+    def write(self, sweep_folder: Path) -> None:
+        """Keep the record with the sweep, whole or not at all."""
+        path = tracking_folder(sweep_folder) / "sweep.json"
+        temporary = path.with_name(".sweep.json")
+        temporary.write_text(json.dumps(asdict(self), indent=2) + "\n", encoding="utf-8")
+        temporary.replace(path)
+
+    def resolve_storage(self, sweep_folder: Path) -> str:
+        """The storage as it is now, after a possible move."""
+        if "://" in self.storage:
+            return self.storage
+        return str((sweep_folder / self.storage).resolve())
+
+
+def tracking_folder(sweep_folder: Path) -> Path:
+    """Where a sweep's spools are."""
+    return sweep_folder / "tracking"
 
 
 def resolve_store(tracking_uri: str | None, storage: str) -> TrackingStore:

@@ -24,7 +24,7 @@ from music_rllib.tracking.mlflow_client import first_line
 from music_rllib.tracking.provenance import provenance_tags
 from music_rllib.tracking.records import as_yaml, finish_of, milliseconds, number_of, texts
 from music_rllib.tracking.sender import Backlog
-from music_rllib.tracking.session import Session, SweepRecord, new_sweep_id, relative_storage
+from music_rllib.tracking.session import Session, new_sweep_id, relative_storage
 from music_rllib.tracking.spool import (
     Metrics,
     Record,
@@ -33,7 +33,13 @@ from music_rllib.tracking.spool import (
     Status,
     check_metric_name,
 )
-from music_rllib.tracking.store import check_reachable, local_folder, resolve_store, version
+from music_rllib.tracking.store import (
+    SweepRecord,
+    check_reachable,
+    local_folder,
+    resolve_store,
+    version,
+)
 
 logger = logging.getLogger(__name__)
 

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from music_rllib.sweep import cli
 from music_rllib.tracking.cli import app as tracking
-from music_rllib.tracking.session import SweepRecord, tracking_folder
+from music_rllib.tracking.store import SweepRecord, tracking_folder
 from tests.integration.conftest import SWEEP
 
 TODO = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import os
 import re
@@ -29,9 +30,11 @@ from music_rllib.experiment.run_info import run_info
 from music_rllib.report.build import PAGE
 from music_rllib.report.cli import app
 from music_rllib.report.location import find_sweep
+from music_rllib.results import from_mlflow
 from music_rllib.results.archive.folder import Format, read_archive
 from music_rllib.results.data import ReportError, Sweep
 from music_rllib.results.from_mlflow import read_mlflow
+from music_rllib.results.mlflow_tables import read_tables
 from music_rllib.tracking import Tracker, resolve_store
 
 STEPS = range(20_000, 100_001, 20_000)
@@ -325,6 +328,30 @@ def test_a_server_gives_the_same_as_its_database(server: str, nodes: list[Node])
     assert sweep.url(sweep.run_id) == f"{server}/#/experiments/{sweep.experiment_id}/runs/" + (
         sweep.run_id
     )
+
+
+def test_its_tables_alone_give_the_same_as_mlflow(
+    sweep_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = resolve_store(None, str(sweep_folder.parent))
+
+    def found() -> tuple[object, ...]:
+        sweep = read_mlflow(store, "tiny")
+        orders = [(list(run.params), list(run.tags)) for run in sweep.runs]
+        history = {
+            name: [getattr(column, part).tolist() for part in ("run", "step", "value", "time")]
+            for name, column in sweep.history.items()
+        }
+        return dataclasses.replace(sweep, history={}), orders, history
+
+    file = sweep_folder.parent / "mlflow.db"
+    assert read_tables(file, "tiny", None) is not None
+    assert read_tables(file, "other", None) is None
+    without = found()
+    monkeypatch.setattr(from_mlflow, "read_tables", lambda *_: None)
+    assert repr(without) == repr(found())  # NaN is not equal to itself
+    (sweep_folder.parent / "not.db").write_bytes(b"no database" * 99)
+    assert read_tables(sweep_folder.parent / "not.db", "tiny", None) is None
 
 
 # In a browser -----------------------------------------------------------------------------------
