@@ -38,6 +38,8 @@ __all__ = ["attach", "download_policy", "read_mlflow"]
 
 RUNS_PER_PAGE = 1000
 REQUESTS_AT_ONCE = 8
+READERS = 4
+"""More would wait for one disk."""
 TABLES_SECONDS = 60.0
 _LARGEST = float(np.finfo(np.float64).max)
 """What MLflow's databases hold in place of infinity."""
@@ -58,7 +60,7 @@ def read_mlflow(
         name: of the sweep, which is that of its experiment.
         sweep_id: tells sweeps of the same name apart; None for the one that began last.
         metrics: which ones to read; None for all.
-        processes: of which one reads the values while MLflow is loaded here.
+        processes: that read the values.
 
     Raises:
         ReportError: where there is no such sweep.
@@ -250,12 +252,12 @@ def _from_databases(
     store: TrackingStore,
     run_ids: Sequence[str],
     metrics: Collection[str] | None,
-    ahead: Future[dict[str, Points]] | None,
+    ahead: Sequence[Future[dict[str, Points]]],
 ) -> dict[str, Column]:
     known: dict[str, Points] = {}
-    if ahead is not None:
-        with contextlib.suppress(Exception):  # then it is read here, with a message if that fails
-            known = ahead.result()
+    with contextlib.suppress(Exception):  # then it is read here, with a message if that fails
+        for part in ahead:
+            known |= part.result()
     with _database(store.uri) as connection:
         return columns(
             known[run] if run in known else _from_database(connection, run, metrics)
@@ -268,20 +270,26 @@ def _begun(
     store: TrackingStore,
     sweep_id: str | None,
     metrics: Collection[str] | None,
-) -> Future[dict[str, Points]] | None:
-    """The values of a sweep that is known by its id, being read; None where they can't be."""
+) -> list[Future[dict[str, Points]]]:
+    """The values of a sweep that is known by its id, being read; nothing where they can't be."""
     file = _sqlite_file(store)
     absent = file is not None and not file.is_file()
     if processes is None or sweep_id is None or store.is_server or absent:
-        return None
+        return []
+    parts = min(len(os.sched_getaffinity(0)), READERS)
     try:
-        return processes.submit(_read_ahead, store.uri, sweep_id, metrics)
+        return [
+            processes.submit(_read_ahead, store.uri, sweep_id, metrics, part, parts)
+            for part in range(parts)
+        ]
     except BrokenExecutor:
-        return None
+        return []
 
 
-def _read_ahead(uri: str, sweep_id: str, metrics: Collection[str] | None) -> dict[str, Points]:
-    """The values of all runs of a sweep, by the runs' ids."""
+def _read_ahead(
+    uri: str, sweep_id: str, metrics: Collection[str] | None, part: int, parts: int
+) -> dict[str, Points]:
+    """The values of a share of a sweep's runs, by the runs' ids."""
     import sqlalchemy as sql
 
     tags = sql.table("tags", *map(sql.column, ("run_uuid", "key", "value")))
@@ -291,10 +299,11 @@ def _read_ahead(uri: str, sweep_id: str, metrics: Collection[str] | None) -> dic
         .join(sweep, sweep.c.run_uuid == run.c.value)
         .where(run.c.key == names.TAG_PARENT_RUN)
         .where(sweep.c.key == names.TAG_SWEEP_ID, sweep.c.value == sweep_id)
+        .order_by(run.c.run_uuid)
     )
     with _database(uri) as connection:
         run_ids = connection.execute(runs).scalars().all()
-        return {one: _from_database(connection, one, metrics) for one in run_ids}
+        return {one: _from_database(connection, one, metrics) for one in run_ids[part::parts]}
 
 
 @contextlib.contextmanager
