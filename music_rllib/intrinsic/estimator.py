@@ -39,6 +39,8 @@ class MutualInformationEstimator(nn.Module):
     """[X + Y] taken from the inputs; 0 for what is used raw."""
     scale: Tensor
     """[X + Y] multiplies what is left; 1 for what is used raw."""
+    compiled = True
+    """Whether bounds on a CPU that nobody differentiates are computed by compiled code."""
 
     def __init__(self, agent_size: int, surrounding_size: int, hidden_size: int = 128) -> None:
         super().__init__()
@@ -97,7 +99,7 @@ class MutualInformationEstimator(nn.Module):
         Returns:
             [N]
         """
-        if agent.device.type == "cpu" and not torch.is_grad_enabled():
+        if self.compiled and agent.device.type == "cpu" and not torch.is_grad_enabled():
             data = self.data(agent, surrounding, permutations, inside)
             return torch.from_numpy(bounds(data, Weights(*self._arrays())))
         shuffled = shuffle_time(surrounding, permutations)
