@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing, suppress
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -23,7 +24,7 @@ from music_rllib.config.schema import SweepConfig
 from music_rllib.experiment.plan import make_plan
 from music_rllib.experiment.run_info import run_info
 from music_rllib.report.build import PAGE
-from music_rllib.tracking import Tracker
+from music_rllib.tracking import StoredRun, Tracker
 
 __all__ = ["rows"]
 
@@ -105,10 +106,9 @@ def make_sweep(storage: Path) -> Path:
     nodes = make_plan(sweep).nodes
     with Tracker(sweep_name="large", storage=str(storage), config=sweep.document) as tracker:
         for node in nodes:
-            tracker.start(run_info(node))
-            tracker.finish(node.key, "FINISHED")
-    deliver = [sys.executable, "-m", "music_rllib.tracking", "deliver", str(storage / "large")]
-    subprocess.run([*deliver, "--timeout", "600"], check=True, capture_output=True)
+            tracker.mirror(run_info(node), partial(StoredRun, ()))
+        if not tracker.flush(600.0):
+            raise RuntimeError(f"MLflow must take {len(nodes)} runs, {tracker.backlog()} are left")
     rng, now = np.random.default_rng(0), int(time.time() * 1000)
     with closing(sqlite3.connect(storage / "mlflow.db")) as database, database:
         runs = [

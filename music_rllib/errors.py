@@ -13,7 +13,7 @@ class BadInputError(Exception):
 
 
 class TrackingError(BadInputError, RuntimeError):
-    """Tracking cannot be set up, or a spool cannot be read or written.
+    """Tracking cannot be set up.
 
     The message names the place (URI or path), the rule and what to do; it holds no password.
     """

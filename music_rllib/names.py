@@ -178,6 +178,8 @@ TAG_SOURCE_NODE = "source_node"
 """Node key, or checkpoint hash, of what this run starts from."""
 TAG_REUSED = "reused"
 """``true`` where the node was finished by an earlier sweep and its history was copied here."""
+TAG_INCOMPLETE = "incomplete"
+"""On a finished run while its learning curve and policy are still to come."""
 TAG_PART = "part"
 """Of a searched stage: ``trialN`` for a run that trials were chosen by, ``finalN`` for one on the
 fresh seeds of the final ranking. Never mixed in one estimate: the choice biases the first."""

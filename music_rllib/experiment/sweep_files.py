@@ -10,6 +10,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from music_rllib.config.problems import shown
@@ -87,7 +88,7 @@ def is_remote(storage: str) -> bool:
 
 
 def write(storage: str, path: str, text: str) -> None:
-    """Write a file below a storage.
+    """Write a file below a storage, whole or not at all.
 
     Raises:
         StorageError: It can't be written.
@@ -96,6 +97,9 @@ def write(storage: str, path: str, text: str) -> None:
     target = f"{root}/{path}"
     try:
         filesystem.create_dir(target.rpartition("/")[0], recursive=True)
+        if not is_remote(storage):
+            write_atomically(Path(target), text.encode())
+            return
         with filesystem.open_output_stream(target) as sink:
             sink.write(text.encode())
     except OSError as error:

@@ -7,19 +7,15 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 
+from music_rllib import names
+from music_rllib.experiment import sweep_files
 from music_rllib.results.archive.folder import is_archive, read_archive
 from music_rllib.results.data import Sweep
 from music_rllib.results.from_mlflow import read_mlflow
 from music_rllib.store.node_store import NodeStore, damage_in_words
 from music_rllib.store.object_folder import StorageError
-from music_rllib.tracking.spool import has_undelivered
-from music_rllib.tracking.store import (
-    SweepRecord,
-    TrackingStore,
-    local_folder,
-    resolve_store,
-    tracking_folder,
-)
+from music_rllib.store.paths import sweep_folder
+from music_rllib.tracking.store import SweepRecord, TrackingStore, local_folder, resolve_store
 
 __all__ = ["ReportSource", "find_sweep"]
 
@@ -50,7 +46,7 @@ def find_sweep(
     """Read the sweep that `place` names.
 
     Args:
-        place: a sweep's folder (`results/smoke`), an exported folder, or a sweep's name.
+        place: a sweep's folder (`results/smoke`) or URI, an exported folder, or a sweep's name.
         storage: where a name is looked for.
         tracking_uri: in place of the store that the sweep was logged to.
         metrics: which ones to read from MLflow; None for all.
@@ -63,18 +59,19 @@ def find_sweep(
     folder = Path(place).expanduser()
     if is_archive(folder):
         return ReportSource(sweep=read_archive(folder), folder=folder, store=None)
-    record = SweepRecord.read(folder)
-    parent = local_folder(storage)
-    if record is None and parent is not None:
-        folder = parent / place
-        record = SweepRecord.read(folder)
+    name, above = folder.absolute().name, str(folder.absolute().parent)
+    if "://" in place:
+        storage = place.rstrip("/").rpartition("/")[0]
+    elif SweepRecord.read(above, name) is not None:
+        storage = above
+    storage = str(local_folder(storage) or storage)
+    folder = sweep_folder(storage, name)
+    record = SweepRecord.read(storage, name)
     if record is None:
         store = resolve_store(tracking_uri, storage)
-        name = Path(place).name
         sweep = read_mlflow(store, name, metrics=metrics)
         return ReportSource(sweep=sweep, folder=folder, store=store)
-    place = record.resolve_storage(folder.absolute())
-    store = resolve_store(tracking_uri or record.tracking_uri, place)
+    store = resolve_store(tracking_uri or record.tracking_uri, storage)
     sweep = read_mlflow(
         store,
         record.sweep_name,
@@ -82,16 +79,29 @@ def find_sweep(
         metrics=metrics,
         processes=processes,
     )
-    spools = tracking_folder(folder)
-    waiting = [spools / "parent", *(spools / "runs").glob("*")]
-    undelivered = sum(map(has_undelivered, waiting))
     return ReportSource(
         sweep=sweep,
         folder=folder,
         store=store,
-        undelivered=undelivered,
-        damaged=_damaged(sweep, place),
+        undelivered=_undelivered(sweep, storage, name),
+        damaged=_damaged(sweep, storage),
     )
+
+
+def _undelivered(sweep: Sweep, storage: str, name: str) -> int:
+    """Finished runs of the sweep that MLflow has not wholly, if the storage can be asked."""
+    whole = {
+        run.node_key
+        for run in sweep.runs
+        if run.status == "FINISHED" and names.TAG_INCOMPLETE not in run.tags
+    }
+    try:
+        planned = sweep_files.read(storage, f"{name}/{sweep_files.PLAN}") or {"nodes": []}
+        nodes = NodeStore(storage)
+        keys = {node["key"] for node in planned["nodes"]}
+        return sum(nodes.is_finished(key) for key in keys - whole)
+    except (OSError, StorageError):  # a report needs MLflow only
+        return 0
 
 
 def _damaged(sweep: Sweep, storage: str) -> str | None:

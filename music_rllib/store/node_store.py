@@ -313,6 +313,13 @@ class WorkFolder:
             self._parts.fetch(part, parts[part])
         return Saved(above / "checkpoint", parts)
 
+    def history(self) -> list[Report]:
+        """Reports up to the newest checkpoint whose history is sound; none where there is none."""
+        for name in reversed(self._checkpoints.names()):
+            with contextlib.suppress(DamagedError, ValueError):
+                return from_json_lines(self._checkpoints.read(name, HISTORY))
+        return []
+
     def tidy(self) -> None:
         """Delete what killed attempts have left. Only for who holds the lease."""
         self._checkpoints.tidy()

@@ -302,7 +302,7 @@ def _compute_and_report(console: Console, opened: Sweep, tracker: Tracker) -> in
         Display(console, opened.plan, opened.scheduler) as display,
         StateFile(opened) as state_file,
     ):
-        mlflow_log = MlflowListener(tracker, lambda text: display.say(text, "yellow"), opened.store)
+        mlflow_log = MlflowListener(tracker, opened.store)
         display.headline = state_file.headline
         _take_over(opened, display, mlflow_log)
         controller = None
@@ -351,7 +351,7 @@ def _take_over(opened: Sweep, display: Display, mlflow_log: MlflowListener) -> N
     if len(reused) > NAMED:
         display.say(f"{len(reused) - NAMED} more: finished earlier, reused")
     for node in reused:
-        mlflow_log.reused(node, opened.store)
+        mlflow_log.finished(node)
 
 
 def _compute(

@@ -25,7 +25,7 @@ def begin_searches(
     """The sweep's searches, as far as earlier results lead."""
 
     def reused(node: Node) -> None:
-        mlflow_log.reused(node, opened.store)
+        mlflow_log.finished(node)
         state_file.reused(node)
 
     searches = open_searches(opened)

@@ -10,15 +10,16 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from music_rllib.experiment.run_info import RunInfo
+    from music_rllib.tracking.from_store import deliver
+    from music_rllib.tracking.projection import StoredRun
     from music_rllib.tracking.sender import Backlog
-    from music_rllib.tracking.session import deliver
     from music_rllib.tracking.store import check_reachable, resolve_store
-    from music_rllib.tracking.tracker import Point, Tracker
+    from music_rllib.tracking.tracker import Tracker
 
 __all__ = [
     "Backlog",
-    "Point",
     "RunInfo",
+    "StoredRun",
     "Tracker",
     "check_reachable",
     "deliver",
@@ -27,11 +28,11 @@ __all__ = [
 
 _HOMES = {
     "Backlog": "sender",
-    "Point": "tracker",
     "RunInfo": "tracker",
+    "StoredRun": "projection",
     "Tracker": "tracker",
     "check_reachable": "store",
-    "deliver": "session",
+    "deliver": "from_store",
     "resolve_store": "store",
 }
 

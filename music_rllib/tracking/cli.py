@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -17,6 +16,7 @@ EXAMPLES = """\
 Examples:
   music-rllib tracking deliver results/smoke
   music-rllib tracking deliver results/smoke --timeout 600
+  music-rllib tracking deliver s3://lab/results/smoke
 
 Exit codes: 0 all is delivered, 1 something is left, 2 bad input.
 """
@@ -31,9 +31,12 @@ def tracking() -> None:
 
 
 def deliver(
-    sweep_folder: Annotated[
-        Path,
-        typer.Argument(metavar="FOLDER", help="The sweep's folder: the one that holds tracking/."),
+    place: Annotated[
+        str,
+        typer.Argument(
+            metavar="SWEEP",
+            help="The sweep's folder, its URI in a bucket, or its name in results/.",
+        ),
     ],
     tracking_uri: Annotated[
         str | None,
@@ -47,11 +50,11 @@ def deliver(
         float, typer.Option(metavar="SECONDS", min=1.0, help="How long to try.")
     ] = 60.0,
 ) -> int:
-    """Send to MLflow what a sweep could not deliver. Sending twice changes nothing."""
+    """Send to MLflow what it has not of a sweep. Sending twice changes nothing."""
     from music_rllib.redaction import for_people
-    from music_rllib.tracking.session import deliver as deliver_sweep
+    from music_rllib.tracking.from_store import deliver as deliver_sweep
 
-    left = deliver_sweep(sweep_folder, tracking_uri, timeout)
+    left = deliver_sweep(place, tracking_uri, timeout)
     if left:
         reason = left.error or f"not done within {timeout:.0f} s"
         typer.echo(
@@ -59,7 +62,7 @@ def deliver(
             err=True,
         )
         return FAILED
-    typer.echo(f"MLflow has everything of {sweep_folder}")
+    typer.echo(f"MLflow has everything of {for_people(place)}")
     return 0
 
 

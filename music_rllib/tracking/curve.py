@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from music_rllib import names
-from music_rllib.tracking.spool import Metrics
+from music_rllib.store.run_record import Report
 
 # Okabe and Ito's colours, told apart by colour-blind readers; line styles tell them apart in grey.
 BLUE, VERMILION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
@@ -66,7 +66,7 @@ PANELS = (
 )
 
 
-def learning_curve(history: Sequence[Metrics], *, title: str) -> Figure:
+def learning_curve(history: Sequence[Report], *, title: str) -> Figure:
     """Success rate (or return), MI bound and MI reward against environment steps.
 
     The return of a task that has a success says the same in other units, and has no panel. Panels
@@ -90,14 +90,14 @@ def learning_curve(history: Sequence[Metrics], *, title: str) -> Figure:
     return figure
 
 
-def learning_curve_png(history: Sequence[Metrics], *, title: str) -> bytes:
+def learning_curve_png(history: Sequence[Report], *, title: str) -> bytes:
     """:func:`learning_curve` as a PNG."""
     buffer = io.BytesIO()
     learning_curve(history, title=title).savefig(buffer, format="png", dpi=120)
     return buffer.getvalue()
 
 
-def _draw(axes: Axes, panel: Panel, history: Sequence[Metrics]) -> None:
+def _draw(axes: Axes, panel: Panel, history: Sequence[Report]) -> None:
     for line in panel.lines:
         points = _points(history, line)
         if points:
@@ -118,9 +118,9 @@ def _draw(axes: Axes, panel: Panel, history: Sequence[Metrics]) -> None:
         axes.legend(loc="best", fontsize=9)
 
 
-def _points(history: Sequence[Metrics], line: Line) -> list[tuple[int, float]]:
+def _points(history: Sequence[Report], line: Line) -> list[tuple[int, float]]:
     return [
-        (record.step, record.values[line.metric])
-        for record in history
-        if line.metric in record.values
+        (report.env_steps, report.metrics[line.metric])
+        for report in history
+        if line.metric in report.metrics
     ]

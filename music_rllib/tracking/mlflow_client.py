@@ -9,10 +9,10 @@ import logging
 import os
 import re
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TypeVar
+from typing import Literal, NamedTuple, TypeVar
 from urllib.parse import quote
 
 from filelock import FileLock
@@ -32,7 +32,6 @@ from music_rllib import names
 from music_rllib.errors import TrackingError
 from music_rllib.redaction import redact
 from music_rllib.tracking.policy_model import MODEL_NAME, write_model
-from music_rllib.tracking.spool import Metrics, Status
 from music_rllib.tracking.store import TrackingStore
 
 MAX_METRICS = 1000
@@ -55,7 +54,7 @@ _LASTING_ERRORS = frozenset(
     }
 )
 _Item = TypeVar("_Item")
-
+Status = Literal["FINISHED", "FAILED", "KILLED"]
 
 _HINTS = {
     r"error code 40[13]\b": "Set MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD in the "
@@ -65,15 +64,47 @@ _HINTS = {
 """What an answer looks like, and what to do then."""
 
 
+_PART = r"(?!\.{1,2}(?:/|$))[\w.\-: ]+"
+_METRIC_NAME = re.compile(rf"{_PART}(?:/{_PART})*")
+
+
+def check_metric_name(name: str) -> None:
+    """Raises ValueError where MLflow would refuse the name."""
+    if len(name) > 250 or not _METRIC_NAME.fullmatch(name):
+        raise ValueError(
+            "a metric's name must have at most 250 letters, digits, '_', '-', '.', ':', spaces, "
+            f"and single slashes between them, got {name!r}"
+        )
+
+
 def is_lasting(error: Exception) -> bool:
     """Whether repeating the call cannot help: a refused value, or a run that was deleted."""
     return isinstance(error, MlflowException) and error.error_code in _LASTING_ERRORS
 
 
-class Experiment:
-    """One MLflow experiment: finds, creates and feeds its runs. Every call may raise."""
+class Value(NamedTuple):
+    """One value of a metric, as MLflow keeps it; `time` in ms since the epoch."""
 
-    def __init__(self, store: TrackingStore, name: str) -> None:
+    name: str
+    value: float
+    time: int
+    step: int
+
+
+class KnownRun(NamedTuple):
+    """A run that MLflow has."""
+
+    run_id: str
+    started: int
+    """ms since the epoch."""
+    whole: bool = False
+    """Whether it is finished, and nothing of it is still to come."""
+
+
+class Experiment:
+    """A sweep's runs in one MLflow experiment: found, created and fed. Every call may raise."""
+
+    def __init__(self, store: TrackingStore, name: str, sweep_id: str) -> None:
         """Connect, and create the experiment where it does not exist.
 
         Raises:
@@ -81,6 +112,9 @@ class Experiment:
         """
         self.store = store
         self._name = name
+        self._sweep_id = sweep_id
+        self._known: dict[str, KnownRun] | None = None
+        """By node key; the sweep's own by an empty one. None before the server was asked."""
         _configure_mlflow()
         try:
             self._client = _open_client(store)
@@ -93,18 +127,50 @@ class Experiment:
                 f"it answered: {first_line(error)}"
             ) from error
 
-    def find_run(self, tags: Mapping[str, str]) -> str | None:
-        """Id of the oldest run with all these tags; None where there is none."""
-        wanted = " and ".join(f"tags.`{key}` = '{value}'" for key, value in tags.items())
-        found = self._client.search_runs(
-            [self.id], wanted, max_results=1, order_by=["attributes.start_time ASC"]
-        )
-        return found[0].info.run_id if found else None
+    def find(self, node_key: str) -> KnownRun | None:
+        """A node's run, or the sweep's own; None where there is none. Asks once for all runs."""
+        if self._known is None:
+            self._known = self._list()
+        return self._known.get(node_key)
 
-    def create_run(self, name: str, time: int, tags: Mapping[str, str]) -> str:
-        """Id of a new run that began at ``time`` (ms since the epoch)."""
-        run = self._client.create_run(self.id, start_time=time, tags=dict(tags), run_name=name)
-        return str(run.info.run_id)
+    def known_id(self, node_key: str) -> str | None:
+        """Id of a run that was found or created; asks nothing."""
+        run = (self._known or {}).get(node_key)
+        return None if run is None else run.run_id
+
+    def create(self, node_key: str, name: str, time: int, tags: Mapping[str, str]) -> KnownRun:
+        """A new run that began at `time` (ms since the epoch), for a node or the sweep itself."""
+        kind = names.KIND_RUN if node_key else names.KIND_SWEEP
+        identity = {names.TAG_KIND: kind, names.TAG_SWEEP_ID: self._sweep_id}
+        if node_key:
+            identity[names.TAG_NODE_KEY] = node_key
+        known, self._known = self._known or {}, None  # to be asked anew if the answer gets lost
+        run = self._client.create_run(
+            self.id, start_time=time, tags={**tags, **identity}, run_name=name
+        )
+        self._known = known | {node_key: KnownRun(str(run.info.run_id), time)}
+        return self._known[node_key]
+
+    def _list(self) -> dict[str, KnownRun]:
+        """The sweep's runs; of two with one key the older one."""
+        wanted, token = f"tags.`{names.TAG_SWEEP_ID}` = '{self._sweep_id}'", None
+        known: dict[str, KnownRun] = {}
+        while True:
+            page = self._client.search_runs(
+                [self.id],
+                wanted,
+                max_results=1000,
+                order_by=["attributes.start_time ASC"],
+                page_token=token,
+            )
+            for run in page:
+                tags = run.data.tags
+                whole = run.info.status == "FINISHED" and names.TAG_INCOMPLETE not in tags
+                found = KnownRun(run.info.run_id, run.info.start_time, whole)
+                known.setdefault(tags.get(names.TAG_NODE_KEY, ""), found)
+            token = page.token
+            if not token:
+                return known
 
     def last_steps(self, run_id: str) -> dict[str, int]:
         """Last step of every metric that the run has."""
@@ -141,15 +207,14 @@ class Experiment:
         for chunk in _chunks([RunTag(*item) for item in tags.items()], MAX_PARAMS):
             self._client.log_batch(run_id, tags=chunk, synchronous=True)
 
-    def log_metrics(self, run_id: str, records: Iterable[Metrics]) -> None:
-        """Send ``records`` with their own times and steps; sending them twice changes nothing."""
-        metrics = [
-            Metric(name, value, record.time, record.step)
-            for record in records
-            for name, value in record.values.items()
-        ]
-        for chunk in _chunks(metrics, MAX_METRICS):
-            self._client.log_batch(run_id, metrics=chunk, synchronous=True)
+    def delete_tag(self, run_id: str, tag: str) -> None:
+        """Take a tag from a run that has it."""
+        self._client.delete_tag(run_id, tag)
+
+    def log_metrics(self, run_id: str, values: Sequence[Value]) -> None:
+        """Send at most MAX_METRICS values; sending them twice changes nothing."""
+        metrics = [Metric(*value) for value in values]
+        self._client.log_batch(run_id, metrics=metrics, synchronous=True)
 
     def end_run(self, run_id: str, status: Status, time: int) -> None:
         """Mark the run as ended at ``time`` (ms since the epoch)."""

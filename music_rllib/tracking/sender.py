@@ -1,16 +1,16 @@
-"""The thread that carries spools to MLflow while the sweep goes on."""
+"""The thread that brings runs to MLflow while the sweep goes on."""
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import random
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from music_rllib.tracking.delivery import Delivery
+from music_rllib.store.object_folder import DamagedError
 from music_rllib.tracking.mlflow_client import first_line, is_lasting
+from music_rllib.tracking.projection import RunProjection
 
 logger = logging.getLogger(__name__)
 
@@ -37,24 +37,25 @@ class Backlog:
 class _Lane:
     """A run's records, or its artefacts: one must not keep the other waiting."""
 
-    delivery: Delivery
+    run: RunProjection
     send: Callable[[], None]
     refused: str | None = None
 
 
 class Sender(threading.Thread):
-    """Delivers every spool in order; after a failure it pauses, longer each time, and repeats.
+    """Sends every run's records in order; after a failure it pauses, longer each time, and repeats.
 
     A failure that can pass (server down, busy, disk full) ends the round, and the lane that met
     it goes to the back, so that one bad run cannot keep the others waiting. After a lasting one
-    (a refused value, a deleted run) the lane rests until the sweep is started again. A run that
-    ended and is delivered whole is forgotten, so that a round costs what is under way.
+    (a refused value, a deleted run, a damaged node) the lane rests until the sweep is started
+    again. A run that ended and is delivered is forgotten, so that a round costs what is under way.
     """
 
     def __init__(self, store: str) -> None:
         """``store`` is its public name, for messages."""
         super().__init__(name="mlflow-sender", daemon=True)
         self._store = store
+        self._runs: set[RunProjection] = set()
         self._records: list[_Lane] = []
         self._artefacts: list[_Lane] = []
         self._change = threading.Condition()
@@ -62,28 +63,27 @@ class Sender(threading.Thread):
         self._failures = 0
         self._error: str | None = None
 
-    def add(self, delivery: Delivery) -> None:
-        """Deliver what is, or will be, in this spool; again, where it was forgotten."""
+    def add(self, run: RunProjection) -> None:
+        """Say that a run has something new to send."""
         with self._change:
-            if not any(lane.delivery is delivery for lane in self._records):
-                self._records.append(_Lane(delivery, delivery.send_records))
-                self._artefacts.append(_Lane(delivery, delivery.send_artefacts))
-        self.wake()
+            if run not in self._runs:
+                self._runs.add(run)
+                self._records.append(_Lane(run, run.send_records))
+                self._artefacts.append(_Lane(run, run.send_artefacts))
+            self._wake()
 
-    def wake(self) -> None:
-        """Say that there is something new to send."""
-        with self._change:
-            self._news = True
-            self._change.notify_all()
+    def _wake(self) -> None:
+        self._news = True
+        self._change.notify_all()
 
     def backlog(self) -> Backlog:
         """What is still to be sent, and why it has not been."""
         with self._change:
-            lanes = list(self._records)
+            runs = list(self._runs)
             refused = [lane.refused for lane in self._lanes() if lane.refused]
         return Backlog(
-            records=sum(lane.delivery.spool.undelivered for lane in lanes),
-            artefacts=sum(len(lane.delivery.spool.queued_artefacts()) for lane in lanes),
+            records=sum(run.records for run in runs),
+            artefacts=sum(run.artefacts for run in runs),
             error=self._error or (refused[0] if refused else None),
         )
 
@@ -91,17 +91,17 @@ class Sender(threading.Thread):
         """Wait until all is delivered; False where it is not after ``timeout`` s or is refused."""
         with self._change:
             self._hurry = True
-            self.wake()
+            self._wake()
             self._change.wait_for(lambda: not self._has_work(), timeout)
             self._hurry = False
         return not self.backlog()
 
     def stop(self) -> None:
-        """End after the request that is under way; what is not sent stays in the spools."""
+        """End after the request that is under way."""
         with self._change:
             self._stopped = True
-            for lane in self._records:
-                lane.delivery.cancel()
+            for run in self._runs:
+                run.cancel()
             self._change.notify_all()
 
     def run(self) -> None:
@@ -136,17 +136,12 @@ class Sender(threading.Thread):
         return True
 
     def _forget_ended(self) -> None:
-        # Whoever puts something into a spool calls `add` after it: either it is seen here, or
-        # `add` comes after this. A storage that doesn't answer must not end the thread.
-        with self._change, contextlib.suppress(OSError):
-            resting = {lane.delivery for lane in self._lanes() if lane.refused is not None}
-            kept = {
-                lane.delivery
-                for lane in self._records
-                if lane.delivery in resting or not lane.delivery.ended
-            }
-            self._records = [lane for lane in self._records if lane.delivery in kept]
-            self._artefacts = [lane for lane in self._artefacts if lane.delivery in kept]
+        # Whoever tells a run something calls `add` after it: either it is seen here, or `add`
+        # comes after this.
+        with self._change:
+            self._runs = {run for run in self._runs if not run.delivered}
+            self._records = [lane for lane in self._records if lane.run in self._runs]
+            self._artefacts = [lane for lane in self._artefacts if lane.run in self._runs]
 
     def _lanes(self) -> list[_Lane]:
         return [*self._records, *self._artefacts]
@@ -154,16 +149,16 @@ class Sender(threading.Thread):
     def _attempt(self, lane: _Lane, lanes: list[_Lane]) -> bool:
         try:
             lane.send()
-        # Whatever goes wrong here, the thread must live: the spool keeps what was not sent.
+        # Whatever goes wrong here, the thread must live: what was not sent waits.
         except Exception as error:
             reason = first_line(error)
-            if is_lasting(error):
+            if is_lasting(error) or isinstance(error, DamagedError):
                 lane.refused = reason
-                logger.warning("MLflow at %s refuses a run's records: %s", self._store, reason)
+                logger.warning("MLflow at %s does not get all of a run: %s", self._store, reason)
                 return True
             if self._error is None:
                 logger.warning(
-                    "MLflow at %s does not accept records, they wait on disk: %s",
+                    "MLflow at %s does not accept records, they wait: %s",
                     self._store,
                     reason,
                 )
@@ -184,9 +179,6 @@ class Sender(threading.Thread):
 
     def _has_work(self) -> bool:
         """Whether something waits that was not refused. Called with the lock held."""
-        return any(
-            lane.refused is None and lane.delivery.spool.undelivered for lane in self._records
-        ) or any(
-            lane.refused is None and lane.delivery.spool.queued_artefacts()
-            for lane in self._artefacts
+        return any(lane.refused is None and lane.run.records for lane in self._records) or any(
+            lane.refused is None and lane.run.artefacts for lane in self._artefacts
         )

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 import shutil
 import socket
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Self
 from urllib.parse import urlsplit
 
 from music_rllib.errors import TrackingError
+from music_rllib.experiment import sweep_files
 from music_rllib.redaction import redact
+from music_rllib.store.object_folder import StorageError
 
 CONNECT_SECONDS = 3.0
 ANSWER_SECONDS = 5.0
@@ -56,56 +57,49 @@ class TrackingStore:
         """The address of MLflow's pages: the server's, or that of what `ui_command` starts."""
         return self.public_uri.rstrip("/") if self.is_server else "http://127.0.0.1:5000"
 
-    def run_url(self, experiment_id: str, run_id: str) -> str | None:
-        """The page of a run, where a server shows it."""
-        if not self.is_server:
-            return None
-        return f"{self.pages}/#/experiments/{experiment_id}/runs/{run_id}"
+
+RECORD = "tracking/sweep.json"
+"""Of a sweep, in its folder."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SweepRecord:
-    """``sweep.json``: what a later process must know to continue or deliver this sweep."""
+    """What a later driver must know to go on with this sweep's runs in MLflow."""
 
     sweep_name: str
     sweep_id: str
     tracking_uri: str | None
     """Without a password; None for the sqlite file in the storage."""
-    storage: str
-    """A bucket's URI, or the folder relative to the sweep's (both may be moved together)."""
 
     @classmethod
-    def read(cls, sweep_folder: Path) -> Self | None:
-        """The record of the sweep in ``sweep_folder``; None where there is none.
+    def read(cls, storage: str, sweep_name: str) -> Self | None:
+        """The record of the sweep in the folder `sweep_name` of a storage; None where none is.
 
         Raises:
             TrackingError: where there is one that cannot be read.
         """
-        path = tracking_folder(sweep_folder) / "sweep.json"
+        place = f"{sweep_name}/{RECORD}"
         try:
-            return cls(**json.loads(path.read_text(encoding="utf-8")))
-        except FileNotFoundError:
-            return None
-        except (OSError, ValueError, TypeError) as error:
-            raise TrackingError(f"{path} must hold a sweep's record, got: {error}") from error
+            found = sweep_files.read(storage, place)
+            if found is None:
+                return None
+            return cls(**{field.name: found[field.name] for field in fields(cls)})
+        except (StorageError, TypeError, KeyError) as error:
+            raise TrackingError(
+                f"{redact(storage)}/{place} must hold a sweep's record, got: {error}"
+            ) from error
 
-    def write(self, sweep_folder: Path) -> None:
-        """Keep the record with the sweep, whole or not at all."""
-        path = tracking_folder(sweep_folder) / "sweep.json"
-        temporary = path.with_name(".sweep.json")
-        temporary.write_text(json.dumps(asdict(self), indent=2) + "\n", encoding="utf-8")
-        temporary.replace(path)
+    def write(self, storage: str) -> None:
+        """Keep the record with the sweep: in a bucket too, where a driver elsewhere goes on.
 
-    def resolve_storage(self, sweep_folder: Path) -> str:
-        """The storage as it is now, after a possible move."""
-        if "://" in self.storage:
-            return self.storage
-        return str((sweep_folder / self.storage).resolve())
-
-
-def tracking_folder(sweep_folder: Path) -> Path:
-    """Where a sweep's spools are."""
-    return sweep_folder / "tracking"
+        Raises:
+            TrackingError: the storage cannot be written.
+        """
+        try:
+            text = sweep_files.as_json(asdict(self))
+            sweep_files.write(storage, f"{self.sweep_name}/{RECORD}", text)
+        except StorageError as error:
+            raise TrackingError(str(error)) from error
 
 
 def resolve_store(tracking_uri: str | None, storage: str) -> TrackingStore:

@@ -1,38 +1,36 @@
-"""The sweep driver's one way to MLflow: log and go on; the rest happens behind.
+"""The sweep driver's one way to MLflow: tell and go on; the rest happens behind.
 
-After the constructor nothing here waits for a server: every call appends to a spool in the
-sweep's folder (:mod:`music_rllib.tracking.spool`), and a thread delivers it.
+MLflow is a projection of what is in the store and what running runs report
+(:mod:`music_rllib.tracking.projection`): after the constructor nothing here waits for a server or
+writes to a disk, and a thread brings what is new.
 """
 
 from __future__ import annotations
 
+import json
 import logging
+import re
 import shlex
 import time
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+import uuid
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 from urllib.parse import urlencode
 
+import yaml
+from filelock import FileLock, Timeout
+
 from music_rllib import names
 from music_rllib.errors import TrackingError
 from music_rllib.experiment.run_info import RunInfo
-from music_rllib.redaction import flat_params
-from music_rllib.tracking.mlflow_client import first_line
+from music_rllib.redaction import flat_params, redact, without_secrets
+from music_rllib.store.run_record import Report
+from music_rllib.tracking.mlflow_client import Experiment, Status, check_metric_name, first_line
+from music_rllib.tracking.projection import End, RunProjection, Start, StoredRun
 from music_rllib.tracking.provenance import provenance_tags
-from music_rllib.tracking.records import as_yaml, finish_of, milliseconds, number_of, texts
-from music_rllib.tracking.sender import Backlog
-from music_rllib.tracking.session import Session, new_sweep_id, relative_storage
-from music_rllib.tracking.spool import (
-    Metrics,
-    Record,
-    Spool,
-    Start,
-    Status,
-    check_metric_name,
-)
+from music_rllib.tracking.sender import Backlog, Sender
 from music_rllib.tracking.store import (
     SweepRecord,
     check_reachable,
@@ -41,24 +39,20 @@ from music_rllib.tracking.store import (
     version,
 )
 
+__all__ = ["Tracker"]
+
 logger = logging.getLogger(__name__)
 
-
-@dataclass(frozen=True, kw_only=True)
-class Point:
-    """Metrics of a finished run at one number of environment steps."""
-
-    env_steps: int
-    timestamp: float
-    """When they were measured, in seconds since the epoch."""
-    metrics: Mapping[str, float]
+MAX_CAUSE_LENGTH = 1000
+"""Characters of why a run ended that are kept as a tag; the rest is in the run's log."""
+_NODE_KEY = re.compile(r"[\w\-]+")
 
 
 class Tracker:
-    """Logs one sweep: an experiment, a parent run, and a child run per node.
+    """Brings one sweep to MLflow: an experiment, a parent run, and a child run per node.
 
-    Opening it again on the same sweep continues the same runs: a value whose step was logged
-    before is left out, so a run that repeats steps after a resume shows each step once.
+    Opening it again on the same sweep continues the same runs: a value whose step MLflow has is
+    left out, so a run that repeats steps after a resume shows each step once.
     Calls may come from several threads; only one process at a time can track a sweep.
     """
 
@@ -70,10 +64,8 @@ class Tracker:
         config: Mapping[str, object],
         tracking_uri: str | None = None,
         sweep_folder: Path | None = None,
-        sweep_id: str | None = None,
-        tags: Mapping[str, object] | None = None,
     ) -> None:
-        """Check the store, create the experiment and the parent run, begin to deliver.
+        """Check the store, create the experiment and the parent run, begin to send.
 
         Args:
             sweep_name: also the experiment's name.
@@ -81,177 +73,118 @@ class Tracker:
             config: the whole sweep's settings: params and the artefact ``config/sweep.yaml``
                 of the parent run.
             tracking_uri: ``mlflow.tracking_uri``; None for a sqlite file in ``storage``.
-            sweep_folder: local folder of the spools; ``<storage>/<sweep_name>`` by default,
-                needed where the storage is a bucket.
-            sweep_id: what tells this sweep from others of its name on the same server; kept in
-                the sweep's folder, so it is needed only where that folder does not outlive the
-                machine (a bucket).
-            tags: tags of the parent run.
+            sweep_folder: the sweep's own files on this machine; ``<storage>/<sweep_name>`` by
+                default, needed where the storage is a bucket.
 
         Raises:
-            TrackingError: where the store is not reachable or refuses, where the folder is not
+            TrackingError: where the store is not reachable or refuses, where the storage is not
                 writable, or where another process tracks this sweep.
             ValueError: where ``sweep_folder`` is missing.
         """
-        store = resolve_store(tracking_uri, storage)
-        check_reachable(store)
+        self.store = resolve_store(tracking_uri, storage)
+        check_reachable(self.store)
         folder = sweep_folder or _default_folder(storage, sweep_name)
-        known = SweepRecord.read(folder)
-        record = SweepRecord(
-            sweep_name=sweep_name,
-            sweep_id=sweep_id or (known.sweep_id if known else new_sweep_id()),
-            tracking_uri=None if tracking_uri is None else store.public_uri,
-            storage=relative_storage(storage, folder),
-        )
-        self.sweep_folder = folder
-        self.store = store
-        self._provenance = provenance_tags()
-        self._session = Session(folder, store, record)
-        self._sweep_tags = {names.TAG_SWEEP: sweep_name, names.TAG_SWEEP_ID: record.sweep_id}
-        self._open: dict[str, Spool] = {}
-        self._settings: dict[str, list[Metrics]] = {}
-        """What is not logged yet of runs that have begun."""
+        self._lock = _locked(folder / "tracking")
+        self._runs: dict[str, RunProjection] = {}
         self._checked_names: set[str] = set()
         self._left: Backlog | None = None
         self._view: dict[str, str] = {}
-        self._unwritten: str | None = None
-        """Why something could not even be kept on disk."""
+        self._place = f"{redact(storage)}/{sweep_name}"
+        self._provenance = provenance_tags()
         try:
-            self._begin(sweep_name, config, tags or {})
+            # A version before this one kept the record of a bucket's sweep on the driver's disk.
+            known = SweepRecord.read(storage, sweep_name) or SweepRecord.read(
+                str(folder.parent), folder.name
+            )
+            self.sweep_id = known.sweep_id if known else uuid.uuid4().hex[:16]
+            self._sweep_tags = {names.TAG_SWEEP: sweep_name, names.TAG_SWEEP_ID: self.sweep_id}
+            SweepRecord(
+                sweep_name=sweep_name,
+                sweep_id=self.sweep_id,
+                tracking_uri=None if tracking_uri is None else self.store.public_uri,
+            ).write(storage)
+            self._experiment = Experiment(self.store, sweep_name, self.sweep_id)
+            self._parent = self._begin(sweep_name, config)
         except BaseException:
-            self._session.abandon()
+            self._lock.release()
             raise
+        self._sender = Sender(self.store.public_uri)
+        self._sender.add(self._parent)
+        self._sender.start()
 
     @property
     def experiment_id(self) -> str:
         """MLflow's id of the sweep's experiment."""
-        return self._session.experiment.id
+        return self._experiment.id
 
     @property
     def parent_run_id(self) -> str:
         """MLflow's id of the sweep's own run."""
-        run_id = self._session.parent.run_id
-        assert run_id is not None, "the constructor creates the parent run"
-        return run_id
+        return self._parent.attach().run_id
 
     def start(self, run: RunInfo) -> None:
-        """A run begins, or goes on after a resume.
+        """A run begins, or goes on after a resume; its reports are then told from its first one on.
 
         Raises:
             ValueError: where a name or key is not one that MLflow accepts.
-            TrackingError: where its spool cannot be written.
         """
-        now = time.time()
-        self._append(run.node_key, [self._opening(run, now)])
-        self._settings[run.node_key] = self._settings_of(run, now)
-        self._open[run.node_key].put_artefact(names.ARTEFACT_RUN_CONFIG, as_yaml(run.config))
-        self._session.wake(run.node_key)
+        told = self._run(run.node_key)
+        told.start(self._as_start(run))
+        told.put_artefact(names.ARTEFACT_RUN_CONFIG, _as_yaml(run.config))
+        self._sender.add(told)
 
-    def log(
-        self,
-        node_key: str,
-        metrics: Mapping[str, float],
-        env_steps: int,
-        timestamp: float | None = None,
-    ) -> None:
-        """Metrics of a started run at ``env_steps``; values of a step logged before are left out.
-
-        Args:
-            node_key: the run.
-            metrics: ``names.*`` to numbers; NaN and infinities are kept.
-            env_steps: environment steps of the run so far; rises from call to call.
-            timestamp: when they were measured, in seconds since the epoch; now by default.
+    def log(self, node_key: str, reports: Sequence[Report]) -> None:
+        """Reports of a started run; values of a step that MLflow has are left out.
 
         Raises:
-            ValueError: where the run was not started, or a metric's name or value is not one
-                that MLflow accepts.
-            TrackingError: where the spool cannot be written.
+            ValueError: where the run was not started, or a metric's name is not one that MLflow
+                accepts.
         """
-        self._started(node_key)
-        when = time.time() if timestamp is None else timestamp
-        measured = self._metrics(metrics, env_steps, when)
-        self._append(node_key, [measured, *self._settings.pop(node_key, [])])
-        self._session.wake(node_key)
+        run = self._started(node_key)
+        for report in reports:
+            self._check_names(report.metrics)
+        run.report(reports)
+        self._sender.add(run)
 
-    def finish(
-        self,
-        node_key: str,
-        status: Status,
-        *,
-        artefacts: Mapping[str, Path] | None = None,
-        failure: str | None = None,
-    ) -> None:
-        """A started run ended; its learning curve is drawn and kept as an artefact.
+    def end(self, node_key: str, status: Status, tags: Mapping[str, str] | None = None) -> None:
+        """A started run ended without a result in the store; its learning curve is drawn.
 
         Args:
             node_key: the run.
-            status: FINISHED, FAILED, or KILLED for one that was stopped and can go on.
-            artefacts: names in MLflow to files, which are copied at once.
-            failure: the cause, where it failed; its beginning becomes a tag.
+            status: FAILED, or KILLED for one that was stopped and can go on.
+            tags: say why; their beginnings are kept.
 
         Raises:
             ValueError: where the run was not started.
-            TrackingError: where an artefact cannot be read or the spool cannot be written.
         """
-        spool = self._started(node_key)
-        for name, file in (artefacts or {}).items():
-            spool.put_artefact(name, file)
-        settings = self._settings.pop(node_key, [])
-        self._append(node_key, [*settings, finish_of(status, time.time(), failure)])
-        del self._open[node_key]
-        self._session.wake(node_key)
+        run = self._started(node_key)
+        run.end(End(time=_now(), status=status, tags=_shortened(tags or {})))
+        self._sender.add(run)
 
-    def log_history(
-        self, run: RunInfo, history: Iterable[Point], artefacts: Mapping[str, Path] | None = None
-    ) -> bool:
-        """A run that an earlier sweep finished, in one go; nothing where it is already here.
+    def mirror(self, run: RunInfo, read: Callable[[], StoredRun]) -> None:
+        """The store has a run: MLflow gets what it has not of it, now or by an earlier sweep.
 
-        Returns:
-            Whether something was added.
+        Args:
+            run: as for `start`.
+            read: gives all of the run; called by another thread, unless MLflow has it.
 
         Raises:
-            ValueError: where a name, key or value is not one that MLflow accepts.
-            TrackingError: where the spool cannot be written.
+            ValueError: where a name or key is not one that MLflow accepts.
         """
-        spool = self._session.open_run(run.node_key)
-        if spool.finished == "FINISHED":
-            return False
-        points = sorted(history, key=lambda point: point.env_steps)
-        first = min((point.timestamp for point in points), default=time.time())
-        last = max((point.timestamp for point in points), default=first)
-        measured = [self._metrics(p.metrics, p.env_steps, p.timestamp) for p in points]
-        records: list[Record] = [
-            self._opening(run, first, {names.TAG_REUSED: "true"}),
-            *measured[:1],
-            *self._settings_of(run, first),
-            *measured[1:],
-            finish_of("FINISHED", last, None),
-        ]
-        spool.put_artefact(names.ARTEFACT_RUN_CONFIG, as_yaml(run.config))
-        for name, file in (artefacts or {}).items():
-            spool.put_artefact(name, file)
-        spool.append(records)
-        self._session.wake(run.node_key)
-        return True
+        told = self._run(run.node_key)
+        told.mirror(self._as_start(run), read)
+        told.put_artefact(names.ARTEFACT_RUN_CONFIG, _as_yaml(run.config))
+        self._sender.add(told)
 
-    def put_sweep_artefact(self, name: str, content: str | bytes | Path) -> None:
-        """An artefact of the parent run: text, bytes, or a file, which is copied at once."""
-        self._session.parent.spool.put_artefact(name, content)
-        self._session.wake()
+    def put_sweep_artefact(self, name: str, content: str) -> None:
+        """An artefact of the parent run."""
+        self._parent.put_artefact(name, content.encode())
+        self._sender.add(self._parent)
 
     def run_id(self, node_key: str) -> str | None:
         """MLflow's id of a run; None until the server has it (see :meth:`flush`)."""
-        return self._session.run_id(node_key)
-
-    def run_url(self, node_key: str) -> str | None:
-        """The page of a run; None without a server, or until the server has the run."""
-        run_id = self.run_id(node_key)
-        return None if run_id is None else self.store.run_url(self.experiment_id, run_id)
-
-    @property
-    def sweep_id(self) -> str:
-        """What the sweep's runs are tagged with."""
-        return self._sweep_tags[names.TAG_SWEEP_ID]
+        run = self._runs.get(node_key)
+        return None if run is None else run.run_id
 
     def keep_view(self, content: str, versions: Sequence[str]) -> None:
         """Have :meth:`comparison_url` open a view, where MLflow is of one of these versions.
@@ -262,7 +195,7 @@ class Tracker:
         if not found.startswith(tuple(f"{known}." for known in versions)):
             return
         try:
-            self._session.experiment.keep_view(self.sweep_id, content)
+            self._experiment.keep_view(self.sweep_id, content)
         except Exception as error:
             logger.warning("MLflow's page has no view of the sweep: %s", first_line(error))
         else:
@@ -279,44 +212,41 @@ class Tracker:
 
     def backlog(self) -> Backlog:
         """What MLflow does not have yet, and why; for a progress display."""
-        return self._left or self._session.backlog()
+        return self._left or self._sender.backlog()
 
     def flush(self, timeout: float) -> bool:
         """Wait until MLflow has everything; False where that takes more than ``timeout`` s."""
-        return self._session.flush(timeout)
+        return self._sender.flush(timeout)
 
     def close(self, status: Status = "FINISHED", timeout: float = 20.0) -> Backlog:
-        """End the sweep's run, deliver for at most ``timeout`` s, and say what is left over.
+        """End the sweep's run, send for at most ``timeout`` s, and say what is left over.
 
         Runs that were started and not finished are marked KILLED; a later sweep continues them.
         The second call only repeats the first one's answer.
         """
         if self._left is None:
-            try:
-                for node_key in list(self._open):
-                    self.finish(node_key, "KILLED")
-                self._session.parent.spool.append([finish_of(status, time.time(), None)])
-            except TrackingError as error:  # results are in the store: this must not hide them
-                self._unwritten = str(error)
-            self._left = self._session.close(timeout)
+            for node_key, run in self._runs.items():
+                if run.under_way:
+                    self.end(node_key, "KILLED")
+            self._parent.end(End(time=_now(), status=status))
+            self._sender.add(self._parent)
+            self._sender.flush(timeout)
+            self._sender.stop()
+            self._sender.join(1.0)  # a request under way ends by itself, and is harmless
+            self._lock.release()
+            self._left = self._sender.backlog()
         return self._left
 
     def undelivered_message(self) -> str | None:
-        """What did not arrive, where it is kept and how to send it; None where all arrived."""
+        """What did not arrive, and how to send it; None where all arrived."""
         left = self.backlog()
-        if self._unwritten is not None:
-            return (
-                f"MLflow doesn't have everything: {self._unwritten}. Repeat the command when that "
-                "is mended: what is finished is logged from the storage"
-            )
         if not left:
             return None
-        command = shlex.join(["python", "-m", "music_rllib.tracking", "deliver"])
+        command = shlex.join(["python", "-m", "music_rllib.tracking", "deliver", self._place])
         return (
             f"{left.records} records and {left.artefacts} artefacts did not reach MLflow at "
-            f"{self.store.public_uri} ({left.error or 'there was no time left'}). They are kept "
-            f"in {self._session.folder}; send them with:\n"
-            f"  {command} {shlex.quote(str(self.sweep_folder))}"
+            f"{self.store.public_uri} ({left.error or 'there was no time left'}). The results are "
+            f"in the storage; send them with:\n  {command}"
         )
 
     def __enter__(self) -> Self:
@@ -333,52 +263,76 @@ class Tracker:
         else:
             self.close("FAILED" if issubclass(kind, Exception) else "KILLED")
 
-    def _begin(
-        self, sweep_name: str, config: Mapping[str, object], tags: Mapping[str, object]
-    ) -> None:
-        self._session.begin(
+    def _begin(self, sweep_name: str, config: Mapping[str, object]) -> RunProjection:
+        """The sweep's own run, found or created at once, so that runs are nested below it."""
+        parent = RunProjection(self._experiment)
+        parent.start(
             Start(
-                time=milliseconds(time.time()),
+                time=_now(),
                 name=sweep_name,
-                tags={**self._provenance, **self._sweep_tags, **texts(tags)},
+                tags=self._sweep_tags,
+                provenance=self._provenance,
                 params=flat_params(config),
             )
         )
-        self.put_sweep_artefact(names.ARTEFACT_SWEEP_CONFIG, as_yaml(config))
+        parent.put_artefact(names.ARTEFACT_SWEEP_CONFIG, _as_yaml(config))
+        try:
+            parent.attach()
+        except Exception as error:
+            raise TrackingError(
+                f"MLflow at {self.store.public_uri} must accept the sweep's run, "
+                f"it answered: {first_line(error)}"
+            ) from error
+        return parent
 
-    def _opening(self, run: RunInfo, when: float, more: Mapping[str, str] | None = None) -> Start:
-        tags = {**self._provenance, **self._sweep_tags, **texts(run.tags), **(more or {})}
+    def _run(self, node_key: str) -> RunProjection:
+        if not _NODE_KEY.fullmatch(node_key):
+            raise ValueError(f"a node key is letters, digits, - and _, got {node_key!r}")
+        if node_key not in self._runs:
+            self._runs[node_key] = RunProjection(
+                self._experiment, node_key, self._parent.attach(), self._experiment.known_id
+            )
+        return self._runs[node_key]
+
+    def _started(self, node_key: str) -> RunProjection:
+        run = self._runs.get(node_key)
+        if run is None or not run.under_way:
+            raise ValueError(f"start(...) must come before log and end, for node {node_key!r}")
+        return run
+
+    def _as_start(self, run: RunInfo) -> Start:
+        self._check_names(run.settings)
+        tags = {key: redact(str(value)) for key, value in run.tags.items() if value is not None}
         return Start(
-            time=milliseconds(when),
+            time=_now(),
             name=run.name,
-            tags=tags,
+            tags={**self._sweep_tags, **tags},
+            provenance=self._provenance,
             params=flat_params(run.config),
+            settings=run.settings,
             source_node=run.source_node,
         )
 
-    def _settings_of(self, run: RunInfo, when: float) -> list[Metrics]:
-        """To be logged behind the first measurement, which MLflow then has on its axes.
+    def _check_names(self, metrics: Mapping[str, float]) -> None:
+        """Before MLflow would refuse all of the run's records for one name."""
+        for name in metrics.keys() - self._checked_names:
+            check_metric_name(name)
+            self._checked_names.add(name)
 
-        Its page that compares runs takes the metric that came first: q against q says nothing.
-        """
-        return [self._metrics(run.settings, 0, when)] if run.settings else []
 
-    def _append(self, node_key: str, records: Iterable[Record]) -> None:
-        self._open[node_key] = self._open.get(node_key) or self._session.open_run(node_key)
-        self._open[node_key].append(records)
+def _now() -> int:
+    """MLflow's time: ms since the epoch."""
+    return round(time.time() * 1000)
 
-    def _started(self, node_key: str) -> Spool:
-        if node_key not in self._open:
-            raise ValueError(f"start(...) must come before log and finish, for node {node_key!r}")
-        return self._open[node_key]
 
-    def _metrics(self, metrics: Mapping[str, float], env_steps: int, when: float) -> Metrics:
-        for name in metrics:
-            if name not in self._checked_names:
-                check_metric_name(name)
-                self._checked_names.add(name)
-        values = {name: number_of(name, value) for name, value in metrics.items()}
-        return Metrics(time=milliseconds(when), step=int(env_steps), values=values)
+def _shortened(tags: Mapping[str, str]) -> dict[str, str]:
+    return {key: redact(value)[:MAX_CAUSE_LENGTH] for key, value in tags.items()}
+
+
+def _as_yaml(settings: Mapping[str, object]) -> bytes:
+    """Settings as a file, no secret in it."""
+    plain = json.loads(json.dumps(without_secrets(settings), default=str))
+    return str(yaml.safe_dump(plain, sort_keys=False, allow_unicode=True)).encode()
 
 
 def _default_folder(storage: str, sweep_name: str) -> Path:
@@ -386,3 +340,19 @@ def _default_folder(storage: str, sweep_name: str) -> Path:
     if folder is None:
         raise ValueError(f"sweep_folder must be given where storage is a bucket, got {storage}")
     return folder / sweep_name
+
+
+def _locked(folder: Path) -> FileLock:
+    """Against a second process that tracks the sweep on this machine."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(folder / "lock", timeout=0, thread_local=False)
+        lock.acquire()
+    except Timeout as error:
+        raise TrackingError(
+            f"{folder} must be used by one process at a time, and another one has it. "
+            "Wait for that sweep to end, or give this one another name."
+        ) from error
+    except OSError as error:
+        raise TrackingError(f"{folder} must be writable: {error}") from error
+    return lock

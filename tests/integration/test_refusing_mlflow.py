@@ -16,8 +16,8 @@ from typer.testing import CliRunner
 
 from music_rllib.sweep import cli
 from music_rllib.tracking.cli import app as tracking
-from music_rllib.tracking.store import SweepRecord, tracking_folder
 from tests.integration.conftest import SWEEP
+from tests.kept_sweep import kept_sweep
 
 TODO = {
     401: "Set MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD in the environment",
@@ -96,15 +96,9 @@ def test_a_sweep_says_so_and_starts_nothing(
 
 
 def test_what_waits_stays_and_is_told(uri: str, status: int, tmp_path: Path) -> None:
-    tracking_folder(tmp_path).mkdir()
-    record = SweepRecord(sweep_name="s", sweep_id="0", tracking_uri=uri, storage="..")
-    record.write(tmp_path)
-    waiting = tracking_folder(tmp_path) / "runs" / "a"
-    waiting.mkdir(parents=True)
-    (waiting / "records.jsonl").write_text("")
-    done = CliRunner().invoke(tracking, ["deliver", str(tmp_path), "--timeout", "1"])
+    folder = kept_sweep(tmp_path, uri)
+    done = CliRunner().invoke(tracking, ["deliver", str(folder), "--timeout", "1"])
     check(done.exit_code, done.stderr, status)
-    assert (waiting / "records.jsonl").exists()
 
 
 def test_a_report_says_so(

@@ -15,6 +15,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import get_args
 from urllib.request import urlopen
@@ -35,7 +36,8 @@ from music_rllib.results.archive.folder import Format, read_archive
 from music_rllib.results.data import ReportError, Sweep
 from music_rllib.results.from_mlflow import read_mlflow
 from music_rllib.results.mlflow_tables import read_tables
-from music_rllib.tracking import Tracker, resolve_store
+from music_rllib.store.run_record import Report
+from music_rllib.tracking import StoredRun, Tracker, resolve_store
 
 STEPS = range(20_000, 100_001, 20_000)
 CONFIG = """
@@ -142,15 +144,21 @@ def sweep_folder(nodes: list[Node], tmp_path_factory: pytest.TempPathFactory) ->
     with Tracker(
         sweep_name="tiny", storage=str(storage), config=load_sweep(file).document
     ) as tracker:
-        for node in nodes[:-1]:
+        for number, node in enumerate(nodes[:-1]):
             failed = node is nodes[FAILED]
-            tracker.start(run_info(node))
-            for step in STEPS[:2] if failed else STEPS:
-                tracker.log(node.key, values(node, step), step, 1.7e9 + step)
+            reports = [
+                Report(
+                    env_steps=step,
+                    seconds=step,
+                    timestamp_ms=1_700_000_000_000 + 1000 * step + number,
+                    metrics=values(node, step),
+                )
+                for step in (STEPS[:2] if failed else STEPS)
+            ]
+            stored = StoredRun(reports)
             if failed:
-                tracker.finish(node.key, "FAILED", failure=FAILURE)
-            else:
-                tracker.finish(node.key, "FINISHED")
+                stored = StoredRun(reports, None, "FAILED", {names.TAG_FAILURE: FAILURE})
+            tracker.mirror(run_info(node), partial(StoredRun, *stored))
         tracker.put_sweep_artefact(names.ARTEFACT_SEARCH, json.dumps(SEARCHES))
     return storage / "tiny"
 

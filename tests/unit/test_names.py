@@ -6,7 +6,7 @@ import subprocess
 import sys
 
 from music_rllib import names
-from music_rllib.tracking.spool import check_metric_name
+from music_rllib.tracking.mlflow_client import check_metric_name
 
 CONSTANTS = {
     key: value for key, value in vars(names).items() if key.isupper() and isinstance(value, str)

@@ -9,14 +9,18 @@ import sys
 import numpy as np
 
 from music_rllib import names
+from music_rllib.store.run_record import Report
 from music_rllib.tracking.curve import learning_curve, learning_curve_png
-from music_rllib.tracking.spool import Metrics
+
+
+def report(step: int, metrics: dict[str, float]) -> Report:
+    return Report(env_steps=step, seconds=step, timestamp_ms=step, metrics=metrics)
+
 
 HISTORY = [
-    Metrics(
-        time=step,
-        step=step,
-        values={
+    report(
+        step,
+        {
             names.EVAL_SUCCESS: step / 10_000,
             names.EVAL_SUCCESS_ANY: step / 5_000,
             names.MI_BOUND: 0.1,
@@ -42,28 +46,28 @@ def test_success_above_and_mutual_information_below() -> None:
 
 
 def test_a_run_without_mutual_information_has_no_empty_panel() -> None:
-    history = [Metrics(time=1, step=1, values={names.EVAL_SUCCESS: 0.5})]
+    history = [report(1, {names.EVAL_SUCCESS: 0.5})]
     assert len(learning_curve(history, title="tac").axes) == 1
 
 
 def test_a_task_without_success_has_its_return() -> None:
-    without = [Metrics(time=1, step=1, values={names.EVAL_RETURN: -7.5})]
+    without = [report(1, {names.EVAL_RETURN: -7.5})]
     (axes,) = learning_curve(without, title="reacher").axes
     assert axes.get_ylabel() == "return of an episode"
     np.testing.assert_array_equal(axes.lines[0].get_ydata(), [-7.5])
-    both = [Metrics(time=1, step=1, values={names.EVAL_RETURN: -7.5, names.EVAL_SUCCESS: 0.5})]
+    both = [report(1, {names.EVAL_RETURN: -7.5, names.EVAL_SUCCESS: 0.5})]
     (axes,) = learning_curve(both, title="push").axes
     assert axes.get_ylabel() == "success rate"
 
 
 def test_a_run_without_evaluation_says_so() -> None:
-    history = [Metrics(time=1, step=1, values={names.TRAIN_RETURN: 0.5})]
+    history = [report(1, {names.TRAIN_RETURN: 0.5})]
     texts = [text.get_text() for text in learning_curve(history, title="cut").axes[0].texts]
     assert texts == ["nothing was evaluated"]
 
 
 def test_a_nan_is_a_gap_and_the_picture_is_a_png() -> None:
-    history = [*HISTORY, Metrics(time=9, step=6000, values={names.EVAL_SUCCESS: math.nan})]
+    history = [*HISTORY, report(6000, {names.EVAL_SUCCESS: math.nan})]
     assert learning_curve_png(history, title="é$x$").startswith(b"\x89PNG")
 
 

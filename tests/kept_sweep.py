@@ -1,0 +1,29 @@
+"""A sweep that was begun, as its storage has it: nothing of it is trained."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import yaml
+
+from music_rllib.config.load import load_sweep
+from music_rllib.experiment.plan import make_plan
+from music_rllib.experiment.session import keep_record, open_sweep
+
+__all__ = ["kept_sweep"]
+
+
+def kept_sweep(storage: Path, tracking_uri: str | None = None) -> Path:
+    """The folder of a sweep `s` that was tracked, its record there but for passwords."""
+    file = storage / "s.yaml"
+    stages = [{"name": "train", "variant": "tac"}]
+    document = {"name": "s", "tasks": ["FetchReach"], "seeds": 3, "stages": stages}
+    file.write_text(yaml.safe_dump(document))
+    config = load_sweep(file, storage=str(storage))
+    folder = storage / "s"
+    keep_record(open_sweep(config, make_plan(config), str(storage), folder))
+    record = {"sweep_name": "s", "sweep_id": "0", "tracking_uri": tracking_uri, "storage": ".."}
+    (folder / "tracking").mkdir()
+    (folder / "tracking" / "sweep.json").write_text(json.dumps(record))
+    return folder
