@@ -108,7 +108,7 @@ def make_sweep(storage: Path) -> Path:
         for node in nodes:
             tracker.mirror(run_info(node), partial(StoredRun, ()))
         if not tracker.flush(600.0):
-            raise RuntimeError(f"MLflow must take {len(nodes)} runs, {tracker.backlog()} are left")
+            raise RuntimeError(f"MLflow must take {len(nodes)} runs, {tracker.pending()} are left")
     rng, now = np.random.default_rng(0), int(time.time() * 1000)
     with closing(sqlite3.connect(storage / "mlflow.db")) as database, database:
         runs = [

@@ -22,6 +22,7 @@ import numpy as np
 from filelock import FileLock
 
 from music_rllib import names
+from music_rllib.errors import BadInputError
 from music_rllib.limits import MOST_JSON_BYTES, read_json, read_regular
 from music_rllib.results.claims.plan import checked_plans
 from music_rllib.results.data import Column, Points, ReportError, RunRecord, Sweep, columns
@@ -68,18 +69,12 @@ def read_mlflow(
     """
     ahead = _begun(processes, store, sweep_id, metrics)
     file = _sqlite_file(store)
-    found = read_tables(file, name, sweep_id) if file is not None and file.is_file() else None
-    client = None if found is not None else _open(store)
     try:
-        if client is None:
-            assert found is not None
-            history = _from_databases(store, [r.run_id for r in found.children], metrics, ahead)
-            return _sweep(store, name, found, history)
-        experiment = client.get_experiment_by_name(name)
-        if experiment is None:
-            raise ReportError(_no_such_sweep(client, store, name))
-        experiment_id = str(experiment.experiment_id)
-        parent = _record(_parent(client, experiment_id, name, sweep_id))
+        if file is not None and file.is_file() and (found := read_tables(file, name, sweep_id)):
+            run_ids = [run.run_id for run in found.children]
+            return _sweep(store, name, found, _from_databases(store, run_ids, metrics, ahead))
+        client = _open(store)
+        experiment_id, parent = _parent(client, store, name, sweep_id)
         runs = _search(client, experiment_id, {names.TAG_PARENT_RUN: parent.run_id})
         if store.is_server:
             history = columns(_from_server(client, runs, metrics))
@@ -88,7 +83,7 @@ def read_mlflow(
         artefact = functools.partial(_artefact, client, parent.run_id)
         found = FoundRuns(experiment_id, parent, [_record(run) for run in runs], artefact)
         return _sweep(store, name, found, history)
-    except ReportError:
+    except BadInputError:
         raise
     except Exception as error:
         raise ReportError(
@@ -186,13 +181,16 @@ def _sqlite_file(store: TrackingStore) -> Path | None:
     return Path(store.uri.partition(":///")[2].partition("?")[0])
 
 
-def _no_such_sweep(client: MlflowClient, store: TrackingStore, name: str) -> str:
-    known = sorted(found.name for found in client.search_experiments() if found.name != "Default")
-    there = f"It has: {', '.join(known)}." if known else "It has none."
-    return f"{name!r} must be a sweep in MLflow at {store.public_uri}. {there}"
-
-
-def _parent(client: MlflowClient, experiment_id: str, name: str, sweep_id: str | None) -> Run:
+def _parent(
+    client: MlflowClient, store: TrackingStore, name: str, sweep_id: str | None
+) -> tuple[str, RunRecord]:
+    """The experiment's id, and the sweep's own run in it."""
+    experiment = client.get_experiment_by_name(name)
+    if experiment is None:
+        others = sorted(e.name for e in client.search_experiments() if e.name != "Default")
+        there = f"It has: {', '.join(others)}." if others else "It has none."
+        raise ReportError(f"{name!r} must be a sweep in MLflow at {store.public_uri}. {there}")
+    experiment_id = str(experiment.experiment_id)
     tags = {names.TAG_KIND: names.KIND_SWEEP}
     if sweep_id is not None:
         tags[names.TAG_SWEEP_ID] = sweep_id
@@ -203,7 +201,7 @@ def _parent(client: MlflowClient, experiment_id: str, name: str, sweep_id: str |
             f"the experiment {name!r} must hold a sweep's own run{which} (tag "
             f"{names.TAG_KIND}={names.KIND_SWEEP}), and holds none: no sweep was logged to it"
         )
-    return max(parents, key=lambda run: run.info.start_time or 0)
+    return experiment_id, _record(max(parents, key=lambda run: run.info.start_time or 0))
 
 
 def _search(client: MlflowClient, experiment_id: str, tags: Mapping[str, str]) -> list[Run]:

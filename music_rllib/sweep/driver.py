@@ -371,7 +371,7 @@ def _compute(
     display.say("starting a local Ray" if address is None else f"connecting to Ray at {address}")
 
     gauges = PrometheusListener(
-        opened.config.name, opened.scheduler, mlflow_log.backlog, opened.folder
+        opened.config.name, opened.scheduler, mlflow_log.pending, opened.folder
     )
     listeners: list[Listener] = [mlflow_log, display, state_file, gauges]
     if controller is not None:

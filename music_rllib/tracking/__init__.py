@@ -12,12 +12,12 @@ if TYPE_CHECKING:
     from music_rllib.experiment.run_info import RunInfo
     from music_rllib.tracking.from_store import deliver
     from music_rllib.tracking.projection import StoredRun
-    from music_rllib.tracking.sender import Backlog
+    from music_rllib.tracking.sender import Pending
     from music_rllib.tracking.store import check_reachable, resolve_store
     from music_rllib.tracking.tracker import Tracker
 
 __all__ = [
-    "Backlog",
+    "Pending",
     "RunInfo",
     "StoredRun",
     "Tracker",
@@ -27,7 +27,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    "Backlog": "sender",
+    "Pending": "sender",
     "RunInfo": "tracker",
     "StoredRun": "projection",
     "Tracker": "tracker",

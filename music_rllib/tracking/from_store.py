@@ -18,7 +18,7 @@ from music_rllib.store.node_store import NodeStore
 from music_rllib.store.object_folder import StorageError
 from music_rllib.tracking.mlflow_client import Status
 from music_rllib.tracking.projection import StoredRun
-from music_rllib.tracking.sender import Backlog
+from music_rllib.tracking.sender import Pending
 from music_rllib.tracking.store import SweepRecord
 from music_rllib.tracking.tracker import Tracker
 
@@ -49,7 +49,7 @@ def _policy(store: NodeStore, node: Node) -> bytes | None:
             return None
 
 
-def deliver(place: str, tracking_uri: str | None, timeout: float) -> Backlog:
+def deliver(place: str, tracking_uri: str | None, timeout: float) -> Pending:
     """Send to MLflow what it has not of a sweep that nobody drives.
 
     Args:

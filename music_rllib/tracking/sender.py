@@ -21,7 +21,7 @@ LONGEST_PAUSE = 30.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Backlog:
+class Pending:
     """What MLflow does not have yet."""
 
     records: int
@@ -76,12 +76,12 @@ class Sender(threading.Thread):
         self._news = True
         self._change.notify_all()
 
-    def backlog(self) -> Backlog:
+    def pending(self) -> Pending:
         """What is still to be sent, and why it has not been."""
         with self._change:
             runs = list(self._runs)
             refused = [lane.refused for lane in self._lanes() if lane.refused]
-        return Backlog(
+        return Pending(
             records=sum(run.records for run in runs),
             artefacts=sum(run.artefacts for run in runs),
             error=self._error or (refused[0] if refused else None),
@@ -94,7 +94,7 @@ class Sender(threading.Thread):
             self._wake()
             self._change.wait_for(lambda: not self._has_work(), timeout)
             self._hurry = False
-        return not self.backlog()
+        return not self.pending()
 
     def stop(self) -> None:
         """End after the request that is under way."""

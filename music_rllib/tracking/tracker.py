@@ -30,7 +30,7 @@ from music_rllib.store.run_record import Report
 from music_rllib.tracking.mlflow_client import Experiment, Status, check_metric_name, first_line
 from music_rllib.tracking.projection import End, RunProjection, Start, StoredRun
 from music_rllib.tracking.provenance import provenance_tags
-from music_rllib.tracking.sender import Backlog, Sender
+from music_rllib.tracking.sender import Pending, Sender
 from music_rllib.tracking.store import (
     SweepRecord,
     check_reachable,
@@ -87,7 +87,7 @@ class Tracker:
         self._lock = _locked(folder / "tracking")
         self._runs: dict[str, RunProjection] = {}
         self._checked_names: set[str] = set()
-        self._left: Backlog | None = None
+        self._left: Pending | None = None
         self._view: dict[str, str] = {}
         self._place = f"{redact(storage)}/{sweep_name}"
         self._provenance = provenance_tags()
@@ -210,15 +210,15 @@ class Tracker:
         """What opens MLflow's pages: a command, or a server's address."""
         return self.store.ui_command()
 
-    def backlog(self) -> Backlog:
+    def pending(self) -> Pending:
         """What MLflow does not have yet, and why; for a progress display."""
-        return self._left or self._sender.backlog()
+        return self._left or self._sender.pending()
 
     def flush(self, timeout: float) -> bool:
         """Wait until MLflow has everything; False where that takes more than ``timeout`` s."""
         return self._sender.flush(timeout)
 
-    def close(self, status: Status = "FINISHED", timeout: float = 20.0) -> Backlog:
+    def close(self, status: Status = "FINISHED", timeout: float = 20.0) -> Pending:
         """End the sweep's run, send for at most ``timeout`` s, and say what is left over.
 
         Runs that were started and not finished are marked KILLED; a later sweep continues them.
@@ -234,12 +234,12 @@ class Tracker:
             self._sender.stop()
             self._sender.join(1.0)  # a request under way ends by itself, and is harmless
             self._lock.release()
-            self._left = self._sender.backlog()
+            self._left = self._sender.pending()
         return self._left
 
     def undelivered_message(self) -> str | None:
         """What did not arrive, and how to send it; None where all arrived."""
-        left = self.backlog()
+        left = self.pending()
         if not left:
             return None
         command = shlex.join(["python", "-m", "music_rllib.tracking", "deliver", self._place])

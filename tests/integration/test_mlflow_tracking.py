@@ -233,7 +233,7 @@ def test_another_driver_that_has_the_storage_alone_goes_on_with_the_runs(
         tracker.start(run_info("a"))
         tracker.log("a", later(steps))
         tracker.flush(2.0)
-        assert tracker.backlog().records == 0  # there is no bucket for artefacts
+        assert tracker.pending().records == 0  # there is no bucket for artefacts
         tracker.close("KILLED", timeout=0.0)
         files = [file.name for file in (tmp_path / driver).rglob("*") if file.is_file()]
         assert files == ["lock"]
@@ -350,7 +350,7 @@ def test_a_final_policy_is_a_model_that_loads_and_acts(
     tracker.start(run_info("a"))
     for _ in range(2):  # as after a crash before the run was known to be whole
         tracker.mirror(run_info("a"), stored([2000], policy.read_bytes()))
-        assert tracker.flush(60.0), tracker.backlog()
+        assert tracker.flush(60.0), tracker.pending()
     assert not tracker.close(timeout=60.0)
     client = client_of(storage)
     run = runs_of(client)["finetune/a"]
@@ -660,11 +660,11 @@ def test_a_server_killed_while_logging_loses_and_doubles_nothing(
     tracker.start(run_info("b"))  # a run whose first word meets a dead server
     tracker.log("b", [report(1)])
     assert not tracker.flush(1.0)
-    assert tracker.backlog().error is not None
+    assert tracker.pending().error is not None
 
     server.start()
     server.wait()
-    assert tracker.flush(30.0), tracker.backlog()
+    assert tracker.flush(30.0), tracker.pending()
     assert caplog.text.count("does not accept records") == 1
 
     server.signal(signal.SIGSTOP)

@@ -12,7 +12,7 @@ from music_rllib.store.node_store import NodeStore
 from music_rllib.store.run_record import Report, RunResult
 from music_rllib.tracking.from_store import finished_run
 from music_rllib.tracking.mlflow_client import Status
-from music_rllib.tracking.sender import Backlog
+from music_rllib.tracking.sender import Pending
 from music_rllib.tracking.tracker import Tracker
 
 __all__ = ["MlflowListener"]
@@ -61,6 +61,6 @@ class MlflowListener(Listener):
         """Close the sweep's run and those that are open, as far as that can be done in a moment."""
         self._tracker.close("KILLED" if killed else "FAILED", timeout=10.0)
 
-    def backlog(self) -> Backlog:
+    def pending(self) -> Pending:
         """What MLflow does not have yet."""
-        return self._tracker.backlog()
+        return self._tracker.pending()

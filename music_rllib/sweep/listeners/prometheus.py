@@ -21,7 +21,7 @@ from music_rllib.experiment.plan import Node
 from music_rllib.experiment.scheduler import Scheduler, Status
 from music_rllib.store.files import write_atomically
 from music_rllib.store.run_record import Report, RunResult
-from music_rllib.tracking.sender import Backlog
+from music_rllib.tracking.sender import Pending
 
 __all__ = ["GAUGES", "TARGETS", "PrometheusListener"]
 
@@ -70,14 +70,14 @@ class PrometheusListener(Listener):
         self,
         sweep: str,
         scheduler: Scheduler,
-        backlog: Callable[[], Backlog],
+        pending: Callable[[], Pending],
         folder: Path,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
         """Say beside the sweep's `folder` where Prometheus finds them; `now` is in seconds."""
         self._sweep = sweep
         self._scheduler = scheduler
-        self._backlog = backlog
+        self._pending = pending
         self._targets = folder.parent / TARGETS / f"{folder.name}.json"
         self._now = now
         self._next = 0.0
@@ -159,9 +159,9 @@ class PrometheusListener(Listener):
         for status in Status:
             tags = {"sweep": self._sweep, "state": status.value}
             self._gauges["music_runs"].set(len(self._scheduler.having(status)), tags=tags)
-        backlog, tags = self._backlog(), {"sweep": self._sweep}
-        self._gauges["music_undelivered_records"].set(backlog.records, tags=tags)
-        self._gauges["music_undelivered_artefacts"].set(backlog.artefacts, tags=tags)
+        pending, tags = self._pending(), {"sweep": self._sweep}
+        self._gauges["music_undelivered_records"].set(pending.records, tags=tags)
+        self._gauges["music_undelivered_artefacts"].set(pending.artefacts, tags=tags)
 
     def _open(self) -> None:
         import ray

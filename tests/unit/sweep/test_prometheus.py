@@ -14,7 +14,7 @@ from music_rllib.experiment.plan import Plan, make_plan
 from music_rllib.experiment.scheduler import Scheduler
 from music_rllib.store.run_record import Report, RunResult
 from music_rllib.sweep.listeners.prometheus import PrometheusListener
-from music_rllib.tracking.sender import Backlog
+from music_rllib.tracking.sender import Pending
 
 KEPT = 3
 
@@ -58,12 +58,12 @@ def report(env_steps: int, success: float) -> Report:
 def test_what_is_exported_does_not_grow_with_the_runs_that_ended(
     exported: dict[str, dict[str, float]], plan: Plan, tmp_path: Path
 ) -> None:
-    def backlog() -> Backlog:
-        return Backlog(records=0, artefacts=0, error=None)
+    def pending() -> Pending:
+        return Pending(records=0, artefacts=0, error=None)
 
     now = iter(range(0, 1000, 10))
     gauges = PrometheusListener(
-        "s", Scheduler(plan, set()), backlog, tmp_path / "s", now=lambda: next(now)
+        "s", Scheduler(plan, set()), pending, tmp_path / "s", now=lambda: next(now)
     )
     slow, *others = plan.nodes
     paused = others.pop()
