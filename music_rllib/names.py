@@ -232,5 +232,7 @@ ARTEFACT_POLICY = "policy.safetensors"
 # Environment variables --------------------------------------------------------------------------
 VARIABLE_TRACKING_URI = "MUSIC_RLLIB_TRACKING_URI"
 """Tells the report of a sweep's end where to read, password included."""
+VARIABLE_STORAGE = "MUSIC_RLLIB_STORAGE"
+"""The same of the sweep's storage, where that is a bucket."""
 VARIABLE_REPORT = "MUSIC_RLLIB_REPORT"
 """`off`: no report at a sweep's end."""

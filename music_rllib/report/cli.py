@@ -53,7 +53,8 @@ def report(
     sweeps: Annotated[
         list[str],
         typer.Argument(
-            help="A sweep's folder, an exported one, or a sweep's name; two are put side by side.",
+            help="A sweep's folder or URI, an exported folder, or a sweep's name; two are put "
+            "side by side.",
             metavar="SWEEP",
         ),
     ],
@@ -62,7 +63,12 @@ def report(
         typer.Option(help="Folder for the report; `report` in the sweep's folder by default."),
     ] = None,
     storage: Annotated[
-        str, typer.Option(help="Where a sweep's name is looked for, as in the sweep's YAML file.")
+        str,
+        typer.Option(
+            help="Where a sweep's name is looked for, as in the sweep's YAML file.",
+            envvar=names.VARIABLE_STORAGE,
+            show_envvar=False,
+        ),
     ] = "results",
     tracking_uri: Annotated[
         str | None,

@@ -334,7 +334,7 @@ def _compute_and_report(console: Console, opened: Sweep, tracker: Tracker) -> in
     console.print(Text(f"Open MLflow's pages with: {tracker.ui_command()}"), soft_wrap=True)
     if stopped_by is None:
         config = opened.config
-        report = report_at_end(opened.folder, config.mlflow.tracking_uri, config.path)
+        report = report_at_end(opened.storage, config.name, config.mlflow.tracking_uri, config.path)
         if report is not None:
             console.print(Text(report), soft_wrap=True)
     if stopped_by is not None:

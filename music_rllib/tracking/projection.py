@@ -245,6 +245,7 @@ class RunProjection:
         known = self._experiment.find(self.node_key)
         if self._run is None and known is not None and known.whole:
             self._run = known
+            self._artefacts.clear()
             return True
         stored = read()
         assert self._start is not None, "mirror() sets it"

@@ -292,6 +292,9 @@ def test_a_reused_node_comes_with_its_history_once(storage: Path, tracker_on: Ma
     tracker.log("new", later([2000]))
     tracker.mirror(run_info("new", source_node="old"), lambda: StoredRun(later([2000])))
     tracker.close()
+    run_id = tracker.run_id("old")
+    uploaded = storage / "mlartifacts" / "smoke" / str(run_id) / "artifacts" / "config" / "run.yaml"
+    when = uploaded.stat().st_mtime_ns
     again = tracker_on()
 
     def read() -> StoredRun:
@@ -299,6 +302,8 @@ def test_a_reused_node_comes_with_its_history_once(storage: Path, tracker_on: Ma
 
     again.mirror(run_info("old"), read)
     assert not again.close()
+    assert again.run_id("old") == run_id
+    assert uploaded.stat().st_mtime_ns == when
 
     client = client_of(storage)
     runs = runs_of(client)
