@@ -14,6 +14,7 @@ import shlex
 import time
 import uuid
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -130,7 +131,7 @@ class Tracker:
         """
         told = self._run(run.node_key)
         told.start(self._as_start(run))
-        told.put_artefact(names.ARTEFACT_RUN_CONFIG, _as_yaml(run.config))
+        told.put_artefact(names.ARTEFACT_RUN_CONFIG, partial(_as_yaml, run.config))
         self._sender.add(told)
 
     def log(self, node_key: str, reports: Sequence[Report]) -> None:
@@ -173,7 +174,7 @@ class Tracker:
         """
         told = self._run(run.node_key)
         told.mirror(self._as_start(run), read)
-        told.put_artefact(names.ARTEFACT_RUN_CONFIG, _as_yaml(run.config))
+        told.put_artefact(names.ARTEFACT_RUN_CONFIG, partial(_as_yaml, run.config))
         self._sender.add(told)
 
     def put_sweep_artefact(self, name: str, content: str) -> None:
