@@ -9,10 +9,9 @@ CONFIG ?=
 PYTEST_ARGS ?=
 SECONDS ?= 600
 SEED    ?= 0
-# The tests of a file stay together and share what they set up; in the order of their names, as the
-# long ones would come last and alone otherwise.
+# The tests of a file stay together and share what they set up.
 JOBS   ?= 2
-PYTEST := $(BIN)/python -m pytest -n $(JOBS) --dist loadscope --no-loadscope-reorder
+PYTEST := $(BIN)/python -m pytest -n $(JOBS) --dist loadscope
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
