@@ -18,9 +18,15 @@ def kept_sweep(storage: Path, tracking_uri: str | None = None) -> Path:
     """The folder of a sweep `s` that was tracked, its record there but for passwords."""
     file = storage / "s.yaml"
     stages = [{"name": "train", "variant": "tac"}]
-    document = {"name": "s", "tasks": ["FetchReach"], "seeds": 3, "stages": stages}
+    document = {
+        "name": "s",
+        "tasks": ["FetchReach"],
+        "seeds": 3,
+        "stages": stages,
+        "storage": "elsewhere",
+    }
     file.write_text(yaml.safe_dump(document))
-    config = load_sweep(file, storage=str(storage))
+    config = load_sweep(file)
     folder = storage / "s"
     keep_record(open_sweep(config, make_plan(config), str(storage), folder))
     record = {"sweep_name": "s", "sweep_id": "0", "tracking_uri": tracking_uri, "storage": ".."}

@@ -76,7 +76,7 @@ def deliver(place: str, tracking_uri: str | None, timeout: float) -> Pending:
     tracker = Tracker(
         sweep_name=found.name,
         storage=found.storage,
-        config=sweep.config.document,
+        config=found.read(sweep_files.CONFIG),
         tracking_uri=tracking_uri or record.tracking_uri,
         sweep_folder=sweep.folder,
     )

@@ -28,6 +28,7 @@ from mlflow.tracking._tracking_service import utils as tracking_utils
 from typer.testing import CliRunner
 
 from music_rllib import names
+from music_rllib.config.load import load_sweep
 from music_rllib.errors import TrackingError
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.location import find_sweep
@@ -472,7 +473,8 @@ def test_the_command_sends_what_the_store_has(
     storage: Path, tracker_on: MakeTracker, tmp_path: Path
 ) -> None:
     folder = kept_sweep(storage)
-    tracker_on(sweep_name="s").close("KILLED")
+    config = load_sweep(storage / "s.yaml")
+    tracker_on(sweep_name="s", config=config.document).close("KILLED")
     plan = find_sweep(str(folder), None).open().plan
     finished, begun, _ = plan.nodes
     node, store = tmp_path / "node", NodeStore(str(storage))
@@ -492,6 +494,7 @@ def test_the_command_sends_what_the_store_has(
         assert (done.exit_code, done.stdout) == (0, f"MLflow has everything of {folder}\n")
         runs = runs_of(client_of(storage), "s")
         of_node = {run.data.tags.get(names.TAG_NODE_KEY): run for run in runs.values()}
+        assert not [key for key in runs["s"].data.tags if key.startswith(names.TAG_CHANGED_PREFIX)]
         assert {run.info.run_name: run.info.status for run in runs.values()} == {
             "s": "KILLED",
             of_node[finished.key].info.run_name: "FINISHED",
