@@ -288,7 +288,6 @@ def _open_tracker(opened: Sweep) -> Tracker:
         storage=opened.storage,
         config=opened.config.document,
         tracking_uri=opened.config.mlflow.tracking_uri,
-        sweep_folder=opened.folder,
     )
     tracker.keep_view(comparison_view(opened.plan, tracker.sweep_id, time.time()), VERSIONS)
     return tracker

@@ -78,7 +78,6 @@ def deliver(place: str, tracking_uri: str | None, timeout: float) -> Pending:
         storage=found.storage,
         config=found.read(sweep_files.CONFIG),
         tracking_uri=tracking_uri or record.tracking_uri,
-        sweep_folder=sweep.folder,
     )
     outcome = state["driver"]["outcome"] if state else ""
     causes = {one["run"]: one["cause"] for one in state["failures"]} if state else {}

@@ -27,6 +27,7 @@ from music_rllib import names
 from music_rllib.errors import TrackingError
 from music_rllib.experiment.run_info import RunInfo
 from music_rllib.redaction import flat_params, redact, without_secrets
+from music_rllib.store.paths import sweep_folder
 from music_rllib.store.run_record import Report
 from music_rllib.tracking.mlflow_client import Experiment, Status, check_metric_name, first_line
 from music_rllib.tracking.projection import End, RunProjection, Start, StoredRun
@@ -35,7 +36,6 @@ from music_rllib.tracking.sender import Pending, Sender
 from music_rllib.tracking.store import (
     SweepRecord,
     check_reachable,
-    local_folder,
     resolve_store,
     version,
 )
@@ -64,7 +64,6 @@ class Tracker:
         storage: str,
         config: Mapping[str, object],
         tracking_uri: str | None = None,
-        sweep_folder: Path | None = None,
     ) -> None:
         """Check the store, create the experiment and the parent run, begin to send.
 
@@ -74,17 +73,14 @@ class Tracker:
             config: the whole sweep's settings: params and the artefact ``config/sweep.yaml``
                 of the parent run.
             tracking_uri: ``mlflow.tracking_uri``; None for a sqlite file in ``storage``.
-            sweep_folder: the sweep's own files on this machine; ``<storage>/<sweep_name>`` by
-                default, needed where the storage is a bucket.
 
         Raises:
             TrackingError: where the store is not reachable or refuses, where the storage is not
                 writable, or where another process tracks this sweep.
-            ValueError: where ``sweep_folder`` is missing.
         """
         self.store = resolve_store(tracking_uri, storage)
         check_reachable(self.store)
-        folder = sweep_folder or _default_folder(storage, sweep_name)
+        folder = sweep_folder(storage, sweep_name)
         self._lock = _locked(folder / "tracking")
         self._runs: dict[str, RunProjection] = {}
         self._checked_names: set[str] = set()
@@ -334,13 +330,6 @@ def _as_yaml(settings: Mapping[str, object]) -> bytes:
     """Settings as a file, no secret in it."""
     plain = json.loads(json.dumps(without_secrets(settings), default=str))
     return str(yaml.safe_dump(plain, sort_keys=False, allow_unicode=True)).encode()
-
-
-def _default_folder(storage: str, sweep_name: str) -> Path:
-    folder = local_folder(storage)
-    if folder is None:
-        raise ValueError(f"sweep_folder must be given where storage is a bucket, got {storage}")
-    return folder / sweep_name
 
 
 def _locked(folder: Path) -> FileLock:

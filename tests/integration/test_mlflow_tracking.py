@@ -228,9 +228,8 @@ def test_another_driver_that_has_the_storage_alone_goes_on_with_the_runs(
     )
     uri = f"sqlite:///{storage}/mlflow.db"
     for driver, steps in (("one", STEPS[:6]), ("two", STEPS)):
-        tracker = tracker_on(
-            storage="s3://lab/results", tracking_uri=uri, sweep_folder=tmp_path / driver
-        )
+        monkeypatch.setenv("HOME", str(tmp_path / driver))
+        tracker = tracker_on(storage="s3://lab/results", tracking_uri=uri)
         tracker.start(run_info("a"))
         tracker.log("a", later(steps))
         tracker.flush(2.0)
