@@ -9,12 +9,17 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 
-__all__ = ["SYMBOLS", "ShortLabels", "is_meant", "symbol"]
+__all__ = ["SYMBOLS", "ShortLabels", "in_runs", "is_meant", "symbol"]
 
 SYMBOLS = {"q": "entropic_index", "weight": "mi_reward_weight"}
 """What papers, tables and labels call a setting to its name."""
 _NAME = re.compile(r"(?<![\w.])(?:(?:tac|music|replay|evaluation)\.)?(\w+)(?==)")
 _ITEM = re.compile(r",(?=[\w:.-]+=)")
+
+
+def in_runs(number: int) -> str:
+    """`1 run`, `2 runs`."""
+    return "1 run" if number == 1 else f"{number} runs"
 
 
 class ShortLabels:

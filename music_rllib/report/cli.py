@@ -163,6 +163,7 @@ def _export(
     *,
     add: bool,
 ) -> None:
+    from music_rllib.labels import in_runs
     from music_rllib.report.location import find_sweep
     from music_rllib.results.archive.folder import is_archive, read_archive, write_archive
     from music_rllib.results.archive.merge import merged
@@ -179,7 +180,7 @@ def _export(
         sweep = merged(earlier, sweep)
     write_archive(sweep, folder, table_format.value)
     values = sum(len(column.run) for column in sweep.history.values())
-    typer.echo(f"{len(sweep.runs)} runs, {values} values: {folder}")
+    typer.echo(f"{in_runs(len(sweep.runs))}, {values} values: {folder}")
 
 
 def _report(

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from music_rllib import names
-from music_rllib.labels import ShortLabels
+from music_rllib.labels import ShortLabels, in_runs
 from music_rllib.results.analysis import StageAnalysis
 from music_rllib.results.data import Sweep
 
@@ -66,9 +66,9 @@ def _missing_runs(sweep: Sweep) -> list[str]:
     waiting = [name for name in planned or () if name not in known]
     if waiting:
         short = ShortLabels.of(planned or ())
-        notes.append(f"{_runs(len(waiting))} not begun: {_some([*map(short, waiting)])}.")
+        notes.append(f"{in_runs(len(waiting))} not begun: {_some([*map(short, waiting)])}.")
     states = Counter(run.status for run in sweep.runs)
-    notes += [f"{_runs(states[s])} {words}." for s, words in _STATES.items() if states[s]]
+    notes += [f"{in_runs(states[s])} {words}." for s, words in _STATES.items() if states[s]]
     return notes
 
 
@@ -99,7 +99,7 @@ def _missing_records(sweep: Sweep, undelivered: int) -> list[str]:
         )
     if undelivered:
         notes.append(
-            f"Not everything of {_runs(undelivered)} has reached MLflow yet; send it with "
+            f"Not everything of {in_runs(undelivered)} has reached MLflow yet; send it with "
             "`python -m music_rllib.tracking deliver` and the sweep's folder, then report again."
         )
     return notes
@@ -107,10 +107,6 @@ def _missing_records(sweep: Sweep, undelivered: int) -> list[str]:
 
 def _finished(sweep: Sweep, runs: Iterable[int]) -> bool:
     return any(sweep.runs[run].status == "FINISHED" for run in runs)
-
-
-def _runs(count: int) -> str:
-    return "1 run" if count == 1 else f"{count} runs"
 
 
 def _some(labels: Sequence[str]) -> str:

@@ -17,7 +17,7 @@ from music_rllib import names
 from music_rllib.config.schema import Stage
 from music_rllib.config.search.settings import SearchSettings
 from music_rllib.experiment.plan import Plan, short
-from music_rllib.labels import symbol
+from music_rllib.labels import in_runs, symbol
 from music_rllib.results.comparison import with_interval
 from music_rllib.results.from_store import Condition, conditions, entropies
 from music_rllib.search.objective import interval
@@ -186,6 +186,6 @@ def best_in_words(best: Mapping[str, Any]) -> str:
     if runs < planned:
         text += f"{runs} of {planned} runs (no condition has all of its runs yet)"
     else:
-        text += f"{runs} runs{' on fresh seeds' if best['on_fresh_seeds'] else ''}"
+        text += f"{in_runs(runs)}{' on fresh seeds' if best['on_fresh_seeds'] else ''}"
     entropy = best.get("entropies", {}).get(names.SHANNON_ENTROPY)
     return text if entropy is None else f"{text}, entropy {entropy['value']:.3g} nats"

@@ -18,6 +18,7 @@ from music_rllib.errors import BadInputError
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.plan import Run
 from music_rllib.experiment.session import Sweep
+from music_rllib.labels import in_runs
 from music_rllib.redaction import redact
 from music_rllib.results.comparison import with_interval
 from music_rllib.results.from_store import Condition, conditions, entropies
@@ -59,7 +60,7 @@ def export_best(sweep: Sweep, stage: str | None, output: Path) -> dict[str, Any]
         "on_fresh_seeds": best.part == "final",
         "why": f"{best.stage}: {best.label} is first by {by} {fresh}; {by} "
         f"({'' if 'trial' in about else 'mean, '}95 %): {number} over "
-        f"{len(best.runs)} runs{rest}",
+        f"{in_runs(len(best.runs))}{rest}",
         "policies": [],
     }
     for task in best.tasks:

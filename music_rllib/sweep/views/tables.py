@@ -17,7 +17,7 @@ from music_rllib.config.search.space import Choice, Dimension
 from music_rllib.envs.tasks import Task
 from music_rllib.experiment.plan import Node, Plan, short
 from music_rllib.experiment.scheduler import Status
-from music_rllib.labels import ShortLabels
+from music_rllib.labels import ShortLabels, in_runs
 from music_rllib.results.comparison import SHOW_SEEDS_BELOW, with_interval
 from music_rllib.store.run_record import RunResult
 from music_rllib.sweep.views.text import clock, measured, percent
@@ -182,7 +182,7 @@ def _axes(stage: Stage) -> list[str]:
 
 def _summary(plan: Plan, finished: Collection[str]) -> str:
     left = [node for node in plan.nodes if node.key not in finished]
-    parts = [f"{len(plan.runs)} runs"]
+    parts = [in_runs(len(plan.runs))]
     if len(plan.nodes) < len(plan.runs):
         parts.append(f"{len(plan.nodes)} different ones")
     parts.append(f"{plan.env_steps:,} env steps in all")

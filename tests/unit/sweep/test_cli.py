@@ -76,7 +76,7 @@ def from_checkpoint(folder: Path) -> Document:
 def test_a_dry_run_shows_the_plan_and_leaves_nothing(program: Program, tmp_path: Path) -> None:
     result = program(document(), "--dry-run")
     assert result.exit_code == 0
-    assert "1 runs, 200,000 env steps in all." in result.output
+    assert "1 run, 200,000 env steps in all." in result.output
     assert f"Storage: {tmp_path}/results" in result.output
     assert [path.name for path in tmp_path.iterdir()] == ["sweep.yaml"]
 

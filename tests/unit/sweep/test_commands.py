@@ -316,7 +316,7 @@ def test_a_condition_with_all_its_runs_is_better_than_a_lucky_one(
     assert "1 of 3 runs (no condition has all of its runs yet)" in said
     lucky = program("best", f"{storage}/mine", "--output", "lucky", "--json").document
     assert lucky["values"] == {"tac.entropic_index": 2.0}
-    assert "over 1 runs, of 3 planned: no condition has all of its runs" in lucky["why"]
+    assert "over 1 run, of 3 planned: no condition has all of its runs" in lucky["why"]
     with StateFile(sweep) as state_file:
         state_file.reused(next(n for n in sweep.plan.nodes if n.key in sweep.finished))
         play(state_file, (1.0, 0), (1.5, 0), (1.5, 1), (1.5, 2))
