@@ -80,6 +80,16 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         items[:] = [item for item in items if not item.get_closest_marker("thorough")]
 
 
+@pytest.fixture(autouse=True)
+def _leaves_the_working_folder() -> Iterator[None]:
+    """A test that goes elsewhere and stays there breaks another one, in some order of the files."""
+    before = Path.cwd()
+    yield
+    if Path.cwd() != before:
+        os.chdir(before)
+        pytest.fail("the test left another working folder behind: use monkeypatch.chdir")
+
+
 # Service -> where its program may be: a name on PATH, or a pattern below the root folder.
 _SERVICES = {
     "postgresql": ("postgres", "usr/lib/postgresql/*/bin/postgres"),

@@ -533,14 +533,8 @@ def test_a_newcomers_screen_stays_clean(fresh_store: FreshStore) -> None:
 DRIVER = """
 import sys, time
 from music_rllib import names
-from music_rllib.experiment.location import find_sweep
-from music_rllib.report.location import find_sweep as find_report
-from music_rllib.store.node_store import NodeStore
-from music_rllib.store.run_record import HISTORY, Report, RunResult, last_values, to_json_lines
-from music_rllib.tracking.cli import app
-from tests.kept_sweep import kept_sweep
-from typer.testing import CliRunner
-from music_rllib.tracking import Tracker, RunInfo
+from music_rllib.store.run_record import Report
+from music_rllib.tracking import RunInfo, Tracker
 tracker = Tracker(sweep_name="smoke", storage=sys.argv[1], config={"name": "smoke", "seeds": [0]})
 tracker.start(RunInfo(node_key="a", name="finetune/a", config={"seed": 0}))
 for step in range(1, 10_000):

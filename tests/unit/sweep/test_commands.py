@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import signal
 import threading
 from collections.abc import Callable
@@ -541,8 +540,10 @@ def test_an_analysis_plan_is_recorded_and_changes_no_run(
     assert (refused.code, "as they were recorded" in refused.errors) == (2, True)
 
 
-def test_plan_as_json_with_more_seeds(tmp_path: Path, program: Program) -> None:
-    os.chdir(tmp_path)
+def test_plan_as_json_with_more_seeds(
+    tmp_path: Path, program: Program, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     Path("sweep.yaml").write_text(yaml.safe_dump(SWEEP | {"resources": {"num_cpus": 1}}))
     plan = program("plan", "sweep.yaml", "--seeds", "5", "--json").document
     assert plan["seeds"] == [0, 1, 2, 3, 4]
