@@ -5,8 +5,9 @@ A *panel* is one task's; it draws itself on the axes that it is given.
 
 from __future__ import annotations
 
+import itertools
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -131,9 +132,16 @@ def curve_panel(
     numbers = {condition: number for number, condition in enumerate(styles)}
 
     def draw(axes: Axes) -> None:
-        for at, (curve, rank) in enumerate(zip(curves, ranks, strict=True)):
-            artists = _draw_curve(axes, curve, styles[curve.condition], rank, at / len(curves))
-            belongs(artists, numbers[curve.condition], curve.condition.label)
+        drawn = [
+            _draw_curve(axes, curve, styles[curve.condition], rank, at / len(curves))
+            for at, (curve, rank) in enumerate(zip(curves, ranks, strict=True))
+        ]
+        axes.autoscale_view()
+        # Of what was seen: a band of two seeds may be many times as wide.
+        axes.set_ylim(axes.get_ylim())
+        for curve, artists in zip(curves, drawn, strict=True):
+            band = _band(axes, curve.steps, curve.estimate, styles[curve.condition].colour)
+            belongs([*artists, band], numbers[curve.condition], curve.condition.label)
         axes.set_xlim(left=0.0)
         axes.set_ylabel(metric.axis)
         axes.set_xlabel("environment steps")
@@ -250,17 +258,8 @@ def _draw_curve(
     artists: list[Artist] = []
     if 1 < len(curve.values) < SHOW_SEEDS_BELOW:
         artists += axes.plot(curve.steps, curve.values.T, color=colour, linewidth=0.6, alpha=0.55)
-    points = np.column_stack([curve.steps, value])
     whole = curve.runs == curve.runs.max()
-    segments: dict[tuple[int, bool], list[Array]] = {}
-    for at in range(len(points) - 1):
-        key = (int(min(rank[at], rank[at + 1])), bool(whole[at + 1]))
-        runs = segments.setdefault(key, [])
-        if runs and runs[-1][-1][0] == points[at][0]:
-            runs[-1] = np.vstack([runs[-1], points[at + 1]])
-        else:
-            runs.append(points[at : at + 2])
-    for (covers, thick), runs in segments.items():
+    for (covers, thick), runs in _alike(np.column_stack([curve.steps, value]), rank, whole):
         dashed = (0.0, (_DASH, _DASH * covers)) if covers else line
         width = 1.8 if thick else 0.8
         made = LineCollection(runs, colors=colour, linestyles=[dashed], linewidths=width, zorder=2)
@@ -276,12 +275,22 @@ def _draw_curve(
         markevery=(int(stagger * every), every),
         markersize=5,
     )
-    axes.autoscale_view()
-    limits = axes.get_ylim()  # of what was seen: a band of two seeds may be many times as wide
-    artists.append(_band(axes, curve.steps, curve.estimate, colour))
-    axes.set_ylim(*limits)
-    axes.set_autoscaley_on(True)
     return artists
+
+
+def _alike(
+    points: Array, rank: Array, whole: Array
+) -> Iterator[tuple[tuple[int, bool], list[Array]]]:
+    """Stretches of a curve by how many others they cover and by whether every run counts there."""
+    covers = np.minimum(rank[:-1], rank[1:])
+    changes = np.flatnonzero((np.diff(covers) != 0) | (whole[1:-1] != whole[2:])) + 1
+    ends = [0, *changes, len(covers)]
+    stretches: dict[tuple[int, bool], list[Array]] = {}
+    for first, last in itertools.pairwise(ends):
+        if first < last:
+            key = (int(covers[first]), bool(whole[first + 1]))
+            stretches.setdefault(key, []).append(points[first : last + 1])
+    yield from stretches.items()
 
 
 def _band(
