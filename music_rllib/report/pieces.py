@@ -13,7 +13,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from jinja2.utils import htmlsafe_json_dumps
 
-from music_rllib.report.figures.palette import Style
+from music_rllib.report.figures.palette import DASHES, Style
 
 __all__ = ["Cell", "Figure", "Panels", "TextTable", "document", "number"]
 
@@ -23,7 +23,6 @@ _POLICY = (
     "default-src 'none'; script-src 'sha256-{script}'; connect-src {connect}; "
     "style-src 'unsafe-inline'; img-src data:; media-src data:; base-uri 'none'; form-action 'none'"
 )
-_DASHES = {"solid": "", "dashed": "6 3", "dashdot": "6 2 1.5 2", "dotted": "1.5 2.5"}
 _MARKS = {"o": "●", "s": "■", "D": "◆", "^": "▲", "v": "▼", "P": "✚", "X": "✖", "*": "★"}
 
 
@@ -132,7 +131,7 @@ def document(data: Any, *, live: bool, **content: Any) -> str:
         # As JSON, in which no text can end the element.
         data=htmlsafe_json_dumps(data, separators=(",", ":"), allow_nan=False),
         policy=_POLICY.format(script=digest, connect="'self'" if live else "'none'"),
-        dashes=_DASHES,
+        dashes=DASHES,
         marks=_MARKS,
         live=live,
         **content,

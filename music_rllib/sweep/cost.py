@@ -12,7 +12,7 @@ from typing import Any
 from rich.table import Table
 
 from music_rllib.config.run_settings import RunSettings
-from music_rllib.config.schema import SweepConfig
+from music_rllib.config.schema import Stage, SweepConfig
 from music_rllib.experiment.plan import Plan
 from music_rllib.runtime import machine
 from music_rllib.runtime.ray_cluster import cluster
@@ -83,40 +83,40 @@ def kinds(config: SweepConfig, plan: Plan, finished: Collection[str]) -> list[Ki
         )
         for group in groups.values()
     ]
-    return found + list(_searched(config))
+    return found + [kind for stage in config.stages for kind in searched(config, stage)]
 
 
-def _searched(config: SweepConfig) -> Iterator[Kind]:
+def searched(config: SweepConfig, stage: Stage) -> Iterator[Kind]:
+    """What the search of a stage asks for at most, with what its fresh seeds start from."""
     stages = {stage.name: stage for stage in config.stages}
-    for stage in config.stages:
-        if stage.search is None:
-            continue
-        source = stages.get(str(stage.source.stage)) if stage.source else None
-        if source is not None and stage.search.final is not None:
-            for task in source.tasks:
-                settings = source.points[0].runs[task.name]
-                yield Kind(
-                    label=f"{source.name}/{task.name}, fresh seeds",
-                    runs=stage.search.final.seeds,
-                    settings=settings,
-                    env_steps=settings.env_steps,
-                )
-        final, budget = stage.search.final, search_budget(stage, stage.search)
-        fresh = fresh_runs(stage, stage.search) // len(stage.tasks)
-        runs = search_runs(stage, stage.search, len(config.seeds)) // len(stage.tasks) - fresh
-        longer = None if final is None else final.env_steps
-        for task in stage.tasks:
-            settings, label = stage.points[0].runs[task.name], f"{stage.name}/{task.name}"
+    if stage.search is None:
+        return
+    source = stages.get(str(stage.source.stage)) if stage.source else None
+    if source is not None and stage.search.final is not None:
+        for task in source.tasks:
+            settings = source.points[0].runs[task.name]
             yield Kind(
-                label=label,
-                runs=runs if longer else runs + fresh,
+                label=f"{source.name}/{task.name}, fresh seeds",
+                runs=stage.search.final.seeds,
                 settings=settings,
-                env_steps=budget,
+                env_steps=settings.env_steps,
             )
-            if longer:
-                yield Kind(
-                    label=f"{label}, fresh seeds", runs=fresh, settings=settings, env_steps=longer
-                )
+    final, budget = stage.search.final, search_budget(stage, stage.search)
+    fresh = fresh_runs(stage, stage.search) // len(stage.tasks)
+    runs = search_runs(stage, stage.search, len(config.seeds)) // len(stage.tasks) - fresh
+    longer = None if final is None else final.env_steps
+    for task in stage.tasks:
+        settings, label = stage.points[0].runs[task.name], f"{stage.name}/{task.name}"
+        yield Kind(
+            label=label,
+            runs=runs if longer else runs + fresh,
+            settings=settings,
+            env_steps=budget,
+        )
+        if longer:
+            yield Kind(
+                label=f"{label}, fresh seeds", runs=fresh, settings=settings, env_steps=longer
+            )
 
 
 def measure(

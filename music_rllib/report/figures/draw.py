@@ -209,7 +209,7 @@ def drawn_figure(panels: Sequence[Panel], legend: Legend, width: float, font: fl
     if entries:
         handles = [
             Line2D(
-                [], [], color=style.colour, marker=style.marker, linestyle=style.line, label=label
+                [], [], color=style.colour, marker=style.marker, linestyle=style.stroke, label=label
             )
             for label, style in entries
         ]

@@ -91,7 +91,7 @@ def _panel(
             axes.set_ylim(low - room, high + room)
         handles = [
             Line2D(
-                [], [], color=style.colour, marker=style.marker, linestyle=style.line, label=label
+                [], [], color=style.colour, marker=style.marker, linestyle=style.stroke, label=label
             )
             for label, style in (lines[one.condition] for one in found)
         ]

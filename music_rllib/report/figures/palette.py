@@ -19,6 +19,7 @@ from music_rllib.results.conditions import Condition
 __all__ = [
     "BARS",
     "DARK",
+    "DASHES",
     "LIGHT",
     "Style",
     "colour_of",
@@ -46,8 +47,18 @@ _MARKERS = "osD^vPX"
 _ALIKE = 60.0
 """Distance in RGB below which thin lines look the same: that of q = 1 and 1.1."""
 
-Line = Literal["solid", "dashed", "dashdot", "dotted"]
+Line = Literal["solid", "dashed", "dashdot", "dotted", "long", "dashdotdot"]
+Stroke = Literal["solid", "dashed", "dashdot", "dotted"] | tuple[float, tuple[float, ...]]
 _LINES: tuple[Line, ...] = get_args(Line)
+DASHES: Mapping[Line, str] = {
+    "solid": "",
+    "dashed": "6 3",
+    "dashdot": "6 2 1.5 2",
+    "dotted": "1.5 2.5",
+    "long": "13 3",
+    "dashdotdot": "6 2 1.5 2 1.5 2",
+}
+"""On the page, in SVG's words."""
 
 
 class Style(NamedTuple):
@@ -56,6 +67,13 @@ class Style(NamedTuple):
     colour: str
     marker: str
     line: Line
+
+    @property
+    def stroke(self) -> Stroke:
+        """The line in Matplotlib's words, which know four."""
+        if self.line == "long" or self.line == "dashdotdot":
+            return 0.0, tuple(float(dash) / 1.5 for dash in DASHES[self.line].split())
+        return self.line
 
 
 @functools.cache

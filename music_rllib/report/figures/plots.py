@@ -163,7 +163,8 @@ def profile_panel(scope: Scope[Condition], siblings: tuple[Condition, ...]) -> P
 
     def draw(axes: Axes) -> None:
         for final, profile in profiles:
-            colour, _, line = style_of(final.condition, siblings)
+            style = style_of(final.condition, siblings)
+            colour, line = style.colour, style.stroke
             lines = axes.step(
                 thresholds, profile.value, where="post", color=colour, linestyle=line, linewidth=1.8
             )
@@ -253,7 +254,7 @@ def _draw_curve(
 
     Where lines coincide the later ones are dashed, so that each earlier one shows in the gaps.
     """
-    colour, marker, line = style
+    colour, marker, line = style.colour, style.marker, style.stroke
     value = curve.estimate.value
     artists: list[Artist] = []
     if 1 < len(curve.values) < SHOW_SEEDS_BELOW:

@@ -38,13 +38,15 @@ def _profile(task: str, means: Sequence[Mean], study: Study) -> Panel:
         for mean in means:
             scores = np.array(list(mean.scores.by_seed.values()))[:, np.newaxis]
             profile = st.performance_profile(scores, thresholds)
-            colour, _, line = style_of(mean.condition, _siblings(study))
-            axes.step(thresholds, profile.value, where="post", color=colour, linestyle=line)
+            style = style_of(mean.condition, _siblings(study))
+            axes.step(
+                thresholds, profile.value, where="post", color=style.colour, linestyle=style.stroke
+            )
             axes.fill_between(
                 thresholds,
                 profile.lower,
                 profile.upper,
-                color=colour,
+                color=style.colour,
                 alpha=0.2,
                 linewidth=0,
                 step="post",

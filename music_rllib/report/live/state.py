@@ -37,6 +37,8 @@ class Progress:
         if state is None:
             return {"sweep": self._found.name, "state": "not started"}
         driver, steps = state["driver"], state["env_steps"]
+        to_come = steps.get("to_come", 0)  # absent from what an earlier version wrote
+        left = steps["left"] + to_come
         running = sweep_files.is_alive(state)
         outcome = driver["outcome"]
         speed = self._speed(driver["heartbeat"], steps["done"]) if running else None
@@ -46,9 +48,10 @@ class Progress:
             "since": driver["started"],
             "ended": None if running else driver["ended"],
             "done": steps["done"],
-            "left": steps["left"],
+            "left": left,
+            "at_most": to_come > 0,
             "speed": speed,
-            "seconds_left": steps["left"] / speed if speed else None,
+            "seconds_left": left / speed if speed else None,
             "stages": [{"name": one["name"], "runs": one["runs"]} for one in state["stages"]],
             "running": [
                 {

@@ -9,6 +9,7 @@ import numpy as np
 
 from music_rllib import names
 from music_rllib.report.figures.choice import Drawing, named_by_stage
+from music_rllib.report.figures.palette import DASHES
 from music_rllib.report.figures.plots import EPOCH
 from music_rllib.results.analysis import Curve
 from music_rllib.results.comparison import SHOW_SEEDS_BELOW
@@ -18,7 +19,6 @@ from music_rllib.results.statistics import Array
 
 __all__ = ["chart_data"]
 
-_DASHES = {"solid": "", "dashed": "6 3", "dashdot": "6 2 1.5 2", "dotted": "1.5 2.5"}
 _FIGURES = 4
 """Significant ones: more cannot be seen."""
 
@@ -87,7 +87,7 @@ def _stage(name: str, drawings: Sequence[Drawing]) -> dict[str, Any]:
                 # Of all stages together a label begins with its stage: the same condition.
                 "key": label if together else f"{name}, {label}",
                 "colour": style.colour,
-                "dash": _DASHES[style.line],
+                "dash": DASHES[style.line],
             }
             for label, style in legend
         ],

@@ -60,8 +60,9 @@ function showState(state) {
   element("strong", {}, head, `The sweep is ${state.state}. `);
   if (state.done !== undefined) {
     const speed = state.speed ? `, ${shown(state.speed)} env steps per second` : "";
-    const left = state.seconds_left ? `, ${time(state.seconds_left)} left` : "";
-    head.append(`${state.done.toLocaleString("en")} env steps done, ${state.left.toLocaleString("en")} to go${speed}${left}. `);
+    const most = state.at_most ? "at most " : "";
+    const left = state.seconds_left ? `, ${most}${time(state.seconds_left)} left` : "";
+    head.append(`${state.done.toLocaleString("en")} env steps done, ${most}${state.left.toLocaleString("en")} to go${speed}${left}. `);
   }
   if (state.error) head.append(state.error);
   act(head, "stop", "/stop", state.state === "running");

@@ -29,6 +29,7 @@ from music_rllib.store.lease import process_start, this_machine
 from music_rllib.store.node_store import steps_of
 from music_rllib.store.object_folder import StorageError
 from music_rllib.store.run_record import Report, RunResult, last_values
+from music_rllib.sweep.cost import searched
 
 __all__ = ["StateFile"]
 
@@ -209,13 +210,26 @@ class StateFile(Listener):
         return {
             "sweep": sweep.config.name,
             "stages": stages,
-            "env_steps": {"done": steps_done, "left": steps_left},
+            "env_steps": {"done": steps_done, "left": steps_left, "to_come": self._to_come()},
             "running": running,
             "best": best_so_far(self._at_the_task(), sweep.plan, self._results, searches),
             "searches": searches,
             "pruned": [node.key for node in sweep.scheduler.having(Status.PRUNED)],
             "failures": self._failures[-SHOWN_FAILURES:],
         }
+
+    def _to_come(self) -> int:
+        """Environment steps of runs that the searches have not asked for yet, at most."""
+        config, plan = self._sweep.config, self._sweep.plan
+        steps = 0
+        for stage in config.stages:
+            asked = [run for run in plan.runs if run.stage == stage.name]
+            if stage.search is None or any(str(run.trial).startswith("final") for run in asked):
+                continue  # the runs on fresh seeds are asked for last, and all at once
+            at_most = sum(kind.runs * kind.env_steps for kind in searched(config, stage))
+            known = sum(node.run.env_steps for node in plan.nodes if node.stage == stage.name)
+            steps += max(0, at_most - known)
+        return steps
 
     def _at_the_task(self) -> list[Stage]:
         """Stages that train for the task: MUSIC-u's success is chance."""

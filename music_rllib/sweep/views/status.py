@@ -36,7 +36,10 @@ def status_view(state: Mapping[str, Any], labels: Iterable[str] = ()) -> Rendera
     parts: list[RenderableType] = [title, Text(_times(state)), _stages(state)]
     label = ShortLabels.of(labels)
     done, left = state["env_steps"]["done"], state["env_steps"]["left"]
-    parts.append(Text(f"Budget: {done:,} env steps spent, {left:,} left of what is known so far"))
+    budget = f"Budget: {done:,} env steps spent, {left:,} left of what is known so far"
+    if to_come := state["env_steps"].get("to_come"):
+        budget += f", at most {to_come:,} more that searches may ask for"
+    parts.append(Text(budget))
     if state["best"] is not None:
         parts.append(Text(f"Best so far: {best_in_words(state['best'])}"))
     parts += [_search(search) for search in state["searches"]]

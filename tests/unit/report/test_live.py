@@ -24,7 +24,7 @@ QUEUED = {**RUNNING, "run": "train/A/seed1", "env_steps": 0}
 CONFIG = {"tasks": ["A"], "stages": [{"name": "train", "tasks": None}]}
 
 
-def write_state(folder: Path, done: int, heartbeat: float, **driver: Any) -> None:
+def write_state(folder: Path, done: int, heartbeat: float, to_come: int = 0, **driver: Any) -> None:
     state = {
         "sweep": "tiny",
         "driver": {
@@ -39,7 +39,7 @@ def write_state(folder: Path, done: int, heartbeat: float, **driver: Any) -> Non
             **driver,
         },
         "stages": [{"name": "train", "runs": {"started": 1, "waiting": 2}}],
-        "env_steps": {"done": done, "left": 300 - done},
+        "env_steps": {"done": done, "left": 300 - done, "to_come": to_come},
         "running": [RUNNING, QUEUED],
         "best": None,
         "searches": [],
@@ -67,6 +67,9 @@ def test_speed_and_the_time_left_are_those_of_the_last_minutes(
     assert (seen["state"], seen["done"], seen["left"]) == ("running", 200, 100)
     assert (seen["speed"], seen["seconds_left"]) == pytest.approx((10.0, 10.0))
     assert [run["run"] for run in seen["running"]] == ["seed0"], "in short, and none that waits"
+    write_state(tmp_path, 200, now - 10, to_come=500)
+    seen = progress.read()
+    assert (seen["left"], seen["at_most"], seen["seconds_left"]) == (600, True, pytest.approx(60.0))
     # A driver that has been silent for long does not run, whatever it said last.
     write_state(tmp_path, 200, now - 1000)
     seen = progress.read()

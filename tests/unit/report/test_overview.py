@@ -10,8 +10,10 @@ from matplotlib.figure import Figure
 from music_rllib import names
 from music_rllib.report.build import PICTURE, build_report, write_report
 from music_rllib.report.figures.overview import overview
+from music_rllib.report.figures.palette import styles_of
 from music_rllib.results.analysis import analyse
 from music_rllib.results.archive.folder import read_archive
+from music_rllib.results.conditions import Condition
 from music_rllib.results.data import Sweep
 
 DATA = Path(__file__).parents[3] / "docs" / "results" / "data"
@@ -61,3 +63,13 @@ def test_one_stage_is_told_by_its_q(tmp_path: Path) -> None:
     success = {names.EVAL_SUCCESS: sweep.history[names.EVAL_SUCCESS]}
     write_report(build_report(replace(sweep, history=success)), tmp_path)
     assert (tmp_path / "figures" / f"{PICTURE}.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_six_alphas_of_a_q_have_lines_of_their_own() -> None:
+    conditions = tuple(
+        Condition(entropic_index="1", others=(("α", str(a)),), runs=()) for a in range(6)
+    )
+    styles = styles_of(conditions).values()
+    assert (
+        len({style.line for style in styles}) == len({str(style.stroke) for style in styles}) == 6
+    )

@@ -147,7 +147,7 @@ def test_status_and_compare(storage: str, tmp_path: Path, program: Program) -> N
     state = program("status", place, "--json").document
     assert state["state"] == "finished"
     assert state["stages"][0]["runs"] == {"finished": 9}
-    assert state["env_steps"] == {"done": 36_000, "left": 0}
+    assert state["env_steps"] == {"done": 36_000, "left": 0, "to_come": 0}
     assert state["best"]["values"] == {"tac.entropic_index": 1.5}
     shown = program("status", "mine", "--storage", storage).output
     assert "Sweep mine: finished" in shown
