@@ -212,19 +212,29 @@ def _of_critics(
 
 @compiled
 def _asked(networks: Networks, pairs: Array, of_values: Array, action: Array) -> Array:
-    """[B, A]: by the policy's actions, through the critics, whose gradients are written."""
-    rows, size = action.shape
+    """[B, A]: by the policy's actions, through the critics, whose gradients are written.
+
+    An action whose smallest critic is another one has no gradient through this one, which is half
+    of the rows of two critics.
+    """
+    count, size = action.shape
     inputs = pairs.shape[1] - size
     of_action, part = np.zeros_like(action), np.empty_like(action)
+    rows, of_value = np.arange(2 * count), np.empty((2 * count, 1), action.dtype)
     for c in range(len(networks.critics)):
         critic = networks.critics[c]
-        of_value = of_values[c].reshape((2 * rows, 1))
-        of_hidden = backward(critic, pairs, of_value, rows, networks.scratch)
+        of_value[:count, 0] = of_values[c, :count]
+        end = count  # of the minibatch, and then of what the policy improves on
+        for r in range(count, 2 * count):
+            if of_values[c, r] != 0.0:
+                rows[end], of_value[end, 0] = r, of_values[c, r]
+                end += 1
+        of_hidden = backward(critic, pairs, rows[:end], of_value[:end], count, networks.scratch)
         weights = layer_weights(critic, critic.values, 0)[inputs:]
-        multiply(of_hidden[rows:], False, weights, True, part)
-        for r in range(rows):
+        multiply(of_hidden[count:], False, weights, True, part[: end - count])
+        for r in range(count, end):
             for a in range(size):
-                of_action[r, a] += part[r, a]
+                of_action[rows[r] - count, a] += part[r - count, a]
     return of_action
 
 
@@ -246,7 +256,7 @@ def _learn_policy(
             slopes[r, a] *= alpha / rows
     outputs = layer_outputs(networks.policy, len(networks.policy.sizes) - 2, len(entered))[:rows]
     of_outputs = through_distribution(of_action, slopes, sample, outputs, rule)
-    backward(networks.policy, entered, of_outputs, rows, networks.scratch)
+    backward(networks.policy, entered, np.arange(rows), of_outputs, rows, networks.scratch)
 
 
 @compiled
@@ -275,7 +285,7 @@ def _learn_value(
         error = values[r, 0] - (smallest[r] - alpha * ln_q_pi[r])
         loss += 0.5 * error * error / rows
         gradient[r, 0] = error / rows
-    backward(networks.value, states, gradient, rows, networks.scratch)
+    backward(networks.value, states, np.arange(rows), gradient, rows, networks.scratch)
     return loss
 
 

@@ -7,14 +7,16 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import numpy as np
 from numpy.typing import NDArray
 
 from music_rllib.compiling import compiled
 from music_rllib.tac.kernels.blas import multiply
 
-__all__ = ["Array", "Network", "backward", "forward", "layer_outputs", "layer_weights"]
+__all__ = ["Array", "Network", "Rows", "backward", "forward", "layer_outputs", "layer_weights"]
 
 Array = NDArray[Any]
+Rows = NDArray[np.int64]
 # Loops in place of expressions of arrays: those take longer to compile, and make new arrays.
 
 
@@ -87,20 +89,21 @@ def forward(network: Network, inputs: Array) -> Array:
 
 @compiled
 def backward(
-    network: Network, inputs: Array, gradient: Array, learned: int, scratch: Array
+    network: Network, inputs: Array, rows: Rows, gradient: Array, learned: int, scratch: Array
 ) -> Array:
-    """Writes the parameters' gradients.
+    """Writes the gradients of the parameters.
 
     Args:
-        inputs: [R, I] of the last forward.
-        gradient: [R', O] of the outputs of its first R' rows.
-        learned: so many rows count for the parameters, the first ones.
-        scratch: is overwritten.
+        inputs: [R, I] of the last forward pass.
+        rows: [R'] the rows of `inputs` that have a gradient.
+        gradient: [R', O] of the outputs at these rows.
+        learned: How many rows count for the parameters: the first ones of all, which come first.
+        scratch: Is overwritten.
 
     Returns:
-        [R', H] of the first layer's outputs before ReLU.
+        [R', H] the gradient of the first layer's outputs before ReLU.
     """
-    rows, last = len(gradient), len(network.sizes) - 2
+    last = len(network.sizes) - 2
     zero = network.values.dtype.type(0)
     bias = _bias(network, network.gradients, last)
     for o in range(len(bias)):
@@ -117,15 +120,15 @@ def backward(
         if layer == 0:
             break
         weights = layer_weights(network, network.values, layer)
-        out = scratch[layer % 2, : rows * network.sizes[layer]].reshape(
-            (rows, network.sizes[layer])
+        out = scratch[layer % 2, : len(rows) * network.sizes[layer]].reshape(
+            (len(rows), network.sizes[layer])
         )
         multiply(gradient, False, weights, not network.by_outputs, out)
         bias = _bias(network, network.gradients, layer - 1)
         for o in range(len(bias)):
             bias[o] = zero
-        for r in range(rows):
-            row, passed = out[r], below[r]
+        for r in range(len(rows)):
+            row, passed = out[r], below[rows[r]]
             for o in range(len(bias)):
                 row[o] = row[o] if passed[o] > zero else zero
             if r < learned:
