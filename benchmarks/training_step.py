@@ -14,7 +14,9 @@ from benchmarks.measure import Row, Taken, compared, interleaved, middle, on_one
 from benchmarks.raw_torch import RawUpdate
 from benchmarks.runs import fill
 from music_rllib import TACConfig
+from music_rllib.compiling import compiled
 from music_rllib.tac.algorithm import TAC
+from music_rllib.tac.kernels.blas import multiply
 from music_rllib.tac.kernels.precision import cpu_flags, has_bf16
 
 __all__ = ["rows"]
@@ -112,19 +114,27 @@ def floors(width: int) -> dict[str, Turn]:
     libraries: dict[str, Callable[[torch.Tensor, torch.Tensor, torch.Tensor], Any]] = {
         "torch.mm": lambda left, right, out: torch.mm(left, right, out=out),
         "OpenBLAS": lambda left, right, out: np.matmul(left.numpy(), right.numpy(), out.numpy()),
+        "compiled updates'": lambda left, right, out: _ours(
+            left.numpy(), right.numpy(), out.numpy()
+        ),
     }
     if torch.backends.mkldnn.is_available():
         onednn = torch.ops.mkldnn._linear_pointwise.default
         libraries["oneDNN"] = lambda left, right, out: onednn(left, right, None, "none", [], "")
     whole = UPDATES * flops(INPUTS, ACTIONS, (width,) * 3, BATCH)
     return {
-        f"{name}, {rows} x {width} x {width}": _products(multiply, rows, width, whole)
-        for name, multiply in libraries.items()
+        f"{name}, {rows} x {width} x {width}": _products(product, rows, width, whole)
+        for name, product in libraries.items()
         for rows in (BATCH, 2 * BATCH)
     }
 
 
-def _products(multiply: Callable[..., Any], rows: int, width: int, whole: int) -> Turn:
+@compiled
+def _ours(left: Any, right: Any, out: Any) -> None:
+    multiply(left, False, right, False, out)
+
+
+def _products(product: Callable[..., Any], rows: int, width: int, whole: int) -> Turn:
     left, right, out = (
         torch.randn(rows, width),
         torch.randn(width, width),
@@ -133,13 +143,16 @@ def _products(multiply: Callable[..., Any], rows: int, width: int, whole: int) -
 
     def turn() -> None:
         for _ in range(round(whole / (2 * rows * width * width))):
-            multiply(left, right, out)
+            product(left, right, out)
 
     return turn
 
 
 def flops(inputs: int, actions: int, hidden: Sequence[int], batch: int) -> int:
-    """Multiplications and additions of all matrix products in one update."""
+    """Multiplications and additions of all matrix products that one update needs.
+
+    An action of the policy has a gradient through its smaller critic only.
+    """
 
     def layers(first: int, last: int) -> list[int]:
         return [a * b for a, b in pairwise([first, *hidden, last])]
@@ -153,7 +166,7 @@ def flops(inputs: int, actions: int, hidden: Sequence[int], batch: int) -> int:
     policy = cost(layers(inputs, 2 * actions), trained)
     value = cost(layers(inputs, 1), trained) + cost(layers(inputs, 1), "forward")
     critic = layers(inputs + actions, 1)
-    critics = 2 * cost(critic, trained) + 2 * cost(critic, "forward inputs")
+    critics = 2 * cost(critic, trained) + 2 * cost(critic, "forward") + cost(critic, "inputs")
     return 2 * batch * (policy + value + critics)
 
 
