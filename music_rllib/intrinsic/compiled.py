@@ -71,11 +71,20 @@ def _transposed(weight: Array) -> Array:
 
 @_inner
 def _half(states: Array, n: int, frames: int, columns: Array, bias: Array, out: Array) -> None:
-    """A half's part of the hidden units in a trajectory: [N, T, I], [I, H], [H] -> [T, H]."""
+    """A half's part of the hidden units in a trajectory: [N, T, I], [I, H], [H] -> [T, H].
+
+    Three features in a pass, as many as a position has: `out` is read and written once for them.
+    """
+    features = len(columns)
+    threes = features - features % 3
     for t in range(frames):
         for h in range(len(bias)):
             out[t, h] = bias[h]
-        for i in range(len(columns)):
+        for i in range(0, threes, 3):
+            x, y, z = states[n, t, i], states[n, t, i + 1], states[n, t, i + 2]
+            for h in range(len(bias)):
+                out[t, h] += x * columns[i, h] + y * columns[i + 1, h] + z * columns[i + 2, h]
+        for i in range(threes, features):
             value = states[n, t, i]
             for h in range(len(bias)):
                 out[t, h] += value * columns[i, h]
