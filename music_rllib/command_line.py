@@ -24,21 +24,6 @@ from music_rllib.errors import BAD_INPUT, BadInputError
 if TYPE_CHECKING:
     from rich.console import Console, RenderHook
 
-__all__ = [
-    "PROGRAM",
-    "Command",
-    "Group",
-    "Json",
-    "add_command",
-    "called_as",
-    "console_for",
-    "how_to_continue",
-    "new_app",
-    "print_json",
-    "run_app",
-    "say_stopped_at_once",
-]
-
 PROGRAM = "music-rllib"
 WIDTH = 160
 """Columns where there is no terminal to ask."""

@@ -13,8 +13,6 @@ from typing import Any
 from numba import njit
 from numba.core.caching import FunctionCache
 
-__all__ = ["compiled", "is_kept", "kept_on_disk", "sources_of"]
-
 logger = logging.getLogger(__name__)
 
 Function = Callable[..., Any]

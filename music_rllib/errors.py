@@ -1,7 +1,5 @@
 """Errors that a user sees, and the exit codes of every command."""
 
-__all__ = ["BAD_INPUT", "FAILED", "BadInputError", "TrackingError"]
-
 FAILED, BAD_INPUT = 1, 2
 
 

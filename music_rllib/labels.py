@@ -9,8 +9,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 
-__all__ = ["SYMBOLS", "ShortLabels", "in_runs", "is_meant", "symbol"]
-
 SYMBOLS = {"q": "entropic_index", "weight": "mi_reward_weight"}
 """What papers, tables and labels call a setting to its name."""
 _NAME = re.compile(r"(?<![\w.])(?:(?:tac|music|replay|evaluation)\.)?(\w+)(?==)")

@@ -14,14 +14,6 @@ import stat
 from pathlib import Path
 from typing import Any, BinaryIO
 
-__all__ = [
-    "check_safetensors",
-    "nesting_of",
-    "open_regular",
-    "read_json",
-    "read_regular",
-]
-
 MOST_JSON_BYTES = 8 << 20
 """Of a manifest, a handoff's description, an export's header, a search."""
 MOST_YAML_BYTES = 256 << 10

@@ -15,8 +15,6 @@ from music_rllib.serve import command as serve
 from music_rllib.sweep.cli import COMMANDS, EXIT_CODES
 from music_rllib.tracking import cli as tracking
 
-__all__ = ["app", "main"]
-
 EPILOG = f"""\
 Examples:
   music-rllib init reach.yaml

@@ -23,21 +23,6 @@ from pydantic import (
     model_validator,
 )
 
-__all__ = [
-    "QUANTITIES",
-    "AdaptiveSchedule",
-    "Follower",
-    "Linear",
-    "Measured",
-    "Piecewise",
-    "Quantity",
-    "Schedule",
-    "bounded",
-    "check_measurable",
-    "extremes",
-    "value_at",
-]
-
 Quantity = Literal["success_rate", "shannon_entropy"]
 """What a setting may follow."""
 QUANTITIES = {"success_rate": "success rate", "shannon_entropy": "Shannon entropy"}

@@ -5,8 +5,6 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-__all__ = ["SCHEMA", "starter"]
-
 SCHEMA = Path(__file__).with_name("sweep.schema.json")
 """Written by docs/generate_configuration.py."""
 

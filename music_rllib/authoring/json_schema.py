@@ -18,8 +18,6 @@ from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.schema import Header, InitFrom, StageHeader
 from music_rllib.envs.tasks import BUILT_IN_TASKS, Task
 
-__all__ = ["json_schema"]
-
 
 class _Described(GenerateJsonSchema):
     """Fields are described by the docstrings below them."""

@@ -14,8 +14,6 @@ from music_rllib.names import EVAL_RETURN
 if TYPE_CHECKING:
     from music_rllib.config.schema import Stage
 
-__all__ = ["Analysis", "Hypothesis", "check_analysis"]
-
 SETTINGS_IN_SHORT = {
     "q": "tac.entropic_index",
     "α": "tac.alpha",

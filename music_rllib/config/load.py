@@ -39,15 +39,10 @@ from music_rllib.config.reading.presets import with_preset
 from music_rllib.config.reading.problem_lines import problem_lines
 from music_rllib.config.reading.yaml_file import YamlFile, read_yaml
 from music_rllib.config.resolve import resolve_stage
-from music_rllib.config.run_settings import Evaluation, RunSettings, Variant
+from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.schema import (
     RESERVED_NAMES,
-    Checkpoint,
     Header,
-    MlflowSettings,
-    Point,
-    Resources,
-    Source,
     Stage,
     SweepConfig,
 )
@@ -59,22 +54,6 @@ from music_rllib.envs.tasks import (
     UnknownTaskError,
 )
 from music_rllib.limits import MOST_RUNS, MOST_SEEDS
-
-__all__ = [
-    "Checkpoint",
-    "ConfigError",
-    "Evaluation",
-    "MlflowSettings",
-    "Point",
-    "Resources",
-    "RunSettings",
-    "Source",
-    "Stage",
-    "SweepConfig",
-    "Variant",
-    "declared_tasks",
-    "load_sweep",
-]
 
 
 def load_sweep(

@@ -18,20 +18,6 @@ from music_rllib.envs.tasks import closest
 from music_rllib.errors import BadInputError
 from music_rllib.labels import SYMBOLS
 
-__all__ = [
-    "ConfigError",
-    "Findings",
-    "Path",
-    "Problem",
-    "from_json",
-    "in_words",
-    "known_fields",
-    "lookup",
-    "same",
-    "shown",
-    "unknown",
-]
-
 Model = TypeVar("Model", bound=BaseModel)
 
 Path = tuple[str | int, ...]

@@ -11,8 +11,6 @@ from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.schema import Stage, SweepConfig
 from music_rllib.envs.tasks import Task
 
-__all__ = ["remarks"]
-
 _BEHIND_RETURNS = frozenset(
     f"{section}.{name}"
     for section, names in (

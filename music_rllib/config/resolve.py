@@ -40,8 +40,6 @@ from music_rllib.envs.tasks import BUILT_IN_TASKS, Task, closest
 from music_rllib.limits import MOST_GRID_POINTS
 from music_rllib.store.handoff import Architecture, HandoffError, open_handoff, read_handoff
 
-__all__ = ["resolve_stage"]
-
 FindTasks = Callable[[Iterable[str], KeyPath], tuple[Task, ...]]
 
 

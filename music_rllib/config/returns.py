@@ -15,8 +15,6 @@ from music_rllib.functional.tsallis import uniform_entropy
 from music_rllib.intrinsic.settings import MusicSettings
 from music_rllib.schedules import extremes
 
-__all__ = ["CutOff", "Range", "cut_off", "reward_a_step"]
-
 _ROUNDING = 1e-6
 """-1 / (1 - 0.98) is -49.99999999999996, which [-50, 0] does not cut off."""
 

@@ -20,17 +20,6 @@ from music_rllib.replay.settings import ReplaySettings
 from music_rllib.schedules import check_measurable
 from music_rllib.store.handoff import Architecture, HandoffInfo, Spaces
 
-__all__ = [
-    "VARIANTS",
-    "Evaluation",
-    "RunSettings",
-    "Variant",
-    "VariantRules",
-    "contradiction",
-    "handed_over",
-    "preset",
-]
-
 Variant = Literal["tac", "music-u", "music-r", "music-f", "music-p"]
 Source = Literal["scratch", "estimator", "agent"]
 """What a variant's runs start from: nothing, a trained estimator, or a whole trained agent."""

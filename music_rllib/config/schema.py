@@ -16,21 +16,6 @@ from music_rllib.config.search.settings import SearchSettings
 from music_rllib.envs.tasks import Task
 from music_rllib.store.handoff import HandoffManifest
 
-__all__ = [
-    "RESERVED_NAMES",
-    "Checkpoint",
-    "Checkpoints",
-    "Header",
-    "InitFrom",
-    "MlflowSettings",
-    "Point",
-    "Resources",
-    "Source",
-    "Stage",
-    "StageHeader",
-    "SweepConfig",
-]
-
 RESERVED_NAMES = frozenset(
     {"nodes", "work", "continuations", "verified.json"}
     | {"mlartifacts", "mlflow.db", "mlflow.db.lock"}

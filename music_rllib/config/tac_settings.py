@@ -27,17 +27,6 @@ from music_rllib.schedules import (
     value_at,
 )
 
-__all__ = [
-    "Alpha",
-    "GaussianNoise",
-    "LearnedAlpha",
-    "MatchedAlpha",
-    "NormalisedAlpha",
-    "TACSettings",
-    "alpha_at",
-    "in_words",
-]
-
 
 class _Frozen(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)

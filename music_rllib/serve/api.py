@@ -28,8 +28,6 @@ from music_rllib.serve.schema import (
     request_model,
 )
 
-__all__ = ["make_api", "token_hash"]
-
 Act = Callable[[Rows], Awaitable[Array]]
 """Rows of one request to their actions [B, A]."""
 

@@ -28,8 +28,6 @@ from music_rllib.serve.api import make_api, token_hash
 from music_rllib.serve.load_limits import FOR_HEALTH, RETRY_SECONDS, Limits
 from music_rllib.serve.schema import Array, PolicyFacts, Rows, compute
 
-__all__ = ["ServeSettings", "app", "application", "policy_of"]
-
 TOGETHER = 64
 """Requests that are computed together at most."""
 WAIT_SECONDS = 0.002

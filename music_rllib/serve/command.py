@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from music_rllib.serve.application import ServeSettings
     from music_rllib.serve.load_limits import Limits
 
-__all__ = ["EXAMPLES", "app", "main", "serve"]
-
 EXAMPLES = f"""\
 Examples:
   music-rllib serve results/smoke/best

@@ -11,8 +11,6 @@ from collections.abc import Iterator
 from html import escape
 from typing import Any
 
-__all__ = ["docs_page"]
-
 STYLE = """\
 body{font:16px/1.5 system-ui,sans-serif;max-width:60rem;margin:2rem auto;padding:0 1rem;
 color:#1b1b1b;background:#fff}

@@ -23,8 +23,6 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from music_rllib.runtime.allocator import give_back_freed_memory
 
-__all__ = ["Admission", "Limits", "controller_environment", "guarded", "middlewares"]
-
 LIMITS_VARIABLE = "MUSIC_RLLIB_SERVE_LIMITS"
 """`Limits` as JSON, for proxies that somebody else starts."""
 FOR_HEALTH = 16

@@ -12,19 +12,6 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, create_model, model_validator
 
-__all__ = [
-    "MAX_ROWS",
-    "Answer",
-    "Failure",
-    "Health",
-    "PolicyFacts",
-    "Request",
-    "Rows",
-    "ServedPolicy",
-    "compute",
-    "request_model",
-]
-
 MAX_ROWS = 1024
 """Observations in one request."""
 _FLOAT32 = float(np.finfo(np.float32).max)

@@ -14,16 +14,6 @@ from music_rllib.config.problems import Path, Problem, known_fields, lookup, sho
 from music_rllib.config.run_settings import VARIANTS, RunSettings, Variant, contradiction, preset
 from music_rllib.envs.tasks import Task
 
-__all__ = [
-    "LAYER_KEYS",
-    "SECTIONS",
-    "Layers",
-    "all_settings",
-    "for_a_grid",
-    "known_settings",
-    "merge",
-]
-
 SECTIONS = ("evaluation", "tac", "music", "replay")
 """Groups of settings; layers replace their fields one by one."""
 LAYER_KEYS = ("env_steps", "num_envs", *SECTIONS)

@@ -17,8 +17,6 @@ from music_rllib.config.reading.layers import LAYER_KEYS, SECTIONS, all_settings
 from music_rllib.config.reading.yaml_file import read_value
 from music_rllib.config.schema import Header, StageHeader
 
-__all__ = ["Override", "lay_overrides", "parse_overrides"]
-
 TOP = (*Header.model_fields, "preset", "environments", "defaults", "stages")
 
 

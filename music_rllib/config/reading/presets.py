@@ -12,8 +12,6 @@ from music_rllib.config.reading.layers import SECTIONS
 from music_rllib.config.reading.yaml_file import YamlFile, read_yaml
 from music_rllib.envs.tasks import closest
 
-__all__ = ["SHIPPED", "shipped_presets", "with_preset"]
-
 FOLDER = "presets"
 """Beside the sweep's file: `presets/small.yaml` there comes before the package's `small`."""
 SHIPPED = Path(music_rllib.__file__).with_name(FOLDER)

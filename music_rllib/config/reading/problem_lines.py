@@ -10,8 +10,6 @@ from music_rllib.config.problems import Path as KeyPath
 from music_rllib.config.problems import Problem, lookup
 from music_rllib.config.reading.yaml_file import YamlFile
 
-__all__ = ["problem_lines"]
-
 
 def problem_lines(
     problems: Iterable[Problem],

@@ -23,8 +23,6 @@ from music_rllib.limits import (
     read_regular,
 )
 
-__all__ = ["YamlFile", "read_value", "read_yaml"]
-
 
 class YamlFile(NamedTuple):
     """A document, and on which line each of its values begins."""

@@ -15,8 +15,6 @@ from music_rllib.config.search.settings import SearchSettings
 from music_rllib.config.search.space import Choice
 from music_rllib.envs.tasks import closest
 
-__all__ = ["check_search", "most_env_steps", "of_stage", "stages_in"]
-
 Place = tuple[str | int, ...]
 ResolveAt = Callable[[Mapping[str, tuple[KeyPath, Any]], Findings], Point]
 

@@ -12,16 +12,6 @@ from pydantic import Discriminator, Field, JsonValue, Tag, model_validator
 
 from music_rllib.config.search.space import Choice, Dimension, Strict, listed
 
-__all__ = [
-    "FINAL_SEED",
-    "Final",
-    "Objective",
-    "Pruning",
-    "Rung",
-    "SearchSettings",
-    "WarmStart",
-]
-
 FINAL_SEED = 1_000_000
 """First of the fresh seeds of the final ranking: no search uses seeds from here on."""
 

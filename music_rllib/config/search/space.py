@@ -9,8 +9,6 @@ from pydantic import BaseModel, ConfigDict, Discriminator, Field, JsonValue, Tag
 
 from music_rllib.config.problems import same, shown
 
-__all__ = ["Choice", "Dimension", "FloatRange", "IntRange", "Strict", "When", "listed"]
-
 
 class Strict(BaseModel):
     """Nothing unknown, nothing infinite, never changed."""

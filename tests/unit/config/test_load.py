@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 import yaml
 
-from music_rllib.config.load import ConfigError, RunSettings, SweepConfig, load_sweep
-from music_rllib.config.run_settings import VARIANTS, handed_over, preset
+from music_rllib.config.load import load_sweep
+from music_rllib.config.problems import ConfigError
+from music_rllib.config.run_settings import VARIANTS, RunSettings, handed_over, preset
+from music_rllib.config.schema import SweepConfig
 from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.schedules import Linear
 from music_rllib.store.handoff import write_handoff
