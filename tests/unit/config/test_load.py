@@ -351,6 +351,10 @@ BAD: list[tuple[Document, str]] = [
     (asking("q = 1.5 against q = 1", stage="x"), "analysis.stage must be one of pretrain, finet"),
     (asking("q = 1.5 against q = 1", margin=0), "analysis.margin must be > 0, got 0"),
     (
+        asking("q = 1.5 against q = 1") | {"defaults": {"tac": {"gamma": 3.0}}},
+        "defaults.tac.gamma must be < 1, got 3.0",
+    ),
+    (
         without_success(asking("q = 1.5 against q = 1")),
         "analysis.margin must be given for tasks without success, got null",
     ),
