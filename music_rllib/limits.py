@@ -70,7 +70,6 @@ def open_regular(path: Path | str, *, follow: bool = False) -> BinaryIO:
     """Open a regular file for reading: other kinds of files may block or have no end.
 
     Args:
-        path: Path of the file.
         follow: Whether `path` itself may be a link. Set it for a path that a user names, not for
             the files in a folder from elsewhere.
 

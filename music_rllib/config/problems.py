@@ -79,12 +79,7 @@ def lookup(document: Any, path: Iterable[str | int]) -> Any:
 
 
 def unknown(key: str, known: Iterable[str]) -> str:
-    """The rule that an unknown key breaks, with a suggestion.
-
-    Args:
-        key: The key, with or without dots.
-        known: The known keys, dotted below the top level.
-    """
+    """The rule that an unknown key breaks, with a suggestion from the `known` (dotted) keys."""
     names = list(known)
     field = key.rpartition(".")[2]
     field = SYMBOLS.get(field, field)
@@ -110,8 +105,6 @@ def in_words(
     """Translate pydantic's error about `document` into problems, with paths relative to it.
 
     Args:
-        error: The error.
-        document: The input that pydantic validated.
         known: Gives the known keys at a path, for suggestions.
     """
     problems = []

@@ -101,12 +101,8 @@ def merge(
     """Merge preset, defaults, stage, its `per_task` and one point of its grid or search.
 
     Args:
-        variant: The stage's variant.
-        task: The task, whose preset weight applies unless a layer sets another.
-        defaults: The sweep's `defaults`.
         stage: The stage's own settings, keys of `LAYER_KEYS` and `per_task` only.
         stage_path: The stage's place in the document.
-        point: The point.
 
     Returns:
         The merged settings, and the problems of their layers.

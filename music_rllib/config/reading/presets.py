@@ -31,7 +31,6 @@ def with_preset(file: YamlFile, check: Callable[[YamlFile], Iterable[str]]) -> d
     """The sweep's document with its preset's settings below its `defaults`.
 
     Args:
-        file: The sweep.
         check: Gives the problems of a preset's own settings, as lines.
 
     Raises:

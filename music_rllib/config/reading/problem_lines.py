@@ -21,9 +21,7 @@ def problem_lines(
     """One line for each different problem, those of the command line first, then by line.
 
     Args:
-        problems: The problems.
-        file: The sweep's file, for line numbers.
-        document: Its content with the values of the command line.
+        document: The content of `file` with the values of the command line.
         options: Values of options like `--name`, by key.
         origins: Place of a value to the `KEY` of the command line that it comes from.
     """

@@ -53,8 +53,6 @@ def check_search(
     """Check a stage's `search` and the stage that its runs start from.
 
     Args:
-        stage: The stage; its one point has everything that is not searched.
-        search: Its search.
         earlier: The stages above this one by name; None for an invalid one.
         seeds: Number of the sweep's seeds; 0 if they are invalid.
         resolve_at: Gives the stage's settings at a point.
@@ -83,12 +81,7 @@ def check_search(
 
 
 def most_env_steps(search: SearchSettings, points: Sequence[Point]) -> int:
-    """Environment steps of a searched stage's longest run; 0 if they are not known.
-
-    Args:
-        search: The stage's search.
-        points: The stage's points, with everything that is not searched.
-    """
+    """Environment steps of the longest run of a searched stage with these points; 0 if unknown."""
     if "env_steps" in search.space:
         return int(max(search.space["env_steps"].ends()))
     if "env_steps" in search.compare:
