@@ -18,8 +18,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator
 from pydantic.fields import FieldInfo
 
 from music_rllib.authoring import SCHEMA
-from music_rllib.authoring.docstrings import docstrings
-from music_rllib.authoring.json_schema import json_schema
+from music_rllib.authoring.json_schema import docstrings, json_schema
 from music_rllib.config.analysis import Analysis
 from music_rllib.config.run_settings import VARIANTS, Evaluation, RunSettings
 from music_rllib.config.schema import (
@@ -230,8 +229,7 @@ def dimensions() -> Iterator[Row]:
             if row[0] not in seen:
                 seen.add(row[0])
                 yield row
-    when = docstrings(FloatRange.__mro__[1])["when"]
-    yield "when", "mapping", "`{}`", when
+    yield "when", "mapping", "`{}`", docstrings(FloatRange)["when"]
 
 
 def table(cells: Iterator[Row] | list[Row]) -> str:

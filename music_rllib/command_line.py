@@ -1,17 +1,18 @@
-"""What every command has in common: how it is called, how its help looks, how it ends.
+"""What all commands share: arguments, help pages, exit codes, output for people and as JSON.
 
-A command is a function whose parameters are its arguments (Typer) and whose number is its exit
-code. It is imported for every `--help`, so that its module loads nothing heavy before it is called.
+A command is a function whose parameters are its arguments (Typer) and which returns its exit code.
+Every `--help` imports all commands: their modules load heavy libraries inside of functions only.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import os
 import shlex
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Annotated, Any
@@ -22,42 +23,35 @@ from typer.core import TyperCommand, TyperGroup
 from music_rllib.errors import BAD_INPUT, BadInputError
 
 if TYPE_CHECKING:
-    from rich.console import Console, RenderHook
-
-__all__ = [
-    "PROGRAM",
-    "Command",
-    "Group",
-    "Json",
-    "add_command",
-    "called_as",
-    "console_for",
-    "how_to_continue",
-    "new_app",
-    "print_json",
-    "run_app",
-    "say_stopped_at_once",
-]
+    from rich.console import Console
+    from rich.segment import Segment
 
 PROGRAM = "music-rllib"
 WIDTH = 160
-"""Columns where there is no terminal to ask."""
+"""Columns of output that goes elsewhere than to a terminal."""
+HELP_OPTIONS = {"help_option_names": ["-h", "--help"]}
 
 Json = Annotated[
     bool, typer.Option("--json", help="One JSON document on stdout, messages on stderr.")
 ]
 
 
-class Command(TyperCommand):
-    """Its function's number is the exit code; what the user must change is one message."""
+class _KeepsExamples:
+    """A help page whose examples keep their line breaks."""
+
+    epilog: str | None
+
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:
+        if self.epilog:
+            formatter.write(f"\n{self.epilog.strip()}\n")
+
+
+class Command(_KeepsExamples, TyperCommand):
+    """A command whose function returns its exit code; a `BadInputError` becomes one message."""
 
     def invoke(self, ctx: typer.Context) -> Any:  # type: ignore[override]
-        """Run the function.
-
-        Raises:
-            typer.Exit: With its exit code.
-        """
-        sys.excepthook = _show_unexpected
+        """Run the function and exit with its code."""
+        sys.excepthook = _print_unexpected
         try:
             code = super().invoke(ctx)
         except BadInputError as error:
@@ -73,53 +67,37 @@ class Command(TyperCommand):
             code = 0
         raise typer.Exit(int(code or 0))
 
-    def format_epilog(self, ctx: Any, formatter: Any) -> None:
-        """Keep the lines of examples as they are."""
-        _write_lines(self.epilog, formatter)
 
-
-class Group(TyperGroup):
-    """Commands; a sweep's file in the place of one is told where it belongs."""
+class Group(_KeepsExamples, TyperGroup):
+    """A group of commands, which explains that `run` is missing before a sweep's file."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse what stands before the command."""
         if args and args[0].endswith((".yaml", ".yml")) and "run" in self.commands:
             ctx.fail(f"COMMAND must come first: {ctx.command_path} run {args[0]}")
         return super().parse_args(ctx, args)
 
-    def format_epilog(self, ctx: Any, formatter: Any) -> None:
-        """Keep the lines of examples as they are."""
-        _write_lines(self.epilog, formatter)
 
-
-def _write_lines(text: str | None, formatter: Any) -> None:
-    if text:
-        formatter.write(f"\n{text.strip()}\n")
-
-
-def new_app(
-    *, epilog: str | None = None, cls: type[TyperGroup] = Group, **options: Any
-) -> typer.Typer:
+def new_app(**options: Any) -> typer.Typer:
     """An application or a group of commands, without boxes or colours in its help."""
-    settings: dict[str, Any] = {
+    defaults: dict[str, Any] = {
+        "cls": Group,
         "add_completion": False,
-        "context_settings": {"help_option_names": ["-h", "--help"]},
+        "context_settings": HELP_OPTIONS,
         "pretty_exceptions_enable": False,
         "rich_markup_mode": None,
     }
-    return typer.Typer(cls=cls, epilog=epilog, **settings | options)
+    return typer.Typer(**defaults | options)
 
 
 def add_command(
     app: typer.Typer, name: str, function: Callable[..., int | None], examples: str
 ) -> None:
     """Make `function` the command `name`; its docstring and `examples` are its help."""
-    settings = {"help_option_names": ["-h", "--help"]}
-    app.command(name, cls=Command, epilog=examples, context_settings=settings)(function)
+    app.command(name, cls=Command, epilog=examples, context_settings=HELP_OPTIONS)(function)
 
 
 def run_app(app: typer.Typer, program: str, arguments: Sequence[str] | None = None) -> int:
-    """Run these arguments, or the process's; the exit code."""
+    """Run the command of `arguments`, by default the process's, and return its exit code."""
     try:
         app(None if arguments is None else list(arguments), prog_name=program)
     except SystemExit as end:
@@ -128,7 +106,7 @@ def run_app(app: typer.Typer, program: str, arguments: Sequence[str] | None = No
 
 
 def called_as() -> list[str]:
-    """How this process was called, up to its arguments, for commands that messages tell."""
+    """The words that start this program, without arguments, for commands shown in messages."""
     path = Path(sys.argv[0])
     if path.name != "__main__.py":
         return [PROGRAM]
@@ -137,20 +115,20 @@ def called_as() -> list[str]:
 
 
 def how_to_continue() -> str:
-    """What a sweep that was stopped has kept, and the command that goes on with it."""
+    """The message of a stopped sweep: what is kept, and the command that continues it."""
     command = shlex.join([*called_as(), *sys.argv[1:]])
     return f"Stopped. Finished runs and the last checkpoints are kept; continue with: {command}"
 
 
 def say_stopped_at_once() -> None:
-    """The same, from a signal's handler: the program ends now, whatever it was doing."""
+    """Print `how_to_continue` from a signal handler, just before the process ends."""
     os.write(sys.stderr.fileno(), f"\nAt once: {how_to_continue()}\n".encode())
 
 
-def _show_unexpected(
+def _print_unexpected(
     kind: type[BaseException], error: BaseException, trace: TracebackType | None
 ) -> None:
-    """A defect's traceback, without the passwords that an environment put into its message."""
+    """Print the traceback of a defect without the passwords that its message may hold."""
     import traceback
 
     from music_rllib.redaction import for_people
@@ -159,11 +137,21 @@ def _show_unexpected(
 
 
 def console_for(*, as_json: bool = False) -> Console:
-    """Where text for people goes: standard output, or standard error beside a JSON document."""
+    """The console for people: standard output, or standard error where JSON goes to the former."""
     from rich.console import Console
+    from rich.segment import Segment
+
+    from music_rllib.redaction import printable
+
+    class PrintableConsole(Console):
+        """A console that escapes control characters in everything it prints."""
+
+        def render(self, renderable: Any, options: Any = None) -> Iterator[Segment]:
+            for text, style, control in super().render(renderable, options):
+                yield Segment(text if control else printable(text), style, control)
 
     terminal = (sys.stderr if as_json else sys.stdout).isatty()
-    console = Console(
+    return PrintableConsole(
         # No [red] in a name is a colour.
         markup=False,
         emoji=False,
@@ -171,46 +159,18 @@ def console_for(*, as_json: bool = False) -> Console:
         stderr=as_json,
         width=None if terminal else int(os.environ.get("COLUMNS") or WIDTH),
     )
-    console.push_render_hook(_printable_hook())
-    return console
-
-
-def _printable_hook() -> RenderHook:
-    """Escapes control characters in whatever a console prints."""
-    from rich.console import ConsoleOptions, ConsoleRenderable, RenderHook, RenderResult
-    from rich.segment import Segment
-
-    from music_rllib.redaction import printable
-
-    class Printable:
-        def __init__(self, inner: ConsoleRenderable) -> None:
-            self._inner = inner
-
-        def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-            for text, style, control in console.render(self._inner, options):
-                yield Segment(text if control else printable(text), style, control)
-
-    class Hook(RenderHook):
-        def process_renderables(
-            self, renderables: list[ConsoleRenderable]
-        ) -> list[ConsoleRenderable]:
-            return [Printable(renderable) for renderable in renderables]
-
-    return Hook()
 
 
 def print_json(document: Any) -> None:
-    """One JSON document on standard output; NaN and infinities, which JSON lacks, are null."""
+    """Print one JSON document; NaN and infinities, which JSON lacks, become null."""
     from music_rllib.redaction import printable
 
-    print(printable(json.dumps(_plain(document), indent=2, ensure_ascii=False, default=str)))
+    print(printable(json.dumps(_finite(document), indent=2, ensure_ascii=False, default=str)))
 
 
-def _plain(value: Any) -> Any:
+def _finite(value: Any) -> Any:
     if isinstance(value, dict):
-        return {str(key): _plain(inner) for key, inner in value.items()}
+        return {str(key): _finite(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(inner) for inner in value]
-    if isinstance(value, float) and (value != value or value in (float("inf"), float("-inf"))):
-        return None
-    return value
+        return [_finite(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

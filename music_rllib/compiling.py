@@ -1,4 +1,4 @@
-"""Functions compiled by numba, where a CPU would else wait for Python or PyTorch between steps."""
+"""Functions compiled by numba, for loops in which Python's or PyTorch's overhead dominates."""
 
 from __future__ import annotations
 
@@ -13,29 +13,27 @@ from typing import Any
 from numba import njit
 from numba.core.caching import FunctionCache
 
-__all__ = ["compiled", "is_kept", "kept_on_disk", "sources_of"]
-
 logger = logging.getLogger(__name__)
 
 Function = Callable[..., Any]
 
 
 def compiled(function: Function, *, any_order: bool = False) -> Any:
-    """A function that other compiled ones call.
+    """Compile a function that other compiled functions call.
 
     Args:
-        any_order: its sums may be taken in any order, the same one in every run: else they are not
-            vectorised. NaN stays NaN.
+        any_order: allows the compiler to reorder sums, which vectorises them. The order is the
+            same in every run, and NaN stays NaN.
     """
     fastmath = {"reassoc", "contract", "nsz"} if any_order else False
     return njit(function, error_model="numpy", fastmath=fastmath)
 
 
 def kept_on_disk(function: Function) -> Any:
-    """One that Python calls. Others may run meanwhile; what it is compiled to is kept.
+    """Compile a function that Python calls, without the GIL, and keep the machine code on disk.
 
-    It lies beside the source, or in the user's cache, or in `NUMBA_CACHE_DIR`, until the source
-    changes; where none can be written, each process compiles it anew.
+    The code lies beside the source, in the user's cache or in `NUMBA_CACHE_DIR` until the source
+    changes. Where none of them is writable, each process compiles the function anew.
     """
     dispatcher: Any = njit(function, nogil=True, error_model="numpy")
     try:
@@ -48,7 +46,7 @@ def kept_on_disk(function: Function) -> Any:
 
 
 def is_kept(function: Any) -> bool:
-    """Whether what `kept_on_disk` has made lies there already, compiled by an earlier process."""
+    """Whether an earlier process has left the machine code of a `kept_on_disk` function."""
     cache = function._cache
     if not isinstance(cache, _Cache):
         return False
@@ -56,16 +54,16 @@ def is_kept(function: Any) -> bool:
 
 
 def sources_of(*modules: ModuleType) -> str:
-    """Changes with any of their files.
+    """A hash of the modules' files.
 
-    What a function encloses decides, beside its own file, whether what was kept of it still holds.
+    A function that encloses it is compiled anew when one of them changes, not only its own file.
     """
     files = (Path(inspect.getfile(module)).read_bytes() for module in modules)
     return hashlib.sha256(b"".join(files)).hexdigest()
 
 
 class _Cache(FunctionCache):
-    """Numba's own, without which a process goes on all the same."""
+    """Numba's cache, whose write errors are warnings."""
 
     def save_overload(self, sig: Any, data: Any) -> None:
         try:

@@ -1,14 +1,12 @@
 """Errors that a user sees, and the exit codes of every command."""
 
-__all__ = ["BAD_INPUT", "FAILED", "BadInputError", "TrackingError"]
-
 FAILED, BAD_INPUT = 1, 2
 
 
 class BadInputError(Exception):
-    """Something that the user must change; nothing has been started.
+    """A mistake of the user, found before anything is started.
 
-    The message names the place, the rule and the value. Commands print it, without a traceback.
+    The message names the place, the rule and the value. Commands print it without a traceback.
     """
 
 

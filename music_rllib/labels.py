@@ -1,7 +1,7 @@
-"""Labels of runs as people say them: `q=1.5/seed0` for a run of a sweep with one stage and task.
+"""Short labels of runs: `q=1.5/seed0` in a sweep with one stage and one task.
 
 A run's whole label is `finetune/FetchPush/tac.entropic_index=1.5,tac.alpha=0.1/seed0`: its stage,
-task, the values that tell its trial apart, its seed.
+its task, the settings in which its trial differs from others, its seed.
 """
 
 from __future__ import annotations
@@ -9,34 +9,31 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 
-__all__ = ["SYMBOLS", "ShortLabels", "in_runs", "is_meant", "symbol"]
-
 SYMBOLS = {"q": "entropic_index", "weight": "mi_reward_weight"}
-"""What papers, tables and labels call a setting to its name."""
+"""Symbol of a setting in papers, tables and labels to its name."""
 _NAME = re.compile(r"(?<![\w.])(?:(?:tac|music|replay|evaluation)\.)?(\w+)(?==)")
 _ITEM = re.compile(r",(?=[\w:.-]+=)")
 
 
 def in_runs(number: int) -> str:
-    """`1 run`, `2 runs`."""
+    """A number of runs in text: `1 run`, `2 runs`."""
     return "1 run" if number == 1 else f"{number} runs"
 
 
 class ShortLabels:
-    """Labels without the stage and the task that all of a sweep's runs have in common."""
+    """Shortens labels of a sweep: omits a stage or task that all runs have, uses symbols."""
 
     def __init__(self, stages: Iterable[str], tasks: Iterable[str]) -> None:
-        """Of a sweep with these stages and tasks."""
         self._stages, self._tasks = set(stages), set(tasks)
 
     @classmethod
     def of(cls, labels: Iterable[str]) -> ShortLabels:
-        """Of a sweep whose runs have these labels."""
+        """For a sweep whose runs have these labels."""
         parts = [label.split("/") for label in labels]
         return cls((part[0] for part in parts), (part[1] for part in parts if len(part) > 1))
 
     def __call__(self, label: str) -> str:
-        """`label` in short; what is no label of the sweep stays as it is."""
+        """The short form of `label`; text that is no label of the sweep is returned unchanged."""
         stage, _, rest = label.partition("/")
         task, _, rest = rest.partition("/")
         if stage not in self._stages or task not in self._tasks or not rest:
@@ -46,17 +43,16 @@ class ShortLabels:
 
 
 def symbol(setting: str) -> str:
-    """A setting as labels call it: `q` for `tac.entropic_index`, `alpha` for `tac.alpha`."""
+    """The short form of a setting: `q` for `tac.entropic_index`, `alpha` for `tac.alpha`."""
     return _NAME.sub(_symbol, f"{setting}=").removesuffix("=")
 
 
-def _symbol(found: re.Match[str]) -> str:
-    name = found[1]
-    return next((symbol for symbol, meant in SYMBOLS.items() if meant == name), name)
+def _symbol(match: re.Match[str]) -> str:
+    return next((symbol for symbol, name in SYMBOLS.items() if name == match[1]), match[1])
 
 
 def is_meant(wanted: str, label: str) -> bool:
-    """Whether `wanted` has parts of `label` only, in short or whole, in any order."""
+    """Whether every part of `wanted` is a part of `label`, short or whole, in any order."""
     parts = [_items(part) for part in label.split("/")]
     return all(
         any(all(any(_same(item, other) for other in part) for item in given) for part in parts)
@@ -65,20 +61,17 @@ def is_meant(wanted: str, label: str) -> bool:
 
 
 def _items(part: str) -> list[tuple[str, str]]:
-    """`tac.lr=0.1,q=2` as names and values; `FetchPush` and `seed0` as names alone."""
-    found = []
-    for item in _ITEM.split(part):
-        name, _, value = item.partition("=")
-        found.append((f"seed{value}", "") if name == "seed" else (name, value))
-    return found
+    """Names and values of `tac.lr=0.1,q=2`; `FetchPush` and `seed0` are names without a value."""
+    pairs = [item.partition("=")[::2] for item in _ITEM.split(part)]
+    return [(f"seed{value}", "") if name == "seed" else (name, value) for name, value in pairs]
 
 
-def _same(item: tuple[str, str], other: tuple[str, str]) -> bool:
-    (name, value), (whole, its) = item, other
-    name = SYMBOLS.get(name, name)
-    if name != whole and not whole.endswith((f".{name}", f":{name}")):
+def _same(given: tuple[str, str], item: tuple[str, str]) -> bool:
+    """Whether a given name and value are those of a label's item."""
+    name = SYMBOLS.get(given[0], given[0])
+    if name != item[0] and not item[0].endswith((f".{name}", f":{name}")):
         return False
-    return value == its or _number(value) == _number(its) is not None
+    return given[1] == item[1] or _number(given[1]) == _number(item[1]) is not None
 
 
 def _number(text: str) -> float | None:

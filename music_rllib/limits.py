@@ -1,7 +1,7 @@
-"""How much of what comes from outside is read: files, JSON, safetensors headers.
+"""Limits on files from outside, and functions that read within them.
 
-Policies, sealed folders, exported sweeps and YAML may come from strangers. What is beyond a limit
-below is refused before it costs time or memory. Each is far above anything that a sweep writes.
+Policies, object folders, exported sweeps and YAML may come from strangers. Input beyond a limit is
+refused before it costs time or memory. Each limit is far above anything that a sweep writes.
 """
 
 from __future__ import annotations
@@ -14,54 +14,46 @@ import stat
 from pathlib import Path
 from typing import Any, BinaryIO
 
-__all__ = [
-    "check_safetensors",
-    "nesting_of",
-    "open_regular",
-    "read_json",
-    "read_regular",
-]
-
 MOST_JSON_BYTES = 8 << 20
-"""Of a manifest, a handoff's description, an export's header, a search."""
+"""Largest JSON file: a manifest, a handoff's description, an export's header, a search."""
 MOST_YAML_BYTES = 256 << 10
-"""Of a sweep's YAML file, or the configuration in an export."""
+"""Largest YAML file: a sweep, or the configuration in an export."""
 MOST_WEIGHTS_BYTES = 1 << 30
-"""Of one module's weights, or a policy's file."""
+"""Largest file of one module's weights, or of a policy."""
 MOST_SAFETENSORS_HEADER_BYTES = 1 << 20
 MOST_NESTED = 64
-"""Levels of lists and mappings in each other."""
+"""Depth of nested lists and mappings."""
 MOST_CONTAINERS = 200_000
-"""Lists and mappings of a JSON document."""
+"""Lists and mappings in a JSON document."""
 MOST_YAML_VALUES = 12_000
-"""Values of a YAML document, those of an alias counted wherever it stands."""
+"""Values in a YAML document; those of an alias count at each of its uses."""
 MOST_DIGITS = 100
-"""Of a whole number: the state of a random generator has 39."""
+"""Digits of an integer: the state of a random generator has 39."""
 MOST_INDICES = 10_000
-"""Entries of an observation that a task may name."""
+"""Indices of an observation that a task may list."""
 MOST_SEEDS = 10_000
 MOST_GRID_POINTS = 10_000
-"""Of a stage's grid."""
+"""Points of a stage's grid."""
 MOST_RUNS = 100_000
-"""Of a sweep."""
+"""Runs of a sweep."""
 MOST_TABLE_ROWS = 50_000_000
-"""Of an exported table."""
+"""Rows of an exported table."""
 MOST_ROWS_PER_BYTE = 4
-"""Of an exported table beyond its first 100,000: those of real runs have 0.1 to 0.3."""
+"""Rows of an exported table per byte, after its first 100,000: real runs have 0.1 to 0.3."""
 MOST_TABLE_TEXT = 64 << 20
-"""Characters of all cells of an exported table."""
+"""Characters in all cells of an exported table."""
 MOST_PAGES = 30_000
-"""Of an exported Parquet table."""
+"""Pages of an exported Parquet table."""
 MOST_PAGE_BYTES = 16 << 20
-"""Of one of its pages, unpacked: Arrow writes pages of 1 MiB."""
+"""Size of one page after unpacking: Arrow writes pages of 1 MiB."""
 MOST_UNPACKED_BYTES = 32 << 20
-"""Of all its pages, and on top of that"""
+"""Size of all pages after unpacking, to which `MOST_UNPACKED_PER_BYTE` is added."""
 MOST_UNPACKED_PER_BYTE = 16
-"""for each byte of the file. Those of real sweeps have 1.5 to 1.8."""
+"""Unpacked bytes for each byte of the file: real sweeps have 1.5 to 1.8."""
 MOST_COLUMNS = 10_000
-"""Of an exported table."""
+"""Columns of an exported table."""
 
-# One that does not end is taken to the end: looking for it again at each quote would be quadratic.
+# A string without an end reaches to the end: a new search at each quote would take quadratic time.
 _TEXTS = re.compile(rb'"(?:[^"\\]++|\\.)*+"?', re.DOTALL)
 _LONG_NUMBER = re.compile(rb"\d{%d}" % (MOST_DIGITS + 1))
 _SURROGATE = re.compile(rb"\\u[dD][89a-fA-F]")
@@ -75,12 +67,11 @@ _KINDS = {
 
 
 def open_regular(path: Path | str, *, follow: bool = False) -> BinaryIO:
-    """Open a regular file for reading; nothing else can be waited for or read without end.
+    """Open a regular file for reading: other kinds of files may block or have no end.
 
     Args:
-        path: Of the file.
-        follow: Whether `path` itself may be a link. For a place that a user names, not for the
-            files in a folder from elsewhere.
+        follow: Whether `path` itself may be a link. Set it for a path that a user names, not for
+            the files in a folder from elsewhere.
 
     Raises:
         OSError: It is a link, FIFO, device, socket or folder, or can't be read.
@@ -113,9 +104,8 @@ def read_regular(path: Path | str, most: int, *, follow: bool = False) -> bytes:
         size = os.fstat(file.fileno()).st_size
         # It may grow while it is read.
         data = b"" if size > most else file.read(most + 1)
-        if max(size, len(data)) > most:
-            found = max(size, len(data))
-            raise OSError(errno.EFBIG, f"it has {found} bytes, more than {most}", str(path))
+        if (size := max(size, len(data))) > most:
+            raise OSError(errno.EFBIG, f"it has {size} bytes, more than {most}", str(path))
     return data
 
 
@@ -123,21 +113,21 @@ def read_json(data: bytes | str) -> Any:
     """Parse JSON that may be hostile.
 
     Raises:
-        ValueError: It is no JSON, or beyond a limit; says which.
+        ValueError: It is not JSON, or beyond a limit; names the limit.
     """
     raw = data.encode("utf-8", "surrogatepass") if isinstance(data, str) else data
     if len(raw) > MOST_JSON_BYTES:
         raise ValueError(f"must have at most {MOST_JSON_BYTES} bytes, it has {len(raw)}")
     bare = _TEXTS.sub(b"", raw)
-    if found := _LONG_NUMBER.search(bare):
-        number = f"{found[0][:8].decode()}..."
+    if match := _LONG_NUMBER.search(bare):
+        number = f"{match[0][:8].decode()}..."
         raise ValueError(f"a number must have at most {MOST_DIGITS} digits, got {number}")
     brackets = bare.translate(None, _NO_BRACKETS)
     if len(brackets) > 2 * MOST_CONTAINERS:
         raise ValueError(
             f"must have at most {MOST_CONTAINERS} lists and mappings, it has {len(brackets) // 2}"
         )
-    if nesting_of(brackets) > MOST_NESTED:
+    if _nesting_of(brackets) > MOST_NESTED:
         raise ValueError(f"must be nested at most {MOST_NESTED} levels deep, it is deeper")
     try:
         value = json.loads(raw)
@@ -148,8 +138,8 @@ def read_json(data: bytes | str) -> Any:
     return value
 
 
-def nesting_of(brackets: bytes) -> int:
-    """Levels of nested pairs, `MOST_NESTED` + 1 for more; 0 for unbalanced ones: no JSON."""
+def _nesting_of(brackets: bytes) -> int:
+    """Depth of nested pairs, at most `MOST_NESTED` + 1; 0 for unbalanced ones: no JSON."""
     for level in range(MOST_NESTED + 1):
         inner = brackets.replace(b"[]", b"").replace(b"{}", b"")
         if inner == brackets:

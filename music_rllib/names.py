@@ -1,14 +1,15 @@
-"""Every metric, tag and parameter name that reaches MLflow, in one place (no imports).
+"""The names of all metrics, tags and params in MLflow. This file imports nothing.
 
-Names use ``group/name``, so that MLflow's chart page groups them. Allowed are letters, digits,
-``_ - . : /`` and space, at most 250 characters, and no empty path part (``//`` or a leading ``/``).
+A metric is called ``group/name``, because MLflow's chart page groups by it. MLflow allows letters,
+digits, ``_ - . : /`` and space, at most 250 characters, and no empty path part (``//`` or a leading
+``/``).
 """
 
 # Counters -----------------------------------------------------------------------------------
 ENV_STEPS = "env_steps"
-"""Environment steps of this run so far; the MLflow step of every other metric."""
+"""Environment steps of the run so far; the MLflow step of every other metric."""
 GRAD_UPDATES = "grad_updates"
-"""Gradient updates of this run so far."""
+"""Gradient updates of the run so far."""
 
 # Deterministic evaluation episodes ------------------------------------------------------------
 EVAL_SUCCESS = "evaluation/success_rate"
@@ -24,20 +25,20 @@ EVAL_TOUCHED = "evaluation/object_moved_share"
 EVAL_EPISODES = "evaluation/episodes"
 """Number of episodes behind the evaluation metrics of this step."""
 EVAL_RATES = frozenset({EVAL_SUCCESS, EVAL_SUCCESS_ANY, EVAL_TOUCHED})
-"""Those that are a share of the evaluation episodes."""
+"""The evaluation metrics that are a share of the episodes."""
 
 
 def primary_metric(success_key: str | None) -> str:
-    """What runs on a task are judged by: its success rate, or the return where none is declared.
+    """The metric that runs on a task are compared by: success rate where declared, else return.
 
     Args:
-        success_key: the task's; None, or `None` as MLflow keeps it, where it has no success.
+        success_key: that of the task; None, or `None` as text in MLflow, if it declares no success.
     """
     return EVAL_RETURN if success_key in (None, "None") else EVAL_SUCCESS
 
 
 def word_of(metric: str) -> str:
-    """An evaluation metric in a line of text; other metrics are called by their name."""
+    """The word for an evaluation metric in a line of text; the name of any other metric."""
     return {EVAL_SUCCESS: "success", EVAL_RETURN: "return"}.get(metric, metric)
 
 
@@ -64,9 +65,9 @@ ENTROPY = "entropy/tsallis"
 SHANNON_ENTROPY = "entropy/shannon"
 """Shannon entropy of the joint policy on [-1, 1]^A, in nats."""
 ENTROPIES = (SHANNON_ENTROPY, ENTROPY)
-"""Of the whole policy."""
+"""Entropies of the whole policy, over all action dimensions."""
 CLIPPED_DENSITIES = "bounds/density_share"
-"""Share of densities beyond which ln_q follows its tangent (`tsallis.MAX_EXPONENT`)."""
+"""Share of densities so extreme that ln_q is replaced by its tangent (`tsallis.MAX_EXPONENT`)."""
 LOG_STD_AT_BOUND = "bounds/log_std_share"
 """Share of log standard deviations at an end of their range."""
 ENTROPIC_INDEX = "schedule/entropic_index"
@@ -78,58 +79,30 @@ FOLLOWED = {
     ENTROPIC_INDEX: ENTROPIC_INDEX_FOLLOWS,
     MI_REWARD_WEIGHT: MI_REWARD_WEIGHT_FOLLOWS,
 }
-"""Setting to the success rate, or entropy in nats, that it is a function of: smoothed, and monotone
-where asked."""
-
-
+"""A setting's metric to that of the quantity it follows: a success rate, or an entropy in nats,
+smoothed and monotone as configured."""
 CLIPPED_TARGETS = "bounds/target_share"
-"""Share of critic targets on `tac.target_bounds`."""
+"""Share of critic targets that lie on `tac.target_bounds`."""
 Q_BIAS = "critics/bias"
-"""Smallest critic at the first step of fresh episodes, minus the return that followed there."""
+"""Smallest critic at the first step of fresh episodes, minus the return of the episode."""
 HELD_OUT_BOUND = "mutual_information/held_out_bound"
 """The bound on fresh episodes, before the estimator is trained on them, in nats."""
 MI_REWARD_LOWEST = "mutual_information/reward_share_lowest"
 MI_REWARD_HIGHEST = "mutual_information/reward_share_highest"
 """Shares of sampled transitions whose intrinsic reward is clipped to -1 and to 0."""
-
 SHANNON_OF_DIMENSION = "entropy/shannon_dimension_"
-"""Followed by the action dimension: its Shannon entropy, in nats."""
+"""Prefix; with an action dimension: the dimension's Shannon entropy, in nats."""
 ENTROPY_OF_DIMENSION = "entropy/tsallis_dimension_"
-"""Followed by the action dimension: S_q of it alone."""
-PER_DIMENSION = (ENTROPY_OF_DIMENSION, SHANNON_OF_DIMENSION)
+"""Prefix; with an action dimension: the dimension's S_q."""
 
-LEARNER = frozenset(
-    {
-        MI_BOUND,
-        MI_REWARD,
-        CRITIC_LOSS,
-        VALUE_LOSS,
-        POLICY_LOSS,
-        Q_MEAN,
-        ENTROPY,
-        SHANNON_ENTROPY,
-        CLIPPED_DENSITIES,
-        LOG_STD_AT_BOUND,
-        CLIPPED_TARGETS,
-        Q_BIAS,
-        HELD_OUT_BOUND,
-        MI_REWARD_LOWEST,
-        MI_REWARD_HIGHEST,
-        ENTROPIC_INDEX,
-        ALPHA,
-        MI_REWARD_WEIGHT,
-        ENTROPIC_INDEX_FOLLOWS,
-        MI_REWARD_WEIGHT_FOLLOWS,
-    }
-)
-"""What the Learner logs, beside the entropies of single dimensions."""
-
+LEARNER_GROUPS = ("bounds/", "critics/", "entropy/", "loss/", "mutual_information/", "schedule/")
+"""Beginnings of the names of the Learner's metrics."""
 
 # Measured in the worker, logged with the other metrics ------------------------------------------
 SYSTEM_CPU = "system/cpu_utilization_percentage"
 SYSTEM_MEMORY = "system/process_memory_megabytes"
 
-# A run's settings that are metrics too: MLflow compares params as text, so `q > 1` needs one ---
+# Settings of a run as metrics: MLflow compares params as text, so that `q > 1` needs a metric ---
 SETTING_ENTROPIC_INDEX = "setting/entropic_index"
 SETTING_ALPHA = "setting/alpha"
 SETTING_MI_REWARD_WEIGHT = "setting/mi_reward_weight"
@@ -146,11 +119,11 @@ GROUPS = (
     "system",
     "training",
 )
-"""Of the names above."""
+"""Groups of the metrics above."""
 
 # Tags -------------------------------------------------------------------------------------------
 TAG_PARENT_RUN = "mlflow.parentRunId"
-"""MLflow's own tag that nests a run below another."""
+"""MLflow's tag that nests a run below another."""
 TAG_KIND = "kind"
 """``sweep`` for the parent run, ``run`` for a child run."""
 KIND_SWEEP = "sweep"
@@ -158,11 +131,11 @@ KIND_RUN = "run"
 TAG_SWEEP = "sweep"
 """Name of the sweep."""
 TAG_SWEEP_ID = "sweep_id"
-"""Tells apart sweeps of the same name that share a server; kept in the sweep's folder."""
+"""Distinguishes sweeps of the same name on one server; kept in the sweep's folder."""
 TAG_NODE_KEY = "node_key"
-"""Content hash of the node; a child run is found again by it."""
+"""Content hash of the run's settings and source, by which a child run is found again."""
 TAG_LABEL = "label"
-"""What the run is called in the sweep, and by `sweep evaluate`."""
+"""The run's label in the sweep, which `sweep evaluate` takes."""
 TAG_STAGE = "stage"
 TAG_TRIAL = "trial"
 TAG_VARIANT = "variant"
@@ -175,32 +148,32 @@ TAG_CONFIG_HASH = "config_hash"
 TAG_SOURCE_RUN = "source_run"
 """MLflow run id of the run whose handoff this run starts from."""
 TAG_SOURCE_NODE = "source_node"
-"""Node key, or checkpoint hash, of what this run starts from."""
+"""Node key of the run, or hash of the checkpoint, that this run starts from."""
 TAG_REUSED = "reused"
-"""``true`` where the node was finished by an earlier sweep and its history was copied here."""
+"""``true`` if an earlier sweep finished the run and its history was copied here."""
 TAG_INCOMPLETE = "incomplete"
-"""On a finished run while its learning curve and policy are still to come."""
+"""Set on a finished run until its learning curve and policy are logged."""
 TAG_PART = "part"
-"""Of a searched stage: ``trialN`` for a run that trials were chosen by, ``finalN`` for one on the
-fresh seeds of the final ranking. Never mixed in one estimate: the choice biases the first."""
+"""In a searched stage: ``trialN`` for a run of the search, ``finalN`` for a run of the final
+ranking, on fresh seeds. One estimate never mixes both: the choice of trials biases the former."""
 TAG_PRUNED = "pruned"
-"""Why a run was stopped early, together with its trial."""
+"""Why the run was stopped early, together with its trial."""
 TAG_FAILURE = "failure"
 """First lines of the cause of a failed run."""
 TAG_GIT_COMMIT = "git_commit"
-"""Commit of the code, with ``-dirty`` where tracked files were changed."""
+"""Commit of the code, with ``-dirty`` if tracked files were changed."""
 TAG_VERSION_PREFIX = "version."
-"""Followed by a package or ``python``: ``version.ray``."""
+"""Prefix of a package or ``python``: ``version.ray``."""
 TAG_ALGORITHM = TAG_VERSION_PREFIX + "algorithm"
-"""Version of what is computed; runs without this tag are of version 2."""
+"""`ALGORITHM_VERSION`; runs without this tag have version 2."""
 TAG_CHANGED_PREFIX = "changed."
-"""Followed by a param: its newer value (MLflow params never change) after a sweep was changed."""
+"""Prefix of a param: its value after the sweep was changed, as MLflow params never change."""
 TAG_VIEW_PREFIX = "mlflow.sharedViewState."
-"""MLflow's own, of an experiment, followed by a view's key."""
+"""MLflow's prefix of the key of an experiment's view."""
 TAG_NOTE = "mlflow.note.content"
-"""MLflow's own: what the run's page shows as its description, in Markdown."""
+"""MLflow's tag for the description of a run, in Markdown."""
 EXPERIMENT_TAGS = {"mlflow.experimentKind": "custom_model_development"}
-"""MLflow 3 shows an experiment without it as one of language models: traces, judges, prompts."""
+"""Without it MLflow 3 shows an experiment as one of language models: traces, judges, prompts."""
 TAGS_OF_A_MODEL = (
     TAG_SWEEP,
     TAG_SWEEP_ID,
@@ -214,9 +187,7 @@ TAGS_OF_A_MODEL = (
     TAG_ALPHA,
     TAG_MI_REWARD_WEIGHT,
 )
-"""What a logged policy is tagged with, besides ``source_run``: the run's own values."""
-TAG_MLFLOW_SOURCE_NAME = "mlflow.source.name"
-"""MLflow's own tag behind its *Source* column."""
+"""Tags of a run that its logged policy has too, besides ``source_run``."""
 
 # Artefacts --------------------------------------------------------------------------------------
 ARTEFACT_SWEEP_CONFIG = "config/sweep.yaml"
@@ -227,12 +198,12 @@ ARTEFACT_ANALYSIS_PLAN = "analysis/analysis_plan.json"
 ARTEFACT_RUN_CONFIG = "config/run.yaml"
 ARTEFACT_LEARNING_CURVE = "learning_curve.png"
 ARTEFACT_POLICY = "policy.safetensors"
-"""The final policy on its way to MLflow, where it becomes the run's logged model."""
+"""The final policy, which MLflow keeps as the run's logged model."""
 
 # Environment variables --------------------------------------------------------------------------
 VARIABLE_TRACKING_URI = "MUSIC_RLLIB_TRACKING_URI"
-"""Tells the report of a sweep's end where to read, password included."""
+"""Where the report at a sweep's end reads runs, password included."""
 VARIABLE_STORAGE = "MUSIC_RLLIB_STORAGE"
-"""The same of the sweep's storage, where that is a bucket."""
+"""Where the report at a sweep's end finds the storage, if that is a bucket."""
 VARIABLE_REPORT = "MUSIC_RLLIB_REPORT"
 """`off`: no report at a sweep's end."""

@@ -15,8 +15,6 @@ from music_rllib.serve import command as serve
 from music_rllib.sweep.cli import COMMANDS, EXIT_CODES
 from music_rllib.tracking import cli as tracking
 
-__all__ = ["app", "main"]
-
 EPILOG = f"""\
 Examples:
   music-rllib init reach.yaml
@@ -49,12 +47,12 @@ def program(
         typer.echo(f"{PROGRAM} {__version__}")
         raise typer.Exit
     if context.invoked_subcommand is None:
-        # Asking what there is isn't a mistake: on standard output, and the exit code is 0.
+        # Without a command the help is an answer, not an error: on standard output, exit code 0.
         typer.echo(context.get_help())
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the program with these arguments, or the process's; the exit code."""
+    """Run the program with `arguments`, by default the process's, and return its exit code."""
     # Ray and MLflow read their environment while they are imported.
     prepare_environment()
     quiet_third_parties()

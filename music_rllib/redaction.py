@@ -1,7 +1,7 @@
-"""What may leave the process: settings as flat params, and text without passwords.
+"""Removes passwords and control characters from text and settings that leave the process.
 
-Every text that comes from elsewhere (an environment's exception, a file, a server) and goes to a
-file, the terminal or MLflow goes through `redact`, and to the terminal through `printable` as well.
+Text from elsewhere (an environment's exception, a file, a server) passes `redact` on its way to a
+file, the terminal or MLflow, and also `printable` on its way to the terminal.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterator, Mapping
 
 MAX_PARAM_LENGTH = 6000
-"""MLflow's limit for the value of a param, in characters."""
+"""Longest value of a param that MLflow takes, in characters."""
 
 _USER_INFO = re.compile(r"(?P<scheme>[A-Za-z][A-Za-z0-9+.\-]{0,40}://)[^/?#\s'\"]*@")
 _QUERY_SECRET = re.compile(
@@ -26,8 +26,8 @@ _ASSIGNED_SECRET = re.compile(
     re.IGNORECASE | re.VERBOSE,
 )
 _BEARER = re.compile(r"(?P<name>\bBearer\s+)[\w.~+/=-]+")
-# C0 and C1 controls but line breaks and tabs, marks that change the direction of writing or hide,
-# and halves of characters, which no terminal can be given.
+# C0 and C1 controls except line breaks and tabs, marks that change the direction of writing, marks
+# that are invisible, and unpaired surrogates, which no terminal can be given.
 _UNPRINTABLE = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u2069\ufeff\ud800-\udfff]"
 )
@@ -38,9 +38,9 @@ _NOT_IN_A_NAME = re.compile(r"[^\w./\- ]")
 def redact(text: str) -> str:
     """``text`` without passwords.
 
-    Left out are ``user:password@`` in URIs, and what is assigned to a name that contains
-    ``password``, ``token``, ``secret``, ``api_key``, ``access_key`` or ``credential``: by ``=``,
-    ``:`` or in a URI's query.
+    Removed are ``user:password@`` in URIs, and values that are assigned (by ``=``, ``:`` or in a
+    URI's query) to a name that contains ``password``, ``token``, ``secret``, ``api_key``,
+    ``access_key`` or ``credential``.
     """
     text = _USER_INFO.sub(lambda match: match["scheme"], text)
     text = _QUERY_SECRET.sub(lambda match: match["name"] + "***", text)
@@ -48,29 +48,29 @@ def redact(text: str) -> str:
     return _ASSIGNED_SECRET.sub(_hidden, text)
 
 
-def _hidden(found: re.Match[str]) -> str:
-    """In quotes after a colon, to stay YAML and JSON."""
-    if found["equals"] is not None:
-        return f"{found['name']}{found['equals']}***"
-    quote = found["quote"] or '"'
-    return f"{found['name']}{found['colon']}{quote}***{quote}"
+def _hidden(match: re.Match[str]) -> str:
+    """The name with ``***`` for its value, in quotes after a colon to stay YAML or JSON."""
+    if match["equals"] is not None:
+        return f"{match['name']}{match['equals']}***"
+    quote = match["quote"] or '"'
+    return f"{match['name']}{match['colon']}{quote}***{quote}"
 
 
 def printable(text: str) -> str:
-    """``text`` with control characters as JSON's escapes: a file can't command a terminal."""
-    return _UNPRINTABLE.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+    """``text`` with control characters as JSON escapes, so that it cannot control a terminal."""
+    return _UNPRINTABLE.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
 
 
 def for_people(text: object) -> str:
-    """An error or a remark as it may be shown: without passwords and control characters."""
+    """An error or a remark without passwords and control characters, ready to be shown."""
     return printable(redact(str(text)))
 
 
 def without_secrets(settings: Mapping[str, object]) -> dict[str, object]:
-    """A copy of nested ``settings`` with redacted URIs and without keys that name a secret.
+    """A copy of nested ``settings`` with redacted text and without keys that name a secret.
 
-    A key names a secret where it contains ``password``, ``token``, ``secret``, ``api_key`` or
-    ``credential``. The input is not changed.
+    A key names a secret if it contains ``password``, ``token``, ``secret``, ``api_key`` or
+    ``credential``.
     """
     return {
         str(key): _clean(value)
@@ -90,30 +90,24 @@ def _clean(value: object) -> object:
 def flat_params(settings: Mapping[str, object]) -> dict[str, str]:
     """Nested ``settings`` as MLflow params: dotted names, scalars as text.
 
-    A list of scalars is one param (JSON text). Left out, since the whole configuration is an
-    artefact anyway: secrets, lists of records, and values above ``MAX_PARAM_LENGTH`` characters.
+    A list of scalars is one param (JSON text). Secrets, lists of records and values above
+    ``MAX_PARAM_LENGTH`` characters are omitted: the whole configuration is an artefact anyway.
     """
     flat = {}
     for name, value in _leaves(without_secrets(settings), ""):
-        text = _param_text(value)
-        if text is not None and len(text) <= MAX_PARAM_LENGTH:
+        if isinstance(value, list):
+            if any(isinstance(item, (Mapping, list)) for item in value):
+                continue
+            value = json.dumps(value, default=str)
+        if len(text := str(value)) <= MAX_PARAM_LENGTH:
             flat[_NOT_IN_A_NAME.sub("_", name)[:250]] = text
     return flat
 
 
 def _leaves(settings: Mapping[str, object], prefix: str) -> Iterator[tuple[str, object]]:
+    """Dotted names and values of nested settings."""
     for key, value in settings.items():
         if isinstance(value, Mapping):
             yield from _leaves(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", value
-
-
-def _param_text(value: object) -> str | None:
-    if isinstance(value, list):
-        return None if any(isinstance(item, (Mapping, list)) for item in value) else _json(value)
-    return str(value)
-
-
-def _json(value: object) -> str:
-    return json.dumps(value, default=str)

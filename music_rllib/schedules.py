@@ -2,14 +2,14 @@
 
 A setting is a plain number (constant), a :class:`Linear` ramp over fractions of the run's budget
 (the curriculum of Lee et al. 2019, "TAC with curricula": 10 % to 90 % of training) or a
-:class:`Piecewise` table of environment steps. All hold their last value for ever. q and the MI
-weight may also be :class:`Measured`: a function of the run's success rate or entropy.
+:class:`Piecewise` table of environment steps. Each holds its last value to the end of the run. q
+and the MI weight may also be :class:`Measured`: a function of the run's success rate or entropy.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from typing import Annotated, Literal, Self
 
@@ -23,40 +23,27 @@ from pydantic import (
     model_validator,
 )
 
-__all__ = [
-    "QUANTITIES",
-    "AdaptiveSchedule",
-    "Follower",
-    "Linear",
-    "Measured",
-    "Piecewise",
-    "Quantity",
-    "Schedule",
-    "bounded",
-    "check_measurable",
-    "extremes",
-    "value_at",
-]
-
 Quantity = Literal["success_rate", "shannon_entropy"]
-"""What a setting may follow."""
+"""Quantities that a `Measured` setting may follow."""
 QUANTITIES = {"success_rate": "success rate", "shannon_entropy": "Shannon entropy"}
-"""In words."""
+"""Quantity to its name in text."""
 
 
-class _Frozen(BaseModel):
+class StrictModel(BaseModel):
+    """Settings that never change, and hold no unknown key, infinity or NaN."""
+
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-class Linear(_Frozen):
+class Linear(StrictModel):
     """Straight line from `start` to `end` between two fractions of the run's budget."""
 
     schedule: Literal["linear"] = "linear"
     """Says which kind of schedule this is."""
     start: float
-    """Value at first."""
+    """Value at the beginning."""
     end: float
-    """Value at last."""
+    """Value at the end."""
     begin: float = Field(0.1, ge=0.0, le=1.0)
     """Fraction of the budget up to which the value is `start`."""
     finish: float = Field(0.9, ge=0.0, le=1.0)
@@ -70,16 +57,8 @@ class Linear(_Frozen):
             )
         return self
 
-    def value(self, env_steps: int, total_env_steps: int) -> float:
-        fraction = env_steps / max(total_env_steps, 1)
-        progress = (fraction - self.begin) / (self.finish - self.begin)
-        return self.start + (self.end - self.start) * min(max(progress, 0.0), 1.0)
 
-    def extremes(self) -> tuple[float, float]:
-        return min(self.start, self.end), max(self.start, self.end)
-
-
-class Piecewise(_Frozen):
+class Piecewise(StrictModel):
     """Values at given environment steps, joined by lines or held until the next one."""
 
     schedule: Literal["piecewise"] = "piecewise"
@@ -87,7 +66,7 @@ class Piecewise(_Frozen):
     points: tuple[tuple[int, float], ...] = Field(min_length=1)
     """(environment steps, value) pairs; the first one must be at step 0."""
     interpolation: Literal["linear", "hold"] = "linear"
-    """Between two points: a straight line, or the earlier value until the later point."""
+    """Between two points: a straight line, or the value of the earlier one."""
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -98,36 +77,23 @@ class Piecewise(_Frozen):
             raise ValueError(f"points must have strictly increasing env steps, got {steps}")
         return self
 
-    def value(self, env_steps: int, total_env_steps: int) -> float:
-        held_step, held = self.points[0]
-        for step, value in self.points[1:]:
-            if env_steps < step:
-                if self.interpolation == "hold":
-                    return held
-                return held + (value - held) * (env_steps - held_step) / (step - held_step)
-            held_step, held = step, value
-        return held
 
-    def extremes(self) -> tuple[float, float]:
-        values = [value for _, value in self.points]
-        return min(values), max(values)
-
-
-class Measured(_Frozen):
-    """Value that follows what is measured of the run: straight lines between points."""
+class Measured(StrictModel):
+    """Value as a function of a measured quantity of the run: straight lines between points."""
 
     follows: Quantity
-    """The success rate at the last step, of the run's evaluations; or the policy's Shannon entropy
-    over all action dimensions, in nats, a mean over the updates after each round of episodes."""
+    """Success rate of the run's evaluations, at the last step of an episode; or Shannon entropy of
+    the policy over all action dimensions, in nats, averaged over the updates after each round of
+    episodes."""
     points: tuple[tuple[float, float], ...] = Field(min_length=2)
-    """(measured, value) pairs, joined by straight lines and held beyond both ends. Before anything
-    is measured, the success rate counts as the lowest and the entropy as the highest of them."""
+    """(measured, value) pairs, joined by straight lines and held beyond both ends. Until the first
+    measurement the success rate counts as the lowest of them and the entropy as the highest."""
     smoothing: float = Field(0.0, ge=0)
-    """Environment steps over which measurements are averaged: of the mean before one, a share of
-    exp(-steps since then/smoothing) is kept. 0: only the last measurement counts."""
+    """Environment steps over which measurements are averaged: each one keeps a share
+    exp(-steps since then/smoothing) of the mean before it. 0: only the last one counts."""
     monotone: bool = False
-    """Only the highest success rate so far counts, or the lowest entropy so far, after smoothing:
-    the value goes one way along the points and never back."""
+    """Whether the highest success rate so far counts, or the lowest entropy so far, after
+    smoothing: the value then moves along the points in one direction only."""
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -138,40 +104,19 @@ class Measured(_Frozen):
             raise ValueError(f"points of a success rate must lie in [0, 1], got {measured}")
         return self
 
-    @property
-    def initial(self) -> float:
-        """The measured value that counts before there is one."""
-        return self.points[0 if self.follows == "success_rate" else -1][0]
-
-    def value(self, measured: float | None) -> float:
-        """The setting where so much is measured; None: nothing yet."""
-        at = self.initial if measured is None else measured
-        below, held = self.points[0]
-        if at <= below:
-            return held
-        for above, value in self.points[1:]:
-            if at < above:
-                return held + (value - held) * (at - below) / (above - below)
-            below, held = above, value
-        return held
-
-    def extremes(self) -> tuple[float, float]:
-        values = [value for _, value in self.points]
-        return min(values), max(values)
-
 
 class Follower:
-    """What has been measured for one `Measured` setting."""
+    """The measured quantity that one `Measured` setting follows."""
 
     def __init__(self, schedule: Measured) -> None:
         self._schedule = schedule
         self._mean: float | None = None
         self._env_steps = 0
         self.measured: float | None = None
-        """What the setting follows: smoothed, and monotone where asked; None before the first."""
+        """The quantity, smoothed, and monotone where asked; None before the first measurement."""
 
     def observe(self, quantity: Quantity, measured: float, env_steps: int) -> None:
-        """Take a measurement made after `env_steps`; others than the one followed are ignored."""
+        """Add a measurement made after `env_steps`, unless it is of another quantity."""
         schedule = self._schedule
         if quantity != schedule.follows or not math.isfinite(measured):
             return
@@ -185,17 +130,17 @@ class Follower:
         self.measured = measured
 
     def state(self) -> dict[str, float | None]:
-        """All of it, for a checkpoint."""
+        """The state for a checkpoint."""
         return {"mean": self._mean, "env_steps": self._env_steps, "measured": self.measured}
 
     def load_state(self, state: dict[str, float | None]) -> None:
-        """Go on from `state`."""
+        """Restore the state of a checkpoint."""
         self._mean, self.measured = state["mean"], state["measured"]
         self._env_steps = int(state["env_steps"] or 0)
 
 
 def _kind(value: object) -> str | None:
-    """Which member of `Schedule` a value claims to be, so that errors speak of that one only."""
+    """Tag of the member of `Schedule` that a value is meant to be; errors are about that one."""
     if isinstance(value, dict):
         return "measured" if "follows" in value else value.get("schedule")
     if isinstance(value, Measured):
@@ -236,29 +181,55 @@ def value_at(
     """The schedule's value after `env_steps` of `total_env_steps` environment steps.
 
     Args:
-        measured: what a `Measured` follows; None before anything has been measured.
+        measured: the quantity that a `Measured` follows; None before the first measurement.
     """
-    if isinstance(schedule, Measured):
-        return schedule.value(measured)
-    if isinstance(schedule, Linear | Piecewise):
-        return schedule.value(env_steps, total_env_steps)
+    match schedule:
+        case Linear():
+            fraction = env_steps / max(total_env_steps, 1)
+            progress = (fraction - schedule.begin) / (schedule.finish - schedule.begin)
+            return schedule.start + (schedule.end - schedule.start) * min(max(progress, 0.0), 1.0)
+        case Piecewise(interpolation="hold"):
+            return next(value for step, value in reversed(schedule.points) if step <= env_steps)
+        case Piecewise():
+            return _interpolated(schedule.points, env_steps)
+        case Measured():
+            if measured is None:
+                measured = schedule.points[0 if schedule.follows == "success_rate" else -1][0]
+            return _interpolated(schedule.points, measured)
     return float(schedule)
+
+
+def _interpolated(points: Sequence[tuple[float, float]], at: float) -> float:
+    """The value at `at` on straight lines between `points`, held beyond both ends."""
+    before, held = points[0]
+    if at <= before:
+        return held
+    for after, value in points[1:]:
+        if at < after:
+            return held + (value - held) * (at - before) / (after - before)
+        before, held = after, value
+    return held
 
 
 def extremes(schedule: float | Linear | Piecewise | Measured) -> tuple[float, float]:
     """Smallest and largest value the schedule ever takes."""
-    if isinstance(schedule, Linear | Piecewise | Measured):
-        return schedule.extremes()
-    return float(schedule), float(schedule)
+    match schedule:
+        case Linear():
+            values = [schedule.start, schedule.end]
+        case Piecewise() | Measured():
+            values = [value for _, value in schedule.points]
+        case _:
+            values = [float(schedule)]
+    return min(values), max(values)
 
 
 def check_measurable(settings: Mapping[str, object], *, success: bool, entropy: bool) -> None:
-    """Refuse settings that follow what the run does not measure.
+    """Refuse settings that follow a quantity that the run does not measure.
 
     Args:
         settings: dotted name to value.
         success: whether the task declares success.
-        entropy: whether the policy has one.
+        entropy: whether the policy has an entropy.
 
     Raises:
         ValueError: names the setting.
@@ -278,13 +249,12 @@ def check_measurable(settings: Mapping[str, object], *, success: bool, entropy: 
 
 
 def bounded(rule: str, holds: Callable[[float], bool]) -> AfterValidator:
-    """A pydantic validator that asks `holds` of the ends of a schedule's range."""
+    """A pydantic validator that `holds` is true of a schedule's smallest and largest value."""
 
     def check(
         schedule: float | Linear | Piecewise | Measured,
     ) -> float | Linear | Piecewise | Measured:
-        low, high = extremes(schedule)
-        for value in (low, high):
+        for value in extremes(schedule):
             if not holds(value):
                 raise ValueError(f"must be {rule}, got {value:g}")
         return schedule

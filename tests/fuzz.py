@@ -29,7 +29,8 @@ from typing import Any
 
 import numpy as np
 
-from music_rllib.config.load import ConfigError, load_sweep
+from music_rllib.config.load import load_sweep
+from music_rllib.config.problems import ConfigError
 from music_rllib.experiment.plan import make_plan
 from music_rllib.policy import PolicyError, load_policy
 from music_rllib.policy.rollout import open_task

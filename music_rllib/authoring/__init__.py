@@ -1,18 +1,16 @@
-"""Help with writing a sweep's file: a starter, and a JSON Schema for editors."""
+"""Starter file and JSON Schema of a sweep's YAML file."""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
 
-__all__ = ["SCHEMA", "starter"]
-
 SCHEMA = Path(__file__).with_name("sweep.schema.json")
-"""Written by docs/generate_configuration.py."""
+"""The JSON Schema, which docs/generate_configuration.py writes."""
 
 
 def starter(file: Path) -> str:
-    """A commented sweep that is to be written as `file`."""
+    """The text of a commented sweep that is written as `file`."""
     name = re.sub(r"[^A-Za-z0-9._-]+", "_", file.stem).strip("._-")[:80] or "sweep"
     text = Path(__file__).with_name("starter.yaml").read_text(encoding="utf-8")
     lines = text.replace("NAME", name).replace("FILE", str(file))

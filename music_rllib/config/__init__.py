@@ -1,1 +1,1 @@
-"""A sweep's YAML file: its schema, its settings layer by layer, and what is wrong with it."""
+"""A sweep's YAML file: schema, layers of settings, problems and warnings."""

@@ -1,20 +1,20 @@
-"""The `analysis` of a sweep: what is asked, and whether the sweep has such conditions."""
+"""The `analysis` section of a sweep: hypotheses about its conditions, stated before the runs."""
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, Field
 
 from music_rllib.config.problems import Findings, lookup, same, shown
 from music_rllib.names import EVAL_RETURN
+from music_rllib.schedules import StrictModel
 
 if TYPE_CHECKING:
     from music_rllib.config.schema import Stage
-
-__all__ = ["Analysis", "Hypothesis", "check_analysis"]
 
 SETTINGS_IN_SHORT = {
     "q": "tac.entropic_index",
@@ -22,7 +22,7 @@ SETTINGS_IN_SHORT = {
     "alpha": "tac.alpha",
     "weight": "music.mi_reward_weight",
 }
-"""What hypotheses may call settings."""
+"""Short name of a setting in hypotheses to the setting."""
 _HYPOTHESIS = re.compile(
     r"(?P<first>.+?) (?P<relation>better than|worse than|equivalent to|against) (?P<second>.+)"
 )
@@ -30,129 +30,124 @@ _NEXT_SETTING = re.compile(r",(?=[^,=]+=)")
 
 
 class Hypothesis(NamedTuple):
-    """`q = 1.5 better than q = 1`: what is compared, and what is expected of it."""
+    """Two conditions and the expected relation between them: `q = 1.5 better than q = 1`."""
 
     text: str
     first: Mapping[str, str]
-    """Dotted setting, or `stage`, to its value."""
+    """The first condition: dotted setting, or `stage`, to its value."""
     second: Mapping[str, str]
     relation: str
-    """`better than`, `worse than`, `equivalent to`, or `against` where nothing is expected."""
+    """`better than`, `worse than`, `equivalent to`, or `against` if nothing is expected."""
 
     @classmethod
     def of(cls, text: str) -> Self:
-        """Read one.
+        """Parse a hypothesis.
 
         Raises:
-            ValueError: It is none; says what one looks like.
+            ValueError: The text is none; says what one looks like.
         """
         words = " ".join(text.split())
-        found = _HYPOTHESIS.fullmatch(words)
-        sides = [] if found is None else [_side(found[name]) for name in ("first", "second")]
-        if found is None or None in sides or sides[0] == sides[1]:
+        match = _HYPOTHESIS.fullmatch(words)
+        first = _condition(match["first"]) if match else {}
+        second = _condition(match["second"]) if match else {}
+        if match is None or not first or not second or first == second:
             raise ValueError(
                 "must be two different conditions with 'better than', 'worse than', 'equivalent "
                 f"to' or 'against' between them, like 'q = 1.5 against q = 1', got {text!r}"
             )
-        first, second = (side or {} for side in sides)
-        return cls(text=words, first=first, second=second, relation=found["relation"])
+        return cls(text=words, first=first, second=second, relation=match["relation"])
 
 
-def _side(text: str) -> dict[str, str] | None:
-    """`q = 1.5, tac.lr = 0.001`; None where it is no such list."""
-    pairs = [part.partition("=") for part in _NEXT_SETTING.split(text)]
-    if not all(name.strip() and sign and value.strip() for name, sign, value in pairs):
-        return None
-    names_ = [SETTINGS_IN_SHORT.get(name.strip(), name.strip()) for name, _, _ in pairs]
-    values = [value.strip() for _, _, value in pairs]
-    return dict(zip(names_, values, strict=True)) if len(set(names_)) == len(names_) else None
+def _condition(text: str) -> dict[str, str]:
+    """The settings of `q = 1.5, tac.lr = 0.001`; empty if it is no such list."""
+    settings = {}
+    for part in _NEXT_SETTING.split(text):
+        name, _, value = (piece.strip() for piece in part.partition("="))
+        name = SETTINGS_IN_SHORT.get(name, name)
+        if not name or not value or name in settings:
+            return {}
+        settings[name] = value
+    return settings
 
 
-def _is_hypothesis(text: str) -> str:
-    return Hypothesis.of(text).text
-
-
-class Analysis(BaseModel):
-    """What is to be found out, stated before the runs; no run's result depends on it."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+class Analysis(StrictModel):
+    """The questions of a sweep, stated before the runs; no run's result depends on them."""
 
     question: str | None = Field(None, min_length=1, max_length=500, pattern=r"^[^\x00-\x1f\x7f]*$")
-    """In a sentence, for the report's first line."""
+    """The question in a sentence, for the report's first line."""
     hypotheses: tuple[
-        Annotated[str, Field(max_length=500), AfterValidator(_is_hypothesis)], ...
+        Annotated[
+            str, Field(max_length=500), AfterValidator(lambda text: Hypothesis.of(text).text)
+        ],
+        ...,
     ] = Field(min_length=1, max_length=50)
     """Two conditions each, with `better than`, `worse than`, `equivalent to` or `against` between
-    them: `q = 1.5 better than q = 1`. A condition is what has these settings (`q`, `alpha`,
-    `weight`, a dotted setting, `stage`); where more varies, differences are averaged over pairs
-    that are alike in the rest."""
+    them: `q = 1.5 better than q = 1`. A condition is all runs that have these settings (`q`,
+    `alpha`, `weight`, a dotted setting, `stage`); if more settings vary, differences are averaged
+    over pairs that are equal in the others."""
     stage: str | None = None
-    """Whose conditions; null: the last stage. A condition may name its own."""
+    """Stage of the conditions; null: the last one. A condition may name another."""
     metric: Literal["auc", "final"] = "auc"
-    """What counts of a run: the area under its curve of the task's primary metric, which is its
-    mean over the budget, or the last value."""
+    """Number of a run: the mean of the task's primary metric over the budget (the area under its
+    curve), or its last value."""
     margin: float | None = Field(None, gt=0)
-    """A difference below it does not matter: equivalence is tested within it. null: 0.05 of a
-    success rate; of a return it must be given."""
+    """Differences below it do not matter: the margin of equivalence tests. null: 0.05 for a success
+    rate; it must be given for a return."""
 
 
 def check_analysis(
     analysis: Analysis, stages: Mapping[str, Stage | None], findings: Findings
 ) -> None:
-    """Whether its hypotheses are about conditions that the sweep has."""
+    """Check that the hypotheses are about conditions that the sweep has."""
     if analysis.stage is not None and analysis.stage not in stages:
         rule = f"must be one of {', '.join(stages)}, got {analysis.stage!r}"
         findings.add(("analysis", "stage"), rule)
         return
     default = analysis.stage or next(reversed(list(stages)), None)
-    about: dict[str, Stage] = {}
+    metrics = set()
     for position, text in enumerate(analysis.hypotheses):
         hypothesis = Hypothesis.of(text)
-        for side in (hypothesis.first, hypothesis.second):
-            name = side.get("stage", default)
-            stage = stages.get(str(name))
-            if stage is not None:
-                about[stage.name] = stage
-            path = ("analysis", "hypotheses", position)
-            if name not in stages:
+        path = ("analysis", "hypotheses", position)
+        for condition in (hypothesis.first, hypothesis.second):
+            name = condition.get("stage", default)
+            if name is None or name not in stages:
                 findings.add(path, f"must name one of the stages {', '.join(stages)}, got {name!r}")
-            elif stage is not None and (wrong := _no_such_condition(stage, side)):
-                findings.add(path, wrong)
-    metrics = {task.primary_metric for stage in about.values() for task in stage.tasks}
+            elif (stage := stages[name]) is not None:
+                metrics |= {task.primary_metric for task in stage.tasks}
+                if broken := _broken_rule(stage, condition):
+                    findings.add(path, broken)
     if analysis.margin is None and EVAL_RETURN in metrics:
         findings.add(("analysis", "margin"), "must be given for tasks without success, got null")
 
 
-def _no_such_condition(stage: Stage, side: Mapping[str, str]) -> str | None:
-    """What is wrong with one side of a hypothesis; None where the stage has such conditions."""
+def _broken_rule(stage: Stage, condition: Mapping[str, str]) -> str | None:
+    """The rule that a condition breaks; None if the stage has such runs."""
     points: list[Mapping[str, Any]] = [point.values for point in stage.points]
     space = stage.search.space if stage.search else {}
     if stage.search:
         points = list(stage.search.arms())
-    varied = dict.fromkeys([*(name for point in points for name in point), *space])
-    for name, text in side.items():
+    runs = list(stage.points[0].runs.values())
+    if not runs:  # the stage's settings are invalid, which is a problem of its own
+        return None
+    fixed = runs[0].model_dump(mode="json")
+    for name, text in condition.items():
         if name == "stage" or name in space:
             continue
-        known = [point[name] for point in points if name in point]
-        run = next(iter(stage.points[0].runs.values())).model_dump(mode="json")
-        known = known or [found for found in [_setting(run, name)] if found is not None]
-        if not known:
+        values = [point[name] for point in points if name in point]
+        if not values:
+            with contextlib.suppress(LookupError):
+                values = [value for value in [lookup(fixed, name.split("."))] if value is not None]
+        if not values:
+            varied = dict.fromkeys([*(name for point in points for name in point), *space])
             settings = ", ".join(varied) or "nothing"
             return f"must name settings, of which {stage.name} varies {settings}, got {name!r}"
-        if not any(_agrees(text, value) for value in known):
-            return f"must name values that {stage.name} has, {name} is {shown(known)}, got {text}"
+        if not any(_equals(text, value) for value in values):
+            return f"must name values that {stage.name} has, {name} is {shown(values)}, got {text}"
     return None
 
 
-def _agrees(text: str, value: Any) -> bool:
+def _equals(text: str, value: Any) -> bool:
     try:
         return same(float(text), value)
     except ValueError:
         return text in (value, shown(value))
-
-
-def _setting(run: Mapping[str, Any], name: str) -> Any:
-    try:
-        return lookup(run, name.split("."))
-    except LookupError:
-        return None

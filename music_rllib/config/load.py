@@ -1,8 +1,8 @@
-"""A sweep's YAML file, read and validated as a whole before anything starts.
+"""Reads and validates a sweep's YAML file before anything starts.
 
-:func:`load_sweep` reports all problems at once, each as ``file:line: key rule, got value``. What it
-returns is resolved: every stage has, for every point of its grid and every task, the complete
-settings of a run.
+:func:`load_sweep` reports all problems at once, each as ``file:line: key rule, got value``. The
+sweep that it returns is resolved: each stage has the complete settings of a run for each point of
+its grid and each task.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ from music_rllib.config.problems import (
     shown,
     unknown,
 )
-from music_rllib.config.problems import Path as KeyPath
 from music_rllib.config.reading.layers import (
     LAYER_KEYS,
     SECTIONS,
@@ -34,20 +33,15 @@ from music_rllib.config.reading.layers import (
     for_a_grid,
     known_settings,
 )
-from music_rllib.config.reading.overrides import Override, lay_overrides, parse_overrides
+from music_rllib.config.reading.overrides import lay_overrides, parse_overrides
 from music_rllib.config.reading.presets import with_preset
 from music_rllib.config.reading.problem_lines import problem_lines
 from music_rllib.config.reading.yaml_file import YamlFile, read_yaml
 from music_rllib.config.resolve import resolve_stage
-from music_rllib.config.run_settings import Evaluation, RunSettings, Variant
+from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.schema import (
     RESERVED_NAMES,
-    Checkpoint,
     Header,
-    MlflowSettings,
-    Point,
-    Resources,
-    Source,
     Stage,
     SweepConfig,
 )
@@ -59,22 +53,6 @@ from music_rllib.envs.tasks import (
     UnknownTaskError,
 )
 from music_rllib.limits import MOST_RUNS, MOST_SEEDS
-
-__all__ = [
-    "Checkpoint",
-    "ConfigError",
-    "Evaluation",
-    "MlflowSettings",
-    "Point",
-    "Resources",
-    "RunSettings",
-    "Source",
-    "Stage",
-    "SweepConfig",
-    "Variant",
-    "declared_tasks",
-    "load_sweep",
-]
 
 
 def load_sweep(
@@ -91,29 +69,31 @@ def load_sweep(
         path: The YAML file.
         name: Replaces the file's `name`.
         storage: Replaces the file's `storage`.
-        seeds: Replaces the file's `seeds`: how many (the file's first, then the smallest that it
-            hasn't), or a list with commas.
-        overrides: `KEY=VALUE` each, laid over the file.
+        seeds: Replaces the file's `seeds`: a number (the file's seeds first, then the smallest
+            others) or a list with commas.
+        overrides: `KEY=VALUE` each, which replace the file's values.
 
     Raises:
         ConfigError: With one line per problem.
     """
-    for key, value in (("name", name), ("storage", storage)):
-        if value is not None and not _is_utf8(value):
-            raise ConfigError([f"--{key} must be UTF-8 text, got {value!a}"])
+    texts = {"name": name, "storage": storage}
+    options: dict[str, Any] = {key: text for key, text in texts.items() if text is not None}
+    for key, text in options.items():
+        try:
+            text.encode()
+        except UnicodeEncodeError:  # bytes of the command line that are not UTF-8
+            raise ConfigError([f"--{key} must be UTF-8 text, got {text!a}"]) from None
     file = read_yaml(Path(path))
-    options: dict[str, Any] = {
-        key: value for key, value in (("name", name), ("storage", storage)) if value is not None
-    }
     given = parse_overrides(overrides)
-    file, origins = _with_preset_of(file, given)
-    document = with_preset(file, _preset_mistakes)
-    document, places = lay_overrides(document, [one for one in given if one.key != "preset"])
-    origins |= places
+    if (preset := given.pop("preset", None)) is not None:
+        file = file._replace(data=file.data | {"preset": preset.value})
+    document, origins = lay_overrides(with_preset(file, _preset_problems), given.values())
+    if preset is not None:
+        origins["preset",] = preset.key
     if "seeds" in document:
-        document["seeds"] = _spelt_out(document["seeds"])
+        document["seeds"] = _listed_seeds(document["seeds"])
     if seeds is not None:
-        options["seeds"] = _seeds(seeds, document.get("seeds"))
+        options["seeds"] = _parsed_seeds(seeds, document.get("seeds"))
     document |= options
     findings = Findings()
     config = _resolve(file, document, findings)
@@ -122,18 +102,8 @@ def load_sweep(
     return replace(config, arguments=tuple(overrides))
 
 
-def _with_preset_of(
-    file: YamlFile, overrides: Iterable[Override]
-) -> tuple[YamlFile, dict[KeyPath, str]]:
-    """The file with the preset of the command line, which others of its arguments lie above."""
-    for one in overrides:
-        if one.key == "preset":
-            return file._replace(data=file.data | {"preset": one.value}), {("preset",): one.key}
-    return file, {}
-
-
-def _spelt_out(seeds: Any) -> Any:
-    """`5` is short for the first five seeds."""
+def _listed_seeds(seeds: Any) -> Any:
+    """The list of seeds for a valid number of them: `5` means the seeds 0 to 4."""
     if isinstance(seeds, bool) or not isinstance(seeds, int | float):
         return seeds
     return list(range(int(seeds))) if 1 <= seeds <= MOST_SEEDS and seeds == int(seeds) else seeds
@@ -143,7 +113,7 @@ def declared_tasks(path: str | Path) -> tuple[Task, ...]:
     """The tasks that a sweep's YAML file declares under `environments`.
 
     Raises:
-        ConfigError: It can't be read, or one of them is wrong.
+        ConfigError: The file can't be read, or a task is invalid.
     """
     file, findings = read_yaml(Path(path)), Findings()
     registry = _registry(file.data, findings)
@@ -152,17 +122,8 @@ def declared_tasks(path: str | Path) -> tuple[Task, ...]:
     return tuple(task for name, task in registry.items() if name not in BUILT_IN_TASKS)
 
 
-def _is_utf8(argument: str) -> bool:
-    """Other bytes of a command line are kept as what no encoding has."""
-    try:
-        argument.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
-
-
-def _seeds(text: str, given: Any) -> list[int]:
-    """`10`, or `0,1,7`."""
+def _parsed_seeds(text: str, given: Any) -> list[int]:
+    """The seeds of `10` or `0,1,7`; a number keeps those `given` in the file."""
     digits = re.fullmatch(r"\d{1,9}(,\d{1,9})*,?", text)
     if digits and "," not in text and int(text) > MOST_SEEDS:
         raise ConfigError([f"--seeds must be at most {MOST_SEEDS:,} seeds, got {text}"])
@@ -177,8 +138,8 @@ def _seeds(text: str, given: Any) -> list[int]:
     return [*known, *itertools.islice(others, max(int(text) - len(known), 0))][: int(text)]
 
 
-def _preset_mistakes(preset: YamlFile) -> list[str]:
-    """What is wrong with a preset by itself, in its own lines."""
+def _preset_problems(preset: YamlFile) -> list[str]:
+    """The problems of a preset's own settings, as lines."""
     findings = Findings()
     _defaults({"defaults": preset.data}, findings)
     problems = [Problem(problem.path[1:], problem.rule) for problem in findings.problems]
@@ -186,32 +147,51 @@ def _preset_mistakes(preset: YamlFile) -> list[str]:
 
 
 def _resolve(file: YamlFile, document: dict[str, Any], findings: Findings) -> SweepConfig | None:
-    """The sweep; None, with the problems in `findings`, if there are any."""
+    """The sweep; None if there are problems, which are added to `findings`."""
     registry = _registry(document, findings)
     header = _header(document, findings)
     defaults = _defaults(document, findings)
-    names = document.get("tasks")
+    names, declared = document.get("tasks"), document.get("environments")
     names = [name for name in names if isinstance(name, str)] if isinstance(names, list) else []
-    known_tasks = _tasks(names, ("tasks",), registry, document, findings)
+
+    def find_tasks(names: Iterable[str], findings: Findings) -> tuple[Task, ...]:
+        tasks = []
+        for position, name in enumerate(names):
+            try:
+                tasks.append(registry[name])
+            except UnknownTaskError as error:
+                # An invalid declaration is a problem already, and its name is not unknown.
+                if not isinstance(declared, dict) or name not in declared:
+                    findings.add((position,), str(error))
+        return tuple(tasks)
+
+    sweep_tasks = find_tasks(names, findings.below("tasks"))
+    raw_stages = document.get("stages")
+    if not isinstance(raw_stages, list) or not raw_stages:
+        rule = f"must be a list of at least one stage, got {shown(raw_stages)}"
+        findings.add(("stages",), rule)
+        raw_stages = []
     stages: dict[str, Stage | None] = {}
-    for index, raw in _raw_stages(document, findings):
+    for index, raw in enumerate(raw_stages):
+        if not isinstance(raw, dict):
+            findings.add(("stages", index), f"must be a mapping, got {shown(raw)}")
+            continue
         stage = resolve_stage(
             raw,
-            ("stages", index),
+            findings.below("stages", index),
             defaults=defaults,
             seeds=header.seeds if header else (),
-            sweep_tasks=known_tasks,
-            find_tasks=lambda names, path: _tasks(names, path, registry, document, findings),
+            sweep_tasks=sweep_tasks,
+            find_tasks=find_tasks,
             earlier=stages,
-            findings=findings,
         )
         stages[stage.name if stage else str(raw.get("name"))] = stage
     if header:
         _count_runs(stages, len(header.seeds), findings)
     if header and any(stage and stage.search for stage in stages.values()):
-        for position, one in enumerate(header.seeds):
-            if one >= FINAL_SEED:
-                rule = f"must be < {FINAL_SEED}, where a search's fresh seeds begin, got {one}"
+        for position, seed in enumerate(header.seeds):
+            if seed >= FINAL_SEED:
+                rule = f"must be < {FINAL_SEED}, where a search's fresh seeds begin, got {seed}"
                 findings.add(("seeds", position), rule)
     if header and header.analysis:
         check_analysis(header.analysis, stages, findings)
@@ -233,7 +213,7 @@ def _resolve(file: YamlFile, document: dict[str, Any], findings: Findings) -> Sw
 
 
 def _count_runs(stages: Mapping[str, Stage | None], seeds: int, findings: Findings) -> None:
-    """Runs multiply from stage to stage; refuse more than can be planned."""
+    """Refuse more runs than can be planned; they multiply from stage to stage."""
     trials: dict[str, int] = {}
     total = 0
     for index, (name, stage) in enumerate(stages.items()):
@@ -260,7 +240,7 @@ def _registry(document: dict[str, Any], findings: Findings) -> TaskRegistry:
             findings.add(path, "is a built-in task; choose another name")
         elif not isinstance(raw, dict) or "name" in raw:
             findings.add(path, f"must be a mapping without a name of its own, got {shown(raw)}")
-        elif task := findings.validate(Task, raw | {"name": name}, path):
+        elif task := findings.below(*path).validate(Task, raw | {"name": name}):
             tasks.append(task)
     return TaskRegistry(tasks)
 
@@ -271,10 +251,10 @@ def _header(document: dict[str, Any], findings: Findings) -> Header | None:
     for key in document.keys() - known:
         findings.add((key,), unknown(key, (*known, *sorted(below))))
     values = {key: value for key, value in document.items() if key in Header.model_fields}
-    if isinstance(values.get("seeds"), int | float):  # else it was spelt out
+    if isinstance(values.get("seeds"), int | float):  # an invalid number: others are lists now
         rule = f"must be a list like [0, 1], or how many (1 to {MOST_SEEDS:,})"
         findings.add(("seeds",), f"{rule}, got {shown(values.pop('seeds'))}")
-    header = findings.validate(Header, values, ())
+    header = findings.validate(Header, values)
     if header and header.name in RESERVED_NAMES:
         findings.add(("name",), f"must not be {header.name!r}, which the storage uses itself")
     for key in ("tasks", "seeds"):
@@ -286,7 +266,7 @@ def _header(document: dict[str, Any], findings: Findings) -> Header | None:
 
 
 def _defaults(document: dict[str, Any], findings: Findings) -> dict[str, Any]:
-    """`defaults`, with what can be said of them alone; the rest shows where they are merged."""
+    """`defaults`, checked as far as they can be before they are merged with a stage."""
     defaults = document.get("defaults") or {}
     if not isinstance(defaults, dict):
         findings.add(("defaults",), f"must be a mapping, got {shown(defaults)}")
@@ -300,42 +280,12 @@ def _defaults(document: dict[str, Any], findings: Findings) -> dict[str, Any]:
 
 
 def _check_fields(key: str, value: Any, findings: Findings) -> None:
-    """Validate fields one by one: rules between them depend on the variant."""
+    """Validate a group's fields alone: rules between groups depend on the variant."""
     field = RunSettings.model_fields[key]
     try:
         from_json(field.rebuild_annotation(), value)
     except ValidationError as error:
-        for found in in_words(error, value, lambda at: known_settings((key, *at))):
-            if found.path or not isinstance(value, dict):
-                rule = for_a_grid(found.rule, (key, *found.path), {key: value})
-                findings.add(("defaults", key, *found.path), rule)
-
-
-def _tasks(
-    names: Iterable[str],
-    path: KeyPath,
-    registry: TaskRegistry,
-    document: dict[str, Any],
-    findings: Findings,
-) -> tuple[Task, ...]:
-    tasks = []
-    declared = document.get("environments") or {}
-    for position, name in enumerate(names):
-        try:
-            tasks.append(registry[name])
-        except UnknownTaskError as error:
-            # One that was declared with a mistake isn't unknown, and the mistake is reported.
-            if not isinstance(declared, dict) or name not in declared:
-                findings.add((*path, position), str(error))
-    return tuple(tasks)
-
-
-def _raw_stages(document: dict[str, Any], findings: Findings) -> list[tuple[int, dict[str, Any]]]:
-    raw = document.get("stages")
-    if not isinstance(raw, list) or not raw:
-        findings.add(("stages",), f"must be a list of at least one stage, got {shown(raw)}")
-        return []
-    for index, stage in enumerate(raw):
-        if not isinstance(stage, dict):
-            findings.add(("stages", index), f"must be a mapping, got {shown(stage)}")
-    return [(index, stage) for index, stage in enumerate(raw) if isinstance(stage, dict)]
+        for path, rule in in_words(error, value, lambda at: known_settings((key, *at))):
+            if path or not isinstance(value, dict):
+                rule = for_a_grid(rule, (key, *path), {key: value})
+                findings.add(("defaults", key, *path), rule)

@@ -1,7 +1,7 @@
-"""What is wrong with a configuration, in words for the person who wrote it.
+"""Problems of a configuration, in words for the person who wrote it.
 
-Every problem names its place (file, line, dotted key), the rule and the value. Validation goes on
-after the first one, so that a file is put right in one round.
+Every problem names its place (file, line, dotted key), the rule and the value. Validation does not
+stop at the first problem, so that a file is corrected in one round.
 """
 
 from __future__ import annotations
@@ -18,33 +18,18 @@ from music_rllib.envs.tasks import closest
 from music_rllib.errors import BadInputError
 from music_rllib.labels import SYMBOLS
 
-__all__ = [
-    "ConfigError",
-    "Findings",
-    "Path",
-    "Problem",
-    "from_json",
-    "in_words",
-    "known_fields",
-    "lookup",
-    "same",
-    "shown",
-    "unknown",
-]
-
 Model = TypeVar("Model", bound=BaseModel)
 
-Path = tuple[str | int, ...]
-"""Keys and list positions from the top of a document to one of its values."""
+KeyPath = tuple[str | int, ...]
+"""Keys and list positions that lead from the top of a document to one of its values."""
 
 
 class Problem(NamedTuple):
     """One broken rule."""
 
-    path: Path
-    """Where, from the top of the document."""
+    path: KeyPath
     rule: str
-    """What must hold, and what was found instead: `must be > 0, got -1`."""
+    """What must hold, and the value that breaks it: `must be > 0, got -1`."""
 
 
 class ConfigError(BadInputError, ValueError):
@@ -57,7 +42,7 @@ class ConfigError(BadInputError, ValueError):
 
 
 def shown(value: Any, limit: int = 60) -> str:
-    """`value` as a user wrote it, more or less, and not too long."""
+    """`value` for a message, about as the user wrote it, cut to `limit` characters."""
     try:
         text = json.dumps(value, ensure_ascii=False)
     except TypeError:
@@ -66,22 +51,22 @@ def shown(value: Any, limit: int = 60) -> str:
     return text if len(text) <= limit else text[: limit - 3] + "..."
 
 
-def same(one: Any, other: Any) -> bool:
+def same(first: Any, second: Any) -> bool:
     """Whether two values are equal as settings: 1 and 1.0 are, 1 and true are not."""
-    if isinstance(one, bool) or isinstance(other, bool):
-        return one is other
-    if isinstance(one, Mapping) and isinstance(other, Mapping):
-        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
-    if isinstance(one, list | tuple) and isinstance(other, list | tuple):
-        return len(one) == len(other) and all(map(same, one, other))
-    return bool(one == other)
+    if isinstance(first, bool) or isinstance(second, bool):
+        return first is second
+    if isinstance(first, Mapping) and isinstance(second, Mapping):
+        return first.keys() == second.keys() and all(same(first[key], second[key]) for key in first)
+    if isinstance(first, list | tuple) and isinstance(second, list | tuple):
+        return len(first) == len(second) and all(map(same, first, second))
+    return bool(first == second)
 
 
 def lookup(document: Any, path: Iterable[str | int]) -> Any:
     """The value at `path`.
 
     Raises:
-        LookupError: There is none.
+        LookupError: The document has none there.
     """
     for part in path:
         if isinstance(document, Mapping) or (
@@ -94,12 +79,7 @@ def lookup(document: Any, path: Iterable[str | int]) -> Any:
 
 
 def unknown(key: str, known: Iterable[str]) -> str:
-    """The rule that an unknown key breaks, with what was probably meant.
-
-    Args:
-        key: What was written, with dots or without.
-        known: What could have been, with dots for what lies deeper.
-    """
+    """The rule that an unknown key breaks, with a suggestion from the `known` (dotted) keys."""
     names = list(known)
     field = key.rpartition(".")[2]
     field = SYMBOLS.get(field, field)
@@ -108,8 +88,8 @@ def unknown(key: str, known: Iterable[str]) -> str:
     return f"is not a known setting{hint}"
 
 
-def known_fields(model: type[BaseModel], path: Path) -> Iterable[str]:
-    """Names of the fields below `path`, as far as models are nested plainly."""
+def known_fields(model: type[BaseModel], path: KeyPath) -> Iterable[str]:
+    """Names of the fields of the model at `path` below `model`; none where it is a union."""
     for part in path:
         field = model.model_fields.get(str(part))
         kind = field.annotation if field else None
@@ -120,22 +100,17 @@ def known_fields(model: type[BaseModel], path: Path) -> Iterable[str]:
 
 
 def in_words(
-    error: ValidationError, document: Any, known: Callable[[Path], Iterable[str]]
+    error: ValidationError, document: Any, known: Callable[[KeyPath], Iterable[str]]
 ) -> list[Problem]:
-    """Translate pydantic's findings about `document`.
+    """Translate pydantic's error about `document` into problems, with paths relative to it.
 
     Args:
-        error: What pydantic raised.
-        document: The input that it was raised for.
-        known: Gives the keys that are known at a path, for suggestions.
-
-    Returns:
-        One problem per finding, paths relative to `document`.
+        known: Gives the known keys at a path, for suggestions.
     """
     problems = []
     for details in error.errors(include_url=False):
         if details["type"] == "too_short" and len(details["input"]) >= details["ctx"]["min_length"]:
-            continue  # pydantic counts the sound entries only; the others are reported
+            continue  # pydantic counts valid entries only; the invalid ones are reported
         path = _without_tags(details["loc"], document, missing=details["type"] == "missing")
         rule = _rule(details, path, known)
         if details["type"] == "value_error":
@@ -144,11 +119,11 @@ def in_words(
     return problems
 
 
-def _without_tags(loc: Path, document: Any, *, missing: bool) -> Path:
-    """Drop the parts of `loc` that name members of a union and not keys of the document."""
+def _without_tags(loc: KeyPath, document: Any, *, missing: bool) -> KeyPath:
+    """The keys in pydantic's `loc`, which also names members of unions (tags)."""
 
-    def readings(rest: Path, here: Any) -> Iterator[tuple[Path, list[str | int]]]:
-        """Every way to read `rest`: the parts that are keys, and those that are dropped."""
+    def readings(rest: KeyPath, here: Any) -> Iterator[tuple[KeyPath, list[str | int]]]:
+        """Every way to split `rest` into keys of `here` and dropped tags."""
         if not rest:
             yield (), []
             return
@@ -161,13 +136,13 @@ def _without_tags(loc: Path, document: Any, *, missing: bool) -> Path:
         for path, dropped in readings(rest[1:], here):
             yield path, [part, *dropped]
 
-    # A tag may be spelt like a key: right is what drops the fewest parts, and not the last one.
+    # A tag may equal a key: the right split drops the fewest parts, and preferably not the last.
     path, _ = min(readings(loc, document), key=lambda r: (len(r[1]), loc[-1:] != r[0][-1:]))
     return path
 
 
-def _more_precise(path: Path, rule: str, document: Any) -> tuple[Path, str]:
-    """Rules about several fields begin with the one to change: put that into the path."""
+def _more_precise(path: KeyPath, rule: str, document: Any) -> tuple[KeyPath, str]:
+    """Move the field that a rule about several fields begins with from the rule into the path."""
     subject, _, rest = rule.partition(" ")
     keys = tuple(subject.split("."))
     here = lookup(document, path)
@@ -177,7 +152,6 @@ def _more_precise(path: Path, rule: str, document: Any) -> tuple[Path, str]:
 
 
 _FIXED_RULES = {
-    "missing": "must be given",
     "finite_number": "must be a finite number",
     "float_type": "must be a number",
     "int_type": "must be a whole number",
@@ -198,12 +172,14 @@ _COMPARISONS = {
 }
 
 
-def _rule(details: ErrorDetails, path: Path, known: Callable[[Path], Iterable[str]]) -> str:
+def _rule(details: ErrorDetails, path: KeyPath, known: Callable[[KeyPath], Iterable[str]]) -> str:
+    """The rule that a finding of pydantic is about."""
     kind, context, value = details["type"], details.get("ctx", {}), details["input"]
+    hint = ""
     if kind == "extra_forbidden":
         return unknown(str(path[-1]), known(path[:-1]))
     if kind == "missing":
-        return _FIXED_RULES[kind]
+        return "must be given"
     if kind in _FIXED_RULES:
         rule = _FIXED_RULES[kind]
     elif kind in _COMPARISONS:
@@ -211,6 +187,9 @@ def _rule(details: ErrorDetails, path: Path, known: Callable[[Path], Iterable[st
         rule = f"must be {sign} {context[bound]:g}"
     elif kind == "literal_error":
         rule = f"must be {context['expected']}"
+        if isinstance(value, str):
+            options = context["expected"].replace(" or ", ", ").split(",")
+            hint = closest(value, [option.strip("' ") for option in options])
     elif kind == "too_short":
         rule = f"must have at least {context['min_length']} entries"
     elif kind == "string_too_short" and context["min_length"] == 1:
@@ -223,14 +202,7 @@ def _rule(details: ErrorDetails, path: Path, known: Callable[[Path], Iterable[st
         rule = details["msg"].replace("Input should", "must", 1)
     if " got " in rule:
         return rule
-    return f"{rule}, got {shown(value)}{_literal_hint(details)}"
-
-
-def _literal_hint(details: ErrorDetails) -> str:
-    if details["type"] != "literal_error" or not isinstance(details["input"], str):
-        return ""
-    expected = details["ctx"]["expected"].replace(" or ", ", ")
-    return closest(details["input"], [word.strip("' ") for word in expected.split(",")])
+    return f"{rule}, got {shown(value)}{hint}"
 
 
 def from_json(kind: Any, value: Any) -> Any:
@@ -244,56 +216,51 @@ def from_json(kind: Any, value: Any) -> Any:
     try:
         return adapter.validate_json(json.dumps(value), strict=True)
     except ValidationError as error:
-        whole = _with_whole_numbers(value, error)
-        if whole is None:
+        whole_numbers = [
+            _without_tags(details["loc"], value, missing=False)
+            for details in error.errors(include_url=False)
+            if details["type"] in {"int_type", "int_from_float"}
+            and isinstance(details["input"], float)
+            and details["input"].is_integer()
+        ]
+        if not whole_numbers:
             raise
-        return adapter.validate_json(json.dumps(whole), strict=True)
-
-
-def _with_whole_numbers(value: Any, error: ValidationError) -> Any:
-    """`value` with integers where it has `1e6` and an integer is asked for; None: it has none."""
-    places = [
-        _without_tags(details["loc"], value, missing=False)
-        for details in error.errors(include_url=False)
-        if details["type"] in {"int_type", "int_from_float"}
-        and isinstance(details["input"], float)
-        and details["input"].is_integer()
-    ]
-    for place in places:
-        value = _replaced(value, place)
-    return value if places else None
-
-
-def _replaced(value: Any, path: Path) -> Any:
-    """A copy of `value` with an integer in place of the number at `path`."""
-    if not path:
-        return int(value)
-    copy: Any = dict(value) if isinstance(value, Mapping) else list(value)
-    copy[path[0]] = _replaced(copy[path[0]], path[1:])
-    return copy
+    # `1e6` is a float in YAML, and valid where an integer is asked for.
+    document = json.loads(json.dumps([value]))
+    for path in whole_numbers:
+        *above, last = (0, *path)
+        parent = lookup(document, above)
+        parent[last] = int(parent[last])
+    return adapter.validate_json(json.dumps(document[0]), strict=True)
 
 
 class Findings:
-    """Problems found so far, in a document that is checked to its end."""
+    """The problems of a document so far; paths are relative to one place in it."""
 
-    def __init__(self) -> None:
-        self.problems: list[Problem] = []
+    def __init__(self, path: KeyPath = (), problems: list[Problem] | None = None) -> None:
+        self.path = path
+        self.problems = [] if problems is None else problems
+        """Problems of the whole document, with paths from its top."""
 
-    def add(self, path: Path, rule: str) -> None:
-        """Note a problem."""
-        self.problems.append(Problem(path, rule))
+    def below(self, *keys: str | int) -> Findings:
+        """The same problems, for paths relative to the value at `keys`."""
+        return Findings((*self.path, *keys), self.problems)
 
-    def validate(self, kind: type[Model], value: Any, path: Path) -> Model | None:
-        """`value` as a `kind`; None, with the problems noted, if it isn't one."""
+    def add(self, path: KeyPath, rule: str) -> None:
+        """Add a problem."""
+        self.problems.append(Problem(self.path + path, rule))
+
+    def validate(self, kind: type[Model], value: Any) -> Model | None:
+        """`value` as a `kind`; None, with the problems added, if it isn't one."""
         try:
             return cast("Model", from_json(kind, value))
         except ValidationError as error:
-            for found in in_words(error, value, lambda at: known_fields(kind, at)):
-                self.add(path + found.path, found.rule)
+            for problem in in_words(error, value, lambda at: known_fields(kind, at)):
+                self.add(problem.path, problem.rule)
             return None
 
-    def forbid_repeats(self, values: Any, path: Path) -> None:
-        """Note entries of the list `values` that are there twice; 1 and 1.0 are the same."""
+    def forbid_repeats(self, values: Any, path: KeyPath) -> None:
+        """Add a problem for each repeated entry of the list `values`; 1 and 1.0 are the same."""
         seen: set[tuple[bool, Any]] = set()
         others: list[Any] = []
         for position, value in enumerate(values if isinstance(values, list | tuple) else ()):

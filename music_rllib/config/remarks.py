@@ -1,4 +1,4 @@
-"""What a sound configuration may not mean: said before anything starts, and refused nowhere."""
+"""Warnings about valid configurations that may not do what their author means."""
 
 from __future__ import annotations
 
@@ -11,32 +11,30 @@ from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.schema import Stage, SweepConfig
 from music_rllib.envs.tasks import Task
 
-__all__ = ["remarks"]
-
-_BEHIND_RETURNS = frozenset(
-    f"{section}.{name}"
-    for section, names in (
-        ("tac", ("gamma", "target_bounds", "alpha", "entropic_index", "policy")),
-        ("music", ("mi_reward_weight",)),
-    )
-    for name in names
+_CHANGE_RETURNS = (
+    "tac.gamma",
+    "tac.target_bounds",
+    "tac.alpha",
+    "tac.entropic_index",
+    "tac.policy",
+    "music.mi_reward_weight",
 )
-"""What the returns within reach and their bounds depend on, where it is searched for."""
+"""Settings that the reachable returns and their bounds depend on."""
 
 
 def remarks(config: SweepConfig) -> list[str]:
-    """One line for each thing to be told, with the stages and tasks that it is true of."""
+    """One line for each warning, with the stages and tasks that it is about."""
     places: dict[str, list[str]] = {}
     for stage in config.stages:
         for task in stage.tasks:
             runs = [runs[task.name] for runs in _points(stage) if task.name in runs]
-            if (text := _of_returns(task, runs)) is not None:
+            if (text := _cut_off_returns(task, runs)) is not None:
                 places.setdefault(text, []).append(f"{stage.name}/{task.name}")
     return [f"{', '.join(where)}: {text}" for text, where in places.items()]
 
 
-def _of_returns(task: Task, runs: Iterable[RunSettings]) -> str | None:
-    """Of the runs whose values are cut off, the one that can reach the widest range."""
+def _cut_off_returns(task: Task, runs: Iterable[RunSettings]) -> str | None:
+    """A warning about the run with the widest range of reachable values that are cut off."""
     bounded = [run for run in runs if run.tac.target_bounds is not None]
     if task.reward_range is None and any(run.music.task_reward for run in bounded):
         return (
@@ -44,14 +42,14 @@ def _of_returns(task: Task, runs: Iterable[RunSettings]) -> str | None:
             f"are not known (environments.{task.name}.reward_range)"
         )
     rewards = Range(*(task.reward_range or (0.0, 0.0)))
-    found = [cut for run in bounded if (cut := cut_off(run.tac, run.music, rewards))]
-    if not found:
+    cuts = [cut for run in bounded if (cut := cut_off(run.tac, run.music, rewards))]
+    if not cuts:
         return None
-    return f"tac.{max(found, key=lambda cut: cut.reached.high - cut.reached.low)}"
+    return f"tac.{max(cuts, key=lambda cut: cut.reached.high - cut.reached.low)}"
 
 
 def _points(stage: Stage) -> Iterator[Mapping[str, RunSettings]]:
-    """Task to settings, of all points of a grid; of what is searched, of the ends."""
+    """Task to settings, for all points of a grid and for the corners of a search's space."""
     yield from (point.runs for point in stage.points)
     if stage.search is None:
         return
@@ -59,10 +57,10 @@ def _points(stage: Stage) -> Iterator[Mapping[str, RunSettings]]:
     axes = {
         name: values
         for name, values in (space | stage.search.compare).items()
-        if name in _BEHIND_RETURNS
+        if name in _CHANGE_RETURNS
     }
     for values in itertools.product(*axes.values()):
         try:
             yield stage.resolve(dict(zip(axes, values, strict=True))).runs
-        except ConfigError:  # a corner that no trial can be at
+        except ConfigError:  # no trial can be at this corner
             continue

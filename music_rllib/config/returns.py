@@ -1,4 +1,4 @@
-"""Which discounted returns a configuration can reach, and whether its targets are cut off there."""
+"""Discounted returns that a configuration can reach, and whether `target_bounds` cut them off."""
 
 from __future__ import annotations
 
@@ -15,8 +15,6 @@ from music_rllib.functional.tsallis import uniform_entropy
 from music_rllib.intrinsic.settings import MusicSettings
 from music_rllib.schedules import extremes
 
-__all__ = ["CutOff", "Range", "cut_off", "reward_a_step"]
-
 _ROUNDING = 1e-6
 """-1 / (1 - 0.98) is -49.99999999999996, which [-50, 0] does not cut off."""
 
@@ -31,47 +29,34 @@ class Range(NamedTuple):
         return f"{self.low:.4g} to {self.high:.4g}"
 
 
-def reward_a_step(task: Range, music: MusicSettings) -> Range:
-    """The reward that is learned from: the task's, and the intrinsic one in weight times [-1, 0].
-
-    Args:
-        task: The task's reward; without effect where MUSIC leaves it out.
-        music: Says what counts, and how much. Of a schedule the largest weight.
-    """
+def _reward_of_step(task: Range, music: MusicSettings) -> Range:
+    """Range of a step's reward: the task's, plus an intrinsic one in weight times [-1, 0]."""
     low, high = task if music.task_reward else Range(0.0, 0.0)
     weight = extremes(music.mi_reward_weight)[1] if music.estimator != "none" else 0.0
     return Range(low - weight, high)
 
 
 class CutOff(NamedTuple):
-    """Targets that can be reached and are clipped; as text, what to say of it."""
+    """Reachable targets that are clipped, and the warning about them."""
 
-    bounds: Range
     reached: Range
-    reward: Range
-    """Of a step."""
-    gamma: float
-    with_entropy: bool
+    warning: str
 
     def __str__(self) -> str:
-        entropy = " and the entropy of one action dimension" if self.with_entropy else ""
-        return (
-            f"target_bounds {self.bounds} cut off values that can be reached, {self.reached}: "
-            f"rewards of {self.reward} a step at gamma {self.gamma:g}{entropy}"
-        )
+        return self.warning
 
 
 def cut_off(tac: TACSettings, music: MusicSettings, task: Range) -> CutOff | None:
-    """Whether `target_bounds` cut off targets that can be reached; None: they don't.
+    """The reachable targets, if `target_bounds` cut off some of them.
 
-    A return without end is a step's reward times 1/(1 - gamma); one that ends by termination is
-    nearer to 0. The averaged value also holds the entropies of the later steps. Those have no
-    lower end (a policy may be as narrow as it likes), so they count at the upper end only, and,
-    since the number of actions is the environment's, with one action dimension.
+    The return of an endless episode is a step's reward times 1/(1 - gamma); that of a terminated
+    one is nearer to 0. The target value network also holds the entropies of later steps. These have
+    no lower bound (a policy may be arbitrarily narrow), so that they count at the upper end only.
+    They count for one action dimension, because the environment decides on the number.
     """
     if tac.target_bounds is None:
         return None
-    bounds, reward = Range(*tac.target_bounds), reward_a_step(task, music)
+    bounds, reward = Range(*tac.target_bounds), _reward_of_step(task, music)
     steps = 1.0 / (1.0 - tac.gamma)
     bonus = _entropy_bonus(tac) * tac.gamma * steps
     reached = Range(
@@ -80,14 +65,16 @@ def cut_off(tac: TACSettings, music: MusicSettings, task: Range) -> CutOff | Non
     slack = _ROUNDING * max(abs(reached.low), abs(reached.high))
     if bounds.low <= reached.low + slack and bounds.high >= reached.high - slack:
         return None
-    return CutOff(bounds, reached, reward, tac.gamma, bonus > 0)
+    entropy = " and the entropy of one action dimension" if bonus > 0 else ""
+    warning = (
+        f"target_bounds {bounds} cut off values that can be reached, {reached}: "
+        f"rewards of {reward} a step at gamma {tac.gamma:g}{entropy}"
+    )
+    return CutOff(reached, warning)
 
 
 def _entropy_bonus(tac: TACSettings) -> float:
-    """The most that one action dimension's entropy adds to a step: alpha times the uniform one's.
-
-    A learned alpha counts as it begins.
-    """
+    """Largest entropy bonus of a step: alpha times the entropy of one uniform action dimension."""
     if tac.policy == "deterministic":
         return 0.0
     qs = extremes(tac.entropic_index)
@@ -96,7 +83,7 @@ def _entropy_bonus(tac: TACSettings) -> float:
 
 def _largest_alpha(alpha: Alpha, q: float) -> float:
     if isinstance(alpha, LearnedAlpha):
-        return alpha.initial
+        return alpha.initial  # where it goes from there is not known
     if isinstance(alpha, MatchedAlpha | NormalisedAlpha):
         return alpha.scaled(extremes(alpha.value)[1], q, 1, "per_dimension")
     return extremes(alpha)[1]

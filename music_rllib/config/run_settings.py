@@ -11,50 +11,38 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, Field, model_validator
 
 from music_rllib.config.tac_settings import TACSettings
 from music_rllib.envs.tasks import Task
 from music_rllib.intrinsic.settings import MusicSettings
 from music_rllib.replay.settings import ReplaySettings
-from music_rllib.schedules import check_measurable
+from music_rllib.schedules import StrictModel, check_measurable
 from music_rllib.store.handoff import Architecture, HandoffInfo, Spaces
-
-__all__ = [
-    "VARIANTS",
-    "Evaluation",
-    "RunSettings",
-    "Variant",
-    "VariantRules",
-    "contradiction",
-    "handed_over",
-    "preset",
-]
 
 Variant = Literal["tac", "music-u", "music-r", "music-f", "music-p"]
 Source = Literal["scratch", "estimator", "agent"]
-"""What a variant's runs start from: nothing, a trained estimator, or a whole trained agent."""
+"""Source of the runs of a variant: nothing, a trained estimator, or a whole trained agent."""
 
 
 class VariantRules(NamedTuple):
-    """What a variant fixes, and what it needs from the run that it starts from."""
+    """The settings that a variant fixes, and the source that it needs."""
 
     fixed: Mapping[str, Any]
-    """Fields of `MusicSettings` that no other layer of the configuration may contradict."""
+    """Fields of `MusicSettings` that no layer of the configuration may contradict."""
     without_effect: frozenset[str]
-    """Dotted settings that change nothing here: ignored in `defaults`, refused in a stage."""
+    """Dotted settings without effect: ignored in `defaults`, refused in a stage."""
     starts_from: Source = "scratch"
-    """What comes from the source of `init_from`."""
+    """The part of the run of `init_from` that is taken over."""
 
     @property
     def uses_mi(self) -> bool:
-        """Whether mutual information plays a part, so that the task must have a split."""
+        """Whether it uses mutual information, so that the task must have a split."""
         return bool(self.fixed["estimator"] != "none")
 
 
-_MUSIC_FIELDS = frozenset(MusicSettings.model_fields)
 _FIXED = ("estimator", "task_reward", "goals")
-_MUSIC_REST = frozenset(f"music.{name}" for name in _MUSIC_FIELDS.difference(_FIXED))
+_OTHER_MUSIC = frozenset(f"music.{name}" for name in MusicSettings.model_fields.keys() - {*_FIXED})
 _TRAINING_OF_ESTIMATOR = frozenset({"music.lr", "music.batch_trajectories"})
 
 
@@ -66,7 +54,7 @@ VARIANTS: Mapping[Variant, VariantRules] = MappingProxyType(
     {
         "tac": VariantRules(
             fixed=_fixed("none", task_reward=True),
-            without_effect=_MUSIC_REST,
+            without_effect=_OTHER_MUSIC,
         ),
         "music-u": VariantRules(
             fixed=_fixed("trained", task_reward=False, goals="zero"),
@@ -80,7 +68,7 @@ VARIANTS: Mapping[Variant, VariantRules] = MappingProxyType(
         ),
         "music-f": VariantRules(
             fixed=_fixed("none", task_reward=True),
-            without_effect=_MUSIC_REST,
+            without_effect=_OTHER_MUSIC,
             starts_from="agent",
         ),
         "music-p": VariantRules(
@@ -97,7 +85,7 @@ VARIANTS: Mapping[Variant, VariantRules] = MappingProxyType(
 
 
 def preset(variant: Variant, task: Task) -> dict[str, Any]:
-    """Fields of `MusicSettings` that the variant sets on this task before any other layer."""
+    """Fields of `MusicSettings` that the variant sets on this task, below all other layers."""
     music = dict(VARIANTS[variant].fixed)
     if variant == "music-u":
         music["mi_reward_weight"] = 1.0
@@ -107,30 +95,26 @@ def preset(variant: Variant, task: Task) -> dict[str, Any]:
 
 
 def contradiction(variant: Variant, fixed: Any, got: Any) -> str:
-    """The rule that is broken where a setting contradicts its variant."""
+    """The rule that a setting breaks if it contradicts its variant."""
     return f"must be {json.dumps(fixed)} for {variant}, got {json.dumps(got)}"
 
 
 YOUNGER: tuple[tuple[str, str], ...] = (("tac", "log_std_form"),)
-"""Section and name of settings that came after keys of finished runs had been written down."""
+"""Group and name of settings that are newer than the node keys of finished runs."""
 
 
-class _Frozen(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class Evaluation(_Frozen):
+class Evaluation(StrictModel):
     """Deterministic evaluation episodes during a run."""
 
     interval: int = Field(5_000, gt=0)
     """Environment steps between two evaluations; the end of a run is always evaluated. Smaller
-    tells more exactly when something was learned, and takes time."""
+    resolves the learning curve better, and takes more time."""
     episodes: int = Field(20, gt=0)
     """Episodes per evaluation. A success rate's standard error is at most .5 / sqrt of them: .11
     with 20."""
 
 
-class RunSettings(_Frozen):
+class RunSettings(StrictModel):
     """Everything that determines the numbers of one run, given the weights it starts from."""
 
     task: Task
@@ -139,8 +123,8 @@ class RunSettings(_Frozen):
     env_steps: int = Field(200_000, gt=0)
     """Budget: environment steps of training, over all sub-environments."""
     num_envs: int = Field(4, gt=0)
-    """Sub-environments stepped together. More: cheaper steps, and a policy that is updated after
-    more of them."""
+    """Sub-environments stepped together. More make a step cheaper, and updates of the policy
+    rarer."""
     evaluation: Evaluation = Evaluation()
     tac: TACSettings = TACSettings()
     music: MusicSettings = MusicSettings()
@@ -148,7 +132,7 @@ class RunSettings(_Frozen):
 
     @property
     def architecture(self) -> Architecture:
-        """The settings that shape the arrays of its networks."""
+        """Settings that determine the shapes of the networks' arrays, or their meaning."""
         return Architecture(
             hidden_sizes=self.tac.hidden_sizes,
             policy=self.tac.policy,
@@ -162,7 +146,7 @@ class RunSettings(_Frozen):
     def handoff_info(
         self, node_key: str, env_steps: int, spaces: Spaces | None = None
     ) -> HandoffInfo:
-        """What a handoff of this run says of itself after `env_steps`."""
+        """The description of a handoff of this run after `env_steps`."""
         return HandoffInfo(
             task=self.task,
             variant=self.variant,
@@ -174,10 +158,10 @@ class RunSettings(_Frozen):
         )
 
     def identity(self) -> dict[str, Any]:
-        """All that determines the numbers, as plain data; the task without what does not.
+        """Everything that determines the numbers, as plain data.
 
-        A setting of `YOUNGER` is left out where it has its default: runs that do not use it keep
-        the identity that they had before there was one.
+        A setting of `YOUNGER` is omitted if it has its default: runs that do not use it keep the
+        identity that they had before it existed.
         """
         settings = self.model_dump(mode="json") | {"task": self.task.identity()}
         if self.replay.hindsight_episodes == "moved" and self.task.moved_distance is not None:
@@ -194,10 +178,8 @@ class RunSettings(_Frozen):
         rules = VARIANTS[self.variant]
         for field, value in rules.fixed.items():
             if getattr(self.music, field) != value:
-                raise ValueError(
-                    f"music.{field} "
-                    + contradiction(self.variant, value, getattr(self.music, field))
-                )
+                rule = contradiction(self.variant, value, getattr(self.music, field))
+                raise ValueError(f"music.{field} {rule}")
         if rules.uses_mi and not self.task.has_split:
             raise ValueError(
                 f"task must have agent_indices and surrounding_indices for {self.variant}, "
@@ -232,7 +214,7 @@ class RunSettings(_Frozen):
 
 
 def handed_over(run: RunSettings) -> tuple[str, ...]:
-    """Names of the modules that `run` gets from its source, as `TrainingRun` calls them."""
+    """Names of the modules that `run` takes over from its source, as in `TrainingRun.modules`."""
     match VARIANTS[run.variant].starts_from:
         case "scratch":
             return ()

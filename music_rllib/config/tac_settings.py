@@ -1,4 +1,4 @@
-"""Named, validated settings of TAC. Declared once here; YAML and `TACConfig` both use them."""
+"""Settings of TAC, declared and validated once, for YAML and for `TACConfig`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
     BaseModel,
-    ConfigDict,
     Discriminator,
     Field,
     Tag,
@@ -22,46 +21,32 @@ from music_rllib.schedules import (
     Measured,
     Piecewise,
     Schedule,
+    StrictModel,
     bounded,
     extremes,
     value_at,
 )
 
-__all__ = [
-    "Alpha",
-    "GaussianNoise",
-    "LearnedAlpha",
-    "MatchedAlpha",
-    "NormalisedAlpha",
-    "TACSettings",
-    "alpha_at",
-    "in_words",
-]
-
-
-class _Frozen(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
 PositiveSchedule = Annotated[Schedule, bounded(">= 0", lambda alpha: alpha >= 0)]
 
 
-class LearnedAlpha(_Frozen):
+class LearnedAlpha(StrictModel):
     """Entropy coefficient learned towards a target entropy (Haarnoja et al. 2018b, eq. 18)."""
 
     learned: Literal[True]
     """Says that alpha is learned."""
     initial: float = Field(0.2, gt=0)
-    """Alpha at first."""
+    """Alpha at the beginning."""
     target_entropy: float | Literal["auto"] = "auto"
     """Target for S_q of the policy. `auto`: the S_q of a density of e per action dimension, which
-    is SAC's usual minus-the-number-of-dimensions at q = 1."""
+    at q = 1 is SAC's usual minus the number of dimensions."""
     target_shannon: float | None = None
     """In place of `target_entropy`: target for the policy's Shannon entropy in nats, over all
-    action dimensions. The same at every q, so that policies of different q are equally random."""
+    action dimensions. It is the same at every q, so that policies of different q are equally
+    random."""
     target_width: float | None = Field(None, gt=0)
     """In place of `target_entropy`: target for the geometric mean of the policy's standard
-    deviations, before tanh. The same at every q."""
+    deviations, before tanh. It is the same at every q."""
     lr: float = Field(3e-4, gt=0)
     """Adam's step size for log alpha."""
 
@@ -78,12 +63,12 @@ class LearnedAlpha(_Frozen):
 
     @model_serializer(mode="wrap")
     def _without_what_is_not_given(self, dump: Any) -> dict[str, Any]:
-        """Keys of runs that use no such target are those of before there were any."""
+        """Omit targets that are not given, so that runs without them keep their older node keys."""
         return {name: value for name, value in dump(self).items() if value is not None}
 
 
-class MatchedAlpha(_Frozen):
-    """Entropy coefficient that weighs the entropy of every q alike at a reference width."""
+class MatchedAlpha(StrictModel):
+    """Entropy coefficient for which every q exerts the same pressure at a reference width."""
 
     value: PositiveSchedule = 0.2
     """Alpha at q = 1."""
@@ -92,25 +77,25 @@ class MatchedAlpha(_Frozen):
     `alpha dS_q / d ln sigma` of q = 1 (docs/comparing_q.md)."""
 
     def scaled(self, alpha: float, q: float, actions: int, form: str) -> float:
-        """Alpha at q, for so many action dimensions."""
+        """Alpha at q for a number of action dimensions."""
         return matched_alpha(alpha, q, self.matched_width, actions, form)
 
 
-class NormalisedAlpha(_Frozen):
-    """Entropy coefficient of S_q as a share of the largest that it can be."""
+class NormalisedAlpha(StrictModel):
+    """Entropy coefficient of S_q as a share of its largest possible value."""
 
     value: PositiveSchedule = 0.2
     """Alpha at q = 1."""
     normalised: Literal[True]
-    """Divides S_q by that of the uniform policy, relative to q = 1. It raises alpha for q > 1, and
-    so makes the pressures on narrow policies more unequal than one alpha does."""
+    """Divides S_q by that of the uniform policy, relative to q = 1. This raises alpha for q > 1, so
+    that the pressures on narrow policies differ more than with one alpha."""
 
     def scaled(self, alpha: float, q: float, actions: int, form: str) -> float:
-        """Alpha at q, for so many action dimensions."""
+        """Alpha at q for a number of action dimensions."""
         return normalised_alpha(alpha, q, actions, form)
 
 
-class GaussianNoise(_Frozen):
+class GaussianNoise(StrictModel):
     """Behaviour of the original MUSIC: tanh(mean) plus noise, some actions uniformly random."""
 
     kind: Literal["gaussian_noise"]
@@ -118,7 +103,7 @@ class GaussianNoise(_Frozen):
     std: float = Field(0.2, ge=0)
     """Standard deviation in units of the action space scaled to [-1, 1]."""
     random_share: float = Field(0.3, ge=0, le=1)
-    """Share of actions drawn uniformly instead."""
+    """Share of actions that are drawn uniformly instead."""
 
 
 _KINDS_OF_ALPHA: dict[str, type[BaseModel]] = {
@@ -126,10 +111,11 @@ _KINDS_OF_ALPHA: dict[str, type[BaseModel]] = {
     "matched_width": MatchedAlpha,
     "normalised": NormalisedAlpha,
 }
-"""By the key that only they have."""
+"""Key that only one kind of alpha has to that kind."""
 
 
 def _alpha_kind(value: object) -> str:
+    """Tag of the member of `Alpha` that a value is meant to be."""
     for key, kind in _KINDS_OF_ALPHA.items():
         if (isinstance(value, dict) and key in value) or type(value) is kind:
             return key
@@ -149,11 +135,11 @@ Alpha = Annotated[
 def alpha_at(
     settings: TACSettings, q: float, env_steps: int, total_env_steps: int, actions: int
 ) -> float:
-    """The entropy coefficient after `env_steps`; a learned one's first.
+    """The entropy coefficient after `env_steps`; the initial one if it is learned.
 
     Args:
         q: entropic index at that time.
-        actions: action dimensions of the task; they count for `entropy_form: joint` only.
+        actions: action dimensions of the task, used with `entropy_form: joint` only.
     """
     alpha = settings.alpha
     if isinstance(alpha, LearnedAlpha):
@@ -172,30 +158,30 @@ Behaviour = Annotated[
     Annotated[Literal["policy"], Tag("policy")] | Annotated[GaussianNoise, Tag("gaussian_noise")],
     Discriminator(_behaviour_kind),
 ]
-"""How training episodes are acted."""
+"""How actions are chosen during training."""
 
 
-class TACSettings(_Frozen):
+class TACSettings(StrictModel):
     """Settings of the Tsallis actor-critic (paper III-B, Fig. 3)."""
 
     entropic_index: Annotated[AdaptiveSchedule, bounded("> 0", lambda q: q > 0)] = 1.0
-    """q of ln_q. 1 is SAC, 2 the sparse Tsallis entropy. At one `alpha` a larger q keeps policies
-    broader, since its pressure grows as they narrow."""
+    """q of ln_q: 1 is SAC, 2 the sparse Tsallis entropy. At the same `alpha` a larger q keeps
+    policies broader, since its pressure grows as they narrow."""
     alpha: Alpha = 0.2
     """Entropy coefficient: a constant, a schedule, `{learned: true, ...}`, or, to compare q at
     equal pressure, `{value: ..., matched_width: ...}` (docs/comparing_q.md). Higher values explore
-    longer, and slow the end of learning."""
+    longer and slow the end of learning."""
     entropy_form: Literal["per_dimension", "joint"] = "per_dimension"
     """ln_q summed over action dimensions (the TAC authors), or of the joint density (the paper),
     whose pressure on a narrow policy grows with their number where q > 1."""
     policy: Literal["stochastic", "deterministic"] = "stochastic"
     """Squashed Gaussian, or tanh(mean) only: with `bootstrap: critics` that is DDPG."""
     bootstrap: Literal["value", "critics"] = "value"
-    """What follows a transition is worth: the averaged value network (the paper), or averaged
-    critics at the policy's next action (SAC with twin targets; with one critic, DDPG)."""
+    """Value of the next state: the target value network (the paper), or target critics at the
+    policy's next action (SAC with twin targets; with one critic, DDPG)."""
     policy_critic: Literal["first", "min"] = "min"
-    """Which critic the policy improves on: Q1 (the TAC authors) or min(Q1, Q2) (SAC practice),
-    which is less drawn to what one of them overrates."""
+    """Critic in the policy's loss: Q1 (the TAC authors) or min(Q1, Q2) (SAC practice), which
+    exploits the overestimates of one critic less."""
     hidden_sizes: tuple[Annotated[int, Field(gt=0)], ...] = Field((256, 256, 256), min_length=1)
     """Hidden layers (ReLU) of policy, value and critics. 3 x 256 takes three times as long as
     3 x 128."""
@@ -203,46 +189,47 @@ class TACSettings(_Frozen):
     """Range of the policy's log standard deviation. A higher lower end keeps noise in the actions
     until the end."""
     log_std_form: Literal["clamp", "tanh"] = "clamp"
-    """How it gets there: cut off at the bounds, so that it begins near 0; or tanh, scaled to them,
-    so that it begins in their middle (TAC-2020: [-20, 2], original MUSIC's SAC: [-5, 2])."""
+    """How log standard deviations are kept in that range: cut off at the bounds, so that they begin
+    near 0; or by a tanh that is scaled to the bounds, so that they begin in the middle (TAC-2020:
+    [-20, 2], original MUSIC's SAC: [-5, 2])."""
     lr: float = Field(1e-3, gt=0)
-    """Adam's step size for policy, value and critics. Larger learns sooner, or not at all."""
+    """Adam's step size for policy, value and critics. Larger learns sooner, or diverges."""
     gamma: float = Field(0.99, ge=0, lt=1)
-    """Discount. The agent looks about 1 / (1 - gamma) steps ahead."""
+    """Discount factor: the horizon is about 1 / (1 - gamma) steps."""
     tau: float = Field(0.005, gt=0, le=1)
-    """Moving-average ratio of the target networks. Larger passes values on sooner, and less
-    steadily."""
+    """Moving-average ratio of the target networks. Larger propagates values sooner and less
+    smoothly."""
     target_update_interval: int = Field(1, gt=0)
-    """Gradient updates between two moves of the target networks."""
+    """Gradient updates between two updates of the target networks."""
     target_bounds: tuple[float, float] | None = None
-    """Critic targets are clipped to this range (original MUSIC: plus/minus 4/(1-gamma)). Values
-    can't run away then; too narrow a range cuts off true ones, of which a sweep warns."""
+    """Range to which critic targets are clipped (original MUSIC: plus/minus 4/(1-gamma)). It keeps
+    values from diverging; too narrow a range cuts off true values, of which a sweep warns."""
     batch_size: int = Field(256, gt=0)
-    """Transitions per update. More: less noise in each, and longer ones."""
+    """Transitions per update. More make updates less noisy and slower."""
     replay_ratio: float = Field(1.0, gt=0)
-    """Gradient updates per environment step. More learns more from each step, and takes longer:
+    """Gradient updates per environment step. More learn more from each step and take longer:
     updates are most of a run's time."""
     precision: Literal["float32", "bf16"] = "float32"
-    """Of the hidden layers' products while learning; weights, outputs and acting stay float32.
-    `bf16` is refused on hardware without it."""
+    """Precision of the hidden layers' products in updates; weights, outputs and acting stay
+    float32. `bf16` is refused on hardware without it."""
     random_steps: int = Field(1_000, ge=0)
-    """First environment steps: uniformly random actions, and no updates before they are over. More
-    has seen more when learning begins, later."""
+    """First environment steps, with uniformly random actions and without updates. More give the
+    first updates more varied data, later."""
     normalise_observations: bool = True
-    """Running mean and standard deviation of observations and goals in front of every network, so
-    that inputs of small numbers (metres, here) count as much as large ones."""
+    """Whether observations and goals are normalised by their running mean and standard deviation,
+    so that inputs of small numbers (metres, here) count as much as large ones."""
     observation_clip: float = Field(5.0, gt=0)
     """Normalised observations are clipped to plus/minus this."""
     normaliser_epsilon: float = Field(1e-2, gt=0)
-    """Smallest standard deviation that the normaliser divides by. Larger leaves what hardly varies
-    small; smaller blows its noise up."""
+    """Smallest standard deviation that the normaliser divides by. Larger keeps inputs small that
+    hardly vary; smaller amplifies their noise."""
     behaviour: Behaviour = "policy"
-    """Acting during training: sample the policy, or the original MUSIC's noise."""
+    """Actions during training: samples of the policy, or with the original MUSIC's noise."""
     action_l2: float = Field(0.0, ge=0)
     """Weight of the policy's mean squared action, in [-1, 1], in its loss (original MUSIC: 1.0).
-    Higher: gentler actions, which may be too gentle to push with."""
+    Higher makes actions gentler, perhaps too gentle to push."""
     max_episode_steps: int | None = Field(None, gt=0)
-    """Truncate episodes here; needed where the environment has no time limit of its own."""
+    """Steps after which episodes are truncated; needed if the environment has no time limit."""
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -287,7 +274,7 @@ class TACSettings(_Frozen):
 def in_words(
     value: float | Linear | Piecewise | Measured | LearnedAlpha | MatchedAlpha | NormalisedAlpha,
 ) -> str:
-    """A constant, a schedule or a coefficient in a few characters: `1.5`, `1 to 2`, `learned`."""
+    """Short text for a constant, a schedule or a coefficient: `1.5`, `1 to 2`, `learned`."""
     match value:
         case MatchedAlpha():
             return f"{in_words(value.value)} matched at {value.matched_width:g}"

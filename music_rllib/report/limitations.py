@@ -43,7 +43,8 @@ def planned_runs(config: str) -> tuple[str, ...] | None:
         None where that cannot be told here: the configuration is one of another version, or starts
         from files that are not on this machine.
     """
-    from music_rllib.config.load import ConfigError, load_sweep
+    from music_rllib.config.load import load_sweep
+    from music_rllib.config.problems import ConfigError
     from music_rllib.experiment.plan import make_plan
     from music_rllib.store.handoff import HandoffError
 

@@ -1,10 +1,10 @@
-"""The web application around a policy: validation, token, errors. Knows no Ray."""
+"""The web application of a policy: validation, token, errors. It does not use Ray."""
 
 from __future__ import annotations
 
 import hashlib
 import hmac
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable
 from typing import Annotated, Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 import music_rllib
 from music_rllib.serve.docs_page import docs_page
+from music_rllib.serve.load_limits import announced_bytes
 from music_rllib.serve.schema import (
     Answer,
     Array,
@@ -28,16 +29,14 @@ from music_rllib.serve.schema import (
     request_model,
 )
 
-__all__ = ["make_api", "token_hash"]
-
 Act = Callable[[Rows], Awaitable[Array]]
-"""Rows of one request to their actions [B, A]."""
+"""Function from the rows of one request to their actions [B, A]."""
 
 Failures = dict[int | str, dict[str, Any]]
-"""Status to what FastAPI is told of it."""
+"""Status to FastAPI's description of the response."""
 
 SHOWN = 10
-"""Problems of a request that are listed."""
+"""Most problems of a request that the answer lists."""
 
 DESCRIPTION = """
 Send `POST /act` what the environment observes; the answer is the policy's deterministic action
@@ -47,7 +46,7 @@ for each row. Requests that arrive together are computed together.
 
 
 def token_hash(token: str) -> str:
-    """What is handed around in place of the token itself."""
+    """The hash that is passed between processes in place of the token."""
     return hashlib.sha256(token.encode()).hexdigest()
 
 
@@ -55,9 +54,9 @@ def make_api(facts: PolicyFacts, act: Act, token_sha256: str | None = None) -> F
     """The application.
 
     Args:
-        facts: Of the policy; its sizes are those that requests must have.
+        facts: Facts about the policy, with the sizes that requests must have.
         act: Called once per valid request.
-        token_sha256: `token_hash` of what clients must send as bearer token; None: nothing.
+        token_sha256: `token_hash` of the bearer token that clients must send; None: no token.
     """
     body = request_model(facts)
     api = FastAPI(
@@ -65,30 +64,31 @@ def make_api(facts: PolicyFacts, act: Act, token_sha256: str | None = None) -> F
         summary=f"Actions for {facts.task}",
         description=DESCRIPTION,
         version=music_rllib.__version__,
-        # Both load scripts from a CDN; `_add_docs` makes a page that needs no network.
+        # Both load scripts from a CDN; `docs_page` makes a page that needs no network.
         docs_url=None,
         redoc_url=None,
     )
     api.add_middleware(_BodyLimit, limit=body.max_bytes)
     api.add_exception_handler(RequestValidationError, _invalid)
     api.add_exception_handler(StarletteHTTPException, _refused)
-    protected = [Depends(_bearer(token_sha256))] if token_sha256 else []
+    protected, unauthorised = [], Failures()
+    if token_sha256:
+        protected = [Depends(_bearer(token_sha256))]
+        unauthorised = {401: {"model": Failure, "description": "The token is missing or wrong"}}
     failures: Failures = {
         400: {"model": Failure, "description": "The body is not JSON"},
         408: {"model": Failure, "description": "The request was not sent, or answered, in time"},
         413: {"model": Failure, "description": "The body is longer than any valid one"},
         422: {"model": Failure, "description": "The observation is not one of this task"},
+        503: {"model": Failure, "description": "Busy; Retry-After says when to come again"},
     }
-    failures[503] = {"model": Failure, "description": "Busy; Retry-After says when to come again"}
-    if token_sha256:
-        failures[401] = {"model": Failure, "description": "The token is missing or wrong"}
 
     @api.get("/health")
     async def health() -> Health:
         """Whether the policy is loaded and can act."""
         return Health(task=facts.task)
 
-    @api.get("/policy", dependencies=protected, responses=_only(failures, 401))
+    @api.get("/policy", dependencies=protected, responses=unauthorised)
     async def policy() -> PolicyFacts:
         """Task and sizes."""
         return facts
@@ -101,34 +101,26 @@ def make_api(facts: PolicyFacts, act: Act, token_sha256: str | None = None) -> F
         answer: Answer = request.answer(actions)
         return answer
 
-    # The body's type is made at run time, so it can't stand in the signature.
+    # The body's type depends on the policy, so it can't stand in the signature.
     act_on.__annotations__["request"] = Annotated[
         body.annotation, Body(openapi_examples={"zeros": {"value": body.example}})
     ]
-    api.post("/act", dependencies=protected, responses=failures)(act_on)
-    _add_docs(api)
-    return api
-
-
-def _add_docs(api: FastAPI) -> None:
-    """`GET /docs`, for people; it isn't part of the OpenAPI document that it shows."""
+    api.post("/act", dependencies=protected, responses=failures | unauthorised)(act_on)
 
     @api.get("/docs", include_in_schema=False)
     async def docs(request: Request) -> HTMLResponse:
         return HTMLResponse(docs_page(api.openapi(), str(request.base_url)))
 
-
-def _only(
-    failures: dict[int | str, dict[str, Any]], *codes: int
-) -> dict[int | str, dict[str, Any]]:
-    return {code: failure for code, failure in failures.items() if code in codes}
+    return api
 
 
 _SCHEME = HTTPBearer(auto_error=False)
-"""Of this module, as FastAPI looks up annotations there."""
+"""The bearer token of a request. FastAPI looks annotations up in the module."""
 
 
 def _bearer(expected: str) -> Callable[..., None]:
+    """A check of the bearer token against the expected `token_hash`."""
+
     def check(given: Annotated[HTTPAuthorizationCredentials | None, Depends(_SCHEME)]) -> None:
         if given is None or not hmac.compare_digest(token_hash(given.credentials), expected):
             raise HTTPException(
@@ -148,26 +140,26 @@ async def _refused(_: Request, error: Exception) -> JSONResponse:
 
 
 async def _invalid(_: Request, error: Exception) -> JSONResponse:
-    """Say what is wrong, without repeating what was sent: that may be NaN, or megabytes."""
+    """Answer with the rules, and not with the values: these may be NaN, or megabytes."""
     assert isinstance(error, RequestValidationError)
     findings = error.errors()
     if findings and findings[0]["type"] == "json_invalid":
         return _failure(400, Failure(error="the body must be JSON"))
-    problems = [_problem(finding) for finding in findings[:SHOWN]]
+    problems = [
+        Problem(
+            # Before the place in the body stand "body" and the kind of request.
+            place=".".join(map(str, finding["loc"][2:])),
+            rule=finding["msg"].removeprefix("Value error, "),
+        )
+        for finding in findings[:SHOWN]
+    ]
     more = f" (the first {SHOWN} of {len(findings)} problems)" if len(findings) > SHOWN else ""
-    return _failure(
-        422, Failure(error=f"the body must be an observation of this task{more}", problems=problems)
-    )
-
-
-def _problem(finding: Mapping[str, Any]) -> Problem:
-    # Before the place in the body stand "body" and the kind of request.
-    place = ".".join(map(str, finding["loc"][2:]))
-    return Problem(place=place, rule=finding["msg"].removeprefix("Value error, "))
+    rule = f"the body must be an observation of this task{more}"
+    return _failure(422, Failure(error=rule, problems=problems))
 
 
 class _BodyLimit:
-    """Refuses bodies that are too long, before they are held in memory and parsed."""
+    """Middleware that refuses too long bodies before they are kept in memory and parsed."""
 
     def __init__(self, app: ASGIApp, limit: int) -> None:
         self._app = app
@@ -187,14 +179,8 @@ class _BodyLimit:
                 raise HTTPException(413, f"the body must be <= {self._limit} bytes")
             return message
 
-        if _announced(scope) > self._limit:
+        if announced_bytes(scope) > self._limit:
             failure = Failure(error=f"the body must be <= {self._limit} bytes")
             await _failure(413, failure)(scope, receive, send)
             return
         await self._app(scope, counting, send)
-
-
-def _announced(scope: Scope) -> int:
-    """Length of the body by its header; 0 where that says nothing."""
-    value = dict(scope["headers"]).get(b"content-length", b"")
-    return int(value) if value.isdigit() else 0

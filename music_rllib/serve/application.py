@@ -1,7 +1,7 @@
-"""The policy as a Ray Serve application: replicas that compute waiting requests together.
+"""A policy as a Ray Serve application, whose replicas compute waiting requests together.
 
-`app` builds it, for `python -m music_rllib.serve`, `serve run` and the configuration of
-`serve deploy` (cluster/serve.yaml).
+`app` builds it for `serve run` and for `serve deploy` (cluster/serve.yaml), `application` for
+`music-rllib serve`.
 """
 
 from __future__ import annotations
@@ -28,55 +28,53 @@ from music_rllib.serve.api import make_api, token_hash
 from music_rllib.serve.load_limits import FOR_HEALTH, RETRY_SECONDS, Limits
 from music_rllib.serve.schema import Array, PolicyFacts, Rows, compute
 
-__all__ = ["ServeSettings", "app", "application", "policy_of"]
-
 TOGETHER = 64
-"""Requests that are computed together at most."""
+"""Most requests that are computed together."""
 WAIT_SECONDS = 0.002
-"""How long the first one waits for more."""
+"""Time that the first of them waits for others."""
 
 
 class ServeSettings(BaseModel):
-    """What is served; the arguments of `app`."""
+    """The arguments of `app`: the policy, and how it is served."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     policy: str = Field(min_length=1)
     """Folder or URI of a finished node, an exported policy, or a run's key or label."""
     storage: str = "results"
-    """Where keys and labels are looked up."""
+    """Storage in which keys and labels are looked up."""
     env: str | None = None
-    """The environment, where the policy doesn't say what it takes and gives: a sweep's YAML file
-    that declares it, or its id."""
+    """The environment, if the policy's file does not have its spaces: a sweep's YAML file that
+    declares it, or its id."""
     replicas: int = Field(1, ge=1)
     """Processes that compute actions."""
     cpus_per_replica: float = Field(1.0, gt=0)
     """CPUs reserved for each."""
     max_requests: int = Field(Limits().max_requests, ge=1)
-    """Requests that wait for a replica at most, for each proxy; further ones get status 503."""
+    """Most requests of a proxy that wait for a replica; further ones get status 503."""
     token_required: bool = False
     """Refuse to start without a token in the environment; for services beyond loopback."""
 
 
 def app(settings: ServeSettings) -> Application:
-    """Load the policy once and give its weights to every replica, so that all act the same.
+    """The application; every replica gets the same weights, which are loaded once.
 
     Raises:
         PolicyError: There is no such policy.
-        ConfigError: The file that declares its environment is wrong.
+        ConfigError: The file that declares its environment is invalid.
         ValueError: A token is required and there is none.
     """
     return application(policy_of(settings), settings)
 
 
 def policy_of(settings: ServeSettings) -> Policy:
-    """The policy that is to be served; raises as `app` does."""
+    """The policy of `settings`; raises the errors of `app`."""
     place = find_policy(settings.policy, settings.storage)
     return load_policy(place, named_environment(settings.env))
 
 
 def application(policy: Policy, settings: ServeSettings) -> Application:
-    """The same for a policy that is loaded.
+    """The application of a loaded policy.
 
     Raises:
         ValueError: A token is required and there is none.
@@ -85,7 +83,7 @@ def application(policy: Policy, settings: ServeSettings) -> Application:
     if settings.token_required and not token:
         raise ValueError(f"{TOKEN_VARIABLE} must be set in the environment for token_required")
     deployment: Any = PolicyServer
-    # The token's hash: a deployment's arguments are kept by Ray and may be shown.
+    # The token's hash, because Ray keeps a deployment's arguments and may show them.
     return deployment.options(
         num_replicas=settings.replicas,
         max_queued_requests=settings.max_requests + FOR_HEALTH,
@@ -103,7 +101,7 @@ class PolicyServer:
     """A replica."""
 
     def __init__(self, weights: bytes, task: str, token_sha256: str | None) -> None:
-        """Take a policy's bytes (`Policy.to_bytes`) for the task of this name."""
+        """Load a policy's bytes (`Policy.to_bytes`), trained on the task of this name."""
         give_back_freed_memory()
         _stay_on_loopback()
         with TemporaryDirectory() as folder:
@@ -114,11 +112,11 @@ class PolicyServer:
         self._token_sha256 = token_sha256
 
     def __serve_build_asgi_app__(self) -> Any:
-        """Called by Serve when the replica is there."""
+        """The web application; Serve calls this when the replica has started."""
         return make_api(self._facts, self._act, self._token_sha256)
 
     def check_health(self) -> None:
-        """Called by Serve now and then; a replica that can't act is replaced.
+        """Serve calls this periodically, and replaces a replica that raises an error.
 
         Raises:
             RuntimeError: The policy gives no finite action for zeros.
@@ -127,17 +125,14 @@ class PolicyServer:
         if not np.isfinite(compute(self._policy, [zeros])[0]).all():
             raise RuntimeError("the policy has no finite action for an observation of zeros")
 
-    async def _act(self, rows: Rows) -> Array:
-        actions: Array = await self._act_together(rows)
-        return actions
-
     @serve.batch(max_batch_size=TOGETHER, batch_wait_timeout_s=WAIT_SECONDS)
-    async def _act_together(self, waiting: list[Rows]) -> list[Array]:
+    async def _act(self, waiting: list[Rows]) -> list[Array]:
+        """Actions of several requests; called with the rows of one of them."""
         return compute(self._policy, waiting)
 
 
 def _stay_on_loopback() -> None:
-    """Where Ray's node listens on loopback only, have this replica do so, too.
+    """Make this replica listen on loopback only, if Ray's node does.
 
     Serve opens a port for calls between deployments on all addresses, and has no setting for it.
     """

@@ -9,7 +9,7 @@ import socket
 import threading
 from collections.abc import Sequence
 from ipaddress import ip_address
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -19,10 +19,9 @@ from music_rllib.runtime.ray_address import check_reachable, cluster_address
 from music_rllib.serve import TOKEN_VARIABLE
 
 if TYPE_CHECKING:
+    from music_rllib.policy import Policy
     from music_rllib.serve.application import ServeSettings
     from music_rllib.serve.load_limits import Limits
-
-__all__ = ["EXAMPLES", "app", "main", "serve"]
 
 EXAMPLES = f"""\
 Examples:
@@ -37,11 +36,6 @@ be set. RAY_ADDRESS=HOST:PORT chooses a Ray cluster.
 
 Exit codes: 0 stopped by Ctrl-C or SIGTERM, 1 serving failed, 2 bad input.
 """
-
-
-class _Address(NamedTuple):
-    host: str
-    port: int
 
 
 def serve(
@@ -91,16 +85,35 @@ def serve(
     """
     _check_exposure(host)
     _check_port(host, port)
-    _check_cluster()
-    return _serve(
-        _Address(host, port),
-        policy=policy,
-        storage=storage,
-        env=env,
-        replicas=replicas,
+    if (cluster := cluster_address()) is not None:
+        check_reachable(cluster)  # Ray itself would go on trying for minutes
+    try:
+        import ray.serve  # noqa: F401
+    except ImportError as error:
+        raise BadInputError(
+            f"Ray Serve must be installed (pip install 'music_rllib[serve]'): {error}"
+        ) from error
+    from music_rllib.serve.application import ServeSettings, policy_of
+    from music_rllib.serve.load_limits import Limits
+    from music_rllib.serve.schema import PolicyFacts, request_model
+
+    settings = ServeSettings(
+        policy=policy, storage=storage, env=env, replicas=replicas, max_requests=max_requests
+    )
+    served = policy_of(settings)
+    if cluster is None:
+        _check_room(settings, [len(os.sched_getaffinity(0))])
+    limits = Limits(
         max_requests=max_requests,
+        max_body_bytes=request_model(PolicyFacts.of(served.task.name, served)).max_bytes,
         send_seconds=send_seconds,
     )
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    _connect(settings)
+    _serve(served, settings, host, port, limits, stop)
+    return 0
 
 
 app = new_app()
@@ -108,11 +121,12 @@ add_command(app, "serve", serve, EXAMPLES)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run `python -m music_rllib.serve`; its exit code."""
+    """Run `python -m music_rllib.serve` and return its exit code."""
     return run_app(app, "python -m music_rllib.serve", arguments)
 
 
 def _check_exposure(host: str) -> None:
+    """Refuse an address that others reach, unless there is a token."""
     try:
         loopback = host == "localhost" or ip_address(host).is_loopback
     except ValueError:
@@ -125,9 +139,9 @@ def _check_exposure(host: str) -> None:
 
 
 def _check_port(host: str, port: int) -> None:
-    """Ray Serve itself would say so only in a worker's log."""
+    """Check that the port is free: Ray Serve itself would say so only in a worker's log."""
     if cluster_address() is not None:
-        return  # it will be another machine that listens
+        return  # another machine listens
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
         with socket.socket(family, socket.SOCK_STREAM) as probe:
@@ -140,68 +154,8 @@ def _check_port(host: str, port: int) -> None:
         ) from error
 
 
-def _check_cluster() -> None:
-    """Before anything is loaded for it; Ray itself would go on trying for minutes."""
-    if (address := cluster_address()) is not None:
-        check_reachable(address)
-
-
-def _serve(
-    address: _Address,
-    *,
-    policy: str,
-    storage: str,
-    env: str | None,
-    replicas: int,
-    max_requests: int,
-    send_seconds: int,
-) -> int:
-    try:
-        from ray import serve as ray_serve
-    except ImportError as error:
-        raise BadInputError(
-            f"Ray Serve must be installed (pip install 'music_rllib[serve]'): {error}"
-        ) from error
-    from music_rllib.serve.application import ServeSettings, application, policy_of
-    from music_rllib.serve.load_limits import Limits
-    from music_rllib.serve.schema import PolicyFacts, request_model
-
-    settings = ServeSettings(
-        policy=policy, storage=storage, env=env, replicas=replicas, max_requests=max_requests
-    )
-    served = policy_of(settings)
-    if cluster_address() is None:
-        _check_room(settings, [len(os.sched_getaffinity(0))])
-    limits = Limits(
-        max_requests=max_requests,
-        max_body_bytes=request_model(PolicyFacts.of(served.task.name, served)).max_bytes,
-        send_seconds=send_seconds,
-    )
-    stop = _stop_signal()
-    _connect(settings)
-    try:
-        _listen(address, limits, ray_serve)
-    except BaseException:
-        _disconnect()
-        raise
-    try:
-        _run(application(served, settings), address, policy, ray_serve)
-        stop.wait()
-    finally:
-        _shut_down(ray_serve)
-    return 0
-
-
-def _stop_signal() -> threading.Event:
-    """Set by Ctrl-C and SIGTERM."""
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
-    return stop
-
-
 def _connect(settings: ServeSettings) -> None:
-    """A local Ray, or the cluster of the environment; refuses replicas that can never start."""
+    """Start a local Ray, or connect to RAY_ADDRESS; refuse replicas that can never start."""
     import ray
 
     from music_rllib.runtime.quiet import quiet_third_parties
@@ -221,7 +175,7 @@ def _connect(settings: ServeSettings) -> None:
             f"{str(error).strip().splitlines()[0]}"
         ) from error
     finally:
-        # Ray sets one of its own for SIGTERM, which would end the process at once.
+        # Ray sets its own handler of SIGTERM, which would end the process at once.
         for number, handler in handlers.items():
             signal.signal(number, handler)
     nodes = [node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"]]
@@ -235,7 +189,7 @@ def _connect(settings: ServeSettings) -> None:
 
 
 def _waits_for_nodes(settings: ServeSettings) -> bool:
-    """Whether an autoscaler adds the nodes that replicas have no place on yet; says so."""
+    """Whether an autoscaler will add nodes for the replicas; if so, prints that."""
     from music_rllib.runtime import autoscaler
 
     if not autoscaler.adds_nodes({"CPU": settings.cpus_per_replica}, settings.replicas):
@@ -249,7 +203,7 @@ def _waits_for_nodes(settings: ServeSettings) -> bool:
 
 
 def _check_room(settings: ServeSettings, cpus_of_nodes: Sequence[float]) -> None:
-    """Ray would wait for ever for more replicas than can be placed."""
+    """Refuse more replicas than can be placed: Ray would wait for them without end."""
     room = sum(int(cpus // settings.cpus_per_replica) for cpus in cpus_of_nodes)
     if settings.replicas > room:
         raise BadInputError(
@@ -260,59 +214,69 @@ def _check_room(settings: ServeSettings, cpus_of_nodes: Sequence[float]) -> None
 QUIET = {"enable_access_log": False, "log_level": "WARNING"}
 APPLICATION = "policy"
 ANSWER_SECONDS = 60.0
-"""A request that a replica has had for so long is answered with status 408."""
+"""Time for a replica to answer a request; after it the answer is status 408."""
 
 
-def _listen(address: _Address, limits: Limits, serve: Any) -> None:
-    """Start Serve's proxy; on a cluster where Serve runs already, see that we would not disturb."""
+def _serve(
+    policy: Policy,
+    settings: ServeSettings,
+    host: str,
+    port: int,
+    limits: Limits,
+    stop: threading.Event,
+) -> None:
+    """Serve until `stop` is set, then leave Ray."""
+    import ray
+    from ray import serve as ray_serve
+
+    from music_rllib.serve.application import application
+
+    listening = False
+    try:
+        _listen(host, port, limits)
+        listening = True
+        ray_serve.run(
+            application(policy, settings),
+            name=APPLICATION,
+            route_prefix="/",
+            logging_config=QUIET,
+        )
+        url = f"http://{f'[{host}]' if ':' in host else host}:{port}"
+        print(f"Serving {settings.policy} at {url}", flush=True)
+        print(f"POST /act, GET /health, GET /policy; described at {url}/docs", flush=True)
+        stop.wait()
+    finally:
+        # Others may serve on a cluster too; a local Ray ends with all that runs on it.
+        if listening and cluster_address() is not None:
+            ray_serve.delete(APPLICATION)
+        ray.shutdown()
+        if listening:
+            print("Stopped.", flush=True)
+
+
+def _listen(host: str, port: int, limits: Limits) -> None:
+    """Start Serve's proxy; refuse to disturb a Serve that runs on the cluster already."""
+    from ray import serve as ray_serve
     from ray.serve.context import _get_global_client
 
     from music_rllib.serve.load_limits import controller_environment
 
     logging.getLogger("ray.serve").setLevel(logging.ERROR)
-    serve.start(
+    ray_serve.start(
         proxy_location="HeadOnly",
-        http_options={
-            "host": address.host,
-            "port": address.port,
-            "request_timeout_s": ANSWER_SECONDS,
-        },
+        http_options={"host": host, "port": port, "request_timeout_s": ANSWER_SECONDS},
         controller_options={"runtime_env": {"env_vars": controller_environment(limits)}},
         logging_config=QUIET,
     )
     # Serve ignores new options where it runs already.
     options = _get_global_client().http_config
-    if (options.host, options.port) != address:
+    if (options.host, options.port) != (host, port):
         raise BadInputError(
             "--host and --port must be those on which Ray Serve listens on this cluster already, "
-            f"{options.host}:{options.port}, got {address.host}:{address.port}"
+            f"{options.host}:{options.port}, got {host}:{port}"
         )
-    if APPLICATION in serve.status().applications:
+    if APPLICATION in ray_serve.status().applications:
         raise BadInputError(
             "RAY_ADDRESS must be a cluster that serves no policy yet, this one does; stop that "
             "service first"
         )
-
-
-def _run(application: Any, address: _Address, policy: str, serve: Any) -> None:
-    host, port = address
-    serve.run(application, name=APPLICATION, route_prefix="/", logging_config=QUIET)
-    shown = f"[{host}]" if ":" in host else host
-    print(f"Serving {policy} at http://{shown}:{port}", flush=True)
-    print(
-        f"POST /act, GET /health, GET /policy; described at http://{shown}:{port}/docs", flush=True
-    )
-
-
-def _shut_down(serve: Any) -> None:
-    # Others may serve on a cluster too; a local Ray ends with all that runs on it.
-    if cluster_address() is not None:
-        serve.delete(APPLICATION)
-    _disconnect()
-    print("Stopped.", flush=True)
-
-
-def _disconnect() -> None:
-    import ray
-
-    ray.shutdown()

@@ -1,4 +1,4 @@
-"""The page of `/docs`: what the OpenAPI document says, readable without a network.
+"""The page of `/docs`: the OpenAPI document for people, readable without a network.
 
 FastAPI's own page loads its script and style sheet from a CDN, so it stays blank behind a firewall.
 """
@@ -11,8 +11,6 @@ from collections.abc import Iterator
 from html import escape
 from typing import Any
 
-__all__ = ["docs_page"]
-
 STYLE = """\
 body{font:16px/1.5 system-ui,sans-serif;max-width:60rem;margin:2rem auto;padding:0 1rem;
 color:#1b1b1b;background:#fff}
@@ -24,11 +22,11 @@ td,th{text-align:left;padding:.1rem 1.5rem .1rem 0;vertical-align:top}
 
 
 def docs_page(document: dict[str, Any], base_url: str) -> str:
-    """HTML without a script, an image or anything else from elsewhere.
+    """HTML that loads nothing: no script, no image, no style sheet.
 
     Args:
         document: The OpenAPI document.
-        base_url: Where the service is reached, for the commands to copy.
+        base_url: Address of the service, for the commands to copy.
     """
     info = document["info"]
     base = base_url.rstrip("/")
@@ -51,7 +49,7 @@ def docs_page(document: dict[str, Any], base_url: str) -> str:
 
 
 def _text(markdown: str) -> str:
-    """The one piece of Markdown that the descriptions use is `code`."""
+    """HTML of a description, whose only Markdown is `code`."""
     pieces = escape(" ".join(markdown.split())).split("`")
     return "".join(
         f"<code>{piece}</code>" if number % 2 else piece for number, piece in enumerate(pieces)
@@ -76,7 +74,7 @@ def _operation(method: str, path: str, operation: dict[str, Any], base: str) -> 
 
 
 def _example(operation: dict[str, Any]) -> Any:
-    """A body that is accepted; None where there is none."""
+    """A valid body; None if the operation has none."""
     content = operation.get("requestBody", {}).get("content", {}).get("application/json", {})
     for example in content.get("examples", {}).values():
         return example["value"]
@@ -84,6 +82,7 @@ def _example(operation: dict[str, Any]) -> Any:
 
 
 def _answer(response: dict[str, Any]) -> str:
+    """A response's description and the name of its schema."""
     schema = response.get("content", {}).get("application/json", {}).get("schema", {})
     name = schema.get("$ref", "").rpartition("/")[2]
     return f"{response['description']}{f': {name}' if name else ''}"

@@ -1,10 +1,10 @@
-"""What a service takes on under load: so many requests, bytes and seconds, and no more.
+"""Limits of a service under load: requests at a time, bytes and seconds.
 
-Ray Serve's proxy (uvicorn) hands a request on as soon as its headers are there and waits for ever
-for the rest. Its one hook for the proxy is an import path in the environment of Serve's controller
-(`controller_environment`); it leads to `middlewares` below. `Admission` takes a request's body in
-before a replica hears of it; `guarded` watches the connection, which a middleware doesn't see.
-Serve's own `max_queued_requests` stands behind both, for proxies without them.
+Ray Serve's proxy (uvicorn) passes a request on as soon as it has its headers, and waits without end
+for the rest. The only hook into the proxy is an import path in the environment of Serve's
+controller (`controller_environment`), here that of `middlewares`. `Admission` receives the whole
+body before a replica gets the request; `guarded` limits the connection, which a middleware does not
+see. Serve's own `max_queued_requests` protects replicas behind proxies without them.
 """
 
 from __future__ import annotations
@@ -23,37 +23,35 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from music_rllib.runtime.allocator import give_back_freed_memory
 
-__all__ = ["Admission", "Limits", "controller_environment", "guarded", "middlewares"]
-
 LIMITS_VARIABLE = "MUSIC_RLLIB_SERVE_LIMITS"
-"""`Limits` as JSON, for proxies that somebody else starts."""
+"""Environment variable with `Limits` as JSON, for proxies that Serve starts."""
 FOR_HEALTH = 16
-"""Requests for health that are answered while all others are refused."""
+"""Health requests that are answered at a time while all others are refused."""
 HEALTH = ("/health", "/-/healthz", "/-/routes")
 CONNECTIONS = 4096
-"""Open at a time; further ones are closed at once."""
+"""Connections open at a time; further ones are closed at once."""
 HEAD_BYTES = 64 * 2**10
-"""Of the request line and all headers; also of what chunks and trailers add to a body."""
+"""Largest request line with all headers; also the largest overhead of a body's chunks."""
 HELD_BYTES = 64 * 2**20
-"""Bodies of all requests together; one alone may be larger."""
+"""Largest bodies of all requests together; a single one may be larger."""
 RETRY_SECONDS = 1
 
 
 class Limits(BaseModel):
-    """Of one proxy."""
+    """Limits of one proxy."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     max_requests: int = Field(256, ge=1)
     """Requests that are answered at a time, waiting ones included."""
     max_body_bytes: int = Field(16 * 2**20, ge=1)
-    """Of one request."""
+    """Largest body of one request, in bytes."""
     send_seconds: float = Field(10.0, gt=0)
-    """For a client to send a whole request, and to take the answer."""
+    """Time for a client to send a whole request, and to receive the answer."""
 
 
 def controller_environment(limits: Limits) -> dict[str, str]:
-    """Environment of Serve's controller, which its proxies inherit, so that they keep `limits`."""
+    """Environment of Serve's controller that makes its proxies, which inherit it, keep `limits`."""
     return {
         "RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH": f"{__name__}.{middlewares.__name__}",
         LIMITS_VARIABLE: limits.model_dump_json(),
@@ -61,24 +59,26 @@ def controller_environment(limits: Limits) -> dict[str, str]:
 
 
 def middlewares() -> list[Middleware]:
-    """Called by Serve in each of its proxies, before that one listens."""
+    """The middlewares of a proxy; Serve calls this in each proxy before it listens."""
     from uvicorn.protocols.http import auto
 
     limits = Limits.model_validate_json(os.environ.get(LIMITS_VARIABLE) or "{}")
     give_back_freed_memory()
-    # Serve has no setting for it; uvicorn looks here for what it makes of a connection.
+    # Serve has no setting for it; uvicorn takes the class of its connections from here.
     auto.AutoHTTPProtocol = guarded(limits)
     return [Middleware(Admission, limits=limits)]
 
 
 class Admission:
-    """Takes whole requests in, as many as can be answered soon; refuses the others at once."""
+    """Middleware that receives whole requests up to the limits and refuses others at once."""
 
     def __init__(self, app: ASGIApp, limits: Limits) -> None:
         self._app = app
         self._limits = limits
         self._answering = 0
+        """Requests that the application has."""
         self._held = 0
+        """Bytes of all bodies in memory."""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -86,16 +86,20 @@ class Admission:
             return
         request = _Request(scope, receive)
         try:
-            refusal = self._refusal(request) or await self._take_in(request)
+            refusal = self._refusal(request) or await self._receive_body(request)
             if refusal is not None:
                 await refusal(scope, receive, send)
             elif request.whole:
-                await self._answer(request, send)
+                self._answering += 1
+                try:
+                    await self._app(scope, request.replay, send)
+                finally:
+                    self._answering -= 1
         finally:
             self._held -= request.size
 
-    async def _take_in(self, request: _Request) -> JSONResponse | None:
-        """The body, piece by piece; why not, where it becomes too much."""
+    async def _receive_body(self, request: _Request) -> JSONResponse | None:
+        """Receive the body piece by piece; returns a refusal as soon as it exceeds a limit."""
         async for piece in request.pieces():
             self._held += len(piece)
             if refusal := self._refusal(request):
@@ -103,6 +107,7 @@ class Admission:
         return None
 
     def _refusal(self, request: _Request) -> JSONResponse | None:
+        """The refusal of a request that exceeds a limit so far; None if it doesn't."""
         most = self._limits.max_body_bytes
         if max(request.announced, request.size) > most:
             return _refusal(413, f"the body must be <= {most} bytes")
@@ -114,35 +119,27 @@ class Admission:
             return _refusal(503, rule, {"Retry-After": str(RETRY_SECONDS)})
         return None
 
-    async def _answer(self, request: _Request, send: Send) -> None:
-        self._answering += 1
-        try:
-            await self._app(request.scope, request.again, send)
-        finally:
-            self._answering -= 1
+
+def announced_bytes(scope: Scope) -> int:
+    """Size of a request's body by its header; 0 if the header is missing or no number."""
+    value = dict(scope["headers"]).get(b"content-length", b"")
+    return int(value) if value.isdigit() else 0
 
 
 class _Request:
-    """A request that is being taken in."""
+    """A request whose body is being received."""
 
     def __init__(self, scope: Scope, receive: Receive) -> None:
-        self.scope = scope
+        self.for_health = scope["path"] in HEALTH
         self.whole = False
         self.size = 0
         """Bytes of the body so far."""
-        announced = dict(scope["headers"]).get(b"content-length", b"")
-        self.announced = int(announced) if announced.isdigit() else 0
-        """Bytes of the body by its header; 0 where that says nothing."""
+        self.announced = announced_bytes(scope)
         self._receive = receive
         self._pieces: list[bytes] = []
 
-    @property
-    def for_health(self) -> bool:
-        """Whether it asks how the service is."""
-        return self.scope["path"] in HEALTH
-
     async def pieces(self) -> AsyncIterator[bytes]:
-        """The body as it comes; ends early where the client leaves."""
+        """The pieces of the body as they arrive; they end early if the client disconnects."""
         while not self.whole:
             message = await self._receive()
             if message["type"] != "http.request":
@@ -152,8 +149,8 @@ class _Request:
             self.size += len(self._pieces[-1])
             yield self._pieces[-1]
 
-    async def again(self) -> Message:
-        """For the application: the whole body, then whatever comes."""
+    async def replay(self) -> Message:
+        """The application's `receive`: the whole body in one message, then further messages."""
         if not self._pieces:
             return await self._receive()
         body = b"".join(self._pieces)
@@ -162,26 +159,26 @@ class _Request:
 
 
 def _refusal(status: int, error: str, headers: Mapping[str, str] | None = None) -> JSONResponse:
-    # As `protocol.Failure`, without loading all that a replica needs into each proxy.
+    # Like `schema.Failure`, which would load a replica's libraries into each proxy.
     return JSONResponse({"error": error, "problems": []}, status, headers)
 
 
 def guarded(limits: Limits) -> type[HttpToolsProtocol]:
-    """Uvicorn's connection, which has a time limit only between requests, with `limits`."""
+    """Uvicorn's class of connections, whose only time limit is between requests, with `limits`."""
 
     class Guarded(HttpToolsProtocol):
-        """Closed where a request, or the taking of its answer, is too long in any sense."""
+        """A connection that is closed if a request or the receipt of an answer exceeds a limit."""
 
         def __init__(self, *arguments: Any, **options: Any) -> None:
             super().__init__(*arguments, **options)
-            self._sending = _Alarm(self.loop, limits.send_seconds, self._overdue)
-            """On while a request is being sent."""
-            self._taking = _Alarm(self.loop, limits.send_seconds, lambda: self.transport.abort())
-            """On while the client must take more of an answer."""
+            self._request_timer = _Timer(self.loop, limits.send_seconds, self._request_overdue)
+            """Runs while the client sends a request."""
+            self._answer_timer = _Timer(self.loop, limits.send_seconds, self._abort)
+            """Runs while the client has to receive more of an answer."""
             self._received = 0
-            """Bytes of the request that is being sent."""
+            """Bytes of the current request so far."""
             self._in_head = True
-            """Whether its headers are not all there."""
+            """Whether headers of the current request are missing."""
 
         def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
             super().connection_made(transport)
@@ -191,16 +188,16 @@ def guarded(limits: Limits) -> type[HttpToolsProtocol]:
                 self._begin()
 
         def connection_lost(self, exc: Exception | None) -> None:
-            self._sending.stop()
-            self._taking.stop()
+            self._request_timer.stop()
+            self._answer_timer.stop()
             super().connection_lost(exc)
 
         def data_received(self, data: bytes) -> None:
-            if self._idle and not self._sending.is_on:
+            if self._idle and not self._request_timer.is_on:
                 self._begin()
             self._received += len(data)
             super().data_received(data)
-            if not self._sending.is_on:  # it is there
+            if not self._request_timer.is_on:  # the request is complete
                 return
             if self._in_head and self._received > HEAD_BYTES:
                 self._close(431, f"the headers must be <= {HEAD_BYTES} bytes")
@@ -209,7 +206,7 @@ def guarded(limits: Limits) -> type[HttpToolsProtocol]:
                 self._close(413, f"the body must be <= {limits.max_body_bytes} bytes")
 
         def on_message_begin(self) -> None:
-            if not self._sending.is_on:
+            if not self._request_timer.is_on:
                 self._begin()
             super().on_message_begin()
 
@@ -218,40 +215,44 @@ def guarded(limits: Limits) -> type[HttpToolsProtocol]:
             super().on_headers_complete()
 
         def on_message_complete(self) -> None:
-            self._sending.stop()
+            self._request_timer.stop()
             self._received = 0
             super().on_message_complete()
 
         def pause_writing(self) -> None:
-            self._taking.start()
+            self._answer_timer.start()
             super().pause_writing()
 
         def resume_writing(self) -> None:
-            self._taking.stop()
+            self._answer_timer.stop()
             super().resume_writing()
 
         def timeout_keep_alive_handler(self) -> None:
             super().timeout_keep_alive_handler()
-            # Which waits for the client to take the rest of the last answer.
-            self._taking.start()
+            # It waits for the client to receive the rest of the last answer.
+            self._answer_timer.start()
 
         @property
         def _idle(self) -> bool:
-            """Whether no answer is under way."""
+            """Whether no request is being answered."""
             return bool(getattr(self.cycle, "response_complete", True))
 
         def _begin(self) -> None:
             self._received, self._in_head = 0, True
-            self._sending.start()
+            self._request_timer.start()
 
-        def _overdue(self) -> None:
-            if self.flow.read_paused:  # it is we who don't read
-                self._sending.start()
+        def _abort(self) -> None:
+            self.transport.abort()
+
+        def _request_overdue(self) -> None:
+            if self.flow.read_paused:  # the delay is the server's: it does not read
+                self._request_timer.start()
             else:
                 self._close(408, f"the request must be sent within {limits.send_seconds:g} s")
 
         def _close(self, status: int, error: str) -> None:
-            self._sending.stop()
+            """Close the connection, with a last answer if none has been started."""
+            self._request_timer.stop()
             if self.transport.is_closing():
                 return
             if self._in_head if self._idle else not self.cycle.response_started:
@@ -261,31 +262,31 @@ def guarded(limits: Limits) -> type[HttpToolsProtocol]:
     return Guarded
 
 
-class _Alarm:
-    """Calls `ring` some seconds after it was last started, unless stopped."""
+class _Timer:
+    """Calls `action` some seconds after its last start, unless it is stopped."""
 
     def __init__(
-        self, loop: asyncio.AbstractEventLoop, seconds: float, ring: Callable[[], None]
+        self, loop: asyncio.AbstractEventLoop, seconds: float, action: Callable[[], None]
     ) -> None:
-        self._loop, self._seconds, self._ring = loop, seconds, ring
-        self._timer: asyncio.TimerHandle | None = None
+        self._loop, self._seconds, self._action = loop, seconds, action
+        self._handle: asyncio.TimerHandle | None = None
 
     @property
     def is_on(self) -> bool:
-        return self._timer is not None
+        return self._handle is not None
 
     def start(self) -> None:
         self.stop()
-        self._timer = self._loop.call_later(self._seconds, self._ring)
+        self._handle = self._loop.call_later(self._seconds, self._action)
 
     def stop(self) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
-        self._timer = None
+        if self._handle is not None:
+            self._handle.cancel()
+        self._handle = None
 
 
 def _last_answer(status: int, error: str) -> bytes:
-    """An answer in one piece, after which the connection is closed."""
+    """The bytes of a whole answer, after which the connection is closed."""
     answer = _refusal(status, error, {"Connection": "close"})
     head = [f"HTTP/1.1 {status} {HTTPStatus(status).phrase}".encode()]
     head += [name + b": " + value for name, value in answer.raw_headers]

@@ -1,4 +1,4 @@
-"""What the served policy accepts and answers: models whose sizes are the policy's own.
+"""Requests and answers of a served policy: models with the sizes of the policy.
 
 Legend: B rows of a batch, D size of an observation, G size of a goal, A size of an action.
 """
@@ -6,27 +6,17 @@ Legend: B rows of a batch, D size of an observation, G size of a goal, A size of
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Annotated, Any, Literal, NamedTuple, Protocol, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, create_model, model_validator
 
-__all__ = [
-    "MAX_ROWS",
-    "Answer",
-    "Failure",
-    "Health",
-    "PolicyFacts",
-    "Request",
-    "Rows",
-    "ServedPolicy",
-    "compute",
-    "request_model",
-]
+if TYPE_CHECKING:
+    from music_rllib.policy import Policy, PolicyNetwork
 
 MAX_ROWS = 1024
-"""Observations in one request."""
+"""Most observations in one request."""
 _FLOAT32 = float(np.finfo(np.float32).max)
 
 Array = npt.NDArray[np.float32]
@@ -34,27 +24,8 @@ Rows = dict[str, Array]
 """Name of a part of the observation to [B, D] or [B, G]."""
 
 
-class ServedPolicy(Protocol):
-    """What is needed of a policy; `music_rllib.policy.PolicyNetwork` has it."""
-
-    @property
-    def observation_size(self) -> int:
-        """D."""
-
-    @property
-    def goal_size(self) -> int:
-        """G; 0 where the task has no goals."""
-
-    @property
-    def action_size(self) -> int:
-        """A."""
-
-    def act(self, observation: Any) -> Array:
-        """Deterministic actions [B, A] in the environment's scale."""
-
-
 class PolicyFacts(BaseModel):
-    """What a client must know of the policy that it talks to."""
+    """Facts about a policy that a client needs."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -64,11 +35,11 @@ class PolicyFacts(BaseModel):
     """0: the task has no goals, and requests have none."""
     action_size: int
     max_rows: int = MAX_ROWS
-    """Observations in one request."""
+    """Most observations in one request."""
 
     @classmethod
-    def of(cls, task: str, policy: ServedPolicy) -> PolicyFacts:
-        """What `policy` says of itself."""
+    def of(cls, task: str, policy: Policy | PolicyNetwork) -> PolicyFacts:
+        """The facts about `policy`."""
         return cls(
             task=task,
             observation_size=policy.observation_size,
@@ -78,7 +49,7 @@ class PolicyFacts(BaseModel):
 
     @property
     def parts(self) -> dict[str, int]:
-        """Names of what an observation consists of, and their sizes."""
+        """Names and sizes of the parts of an observation."""
         goals = {"desired_goal": self.goal_size, "achieved_goal": self.goal_size}
         return {"observation": self.observation_size} | (goals if self.goal_size else {})
 
@@ -105,7 +76,7 @@ class Problem(BaseModel):
 
 
 class Failure(BaseModel):
-    """Why there is no action."""
+    """The reason why a request has no action."""
 
     error: str
     problems: list[Problem] = Field(default_factory=list)
@@ -117,7 +88,7 @@ class Request(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
     def rows(self) -> Rows:
-        """Everything that was given, with a row dimension."""
+        """The given parts as arrays with a row dimension."""
         given = self.model_dump(exclude_none=True)
         return {name: np.atleast_2d(np.asarray(part, np.float32)) for name, part in given.items()}
 
@@ -143,25 +114,27 @@ class _Batch(Request):
 
 
 class RequestType(NamedTuple):
-    """What a body is validated against."""
+    """The type of a request's body."""
 
     annotation: Any
-    """For FastAPI: one observation or a batch of them."""
+    """The annotation for FastAPI: one observation or a batch of them."""
     example: dict[str, Any]
     max_bytes: int
-    """No valid body is longer."""
+    """Upper bound on the size of a valid body."""
 
 
 def request_model(facts: PolicyFacts) -> RequestType:
     """The bodies that a policy of these sizes accepts.
 
-    `achieved_goal` is accepted, so that an environment's whole observation can be sent, and not
-    used.
+    `achieved_goal` is accepted, so that a client can send an environment's whole observation, and
+    not used.
     """
+
+    def rows(vector: Any) -> Any:
+        return Annotated[list[vector], Field(min_length=1, max_length=facts.max_rows)]
+
     one: Any = _model("Observation", Request, facts, lambda vector: vector)
-    many: Any = _model(
-        "Observations", _Batch, facts, lambda vector: _rows_of(vector, facts.max_rows)
-    )
+    many: Any = _model("Observations", _Batch, facts, rows)
     either: Any = Annotated[one, Tag("one")] | Annotated[many, Tag("many")]
     body = Annotated[either, Discriminator(_one_or_many)]
     numbers = facts.max_rows * sum(facts.parts.values())
@@ -181,22 +154,19 @@ def _model(
     return create_model(name, __base__=base, **fields)
 
 
-def _rows_of(vector: Any, max_rows: int) -> Any:
-    return Annotated[list[vector], Field(min_length=1, max_length=max_rows)]
-
-
 def _one_or_many(body: Any) -> str:
+    """Tag of the model that a body is meant to be."""
     observation = body.get("observation") if isinstance(body, dict) else None
     nested = isinstance(observation, list) and observation and isinstance(observation[0], list)
     return "many" if nested else "one"
 
 
-def compute(policy: ServedPolicy, waiting: list[Rows]) -> list[Array]:
+def compute(policy: PolicyNetwork, waiting: list[Rows]) -> list[Array]:
     """Actions [B_i, A] of several requests in one pass through the network."""
-    # What the policy needs; an achieved goal may be in some requests and not in others.
+    # Without achieved goals, which only some requests may have.
     needed = ("observation", "desired_goal") if policy.goal_size else ("observation",)
     stacked = {name: np.concatenate([rows[name] for rows in waiting]) for name in needed}
-    # Huge numbers may overflow; the caller looks whether actions are finite.
+    # Huge numbers may overflow; the caller checks that actions are finite.
     with np.errstate(over="ignore", invalid="ignore"):
         actions = policy.act(stacked)
     ends = np.cumsum([len(rows["observation"]) for rows in waiting])[:-1]

@@ -278,5 +278,5 @@ def _training_metrics(result: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
             yield name, float(episodes[key])
     learner = result.get(LEARNER_RESULTS, {}).get(DEFAULT_MODULE_ID, {})
     for key, value in learner.items():
-        if key in names.LEARNER or key == HELD_OUT_STEPS or key.startswith(names.PER_DIMENSION):
+        if key == HELD_OUT_STEPS or key.startswith(names.LEARNER_GROUPS):
             yield key, float(value)

@@ -1,1 +1,1 @@
-"""From a file to plain settings: strict YAML, presets, overrides, and layers of settings."""
+"""Reads settings: strict YAML, presets, overrides of the command line, layers of settings."""

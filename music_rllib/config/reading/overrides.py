@@ -1,23 +1,21 @@
-"""`KEY=VALUE` of the command line, laid over a sweep's file.
+"""`KEY=VALUE` arguments of the command line, which replace values of a sweep's file.
 
-A setting (`tac.alpha=0.1`) holds in every stage, over what the file says of it in `defaults`, in
+A setting (`tac.alpha=0.1`) holds in every stage and replaces the file's values in `defaults`, in
 stages and for single tasks; `stages.NAME.tac.alpha=0.1` changes one stage. A key of the file's top
-(`seeds=5`, `resources.cpus_per_run=2`) replaces that.
+level (`seeds=5`, `resources.cpus_per_run=2`) replaces the value there.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path as FilePath
+from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
-from music_rllib.config.problems import ConfigError, Path, shown, unknown
+from music_rllib.config.problems import ConfigError, KeyPath, shown, unknown
 from music_rllib.config.reading.layers import LAYER_KEYS, SECTIONS, all_settings
 from music_rllib.config.reading.yaml_file import read_value
 from music_rllib.config.schema import Header, StageHeader
-
-__all__ = ["Override", "lay_overrides", "parse_overrides"]
 
 TOP = (*Header.model_fields, "preset", "environments", "defaults", "stages")
 
@@ -27,27 +25,23 @@ class Override(NamedTuple):
 
     key: str
     parts: tuple[str, ...]
+    """The parts of the dotted key."""
     value: Any
 
-    @property
-    def is_setting(self) -> bool:
-        """Whether it holds in every stage."""
-        return self.parts[0] in LAYER_KEYS
 
-
-def parse_overrides(arguments: Iterable[str]) -> list[Override]:
-    """What `KEY=VALUE` arguments mean; values are YAML.
+def parse_overrides(arguments: Iterable[str]) -> dict[str, Override]:
+    """Key to override, for `KEY=VALUE` arguments with values in YAML.
 
     Raises:
-        ConfigError: One has no `=`, its key is not known or is given twice, or its value no YAML.
+        ConfigError: One has no `=`, its key is unknown or repeated, or its value is not YAML.
     """
-    found: dict[str, Override] = {}
+    overrides: dict[str, Override] = {}
     for argument in arguments:
         key, equals, text = argument.partition("=")
         parts = tuple(key.split("."))
         if not equals or not all(parts):
             raise _refusal(f"must be KEY=VALUE like tac.alpha=0.1, got {shown(argument)}")
-        if key in found:
+        if key in overrides:
             raise _refusal(f"{key} must not repeat")
         if parts[0] not in (*LAYER_KEYS, *TOP):
             raise _refusal(f"{key} {unknown(key, (*all_settings(), *TOP))}")
@@ -56,56 +50,59 @@ def parse_overrides(arguments: Iterable[str]) -> list[Override]:
         except ValueError as error:
             raise _refusal(f"{key} {error}, got {shown(text)}") from None
         if key == "preset" and isinstance(value, str) and value.endswith((".yaml", ".yml")):
-            value = str(FilePath(value).expanduser().absolute())
-        found[key] = Override(key, parts, value)
-    return list(found.values())
+            value = str(Path(value).expanduser().absolute())
+        overrides[key] = Override(key, parts, value)
+    return overrides
 
 
 def lay_overrides(
-    document: Mapping[str, Any], overrides: Sequence[Override]
-) -> tuple[dict[str, Any], dict[Path, str]]:
+    document: Mapping[str, Any], overrides: Iterable[Override]
+) -> tuple[dict[str, Any], dict[KeyPath, str]]:
     """The document with `overrides` in it, and the key of the command line at each changed place.
 
     Raises:
-        ConfigError: One names a stage that there is not, or what a grid or search varies.
+        ConfigError: One names a stage that does not exist, or a setting that a grid or search
+            varies.
     """
     changed = copy.deepcopy(dict(document))
-    origins: dict[Path, str] = {}
-    for one in overrides:
-        if one.is_setting:
-            places = _of_every_stage(changed, one)
-        elif one.parts[0] == "stages" and len(one.parts) > 1:
-            places = [_of_stage(changed, one)]
+    origins: dict[KeyPath, str] = {}
+    for override in overrides:
+        if override.parts[0] in LAYER_KEYS:
+            places = _places_of_setting(changed, override)
+        elif override.parts[0] == "stages" and len(override.parts) > 1:
+            places = [_place_in_stage(changed, override)]
         else:
-            places = [one.parts]
+            places = [override.parts]
         for place in places:
-            _put(changed, place, copy.deepcopy(one.value), one.key)
-            origins[place] = one.key
+            _put(changed, place, copy.deepcopy(override.value), override.key)
+            origins[place] = override.key
     return changed, origins
 
 
-def _of_every_stage(document: dict[str, Any], one: Override) -> list[Path]:
-    """Where to put a setting for it to hold everywhere; what would win over it is taken out."""
-    layers: list[Path] = []
+def _places_of_setting(document: dict[str, Any], override: Override) -> list[KeyPath]:
+    """The places at which a setting holds in every stage; removes values that would replace it."""
+    layers: list[KeyPath] = []
     for index, stage in enumerate(_stages(document)):
-        _check_not_varied(stage, one)
+        _check_not_varied(stage, override)
         layers.append(("stages", index))
-        tasks = stage.get("per_task")
-        layers += [("stages", index, "per_task", task) for task in tasks or {}]
-    if len(one.parts) <= 2:
+        layers += [("stages", index, "per_task", task) for task in stage.get("per_task") or {}]
+    *above, field = override.parts
+    if len(above) <= 1:
         for layer in layers:
-            _take_out(_find(document, layer), one.parts)
-        return [("defaults", *one.parts)]
-    # Inside of a value, as tac.alpha.value is: wherever that value is a mapping.
-    inner = [
-        place
-        for place in [("defaults",), *layers]
-        if isinstance(_find(document, (*place, *one.parts[:-1])), dict)
+            group = _find(document, (*layer, *above))
+            if isinstance(group, dict):
+                group.pop(field, None)
+        return [("defaults", *override.parts)]
+    # A key inside of a value, as tac.alpha.value is: wherever that value is a mapping.
+    places: list[KeyPath] = [
+        (*layer, *override.parts)
+        for layer in [("defaults",), *layers]
+        if isinstance(_find(document, (*layer, *above)), dict)
     ]
-    return [(*place, *one.parts) for place in inner] or [("defaults", *one.parts)]
+    return places or [("defaults", *override.parts)]
 
 
-def _check_not_varied(stage: Mapping[str, Any], one: Override) -> None:
+def _check_not_varied(stage: Mapping[str, Any], override: Override) -> None:
     search = stage.get("search")
     groups = {"grid": stage.get("grid")}
     if isinstance(search, dict):
@@ -113,44 +110,43 @@ def _check_not_varied(stage: Mapping[str, Any], one: Override) -> None:
     for group, values in groups.items():
         for name in values if isinstance(values, dict) else ():
             setting = str(name).rpartition(":")[2]
-            if f"{setting}.".startswith(f"{one.key}.") or f"{one.key}.".startswith(f"{setting}."):
+            key, varied = f"{override.key}.", f"{setting}."
+            if varied.startswith(key) or key.startswith(varied):
                 place = f"stages.{stage.get('name')}.{group}.{name}"
-                example = f"; {place}='[{shown(one.value)}]' replaces its values"
+                example = f"; {place}='[{shown(override.value)}]' replaces its values"
                 raise _refusal(
-                    f"{one.key} must not be given where {place} varies it"
+                    f"{override.key} must not be given where {place} varies it"
                     + (example if group == "grid" else "")
                 )
 
 
-def _of_stage(document: dict[str, Any], one: Override) -> Path:
-    """The place of `stages.NAME...`, with the dotted keys of its grid or space in one piece."""
+def _place_in_stage(document: dict[str, Any], override: Override) -> KeyPath:
+    """The place of `stages.NAME...`; a dotted key of a grid or space is one part of it."""
+    key = override.key
     names = [str(stage.get("name")) for stage in _stages(document)]
+    rest = key.removeprefix("stages.")
     # A stage's name may have dots.
-    rest = one.key.removeprefix("stages.")
-    name = next(
-        (n for n in sorted(names, key=len, reverse=True) if f"{rest}.".startswith(f"{n}.")), None
-    )
+    name = max((name for name in names if f"{rest}.".startswith(f"{name}.")), key=len, default=None)
     if name is None or rest == name:
-        raise _refusal(f"{one.key} must be stages.NAME.KEY, with NAME one of {', '.join(names)}")
-    parts: Path = tuple(rest.removeprefix(f"{name}.").split("."))
+        raise _refusal(f"{key} must be stages.NAME.KEY, with NAME one of {', '.join(names)}")
+    rest = rest.removeprefix(f"{name}.")
+    parts = tuple(rest.split("."))
     if parts[0] not in (*StageHeader.model_fields, *LAYER_KEYS):
-        known = (*StageHeader.model_fields, *all_settings())
-        raise _refusal(f"{one.key} {unknown('.'.join(map(str, parts)), known)}")
-    head = 2 if parts[:1] == ("search",) else 1
-    if parts[:head] in {("grid",), ("search", "space"), ("search", "compare")}:
-        dotted = ".".join(map(str, parts[head:]))
-        parts = (*parts[:head], *([dotted] if dotted else ()))
+        raise _refusal(f"{key} {unknown(rest, (*StageHeader.model_fields, *all_settings()))}")
+    for group in (("grid",), ("search", "space"), ("search", "compare")):
+        if parts[: len(group)] == group and len(parts) > len(group):
+            parts = (*group, ".".join(parts[len(group) :]))
     return ("stages", names.index(name), *parts)
 
 
 def _stages(document: Mapping[str, Any]) -> list[dict[str, Any]]:
     stages = document.get("stages")
-    return (
-        [one if isinstance(one, dict) else {} for one in stages] if isinstance(stages, list) else []
-    )
+    stages = stages if isinstance(stages, list) else []
+    return [stage if isinstance(stage, dict) else {} for stage in stages]
 
 
-def _find(document: Any, path: Path) -> Any:
+def _find(document: Any, path: KeyPath) -> Any:
+    """The value at `path`; None if there is none."""
     for part in path:
         try:
             document = document[part]
@@ -159,14 +155,7 @@ def _find(document: Any, path: Path) -> Any:
     return document
 
 
-def _take_out(layer: Any, parts: Sequence[str]) -> None:
-    for part in parts[:-1]:
-        layer = layer.get(part) if isinstance(layer, dict) else None
-    if isinstance(layer, dict):
-        layer.pop(parts[-1], None)
-
-
-def _put(document: dict[str, Any], path: Path, value: Any, key: str) -> None:
+def _put(document: dict[str, Any], path: KeyPath, value: Any, key: str) -> None:
     here: Any = document
     for part in path[:-1]:
         if isinstance(here, dict) and here.get(part) is None:

@@ -1,4 +1,4 @@
-"""Presets: YAML files of settings that a sweep lays below its `defaults`, by `preset: NAME`."""
+"""Presets: YAML files of settings that a sweep's `preset: NAME` puts below its `defaults`."""
 
 from __future__ import annotations
 
@@ -12,32 +12,29 @@ from music_rllib.config.reading.layers import SECTIONS
 from music_rllib.config.reading.yaml_file import YamlFile, read_yaml
 from music_rllib.envs.tasks import closest
 
-__all__ = ["SHIPPED", "shipped_presets", "with_preset"]
-
 FOLDER = "presets"
-"""Beside the sweep's file: `presets/small.yaml` there comes before the package's `small`."""
+"""Folder beside the sweep's file, whose presets come before the package's of the same name."""
 SHIPPED = Path(music_rllib.__file__).with_name(FOLDER)
 """The package's own presets, one file each."""
 
 
 def shipped_presets() -> dict[str, str]:
-    """Names of the package's presets, and the line that each begins with."""
-    found = {}
+    """Name of each of the package's presets to the description in its first line."""
+    descriptions = {}
     for path in sorted(SHIPPED.glob("*.yaml")):
         line = path.read_text(encoding="utf-8").partition("\n")[0]
-        found[path.stem] = line.removeprefix(f"# {path.stem}: ")
-    return found
+        descriptions[path.stem] = line.removeprefix(f"# {path.stem}: ")
+    return descriptions
 
 
 def with_preset(file: YamlFile, check: Callable[[YamlFile], Iterable[str]]) -> dict[str, Any]:
-    """The sweep's document with its preset's settings laid below its `defaults`.
+    """The sweep's document with its preset's settings below its `defaults`.
 
     Args:
-        file: The sweep.
-        check: Gives what is wrong with a preset's own settings, as lines.
+        check: Gives the problems of a preset's own settings, as lines.
 
     Raises:
-        ConfigError: There is no such preset, or it has mistakes of its own.
+        ConfigError: There is no such preset, or it has problems.
     """
     document = dict(file.data)
     if "preset" not in document:
@@ -46,8 +43,8 @@ def with_preset(file: YamlFile, check: Callable[[YamlFile], Iterable[str]]) -> d
     if problems := list(check(preset)):
         raise ConfigError(problems)
     defaults = document.get("defaults") or {}
-    if isinstance(defaults, Mapping):  # else it is reported as what it is
-        document["defaults"] = _laid(preset.data, defaults)
+    if isinstance(defaults, Mapping):  # anything else becomes a problem later
+        document["defaults"] = _merged(preset.data, defaults)
     return document
 
 
@@ -68,11 +65,11 @@ def _read(file: YamlFile, name: Any) -> YamlFile:
     return read_yaml(known[name])
 
 
-def _laid(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
-    """`above` over `below`, the fields of sections one by one."""
-    merged = dict(below) | dict(above)
+def _merged(preset: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
+    """`defaults` over `preset`, the fields of groups one by one."""
+    merged = dict(preset) | dict(defaults)
     for section in SECTIONS:
-        lower, upper = below.get(section), above.get(section)
+        lower, upper = preset.get(section), defaults.get(section)
         if isinstance(lower, Mapping) and (upper is None or isinstance(upper, Mapping)):
             merged[section] = dict(lower) | dict(upper or {})
     return merged

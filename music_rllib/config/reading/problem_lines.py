@@ -1,16 +1,14 @@
-"""The mistakes of a sweep's file as lines: where, which key, which rule."""
+"""Problems of a sweep's file as lines of text: place, key, rule."""
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 from typing import Any
 
-from music_rllib.config.problems import Path as KeyPath
-from music_rllib.config.problems import Problem, lookup
+from music_rllib.config.problems import KeyPath, Problem, lookup
 from music_rllib.config.reading.yaml_file import YamlFile
-
-__all__ = ["problem_lines"]
 
 
 def problem_lines(
@@ -20,33 +18,34 @@ def problem_lines(
     options: Mapping[str, Any],
     origins: Mapping[KeyPath, str] = MappingProxyType({}),
 ) -> list[str]:
-    """One line per different mistake, in the order of the file, those of the command line first."""
+    """One line for each different problem, those of the command line first, then by line.
+
+    Args:
+        document: The content of `file` with the values of the command line.
+        options: Values of options like `--name`, by key.
+        origins: Place of a value to the `KEY` of the command line that it comes from.
+    """
 
     def line(problem: Problem) -> str:
-        if problem.path and problem.path[0] in options:
-            return f"--{problem.path[0]} {problem.rule}"
-        place, key = file.place(problem.path), _dotted(problem.path, document)
-        for length in range(len(problem.path), 0, -1):
-            if problem.path[:length] in origins:
-                place, key = "command line", origins[problem.path[:length]]
-                key += "".join(
-                    f"[{part}]" if isinstance(part, int) else f".{part}"
-                    for part in problem.path[length:]
-                )
-                break
-        else:
-            inside = (path[: len(problem.path)] for path in origins)
-            if problem.path not in file.lines and problem.path in inside:
-                place = "command line"
-        separator = " " if problem.rule.startswith(("must ", "is ", "has ", "needs ")) else ": "
-        return f"{place}: {key}{separator if key else ''}{problem.rule}"
+        path, rule = problem
+        if path and path[0] in options:
+            return f"--{path[0]} {rule}"
+        place, key = file.place(path), _dotted(path, document)
+        above = next((path[:end] for end in range(len(path), 0, -1) if path[:end] in origins), None)
+        if above is not None:
+            rest = (f"[{k}]" if isinstance(k, int) else f".{k}" for k in path[len(above) :])
+            place, key = "command line", origins[above] + "".join(rest)
+        elif path not in file.lines and any(path == origin[: len(path)] for origin in origins):
+            place = "command line"
+        separator = " " if rule.startswith(("must ", "is ", "has ", "needs ")) else ": "
+        return f"{place}: {key}{separator if key else ''}{rule}"
 
     in_order = sorted(_merged(problems), key=lambda problem: file.line(problem.path) or 0)
     return list(dict.fromkeys(line(problem) for problem in in_order))
 
 
 def _merged(problems: Iterable[Problem]) -> list[Problem]:
-    """The values of one list in a grid that break the same rule are one mistake."""
+    """The problems, where those of values in one list of a grid that break one rule are one."""
     groups: dict[tuple[KeyPath, str], list[Problem]] = {}
     for problem in dict.fromkeys(problems):
         path, rule = problem.path, problem.rule
@@ -65,16 +64,15 @@ def _got(group: Iterable[Problem]) -> str:
 
 
 def _dotted(path: KeyPath, document: Any) -> str:
-    """`stages.finetune.tac.lr`: stages by name, positions in other lists in brackets."""
+    """`stages.finetune.tac.lr`: a stage by its name, positions in other lists in brackets."""
     text = ""
     for position, part in enumerate(path):
-        if isinstance(part, str):
-            text += f".{part}" if text else part
-            continue
-        try:
-            name = lookup(document, (*path[: position + 1], "name"))
-        except LookupError:
-            name = None
-        by_name = path[0] == "stages" and position == 1 and isinstance(name, str)
-        text += f".{name}" if by_name else f"[{part}]"
+        name: Any = part
+        if path[0] == "stages" and position == 1:
+            with contextlib.suppress(LookupError):
+                name = lookup(document, (*path[:2], "name"))
+        if isinstance(name, str):
+            text += f".{name}" if text else name
+        else:
+            text += f"[{part}]"
     return text

@@ -1,4 +1,4 @@
-"""Strict reading of a YAML file: nothing in it is silently read as something else.
+"""Strict reading of a YAML file, without the surprises of PyYAML.
 
 Scalars follow the core schema of YAML 1.2, not PyYAML's 1.1, where ``1e-3`` is text, ``3:6`` is
 the number 186 and ``010`` is eight. Keys must be text and may not repeat; PyYAML keeps the last.
@@ -7,14 +7,14 @@ the number 186 and ``010`` is eight. Keys must be text and may not repeat; PyYAM
 from __future__ import annotations
 
 import re
-from collections.abc import Hashable, Mapping
-from pathlib import Path as FilePath
+from collections.abc import Hashable, Iterator, Mapping
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import yaml
 
-from music_rllib.config.problems import ConfigError, Path
+from music_rllib.config.problems import ConfigError, KeyPath
 from music_rllib.limits import (
     MOST_DIGITS,
     MOST_NESTED,
@@ -23,34 +23,32 @@ from music_rllib.limits import (
     read_regular,
 )
 
-__all__ = ["YamlFile", "read_value", "read_yaml"]
-
 
 class YamlFile(NamedTuple):
-    """A document, and on which line each of its values begins."""
+    """A YAML file's document, and the line on which each of its values begins."""
 
-    path: FilePath
+    path: Path
     text: str
     data: dict[str, Any]
-    lines: Mapping[Path, int]
+    lines: Mapping[KeyPath, int]
 
-    def line(self, path: Path) -> int | None:
-        """Where the value at `path`, or the nearest one above it that exists, begins."""
+    def line(self, path: KeyPath) -> int | None:
+        """The line of the value at `path`, or of the nearest existing value above it."""
         while path and path not in self.lines:
             path = path[:-1]
         return self.lines.get(path)
 
-    def place(self, path: Path) -> str:
-        """`smoke.yaml:14`, for messages."""
+    def place(self, path: KeyPath) -> str:
+        """The place of a value for messages: `smoke.yaml:14`."""
         line = self.line(path)
         return f"{self.path.name}:{line}" if line else self.path.name
 
 
-def read_yaml(path: FilePath) -> YamlFile:
+def read_yaml(path: Path) -> YamlFile:
     """Read a YAML mapping.
 
     Raises:
-        ConfigError: The file is missing, unreadable or not a sound YAML mapping.
+        ConfigError: The file is missing, unreadable or not a valid YAML mapping.
     """
     try:
         text = read_regular(path, MOST_YAML_BYTES, follow=True).decode("utf-8")
@@ -60,45 +58,41 @@ def read_yaml(path: FilePath) -> YamlFile:
         reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
         raise ConfigError([f"{path}: must be a readable YAML file: {reason}"]) from None
     try:
-        loader = _StrictLoader(text)
-        root = loader.get_single_node()
-        lines: dict[Path, int] = {}
-        if root is not None:
-            _count(root, {})
-        _note_lines(root, (), lines)
-        data = loader.construct_document(root) if root is not None else None
+        data, lines = _parse(text)
     except yaml.YAMLError as error:
-        raise ConfigError([f"{path.name}{_mark(error)}: {_complaint(error)}"]) from None
+        mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
+        line = f":{mark.line + 1}" if mark else ""
+        raise ConfigError([f"{path.name}{line}: {_rule(error)}"]) from None
     if not isinstance(data, dict):
         raise ConfigError([f"{path.name}: must be a mapping of keys to values at its top"])
     return YamlFile(path, text, data, MappingProxyType(lines))
 
 
 def read_value(text: str) -> Any:
-    """One value by the same rules, as it stands behind a key.
+    """Read one YAML value, as it stands behind a key.
 
     Raises:
-        ValueError: It is none; says what it must be.
+        ValueError: It is invalid; names the rule.
     """
     try:
-        loader = _StrictLoader(text[:MOST_YAML_BYTES])
-        root = loader.get_single_node()
-        if root is None:
-            return None
-        _count(root, {})
-        return loader.construct_document(root)
+        return _parse(text[:MOST_YAML_BYTES])[0]
     except yaml.YAMLError as error:
-        raise ValueError(_complaint(error)) from None
+        raise ValueError(_rule(error)) from None
 
 
-def _mark(error: yaml.YAMLError) -> str:
-    mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
-    return f":{mark.line + 1}" if mark else ""
+def _parse(text: str) -> tuple[Any, dict[KeyPath, int]]:
+    """The document of a text, and the lines of its values."""
+    loader = _StrictLoader(text)
+    root = loader.get_single_node()
+    if root is None:
+        return None, {}
+    _count_values(root, {})
+    lines = dict(_lines(root, ()))  # construction changes the nodes of mappings with `<<`
+    return loader.construct_document(root), lines
 
 
-def _complaint(error: yaml.YAMLError) -> str:
-    problem = getattr(error, "problem", None)
-    return f"must be valid YAML: {problem or error}"
+def _rule(error: yaml.YAMLError) -> str:
+    return f"must be valid YAML: {getattr(error, 'problem', None) or error}"
 
 
 class _StrictLoader(yaml.SafeLoader):
@@ -109,7 +103,7 @@ class _StrictLoader(yaml.SafeLoader):
     _depth = _composed = 0
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        """Refuse what is nested too deeply, before Python does, and what is too much, in time."""
+        """Refuse too deep nesting before Python's own limit, and too many values early."""
         self._depth += 1
         self._composed += 1
         rule = f"must be nested at most {MOST_NESTED} levels deep"
@@ -124,14 +118,12 @@ class _StrictLoader(yaml.SafeLoader):
             self._depth -= 1
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
-        """As usual; what a tag promises and the text isn't (`!!int x`) is an error of the file."""
+        """Construct a value; text that does not fit its tag (`!!int x`) is an error of the file."""
         try:
             return super().construct_object(node, deep=deep)
         except (ValueError, TypeError, LookupError, AttributeError) as error:
             tag = node.tag.rpartition(":")[2]
-            raise yaml.constructor.ConstructorError(
-                None, None, f"must be of its type, {tag}: {error}", node.start_mark
-            ) from None
+            raise _refusal(f"must be of its type, {tag}: {error}", node) from None
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
         seen = set()
@@ -139,21 +131,15 @@ class _StrictLoader(yaml.SafeLoader):
             if key_node.tag == "tag:yaml.org,2002:merge":
                 continue
             if not (isinstance(key_node, yaml.ScalarNode) and key_node.tag.endswith(":str")):
-                raise yaml.constructor.ConstructorError(
-                    None, None, "keys must be text", key_node.start_mark
-                )
+                raise _refusal("keys must be text", key_node)
             if key_node.value in seen:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"key {key_node.value!r} must not repeat", key_node.start_mark
-                )
+                raise _refusal(f"key {key_node.value!r} must not repeat", key_node)
             seen.add(key_node.value)
         return super().construct_mapping(node, deep=deep)
 
     def reject(self, node: yaml.Node) -> Any:
         """Refuse a value that is neither text, number, truth value, null, list nor mapping."""
-        raise yaml.constructor.ConstructorError(
-            None, None, f"the tag {node.tag!r} is not allowed here", node.start_mark
-        )
+        raise _refusal(f"the tag {node.tag!r} is not allowed here", node)
 
 
 for _tag, _pattern, _first in (
@@ -175,22 +161,25 @@ for _tag in ("binary", "omap", "pairs", "set", "timestamp"):
     _StrictLoader.add_constructor(f"tag:yaml.org,2002:{_tag}", _StrictLoader.reject)
 
 
-def _count(node: yaml.Node, counts: dict[int, int | None]) -> int:
-    """Values in `node`, those of an alias counted wherever it stands; refuse more than allowed.
+def _count_values(node: yaml.Node, counts: dict[int, int | None]) -> int:
+    """Number of values in `node`, with those of an alias at each of its uses.
 
-    Each is looked at once: with nine aliases in a row the document would have a thousand million.
+    Args:
+        node: The node; too many values in it are an error.
+        counts: Numbers of the nodes that are counted, by id, None during the count. Each node is
+            visited once: nine nested aliases can stand for a thousand million values.
     """
     if id(node) in counts:
-        found = counts[id(node)]
-        if found is None:
+        count = counts[id(node)]
+        if count is None:
             raise _refusal("an alias must not contain itself", node)
-        return found
+        return count
     counts[id(node)] = None
     total = 1
     if isinstance(node, yaml.MappingNode):
-        total += sum(_count(key, counts) + _count(value, counts) for key, value in node.value)
+        total += sum(_count_values(inner, counts) for pair in node.value for inner in pair)
     elif isinstance(node, yaml.SequenceNode):
-        total += sum(_count(value, counts) for value in node.value)
+        total += sum(_count_values(value, counts) for value in node.value)
     elif node.tag.endswith(":int") and len(node.value) > MOST_DIGITS + 1:
         shown = f"{node.value[:8]}..."
         raise _refusal(f"a number must have at most {MOST_DIGITS} digits, got {shown}", node)
@@ -204,14 +193,13 @@ def _refusal(rule: str, node: yaml.Node) -> yaml.YAMLError:
     return yaml.constructor.ConstructorError(None, None, rule, node.start_mark)
 
 
-def _note_lines(node: yaml.Node | None, path: Path, lines: dict[Path, int]) -> None:
-    """Record where each value begins."""
+def _lines(node: yaml.Node, path: KeyPath) -> Iterator[tuple[KeyPath, int]]:
+    """Paths and lines of all values below `node`."""
+    inner: list[tuple[str | int, yaml.Node, yaml.Node]] = []
     if isinstance(node, yaml.MappingNode):
-        for key_node, value_node in node.value:
-            inner = (*path, str(key_node.value))
-            lines[inner] = key_node.start_mark.line + 1
-            _note_lines(value_node, inner, lines)
+        inner = [(str(key.value), key, value) for key, value in node.value]
     elif isinstance(node, yaml.SequenceNode):
-        for index, value_node in enumerate(node.value):
-            lines[*path, index] = value_node.start_mark.line + 1
-            _note_lines(value_node, (*path, index), lines)
+        inner = [(index, value, value) for index, value in enumerate(node.value)]
+    for key, first, value in inner:
+        yield (*path, key), first.start_mark.line + 1
+        yield from _lines(value, (*path, key))

@@ -1,1 +1,1 @@
-"""The `search` section of a sweep: its space, its settings, and what is checked of them."""
+"""The `search` section of a stage: its settings, its space, and their checks."""

@@ -1,4 +1,4 @@
-"""A searched stage checked before anything starts: its space, its objective, its source."""
+"""Checks of a searched stage before anything starts: its space, its objective, its source."""
 
 from __future__ import annotations
 
@@ -7,18 +7,15 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from music_rllib import names
-from music_rllib.config.problems import ConfigError, Findings, shown
-from music_rllib.config.problems import Path as KeyPath
+from music_rllib.config.problems import ConfigError, Findings, KeyPath, shown
+from music_rllib.config.reading.layers import PlacedPoint
 from music_rllib.config.run_settings import RunSettings
-from music_rllib.config.schema import Point, Source, Stage, StageHeader
+from music_rllib.config.schema import Point, Stage
 from music_rllib.config.search.settings import SearchSettings
 from music_rllib.config.search.space import Choice
 from music_rllib.envs.tasks import closest
 
-__all__ = ["check_search", "most_env_steps", "of_stage", "stages_in"]
-
-Place = tuple[str | int, ...]
-ResolveAt = Callable[[Mapping[str, tuple[KeyPath, Any]], Findings], Point]
+ResolveAt = Callable[[PlacedPoint, Findings], Point]
 
 _METRICS = frozenset(
     value
@@ -31,7 +28,7 @@ _METRICS = frozenset(
 
 
 def of_stage(values: Mapping[str, Any], stage: str) -> dict[str, Any]:
-    """Of dotted settings, those that are `stage`'s by their prefix, without it."""
+    """The dotted settings that have the prefix of `stage`, without it."""
     prefix = f"{stage}:"
     return {
         name.removeprefix(prefix): value
@@ -46,60 +43,45 @@ def stages_in(search: SearchSettings) -> set[str]:
 
 
 def check_search(
-    header: StageHeader,
-    source: Source | None,
+    stage: Stage,
+    search: SearchSettings,
     earlier: Mapping[str, Stage | None],
-    points: Sequence[Point],
     seeds: int,
     resolve_at: ResolveAt,
-    path: KeyPath,
     findings: Findings,
 ) -> None:
-    """Note what is wrong with a stage's `search` and with what it is searched from.
+    """Check a stage's `search` and the stage that its runs start from.
 
     Args:
-        header: The stage, which has a search.
-        source: What its runs start from.
-        earlier: The stages above this one by name; None for one that can't be made out.
-        points: The stage as it is without what is searched.
-        seeds: How many the sweep has; 0 if that isn't known.
-        resolve_at: Makes the stage's settings at a point.
-        path: The stage's place in the document.
-        findings: Takes the problems.
+        earlier: The stages above this one by name; None for an invalid one.
+        seeds: Number of the sweep's seeds; 0 if they are invalid.
+        resolve_at: Gives the stage's settings at a point.
+        findings: Takes the problems; its path is the stage's.
     """
-    search = header.search
-    assert search is not None
-    place = (*path, "search")
     problems_before = len(findings.problems)
-    if header.grid:
-        findings.add((*path, "grid"), "must not be given beside search: put it into the space")
+    in_search = findings.below("search")
     for position, objective in enumerate(search.objectives):
         if objective.metric not in _METRICS:
-            where = (*place, "objective", *([position] if len(search.objectives) > 1 else []))
-            findings.add(
-                (*where, "metric"),
+            several = (position,) if len(search.objectives) > 1 else ()
+            in_search.add(
+                ("objective", *several, "metric"),
                 f"must be a metric that runs report, got {shown(objective.metric)}"
                 f"{closest(objective.metric, _METRICS)}",
             )
-    above = earlier.get(source.stage) if source is not None and source.stage else None
+    above = earlier.get(stage.source.stage) if stage.source and stage.source.stage else None
     if above is not None and above.search is None and len(above.points) > 1:
         findings.add(
-            (*path, "init_from"),
+            ("init_from",),
             f"must be a stage without a grid where trials are searched, got {above.name!r}; "
             f"search its settings as '{above.name}:...'",
         )
-    _check_values(search, above, resolve_at, place, findings)
-    if len(findings.problems) == problems_before:  # the budget is a sound number then
-        _check_rungs(search, seeds, most_env_steps(search, points), place, findings)
+    _check_values(search, above, resolve_at, findings)
+    if len(findings.problems) == problems_before:  # the budget is a valid number then
+        _check_rungs(search, seeds, most_env_steps(search, stage.points), in_search)
 
 
 def most_env_steps(search: SearchSettings, points: Sequence[Point]) -> int:
-    """Environment steps of a searched stage's longest run; 0 if nothing says so.
-
-    Args:
-        search: What is searched or compared.
-        points: The stage as it is without that.
-    """
+    """Environment steps of the longest run of a searched stage with these points; 0 if unknown."""
     if "env_steps" in search.space:
         return int(max(search.space["env_steps"].ends()))
     if "env_steps" in search.compare:
@@ -107,87 +89,77 @@ def most_env_steps(search: SearchSettings, points: Sequence[Point]) -> int:
     return max((run.env_steps for point in points for run in point.runs.values()), default=0)
 
 
-def _check_rungs(
-    search: SearchSettings, seeds: int, env_steps: int, place: Place, findings: Findings
-) -> None:
-    """A rung must be reached before a trial ends, or at its end."""
+def _check_rungs(search: SearchSettings, seeds: int, env_steps: int, findings: Findings) -> None:
+    """A trial must reach each rung before its end, or at its end."""
     for position, rung in enumerate(search.pruning.rungs if search.pruning else ()):
-        here = (*place, "pruning", "rungs", position)
+        path = ("pruning", "rungs", position)
         if seeds and rung.seeds is not None and rung.seeds > seeds:
             rule = f"must be <= {seeds}, the number of the sweep's seeds, got {rung.seeds}"
-            findings.add((*here, "seeds"), rule)
+            findings.add((*path, "seeds"), rule)
         if env_steps and rung.env_steps is not None and rung.env_steps > env_steps:
             rule = f"must be <= {env_steps}, the longest run's env steps, got {rung.env_steps}"
-            findings.add((*here, "env_steps"), rule)
+            findings.add((*path, "env_steps"), rule)
 
 
 def _check_values(
-    search: SearchSettings,
-    above: Stage | None,
-    resolve_at: ResolveAt,
-    place: Place,
-    findings: Findings,
+    search: SearchSettings, above: Stage | None, resolve_at: ResolveAt, findings: Findings
 ) -> None:
-    """Every end of the space, each compared value and each given point must make sound settings."""
-    for stage in stages_in(search):
-        if above is None or stage != above.name:
+    """Every end of the space, compared value and given point must make valid settings."""
+    in_search = findings.below("search")
+    for name in stages_in(search):
+        if above is None or name != above.name:
             known = f", which is {above.name!r}" if above else "; this one starts from none"
-            findings.add(
-                (*place, "space"),
+            in_search.add(
+                ("space",),
                 f"must name settings of this stage or of the one it starts from{known}, "
-                f"got '{stage}:...'",
+                f"got '{name}:...'",
             )
             return
     problems_before = len(findings.problems)
     for name, values in search.compare.items():
-        findings.forbid_repeats(values, (*place, "compare", name))
+        in_search.forbid_repeats(values, ("compare", name))
     for name, dimension in search.space.items():
         if isinstance(dimension, Choice):
-            findings.forbid_repeats(dimension.choice, (*place, "space", name, "choice"))
+            in_search.forbid_repeats(dimension.choice, ("space", name, "choice"))
     tried: list[tuple[KeyPath, Any, _Runs]] = []
-    for where, point in _worth_trying(search):
-        if where[-1] not in point:
-            rule = f"must be able to hold, got {shown(search.space[str(where[-1])].when)}"
-            findings.add((*place, *where, "when"), rule)
+    for section, name, point in _points_to_check(search):
+        if name not in point:
+            rule = f"must be able to hold, got {shown(search.space[name].when)}"
+            in_search.add((section, name, "when"), rule)
             continue
-        own = resolve_at({name: at for name, at in point.items() if ":" not in name}, findings)
-        theirs = None if above is None else _check_above(above, point, place[:-1], findings)
-        tried.append((where, point[str(where[-1])][1], (own.runs, theirs)))
+        own = resolve_at({key: at for key, at in point.items() if ":" not in key}, findings)
+        theirs = None if above is None else _runs_above(above, point, findings)
+        tried.append(((section, name), point[name][1], (own.runs, theirs)))
     if len(findings.problems) == problems_before:
-        _forbid_equal_values(tried, place, findings)
-    _check_points(search, place, findings)
+        _forbid_equal_values(tried, in_search)
+    _check_given_points(search, in_search)
 
 
 _Runs = tuple[Mapping[str, RunSettings], Mapping[str, RunSettings] | None]
-"""Settings of a stage's runs by task, and of those that they start from."""
+"""Settings of a stage's runs by task, and of the runs that they start from."""
 
 
-def _worth_trying(
-    search: SearchSettings,
-) -> Iterator[tuple[KeyPath, Mapping[str, tuple[KeyPath, Any]]]]:
-    """The place of a value below `search`, and a point that shows whether it is sound."""
+def _points_to_check(search: SearchSettings) -> Iterator[tuple[str, str, PlacedPoint]]:
+    """Section and name of a setting, and a point that has one of its values to check."""
     for name, corner in search.corners():
-        point = {key: (("search", *at), value) for key, (at, value) in corner.items()}
-        yield ("space", name), point
+        point = {key: (("search", "space", key), value) for key, value in corner.items()}
+        yield "space", name, point
     for name, values in search.compare.items():
         for position, value in enumerate(values):
-            yield ("compare", name), {name: (("search", "compare", name, position), value)}
+            yield "compare", name, {name: (("search", "compare", name, position), value)}
 
 
-def _forbid_equal_values(
-    tried: Sequence[tuple[KeyPath, Any, _Runs]], place: Place, findings: Findings
-) -> None:
-    """Two spellings of one schedule, say: two studies, or two options, of the same runs."""
+def _forbid_equal_values(tried: Sequence[tuple[KeyPath, Any, _Runs]], findings: Findings) -> None:
+    """Two values may be two spellings of one schedule, and so the same runs."""
     for (where, _, one), (elsewhere, value, other) in itertools.combinations(tried, 2):
         if where == elsewhere and one == other and other[0]:
-            rule = f"must not have two equal values, got {shown(value)} again"
-            findings.add((*place, *where), rule)
+            findings.add(where, f"must not have two equal values, got {shown(value)} again")
 
 
-def _check_above(
-    above: Stage, point: Mapping[str, tuple[KeyPath, Any]], path: Place, findings: Findings
+def _runs_above(
+    above: Stage, point: PlacedPoint, findings: Findings
 ) -> Mapping[str, RunSettings] | None:
-    """Settings of the stage above, with the problems at their place in this one."""
+    """Settings of the stage above at a point, with problems at their place in this stage."""
     theirs = of_stage({name: value for name, (_, value) in point.items()}, above.name)
     if not theirs:
         return None
@@ -196,12 +168,12 @@ def _check_above(
     except ConfigError as error:
         name = next(name for name in point if name.startswith(f"{above.name}:"))
         for line in error.lines:
-            findings.add((*path, *point[name][0]), f"in stage {above.name}, {line}")
+            findings.add(point[name][0], f"in stage {above.name}, {line}")
         return None
 
 
-def _check_points(search: SearchSettings, place: Place, findings: Findings) -> None:
-    """Each given value must be in the space, and beside what it depends on.
+def _check_given_points(search: SearchSettings, findings: Findings) -> None:
+    """Each value of `points_to_evaluate` must be in the space, and beside what it depends on.
 
     The sampler chooses what a point leaves open: a setting that depends on that might be dropped.
     """
@@ -210,11 +182,11 @@ def _check_points(search: SearchSettings, place: Place, findings: Findings) -> N
         for name, dimension in search.space.items():
             if name not in point:
                 continue
-            here, value = (*place, "points_to_evaluate", position, name), point[name]
+            path, value = ("points_to_evaluate", position, name), point[name]
             if not dimension.contains(value):
-                findings.add(here, f"must be {dimension.rule}, got {shown(value)}")
+                findings.add(path, f"must be {dimension.rule}, got {shown(value)}")
             elif dimension.applies(existing):
                 existing[name] = value
             else:
                 wanted = " and ".join(f"{key}: {shown(one)}" for key, one in dimension.when.items())
-                findings.add(here, f"must only be given beside {wanted}, got {shown(point)}")
+                findings.add(path, f"must only be given beside {wanted}, got {shown(point)}")

@@ -1,4 +1,4 @@
-"""How a stage is searched: the `search` section of a sweep's YAML file."""
+"""The `search` section of a stage in a sweep's YAML file."""
 
 from __future__ import annotations
 
@@ -10,27 +10,18 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Discriminator, Field, JsonValue, Tag, model_validator
 
-from music_rllib.config.search.space import Choice, Dimension, Strict, listed
-
-__all__ = [
-    "FINAL_SEED",
-    "Final",
-    "Objective",
-    "Pruning",
-    "Rung",
-    "SearchSettings",
-    "WarmStart",
-]
+from music_rllib.config.search.space import Choice, Dimension, listed
+from music_rllib.schedules import StrictModel
 
 FINAL_SEED = 1_000_000
-"""First of the fresh seeds of the final ranking: no search uses seeds from here on."""
+"""First fresh seed of final rankings. Seeds of a search are smaller."""
 
 MOST_GRID_POINTS = 100_000
-"""Of a search with `sampler: grid`: far more than anyone can train, and still quick to list."""
+"""Largest grid with `sampler: grid`: more than anyone can train, and still quick to list."""
 
 
-class Objective(Strict):
-    """What makes a trial good: one number from its runs."""
+class Objective(StrictModel):
+    """One number of a trial, computed from its runs, that the search maximizes or minimizes."""
 
     metric: str = "evaluation/success_rate"
     """A metric as MLflow shows it (docs/algorithms.md); `env_steps` for the budget itself."""
@@ -38,12 +29,12 @@ class Objective(Strict):
     """A run's number: the metric's last value, its best one, the mean over the run, or the
     environment steps until it reaches `threshold` (the budget where it never does)."""
     threshold: float | None = None
-    """Of `steps_to`."""
+    """Value of the metric that `steps_to` waits for."""
     aggregate: Literal["iqm", "mean", "median", "worst_task"] = "iqm"
-    """A trial's number from its runs' (seeds times tasks): interquartile mean, mean or median over
-    all of them, or the mean over seeds of the task where that is worst."""
+    """A trial's number from those of its runs (seeds times tasks): interquartile mean, mean or
+    median over all of them, or the mean over seeds for the worst task."""
     direction: Literal["maximize", "minimize"] | None = None
-    """null: maximize, and minimize with `steps_to`."""
+    """null: minimize with `read: steps_to`, else maximize."""
 
     @model_validator(mode="after")
     def _threshold_belongs(self) -> Self:
@@ -56,21 +47,20 @@ class Objective(Strict):
 
     @property
     def maximised(self) -> bool:
-        """Whether more is better."""
-        return (self.direction or ("minimize" if self.read == "steps_to" else "maximize")) == (
-            "maximize"
-        )
+        """Whether a larger number is better."""
+        default = "minimize" if self.read == "steps_to" else "maximize"
+        return (self.direction or default) == "maximize"
 
     @property
     def label(self) -> str:
-        """`iqm of evaluation/success_rate`."""
+        """The objective in text: `iqm of evaluation/success_rate`."""
         read = {"last": "", "best": "best ", "mean": "mean ", "steps_to": "steps to "}[self.read]
         until = "" if self.threshold is None else f" >= {self.threshold:g}"
         return f"{self.aggregate} of {read}{self.metric}{until}"
 
 
 def _one_or_several(value: Any) -> str:
-    """Which of the two a value claims to be, so that errors speak of that one only."""
+    """Tag of the member of `Objectives` that a value is meant to be; errors are about that one."""
     return "several" if isinstance(value, list | tuple) else "one"
 
 
@@ -80,116 +70,119 @@ Objectives = Annotated[
 ]
 
 
-class Rung(Strict):
+class Rung(StrictModel):
     """A point of a trial at which it may be stopped."""
 
     seeds: int | None = Field(None, gt=0)
-    """Its first so many seeds have run, no more than the sweep has; null: all."""
+    """Number of first seeds that have run up to here, no more than the sweep has; null: all."""
     env_steps: int | None = Field(None, gt=0)
-    """Up to so many environment steps, rounded up to the next evaluation, and no more than the
+    """Environment steps of these runs, rounded up to the next evaluation, and no more than the
     longest run has; null: to the end."""
 
 
-class Pruning(Strict):
-    """Successive halving over budgets and seeds, with an interval as a second opinion."""
+class Pruning(StrictModel):
+    """Successive halving over budgets and seeds; a confidence interval may keep a trial."""
 
     rungs: tuple[Rung, ...] = Field(min_length=1)
-    """In order; each with at least the seeds and steps of the one before."""
+    """Rungs in order; each has at least the seeds and environment steps of the one before."""
     keep: float = Field(0.5, gt=0, lt=1)
-    """A trial goes on if it is in this best part of those that have reached the rung, ..."""
+    """A trial continues if it is in this best share of those that have reached the rung, ..."""
     confidence: float = Field(0.9, gt=0, lt=1)
     """... or if its interval at this confidence reaches the best trial's value there."""
     warm_up: int = Field(4, gt=0)
-    """The first so many trials always go on."""
+    """Number of first trials that always continue."""
 
 
-class Final(Strict):
-    """The best trials once more, on seeds that had no part in choosing them."""
+class Final(StrictModel):
+    """Runs of the best trials on fresh seeds, which had no part in choosing them."""
 
     trials: int = Field(3, gt=0)
-    """So many of the best; in `compare` mode so many of each value."""
+    """Number of best trials; in `compare` mode for each value."""
     baselines: bool = False
-    """The `points_to_evaluate` run again as well, whatever they were worth, as far as they were
-    judged: what the best ones have to beat."""
+    """Whether the evaluated `points_to_evaluate` run again too, whatever their values, as baselines
+    for the best trials."""
     seeds: int = Field(5, gt=0)
-    """Fresh seeds for each."""
+    """Fresh seeds of each trial."""
     env_steps: int | None = Field(None, gt=0)
-    """Budget of these runs; null: that of the search's."""
+    """Budget of these runs; null: that of the search's runs."""
 
     def most(self, points: int) -> int:
-        """Trials in it at most, of a search with so many `points_to_evaluate`."""
+        """Largest number of trials in it, for a search with `points` `points_to_evaluate`."""
         return self.trials + (points if self.baselines else 0)
 
 
-class WarmStart(Strict):
-    """An earlier study to learn from; its trials are not ranked again."""
+class WarmStart(StrictModel):
+    """An earlier study that the sampler learns from; its trials are not ranked again."""
 
     study: str
     """Its name, as `music-rllib status` shows it, or the beginning of it."""
     storage: str | None = None
-    """Its Optuna storage: a database URL or a sqlite file; null: this search's own."""
+    """Its Optuna storage: a database URL or a sqlite file; null: this search's storage."""
 
 
-class SearchSettings(Strict):
-    """How a stage's trials are chosen, and judged."""
+class SearchSettings(StrictModel):
+    """How the trials of a stage are proposed and evaluated."""
 
     mode: Literal["search", "compare"] = "search"
     """`search`: find the best point. `compare`: the same search for each value of `compare`, with
-    the same number of trials and the same seeds, and then those values side by side."""
+    the same number of trials and the same seeds, and then a comparison of these values."""
     space: dict[str, Dimension] = Field(min_length=1)
-    """Dotted setting to where it is searched; `STAGE:setting` for one of the stage that this one
-    starts from."""
+    """Dotted setting to its range or choices; `STAGE:setting` for a setting of the stage that this
+    one starts from."""
     compare: dict[str, Annotated[list[JsonValue], Field(min_length=2)]] = Field(
         default_factory=dict
     )
-    """Of `compare` mode: dotted setting to the values to tell apart."""
+    """In `compare` mode: dotted setting to the values that are compared."""
     sampler: Literal["tpe", "random", "grid", "cmaes", "nsga2"] = "tpe"
     """Optuna's TPE, CMA-ES (numbers only) and NSGA-II (several objectives), random, or all points
     of a grid in order, at most 100,000."""
     trials: int | None = Field(None, gt=0)
-    """Trials to judge; null with `grid`: all points."""
+    """Number of trials; null with `grid`: all points."""
     startup_trials: int = Field(5, gt=0)
-    """Random trials before TPE or CMA-ES has something to go by."""
+    """Random trials before TPE or CMA-ES proposes."""
     population: int = Field(10, gt=1)
     """Size of a generation of CMA-ES and NSGA-II."""
     concurrent: int = Field(2, gt=0)
-    """Trial n is chosen when all up to n minus this are judged, and by their results alone: more
-    keeps more CPUs busy, less learns sooner. Part of what makes a study reproducible."""
+    """Trial n is proposed from the results of the trials up to n minus this, when these are
+    complete. Larger keeps more CPUs busy, smaller learns sooner. A study is reproducible with the
+    same value only."""
     seed: int = Field(0, ge=0, lt=2**31)
-    """Of the choice of points."""
+    """Seed of the sampler."""
     objective: Objectives = Objective()
     """What is optimised; a list of several gives a Pareto front."""
     points_to_evaluate: list[dict[str, JsonValue]] = Field(default_factory=list)
-    """Points, or parts of points, that are the first trials, just as written. Each value must be
-    one of the space, and one with `when` stand beside what it depends on."""
+    """Points, or parts of points, that are the first trials, exactly as written. Each value must be
+    in the space, and a setting with `when` must stand beside the settings that it depends on."""
     pruning: Pruning | None = None
-    """null: every trial runs to its end on all seeds."""
+    """When trials are stopped early; null: every trial runs to its end on all seeds."""
     final: Final | None = Final()
-    """The ranking at the end; null: none, and the best value found is too good to be true."""
+    """The final ranking on fresh seeds; null: none, and the best value found is biased upwards."""
     study: str | None = Field(None, min_length=1)
     """Name under which drivers share a study; null: the sweep's name."""
     storage: str | None = Field(None, min_length=1)
     """Optuna's storage: `postgresql://user@host/database` (the password comes from `PGPASSWORD` or
     a password file), or another SQLAlchemy URL; null: a sqlite file in the sweep's folder."""
     warm_start: WarmStart | None = None
-    """null: begin with what is known of the space alone."""
+    """An earlier study to learn from; null: none."""
 
     @property
     def objectives(self) -> tuple[Objective, ...]:
-        """One, or several."""
+        """The objectives as a tuple, also if there is only one."""
         return tuple(self.objective) if isinstance(self.objective, list) else (self.objective,)
 
     @cached_property
     def count(self) -> int:
-        """Trials of each study."""
-        grid = self.grid() if self.sampler == "grid" else []
-        return min(self.trials or len(grid), len(grid)) if grid else (self.trials or 0)
+        """Number of trials of each study."""
+        if self.sampler != "grid":
+            return self.trials or 0
+        points = len(self.grid())
+        return min(self.trials or points, points)
 
     def grid(self) -> list[dict[str, Any]]:
         """All points, the last dimension varying fastest.
 
         Raises:
-            ValueError: There are too many to list.
+            ValueError: There are more than `MOST_GRID_POINTS`.
         """
         points: list[dict[str, Any]] = [{}]
         for name, dimension in self.space.items():
@@ -209,39 +202,33 @@ class SearchSettings(Strict):
         return points
 
     def arms(self) -> list[dict[str, Any]]:
-        """What `compare` tells apart; one empty mapping in `search` mode."""
+        """Settings of each compared value; one empty mapping in `search` mode."""
         choices = [[(name, value) for value in values] for name, values in self.compare.items()]
         return [dict(pairs) for pairs in itertools.product(*choices)]
 
-    def corners(self) -> Iterator[tuple[str, dict[str, tuple[tuple[str | int, ...], Any]]]]:
-        """Points that show whether the space's ends are sound: each end once, the rest at first.
+    def corners(self) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Points with one setting at an end of its dimension, which show whether the end is valid.
 
         Yields:
-            The setting that is at its end, and the point: dotted setting to (place below `search`,
-            value).
+            The setting, and the point, which has other settings at their first end.
         """
-        middle = {
-            name: (("space", name), dimension.ends()[0]) for name, dimension in self.space.items()
-        }
+        first = {name: dimension.ends()[0] for name, dimension in self.space.items()}
         for name, dimension in self.space.items():
             for value in dimension.ends():
-                yield name, self._existing(middle | {name: (("space", name), value)}, keep=name)
+                yield name, self._existing(first | {name: value}, keep=name)
 
-    def _existing(
-        self, point: dict[str, tuple[tuple[str | int, ...], Any]], keep: str
-    ) -> dict[str, tuple[tuple[str | int, ...], Any]]:
-        """Set what `keep` depends on, and leave out what does not exist then."""
-        point = dict(point)
+    def _existing(self, point: dict[str, Any], keep: str) -> dict[str, Any]:
+        """The settings of `point` that apply after those that `keep` depends on are set."""
         todo = [keep]
         while todo:
             for name, wanted in self.space[todo.pop()].when.items():
-                point[name] = (("space", name), listed(wanted)[0])
+                point[name] = listed(wanted)[0]
                 todo.append(name)
-        found: dict[str, tuple[tuple[str | int, ...], Any]] = {}
+        existing: dict[str, Any] = {}
         for name, dimension in self.space.items():
-            if dimension.applies({key: value for key, (_, value) in found.items()}):
-                found[name] = point[name]
-        return found
+            if dimension.applies(existing):
+                existing[name] = point[name]
+        return existing
 
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
@@ -284,7 +271,7 @@ class SearchSettings(Strict):
             for name, dimension in self.space.items():
                 if dimension.size is None:
                     yield f"space.{name} must have a step to be part of a grid, got none"
-            self.grid()  # which says so if it is too large
+            self.grid()  # raises an error if it is too large
         elif self.trials is None:
             yield f"trials must be given with sampler: {self.sampler}, got null"
         if self.sampler == "cmaes":

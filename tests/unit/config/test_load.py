@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 import yaml
 
-from music_rllib.config.load import ConfigError, RunSettings, SweepConfig, load_sweep
-from music_rllib.config.run_settings import VARIANTS, handed_over, preset
+from music_rllib.config.load import load_sweep
+from music_rllib.config.problems import ConfigError
+from music_rllib.config.run_settings import VARIANTS, RunSettings, handed_over, preset
+from music_rllib.config.schema import SweepConfig
 from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.schedules import Linear
 from music_rllib.store.handoff import write_handoff
@@ -348,6 +350,10 @@ BAD: list[tuple[Document, str]] = [
     (asking("stage = a against q = 1"), "must name one of the stages pretrain, finetune, got 'a'"),
     (asking("q = 1.5 against q = 1", stage="x"), "analysis.stage must be one of pretrain, finet"),
     (asking("q = 1.5 against q = 1", margin=0), "analysis.margin must be > 0, got 0"),
+    (
+        asking("q = 1.5 against q = 1") | {"defaults": {"tac": {"gamma": 3.0}}},
+        "defaults.tac.gamma must be < 1, got 3.0",
+    ),
     (
         without_success(asking("q = 1.5 against q = 1")),
         "analysis.margin must be given for tasks without success, got null",

@@ -6,7 +6,10 @@ from typing import Any
 
 import pytest
 
-from music_rllib.config.load import ConfigError, RunSettings, SweepConfig, load_sweep
+from music_rllib.config.load import load_sweep
+from music_rllib.config.problems import ConfigError
+from music_rllib.config.run_settings import RunSettings
+from music_rllib.config.schema import SweepConfig
 
 SWEEP = """
 name: mine

@@ -40,7 +40,7 @@ class Sums:
 @contextmanager
 def serving(token: str | None = None) -> Iterator[str]:
     """The application on a free port; gives its URL."""
-    policy = Sums()
+    policy: Any = Sums()
 
     async def act(rows: Rows) -> Array:
         return compute(policy, [rows])[0]

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from music_rllib.config.load import ConfigError, load_sweep
+from music_rllib.config.load import load_sweep
+from music_rllib.config.problems import ConfigError
 from music_rllib.store import paths
 from music_rllib.store.object_folder import StorageError
 from music_rllib.store.paths import check_answers, check_storage, resolve_storage
