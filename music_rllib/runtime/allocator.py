@@ -6,8 +6,6 @@ import ctypes
 import sys
 from collections.abc import Mapping
 
-__all__ = ["give_back_freed_memory", "keep_freed_memory"]
-
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8
 # Activations are smaller. Whole batches are larger and go back to the system: kept as well, they
 # had a MUSIC-u run grow by 40 MB per thousand steps, as its heap fell into ever smaller pieces.

@@ -10,8 +10,6 @@ from typing import Any, NamedTuple
 import ray
 import ray.util.client
 
-__all__ = ["adds_nodes", "is_there"]
-
 ANSWER_SECONDS = 40.0
 """It looks at what waits every five seconds; a busy one takes longer."""
 REPORT_SECONDS = 10.0

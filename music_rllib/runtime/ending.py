@@ -9,8 +9,6 @@ import threading
 from collections.abc import Callable
 from typing import NoReturn
 
-__all__ = ["end_process", "try_for"]
-
 
 def try_for(seconds: float, *steps: Callable[[], object]) -> None:
     """Take each step, whatever becomes of the others, and wait so long at most for all of them."""

@@ -11,8 +11,6 @@ from collections.abc import Iterator
 from music_rllib.errors import BAD_INPUT
 from music_rllib.runtime.ending import end_process
 
-__all__ = ["in_time"]
-
 STDERR = 2
 SLACK = 5.0
 """Seconds after which the message is left out, as code that holds Python's lock leaves no room."""

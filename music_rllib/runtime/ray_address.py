@@ -7,8 +7,6 @@ import socket
 
 from music_rllib.errors import BadInputError
 
-__all__ = ["ClusterError", "check_reachable", "cluster_address"]
-
 REACH_SECONDS = 5.0
 
 

@@ -16,8 +16,6 @@ from music_rllib.runtime import autoscaler
 from music_rllib.runtime.machine import ClusterError, check_cpus, cluster_address
 from music_rllib.runtime.quiet import quiet_third_parties
 
-__all__ = ["Room", "check_fits", "cluster", "slots"]
-
 OBJECT_STORE_BYTES = 128 * 2**20
 """Enough, as reports are all that workers send; Ray's default takes a third of the memory."""
 

@@ -12,8 +12,6 @@ import ray
 
 from music_rllib.runtime.machine import cluster_address
 
-__all__ = ["RayWatch"]
-
 LOOK_SECONDS = 5.0
 """Between two looks at a cluster, and for each to answer."""
 DAEMONS = ("gcs_server", "raylet")

@@ -10,8 +10,6 @@ from typing import Any
 
 from music_rllib.command_line import say_stopped_at_once
 
-__all__ = ["SIGNALS", "EarlySignals", "early"]
-
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 

@@ -10,8 +10,6 @@ import uuid
 from pathlib import Path
 from typing import Any
 
-__all__ = ["canonical_json", "content_key", "sync_folder", "write_atomically"]
-
 
 def canonical_json(value: Any) -> str:
     """JSON with one spelling per value: sorted keys, no spaces, shortest floats, no NaN.

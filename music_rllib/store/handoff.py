@@ -38,18 +38,6 @@ from music_rllib.version import ALGORITHM_VERSION
 if TYPE_CHECKING:
     import gymnasium as gym
 
-__all__ = [
-    "Architecture",
-    "HandoffError",
-    "HandoffInfo",
-    "HandoffManifest",
-    "Spaces",
-    "Weights",
-    "open_handoff",
-    "read_handoff",
-    "write_handoff",
-]
-
 Weights = Mapping[str, Mapping[str, npt.NDArray[Any]]]
 """Module name to array name to array."""
 

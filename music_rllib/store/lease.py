@@ -27,16 +27,6 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from music_rllib.store.object_folder import StorageError
 
-__all__ = [
-    "HeldLease",
-    "Lease",
-    "LeaseFile",
-    "LeaseLostError",
-    "process_start",
-    "runs_here",
-    "this_machine",
-]
-
 EXPIRES_SECONDS = 60.0
 """How long a lease holds that isn't renewed; clocks of machines should agree better than that."""
 RENEWALS = 4

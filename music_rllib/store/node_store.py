@@ -36,18 +36,6 @@ from music_rllib.store.run_record import (
 )
 from music_rllib.store.verified import Verified, fingerprint
 
-__all__ = [
-    "CONTINUATIONS",
-    "KEEP",
-    "TRAIN_AGAIN",
-    "Draft",
-    "NodeStore",
-    "Saved",
-    "WorkFolder",
-    "damage_in_words",
-    "steps_of",
-]
-
 FORMAT = "music_rllib checkpoint 2"
 KEEP = 2
 """Checkpoints of a run that are kept, unless a sweep says else."""

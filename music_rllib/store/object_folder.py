@@ -26,8 +26,6 @@ from music_rllib.errors import BadInputError
 from music_rllib.limits import MOST_JSON_BYTES, open_regular, read_json
 from music_rllib.store.files import sync_folder, write_atomically
 
-__all__ = ["DamagedError", "Manifest", "ObjectFolders", "StorageError", "open_storage"]
-
 MANIFEST = "manifest.json"
 _CHUNK = 1 << 20
 _CANNOT_WRITE = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO}

@@ -14,8 +14,6 @@ from pathlib import Path
 from music_rllib.redaction import redact
 from music_rllib.store.object_folder import StorageError
 
-__all__ = ["check_answers", "check_storage", "in_ray_job", "resolve_storage", "sweep_folder"]
-
 ANSWER_SECONDS = 15.0
 """For a bucket to say whether it is there; its client would go on trying for minutes."""
 NAME_BYTES = 255

@@ -7,8 +7,6 @@ from collections.abc import Iterable
 
 from pydantic import BaseModel, ConfigDict
 
-__all__ = ["HISTORY", "Report", "RunResult", "from_json_lines", "last_values", "to_json_lines"]
-
 HISTORY = "history.jsonl"
 """A run's reports, one JSON object per line, in a node and in a checkpoint."""
 

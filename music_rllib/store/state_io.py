@@ -19,8 +19,6 @@ from safetensors.numpy import save as save_safetensors
 
 from music_rllib.limits import check_safetensors, open_regular
 
-__all__ = ["StateError", "read_arrays", "read_state", "write_arrays", "write_state"]
-
 TREE, ARRAYS = "state.json", "state.safetensors"
 
 

@@ -16,8 +16,6 @@ from pathlib import Path
 
 from music_rllib.store.files import write_atomically
 
-__all__ = ["Verified", "fingerprint"]
-
 SETTLED_SECONDS = 2.0
 """A file that was written just now may be written again at what its disk calls the same time."""
 
