@@ -1,4 +1,4 @@
-"""Which Ray cluster the environment names, and whether it answers. Loads no Ray."""
+"""The address of the Ray cluster that the environment names. Loads no Ray."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ REACH_SECONDS = 5.0
 
 
 class ClusterError(BadInputError, RuntimeError):
-    """Ray can't be reached, or can't hold a single run."""
+    """Ray cannot be reached, or cannot hold a single run."""
 
 
 def cluster_address() -> str | None:
-    """The cluster that the environment names; Ray sets it in submitted jobs too."""
+    """RAY_ADDRESS, which Ray sets in submitted jobs too; None for a local Ray."""
     return os.environ.get("RAY_ADDRESS") or None
 
 
 def check_reachable(address: str) -> None:
-    """Knock at a cluster's address; Ray itself would go on trying for minutes.
+    """Connect to a cluster's address once, as Ray itself would retry for minutes.
 
     Raises:
-        ClusterError: Nobody answers there, or it is no address of a cluster.
+        ClusterError: Nothing answers, or it is no address of a cluster.
     """
     if address in {"auto", "local"}:
         return
