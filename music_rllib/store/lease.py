@@ -126,10 +126,12 @@ def runs_here(pid: int, started: float) -> bool:
 
 
 class LeaseFile:
-    """The file of one lease."""
+    """The file of one lease; it and its folder need not exist.
+
+    Methods raise StorageError if it cannot be written.
+    """
 
     def __init__(self, filesystem: pafs.FileSystem, path: str) -> None:
-        """Use the file `path`; it and its folder need not exist."""
         self._fs = filesystem
         self.path = path
         self._local = isinstance(filesystem, pafs.LocalFileSystem)
@@ -145,11 +147,7 @@ class LeaseFile:
             return None
 
     def acquire(self, lease: Lease) -> Lease | None:
-        """Take the lease and return None, or return the lease of another owner that holds.
-
-        Raises:
-            StorageError: The file cannot be written.
-        """
+        """Take the lease and return None, or return the lease of another owner that holds."""
         # A process that only waits must not write to a folder that the owner may be deleting.
         with contextlib.suppress(OSError):  # raised below, with the path
             if (holder := self._other_holder(lease)) is not None:
@@ -175,11 +173,7 @@ class LeaseFile:
         return None if holder.seconds > EXPIRES_SECONDS and stale else holder
 
     def renew(self, lease: Lease) -> bool:
-        """Write the lease again, unless another owner has it; returns whether it was written.
-
-        Raises:
-            StorageError: The file cannot be written.
-        """
+        """Write the lease again, unless another owner has it; returns whether it was written."""
         if not self.is_owned_by(lease.owner):
             return False
         with self._exclusively():
@@ -255,15 +249,14 @@ class LeaseFile:
 
 
 class HeldLease:
-    """A lease of this process, which a thread renews until it is released."""
+    """A lease that was just acquired in `file`, which a thread renews until it is released.
+
+    The thread calls `on_lost` when it finds that another process has taken the lease.
+    """
 
     def __init__(
         self, file: LeaseFile, lease: Lease, on_lost: Callable[[], None] = lambda: None
     ) -> None:
-        """Start to renew `lease`, which was just acquired in `file`.
-
-        The thread calls `on_lost` when it finds that another process has taken the lease.
-        """
         self._file, self._lease = file, lease
         self._duration = lease.expires - lease.since
         self._ended = threading.Event()

@@ -40,14 +40,13 @@ TRAIN_AGAIN = "'run' and 'resume' train what is damaged again with --retrain-dam
 
 
 class NodeStore:
-    """The finished nodes and the work folders of one storage."""
+    """The finished nodes and the work folders of the storage `uri` (see `open_storage`).
+
+    Methods raise DamagedError if a node does not exist or differs from its manifest, and
+    StorageError if the storage cannot be reached or written.
+    """
 
     def __init__(self, uri: str) -> None:
-        """Open the storage `uri`, as `open_storage` does.
-
-        Raises:
-            StorageError: The storage cannot be reached.
-        """
         self.uri = uri
         self._fs, self._root = open_storage(uri)
         self._nodes = ObjectFolders(self._fs, f"{self._root}/nodes")
@@ -63,32 +62,20 @@ class NodeStore:
         return self._nodes.exists(key)
 
     def result(self, key: str) -> RunResult | None:
-        """The result of a finished run; None for an imported handoff.
-
-        Raises:
-            DamagedError: The node does not exist or cannot be read.
-        """
+        """The result of a finished run; None for an imported handoff."""
         with self._advice():
             result = self._nodes.manifest(key).meta.get("result")
         return None if result is None else RunResult.model_validate(result)
 
     def history(self, key: str) -> list[Report]:
-        """All reports of a finished run.
-
-        Raises:
-            DamagedError: The history cannot be read.
-        """
+        """All reports of a finished run."""
         try:
             return from_json_lines(self._nodes.read(key, HISTORY))
         except ValueError as error:
             raise DamagedError(f"{self.path(key)}/{HISTORY} must hold reports: {error}") from error
 
     def publish(self, key: str, folder: Path, result: RunResult | None = None) -> None:
-        """Copy the files of `folder` to the node `key`, unless it exists already.
-
-        Raises:
-            StorageError: The storage cannot be written.
-        """
+        """Copy the files of `folder` to the node `key`, unless it exists already."""
         if self.is_finished(key):
             return
         meta = {"result": None if result is None else result.model_dump()}
@@ -104,19 +91,11 @@ class NodeStore:
         self._nodes.tidy(key)
 
     def fetch(self, key: str, folder: Path) -> None:
-        """Copy a finished node's files into `folder`, verified.
-
-        Raises:
-            DamagedError: The node differs from its manifest.
-        """
+        """Copy a finished node's files into `folder`, verified."""
         self._nodes.fetch(key, folder)
 
     def verify(self, key: str) -> None:
-        """Check that a finished node matches its manifest.
-
-        Raises:
-            DamagedError: The node differs from its manifest; the message says what to do.
-        """
+        """Check that a finished node matches its manifest."""
         with self._advice():
             self._nodes.check(key)
 
@@ -212,14 +191,13 @@ def damage_in_words(damage: Mapping[str, DamagedError]) -> str:
 
 
 class WorkFolder:
-    """The checkpoints of one run, numbered by environment steps.
+    """The newest `keep` checkpoints of one run in the folder `root`, by environment steps.
 
     Data that does not change any more, such as old trajectories, is in *parts* below `parts/`.
     Several checkpoints may need the same parts; each names its own.
     """
 
     def __init__(self, filesystem: pafs.FileSystem, root: str, keep: int = KEEP) -> None:
-        """Use the folder `root`; keep the newest `keep` checkpoints and the parts they need."""
         self.root = root
         self.lease = LeaseFile(filesystem, f"{root}/lease.json")
         self._checkpoints = ObjectFolders(filesystem, root)
@@ -352,10 +330,9 @@ class Saved(NamedTuple):
 
 
 class Draft:
-    """A checkpoint that is being written."""
+    """A checkpoint that is being written to `folder`, with its new parts in `parts`."""
 
     def __init__(self, folder: Path, parts: ObjectFolders) -> None:
-        """Create a draft in `folder`, whose new parts go to `parts`."""
         self.folder = folder
         self.needs: list[str] = []
         """Names of the parts that the checkpoint needs, new or of earlier checkpoints."""
@@ -363,11 +340,7 @@ class Draft:
 
     @contextlib.contextmanager
     def new_part(self, label: str) -> Iterator[tuple[str, Path]]:
-        """Yield the name of a new part and a folder to fill.
-
-        Raises:
-            StorageError: The storage cannot be written.
-        """
+        """Yield the name of a new part and a folder to fill."""
         # Never the name of an existing part, which may be damaged.
         name = f"{label}-{uuid.uuid4().hex[:8]}"
         with self._parts.sealing(name, {}) as folder:

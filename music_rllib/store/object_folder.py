@@ -110,10 +110,12 @@ def open_storage(uri: str) -> tuple[pafs.FileSystem, str]:
 
 
 class ObjectFolders:
-    """The sealed folders below one root."""
+    """The sealed folders below `root`, which may not exist yet.
+
+    Reading raises DamagedError if a folder does not exist or differs from its manifest.
+    """
 
     def __init__(self, filesystem: pafs.FileSystem, root: str) -> None:
-        """Use the folder `root`, which may not exist yet."""
         self._fs = filesystem
         self._root = root
         self._local = isinstance(filesystem, pafs.LocalFileSystem)
@@ -133,11 +135,7 @@ class ObjectFolders:
         return bool(self._fs.get_file_info(f"{self.path(name)}/{MANIFEST}").is_file)
 
     def manifest(self, name: str) -> Manifest:
-        """The manifest of a folder.
-
-        Raises:
-            DamagedError: The manifest does not exist or cannot be read.
-        """
+        """The manifest of a folder."""
         path = f"{self.path(name)}/{MANIFEST}"
         try:
             with self._open(path) as stream:
@@ -217,11 +215,7 @@ class ObjectFolders:
             sink.write(manifest.model_dump_json(indent=1).encode())
 
     def read(self, name: str, file: str) -> bytes:
-        """The verified content of one small file.
-
-        Raises:
-            DamagedError: The file does not exist or differs from the manifest.
-        """
+        """The verified content of one small file."""
         manifest = self.manifest(name)
         if file not in manifest.files:
             raise DamagedError(f"{self.path(name)} must have {file}, it hasn't")
@@ -233,9 +227,6 @@ class ObjectFolders:
         """Compare the size of every file with the manifest, and on a disk its hash too.
 
         An object store keeps hashes of its own; there, files are hashed when they are read.
-
-        Raises:
-            DamagedError: A file does not exist, cannot be read or differs from the manifest.
         """
         manifest = self.manifest(name)
         for file, expected in manifest.files.items():
@@ -249,11 +240,7 @@ class ObjectFolders:
             _check_size(source, expected, info.size)
 
     def files(self, name: str) -> list[str]:
-        """Paths of the manifest and of the folder's files.
-
-        Raises:
-            DamagedError: The manifest cannot be read.
-        """
+        """Paths of the manifest and of the folder's files."""
         manifest = self.manifest(name)
         own = [self._source(name, manifest, file) for file in sorted(manifest.files)]
         return [f"{self.path(name)}/{MANIFEST}", *own]
@@ -261,11 +248,7 @@ class ObjectFolders:
     def fetch(
         self, name: str, folder: Path, wanted: Callable[[str], bool] = lambda file: True
     ) -> Manifest:
-        """Copy the files whose names are `wanted` into `folder`, verified.
-
-        Raises:
-            DamagedError: A file does not exist or differs from the manifest.
-        """
+        """Copy the files whose names are `wanted` into `folder`, verified."""
         manifest = self.manifest(name)
         for file in filter(wanted, manifest.files):
             target = folder / file
@@ -275,11 +258,7 @@ class ObjectFolders:
         return manifest
 
     def _copy(self, source: str, expected: FileRecord, write: Callable[[bytes], object]) -> None:
-        """Pass a file to `write` in chunks, and at most one byte more than the manifest says.
-
-        Raises:
-            DamagedError: The file does not exist or differs from the manifest.
-        """
+        """Pass a file to `write` in chunks, and at most one byte more than the manifest says."""
         size, digest = 0, hashlib.sha256()
         try:
             with self._open(source, expected.bytes) as stream:
@@ -296,12 +275,7 @@ class ObjectFolders:
             )
 
     def _open(self, path: str, size: int | None = None) -> contextlib.AbstractContextManager[Any]:
-        """Open a file for reading; on a disk it must be a regular file of `size` bytes.
-
-        Raises:
-            FileNotFoundError: The file does not exist.
-            DamagedError: It is something else.
-        """
+        """Open a file for reading; on a disk it must be a regular file of `size` bytes."""
         if not self._local:
             return self._fs.open_input_stream(path)  # type: ignore[no-any-return]
         try:

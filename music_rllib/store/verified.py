@@ -38,10 +38,9 @@ def fingerprint_of(paths: Iterable[Path]) -> str | None:
 
 
 class Verified:
-    """A file of fingerprints of sound runs. A damaged file counts as empty."""
+    """A file of fingerprints of sound runs; it need not be readable or writable."""
 
     def __init__(self, path: Path) -> None:
-        """Use the file `path`, which need not exist or be writable."""
         self._path = path
         self._changed = False
 

@@ -75,15 +75,6 @@ def is_lasting(error: Exception) -> bool:
     return isinstance(error, MlflowException) and error.error_code in _LASTING_ERRORS
 
 
-class Value(NamedTuple):
-    """One value of a metric; `time` in ms since the epoch."""
-
-    name: str
-    value: float
-    time: int
-    step: int
-
-
 class KnownRun(NamedTuple):
     """A run that exists in MLflow."""
 
@@ -97,15 +88,11 @@ class KnownRun(NamedTuple):
 class Experiment:
     """The MLflow experiment of a sweep: finds, creates and updates the sweep's runs.
 
-    Every method but `known_id` asks the server, and raises MLflow's errors.
+    The constructor creates the experiment if it does not exist, and raises TrackingError if the
+    store refuses that. Every method but `known_id` asks the server, and raises MLflow's errors.
     """
 
     def __init__(self, store: TrackingStore, name: str, sweep_id: str) -> None:
-        """Connect, and create the experiment if it does not exist.
-
-        Raises:
-            TrackingError: The store refuses that.
-        """
         self._store = store
         self._name = name
         self._sweep_id = sweep_id
@@ -209,9 +196,8 @@ class Experiment:
         """Delete a tag that the run has."""
         self._client.delete_tag(run_id, tag)
 
-    def log_metrics(self, run_id: str, values: Sequence[Value]) -> None:
+    def log_metrics(self, run_id: str, metrics: Sequence[Metric]) -> None:
         """Log values of metrics; logging them twice changes nothing."""
-        metrics = [Metric(*value) for value in values]
         self._client.log_batch(run_id, metrics=metrics, synchronous=True)
 
     def end_run(self, run_id: str, status: Status, time: int) -> None:

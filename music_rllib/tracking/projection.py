@@ -18,10 +18,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
+from mlflow.entities import Metric
+
 from music_rllib import names
 from music_rllib.store.run_record import Report
 from music_rllib.tracking.curve import learning_curve_png
-from music_rllib.tracking.mlflow_client import MAX_METRICS, Experiment, KnownRun, Status, Value
+from music_rllib.tracking.mlflow_client import MAX_METRICS, Experiment, KnownRun, Status
 
 logger = logging.getLogger(__name__)
 
@@ -72,19 +74,13 @@ class _Cancelled(Exception):  # noqa: N818 - no error
 class RunProjection:
     """Queues the events and artefacts of one run, and sends them to MLflow.
 
-    Any thread may add to the queue; only one thread sends.
+    Any thread may add to the queue; only one thread sends. `start` or `mirror` must come first.
+    The sweep's own run has no node key and no parent.
     """
 
     def __init__(
         self, experiment: Experiment, node_key: str = "", parent: KnownRun | None = None
     ) -> None:
-        """Create an empty queue. `start` or `mirror` must be called before anything is sent.
-
-        Args:
-            experiment: The experiment of the run.
-            node_key: Key of the run; empty for the sweep's own run.
-            parent: The run below which MLflow shows this one.
-        """
         self.node_key = node_key
         self._experiment = experiment
         self._parent = parent
@@ -270,17 +266,17 @@ class RunProjection:
                 raise _Cancelled
             chunk = new[begin : begin + MAX_METRICS]
             self._experiment.log_metrics(run_id, chunk)
-            self._last_steps.update((value.name, value.step) for value in chunk)
+            self._last_steps.update((metric.key, metric.step) for metric in chunk)
 
-    def _new_values(self, reports: Sequence[Report]) -> Iterator[Value]:
+    def _new_values(self, reports: Sequence[Report]) -> Iterator[Metric]:
         """The values that MLflow does not have, each once: a resumed run repeats steps."""
         last = dict(self._last_steps)
-        for value in self._values(reports):
-            if value.step > last.get(value.name, -1):
-                last[value.name] = value.step
-                yield value
+        for metric in self._values(reports):
+            if metric.step > last.get(metric.key, -1):
+                last[metric.key] = metric.step
+                yield metric
 
-    def _values(self, reports: Sequence[Report]) -> Iterator[Value]:
+    def _values(self, reports: Sequence[Report]) -> Iterator[Metric]:
         """The values of the first report, the settings, and the values of the other reports.
 
         MLflow's page that compares runs plots the metric that was logged first: a setting there,
@@ -289,7 +285,7 @@ class RunProjection:
         for report in reports[:1]:
             yield from _values_of(report)
         for name, value in self._start.settings.items():
-            yield Value(name, value, self._start.time, 0)
+            yield Metric(name, value, self._start.time, 0)
         for report in reports[1:]:
             yield from _values_of(report)
 
@@ -315,9 +311,9 @@ class RunProjection:
         return {names.TAG_SOURCE_NODE: source, **known}
 
 
-def _values_of(report: Report) -> Iterator[Value]:
+def _values_of(report: Report) -> Iterator[Metric]:
     for name, value in report.metrics.items():
-        yield Value(name, value, report.timestamp_ms, report.env_steps)
+        yield Metric(name, value, report.timestamp_ms, report.env_steps)
 
 
 def _learning_curve(reports: Sequence[Report], title: str) -> bytes | None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import random
 import threading
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from music_rllib.store.object_folder import DamagedError
@@ -38,9 +37,21 @@ class _Lane:
     """Either the records or the artefacts of a run; neither waits for the other."""
 
     run: RunProjection
-    send: Callable[[], None]
+    has_artefacts: bool
     refused: str | None = None
     """Reason of a lasting failure, after which nothing more is sent."""
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether there is anything to send that was not refused."""
+        size = self.run.artefacts if self.has_artefacts else self.run.records
+        return self.refused is None and size > 0
+
+    def send(self) -> None:
+        if self.has_artefacts:
+            self.run.send_artefacts()
+        else:
+            self.run.send_records()
 
 
 class Sender(threading.Thread):
@@ -50,16 +61,14 @@ class Sender(threading.Thread):
     the end of the queue, so that one bad run does not block the others. After a lasting failure
     (a refused value, a deleted run, a damaged node) the lane stops until the sweep is started
     again. A run that has ended and is delivered is dropped, so the cost of a round depends only on
-    the runs under way.
+    the runs under way. `store` is the public URI of MLflow's store, for messages.
     """
 
     def __init__(self, store: str) -> None:
-        """Create the thread; `store` is the public URI of MLflow's store, for messages."""
         super().__init__(name="mlflow-sender", daemon=True)
         self._store = store
         self._runs: set[RunProjection] = set()
-        self._records: list[_Lane] = []
-        self._artefacts: list[_Lane] = []
+        self._lanes: list[_Lane] = []
         self._change = threading.Condition()
         self._has_news = self._hurry = self._stopped = False
         self._failures = 0
@@ -70,8 +79,7 @@ class Sender(threading.Thread):
         with self._change:
             if run not in self._runs:
                 self._runs.add(run)
-                self._records.append(_Lane(run, run.send_records))
-                self._artefacts.append(_Lane(run, run.send_artefacts))
+                self._lanes += [_Lane(run, has_artefacts=False), _Lane(run, has_artefacts=True)]
             self._has_news = True
             self._change.notify_all()
 
@@ -79,7 +87,7 @@ class Sender(threading.Thread):
         """What MLflow does not have yet, and why."""
         with self._change:
             runs = list(self._runs)
-            refused = [lane.refused for lane in [*self._records, *self._artefacts] if lane.refused]
+            refused = [lane.refused for lane in self._lanes if lane.refused]
         return Pending(
             records=sum(run.records for run in runs),
             artefacts=sum(run.artefacts for run in runs),
@@ -91,7 +99,7 @@ class Sender(threading.Thread):
         with self._change:
             self._hurry = self._has_news = True
             self._change.notify_all()
-            self._change.wait_for(lambda: not self._has_work(), timeout)
+            self._change.wait_for(lambda: not any(lane.is_waiting for lane in self._lanes), timeout)
             self._hurry = False
         return not self.pending()
 
@@ -123,19 +131,19 @@ class Sender(threading.Thread):
 
     def _send_round(self) -> bool:
         """Send everything in the queues; False if a failure ended the round."""
-        for lanes in (self._records, self._artefacts):
-            with self._change:
-                waiting = [lane for lane in lanes if lane.refused is None]
-            for lane in waiting:
-                if self._stopped or not self._send_lane(lane, lanes):
-                    return False
+        with self._change:
+            lanes = [lane for lane in self._lanes if lane.refused is None]
+        # All records first: artefacts are larger, and sending a stored run's records adds some.
+        for lane in sorted(lanes, key=lambda lane: lane.has_artefacts):
+            if self._stopped or not self._send_lane(lane):
+                return False
         if self._error is not None:
             logger.warning("MLflow at %s accepts again what was waiting", self._store)
         self._failures, self._error = 0, None
         self._drop_delivered()
         return True
 
-    def _send_lane(self, lane: _Lane, lanes: list[_Lane]) -> bool:
+    def _send_lane(self, lane: _Lane) -> bool:
         try:
             lane.send()
         # The thread must survive every error; what was not sent stays in the queue.
@@ -151,8 +159,8 @@ class Sender(threading.Thread):
                 )
             self._failures, self._error = self._failures + 1, reason
             with self._change:
-                lanes.remove(lane)
-                lanes.append(lane)
+                self._lanes.remove(lane)
+                self._lanes.append(lane)
             return False
         return True
 
@@ -161,8 +169,7 @@ class Sender(threading.Thread):
         # after this and adds the run again.
         with self._change:
             self._runs = {run for run in self._runs if not run.delivered}
-            self._records = [lane for lane in self._records if lane.run in self._runs]
-            self._artefacts = [lane for lane in self._artefacts if lane.run in self._runs]
+            self._lanes = [lane for lane in self._lanes if lane.run in self._runs]
 
     def _pause(self) -> None:
         longest = FIRST_PAUSE if self._hurry else LONGEST_PAUSE
@@ -171,9 +178,3 @@ class Sender(threading.Thread):
         with self._change:
             was_hurried = self._hurry
             self._change.wait_for(lambda: self._stopped or self._hurry > was_hurried, seconds)
-
-    def _has_work(self) -> bool:
-        """Whether anything that was not refused waits. The caller holds the lock."""
-        return any(lane.refused is None and lane.run.records for lane in self._records) or any(
-            lane.refused is None and lane.run.artefacts for lane in self._artefacts
-        )

@@ -47,7 +47,8 @@ class Tracker:
 
     A tracker that is opened again on the same sweep continues its runs. Values of steps that
     MLflow has already are skipped, so a run that repeats steps after a resume shows each step once.
-    Several threads may call it, but only one process at a time may track a sweep.
+    Several threads may call it, but only one process at a time may track a sweep. Methods raise
+    ValueError for names that MLflow would refuse, and for events of a run that was not started.
     """
 
     def __init__(
@@ -113,21 +114,13 @@ class Tracker:
         return self._parent.attach().run_id
 
     def start(self, run: RunInfo) -> None:
-        """A run starts or is resumed; all its reports follow, from the first one on.
-
-        Raises:
-            ValueError: MLflow would refuse a name or the key.
-        """
+        """A run starts or is resumed; all its reports follow, from the first one on."""
         projection = self._projection(run)
         projection.start(self._as_start(run))
         self._sender.add(projection)
 
     def log(self, node_key: str, reports: Sequence[Report]) -> None:
-        """Log reports of a started run.
-
-        Raises:
-            ValueError: The run was not started, or MLflow would refuse a metric's name.
-        """
+        """Log reports of a started run."""
         projection = self._started(node_key)
         for report in reports:
             self._check_names(report.metrics)
@@ -141,9 +134,6 @@ class Tracker:
             node_key: Key of the run.
             status: FAILED, or KILLED for a run that was stopped and can be continued.
             tags: Tags that say why, each shortened to `MAX_CAUSE_LENGTH`.
-
-        Raises:
-            ValueError: The run was not started.
         """
         projection = self._started(node_key)
         short = {key: redact(value)[:MAX_CAUSE_LENGTH] for key, value in (tags or {}).items()}
@@ -156,9 +146,6 @@ class Tracker:
         Args:
             run: As for `start`.
             read: Reads the run. The sending thread calls it if MLflow does not have all of it.
-
-        Raises:
-            ValueError: MLflow would refuse a name or the key.
         """
         projection = self._projection(run)
         projection.mirror(self._as_start(run), read)
@@ -250,15 +237,7 @@ class Tracker:
     def _parent_run(self, sweep_name: str, config: Mapping[str, object]) -> RunProjection:
         """The sweep's own run. It is created at once, as its children need its id."""
         parent = RunProjection(self._experiment)
-        parent.start(
-            Start(
-                time=_now(),
-                name=sweep_name,
-                tags=self._sweep_tags,
-                provenance=self._provenance,
-                params=flat_params(config),
-            )
-        )
+        parent.start(self._as_start(RunInfo(node_key="", name=sweep_name, config=config)))
         parent.put_artefact(names.ARTEFACT_SWEEP_CONFIG, _as_yaml(config))
         try:
             parent.attach()
