@@ -1,25 +1,54 @@
-"""CPUs, memory and GPUs of this machine, without loading Ray."""
+"""This machine, and the Ray cluster that the environment names. Loads no Ray."""
 
 from __future__ import annotations
 
 import math
 import os
+import socket
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import psutil
 
-from music_rllib.config.schema import Resources
-from music_rllib.runtime.ray_address import ClusterError, check_reachable, cluster_address
+from music_rllib.errors import BadInputError
 
-__all__ = [
-    "ClusterError",
-    "check_cpus",
-    "check_memory_and_gpus",
-    "check_reachable",
-    "claimable",
-    "cluster_address",
-    "memory",
-]
+if TYPE_CHECKING:
+    from music_rllib.config.schema import Resources
+
+REACH_SECONDS = 5.0
+MEMORY_LIMITS = ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory.max")
+"""Files with a container's memory limit, for either version of cgroups."""
+
+
+class ClusterError(BadInputError, RuntimeError):
+    """Ray cannot be reached, or cannot hold a single run."""
+
+
+def cluster_address() -> str | None:
+    """RAY_ADDRESS, which Ray sets in submitted jobs too; None for a local Ray."""
+    return os.environ.get("RAY_ADDRESS") or None
+
+
+def check_reachable(address: str) -> None:
+    """Connect to a cluster's address once, as Ray itself would retry for minutes.
+
+    Raises:
+        ClusterError: Nothing answers, or it is no address of a cluster.
+    """
+    if address in {"auto", "local"}:
+        return
+    if address.startswith(("http://", "https://")):
+        raise ClusterError(
+            f"RAY_ADDRESS must be HOST:PORT of a cluster's head, got {address!r}; an http "
+            "address is for 'ray job submit'"
+        )
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=REACH_SECONDS).close()
+    except (OSError, ValueError, OverflowError) as error:
+        raise ClusterError(
+            f"RAY_ADDRESS must be HOST:PORT of a Ray cluster that answers, got {address!r}: {error}"
+        ) from error
 
 
 def check_cpus(resources: Resources) -> int | None:
@@ -38,10 +67,6 @@ def check_cpus(resources: Resources) -> int | None:
                 f"resources.{name} must be <= {here}, the CPUs of this machine, got {asked}"
             )
     return resources.num_cpus
-
-
-MEMORY_LIMITS = ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory.max")
-"""Files with a container's memory limit, for either version of cgroups."""
 
 
 def check_memory_and_gpus(resources: Resources) -> None:

@@ -247,9 +247,9 @@ class WorkFolder:
         for name in reversed(self._checkpoints.names()):
             if most is not None and steps_of(name) > most:
                 continue
-            with TemporaryDirectory() as above:
+            with TemporaryDirectory() as temporary:
                 try:
-                    saved = self._fetch(name, Path(above))
+                    saved = self._fetch(name, Path(temporary))
                 except DamagedError as error:
                     warn(f"a damaged checkpoint is skipped: {error}")
                     continue
@@ -257,8 +257,8 @@ class WorkFolder:
                 return
         yield None
 
-    def _fetch(self, name: str, above: Path) -> Saved:
-        manifest = self._checkpoints.fetch(name, above / "checkpoint")
+    def _fetch(self, name: str, folder: Path) -> Saved:
+        manifest = self._checkpoints.fetch(name, folder / "checkpoint")
         if manifest.meta.get("format") != FORMAT:
             raise DamagedError(
                 f"{self._checkpoints.path(name)} must be a {FORMAT!r}, "
@@ -266,9 +266,9 @@ class WorkFolder:
             )
         parts = {}
         for part in _needs(manifest):
-            parts[part] = above / "parts" / part
+            parts[part] = folder / "parts" / part
             self._parts.fetch(part, parts[part])
-        return Saved(above / "checkpoint", parts)
+        return Saved(folder / "checkpoint", parts)
 
     def history(self) -> list[Report]:
         """Reports of the newest checkpoint whose history is sound; [] if there is none."""

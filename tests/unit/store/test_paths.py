@@ -1,4 +1,4 @@
-"""Storages that can keep nothing: a message before anything starts, and nothing left behind."""
+"""A storage that cannot be written is reported before anything starts, without leaving files."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_devices_and_what_only_looks_like_folders(place: str) -> None:
 
 
 def test_a_folder_of_somebody_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As root may write everywhere, the system's answer is given here."""
+    """The error is simulated, because root may write everywhere."""
 
     def refuse(dir: Path) -> None:  # noqa: A002
         raise PermissionError(13, "Permission denied", str(dir))
@@ -96,7 +96,7 @@ def test_nobodys_home_and_bytes_that_are_no_text() -> None:
 
 
 def test_a_bucket_that_does_not_answer_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Somebody takes the connection and says nothing; the client itself would wait for minutes."""
+    """The server accepts the connection and never answers; the client would wait for minutes."""
     monkeypatch.setattr(paths, "ANSWER_SECONDS", 3.0)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         kept = []
