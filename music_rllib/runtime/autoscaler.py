@@ -67,16 +67,20 @@ def adds_nodes(bundle: Mapping[str, float], count: int = 1) -> bool:
         ray.util.remove_placement_group(group)
 
 
-def _feasible(
-    group: str, ready: Callable[[float], bool], now: Callable[[], float] = time.monotonic
-) -> bool:
-    began, first = now(), _state().version
+def _feasible(group: str, ready: Callable[[float], bool]) -> bool:
+    """Whether the autoscaler can start a node for a placement group, which it may take long to say.
+
+    Args:
+        group: Id of the placement group.
+        ready: Waits for some seconds; returns whether the group has its place.
+    """
+    began, first = time.monotonic(), _state().version
     while not ready(1.0):
         state = _state()
         if any(group in details for details in state.infeasible):
             return False
         # The first look may have begun before the request.
-        if state.version - first > LOOKS or now() - began > ANSWER_SECONDS:
+        if state.version - first > LOOKS or time.monotonic() - began > ANSWER_SECONDS:
             return True
     return True
 

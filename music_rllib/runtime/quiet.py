@@ -17,6 +17,7 @@ import logging
 import os
 import secrets
 import warnings
+from functools import partial
 
 from music_rllib.envs.farama_notice import drop_farama_notice
 
@@ -52,17 +53,12 @@ LOCAL_RAY_BEYOND_LOOPBACK = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
 """If "0", Ray's address is 127.0.0.1, and no other node can join. Ray reads it when imported."""
 
 
-class _DropExpected(logging.Filter):
-    """Drops messages below ERROR with one of these beginnings."""
+def _is_shown(beginnings: tuple[str, ...], record: logging.LogRecord) -> bool:
+    return record.levelno >= logging.ERROR or not record.getMessage().startswith(beginnings)
 
-    def __init__(self, beginnings: tuple[str, ...]) -> None:
-        super().__init__()
-        self.beginnings = beginnings
 
-    def filter(self, record: logging.LogRecord) -> bool:
-        if record.levelno >= logging.ERROR:
-            return True
-        return not record.getMessage().startswith(self.beginnings)
+# Made once, because a logger ignores a filter that it has already.
+_FILTERS = {name: partial(_is_shown, texts) for name, texts in _EXPECTED_NOTICES.items()}
 
 
 def prepare_environment() -> None:
@@ -94,10 +90,8 @@ def prepare_environment() -> None:
 
 def quiet_third_parties() -> None:
     """Hide known third-party notices in this process. Calling it again changes nothing."""
-    for name, beginnings in _EXPECTED_NOTICES.items():
-        logger = logging.getLogger(name)
-        if not any(isinstance(present, _DropExpected) for present in logger.filters):
-            logger.addFilter(_DropExpected(beginnings))
+    for name, is_shown in _FILTERS.items():
+        logging.getLogger(name).addFilter(is_shown)
     for name in _CHATTY_LOGGERS:
         logging.getLogger(name).setLevel(logging.WARNING)
     # RLlib registers its wrapper environment again for every environment runner that it builds.

@@ -18,8 +18,15 @@ ANSWER_SECONDS = 15.0
 """Timeout for a bucket to answer; its client would retry for minutes."""
 NAME_BYTES = 255
 """Longest name of a file or folder on Linux."""
+_KINDS = {
+    stat.S_IFREG: "file",
+    stat.S_IFCHR: "device",
+    stat.S_IFBLK: "device",
+    stat.S_IFIFO: "pipe",
+    stat.S_IFSOCK: "socket",
+}
 BUCKETS = ("s3://", "gs://", "gcs://", "abfs://", "abfss://")
-_ASK = """
+_ASK_FOR_BUCKET = """
 import sys
 from music_rllib.store.object_folder import StorageError, open_storage
 try:
@@ -59,10 +66,9 @@ def resolve_storage(storage: str) -> tuple[str, str | None]:
 
 def sweep_folder(storage: str, name: str) -> Path:
     """Local folder of a sweep's own files: in the storage, or in the home folder for a bucket."""
-    if "://" not in storage:
-        return Path(storage) / name
-    if storage.startswith("file://"):
-        return Path(storage.removeprefix("file://")) / name
+    folder = storage.removeprefix("file://")
+    if "://" not in folder:
+        return Path(folder) / name
     bucket = hashlib.sha256(storage.encode()).hexdigest()[:12]
     return Path.home() / ".music_rllib" / bucket / name
 
@@ -82,13 +88,10 @@ def check_storage(storage: str, name: str) -> None:
             f"storage must be UTF-8 text without control characters, got {storage!a}"
         )
     check_answers(storage)
-    folder = storage.removeprefix("file://")
-    if "://" not in folder:
-        plain = os.path.normpath(folder)  # a folder that does not exist yet has no ".."
-        for entry in (name, "nodes", "work"):
-            _check_folder(Path(plain, entry))
-    else:  # the sweep's own files are on this machine too
-        _check_folder(sweep_folder(storage, name))
+    is_remote = "://" in storage.removeprefix("file://")
+    for entry in (name,) if is_remote else (name, "nodes", "work"):
+        folder = sweep_folder(storage, entry)
+        _check_folder(Path(os.path.normpath(folder)))  # a new folder has no ".." yet
 
 
 def check_answers(storage: str) -> None:
@@ -101,7 +104,7 @@ def check_answers(storage: str) -> None:
         return
     try:
         done = subprocess.run(  # noqa: S603 - this Python, and the URI on its standard input
-            [sys.executable, "-c", _ASK],
+            [sys.executable, "-c", _ASK_FOR_BUCKET],
             input=storage,
             capture_output=True,
             text=True,
@@ -120,12 +123,12 @@ def check_answers(storage: str) -> None:
 
 def _check_folder(folder: Path) -> None:
     """Check that a folder can be written, or that it can be created."""
-    named = _cut(str(folder), 300)
+    named = str(folder) if len(str(folder)) <= 300 else f"{str(folder)[:300]}..."
     for part in folder.parts:
         if (length := len(os.fsencode(part))) > NAME_BYTES:
             raise StorageError(
                 f"storage must have names of at most {NAME_BYTES} bytes in its path, got one of "
-                f"{length}: {_cut(part, 40)}"
+                f"{length}: {part[:40]}..."
             )
     try:
         existing = _nearest(folder)
@@ -137,10 +140,6 @@ def _check_folder(folder: Path) -> None:
             pass
     except OSError as error:
         raise StorageError(f"{existing} must be writable, for {named}: {error.strerror}") from error
-
-
-def _cut(text: str, longest: int) -> str:
-    return text if len(text) <= longest else f"{text[:longest]}..."
 
 
 def _nearest(folder: Path) -> Path:
@@ -162,12 +161,7 @@ def _nearest(folder: Path) -> Path:
         except NotADirectoryError:
             continue
         if not stat.S_ISDIR(mode):
-            raise StorageError(f"{folder} must be a folder or free, {path} is a {_kind(mode)}")
+            kind = _KINDS.get(stat.S_IFMT(mode), "special file")
+            raise StorageError(f"{folder} must be a folder or free, {path} is a {kind}")
         return path
     raise AssertionError("the root is a folder")
-
-
-def _kind(mode: int) -> str:
-    kinds = {stat.S_ISREG: "file", stat.S_ISCHR: "device", stat.S_ISBLK: "device"}
-    kinds |= {stat.S_ISFIFO: "pipe", stat.S_ISSOCK: "socket"}
-    return next((name for is_one, name in kinds.items() if is_one(mode)), "special file")
