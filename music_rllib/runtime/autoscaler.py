@@ -68,12 +68,7 @@ def adds_nodes(bundle: Mapping[str, float], count: int = 1) -> bool:
 
 
 def _feasible(group: str, ready: Callable[[float], bool]) -> bool:
-    """Whether the autoscaler can start a node for a placement group, which it may take long to say.
-
-    Args:
-        group: Id of the placement group.
-        ready: Waits for some seconds; returns whether the group has its place.
-    """
+    """Whether the autoscaler can start nodes for a placement group, unless that is `ready`."""
     began, first = time.monotonic(), _state().version
     while not ready(1.0):
         state = _state()

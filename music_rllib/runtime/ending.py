@@ -41,12 +41,7 @@ def end_process(code: int) -> NoReturn:
 
 @contextlib.contextmanager
 def in_time(seconds: float | None, rule: str) -> Iterator[None]:
-    """End the program, and print its stack, if this `with` takes longer than `seconds`.
-
-    Args:
-        seconds: The limit; None for no limit.
-        rule: What took longer than what, for the message.
-    """
+    """End the program, with `rule` and its stack, if this `with` takes longer than `seconds`."""
     if seconds is None:
         yield
         return

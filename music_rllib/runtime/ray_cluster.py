@@ -123,15 +123,10 @@ def _room(resources: Resources) -> Room:
 
 
 def slots(resources: Resources, nodes: Sequence[Mapping[str, float]], *, local: bool) -> int:
-    """Number of runs that these nodes can hold at once.
-
-    Args:
-        resources: The resources that a run reserves.
-        nodes: Ray's resources of each node.
-        local: Whether the only node is this machine, for the message.
+    """Number of runs that nodes with Ray's resources `nodes` can hold at once.
 
     Raises:
-        ClusterError: No node can hold a run.
+        ClusterError: No node can hold a run. The message depends on whether Ray is `local`.
     """
     bundle = resources.bundle
     count = sum(

@@ -151,12 +151,7 @@ class HandoffManifest(_Strict):
 
 
 def write_handoff(folder: Path, modules: Weights, info: HandoffInfo) -> HandoffManifest:
-    """Write `modules` and their manifest into `folder`.
-
-    Args:
-        folder: A folder without a handoff; it is created if necessary.
-        modules: The arrays of `TrainingRun.modules`.
-        info: The run that they come from.
+    """Write `modules`, as `TrainingRun.modules` gives them, and their manifest into `folder`.
 
     Raises:
         ValueError: An array contains NaN or infinity: the run diverged, and none may start from it.
@@ -188,13 +183,7 @@ def _descriptions(arrays: Mapping[str, npt.NDArray[Any]]) -> dict[str, _Array]:
 
 
 def open_handoff(folder: Path) -> tuple[Path, HandoffManifest]:
-    """Find a handoff and read its manifest, but not its weights.
-
-    Args:
-        folder: A handoff, or a folder with one in its folder `handoff/`, such as a finished node.
-
-    Returns:
-        The handoff's own folder, and its manifest.
+    """The folder and the manifest of a handoff in `folder`, or in its folder `handoff/`.
 
     Raises:
         HandoffError: There is no handoff, or its manifest is not valid.
@@ -224,15 +213,9 @@ def _reason(error: ValueError | OSError) -> str:
 def read_handoff(
     folder: Path, modules: Sequence[str], task: Task
 ) -> dict[str, dict[str, npt.NDArray[Any]]]:
-    """Read and verify the weights of `modules`.
+    """Read and verify the weights of `modules`, which must have been trained on `task`.
 
-    Args:
-        folder: As for `open_handoff`.
-        modules: Names of the modules.
-        task: The task that they must have been trained on; its name may differ.
-
-    Returns:
-        Writable arrays by module name and array name.
+    Another name of the task does not matter. `folder` is as for `open_handoff`.
 
     Raises:
         HandoffError: A module is missing, damaged, or was trained on another task.

@@ -74,11 +74,7 @@ def sweep_folder(storage: str, name: str) -> Path:
 
 
 def check_storage(storage: str, name: str) -> None:
-    """Check that a storage can be written, without leaving a file in it.
-
-    Args:
-        storage: The storage of `resolve_storage`.
-        name: The sweep's name.
+    """Check that a sweep can write to a resolved storage, without leaving a file in it.
 
     Raises:
         StorageError: The storage cannot be written.

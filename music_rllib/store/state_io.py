@@ -29,10 +29,8 @@ class StateError(ValueError):
 def write_state(folder: Path, state: Any) -> None:
     """Write `state` into an existing folder.
 
-    Args:
-        folder: The folder.
-        state: None, booleans, numbers, strings, numpy arrays and scalars, in any nesting of dicts
-            (with strings or integers as keys), lists and tuples.
+    A state is None, booleans, numbers, strings, numpy arrays and scalars, in any nesting of dicts
+    (with strings or integers as keys), lists and tuples.
 
     Raises:
         TypeError: The state contains something else; the message names the place.

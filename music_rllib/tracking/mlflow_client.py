@@ -208,28 +208,32 @@ class Experiment:
         """Save a view of the experiment's pages under `key`."""
         self._client.set_experiment_tag(self.id, names.TAG_VIEW_PREFIX + key, content)
 
-    def upload(self, run_id: str, name: str, file: Path) -> None:
-        """Upload `file` as the artefact `name`, whose last part is the file's name."""
-        folder = name.rpartition("/")[0]
-        self._client.log_artifact(run_id, str(file), folder or None)
+    def upload(self, run_id: str, name: str, content: bytes) -> None:
+        """Upload a file as the artefact `name`."""
+        folder, _, base = name.rpartition("/")
+        with TemporaryDirectory() as temporary:
+            file = Path(temporary, base)
+            file.write_bytes(content)
+            self._client.log_artifact(run_id, str(file), folder or None)
         _forget_repository(run_id)
 
-    def log_policy(self, run_id: str, name: str, file: Path) -> None:
-        """Upload the policy in `file` as the run's logged model, unless that is there already.
+    def log_policy(self, run_id: str, name: str, content: bytes) -> None:
+        """Upload a policy as the run's logged model, unless that is there already.
 
-        A server without logged models (MLflow 2) gets the file as the artefact `name`.
+        A server without logged models (MLflow 2) gets it as the artefact `name`.
         """
         try:
             model = self._policy_model(run_id)
         except MlflowException as error:
             if error.error_code != "ENDPOINT_NOT_FOUND":
                 raise
-            self.upload(run_id, name, file)
+            self.upload(run_id, name, content)
             return
         if model.status == LoggedModelStatus.READY:
             return
         with TemporaryDirectory() as temporary:
-            folder = Path(temporary, "model")
+            file, folder = Path(temporary, "policy.safetensors"), Path(temporary, "model")
+            file.write_bytes(content)
             policy = write_model(file, folder, run_id=run_id, model_id=model.model_id)
             self._client.log_model_artifacts(model.model_id, str(folder))
             _forget_repository(model.model_id)

@@ -52,13 +52,7 @@ mlflow.models.set_model(PolicyModel())
 
 
 def write_model(file: Path, folder: Path, *, run_id: str, model_id: str) -> PolicyNetwork:
-    """Write an MLflow model of the policy in `file`, and return the policy.
-
-    Args:
-        file: The policy's file.
-        folder: Folder of the model, which must not exist.
-        run_id: MLflow's id of the run that trained the policy.
-        model_id: MLflow's id of the logged model.
+    """Write an MLflow model of the policy in `file` to a new folder, and return the policy.
 
     Raises:
         PolicyFileError: The file is no policy.

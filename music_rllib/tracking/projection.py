@@ -11,11 +11,10 @@ import contextlib
 import logging
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path
-from tempfile import TemporaryDirectory
+from itertools import islice, takewhile
 from typing import NamedTuple
 
 from mlflow.entities import Metric
@@ -181,7 +180,9 @@ class RunProjection:
                 return
             data = content() if callable(content) else content
             if data is not None:
-                self._upload(name, data)
+                is_policy = name == names.ARTEFACT_POLICY
+                upload = self._experiment.log_policy if is_policy else self._experiment.upload
+                upload(self.attach().run_id, name, data)
             with self._lock:
                 if self._artefacts[name] is content:
                     del self._artefacts[name]
@@ -205,12 +206,8 @@ class RunProjection:
     def _next_events(self) -> list[Event]:
         """The first event, or all reports at the front of the queue, for one request."""
         with self._lock:
-            events: list[Event] = []
-            for event in self._events:
-                if events and not (isinstance(event, Report) and isinstance(events[0], Report)):
-                    break
-                events.append(event)
-            return events
+            reports = list(takewhile(lambda event: isinstance(event, Report), self._events))
+            return reports or list(islice(self._events, 1))
 
     def _remove(self, events: Iterable[Event]) -> None:
         """Remove sent events from the queue, unless `mirror` has replaced them meanwhile."""
@@ -259,45 +256,26 @@ class RunProjection:
                 self._artefacts[names.ARTEFACT_POLICY] = stored.policy
 
     def _log(self, reports: Sequence[Report]) -> None:
-        run_id = self.attach().run_id
-        new = list(self._new_values(reports))
+        """Log the settings and the values that MLflow lacks, as a resumed run repeats steps."""
+        run_id, start = self.attach().run_id, self._start
+        metrics = [metric for report in reports for metric in _metrics_of(report)]
+        # Settings follow the first report, as MLflow's page that compares runs plots the metric
+        # that was logged first: a setting there, such as q against q, would say nothing.
+        position = len(reports[0].metrics) if reports else 0
+        metrics[position:position] = [
+            Metric(name, value, start.time, 0) for name, value in start.settings.items()
+        ]
+        last, new = dict(self._last_steps), []
+        for metric in metrics:
+            if metric.step > last.get(metric.key, -1):
+                last[metric.key] = metric.step
+                new.append(metric)
         for begin in range(0, len(new), MAX_METRICS):
             if self._cancelled:
                 raise _Cancelled
             chunk = new[begin : begin + MAX_METRICS]
             self._experiment.log_metrics(run_id, chunk)
             self._last_steps.update((metric.key, metric.step) for metric in chunk)
-
-    def _new_values(self, reports: Sequence[Report]) -> Iterator[Metric]:
-        """The values that MLflow does not have, each once: a resumed run repeats steps."""
-        last = dict(self._last_steps)
-        for metric in self._values(reports):
-            if metric.step > last.get(metric.key, -1):
-                last[metric.key] = metric.step
-                yield metric
-
-    def _values(self, reports: Sequence[Report]) -> Iterator[Metric]:
-        """The values of the first report, the settings, and the values of the other reports.
-
-        MLflow's page that compares runs plots the metric that was logged first: a setting there,
-        such as q against q, would say nothing.
-        """
-        for report in reports[:1]:
-            yield from _values_of(report)
-        for name, value in self._start.settings.items():
-            yield Metric(name, value, self._start.time, 0)
-        for report in reports[1:]:
-            yield from _values_of(report)
-
-    def _upload(self, name: str, content: bytes) -> None:
-        run_id = self.attach().run_id
-        with TemporaryDirectory() as folder:
-            file = Path(folder, Path(name).name)
-            file.write_bytes(content)
-            if name == names.ARTEFACT_POLICY:
-                self._experiment.log_policy(run_id, name, file)
-            else:
-                self._experiment.upload(run_id, name, file)
 
     def _parent_tag(self) -> dict[str, str]:
         return {} if self._parent is None else {names.TAG_PARENT_RUN: self._parent.run_id}
@@ -311,9 +289,11 @@ class RunProjection:
         return {names.TAG_SOURCE_NODE: source, **known}
 
 
-def _values_of(report: Report) -> Iterator[Metric]:
-    for name, value in report.metrics.items():
-        yield Metric(name, value, report.timestamp_ms, report.env_steps)
+def _metrics_of(report: Report) -> list[Metric]:
+    return [
+        Metric(name, value, report.timestamp_ms, report.env_steps)
+        for name, value in report.metrics.items()
+    ]
 
 
 def _learning_curve(reports: Sequence[Report], title: str) -> bytes | None:

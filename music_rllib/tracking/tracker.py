@@ -128,12 +128,9 @@ class Tracker:
         self._sender.add(projection)
 
     def end(self, node_key: str, status: Status, tags: Mapping[str, str] | None = None) -> None:
-        """End a started run that has no result in the store.
+        """End a started run that has no result in the store; `tags` say why.
 
-        Args:
-            node_key: Key of the run.
-            status: FAILED, or KILLED for a run that was stopped and can be continued.
-            tags: Tags that say why, each shortened to `MAX_CAUSE_LENGTH`.
+        A run that was stopped, and can be continued, is KILLED.
         """
         projection = self._started(node_key)
         short = {key: redact(value)[:MAX_CAUSE_LENGTH] for key, value in (tags or {}).items()}
@@ -143,9 +140,7 @@ class Tracker:
     def mirror(self, run: RunInfo, read: Callable[[], StoredRun]) -> None:
         """Log a run of the store, from this sweep or an earlier one.
 
-        Args:
-            run: As for `start`.
-            read: Reads the run. The sending thread calls it if MLflow does not have all of it.
+        The sending thread calls `read`, unless MLflow has all of the run already.
         """
         projection = self._projection(run)
         projection.mirror(self._as_start(run), read)
