@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import socket
-import threading
 import time
 from pathlib import Path
 
@@ -96,12 +95,9 @@ def test_nobodys_home_and_bytes_that_are_no_text() -> None:
 
 
 def test_a_bucket_that_does_not_answer_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The server accepts the connection and never answers; the client would wait for minutes."""
+    """The system accepts the connection, and nothing answers; the client would wait for minutes."""
     monkeypatch.setattr(paths, "ANSWER_SECONDS", 3.0)
     with socket.create_server(("127.0.0.1", 0)) as silent:
-        kept = []
-        thread = threading.Thread(target=lambda: kept.append(silent.accept()), daemon=True)
-        thread.start()
         uri = f"s3://key:secret@b/x?endpoint_override=127.0.0.1:{silent.getsockname()[1]}"
         began = time.monotonic()
         with pytest.raises(
@@ -111,5 +107,3 @@ def test_a_bucket_that_does_not_answer_is_given_up(monkeypatch: pytest.MonkeyPat
         assert time.monotonic() - began < 30
         assert "no answer within 3 s" in str(no.value)
         assert "secret" not in str(no.value)
-    for connection, _ in kept:
-        connection.close()
