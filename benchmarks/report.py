@@ -24,7 +24,8 @@ from music_rllib.config.schema import SweepConfig
 from music_rllib.experiment.plan import make_plan
 from music_rllib.experiment.run_info import run_info
 from music_rllib.report.build import PAGE
-from music_rllib.tracking import StoredRun, Tracker
+from music_rllib.tracking.projection import StoredRun
+from music_rllib.tracking.tracker import Tracker
 
 __all__ = ["rows"]
 

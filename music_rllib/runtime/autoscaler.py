@@ -1,4 +1,4 @@
-"""Ray's autoscaler, where a cluster has one: whether it is there, and what it could add."""
+"""Ray's autoscaler: whether a cluster has one, and whether it would add nodes."""
 
 from __future__ import annotations
 
@@ -10,50 +10,48 @@ from typing import Any, NamedTuple
 import ray
 import ray.util.client
 
-__all__ = ["adds_nodes", "is_there"]
-
 ANSWER_SECONDS = 40.0
-"""It looks at what waits every five seconds; a busy one takes longer."""
+"""Longest wait for its answer: it looks at requests every five seconds, or later if it is busy."""
 REPORT_SECONDS = 10.0
-"""A cluster that has just been started has no report yet."""
+"""Longest wait for its first report after a cluster was started."""
 LOOKS = 2
-"""As often must it have looked at a request before silence means that it can be met."""
-MACHINES_OF_YOURS = "local.cluster.node"
-"""The launcher's type for listed machines: it starts them, and can't find others."""
+"""Number of its looks after which a request counts as feasible if it reports nothing."""
+LISTED_MACHINES = "local.cluster.node"
+"""The launcher's node type for listed machines, to which it cannot add others."""
 
 
 class State(NamedTuple):
-    """What the autoscaler has reported last."""
+    """The last report of Ray's second autoscaler."""
 
     version: int
-    """Grows with each look; 0 where there is no autoscaler of this kind."""
+    """Counts its looks at requests; 0 if the cluster has no autoscaler of this kind."""
     types: frozenset[str]
-    """Names of nodes' types; "" for a node that was started by hand."""
+    """Names of the nodes' types; "" for a node that was started by hand."""
     infeasible: frozenset[str]
-    """What it says of waiting placement groups that no node it may start could hold."""
+    """Descriptions of the placement groups that no node could hold that it may start."""
 
 
 def is_there() -> bool:
-    """Whether this cluster's nodes are of types, as those of an autoscaler are.
+    """Whether the cluster's nodes have types, as an autoscaler's nodes do.
 
-    KubeRay names the types where nothing is scaled too: only `adds_nodes` is sure.
+    KubeRay's nodes have types even without an autoscaler: only `adds_nodes` is certain.
     """
     by_hand = {"", *(f"node_{node['NodeID']}" for node in ray.nodes())}
-    return bool(_types() - by_hand - {MACHINES_OF_YOURS})
+    return bool(_types() - by_hand - {LISTED_MACHINES})
 
 
 def _types() -> frozenset[str]:
-    """Of the nodes, as the autoscaler reports them; none where nothing reports."""
+    """The nodes' types that the autoscaler reports; none if there is no report."""
     if ray.util.client.ray.is_connected():
-        return frozenset()  # `ray://` doesn't reach what has the reports
+        return frozenset()  # `ray://` has no access to the reports
     state = _state()
     return state.types if state.version else _types_of_the_first()
 
 
 def adds_nodes(bundle: Mapping[str, float], count: int = 1) -> bool:
-    """Whether nodes will be added where those that there are can't hold so many bundles.
+    """Whether the autoscaler adds nodes if the present ones cannot hold so many bundles.
 
-    Asks by letting them wait for a place, so the nodes are on their way afterwards.
+    Asks by requesting a placement group, so the nodes are being started afterwards.
     """
     began = time.monotonic()
     while not is_there():
@@ -61,7 +59,7 @@ def adds_nodes(bundle: Mapping[str, float], count: int = 1) -> bool:
             return False
         time.sleep(0.5)
     if not _state().version:
-        return True  # the first autoscaler, before Ray 2.50, says nothing of it
+        return True  # the first autoscaler, before Ray 2.50, does not report infeasible requests
     group = ray.util.placement_group([dict(bundle) for _ in range(count)])
     try:
         return _feasible(group.id.hex(), group.wait)
@@ -69,16 +67,15 @@ def adds_nodes(bundle: Mapping[str, float], count: int = 1) -> bool:
         ray.util.remove_placement_group(group)
 
 
-def _feasible(
-    group: str, ready: Callable[[float], bool], now: Callable[[], float] = time.monotonic
-) -> bool:
-    began, first = now(), _state().version
+def _feasible(group: str, ready: Callable[[float], bool]) -> bool:
+    """Whether the autoscaler can start nodes for a placement group, unless that is `ready`."""
+    began, first = time.monotonic(), _state().version
     while not ready(1.0):
         state = _state()
         if any(group in details for details in state.infeasible):
             return False
-        # The request may have come in the middle of a look.
-        if state.version - first > LOOKS or now() - began > ANSWER_SECONDS:
+        # The first look may have begun before the request.
+        if state.version - first > LOOKS or time.monotonic() - began > ANSWER_SECONDS:
             return True
     return True
 
@@ -100,7 +97,7 @@ def _state() -> State:
 
 
 def _types_of_the_first() -> frozenset[str]:
-    """Types by the report of Ray's first autoscaler; every head node has such a report."""
+    """The nodes' types in the report of Ray's first autoscaler, which every head node has."""
     from ray._private.ray_constants import DEBUG_AUTOSCALING_STATUS
     from ray.experimental.internal_kv import _internal_kv_get
 

@@ -1,32 +1,61 @@
-"""What is known of this machine and of the environment without loading Ray."""
+"""This machine, and the Ray cluster that the environment names. Loads no Ray."""
 
 from __future__ import annotations
 
 import math
 import os
+import socket
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import psutil
 
-from music_rllib.config.schema import Resources
-from music_rllib.runtime.ray_address import ClusterError, check_reachable, cluster_address
+from music_rllib.errors import BadInputError
 
-__all__ = [
-    "ClusterError",
-    "check_cpus",
-    "check_memory_and_gpus",
-    "check_reachable",
-    "claimable",
-    "cluster_address",
-    "memory",
-]
+if TYPE_CHECKING:
+    from music_rllib.config.schema import Resources
+
+REACH_SECONDS = 5.0
+MEMORY_LIMITS = ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory.max")
+"""Files with a container's memory limit, for either version of cgroups."""
+
+
+class ClusterError(BadInputError, RuntimeError):
+    """Ray cannot be reached, or cannot hold a single run."""
+
+
+def cluster_address() -> str | None:
+    """RAY_ADDRESS, which Ray sets in submitted jobs too; None for a local Ray."""
+    return os.environ.get("RAY_ADDRESS") or None
+
+
+def check_reachable(address: str) -> None:
+    """Connect to a cluster's address once, as Ray itself would retry for minutes.
+
+    Raises:
+        ClusterError: Nothing answers, or it is no address of a cluster.
+    """
+    if address in {"auto", "local"}:
+        return
+    if address.startswith(("http://", "https://")):
+        raise ClusterError(
+            f"RAY_ADDRESS must be HOST:PORT of a cluster's head, got {address!r}; an http "
+            "address is for 'ray job submit'"
+        )
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=REACH_SECONDS).close()
+    except (OSError, ValueError, OverflowError) as error:
+        raise ClusterError(
+            f"RAY_ADDRESS must be HOST:PORT of a Ray cluster that answers, got {address!r}: {error}"
+        ) from error
 
 
 def check_cpus(resources: Resources) -> int | None:
-    """CPUs of the local Ray to start; None: what Ray finds, or a cluster is used instead.
+    """Number of CPUs for a local Ray; None to let Ray decide, or if a cluster is used.
 
     Raises:
-        ClusterError: More are asked for than this machine has.
+        ClusterError: This machine has fewer CPUs than `resources` asks for.
     """
     if cluster_address() is not None:
         return None
@@ -40,15 +69,11 @@ def check_cpus(resources: Resources) -> int | None:
     return resources.num_cpus
 
 
-MEMORY_LIMITS = ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory.max")
-"""Where a container's limit is, of either version of cgroups."""
-
-
 def check_memory_and_gpus(resources: Resources) -> None:
-    """Look whether this machine has at all what a run reserves, where runs are to run on it.
+    """Check that this machine can hold a run, unless a cluster is used.
 
     Raises:
-        ClusterError: It hasn't.
+        ClusterError: This machine has less memory or fewer GPUs than a run reserves.
     """
     if cluster_address() is not None:
         return
@@ -58,7 +83,7 @@ def check_memory_and_gpus(resources: Resources) -> None:
             f"resources.memory_per_run must be <= {math.floor(here * 10) / 10:g}, the GiB of "
             f"memory of this machine, got {reserved:g}"
         )
-    if gpus and gpus > (count := _gpus()):
+    if gpus and gpus > (count := _gpu_count()):
         raise ClusterError(
             f"resources.gpus_per_run must be <= {count}, the GPUs of this machine that PyTorch "
             f"can use, got {gpus:g}"
@@ -66,24 +91,24 @@ def check_memory_and_gpus(resources: Resources) -> None:
 
 
 def memory() -> int:
-    """Bytes of this machine's memory, or of this container's."""
-    found = [int(psutil.virtual_memory().total)]
+    """Bytes of memory of this machine or container."""
+    limits = [int(psutil.virtual_memory().total)]
     for place in MEMORY_LIMITS:
         try:
             text = Path(place).read_text().strip()
         except OSError:
             continue
         if text.isdecimal():  # or "max"
-            found.append(int(text))
-    return min(found)
+            limits.append(int(text))
+    return min(limits)
 
 
 def claimable() -> int:
-    """Bytes that Linux grants a process at once by default, used or not: all memory and swap."""
+    """Bytes that Linux by default lets a process allocate at once: all memory and swap."""
     return int(psutil.virtual_memory().total + psutil.swap_memory().total)
 
 
-def _gpus() -> int:
-    import torch  # only where a sweep asks for GPUs
+def _gpu_count() -> int:
+    import torch  # slow to load, and needed only if a sweep asks for GPUs
 
     return torch.cuda.device_count()

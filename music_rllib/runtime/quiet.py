@@ -1,14 +1,14 @@
-"""Keep third-party notices that a user cannot act on off the screen, in driver and workers.
+"""Hides third-party notices that a user cannot act on, in the driver and in workers.
 
-Two steps, because some libraries read their switches while they are imported:
+There are two steps, because some libraries read their switches while they are imported:
 
-1. ``prepare_environment()`` is the first thing that an entry point does, before ``import ray``.
-2. ``quiet_third_parties()`` runs in the driver and, as Ray's setup hook, in every worker::
+1. An entry point calls `prepare_environment` first, before `import ray`.
+2. `quiet_third_parties` runs in the driver and, as Ray's setup hook, in every worker::
 
        ray.init(runtime_env={"worker_process_setup_hook": quiet_third_parties})
 
-Each filter names one logger and the beginning of one message (or a library's chatter below
-WARNING), so whatever is new, and every error, still shows.
+Each filter names a logger and the beginning of a message, or hides a logger's messages below
+WARNING. New warnings and all errors are still shown.
 """
 
 from __future__ import annotations
@@ -17,11 +17,12 @@ import logging
 import os
 import secrets
 import warnings
+from functools import partial
 
 from music_rllib.envs.farama_notice import drop_farama_notice
 
-# Notices at WARNING level: logger -> how the message begins. All are about our own use of the
-# library, are expected, and leave a user nothing to do.
+# Logger -> beginnings of messages at WARNING level. All are about our own use of the library and
+# expected, and a user can do nothing about them.
 _EXPECTED_NOTICES: dict[str, tuple[str, ...]] = {
     # Once per algorithm class; the new API stack is the one this package is written for.
     "ray.rllib.algorithms.algorithm_config": ("You are running ",),
@@ -29,12 +30,12 @@ _EXPECTED_NOTICES: dict[str, tuple[str, ...]] = {
     "ray._common.deprecation": (
         "DeprecationWarning: `RLModule(config=[RLModuleConfig object])` has been deprecated.",
     ),
-    # GPUtil is unmaintained; the sweeper measures its processes with psutil.
-    # Tune complains of any callback that takes half a second, as all do on a busy machine.
+    # GPUtil is unmaintained, and psutil measures our processes. Tune also warns of any callback
+    # that takes half a second, as all do on a busy machine ("The `...").
     "ray.tune.utils.util": ("Install gputil for GPU system monitoring.", "The `"),
 }
 
-# Loggers whose INFO lines repeat what the command line says better, or say nothing to a user.
+# Loggers whose INFO messages repeat what the command line says, or mean nothing to a user.
 _CHATTY_LOGGERS = (
     "ray._private.worker",  # "Started a local Ray instance."
     "ray.tune.tune",  # "Wrote the latest version of all result files ..."
@@ -49,72 +50,51 @@ _CHATTY_LOGGERS = (
 )
 
 LOCAL_RAY_BEYOND_LOOPBACK = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
-"""0: Ray's address is 127.0.0.1, and no other node can join. Read while Ray is imported."""
+"""If "0", Ray's address is 127.0.0.1, and no other node can join. Ray reads it when imported."""
 
 
-class _DropExpected(logging.Filter):
-    """Drop the records whose message begins with one of ``beginnings``; errors always pass."""
+def _is_shown(beginnings: tuple[str, ...], record: logging.LogRecord) -> bool:
+    return record.levelno >= logging.ERROR or not record.getMessage().startswith(beginnings)
 
-    def __init__(self, beginnings: tuple[str, ...]) -> None:
-        super().__init__()
-        self.beginnings = beginnings
 
-    def filter(self, record: logging.LogRecord) -> bool:
-        if record.levelno >= logging.ERROR:
-            return True
-        return not record.getMessage().startswith(self.beginnings)
+# Made once, because a logger ignores a filter that it has already.
+_FILTERS = {name: partial(_is_shown, texts) for name, texts in _EXPECTED_NOTICES.items()}
 
 
 def prepare_environment() -> None:
-    """Set what Ray and MLflow read from the environment; what the user has set is kept.
+    """Set environment variables for Ray and MLflow, unless the user has set them.
 
-    Must run before ``import ray``: the core library reads its configuration once. A local Ray's
-    workers inherit these variables; those of a cluster that runs already do not.
+    Must run before `import ray`, which reads its configuration once. The workers of a local Ray
+    inherit the variables; those of a running cluster do not.
     """
-    # Ray's new progress output prints a table even with verbose=0; the older one is silent then.
+    # Ray's new progress output prints a table even with verbose=0; the old one is silent then.
     os.environ.setdefault("RAY_AIR_NEW_OUTPUT", "0")
-    # Nothing is reported to anyone unless the user asks for it.
+    # No usage data is sent unless the user asks for it.
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
-    # MLflow reads the commit through GitPython, which complains at length where git is missing.
+    # MLflow reads the commit through GitPython, which prints a long warning if git is missing.
     os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
-    _keep_local_ray_on_loopback()
-    _authenticate_local_ray()
-
-
-def _keep_local_ray_on_loopback() -> None:
-    """Have a local Ray listen on loopback only, unless a cluster has been chosen.
-
-    Left alone, every process of it listens on all addresses, its ``/metrics`` without a token.
-    Ray's own setting for this is named after the systems on which it is the default.
-    """
-    if "RAY_ADDRESS" not in os.environ:
-        os.environ.setdefault(LOCAL_RAY_BEYOND_LOOPBACK, "0")
-
-
-def _authenticate_local_ray() -> None:
-    """Give a local Ray a token of its own, unless a cluster or a mode has been chosen.
-
-    Left alone, Ray writes a token file into the home folder, says so, and from then on every
-    ``ray start`` on the machine behaves differently. A token in the environment keeps the local
-    Ray closed to other users of the machine and leaves nothing behind.
-    """
-    if "RAY_ADDRESS" in os.environ or "RAY_AUTH_MODE" in os.environ:
+    if "RAY_ADDRESS" in os.environ:
         return
-    os.environ["RAY_AUTH_MODE"] = "token"
-    if "RAY_AUTH_TOKEN" not in os.environ and "RAY_AUTH_TOKEN_PATH" not in os.environ:
-        os.environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)
+    # By default every process of a local Ray listens on all addresses, its `/metrics` without a
+    # token. Ray's setting for this is named after the systems on which it is the default.
+    os.environ.setdefault(LOCAL_RAY_BEYOND_LOOPBACK, "0")
+    # By default Ray writes a token file into the home folder, says so, and every `ray start` on
+    # the machine behaves differently from then on. A token in the environment closes the local Ray
+    # to other users of the machine, and leaves nothing behind.
+    if "RAY_AUTH_MODE" not in os.environ:
+        os.environ["RAY_AUTH_MODE"] = "token"
+        if "RAY_AUTH_TOKEN" not in os.environ and "RAY_AUTH_TOKEN_PATH" not in os.environ:
+            os.environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)
 
 
 def quiet_third_parties() -> None:
-    """Filter the known third-party notices in this process. May be called more than once."""
-    for name, beginnings in _EXPECTED_NOTICES.items():
-        logger = logging.getLogger(name)
-        if not any(isinstance(present, _DropExpected) for present in logger.filters):
-            logger.addFilter(_DropExpected(beginnings))
+    """Hide known third-party notices in this process. Calling it again changes nothing."""
+    for name, is_shown in _FILTERS.items():
+        logging.getLogger(name).addFilter(is_shown)
     for name in _CHATTY_LOGGERS:
         logging.getLogger(name).setLevel(logging.WARNING)
-    # RLlib registers its wrapper environment anew for every environment runner that it builds.
+    # RLlib registers its wrapper environment again for every environment runner that it builds.
     warnings.filterwarnings(
         "ignore", message=r".*Overriding environment rllib-(single|multi)-agent-env-v0"
     )

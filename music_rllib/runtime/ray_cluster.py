@@ -1,4 +1,4 @@
-"""Ray: a local one for the sweep, or the cluster that the environment names."""
+"""Connects to Ray: a local Ray for the sweep, or the cluster that the environment names."""
 
 from __future__ import annotations
 
@@ -16,40 +16,36 @@ from music_rllib.runtime import autoscaler
 from music_rllib.runtime.machine import ClusterError, check_cpus, cluster_address
 from music_rllib.runtime.quiet import quiet_third_parties
 
-__all__ = ["Room", "check_fits", "cluster", "slots"]
-
 OBJECT_STORE_BYTES = 128 * 2**20
-"""Enough, as reports are all that workers send; Ray's default takes a third of the memory."""
-
-
+"""Enough for reports, the only data of workers; Ray's default is a third of the memory."""
 WAITING = 200
-"""Runs that wait at most where nodes are added for those that wait; Tune's own default."""
+"""Most runs that wait if an autoscaler adds nodes for them; Tune's own default."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Room:
-    """What a cluster has for runs."""
+    """The capacity of a cluster."""
 
     now: int
-    """Runs that fit at once into the nodes that there are; 0 only where it grows."""
+    """Number of runs that the present nodes can hold at once; 0 only if the cluster grows."""
     grows: bool = False
-    """Whether nodes may be added for what waits."""
+    """Whether an autoscaler may add nodes."""
     memory: int = 0
-    """Bytes of the largest node."""
+    """Memory of the largest node, in bytes."""
 
     @property
     def at_once(self) -> int:
-        """Runs at a time that can be counted on."""
+        """Number of runs at a time to count on."""
         return max(self.now, 1)
 
     @property
     def waiting(self) -> int:
-        """How many runs to let wait for a place, beside those that have one."""
+        """Number of runs that may wait for a place, beside those that have one."""
         return max(self.now, WAITING) if self.grows else self.now
 
     @property
     def remark(self) -> str | None:
-        """What a person should know who sees nothing happen."""
+        """Explanation for the user if no run can start yet."""
         if self.now:
             return None
         return (
@@ -60,11 +56,11 @@ class Room:
 
 @contextlib.contextmanager
 def cluster(resources: Resources) -> Iterator[Room]:
-    """Connect to Ray, and say what it has for runs.
+    """Connect to Ray for this `with`, and yield its capacity.
 
     Raises:
-        ClusterError: There is no cluster at the address, or no node can hold a run: none of
-            those that there are, and none that an autoscaler would add.
+        ClusterError: There is no cluster at the address, or no node can hold a run, neither a
+            present one nor one that an autoscaler would add.
     """
     address = cluster_address()
     options: dict[str, Any] = {
@@ -74,7 +70,7 @@ def cluster(resources: Resources) -> Iterator[Room]:
     }
     if address is None:
         options |= {
-            "address": "local",  # and not one that happens to run on this machine
+            "address": "local",  # never a Ray that happens to run on this machine
             "num_cpus": check_cpus(resources),
             "include_dashboard": False,
             "object_store_memory": OBJECT_STORE_BYTES,
@@ -95,16 +91,17 @@ def cluster(resources: Resources) -> Iterator[Room]:
 
 
 def check_fits(resources: Resources) -> str | None:
-    """Ask Ray, where that can't be known without it, whether it can hold a run.
+    """Check that Ray can hold a run, if that is not obvious without asking it.
 
     Returns:
-        What a person should know who will have to wait for it.
+        `Room.remark`.
 
     Raises:
-        ClusterError: It can't be reached, or can't.
+        ClusterError: Ray cannot be reached, or cannot hold a run.
     """
-    more = set(resources.bundle) - {"CPU"}
-    if more or (cluster_address() is not None and resources.cpus_per_run > 1):
+    if resources.bundle.keys() != {"CPU"} or (
+        cluster_address() is not None and resources.cpus_per_run > 1
+    ):
         with cluster(resources) as room:
             return room.remark
     return None
@@ -126,15 +123,10 @@ def _room(resources: Resources) -> Room:
 
 
 def slots(resources: Resources, nodes: Sequence[Mapping[str, float]], *, local: bool) -> int:
-    """How many runs fit at once into nodes with these resources.
-
-    Args:
-        resources: What is reserved for a run.
-        nodes: Ray's resources of each node.
-        local: Whether this is the Ray of one sweep; for the message.
+    """Number of runs that nodes with Ray's resources `nodes` can hold at once.
 
     Raises:
-        ClusterError: Not even one fits.
+        ClusterError: No node can hold a run. The message depends on whether Ray is `local`.
     """
     bundle = resources.bundle
     count = sum(
@@ -163,4 +155,4 @@ _SETTINGS = {
     "GPU": ("gpus_per_run", "GPUs", 1),
     "memory": ("memory_per_run", "GiB of memory for Ray", 2**30),
 }
-"""Ray's name to the setting, the unit in messages, and what a unit is."""
+"""Ray's resource -> setting, unit in messages, and size of the unit."""

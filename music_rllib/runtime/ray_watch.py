@@ -1,102 +1,88 @@
-"""Whether the Ray that a driver talks to is still there: Ray itself would wait for it for good."""
+"""Detects that Ray has died. Ray itself would wait for ever."""
 
 from __future__ import annotations
 
 import os
 import socket
 import time
-from collections.abc import Callable
 
 import psutil
 import ray
 
 from music_rllib.runtime.machine import cluster_address
 
-__all__ = ["RayWatch"]
-
 LOOK_SECONDS = 5.0
-"""Between two looks at a cluster, and for each to answer."""
+"""Time between two checks of a cluster, and timeout of each."""
 DAEMONS = ("gcs_server", "raylet")
 
 
 def silence_seconds() -> float:
-    """After so long a cluster counts as dead: sooner than Ray ends the process with its own words.
+    """Seconds after which a silent cluster counts as dead, before Ray itself ends the process.
 
-    A head whose state is in Redis may come back before that.
+    A head whose state is in Redis may come back in this time.
     """
     setting = "RAY_gcs_rpc_server_reconnect_timeout_s"
     return float(os.environ.get(setting, "60")) * 2 / 3
 
 
 class RayWatch:
-    """Looks at a local Ray's daemons, or knocks at a cluster's. Only while Ray is connected."""
+    """Watches the daemons of a local Ray, or connects to a cluster's addresses."""
 
-    def __init__(
-        self,
-        now: Callable[[], float] = time.monotonic,
-        doors: tuple[str, ...] | None = None,
-    ) -> None:
-        """Watch the Ray that this process is connected to.
-
-        Args:
-            now: A clock in seconds.
-            doors: In place of the cluster's: `HOST:PORT`, or the path of a socket.
-        """
-        self._now = now
+    def __init__(self) -> None:
+        """Watch the Ray that this process is connected to."""
         self._address = cluster_address()
-        self._daemons: dict[psutil.Process, str] = {}
-        if self._address is None and doors is None:
-            named = {child: child.name() for child in psutil.Process().children()}
-            self._daemons = {child: name for child, name in named.items() if name in DAEMONS}
-            doors = ()
-        self._doors = doors if doors is not None else tuple(_doors(self._address or ""))
-        self._answered = dict.fromkeys(self._doors, now())
-        self._looked = now()
+        children = [] if self._address else psutil.Process().children()
+        named = {child: child.name() for child in children}
+        self._daemons = {child: name for child, name in named.items() if name in DAEMONS}
+        addresses = _addresses(self._address) if self._address else []
+        self._checked = time.monotonic()
+        self._answered = dict.fromkeys(addresses, self._checked)
+        """Time of the last answer of each address."""
 
     def look(self) -> str | None:
-        """What is gone, in a sentence; None while all is there."""
+        """A sentence that says what has died; None if nothing has."""
         for daemon, name in self._daemons.items():
             if not _is_alive(daemon):
                 return (
                     f"the local Ray has died: its {name} (process {daemon.pid}) is gone; often the "
                     "system killed it for lack of memory"
                 )
-        now = self._now()
-        if now - self._looked < LOOK_SECONDS:
+        now = time.monotonic()
+        if now - self._checked < LOOK_SECONDS:
             return None
-        if now - self._looked > 3 * LOOK_SECONDS:  # this process slept, and the others may have
-            self._answered = dict.fromkeys(self._doors, now)
-        for door, answered in self._answered.items():
-            if _opens(door):
-                self._answered[door] = self._now()
-            elif self._now() - answered > silence_seconds():
+        if now - self._checked > 3 * LOOK_SECONDS:  # this machine slept, and the cluster may have
+            self._answered = dict.fromkeys(self._answered, now)
+        for address, answered in self._answered.items():
+            if _answers(address):
+                self._answered[address] = time.monotonic()
+            elif time.monotonic() - answered > silence_seconds():
                 return (
-                    f"the Ray cluster at {self._address} has died or can't be reached: {door} has "
-                    f"not answered for {self._now() - answered:.0f} s"
+                    f"the Ray cluster at {self._address} has died or can't be reached: {address} "
+                    f"has not answered for {time.monotonic() - answered:.0f} s"
                 )
-        self._looked = self._now()
+        self._checked = time.monotonic()
         return None
 
 
-def _doors(address: str) -> list[str]:
-    """Where the head and this machine's raylet take connections."""
-    if address.startswith("ray://"):
-        return [address.removeprefix("ray://")]
-    doors = [ray.get_runtime_context().gcs_address]
+def _addresses(cluster: str) -> list[str]:
+    """`HOST:PORT` of the head, and the socket of this machine's raylet if there is one."""
+    if cluster.startswith("ray://"):
+        return [cluster.removeprefix("ray://")]
+    addresses = [ray.get_runtime_context().gcs_address]
     node = ray._private.worker._global_node
     if node is not None and node.raylet_socket_name:
-        doors.append(node.raylet_socket_name.removeprefix("unix://"))
-    return doors
+        addresses.append(node.raylet_socket_name.removeprefix("unix://"))
+    return addresses
 
 
-def _opens(door: str) -> bool:
+def _answers(address: str) -> bool:
     try:
-        if door.startswith("/"):
-            with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as knock:
-                knock.settimeout(LOOK_SECONDS)
-                knock.connect(door)
+        if address.startswith("/"):
+            with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
+                connection.settimeout(LOOK_SECONDS)
+                connection.connect(address)
             return True
-        host, _, port = door.rpartition(":")
+        host, _, port = address.rpartition(":")
         socket.create_connection((host.strip("[]"), int(port)), timeout=LOOK_SECONDS).close()
     except OSError:
         return False

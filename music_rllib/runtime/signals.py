@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM while a sweep is being set up: a library may swallow what they raise."""
+"""Ctrl-C and SIGTERM while a sweep is being set up."""
 
 from __future__ import annotations
 
@@ -10,13 +10,11 @@ from typing import Any
 
 from music_rllib.command_line import say_stopped_at_once
 
-__all__ = ["SIGNALS", "EarlySignals", "early"]
-
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class EarlySignals:
-    """Raises KeyboardInterrupt, and remembers that it did, until Tune's loop can be told."""
+    """Raises KeyboardInterrupt for a signal, and remembers it in case a library swallows that."""
 
     def __init__(self) -> None:
         self.received: int | None = None
@@ -35,13 +33,13 @@ class EarlySignals:
         self._before = {}
 
     def install(self) -> None:
-        """Set the handlers; once more where a library has set others."""
+        """Set the handlers, again if a library has set others."""
         if self._before:
             for number in SIGNALS:
                 signal.signal(number, self._handle)
 
     def check(self) -> None:
-        """Raise KeyboardInterrupt, if a signal has come that somebody swallowed."""
+        """Raise KeyboardInterrupt if a signal has come."""
         if self.received is not None:
             raise KeyboardInterrupt
 
@@ -54,4 +52,4 @@ class EarlySignals:
 
 
 early = EarlySignals()
-"""Of the one sweep that this process drives."""
+"""The handlers of this process, which drives one sweep at most."""

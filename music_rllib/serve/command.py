@@ -15,7 +15,7 @@ import typer
 
 from music_rllib.command_line import add_command, new_app, run_app
 from music_rllib.errors import BadInputError
-from music_rllib.runtime.ray_address import check_reachable, cluster_address
+from music_rllib.runtime.machine import check_reachable, cluster_address
 from music_rllib.serve import TOKEN_VARIABLE
 
 if TYPE_CHECKING:

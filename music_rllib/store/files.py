@@ -1,4 +1,4 @@
-"""Small files, written so that a crash leaves the old content or the new one, never half of it."""
+"""Atomic writes of small files, and canonical JSON with its hash."""
 
 from __future__ import annotations
 
@@ -10,42 +10,41 @@ import uuid
 from pathlib import Path
 from typing import Any
 
-__all__ = ["canonical_json", "content_key", "sync_folder", "write_atomically"]
-
 
 def canonical_json(value: Any) -> str:
-    """JSON with one spelling per value: sorted keys, no spaces, shortest floats, no NaN.
+    """JSON that is the same for equal values: sorted keys, no spaces, shortest floats.
 
     Raises:
-        ValueError: `value` holds NaN or infinity.
+        ValueError: `value` contains NaN or infinity.
     """
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
 
 
 def content_key(value: Any) -> str:
-    """80 bits of the hash of `value`'s canonical JSON, the same on every machine."""
+    """The first 80 bits of the SHA-256 of `value`'s canonical JSON, in hex."""
     return hashlib.sha256(canonical_json(value).encode()).hexdigest()[:20]
 
 
 def write_atomically(path: Path, data: bytes, *, sync: bool = True) -> None:
-    """Replace `path` by `data`: beside it, flushed to the disk (`sync`), then renamed.
+    """Replace the content of `path`; a crash leaves either the old content or the new one.
 
-    Who may read it is up to the umask, as for any other file.
+    Writes a temporary file, flushes it to the disk if `sync`, and renames it. The umask decides who
+    may read the file.
 
     Raises:
-        OSError: With the path in its message, also where the disk is full.
+        OSError: The file cannot be written; the message names the path.
     """
-    beside = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}")
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}")
     try:
-        with beside.open("xb") as file:
+        with temporary.open("xb") as file:
             file.write(data)
             if sync:
                 file.flush()
                 os.fsync(file.fileno())
-        beside.replace(path)
+        temporary.replace(path)
     except BaseException as error:
         with contextlib.suppress(OSError):
-            beside.unlink()
+            temporary.unlink()
         if isinstance(error, OSError) and error.filename is None:
             raise OSError(error.errno, error.strerror, str(path)) from error
         raise
@@ -54,7 +53,7 @@ def write_atomically(path: Path, data: bytes, *, sync: bool = True) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Flush a folder's entries, so that a rename in it outlives a power cut."""
+    """Flush a folder's entries to the disk, so that a rename in it survives a power cut."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)

@@ -1,9 +1,9 @@
-"""Weights handed from one run to another: plain arrays, and a manifest that says what they are.
+"""Handoffs: the weights that one run takes over from another, with a manifest.
 
-A handoff is a folder with one safetensors file per module and ``handoff.json``, which names the
-task, the run that made them, and each file's size, hash and shapes. It is written last and read
-first. Nothing here can execute: a pickle in place of weights is refused by its hash, and by the
-safetensors format if the manifest was forged with it.
+A handoff is a folder with one safetensors file per module and `handoff.json`, which names the task,
+the source run, and the size, hash and shapes of each file. The manifest is written last and read
+first. A handoff cannot contain code: a pickle in place of weights has the wrong hash, and is no
+safetensors file if the manifest was forged too.
 """
 
 from __future__ import annotations
@@ -38,26 +38,14 @@ from music_rllib.version import ALGORITHM_VERSION
 if TYPE_CHECKING:
     import gymnasium as gym
 
-__all__ = [
-    "Architecture",
-    "HandoffError",
-    "HandoffInfo",
-    "HandoffManifest",
-    "Spaces",
-    "Weights",
-    "open_handoff",
-    "read_handoff",
-    "write_handoff",
-]
-
 Weights = Mapping[str, Mapping[str, npt.NDArray[Any]]]
-"""Module name to array name to array."""
+"""Arrays by module name and array name."""
 
 MANIFEST = "handoff.json"
 
 
 class HandoffError(BadInputError, ValueError):
-    """A handoff that is missing, damaged or made for something else; says which and where."""
+    """A handoff is missing, damaged or does not fit; the message says which and why."""
 
 
 class _Strict(BaseModel):
@@ -65,7 +53,7 @@ class _Strict(BaseModel):
 
 
 class Architecture(_Strict):
-    """The settings that shape a handoff's arrays."""
+    """The settings that determine the shapes and the meaning of a handoff's arrays."""
 
     hidden_sizes: tuple[int, ...]
     policy: str
@@ -73,12 +61,12 @@ class Architecture(_Strict):
     normalise_observations: bool
     estimator_hidden_size: int
     log_std_form: str = "clamp"
-    """What the policy's outputs mean; handoffs from before there was a choice do not say."""
+    """Meaning of the policy's outputs; older handoffs, made before there was a choice, lack it."""
     log_std_bounds: tuple[float, float] | None = None
-    """Of `tanh`, which scales to them; others only cut off there."""
+    """Range to which the form `tanh` scales; other forms only clip to it."""
 
     def differences(self, other: Architecture, starts_from: str) -> list[str]:
-        """Names of the settings, as in a sweep's YAML, that keep a handoff from fitting."""
+        """Names, as in a sweep's YAML, of the settings because of which a handoff does not fit."""
         if starts_from == "estimator":
             fits = self.estimator_hidden_size == other.estimator_hidden_size
             return [] if fits else ["music.hidden_size"]
@@ -89,21 +77,20 @@ class Architecture(_Strict):
 
 
 class Spaces(_Strict):
-    """What a policy must know of its environment to act without it."""
+    """The sizes and bounds of an environment's spaces that a policy needs to act."""
 
     observation_size: int = Field(gt=0)
     goal_size: int = Field(ge=0)
-    """0 without goals."""
+    """Size of a goal; 0 without goals."""
     action_low: tuple[float, ...] = Field(min_length=1)
     action_high: tuple[float, ...]
-    """The lowest and the highest action."""
 
     @classmethod
     def of(cls, observations: gym.Space[Any], actions: gym.Space[Any]) -> Spaces:
-        """Of an environment's spaces.
+        """The sizes and bounds of these spaces.
 
         Raises:
-            ValueError: Nothing can be trained in them.
+            ValueError: Training does not support such spaces.
         """
         from music_rllib.envs.make import check_action_space, observation_sizes
 
@@ -118,19 +105,19 @@ class Spaces(_Strict):
 
 
 class HandoffInfo(_Strict):
-    """Where a handoff comes from."""
+    """The run that a handoff comes from."""
 
     task: Task
     variant: str
     architecture: Architecture
     env_steps: int
-    """Environment steps that the source run had trained."""
+    """Environment steps of the source run."""
     seed: int
     node_key: str
-    """Key of the source run; determines its settings and its own source."""
+    """Key of the source run, a hash of its settings and of its own source."""
     algorithm_version: str = ALGORITHM_VERSION
     spaces: Spaces | None = None
-    """None in handoffs of earlier versions."""
+    """Spaces of the environment; None in handoffs of earlier versions."""
 
 
 class _Array(_Strict):
@@ -140,14 +127,14 @@ class _Array(_Strict):
 
 class _ModuleFile(_Strict):
     file: Annotated[str, Field(pattern=r"^[a-z_]+\.safetensors$")]
-    """Beside the manifest; the pattern keeps a forged one from pointing elsewhere."""
+    """Name beside the manifest; the pattern keeps a forged manifest from naming another place."""
     sha256: str
     bytes: int
     arrays: dict[str, _Array]
 
 
 class HandoffManifest(_Strict):
-    """Content of ``handoff.json``."""
+    """Content of `handoff.json`."""
 
     format: Literal["music_rllib handoff 1"] = "music_rllib handoff 1"
     info: HandoffInfo
@@ -155,7 +142,7 @@ class HandoffManifest(_Strict):
 
     @property
     def content_hash(self) -> str:
-        """Hash of what a run that starts from this handoff depends on."""
+        """Hash of everything in the handoff that affects a run that starts from it."""
         content = {
             "task": self.info.task.identity(),
             "modules": {name: module.sha256 for name, module in self.modules.items()},
@@ -164,16 +151,11 @@ class HandoffManifest(_Strict):
 
 
 def write_handoff(folder: Path, modules: Weights, info: HandoffInfo) -> HandoffManifest:
-    """Write `modules` and their manifest into `folder`.
-
-    Args:
-        folder: Is created; must not hold a handoff already.
-        modules: At least one; names are those of `TrainingRun.modules`.
-        info: Where they come from.
+    """Write `modules`, as `TrainingRun.modules` gives them, and their manifest into `folder`.
 
     Raises:
-        ValueError: An array holds NaN or infinity: the run diverged, nobody must start from it.
-        OSError: The folder can't be written.
+        ValueError: An array contains NaN or infinity: the run diverged, and none may start from it.
+        OSError: The folder cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     files = {}
@@ -181,7 +163,7 @@ def write_handoff(folder: Path, modules: Weights, info: HandoffInfo) -> HandoffM
         for key, array in arrays.items():
             if not np.isfinite(array).all():
                 raise ValueError(f"{name}.{key} must be finite to be handed over, it is not")
-        # C order, because safetensors writes the memory as it lies and ignores strides.
+        # In C order, because safetensors ignores strides.
         data = save_safetensors({key: np.asarray(a, order="C") for key, a in arrays.items()})
         file = f"{name}.safetensors"
         write_atomically(folder / file, data)
@@ -189,24 +171,22 @@ def write_handoff(folder: Path, modules: Weights, info: HandoffInfo) -> HandoffM
             file=file,
             sha256=hashlib.sha256(data).hexdigest(),
             bytes=len(data),
-            arrays={k: _Array(shape=a.shape, dtype=str(a.dtype)) for k, a in arrays.items()},
+            arrays=_descriptions(arrays),
         )
     manifest = HandoffManifest(info=info, modules=files)
     write_atomically(folder / MANIFEST, manifest.model_dump_json(indent=1).encode())
     return manifest
 
 
+def _descriptions(arrays: Mapping[str, npt.NDArray[Any]]) -> dict[str, _Array]:
+    return {key: _Array(shape=a.shape, dtype=str(a.dtype)) for key, a in arrays.items()}
+
+
 def open_handoff(folder: Path) -> tuple[Path, HandoffManifest]:
-    """Find and check a handoff's manifest, without its weights.
-
-    Args:
-        folder: A handoff, or a folder that has one below `handoff/`, as finished nodes do.
-
-    Returns:
-        The handoff's own folder, and its manifest.
+    """The folder and the manifest of a handoff in `folder`, or in its folder `handoff/`.
 
     Raises:
-        HandoffError: There is none, or it isn't one of this format.
+        HandoffError: There is no handoff, or its manifest is not valid.
     """
     for candidate in (folder, folder / "handoff"):
         path = candidate / MANIFEST
@@ -215,13 +195,12 @@ def open_handoff(folder: Path) -> tuple[Path, HandoffManifest]:
                 content = read_json(read_regular(path, MOST_JSON_BYTES))
                 return candidate, HandoffManifest.model_validate(content)
             except (ValueError, OSError) as error:
-                reason = _first_finding(error)
-                raise HandoffError(f"{path} must be a handoff manifest: {reason}") from None
+                raise HandoffError(f"{path} must be a handoff manifest: {_reason(error)}") from None
     found = "the folder is there" if folder.is_dir() else "there is no such folder"
     raise HandoffError(f"{folder} must hold a handoff ({MANIFEST} and weights): {found}")
 
 
-def _first_finding(error: ValueError | OSError) -> str:
+def _reason(error: ValueError | OSError) -> str:
     if isinstance(error, OSError):
         return str(error.strerror)
     if not isinstance(error, ValidationError):
@@ -234,18 +213,12 @@ def _first_finding(error: ValueError | OSError) -> str:
 def read_handoff(
     folder: Path, modules: Sequence[str], task: Task
 ) -> dict[str, dict[str, npt.NDArray[Any]]]:
-    """Load and verify `modules`.
+    """Read and verify the weights of `modules`, which must have been trained on `task`.
 
-    Args:
-        folder: As for `open_handoff`.
-        modules: Names of the modules that are needed.
-        task: The task that they must have been trained on; its name may differ.
-
-    Returns:
-        Module name to array name to array, writable.
+    Another name of the task does not matter. `folder` is as for `open_handoff`.
 
     Raises:
-        HandoffError: Something is missing, damaged, of another task or not as the manifest says.
+        HandoffError: A module is missing, damaged, or was trained on another task.
     """
     folder, manifest = open_handoff(folder)
     _check_task(folder, manifest.info.task, task)
@@ -258,8 +231,8 @@ def read_handoff(
     return {name: _read_module(folder, manifest.modules[name]) for name in modules}
 
 
-def _check_task(folder: Path, made_for: Task, wanted: Task) -> None:
-    theirs, ours = made_for.identity(), wanted.identity()
+def _check_task(folder: Path, source: Task, task: Task) -> None:
+    theirs, ours = source.identity(), task.identity()
     differences = [
         f"{key} is {json.dumps(theirs[key])} there and {json.dumps(ours[key])} here"
         for key in ours
@@ -267,7 +240,7 @@ def _check_task(folder: Path, made_for: Task, wanted: Task) -> None:
     ]
     if differences:
         raise HandoffError(
-            f"{folder} must be of task {wanted.name}, it is of {made_for.name}: "
+            f"{folder} must be of task {task.name}, it is of {source.name}: "
             + "; ".join(differences)
         )
 
@@ -293,12 +266,9 @@ def _read_module(folder: Path, expected: _ModuleFile) -> dict[str, npt.NDArray[A
         arrays = load_safetensors(data)
     except (safetensors.SafetensorError, ValueError, KeyError, TypeError) as error:
         raise HandoffError(f"{path} must be a safetensors file: {error}") from None
-    found = {key: _Array(shape=a.shape, dtype=str(a.dtype)) for key, a in arrays.items()}
-    if found != expected.arrays:
-        wrong = sorted(
-            key
-            for key in found.keys() | expected.arrays.keys()
-            if found.get(key) != expected.arrays.get(key)
-        )
+    found = _descriptions(arrays)
+    keys = found.keys() | expected.arrays.keys()
+    wrong = sorted(key for key in keys if found.get(key) != expected.arrays.get(key))
+    if wrong:
         raise HandoffError(f"{path} must have the arrays in {MANIFEST}; wrong: {', '.join(wrong)}")
     return arrays

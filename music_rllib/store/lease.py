@@ -1,12 +1,12 @@
-"""Who may write something: one owner at a time, for a while, and again while it renews.
+"""Leases: only one process at a time may write a run.
 
-A worker can outlive the driver that started it, and a second sweep may want the same run: whoever
-computes a run holds its lease. A lease that isn't renewed expires; one whose process is known to
-be dead, because it ran on this machine, needs no waiting. A process that was suspended (a laptop
-asleep) finds its lease lost when it goes on, and makes way.
+A worker can outlive the driver that started it, and a second sweep may need the same run, so
+whoever computes a run holds its lease. A lease expires unless it is renewed. The lease of a process
+of this machine that is known to be dead need not expire first. A process that was suspended (a
+laptop asleep) finds its lease lost when it resumes, and stops writing.
 
-On a disk, taking and renewing happen under a file lock. An object store has none: there, who
-writes last has the lease, and everybody looks again after a moment.
+On a disk, a file lock protects taking and renewing a lease. An object store has no locks: the last
+writer has the lease, and every writer reads it again after a moment.
 """
 
 from __future__ import annotations
@@ -25,53 +25,43 @@ import pyarrow.fs as pafs
 from filelock import FileLock
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from music_rllib.store.object_folder import StorageError
-
-__all__ = [
-    "HeldLease",
-    "Lease",
-    "LeaseFile",
-    "LeaseLostError",
-    "process_start",
-    "runs_here",
-    "this_machine",
-]
+from music_rllib.store.object_folder import StorageError, must_be_writable
 
 EXPIRES_SECONDS = 60.0
-"""How long a lease holds that isn't renewed; clocks of machines should agree better than that."""
+"""Time until a lease expires that is not renewed; machines' clocks must agree better than that."""
 RENEWALS = 4
-"""So often it is renewed in that time."""
+"""Number of renewals in that time."""
 SETTLE_SECONDS = 2.0
-"""Between writing a lease into an object store and trusting that nobody else did."""
+"""Wait between writing a lease into an object store and reading it again."""
 LOCK_SECONDS = 30.0
 
 
 class LeaseLostError(RuntimeError):
-    """Somebody else computes the run now: what this process has must not be written."""
+    """Another process computes the run now, so this one must not write its results."""
 
 
 class Lease(BaseModel):
-    """Who holds it, and until when."""
+    """The process that holds the lease, and until when."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     owner: str
-    """Unlike any other."""
+    """Unique id of the owner."""
     what: str
-    """For messages: what the owner is doing it for."""
+    """Purpose of the lease, for messages."""
     host: str
     machine: str
-    """Where `pid` has a meaning: a boot of a machine, and a container on it."""
+    """Value of `this_machine`, where `pid` is valid."""
     pid: int
     process_started: float
-    """As `process_start` gives it."""
+    """Value of `process_start`."""
     since: float
-    """Seconds since the epoch, as is `expires`."""
+    """Seconds since the epoch, like `expires`."""
     expires: float
 
     @classmethod
     def of_this_process(cls, what: str, seconds: float | None = None) -> Lease:
-        """A new lease, from now on."""
+        """A new lease of this process that starts now."""
         now = time.time()
         seconds = EXPIRES_SECONDS if seconds is None else seconds
         return cls(
@@ -87,11 +77,11 @@ class Lease(BaseModel):
 
     @property
     def seconds(self) -> float:
-        """How long it holds without being renewed: at most."""
+        """Seconds until the lease expires."""
         return max(0.0, self.expires - time.time())
 
     def holds(self) -> bool:
-        """Whether its owner may still be at work."""
+        """Whether the owner may still be at work."""
         if time.time() >= self.expires:
             return False
         return self.machine != this_machine() or runs_here(self.pid, self.process_started)
@@ -102,7 +92,7 @@ class Lease(BaseModel):
 
 
 def this_machine() -> str:
-    """What tells two places apart whose process ids have nothing to do with each other."""
+    """Id of the boot of this machine and of the container, within which process ids are unique."""
     try:
         boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
         return f"{boot} {Path('/proc/self/ns/pid').readlink()}"
@@ -111,22 +101,22 @@ def this_machine() -> str:
 
 
 def process_start(pid: int) -> float:
-    """When a process of this machine began, in seconds, by a clock that nobody sets.
+    """Start time of a process of this machine, in seconds of a clock that nobody can set.
 
     Raises:
-        psutil.NoSuchProcess: There is none.
+        psutil.NoSuchProcess: The process does not exist.
     """
     try:
         stat = Path(f"/proc/{pid}/stat").read_text()
     except FileNotFoundError:
-        # Not Linux, or no such process; psutil adds the time of day of the boot.
+        # Not Linux, or no such process. psutil's value depends on the time of day of the boot.
         return float(psutil.Process(pid).create_time())
-    # After the name, which may hold anything, come the third and further fields; this is the 22nd.
+    # The 22nd field. The third one follows the name, which may contain anything, in parentheses.
     return int(stat.rpartition(")")[2].split()[19]) / os.sysconf("SC_CLK_TCK")
 
 
 def runs_here(pid: int, started: float) -> bool:
-    """Whether this machine has that process, and it is the one that began then."""
+    """Whether this machine runs the process `pid` that started at `started`."""
     try:
         return abs(process_start(pid) - started) < 1 and psutil.Process(pid).status() != "zombie"
     except psutil.NoSuchProcess:
@@ -136,18 +126,20 @@ def runs_here(pid: int, started: float) -> bool:
 
 
 class LeaseFile:
-    """Where one lease is kept."""
+    """The file of one lease; it and its folder need not exist.
+
+    Methods raise StorageError if it cannot be written.
+    """
 
     def __init__(self, filesystem: pafs.FileSystem, path: str) -> None:
-        """Look at `path`, which need not exist; nor need its folder."""
         self._fs = filesystem
         self.path = path
         self._local = isinstance(filesystem, pafs.LocalFileSystem)
         self._seen: tuple[Lease | None, float] = (None, 0.0)
-        """Somebody's lease, and since when it is there, by a clock that nobody sets."""
+        """The lease of another owner, and the monotonic time when it was first seen."""
 
     def read(self) -> Lease | None:
-        """What is there; None if nothing is, or nothing that can be read."""
+        """The lease in the file; None if the file does not exist or is not readable."""
         try:
             with self._fs.open_input_stream(self.path) as stream:
                 return Lease.model_validate_json(stream.read())
@@ -155,17 +147,13 @@ class LeaseFile:
             return None
 
     def acquire(self, lease: Lease) -> Lease | None:
-        """Take it over, unless somebody holds it: then theirs, which is to be waited for.
-
-        Raises:
-            StorageError: The place can't be written.
-        """
-        # Who only waits must not touch a folder that its owner may be deleting.
-        with contextlib.suppress(OSError):  # said below, with the place
-            if (holder := self._holder_beside(lease)) is not None:
+        """Take the lease and return None, or return the lease of another owner that holds."""
+        # A process that only waits must not write to a folder that the owner may be deleting.
+        with contextlib.suppress(OSError):  # raised below, with the path
+            if (holder := self._other_holder(lease)) is not None:
                 return holder
         with self._exclusively(make_folder=True):
-            if (holder := self._holder_beside(lease)) is not None:
+            if (holder := self._other_holder(lease)) is not None:
                 return holder
             self._write(lease)
         if self._local:
@@ -174,22 +162,18 @@ class LeaseFile:
         holder = self.read()
         return None if holder is None or holder.owner == lease.owner else holder
 
-    def _holder_beside(self, lease: Lease) -> Lease | None:
+    def _other_holder(self, lease: Lease) -> Lease | None:
         holder = self.read()
         if holder is None or holder.owner == lease.owner or not holder.holds():
             return None
         if holder != self._seen[0]:
             self._seen = (holder, time.monotonic())
-        # One that would hold longer was dated by another clock, or before this one was set back.
+        # A lease that holds longer was dated by another clock, or before this one was set back.
         stale = time.monotonic() - self._seen[1] >= EXPIRES_SECONDS
         return None if holder.seconds > EXPIRES_SECONDS and stale else holder
 
     def renew(self, lease: Lease) -> bool:
-        """Write a later expiry; False, and nothing is written, where it is somebody else's.
-
-        Raises:
-            StorageError: The place can't be written.
-        """
+        """Write the lease again, unless another owner has it; returns whether it was written."""
         if not self.is_owned_by(lease.owner):
             return False
         with self._exclusively():
@@ -199,19 +183,21 @@ class LeaseFile:
         return True
 
     def is_owned_by(self, owner: str) -> bool:
-        """Whether the lease that is there is this owner's."""
+        """Whether the file has a lease of this owner."""
         holder = self.read()
         return holder is not None and holder.owner == owner
 
     def release(self, owner: str) -> None:
-        """Remove it, if it is this owner's."""
+        """Delete the lease if it is this owner's."""
         with contextlib.suppress(OSError, StorageError):
             if not self.is_owned_by(owner):
-                return  # and nothing is made where the new owner may have deleted all
+                return  # creates no lock file in a folder that the new owner may have deleted
             with self._exclusively():
                 if self.is_owned_by(owner):
                     self._fs.delete_file(self.path)
-                    if self._local:  # who waits for the lock notices, and makes another one
+                    if (
+                        self._local
+                    ):  # a process that waits for the lock notices, and creates another
                         self._lock_path.unlink()
 
     @contextlib.contextmanager
@@ -219,11 +205,8 @@ class LeaseFile:
         if not self._local:
             yield
             return
-        try:
+        with must_be_writable(self.path):
             lock = self._lock(make_folder=make_folder)
-        except OSError as error:
-            place = error.filename or self.path
-            raise StorageError(f"{place} must be writable: {error.strerror or error}") from error
         try:
             yield
         finally:
@@ -236,7 +219,7 @@ class LeaseFile:
                 if make_folder:
                     self._lock_path.parent.mkdir(parents=True, exist_ok=True)
                 lock.acquire()
-            except (FileNotFoundError, FileExistsError):  # somebody has just deleted the folder
+            except (FileNotFoundError, FileExistsError):  # the folder was deleted just now
                 attempts -= 1
                 if not make_folder or not attempts:
                     raise
@@ -255,7 +238,7 @@ class LeaseFile:
                 with self._fs.open_output_stream(self.path) as sink:
                     sink.write(data)
                 return
-            # Renamed, so that nobody reads half of it; after a power cut nobody needs it.
+            # Renamed, so that nobody reads half of it; not flushed: no owner survives a power cut.
             temporary = Path(f"{self.path}.{lease.owner}")
             temporary.write_bytes(data)
             temporary.replace(self.path)
@@ -266,35 +249,34 @@ class LeaseFile:
 
 
 class HeldLease:
-    """A lease that this process has acquired, renewed in the background until it is released."""
+    """A lease that was just acquired in `file`, which a thread renews until it is released.
+
+    The thread calls `on_lost` when it finds that another process has taken the lease.
+    """
 
     def __init__(
         self, file: LeaseFile, lease: Lease, on_lost: Callable[[], None] = lambda: None
     ) -> None:
-        """Go on renewing `lease`, which `file` has just accepted.
-
-        `on_lost` is called, in a thread, when a renewal finds that it is somebody else's.
-        """
         self._file, self._lease = file, lease
         self._duration = lease.expires - lease.since
         self._ended = threading.Event()
         self._on_lost = on_lost
         self.lost = False
-        """Whether somebody else has it, as far as that is known without asking."""
+        """Whether another process is known to have the lease."""
         self._thread = threading.Thread(target=self._renew, name="lease", daemon=True)
         self._thread.start()
 
     def is_lost(self) -> bool:
-        """Look again whether somebody else has it."""
-        with contextlib.suppress(OSError):  # a store that doesn't answer says nothing
+        """Read the file again; returns whether another process has the lease."""
+        with contextlib.suppress(OSError):  # a store that does not answer proves nothing
             self.lost = self.lost or not self._file.is_owned_by(self._lease.owner)
         return self.lost
 
     def check(self) -> None:
-        """Look again, before something is written that belongs to the owner.
+        """Read the file again, before something is written that only the owner may write.
 
         Raises:
-            LeaseLostError: It is somebody else's by now.
+            LeaseLostError: Another process has the lease.
         """
         if self.is_lost():
             raise LeaseLostError(
@@ -304,12 +286,12 @@ class HeldLease:
             )
 
     def release(self) -> None:
-        """Let others have it."""
+        """Stop renewing, and delete the lease."""
         self.end()
         self._file.release(self._lease.owner)
 
     def end(self) -> None:
-        """Renew no more."""
+        """Stop renewing."""
         self._ended.set()
         if threading.current_thread() is not self._thread:
             self._thread.join(timeout=5.0)
@@ -317,7 +299,7 @@ class HeldLease:
     def _renew(self) -> None:
         while self._wait_until_due():
             later = self._lease.model_copy(update={"expires": time.time() + self._duration})
-            # A full disk, or a store that doesn't answer: until it expires there is time.
+            # A full disk, or a store that does not answer, may recover before the lease expires.
             with contextlib.suppress(OSError, StorageError):
                 if not self._file.renew(later):
                     self.lost = True
@@ -325,9 +307,9 @@ class HeldLease:
                     return
 
     def _wait_until_due(self) -> bool:
-        """Wait for the next renewal; False at the end.
+        """Wait for the next renewal; False if there is none because of `end`.
 
-        It is due at once after the process or the machine slept, or the time of day was set.
+        A renewal is due at once after the machine slept or the time of day was set.
         """
         pause = self._duration / RENEWALS
         day, steady = time.time(), time.monotonic()

@@ -1,15 +1,15 @@
-"""The node store: finished runs by the hash of what determines them, and the state of others.
+"""The node store: finished runs by the hash of their settings, and checkpoints of unfinished runs.
 
-Below one storage folder or bucket, shared by all sweeps in it::
+All sweeps in a storage folder or bucket share one store::
 
     nodes/<key>/      a finished run: handoff/, history.jsonl, run.json, manifest.json last
-    work/<key>/<n>/   checkpoints of a run that isn't finished, each with its manifest
-    work/<key>/parts/ what checkpoints share, such as old trajectories
-    work/<key>/lease.json   who is computing the run, and until when that holds
-    continuations/<key>/<n>/   where a finished run ended, for one with a larger budget
-    verified.json     on a disk: finished runs that have been read through
+    work/<key>/<n>/   checkpoints of an unfinished run, each with its manifest
+    work/<key>/parts/ data that checkpoints share, such as old trajectories
+    work/<key>/lease.json   the process that computes the run, and until when that holds
+    continuations/<key>/<n>/   the end of a finished run, for a run with a larger budget
+    verified.json     on a disk: fingerprints of finished runs that were verified
 
-The store, not Tune's snapshot, says what is finished.
+The store, not Tune's snapshot, decides which runs are finished.
 """
 
 from __future__ import annotations
@@ -27,55 +27,34 @@ import pyarrow.fs as pafs
 
 from music_rllib.store.lease import LeaseFile
 from music_rllib.store.object_folder import DamagedError, Manifest, ObjectFolders, open_storage
-from music_rllib.store.run_record import (
-    HISTORY,
-    Report,
-    RunResult,
-    from_json_lines,
-    last_values,
-)
-from music_rllib.store.verified import Verified, fingerprint
-
-__all__ = [
-    "CONTINUATIONS",
-    "KEEP",
-    "TRAIN_AGAIN",
-    "Draft",
-    "NodeStore",
-    "Saved",
-    "WorkFolder",
-    "damage_in_words",
-    "steps_of",
-]
+from music_rllib.store.run_record import HISTORY, Report, RunResult, from_json_lines, last_values
+from music_rllib.store.verified import Verified, fingerprint_of
 
 FORMAT = "music_rllib checkpoint 2"
 KEEP = 2
-"""Checkpoints of a run that are kept, unless a sweep says else."""
-LEASE = "lease.json"
+"""Number of checkpoints of a run that are kept by default."""
 SHOWN = 10
-"""Damaged runs that are named."""
+"""Number of damaged runs that a message names."""
 CONTINUATIONS = "continuations"
-VERIFIED = "verified.json"
 TRAIN_AGAIN = "'run' and 'resume' train what is damaged again with --retrain-damaged"
 
 
 class NodeStore:
-    """Finished nodes and the checkpoints of unfinished ones."""
+    """The finished nodes and the work folders of the storage `uri` (see `open_storage`).
+
+    Methods raise DamagedError if a node does not exist or differs from its manifest, and
+    StorageError if the storage cannot be reached or written.
+    """
 
     def __init__(self, uri: str) -> None:
-        """Open `uri`, a folder or bucket as for `sealed.open_storage`.
-
-        Raises:
-            StorageError: It can't be resolved or reached.
-        """
         self.uri = uri
         self._fs, self._root = open_storage(uri)
         self._nodes = ObjectFolders(self._fs, f"{self._root}/nodes")
         self._local = isinstance(self._fs, pafs.LocalFileSystem)
-        self._verified = Verified(Path(self._root, VERIFIED))
+        self._verified = Verified(Path(self._root, "verified.json"))
 
     def path(self, key: str) -> str:
-        """Where the node is or would be, for messages."""
+        """Path of a node, whether it exists or not."""
         return self._nodes.path(key)
 
     def is_finished(self, key: str) -> bool:
@@ -83,148 +62,127 @@ class NodeStore:
         return self._nodes.exists(key)
 
     def result(self, key: str) -> RunResult | None:
-        """The end of a finished run; None for a node that is an imported handoff.
-
-        Raises:
-            DamagedError: The node isn't there or can't be read.
-        """
-        with self._saying_what_to_do(key):
+        """The result of a finished run; None for an imported handoff."""
+        with self._advice():
             result = self._nodes.manifest(key).meta.get("result")
         return None if result is None else RunResult.model_validate(result)
 
     def history(self, key: str) -> list[Report]:
-        """All reports of a finished run.
-
-        Raises:
-            DamagedError: The node has no readable history.
-        """
+        """All reports of a finished run."""
         try:
             return from_json_lines(self._nodes.read(key, HISTORY))
         except ValueError as error:
             raise DamagedError(f"{self.path(key)}/{HISTORY} must hold reports: {error}") from error
 
     def publish(self, key: str, folder: Path, result: RunResult | None = None) -> None:
-        """Make `folder`'s files the node `key`, for good. A node that exists stays as it is.
-
-        Raises:
-            StorageError: The storage can't be written; names the path.
-        """
+        """Copy the files of `folder` to the node `key`, unless it exists already."""
         if self.is_finished(key):
             return
         meta = {"result": None if result is None else result.model_dump()}
         with self._nodes.sealing(key, meta) as staging:
-            # Without the modes of a temporary folder, which only its owner may read.
+            # The modes of a temporary folder, which only its owner may read, are not copied.
             for file in filter(Path.is_file, folder.rglob("*")):
                 target = staging / file.relative_to(folder)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(file, target)
 
     def tidy(self, key: str) -> None:
-        """Delete what killed attempts at publishing `key` have left: for its lease's holder."""
+        """Delete what killed attempts at publishing a node have left; needs the node's lease."""
         self._nodes.tidy(key)
 
     def fetch(self, key: str, folder: Path) -> None:
-        """Copy a finished node's files into `folder`, verified.
-
-        Raises:
-            DamagedError: The node isn't what its manifest says.
-        """
+        """Copy a finished node's files into `folder`, verified."""
         self._nodes.fetch(key, folder)
 
     def verify(self, key: str) -> None:
-        """Compare a finished node with its manifest, so that nothing depends on a damaged one.
-
-        Raises:
-            DamagedError: The node isn't what its manifest says; the message says what to do.
-        """
-        with self._saying_what_to_do(key):
+        """Check that a finished node matches its manifest."""
+        with self._advice():
             self._nodes.check(key)
 
     def is_sound(self, key: str) -> bool:
-        """Whether the node has been published and is what its manifest says."""
+        """Whether the node has been published and matches its manifest."""
         return self.is_finished(key) and not self.damage([key])
 
     def damage(self, keys: Iterable[str]) -> dict[str, DamagedError]:
-        """Which of these finished nodes aren't what their manifests say, and why.
+        """The finished nodes among `keys` that differ from their manifests, with the errors.
 
-        On a disk a node that was sound before, and whose files have the same places, sizes and
-        times, isn't read again.
+        On a disk, a node that was sound before and whose files have the same inodes, sizes and
+        times is not read again.
         """
-        found = {}
+        damaged = {}
         for key in keys:
             try:
-                mark = self._fingerprint(key)
-                if not self._verified.has(key, mark):
+                fingerprint = self._fingerprint(key)
+                if not self._verified.has(key, fingerprint):
                     self._check(key)
-                    self._verified.add(key, mark)
+                    self._verified.add(key, fingerprint)
             except DamagedError as error:
-                found[key] = error
+                damaged[key] = error
             except OSError as error:
                 place = error.filename or self.path(key)
-                found[key] = DamagedError(f"{place} must be readable: {error.strerror}")
-        self._verified.keep()
-        return found
+                damaged[key] = DamagedError(f"{place} must be readable: {error.strerror}")
+        self._verified.save()
+        return damaged
 
     def _fingerprint(self, key: str) -> str | None:
         if not self._local:
             return None
         try:
-            return fingerprint(map(Path, self._nodes.files(key)))
+            return fingerprint_of(map(Path, self._nodes.files(key)))
         except FileNotFoundError:
-            return None  # to be named
+            return None  # `_check` names the file
 
     def _check(self, key: str) -> None:
         self._nodes.check(key)
         manifest = self._nodes.manifest(key)
         result = manifest.meta.get("result")
-        # The manifest has no hash of its own; what it says of the result is in the history too.
+        # The manifest has no hash of its own, but the history has the values of its result too.
         if self._local and result is not None and HISTORY in manifest.files:
             last = last_values(self.history(key))
-            if not _same(RunResult.model_validate(result).metrics, last):
+            # As text, because NaN equals nothing.
+            if _as_text(RunResult.model_validate(result).metrics) != _as_text(last):
                 raise DamagedError(
                     f"{self.path(key)}/manifest.json must have the last values of {HISTORY}, it "
                     "has others"
                 )
 
     def remove(self, key: str) -> None:
-        """Delete a node, for it to be trained again."""
+        """Delete a node, so that it is trained again."""
         self._nodes.remove(key)
 
     @contextlib.contextmanager
-    def _saying_what_to_do(self, key: str) -> Iterator[None]:
+    def _advice(self) -> Iterator[None]:
+        """Append what to do to the message of a DamagedError."""
         try:
             yield
         except DamagedError as error:
             raise DamagedError(f"{error}. {TRAIN_AGAIN}") from error
 
     def begun(self) -> set[str]:
-        """Keys of runs that have a work folder."""
+        """Keys of the runs that have a work folder."""
         selector = pafs.FileSelector(f"{self._root}/work", allow_not_found=True)
         return {info.base_name for info in self._fs.get_file_info(selector)}
 
     def work_folder(self, key: str, keep: int = KEEP) -> WorkFolder:
-        """Where a run that isn't finished keeps its newest `keep` checkpoints."""
+        """The folder of an unfinished run, with its newest `keep` checkpoints."""
         return WorkFolder(self._fs, f"{self._root}/work/{key}", keep)
 
     def has_continuations(self) -> bool:
-        """Whether any run has left its end to a longer one."""
+        """Whether there is any folder of `continuation`."""
         selector = pafs.FileSelector(f"{self._root}/{CONTINUATIONS}", allow_not_found=True)
         return bool(self._fs.get_file_info(selector))
 
     def continuation(self, key: str) -> WorkFolder:
-        """Where runs that differ in their budget alone leave the last checkpoint of the longest."""
+        """The folder with the last checkpoint of the longest of runs that differ only in budget."""
         return WorkFolder(self._fs, f"{self._root}/{CONTINUATIONS}/{key}", keep=1)
 
 
-def _same(one: Mapping[str, float], other: Mapping[str, float]) -> bool:
-    """Also where both have a NaN, which equals nothing."""
-    return {name: repr(value) for name, value in one.items()} == {
-        name: repr(value) for name, value in other.items()
-    }
+def _as_text(metrics: Mapping[str, float]) -> dict[str, str]:
+    return {name: repr(value) for name, value in metrics.items()}
 
 
 def damage_in_words(damage: Mapping[str, DamagedError]) -> str:
-    """Labels of runs, and what is wrong with each; with what to do."""
+    """A message with the labels of damaged runs, their errors, and what to do."""
     lines = [f"  {label}: {error}" for label, error in list(damage.items())[:SHOWN]]
     if len(damage) > SHOWN:
         lines.append(f"  ... and {len(damage) - SHOWN} more")
@@ -233,16 +191,15 @@ def damage_in_words(damage: Mapping[str, DamagedError]) -> str:
 
 
 class WorkFolder:
-    """Checkpoints of one run, numbered by environment steps.
+    """The newest `keep` checkpoints of one run in the folder `root`, by environment steps.
 
-    Content that doesn't change any more (old trajectories) is in *parts* of their own, below
-    ``parts/``: a checkpoint names those that it needs, and a later one needs them too.
+    Data that does not change any more, such as old trajectories, is in *parts* below `parts/`.
+    Several checkpoints may need the same parts; each names its own.
     """
 
     def __init__(self, filesystem: pafs.FileSystem, root: str, keep: int = KEEP) -> None:
-        """Look at `root`; keep the newest `keep` checkpoints, and the parts that they need."""
         self.root = root
-        self.lease = LeaseFile(filesystem, f"{root}/{LEASE}")
+        self.lease = LeaseFile(filesystem, f"{root}/lease.json")
         self._checkpoints = ObjectFolders(filesystem, root)
         self._parts = ObjectFolders(filesystem, f"{root}/parts")
         self._keep = keep
@@ -251,12 +208,12 @@ class WorkFolder:
 
     @contextlib.contextmanager
     def new_checkpoint(self, env_steps: int) -> Iterator[Draft]:
-        """Give a draft to fill; it becomes the newest checkpoint when the `with` ends.
+        """Yield a draft to fill; it becomes the newest checkpoint when the `with` ends.
 
         Raises:
-            StorageError: The storage can't be written; older checkpoints are intact.
+            StorageError: The storage cannot be written; older checkpoints are intact.
         """
-        # Two attempts may reach the same step, the second one because the first is damaged.
+        # A run may save the same step twice, if the first checkpoint is damaged.
         name = f"{env_steps:012d}-{uuid.uuid4().hex[:8]}"
         meta: dict[str, Any] = {"format": FORMAT}
         with self._checkpoints.sealing(name, meta) as folder:
@@ -271,7 +228,7 @@ class WorkFolder:
             self._checkpoints.remove(name)
         needed: set[str] = set()
         for name in names[-self._keep :]:
-            # One whose manifest is damaged can't be used, whatever it needs.
+            # A checkpoint with a damaged manifest cannot be used, so it needs no parts.
             with contextlib.suppress(DamagedError):
                 needed.update(_needs(self._checkpoints.manifest(name)))
         for name in set(self._parts.names()) - needed:
@@ -281,18 +238,18 @@ class WorkFolder:
     def newest(
         self, warn: Callable[[str], None] = warnings.warn, most: int | None = None
     ) -> Iterator[Saved | None]:
-        """A verified local copy of the newest sound checkpoint, or None, for this `with`.
+        """Yield a verified local copy of the newest sound checkpoint, or None.
 
         Args:
-            warn: Is told about each damaged checkpoint that is skipped.
-            most: Only those of at most so many environment steps.
+            warn: Called with a message for each damaged checkpoint, which is skipped.
+            most: Largest number of environment steps of the checkpoint.
         """
         for name in reversed(self._checkpoints.names()):
             if most is not None and steps_of(name) > most:
                 continue
-            with TemporaryDirectory() as above:
+            with TemporaryDirectory() as temporary:
                 try:
-                    saved = self._fetch(name, Path(above))
+                    saved = self._fetch(name, Path(temporary))
                 except DamagedError as error:
                     warn(f"a damaged checkpoint is skipped: {error}")
                     continue
@@ -300,8 +257,8 @@ class WorkFolder:
                 return
         yield None
 
-    def _fetch(self, name: str, above: Path) -> Saved:
-        manifest = self._checkpoints.fetch(name, above / "checkpoint")
+    def _fetch(self, name: str, folder: Path) -> Saved:
+        manifest = self._checkpoints.fetch(name, folder / "checkpoint")
         if manifest.meta.get("format") != FORMAT:
             raise DamagedError(
                 f"{self._checkpoints.path(name)} must be a {FORMAT!r}, "
@@ -309,28 +266,28 @@ class WorkFolder:
             )
         parts = {}
         for part in _needs(manifest):
-            parts[part] = above / "parts" / part
+            parts[part] = folder / "parts" / part
             self._parts.fetch(part, parts[part])
-        return Saved(above / "checkpoint", parts)
+        return Saved(folder / "checkpoint", parts)
 
     def history(self) -> list[Report]:
-        """Reports up to the newest checkpoint whose history is sound; none where there is none."""
+        """Reports of the newest checkpoint whose history is sound; [] if there is none."""
         for name in reversed(self._checkpoints.names()):
             with contextlib.suppress(DamagedError, ValueError):
                 return from_json_lines(self._checkpoints.read(name, HISTORY))
         return []
 
     def tidy(self) -> None:
-        """Delete what killed attempts have left. Only for who holds the lease."""
+        """Delete what killed attempts have left; the caller must hold the lease."""
         self._checkpoints.tidy()
         self._parts.tidy()
 
     def names(self) -> list[str]:
-        """The checkpoints there are, oldest first."""
+        """Names of the checkpoints, oldest first."""
         return self._checkpoints.names()
 
     def read(self, name: str) -> str | None:
-        """A small text file in the folder; None where it isn't there."""
+        """Content of a small text file in the folder; None if it does not exist."""
         try:
             with self._fs.open_input_stream(f"{self.root}/{name}") as stream:
                 return bytes(stream.read()).decode(errors="replace")
@@ -338,24 +295,24 @@ class WorkFolder:
             return None
 
     def remove_file(self, name: str) -> None:
-        """Delete such a file, if it is there."""
+        """Delete a file in the folder, if it exists."""
         with contextlib.suppress(FileNotFoundError):
             self._fs.delete_file(f"{self.root}/{name}")
 
     def remove_if_empty(self) -> None:
-        """Delete the folder, where it is on a disk and has nothing in it."""
+        """Delete the folder if it is on a disk and empty."""
         if self._local:
             with contextlib.suppress(OSError):
                 Path(self.root).rmdir()
 
     def clear(self) -> None:
-        """Delete all checkpoints: the run is finished."""
+        """Delete all checkpoints and parts, as the run is finished."""
         self._parts.remove_all()
         self._checkpoints.remove_all()
 
 
 def steps_of(checkpoint: str) -> int:
-    """Environment steps of a checkpoint, by its name."""
+    """Environment steps of the checkpoint of this name."""
     return int(checkpoint.split("-")[0])
 
 
@@ -365,31 +322,26 @@ def _needs(manifest: Manifest) -> list[str]:
 
 
 class Saved(NamedTuple):
-    """A checkpoint, on the local disk and verified."""
+    """A verified copy of a checkpoint on the local disk."""
 
     folder: Path
     parts: Mapping[str, Path]
-    """Name to folder of what it shares with other checkpoints."""
+    """Folder of each part, by its name."""
 
 
 class Draft:
-    """A checkpoint that is being written."""
+    """A checkpoint that is being written to `folder`, with its new parts in `parts`."""
 
     def __init__(self, folder: Path, parts: ObjectFolders) -> None:
-        """Let `folder` be filled, and parts be added to `parts`."""
         self.folder = folder
         self.needs: list[str] = []
-        """Names of the parts that belong to it: new ones and those of earlier checkpoints."""
+        """Names of the parts that the checkpoint needs, new or of earlier checkpoints."""
         self._parts = parts
 
     @contextlib.contextmanager
     def new_part(self, label: str) -> Iterator[tuple[str, Path]]:
-        """Give the name of a new part, and a folder to fill with it.
-
-        Raises:
-            StorageError: The storage can't be written.
-        """
-        # Never the name of one that is there: that one may be damaged.
+        """Yield the name of a new part and a folder to fill."""
+        # Never the name of an existing part, which may be damaged.
         name = f"{label}-{uuid.uuid4().hex[:8]}"
         with self._parts.sealing(name, {}) as folder:
             yield name, folder

@@ -1,9 +1,9 @@
-"""Folders that are either complete and verifiable or not there, on disks and in object stores.
+"""Sealed folders: written completely or not at all, and verifiable, on disks and object stores.
 
-A sealed folder has a ``manifest.json`` with the size and SHA-256 of each of its files. The
-manifest appears last: on a disk the whole folder is written under another name, flushed and
-renamed; an object store can't rename, so the files of each attempt have a prefix of their own and
-the manifest, which names it, is uploaded at the end. A folder without a manifest doesn't exist.
+A sealed folder has a `manifest.json` with the size and SHA-256 of each of its files. The manifest
+appears last: on a disk the whole folder is written under another name, flushed and renamed. An
+object store cannot rename, so each attempt uploads its files under a prefix of its own, and the
+manifest, which names the prefix, at the end. A folder without a manifest does not exist.
 """
 
 from __future__ import annotations
@@ -11,13 +11,14 @@ from __future__ import annotations
 import contextlib
 import errno
 import hashlib
+import io
 import os
 import shutil
 import tempfile
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterator
 from pathlib import Path, PurePosixPath
-from typing import IO, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import pyarrow.fs as pafs
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue, ValidationError
@@ -26,19 +27,30 @@ from music_rllib.errors import BadInputError
 from music_rllib.limits import MOST_JSON_BYTES, open_regular, read_json
 from music_rllib.store.files import sync_folder, write_atomically
 
-__all__ = ["DamagedError", "Manifest", "ObjectFolders", "StorageError", "open_storage"]
-
 MANIFEST = "manifest.json"
 _CHUNK = 1 << 20
 _CANNOT_WRITE = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO}
 
 
 class StorageError(BadInputError, RuntimeError):
-    """Storage that can't be used; the message names the place and what to do."""
+    """Storage that cannot be used; the message names the place and what to do."""
 
 
 class DamagedError(StorageError):
-    """Content that isn't what its manifest says."""
+    """Content that differs from its manifest."""
+
+
+@contextlib.contextmanager
+def must_be_writable(path: str, codes: Container[int | None] | None = None) -> Iterator[None]:
+    """Raise StorageError for an OSError of this `with`; if `codes` are given, only for these."""
+    try:
+        yield
+    except OSError as error:
+        if codes is not None and error.errno not in codes:
+            raise
+        raise StorageError(
+            f"{error.filename or path} must be writable: {error.strerror or error}"
+        ) from error
 
 
 def _inside(name: str) -> str:
@@ -49,11 +61,8 @@ def _inside(name: str) -> str:
     return name
 
 
-FileName = Annotated[str, AfterValidator(_inside)]
-
-
 class FileRecord(BaseModel):
-    """Size and hash of one file."""
+    """Size and hash of a file."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -62,31 +71,31 @@ class FileRecord(BaseModel):
 
 
 class Manifest(BaseModel):
-    """Content of a sealed folder's ``manifest.json``."""
+    """Content of a sealed folder's `manifest.json`."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="constants")
 
     format: Literal["music_rllib sealed folder 1"] = "music_rllib sealed folder 1"
     name: str
     prefix: Annotated[str, Field(pattern=r"^([0-9a-f]{32}/)?$")] = ""
-    """Where the files lie below the folder: nowhere else, or below their attempt's name."""
-    files: dict[FileName, FileRecord]
+    """Path of the files below the folder: empty, or the name of an upload attempt."""
+    files: dict[Annotated[str, AfterValidator(_inside)], FileRecord]
     meta: dict[str, JsonValue]
-    """What the owner of the folder says about it."""
+    """Data of the folder's owner."""
 
 
 def open_storage(uri: str) -> tuple[pafs.FileSystem, str]:
-    """Resolve a folder or bucket.
+    """Open a folder or bucket.
 
     Args:
-        uri: A path (`~` is expanded, a relative one starts at the working directory) or a URI
+        uri: A path (`~` is expanded, a relative path starts at the working directory) or a URI
             that pyarrow knows: `s3://bucket/path`, `gs://bucket/path`, `file:///path`.
 
     Returns:
         The file system, and the root within it, without a trailing slash.
 
     Raises:
-        StorageError: The URI has no meaning, or the place can't be reached.
+        StorageError: The URI is not valid, or the place cannot be reached.
     """
     if "://" not in uri:
         uri = str(Path(uri).expanduser().absolute())
@@ -101,84 +110,74 @@ def open_storage(uri: str) -> tuple[pafs.FileSystem, str]:
 
 
 class ObjectFolders:
-    """The sealed folders below one place."""
+    """The sealed folders below `root`, which may not exist yet.
+
+    Reading raises DamagedError if a folder does not exist or differs from its manifest.
+    """
 
     def __init__(self, filesystem: pafs.FileSystem, root: str) -> None:
-        """Look at `root`, which need not exist yet."""
         self._fs = filesystem
         self._root = root
         self._local = isinstance(filesystem, pafs.LocalFileSystem)
 
     def path(self, name: str) -> str:
-        """Where `name` is or would be, for messages."""
+        """Path of the folder `name`, whether it exists or not."""
         return f"{self._root}/{name}"
 
     def names(self) -> list[str]:
-        """The sealed folders there are, sorted."""
+        """Sorted names of the sealed folders."""
         selector = pafs.FileSelector(self._root, allow_not_found=True)
         folders = [info.base_name for info in self._fs.get_file_info(selector) if not info.is_file]
         return sorted(name for name in folders if not name.startswith(".") and self.exists(name))
 
     def exists(self, name: str) -> bool:
-        """Whether `name` is there, complete. Says nothing about damage since."""
+        """Whether the folder has been sealed; it may have been damaged since."""
         return bool(self._fs.get_file_info(f"{self.path(name)}/{MANIFEST}").is_file)
 
     def manifest(self, name: str) -> Manifest:
-        """The manifest of a folder that exists.
-
-        Raises:
-            DamagedError: It can't be read.
-        """
+        """The manifest of a folder."""
         path = f"{self.path(name)}/{MANIFEST}"
         try:
             with self._open(path) as stream:
                 manifest = Manifest.model_validate(read_json(stream.read(MOST_JSON_BYTES + 1)))
         except FileNotFoundError as error:
             raise DamagedError(f"{path} must exist, it does not") from error
-        except ValidationError as error:
-            reason = error.errors(include_url=False)[0]["msg"]
-            raise DamagedError(f"{path} must be a manifest: {reason}") from error
         except ValueError as error:
-            raise DamagedError(f"{path} must be a manifest: {error}") from error
+            reason: object = error
+            if isinstance(error, ValidationError):
+                reason = error.errors(include_url=False)[0]["msg"]
+            raise DamagedError(f"{path} must be a manifest: {reason}") from error
         if manifest.name != name:
             raise DamagedError(f"{path} must be the manifest of {name}, got {manifest.name!r}")
         return manifest
 
     @contextlib.contextmanager
     def sealing(self, name: str, meta: dict[str, Any]) -> Iterator[Path]:
-        """Give a local folder to fill, and seal what is in it at the end of the `with`.
+        """Yield a local folder to fill, and seal it at the end of the `with`.
 
-        Nothing remains of it after an exception. If `name` has been sealed by somebody else in
-        the meantime, theirs stays and this one is dropped: equal names mean equal content.
+        Nothing is left after an exception. If another process has sealed `name` meanwhile, its
+        folder stays and this one is dropped: equal names mean equal content.
 
         Raises:
-            StorageError: The place can't be written; names the path.
+            StorageError: The place cannot be written.
         """
-        attempt = uuid.uuid4().hex
+        attempt, path = uuid.uuid4().hex, self.path(name)
         with contextlib.ExitStack() as cleaning:
-            try:
+            with must_be_writable(path):
                 if self._local:
                     folder = Path(self._root, f".{name}.{attempt}")
                     folder.mkdir(parents=True)
                     cleaning.callback(shutil.rmtree, folder, ignore_errors=True)
                 else:
                     folder = Path(cleaning.enter_context(tempfile.TemporaryDirectory()))
-            except OSError as error:
-                raise _unwritable(self.path(name), error) from error
-            try:
+            # The caller writes to the same disk, and its errors often name no path.
+            with must_be_writable(path, _CANNOT_WRITE):
                 yield folder
-            except OSError as error:
-                # What the caller writes goes into the same disk; its error often names no path.
-                if error.errno in _CANNOT_WRITE:
-                    raise _unwritable(self.path(name), error) from error
-                raise
-            try:
+            with must_be_writable(path):
                 if self._local:
                     self._rename(name, folder, meta)
                 else:
                     self._upload(name, folder, f"{attempt}/", meta)
-            except OSError as error:
-                raise _unwritable(self.path(name), error) from error
 
     def _rename(self, name: str, folder: Path, meta: dict[str, Any]) -> None:
         records = {file: _record(folder / file, sync=True) for file in _files_below(folder)}
@@ -194,7 +193,7 @@ class ObjectFolders:
                 return
             if not target.exists():
                 raise
-            # Left there without a manifest by something that copies folders: not a node.
+            # A folder without a manifest, left by something that copies folders.
             shutil.rmtree(target)
             folder.rename(target)
         sync_folder(target.parent)
@@ -204,7 +203,7 @@ class ObjectFolders:
         for file in _files_below(folder):
             records[file] = _record(folder / file)
             target = f"{self.path(name)}/{prefix}{file}"
-            # A no-op for object stores; other remote file systems want it.
+            # Object stores ignore it, but other remote file systems need it.
             self._fs.create_dir(str(PurePosixPath(target).parent), recursive=True)
             with (folder / file).open("rb") as source, self._fs.open_output_stream(target) as sink:
                 shutil.copyfileobj(source, sink, _CHUNK)
@@ -216,49 +215,32 @@ class ObjectFolders:
             sink.write(manifest.model_dump_json(indent=1).encode())
 
     def read(self, name: str, file: str) -> bytes:
-        """The content of one small file, verified.
-
-        Raises:
-            DamagedError: It isn't there or isn't what the manifest says.
-        """
+        """The verified content of one small file."""
         manifest = self.manifest(name)
         if file not in manifest.files:
             raise DamagedError(f"{self.path(name)} must have {file}, it hasn't")
-        source = self._source(name, manifest, file)
-        try:
-            with self._open(source) as stream:
-                data: bytes = stream.read(manifest.files[file].bytes + 1)
-        except FileNotFoundError as error:
-            raise DamagedError(f"{source} must exist, its manifest lists it") from error
-        _check(source, manifest.files[file], len(data), hashlib.sha256(data).hexdigest())
-        return data
+        content = io.BytesIO()
+        self._copy(self._source(name, manifest, file), manifest.files[file], content.write)
+        return content.getvalue()
 
     def check(self, name: str) -> None:
-        """Compare every file with the manifest: its size, and on a disk its hash.
+        """Compare the size of every file with the manifest, and on a disk its hash too.
 
-        An object store keeps hashes of its own; there, files are hashed where they are read.
-
-        Raises:
-            DamagedError: One is missing, can't be read or isn't what the manifest says.
+        An object store keeps hashes of its own; there, files are hashed when they are read.
         """
         manifest = self.manifest(name)
         for file, expected in manifest.files.items():
             source = self._source(name, manifest, file)
+            if self._local:
+                self._copy(source, expected, write=len)
+                continue
             info = self._fs.get_file_info(source)
             if info.type == pafs.FileType.NotFound:
                 raise DamagedError(f"{source} must exist, its manifest lists it")
-            digest = expected.sha256
-            if self._local:
-                with self._open(source, expected.bytes) as stream:
-                    digest = hashlib.file_digest(stream, "sha256").hexdigest()
-            _check(source, expected, info.size, digest)
+            _check_size(source, expected, info.size)
 
     def files(self, name: str) -> list[str]:
-        """Where its files are, its manifest first.
-
-        Raises:
-            DamagedError: It can't be read.
-        """
+        """Paths of the manifest and of the folder's files."""
         manifest = self.manifest(name)
         own = [self._source(name, manifest, file) for file in sorted(manifest.files)]
         return [f"{self.path(name)}/{MANIFEST}", *own]
@@ -266,33 +248,34 @@ class ObjectFolders:
     def fetch(
         self, name: str, folder: Path, wanted: Callable[[str], bool] = lambda file: True
     ) -> Manifest:
-        """Copy the files that are `wanted` by their names into `folder`, and verify them.
-
-        Of none more is copied than the manifest says that it has.
-
-        Raises:
-            DamagedError: One is missing or isn't what the manifest says.
-        """
+        """Copy the files whose names are `wanted` into `folder`, verified."""
         manifest = self.manifest(name)
-        for file, expected in manifest.files.items():
-            if not wanted(file):
-                continue
-            source, target = self._source(name, manifest, file), folder / file
+        for file in filter(wanted, manifest.files):
+            target = folder / file
             target.parent.mkdir(parents=True, exist_ok=True)
-            try:
-                with self._open(source, expected.bytes) as stream, target.open("wb") as sink:
-                    size, digest = _copy(stream, sink, expected.bytes)
-            except FileNotFoundError as error:
-                raise DamagedError(f"{source} must exist, its manifest lists it") from error
-            _check(source, expected, size, digest)
+            with target.open("wb") as sink:
+                self._copy(self._source(name, manifest, file), manifest.files[file], sink.write)
         return manifest
 
-    def _open(self, path: str, size: int | None = None) -> contextlib.AbstractContextManager[Any]:
-        """A file for reading; on a disk only a regular one, and only of `size` bytes.
+    def _copy(self, source: str, expected: FileRecord, write: Callable[[bytes], object]) -> None:
+        """Pass a file to `write` in chunks, and at most one byte more than the manifest says."""
+        size, digest = 0, hashlib.sha256()
+        try:
+            with self._open(source, expected.bytes) as stream:
+                while chunk := stream.read(min(_CHUNK, expected.bytes + 1 - size)):
+                    write(chunk)
+                    digest.update(chunk)
+                    size += len(chunk)
+        except FileNotFoundError as error:
+            raise DamagedError(f"{source} must exist, its manifest lists it") from error
+        _check_size(source, expected, size)
+        if digest.hexdigest() != expected.sha256:
+            raise DamagedError(
+                f"{source} must have the hash in its manifest, its content has changed"
+            )
 
-        Raises:
-            DamagedError: It is something else.
-        """
+    def _open(self, path: str, size: int | None = None) -> contextlib.AbstractContextManager[Any]:
+        """Open a file for reading; on a disk it must be a regular file of `size` bytes."""
         if not self._local:
             return self._fs.open_input_stream(path)  # type: ignore[no-any-return]
         try:
@@ -311,16 +294,16 @@ class ObjectFolders:
         return f"{self.path(name)}/{manifest.prefix}{file}"
 
     def remove(self, name: str) -> None:
-        """Delete a folder, its manifest first, so that a half deleted one doesn't exist."""
+        """Delete a folder, its manifest first, so that a half-deleted folder does not count."""
         with contextlib.suppress(FileNotFoundError):
             self._fs.delete_file(f"{self.path(name)}/{MANIFEST}")
         with contextlib.suppress(FileNotFoundError):
             self._fs.delete_dir(self.path(name))
 
     def tidy(self, name: str | None = None) -> None:
-        """Delete what killed attempts have left on a disk, at sealing `name` or anything here.
+        """Delete what killed attempts at sealing `name` (or any folder) have left on a disk.
 
-        Only for who knows that nobody else is sealing that.
+        The caller must know that no other process is sealing it.
         """
         if self._local:
             pattern = ".*" if name is None else f".{name}"
@@ -328,7 +311,7 @@ class ObjectFolders:
                 shutil.rmtree(folder, ignore_errors=True)
 
     def remove_all(self) -> None:
-        """Delete all there is below the root, also what was never sealed."""
+        """Delete the root with everything in it, including folders that were never sealed."""
         for name in self.names():
             self.remove(name)
         with contextlib.suppress(FileNotFoundError):
@@ -349,22 +332,6 @@ def _record(path: Path, *, sync: bool = False) -> FileRecord:
     return FileRecord(bytes=path.stat().st_size, sha256=digest)
 
 
-def _copy(source: IO[bytes], target: IO[bytes], most: int) -> tuple[int, str]:
-    """Size and hash of what was copied: `most` bytes, and one more where there are more."""
-    size, digest = 0, hashlib.sha256()
-    while chunk := source.read(min(_CHUNK, most + 1 - size)):
-        target.write(chunk)
-        digest.update(chunk)
-        size += len(chunk)
-    return size, digest.hexdigest()
-
-
-def _check(path: str, expected: FileRecord, size: int, digest: str) -> None:
+def _check_size(path: str, expected: FileRecord, size: int) -> None:
     if size != expected.bytes:
         raise DamagedError(f"{path} must have {expected.bytes} bytes, it has {size}")
-    if digest != expected.sha256:
-        raise DamagedError(f"{path} must have the hash in its manifest, its content has changed")
-
-
-def _unwritable(path: str, error: OSError) -> StorageError:
-    return StorageError(f"{error.filename or path} must be writable: {error.strerror or error}")

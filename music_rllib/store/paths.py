@@ -1,4 +1,4 @@
-"""Where a sweep keeps things."""
+"""Folders of a storage, and checks of whether a storage can be used."""
 
 from __future__ import annotations
 
@@ -14,14 +14,19 @@ from pathlib import Path
 from music_rllib.redaction import redact
 from music_rllib.store.object_folder import StorageError
 
-__all__ = ["check_answers", "check_storage", "in_ray_job", "resolve_storage", "sweep_folder"]
-
 ANSWER_SECONDS = 15.0
-"""For a bucket to say whether it is there; its client would go on trying for minutes."""
+"""Timeout for a bucket to answer; its client would retry for minutes."""
 NAME_BYTES = 255
-"""Of a file or folder, on Linux."""
+"""Longest name of a file or folder on Linux."""
+_KINDS = {
+    stat.S_IFREG: "file",
+    stat.S_IFCHR: "device",
+    stat.S_IFBLK: "device",
+    stat.S_IFIFO: "pipe",
+    stat.S_IFSOCK: "socket",
+}
 BUCKETS = ("s3://", "gs://", "gcs://", "abfs://", "abfss://")
-_ASK = """
+_ASK_FOR_BUCKET = """
 import sys
 from music_rllib.store.object_folder import StorageError, open_storage
 try:
@@ -34,19 +39,14 @@ if bucket.type.name == "NotFound":
 """
 
 
-def in_ray_job() -> bool:
-    """Whether this is the driver of a submitted Ray job, in a working directory that will go."""
-    return "RAY_JOB_CONFIG_JSON_ENV_VAR" in os.environ
-
-
 def resolve_storage(storage: str) -> tuple[str, str | None]:
-    """Make a folder absolute, so that it is the same for every worker; leave a URI as it is.
+    """Make a folder absolute, so that it is the same for every worker; a URI stays as it is.
 
     Returns:
-        The storage, and what to tell the user if it isn't where a shell would look for it.
+        The storage, and a notice for the user if it is not relative to the working directory.
 
     Raises:
-        StorageError: It begins with the home folder of nobody.
+        StorageError: The storage begins with the home folder of an unknown user.
     """
     if "://" in storage:
         return storage, None
@@ -54,7 +54,8 @@ def resolve_storage(storage: str) -> tuple[str, str | None]:
         path = Path(storage).expanduser()
     except RuntimeError as error:
         raise StorageError(f"storage must be in a home that is known, got {storage!r}") from error
-    if path.is_absolute() or not in_ray_job():
+    in_ray_job = "RAY_JOB_CONFIG_JSON_ENV_VAR" in os.environ
+    if path.is_absolute() or not in_ray_job:
         return str(path.absolute()), None
     resolved = Path.home() / path
     return str(resolved), (
@@ -65,50 +66,41 @@ def resolve_storage(storage: str) -> tuple[str, str | None]:
 
 def sweep_folder(storage: str, name: str) -> Path:
     """Local folder of a sweep's own files: in the storage, or in the home folder for a bucket."""
-    if "://" not in storage:
-        return Path(storage) / name
-    if storage.startswith("file://"):
-        return Path(storage.removeprefix("file://")) / name
+    folder = storage.removeprefix("file://")
+    if "://" not in folder:
+        return Path(folder) / name
     bucket = hashlib.sha256(storage.encode()).hexdigest()[:12]
     return Path.home() / ".music_rllib" / bucket / name
 
 
 def check_storage(storage: str, name: str) -> None:
-    """Look whether results can be kept there, without leaving anything behind.
-
-    Args:
-        storage: An absolute folder, or a URI, of `resolve_storage`.
-        name: Of the sweep.
+    """Check that a sweep can write to a resolved storage, without leaving a file in it.
 
     Raises:
-        StorageError: They can't.
+        StorageError: The storage cannot be written.
     """
     if any(unicodedata.category(character) in {"Cc", "Cs"} for character in storage):
         raise StorageError(
             f"storage must be UTF-8 text without control characters, got {storage!a}"
         )
     check_answers(storage)
-    folder = storage.removeprefix("file://")
-    if "://" not in folder:
-        plain = os.path.normpath(folder)  # a folder that isn't there yet has no ".."
-        for entry in (name, "nodes", "work"):
-            _check_folder(Path(plain, entry))
-    else:  # its own files are on this machine as well
-        _check_folder(sweep_folder(storage, name))
+    is_remote = "://" in storage.removeprefix("file://")
+    for entry in (name,) if is_remote else (name, "nodes", "work"):
+        folder = sweep_folder(storage, entry)
+        _check_folder(Path(os.path.normpath(folder)))  # a new folder has no ".." yet
 
 
 def check_answers(storage: str) -> None:
-    """Ask a bucket whether it is there, in a process of its own: its client can't be interrupted.
+    """Check that a bucket exists, in a child process because its client cannot be interrupted.
 
     Raises:
-        StorageError: It isn't, refuses, or doesn't answer in time.
+        StorageError: The bucket does not exist, refuses, or does not answer in time.
     """
     if not storage.startswith(BUCKETS):
         return
-    command = [sys.executable, "-c", _ASK]
     try:
         done = subprocess.run(  # noqa: S603 - this Python, and the URI on its standard input
-            command,
+            [sys.executable, "-c", _ASK_FOR_BUCKET],
             input=storage,
             capture_output=True,
             text=True,
@@ -126,36 +118,32 @@ def check_answers(storage: str) -> None:
 
 
 def _check_folder(folder: Path) -> None:
-    """Look whether a folder is there and can be written, or can be made."""
-    named = _cut(str(folder), 300)
+    """Check that a folder can be written, or that it can be created."""
+    named = str(folder) if len(str(folder)) <= 300 else f"{str(folder)[:300]}..."
     for part in folder.parts:
         if (length := len(os.fsencode(part))) > NAME_BYTES:
             raise StorageError(
                 f"storage must have names of at most {NAME_BYTES} bytes in its path, got one of "
-                f"{length}: {_cut(part, 40)}"
+                f"{length}: {part[:40]}..."
             )
     try:
-        there = _nearest(folder)
+        existing = _nearest(folder)
     except OSError as error:
         rule = "must be a folder that can be made and written"
         raise StorageError(f"{named} {rule}: {error.strerror}") from error
     try:
-        with tempfile.TemporaryFile(dir=there):
+        with tempfile.TemporaryFile(dir=existing):
             pass
     except OSError as error:
-        raise StorageError(f"{there} must be writable, for {named}: {error.strerror}") from error
-
-
-def _cut(text: str, longest: int) -> str:
-    return text if len(text) <= longest else f"{text[:longest]}..."
+        raise StorageError(f"{existing} must be writable, for {named}: {error.strerror}") from error
 
 
 def _nearest(folder: Path) -> Path:
-    """The folder itself, or the one of those above it that is there.
+    """The folder itself, or the nearest folder above it that exists.
 
     Raises:
-        StorageError: Something else is in its place.
-        OSError: It can't be looked at.
+        StorageError: Something other than a folder is in its place.
+        OSError: The status of a path cannot be read.
     """
     for path in (folder, *folder.parents):
         try:
@@ -169,12 +157,7 @@ def _nearest(folder: Path) -> Path:
         except NotADirectoryError:
             continue
         if not stat.S_ISDIR(mode):
-            raise StorageError(f"{folder} must be a folder or free, {path} is a {_kind(mode)}")
+            kind = _KINDS.get(stat.S_IFMT(mode), "special file")
+            raise StorageError(f"{folder} must be a folder or free, {path} is a {kind}")
         return path
     raise AssertionError("the root is a folder")
-
-
-def _kind(mode: int) -> str:
-    kinds = {stat.S_ISREG: "file", stat.S_ISCHR: "device", stat.S_ISBLK: "device"}
-    kinds |= {stat.S_ISFIFO: "pipe", stat.S_ISSOCK: "socket"}
-    return next((name for is_one, name in kinds.items() if is_one(mode)), "special file")

@@ -1,4 +1,4 @@
-"""What a finished run leaves behind besides its weights."""
+"""The history and the result of a run."""
 
 from __future__ import annotations
 
@@ -7,14 +7,12 @@ from collections.abc import Iterable
 
 from pydantic import BaseModel, ConfigDict
 
-__all__ = ["HISTORY", "Report", "RunResult", "from_json_lines", "last_values", "to_json_lines"]
-
 HISTORY = "history.jsonl"
-"""A run's reports, one JSON object per line, in a node and in a checkpoint."""
+"""File of a run's reports in its node and in each checkpoint, one JSON object per line."""
 
 
 class Report(BaseModel):
-    """Metrics of a run at one moment. Unlike settings, a metric may be NaN (JSON: `NaN`)."""
+    """Metrics of a run at one moment; they may be NaN (`NaN` in JSON)."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="constants")
 
@@ -22,25 +20,25 @@ class Report(BaseModel):
     seconds: float
     """Training time so far, over all attempts at this run."""
     timestamp_ms: int
-    """Unix time of the report; a replay to MLflow uses it again, so that nothing doubles."""
+    """Unix time of the report. MLflow gets it too, so that logging a report twice is harmless."""
     metrics: dict[str, float]
 
 
 class RunResult(BaseModel):
-    """The end of a run, kept in its node's manifest."""
+    """The result of a finished run, in its node's manifest."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="constants")
 
     label: str
-    """Of the run that made it; another sweep may call the same node differently."""
+    """Label of the run that made it; another sweep may give the same node another label."""
     env_steps: int
     seconds: float
     metrics: dict[str, float]
-    """The last value that the run reported of each metric."""
+    """The last reported value of each metric."""
 
 
 def to_json_lines(reports: Iterable[Report]) -> bytes:
-    """One line per report."""
+    """Reports as JSON, one per line."""
     return b"".join(report.model_dump_json().encode() + b"\n" for report in reports)
 
 
@@ -48,13 +46,13 @@ def from_json_lines(data: bytes) -> list[Report]:
     """Inverse of `to_json_lines`.
 
     Raises:
-        ValueError: A line isn't a report.
+        ValueError: A line is no report.
     """
     return [Report.model_validate(json.loads(line)) for line in data.splitlines()]
 
 
 def last_values(reports: Iterable[Report]) -> dict[str, float]:
-    """The last value of each metric; an evaluation isn't part of every report."""
+    """The last value of each metric; not every report has all metrics."""
     values: dict[str, float] = {}
     for report in reports:
         values |= report.metrics

@@ -1,7 +1,7 @@
-"""Nested plain values and arrays in two files that nothing can hide code in.
+"""Nested plain values and arrays as two files that cannot contain code.
 
-``state.json`` has the nesting, the names and the plain values; ``state.safetensors`` the arrays.
-Reading gives back equal values of equal types, and writing those again gives equal bytes.
+`state.json` has the nesting, the names and the plain values; `state.safetensors` the arrays.
+Reading gives equal values of equal types, and writing them again gives equal bytes.
 """
 
 from __future__ import annotations
@@ -19,26 +19,22 @@ from safetensors.numpy import save as save_safetensors
 
 from music_rllib.limits import check_safetensors, open_regular
 
-__all__ = ["StateError", "read_arrays", "read_state", "write_arrays", "write_state"]
-
 TREE, ARRAYS = "state.json", "state.safetensors"
 
 
 class StateError(ValueError):
-    """Files that hold no state; the message names them."""
+    """The files contain no state; the message names them."""
 
 
 def write_state(folder: Path, state: Any) -> None:
-    """Write `state` into `folder`, which exists.
+    """Write `state` into an existing folder.
 
-    Args:
-        folder: Where.
-        state: None, booleans, numbers, texts, numpy arrays and scalars, in dicts (with texts or
-            integers as keys), lists and tuples, nested as they like.
+    A state is None, booleans, numbers, strings, numpy arrays and scalars, in any nesting of dicts
+    (with strings or integers as keys), lists and tuples.
 
     Raises:
-        TypeError: There is something else in it; names the place.
-        OSError: The folder can't be written.
+        TypeError: The state contains something else; the message names the place.
+        OSError: The folder cannot be written.
     """
     arrays: dict[str, npt.NDArray[Any]] = {}
     tree = _encode(state, "state", arrays)
@@ -50,7 +46,7 @@ def read_state(folder: Path) -> Any:
     """Inverse of `write_state`.
 
     Raises:
-        StateError: There is no state, or what is there is none.
+        StateError: The folder contains no state.
     """
     arrays = read_arrays(folder / ARRAYS)
     try:
@@ -64,7 +60,7 @@ def write_arrays(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
     """Write named arrays as a safetensors file.
 
     Raises:
-        OSError: With the path, where it can't be written.
+        OSError: The file cannot be written.
     """
     # C order, because safetensors writes the memory as it lies and ignores strides.
     path.write_bytes(save_safetensors({k: np.asarray(a, order="C") for k, a in arrays.items()}))
@@ -74,7 +70,7 @@ def read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
     """Inverse of `write_arrays`.
 
     Raises:
-        StateError: There is no such file, or it is no safetensors file.
+        StateError: The file does not exist or is no safetensors file.
     """
     try:
         with open_regular(path) as file:
@@ -86,7 +82,7 @@ def read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
 
 
 def _encode(value: Any, place: str, arrays: dict[str, npt.NDArray[Any]]) -> Any:
-    """As JSON: plain values are themselves, everything else a list that begins with its kind."""
+    """`value` as JSON: a plain value as it is, others as a list that begins with their kind."""
     if value is None or isinstance(value, bool | int | str):
         return value
     if isinstance(value, np.ndarray | np.generic):
@@ -96,7 +92,7 @@ def _encode(value: Any, place: str, arrays: dict[str, npt.NDArray[Any]]) -> Any:
         name = str(len(arrays))
         arrays[name] = np.asarray(value)
         return [kind, name]
-    if isinstance(value, float):
+    if isinstance(value, float):  # np.float64, which is a float too, is above
         return value
     if isinstance(value, Mapping):
         for key in value:

@@ -1,7 +1,7 @@
-"""Which finished runs have been read through, and not been touched since: nobody reads them twice.
+"""Remembers which finished runs were verified, so that unchanged files are not read again.
 
-A run is known by its files' places, sizes and times on the disk. That is a few microseconds for
-each file, where reading and hashing it takes milliseconds.
+A run is recognised by the inodes, sizes and times of its files, which takes microseconds per file;
+reading and hashing a file takes milliseconds.
 """
 
 from __future__ import annotations
@@ -16,34 +16,31 @@ from pathlib import Path
 
 from music_rllib.store.files import write_atomically
 
-__all__ = ["Verified", "fingerprint"]
-
 SETTLED_SECONDS = 2.0
-"""A file that was written just now may be written again at what its disk calls the same time."""
+"""A newer file may be written again without a change of its time stamp."""
 
 
-def fingerprint(paths: Iterable[Path]) -> str | None:
-    """What changes with any of the files; None while one of them is new.
+def fingerprint_of(paths: Iterable[Path]) -> str | None:
+    """A hash of the files' inodes, sizes and times; None if one of them is very new.
 
     Raises:
-        OSError: One can't be looked at.
+        OSError: The status of a file cannot be read.
     """
     digest, newest = hashlib.sha256(), 0
     for path in paths:
-        found = path.stat()
+        status = path.stat()
         digest.update(
-            f"{path.name} {found.st_dev} {found.st_ino} {found.st_size} {found.st_mtime_ns} "
-            f"{found.st_ctime_ns}\n".encode()
+            f"{path.name} {status.st_dev} {status.st_ino} {status.st_size} {status.st_mtime_ns} "
+            f"{status.st_ctime_ns}\n".encode()
         )
-        newest = max(newest, found.st_mtime_ns, found.st_ctime_ns)
+        newest = max(newest, status.st_mtime_ns, status.st_ctime_ns)
     return None if time.time() - newest / 1e9 < SETTLED_SECONDS else digest.hexdigest()[:20]
 
 
 class Verified:
-    """A file with the fingerprints of what was found sound. Whatever is in it, no error of it."""
+    """A file of fingerprints of sound runs; it need not be readable or writable."""
 
     def __init__(self, path: Path) -> None:
-        """Look at `path`, which need not exist, nor be writable."""
         self._path = path
         self._changed = False
 
@@ -56,20 +53,20 @@ class Verified:
         return {}
 
     def has(self, key: str, mark: str | None) -> bool:
-        """Whether it was sound when it had this fingerprint."""
+        """Whether the run was sound when it had the fingerprint `mark`."""
         return mark is not None and self._known.get(key) == mark
 
     def add(self, key: str, mark: str | None) -> None:
-        """It is sound."""
+        """Remember that the run is sound; without a fingerprint, do nothing."""
         if mark is not None:
             self._known[key] = mark
             self._changed = True
 
-    def keep(self) -> None:
-        """Write it, where that can be done; what others have added meanwhile is lost."""
+    def save(self) -> None:
+        """Write the file if possible; additions of other processes meanwhile are lost."""
         if not self._changed:
             return
         with contextlib.suppress(OSError):
             data = json.dumps(self._known, indent=0).encode()
-            write_atomically(self._path, data, sync=False)  # lost, it costs a second reading
+            write_atomically(self._path, data, sync=False)  # its loss only costs time
             self._changed = False

@@ -330,7 +330,7 @@ def _compute_and_report(console: Console, opened: Sweep, tracker: Tracker) -> in
     if undelivered := tracker.undelivered_message():
         console.print(Text(undelivered, style="yellow"), soft_wrap=True)
     console.print(Text(f"Compare in MLflow: {tracker.comparison_url()}"), soft_wrap=True)
-    console.print(Text(f"Open MLflow's pages with: {tracker.ui_command()}"), soft_wrap=True)
+    console.print(Text(f"Open MLflow's pages with: {tracker.store.ui_command()}"), soft_wrap=True)
     if stopped_by is None:
         config = opened.config
         report = report_at_end(opened.storage, config.name, config.mlflow.tracking_uri, config.path)

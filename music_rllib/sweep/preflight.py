@@ -18,8 +18,8 @@ from music_rllib.experiment import sweep_files
 from music_rllib.experiment.plan import Input, Plan
 from music_rllib.experiment.scheduler import Scheduler, Status
 from music_rllib.experiment.session import Sweep
-from music_rllib.runtime.in_time import in_time
-from music_rllib.runtime.ray_address import check_reachable, cluster_address
+from music_rllib.runtime.ending import in_time
+from music_rllib.runtime.machine import check_reachable, cluster_address
 from music_rllib.runtime.signals import early
 from music_rllib.store.handoff import open_handoff, read_handoff
 from music_rllib.store.node_store import NodeStore

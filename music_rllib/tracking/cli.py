@@ -1,4 +1,4 @@
-"""`tracking`: look after what sweeps log to MLflow."""
+"""The command `tracking`."""
 
 from __future__ import annotations
 
@@ -9,8 +9,6 @@ import typer
 
 from music_rllib.command_line import add_command, new_app, run_app
 from music_rllib.errors import FAILED
-
-__all__ = ["app", "main"]
 
 EXAMPLES = """\
 Examples:
@@ -54,13 +52,11 @@ def deliver(
     from music_rllib.redaction import for_people
     from music_rllib.tracking.from_store import deliver as deliver_sweep
 
-    left = deliver_sweep(place, tracking_uri, timeout)
-    if left:
-        reason = left.error or f"not done within {timeout:.0f} s"
-        typer.echo(
-            f"{left.records} records and {left.artefacts} artefacts are left: {for_people(reason)}",
-            err=True,
-        )
+    pending = deliver_sweep(place, tracking_uri, timeout)
+    if pending:
+        reason = for_people(pending.error or f"not done within {timeout:.0f} s")
+        left = f"{pending.records} records and {pending.artefacts} artefacts are left"
+        typer.echo(f"{left}: {reason}", err=True)
         return FAILED
     typer.echo(f"MLflow has everything of {for_people(place)}")
     return 0
@@ -70,5 +66,5 @@ add_command(app, "deliver", deliver, EXAMPLES)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run `python -m music_rllib.tracking`; its exit code."""
+    """Run `python -m music_rllib.tracking` and return its exit code."""
     return run_app(app, "python -m music_rllib.tracking", arguments)

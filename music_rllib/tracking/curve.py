@@ -1,10 +1,10 @@
-"""The learning-curve picture of one run: success or return above, mutual information below."""
+"""The figure of one run's learning curve."""
 
 from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -18,64 +18,51 @@ from music_rllib.store.run_record import Report
 BLUE, VERMILION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 
 
-@dataclass(frozen=True, kw_only=True)
-class Line:
-    """One metric of a panel."""
+class Line(NamedTuple):
+    """How a panel draws one metric."""
 
     metric: str
     label: str
     colour: str
-    style: str
-    marker: str
+    style: str = "-"
+    marker: str = "o"
 
 
-@dataclass(frozen=True, kw_only=True)
-class Panel:
-    """Metrics that share a y axis; ``limits`` where the axis has natural ones."""
+class Panel(NamedTuple):
+    """Metrics that share a y axis; `limits` if the axis has natural ones."""
 
     ylabel: str
     lines: Sequence[Line]
     limits: tuple[float, float] | None = None
 
 
-def _line(metric: str, label: str, colour: str, style: str, marker: str) -> Line:
-    return Line(metric=metric, label=label, colour=colour, style=style, marker=marker)
-
-
-PANELS = (
-    Panel(
-        ylabel="success rate",
-        limits=(-0.03, 1.03),
-        lines=(
-            _line(names.EVAL_SUCCESS, "at the last step", BLUE, "-", "o"),
-            _line(names.EVAL_SUCCESS_ANY, "at any step", VERMILION, "--", "s"),
-        ),
+SUCCESS = Panel(
+    "success rate",
+    (
+        Line(names.EVAL_SUCCESS, "at the last step", BLUE),
+        Line(names.EVAL_SUCCESS_ANY, "at any step", VERMILION, "--", "s"),
     ),
-    Panel(
-        ylabel="return of an episode",
-        lines=(_line(names.EVAL_RETURN, "return", BLUE, "-", "o"),),
-    ),
-    Panel(
-        ylabel="MI bound (nats)",
-        lines=(_line(names.MI_BOUND, "MI bound", GREEN, "-", "o"),),
-    ),
-    Panel(
-        ylabel="MI reward per step",
-        lines=(_line(names.MI_REWARD, "MI reward", PURPLE, "-", "o"),),
-    ),
+    limits=(-0.03, 1.03),
 )
+RETURN = Panel("return of an episode", [Line(names.EVAL_RETURN, "return", BLUE)])
+MI_BOUND = Panel("MI bound (nats)", [Line(names.MI_BOUND, "MI bound", GREEN)])
+MI_REWARD = Panel("MI reward per step", [Line(names.MI_REWARD, "MI reward", PURPLE)])
 
 
 def learning_curve(history: Sequence[Report], *, title: str) -> Figure:
     """Success rate (or return), MI bound and MI reward against environment steps.
 
-    The return of a task that has a success says the same in other units, and has no panel. Panels
-    without a value are left out; a history with none of the metrics says so. Draws on its own
-    figure, never through pyplot, so that it is safe in a thread and needs no display.
+    The return has a panel only if the task has no success rate, which says the same in other
+    units. Panels without data are left out; a history without any says so. Works in any thread
+    and without a display, as pyplot is not involved.
     """
-    panels = [panel for panel in PANELS if any(_points(history, line) for line in panel.lines)]
-    if PANELS[0] in panels:
-        panels = [panel for panel in panels if panel.lines[0].metric != names.EVAL_RETURN]
+    panels = [
+        panel
+        for panel in (SUCCESS, RETURN, MI_BOUND, MI_REWARD)
+        if any(_points(history, line) for line in panel.lines)
+    ]
+    if SUCCESS in panels and RETURN in panels:
+        panels.remove(RETURN)
     figure = Figure(figsize=(6.4, 1.2 + 2.1 * max(1, len(panels))), layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(title, fontsize=11)
@@ -91,7 +78,7 @@ def learning_curve(history: Sequence[Report], *, title: str) -> Figure:
 
 
 def learning_curve_png(history: Sequence[Report], *, title: str) -> bytes:
-    """:func:`learning_curve` as a PNG."""
+    """`learning_curve` as a PNG file."""
     buffer = io.BytesIO()
     learning_curve(history, title=title).savefig(buffer, format="png", dpi=120)
     return buffer.getvalue()
@@ -102,8 +89,7 @@ def _draw(axes: Axes, panel: Panel, history: Sequence[Report]) -> None:
         points = _points(history, line)
         if points:
             axes.plot(
-                [step for step, _ in points],
-                [value for _, value in points],
+                *zip(*points, strict=True),
                 color=line.colour,
                 linestyle=line.style,
                 marker=line.marker if len(points) <= 60 else "",

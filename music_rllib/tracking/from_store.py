@@ -1,4 +1,4 @@
-"""What the store has of a sweep's runs, for MLflow."""
+"""Runs of the store, sent to MLflow."""
 
 from __future__ import annotations
 
@@ -22,65 +22,62 @@ from music_rllib.tracking.sender import Pending
 from music_rllib.tracking.store import SweepRecord
 from music_rllib.tracking.tracker import Tracker
 
-__all__ = ["deliver", "finished_run"]
-
 logger = logging.getLogger(__name__)
 
-_OUTCOMES: dict[str, Status] = {"finished": "FINISHED", "failed": "FAILED"}
-"""Of a sweep; any other was stopped."""
+_STATUS_OF_OUTCOME: dict[str, Status] = {"finished": "FINISHED", "failed": "FAILED"}
+"""MLflow's status of a sweep's outcome; it is KILLED for any other."""
 
 
 def finished_run(store: NodeStore, node: Node) -> StoredRun:
-    """A finished run with its policy.
+    """A finished run with its policy, or without one if that cannot be read.
 
     Raises:
-        DamagedError: it has no readable history.
+        DamagedError: The run's history cannot be read.
     """
-    return StoredRun(store.history(node.key), _policy(store, node))
-
-
-def _policy(store: NodeStore, node: Node) -> bytes | None:
+    reports, policy = store.history(node.key), None
     with TemporaryDirectory() as folder:
         try:
             store.fetch(node.key, Path(folder))
-            return policy_from_folder(Path(folder), [node.run.task]).to_bytes()
+            policy = policy_from_folder(Path(folder), [node.run.task]).to_bytes()
         except (OSError, ValueError, StorageError) as error:
             logger.warning("MLflow gets no policy of %s: %s", node.label, error)
-            return None
+    return StoredRun(reports, policy)
 
 
 def deliver(place: str, tracking_uri: str | None, timeout: float) -> Pending:
-    """Send to MLflow what it has not of a sweep that nobody drives.
+    """Send to MLflow all that it does not have of a sweep that is not running.
 
     Args:
-        place: the sweep's folder, its URI in a bucket, or its name.
-        tracking_uri: where to, in place of the sweep's own (which is kept without its password).
-        timeout: seconds to try for.
+        place: The sweep's folder, its URI in a bucket, or its name.
+        tracking_uri: The store, if not the one that the sweep was logged to, whose URI is kept
+            without its password.
+        timeout: Longest time to try, in seconds.
 
     Returns:
-        What is left over.
+        What is not delivered.
 
     Raises:
-        BadInputError: there is no such sweep, or it is running; as TrackingError, where it was
-            not tracked, another process has it, or the store is not reachable.
-        StorageError: its storage is not readable, or finished runs in it are damaged.
+        BadInputError: The sweep does not exist.
+        TrackingError: The sweep is running or was not tracked, another process tracks it, or the
+            store is not reachable.
+        StorageError: The storage is not readable, or finished runs in it are damaged.
     """
-    found = find_sweep(place, None)
-    record = SweepRecord.read(found.storage, found.name)
+    location = find_sweep(place, None)
+    record = SweepRecord.read(location.storage, location.name)
     if record is None:
-        raise TrackingError(f"SWEEP must be a sweep that was tracked, got {found.place}")
-    state = found.read(sweep_files.STATE)
+        raise TrackingError(f"SWEEP must be a sweep that was tracked, got {location.place}")
+    state = location.read(sweep_files.STATE)
     if sweep_files.is_alive(state):
-        raise TrackingError(f"{found.place} is running, and sends all that it has itself")
-    sweep = found.open()
+        raise TrackingError(f"{location.place} is running, and sends all that it has itself")
+    sweep = location.open()
     tracker = Tracker(
-        sweep_name=found.name,
-        storage=found.storage,
-        config=found.read(sweep_files.CONFIG),
+        sweep_name=location.name,
+        storage=location.storage,
+        config=location.read(sweep_files.CONFIG),
         tracking_uri=tracking_uri or record.tracking_uri,
     )
     outcome = state["driver"]["outcome"] if state else ""
-    causes = {one["run"]: one["cause"] for one in state["failures"]} if state else {}
+    causes = {failure["run"]: failure["cause"] for failure in state["failures"]} if state else {}
     begun = sweep.store.begun()
     try:
         for node in sweep.plan.nodes:
@@ -90,8 +87,8 @@ def deliver(place: str, tracking_uri: str | None, timeout: float) -> Pending:
                 cause = causes.get(node.label)
                 tracker.mirror(run_info(node), partial(_unfinished_run, sweep.store, node, cause))
     finally:
-        left = tracker.close(_OUTCOMES.get(outcome, "KILLED"), timeout)
-    return left
+        pending = tracker.close(_STATUS_OF_OUTCOME.get(outcome, "KILLED"), timeout)
+    return pending
 
 
 def _unfinished_run(store: NodeStore, node: Node, cause: str | None) -> StoredRun:

@@ -1,7 +1,4 @@
-"""The few MLflow calls that tracking makes, and which of their failures can pass.
-
-The only module that talks to MLflow.
-"""
+"""Every call to MLflow that tracking makes, and which failures are worth a retry."""
 
 from __future__ import annotations
 
@@ -9,10 +6,10 @@ import logging
 import os
 import re
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Literal, NamedTuple, TypeVar
+from typing import Literal, NamedTuple
 from urllib.parse import quote
 
 from filelock import FileLock
@@ -35,13 +32,11 @@ from music_rllib.tracking.policy_model import MODEL_NAME, write_model
 from music_rllib.tracking.store import TrackingStore
 
 MAX_METRICS = 1000
-"""MLflow's limit for the metrics of one ``log_batch``."""
-MAX_PARAMS = 100
-"""MLflow's limit for the params, and for the tags, of one ``log_batch``."""
+"""MLflow's limit for the metrics of one request."""
 REQUEST_SECONDS = 30
-"""How long a server may take for one request, unless MLFLOW_HTTP_REQUEST_TIMEOUT says else."""
+"""Timeout of one request, unless MLFLOW_HTTP_REQUEST_TIMEOUT sets another."""
 SCHEMA_SECONDS = 120.0
-"""How long to wait for another process that sets up the same sqlite file."""
+"""Longest wait for another process that creates the tables of the same sqlite file."""
 
 _LASTING_ERRORS = frozenset(
     {
@@ -53,7 +48,6 @@ _LASTING_ERRORS = frozenset(
         "ENDPOINT_NOT_FOUND",
     }
 )
-_Item = TypeVar("_Item")
 Status = Literal["FINISHED", "FAILED", "KILLED"]
 
 _HINTS = {
@@ -61,15 +55,14 @@ _HINTS = {
     "environment.",
     r"\b5\d\d error responses|error code 5\d\d\b": "The server's own log says why.",
 }
-"""What an answer looks like, and what to do then."""
-
+"""Pattern of a server's error message -> advice that is appended to it."""
 
 _PART = r"(?!\.{1,2}(?:/|$))[\w.\-: ]+"
 _METRIC_NAME = re.compile(rf"{_PART}(?:/{_PART})*")
 
 
 def check_metric_name(name: str) -> None:
-    """Raises ValueError where MLflow would refuse the name."""
+    """Raise ValueError if MLflow would refuse the metric name."""
     if len(name) > 250 or not _METRIC_NAME.fullmatch(name):
         raise ValueError(
             "a metric's name must have at most 250 letters, digits, '_', '-', '.', ':', spaces, "
@@ -78,43 +71,33 @@ def check_metric_name(name: str) -> None:
 
 
 def is_lasting(error: Exception) -> bool:
-    """Whether repeating the call cannot help: a refused value, or a run that was deleted."""
+    """Whether a retry cannot succeed: MLflow refuses the value, or the run was deleted."""
     return isinstance(error, MlflowException) and error.error_code in _LASTING_ERRORS
 
 
-class Value(NamedTuple):
-    """One value of a metric, as MLflow keeps it; `time` in ms since the epoch."""
-
-    name: str
-    value: float
-    time: int
-    step: int
-
-
 class KnownRun(NamedTuple):
-    """A run that MLflow has."""
+    """A run that exists in MLflow."""
 
     run_id: str
     started: int
-    """ms since the epoch."""
-    whole: bool = False
-    """Whether it is finished, and nothing of it is still to come."""
+    """Start time in ms since the epoch."""
+    complete: bool = False
+    """Whether it is finished and all of its data has arrived."""
 
 
 class Experiment:
-    """A sweep's runs in one MLflow experiment: found, created and fed. Every call may raise."""
+    """The MLflow experiment of a sweep: finds, creates and updates the sweep's runs.
+
+    The constructor creates the experiment if it does not exist, and raises TrackingError if the
+    store refuses that. Every method but `known_id` asks the server, and raises MLflow's errors.
+    """
 
     def __init__(self, store: TrackingStore, name: str, sweep_id: str) -> None:
-        """Connect, and create the experiment where it does not exist.
-
-        Raises:
-            TrackingError: where the store refuses that.
-        """
-        self.store = store
+        self._store = store
         self._name = name
         self._sweep_id = sweep_id
         self._known: dict[str, KnownRun] | None = None
-        """By node key; the sweep's own by an empty one. None before the server was asked."""
+        """Runs by node key ("" for the sweep's own run); None until the server has listed them."""
         _configure_mlflow()
         try:
             self._client = _open_client(store)
@@ -128,13 +111,16 @@ class Experiment:
             ) from error
 
     def find(self, node_key: str) -> KnownRun | None:
-        """A node's run, or the sweep's own; None where there is none. Asks once for all runs."""
+        """The run of a node, or the sweep's own run ("").
+
+        Lists all runs of the sweep on the first call.
+        """
         if self._known is None:
             self._known = self._list()
         return self._known.get(node_key)
 
     def known_id(self, node_key: str) -> str | None:
-        """Id of a run that was found or created; asks nothing."""
+        """Run id of a node whose run was found or created before; sends no request."""
         run = (self._known or {}).get(node_key)
         return None if run is None else run.run_id
 
@@ -144,7 +130,7 @@ class Experiment:
         identity = {names.TAG_KIND: kind, names.TAG_SWEEP_ID: self._sweep_id}
         if node_key:
             identity[names.TAG_NODE_KEY] = node_key
-        known, self._known = self._known or {}, None  # to be asked anew if the answer gets lost
+        known, self._known = self._known or {}, None  # listed again if the response gets lost
         run = self._client.create_run(
             self.id, start_time=time, tags={**tags, **identity}, run_name=name
         )
@@ -152,7 +138,7 @@ class Experiment:
         return self._known[node_key]
 
     def _list(self) -> dict[str, KnownRun]:
-        """The sweep's runs; of two with one key the older one."""
+        """The sweep's runs by node key; the older run where two have the same key."""
         wanted, token = f"tags.`{names.TAG_SWEEP_ID}` = '{self._sweep_id}'", None
         known: dict[str, KnownRun] = {}
         while True:
@@ -165,15 +151,15 @@ class Experiment:
             )
             for run in page:
                 tags = run.data.tags
-                whole = run.info.status == "FINISHED" and names.TAG_INCOMPLETE not in tags
-                found = KnownRun(run.info.run_id, run.info.start_time, whole)
-                known.setdefault(tags.get(names.TAG_NODE_KEY, ""), found)
+                complete = run.info.status == "FINISHED" and names.TAG_INCOMPLETE not in tags
+                node_key = tags.get(names.TAG_NODE_KEY, "")
+                known.setdefault(node_key, KnownRun(run.info.run_id, run.info.start_time, complete))
             token = page.token
             if not token:
                 return known
 
     def last_steps(self, run_id: str) -> dict[str, int]:
-        """Last step of every metric that the run has."""
+        """Last step of each metric of the run."""
         metrics = self._client.get_run(run_id).data.metrics
         return {
             name: max(point.step for point in self._client.get_metric_history(run_id, name))
@@ -181,10 +167,10 @@ class Experiment:
         }
 
     def begin_run(self, run_id: str, tags: Mapping[str, str], params: Mapping[str, str]) -> None:
-        """Mark the run as running, for the first time or again, with these tags and params.
+        """Mark the run as running, with these tags and params, and remove its failure tag.
 
-        MLflow's params are immutable, and a sweep that is continued with more seeds has others:
-        a changed param becomes a tag. The tag of an earlier failure goes.
+        MLflow's params are immutable, but a sweep may be continued with other settings, such as
+        more seeds: a changed param becomes a tag.
         """
         run = self._client.get_run(run_id)
         known = run.data.params
@@ -195,25 +181,23 @@ class Experiment:
         }
         self.set_tags(run_id, {**tags, **changed})
         fresh = [Param(key, value) for key, value in params.items() if key not in known]
-        for chunk in _chunks(fresh, MAX_PARAMS):
-            self._client.log_batch(run_id, params=chunk, synchronous=True)
+        self._client.log_batch(run_id, params=fresh, synchronous=True)
         if names.TAG_FAILURE in run.data.tags:
             self._client.delete_tag(run_id, names.TAG_FAILURE)
         if run.info.status != "RUNNING":
             self._client.update_run(run_id, status="RUNNING")
 
     def set_tags(self, run_id: str, tags: Mapping[str, str]) -> None:
-        """Set tags, over those of the same names."""
-        for chunk in _chunks([RunTag(*item) for item in tags.items()], MAX_PARAMS):
-            self._client.log_batch(run_id, tags=chunk, synchronous=True)
+        """Set tags; existing tags of the same names are overwritten."""
+        values = [RunTag(*item) for item in tags.items()]
+        self._client.log_batch(run_id, tags=values, synchronous=True)
 
     def delete_tag(self, run_id: str, tag: str) -> None:
-        """Take a tag from a run that has it."""
+        """Delete a tag that the run has."""
         self._client.delete_tag(run_id, tag)
 
-    def log_metrics(self, run_id: str, values: Sequence[Value]) -> None:
-        """Send at most MAX_METRICS values; sending them twice changes nothing."""
-        metrics = [Metric(*value) for value in values]
+    def log_metrics(self, run_id: str, metrics: Sequence[Metric]) -> None:
+        """Log values of metrics; logging them twice changes nothing."""
         self._client.log_batch(run_id, metrics=metrics, synchronous=True)
 
     def end_run(self, run_id: str, status: Status, time: int) -> None:
@@ -221,31 +205,35 @@ class Experiment:
         self._client.set_terminated(run_id, status=status, end_time=time)
 
     def keep_view(self, key: str, content: str) -> None:
-        """Keep a view of the experiment's pages under a key of its own."""
+        """Save a view of the experiment's pages under `key`."""
         self._client.set_experiment_tag(self.id, names.TAG_VIEW_PREFIX + key, content)
 
-    def upload(self, run_id: str, name: str, file: Path) -> None:
-        """Store ``file`` as the artefact ``name`` (its last part is the file's name)."""
-        folder = name.rpartition("/")[0]
-        self._client.log_artifact(run_id, str(file), folder or None)
+    def upload(self, run_id: str, name: str, content: bytes) -> None:
+        """Upload a file as the artefact `name`."""
+        folder, _, base = name.rpartition("/")
+        with TemporaryDirectory() as temporary:
+            file = Path(temporary, base)
+            file.write_bytes(content)
+            self._client.log_artifact(run_id, str(file), folder or None)
         _forget_repository(run_id)
 
-    def log_policy(self, run_id: str, name: str, file: Path) -> None:
-        """Store the policy in `file` as the run's logged model; a finished one stays as it is.
+    def log_policy(self, run_id: str, name: str, content: bytes) -> None:
+        """Upload a policy as the run's logged model, unless that is there already.
 
-        A server that knows no logged models (MLflow 2) keeps the file as the artefact `name`.
+        A server without logged models (MLflow 2) gets it as the artefact `name`.
         """
         try:
             model = self._policy_model(run_id)
         except MlflowException as error:
             if error.error_code != "ENDPOINT_NOT_FOUND":
                 raise
-            self.upload(run_id, name, file)
+            self.upload(run_id, name, content)
             return
         if model.status == LoggedModelStatus.READY:
             return
         with TemporaryDirectory() as temporary:
-            folder = Path(temporary, "model")
+            file, folder = Path(temporary, "policy.safetensors"), Path(temporary, "model")
+            file.write_bytes(content)
             policy = write_model(file, folder, run_id=run_id, model_id=model.model_id)
             self._client.log_model_artifacts(model.model_id, str(folder))
             _forget_repository(model.model_id)
@@ -256,7 +244,7 @@ class Experiment:
         self._client.finalize_logged_model(model.model_id, LoggedModelStatus.READY)
 
     def _policy_model(self, run_id: str) -> LoggedModel:
-        """The run's logged model: a new one, or the one that a delivery before has begun."""
+        """The run's logged model; created unless an earlier attempt has created it."""
         found = self._client.search_logged_models(
             [self.id], f"tags.`{names.TAG_SOURCE_RUN}` = '{run_id}'", max_results=1
         )
@@ -276,9 +264,11 @@ class Experiment:
     def _find_or_create(self) -> str:
         experiment = self._client.get_experiment_by_name(self._name)
         if experiment is None:
+            root = self._store.artefact_root
+            location = None if root is None else f"{root}/{quote(self._name)}"
             try:
                 return self._client.create_experiment(
-                    self._name, self._artefact_location(), tags=names.EXPERIMENT_TAGS
+                    self._name, location, tags=names.EXPERIMENT_TAGS
                 )
             except MlflowException as error:
                 if error.error_code != "RESOURCE_ALREADY_EXISTS":
@@ -286,18 +276,14 @@ class Experiment:
                 experiment = self._client.get_experiment_by_name(self._name)
         if experiment is None or experiment.lifecycle_stage != "active":
             raise TrackingError(
-                f"the experiment {self._name!r} at {self.store.public_uri} must not be deleted. "
+                f"the experiment {self._name!r} at {self._store.public_uri} must not be deleted. "
                 "Restore it (mlflow experiments restore) or give the sweep another name."
             )
         return str(experiment.experiment_id)
 
-    def _artefact_location(self) -> str | None:
-        root = self.store.artefact_root
-        return None if root is None else f"{root}/{quote(self._name)}"
-
 
 def first_line(error: Exception) -> str:
-    """The first line of an error that says something, without passwords, and what to do."""
+    """The first meaningful line of an error's message, redacted, with advice if there is any."""
     lines = [
         line
         for line in str(error).strip().splitlines()
@@ -309,28 +295,28 @@ def first_line(error: Exception) -> str:
 
 
 def _configure_mlflow() -> None:
-    """Leave repeating to the sender, and MLflow's chatter off the screen.
+    """Turn off MLflow's own retries and its notices.
 
-    MLflow's own repeating would block for minutes, and could create a run twice where an answer
-    got lost: the sender looks for the run first.
+    MLflow's retries would block for minutes, and could create a run twice if a response gets
+    lost. The sender retries instead, and looks for the run first.
     """
     os.environ["MLFLOW_HTTP_REQUEST_MAX_RETRIES"] = "0"
     os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", str(REQUEST_SECONDS))
     os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
     os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
-    # MLflow's own use of SQLAlchemy, met when its database code is imported.
+    # Raised by MLflow's use of SQLAlchemy when its database code is imported.
     warnings.filterwarnings("ignore", r"The ``noload`` loader strategy", DeprecationWarning)
-    # And of its own type hints, met when its model code is imported.
+    # Raised by MLflow's own type hints when its model code is imported.
     warnings.filterwarnings("ignore", r".*Any type hint is inferred as AnyType", UserWarning)
     logging.getLogger("alembic").setLevel(logging.WARNING)
-    # It logs pages of traceback about what it raises as well, and the sender says in a line.
+    # It logs tracebacks of errors that it also raises, and that the sender logs in one line.
     logging.getLogger("mlflow.store.db.utils").setLevel(logging.CRITICAL)
 
 
 def _open_client(store: TrackingStore) -> MlflowClient:
-    """A client; for an embedded file its tables are made by one process at a time.
+    """Connect to the store. Only one process at a time may create the tables of a sqlite file.
 
-    Opening a fresh sqlite file from several processes crashes MLflow's migration.
+    MLflow's migration crashes if several processes open a new file at once.
     """
     if store.database is None:
         return MlflowClient(store.uri)
@@ -347,11 +333,6 @@ def _open_client(store: TrackingStore) -> MlflowClient:
         ) from error
 
 
-def _chunks(items: Sequence[_Item], size: int) -> Iterator[Sequence[_Item]]:
-    for begin in range(0, len(items), size):
-        yield items[begin : begin + size]
-
-
 def _forget_repository(owner: str) -> None:
-    """MLflow keeps what it uploads with, a thread pool and queues, for 1,024 runs and models."""
+    """Free MLflow's upload client of a run or model, with its threads; it would cache 1,024."""
     getattr(utils, "_artifact_repos_cache", {}).pop(owner, None)

@@ -1,8 +1,7 @@
-"""A policy's file as an MLflow model: it loads with ``mlflow.pyfunc`` and acts.
+"""A policy as an MLflow model that `mlflow.pyfunc` loads, without a pickle or this package.
 
-The model's folder holds the policy's own file and a script, which is a copy of
-:mod:`music_rllib.policy.network` and ``MODEL_CODE``: no pickle, and nothing of this package is
-needed to load it.
+The model's folder holds the policy's file and a script, which is a copy of
+:mod:`music_rllib.policy.network` followed by `_MODEL_CODE`.
 """
 
 from __future__ import annotations
@@ -18,14 +17,12 @@ from typing import Any
 from music_rllib.policy import network
 from music_rllib.policy.network import PolicyNetwork
 
-__all__ = ["MODEL_NAME", "write_model"]
-
 MODEL_NAME = "policy"
 """Name of the logged model, and of its artefact folder."""
 _POLICY_FILE = Path("artifacts", "policy.safetensors")
-"""The policy in a model's folder."""
+"""Path of the policy in the model's folder."""
 
-MODEL_CODE = '''
+_MODEL_CODE = '''
 
 import mlflow
 
@@ -52,20 +49,13 @@ class PolicyModel(mlflow.pyfunc.PythonModel):
 
 mlflow.models.set_model(PolicyModel())
 '''
-"""What follows the text of :mod:`music_rllib.policy.network` in a model's code."""
 
 
 def write_model(file: Path, folder: Path, *, run_id: str, model_id: str) -> PolicyNetwork:
-    """Make `folder` an MLflow model of the policy in `file`, which is returned.
-
-    Args:
-        file: the policy.
-        folder: must not exist.
-        run_id: MLflow's id of the run that trained it.
-        model_id: MLflow's id of the logged model.
+    """Write an MLflow model of the policy in `file` to a new folder, and return the policy.
 
     Raises:
-        PolicyFileError: the file isn't a policy.
+        PolicyFileError: The file is no policy.
     """
     from mlflow.models import Model
     from mlflow.models.model import MLMODEL_FILE_NAME
@@ -75,33 +65,43 @@ def write_model(file: Path, folder: Path, *, run_id: str, model_id: str) -> Poli
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(content)
     shutil.copyfile(file, folder / _POLICY_FILE)
-    described = Model.load(folder)
-    size = sum(part.stat().st_size for part in folder.rglob("*") if part.is_file())
+    description = Model.load(folder)
+    size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     Model(
         run_id=run_id,
         model_id=model_id,
-        flavors=described.flavors,
-        saved_input_example_info=described.saved_input_example_info,
+        flavors=description.flavors,
+        saved_input_example_info=description.saved_input_example_info,
         model_size_bytes=size,
-        metadata=_metadata(policy),
+        metadata={
+            "input_size": policy.input_size,
+            "action_size": policy.action_size,
+            **policy.about,
+        },
     ).save(folder / MLMODEL_FILE_NAME)
     return policy
 
 
 @functools.cache
 def _files(observation_size: int, goal_size: int) -> Mapping[Path, bytes]:
-    """The files of a model for observations of these sizes, its policy empty.
+    """The files of a model for observations of these sizes, with an empty policy.
 
-    MLflow runs a model's code when it saves one, and keeps what has run for as long as the process
-    lives: a driver that tracks thousands of runs has it done once.
+    Cached because MLflow runs a model's code when it saves the model, and keeps it in memory for
+    as long as the process lives; a driver may track thousands of runs.
     """
     import mlflow.pyfunc
+    import numpy as np
 
+    example: Any = np.zeros((1, observation_size), np.float32)
+    if goal_size:
+        goal = np.zeros((1, goal_size), np.float32)
+        example = {"observation": example, "desired_goal": goal}
     with TemporaryDirectory() as temporary:
         code, policy = Path(temporary, "policy_model.py"), Path(temporary, _POLICY_FILE.name)
-        code.write_text(Path(network.__file__).read_text() + MODEL_CODE)
+        code.write_text(Path(network.__file__).read_text() + _MODEL_CODE)
         policy.touch()
         folder = Path(temporary, "model")
+        requirements = [f"{name}=={version(name)}" for name in ("mlflow", "numpy", "safetensors")]
         mlflow.pyfunc.save_model(
             folder,
             python_model=str(code),
@@ -109,24 +109,8 @@ def _files(observation_size: int, goal_size: int) -> Mapping[Path, bytes]:
             # No signature: it would refuse what environments give (float64, one observation, an
             # achieved goal); the policy checks sizes itself.
             signature=False,
-            input_example=_example(observation_size, goal_size),
-            pip_requirements=[f"{name}=={version(name)}" for name in _REQUIREMENTS],
+            input_example=example,
+            pip_requirements=requirements,
         )
         files = [file for file in folder.rglob("*") if file.is_file()]
         return {file.relative_to(folder): file.read_bytes() for file in files}
-
-
-_REQUIREMENTS = ("mlflow", "numpy", "safetensors")
-
-
-def _example(observation_size: int, goal_size: int) -> Any:
-    import numpy as np
-
-    observation = np.zeros((1, observation_size), np.float32)
-    if not goal_size:
-        return observation
-    return {"observation": observation, "desired_goal": np.zeros((1, goal_size), np.float32)}
-
-
-def _metadata(policy: PolicyNetwork) -> dict[str, Any]:
-    return {"input_size": policy.input_size, "action_size": policy.action_size, **policy.about}

@@ -1,50 +1,50 @@
-"""One run on its way to MLflow: what it does not have yet, in order, and safe to repeat.
+"""The queue of what one run still has to send to MLflow.
 
-Nothing here is on disk. What a driver that dies had not sent is in the store: a run that goes on
-tells the history of its checkpoint again, and a finished one has all of it in its node. The last
-step that MLflow has of each metric says what is to be left out, so that each value is there once.
+The queue is in memory only. If the driver dies, nothing is lost: a run that is resumed reports the
+history of its checkpoint again, and a finished run has its whole history in the store. Values up to
+the last step that MLflow has of a metric are skipped, so each value is logged once.
 """
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path
-from tempfile import TemporaryDirectory
+from itertools import islice, takewhile
 from typing import NamedTuple
+
+from mlflow.entities import Metric
 
 from music_rllib import names
 from music_rllib.store.run_record import Report
 from music_rllib.tracking.curve import learning_curve_png
-from music_rllib.tracking.mlflow_client import MAX_METRICS, Experiment, KnownRun, Status, Value
-
-__all__ = ["End", "RunProjection", "Start", "StoredRun"]
+from music_rllib.tracking.mlflow_client import MAX_METRICS, Experiment, KnownRun, Status
 
 logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Start:
-    """The run begins, or goes on. `time` in ms since the epoch."""
+    """A run starts or is resumed. `time` in ms since the epoch."""
 
     time: int
     name: str
     tags: Mapping[str, str] = field(default_factory=dict)
     provenance: Mapping[str, str] = field(default_factory=dict)
-    """Tags of the code that computes it."""
+    """Tags for the versions of the code that computes the run."""
     params: Mapping[str, str] = field(default_factory=dict)
     settings: Mapping[str, float] = field(default_factory=dict)
-    """Logged as metrics at step 0."""
+    """Settings that are logged as metrics at step 0."""
     source_node: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class End:
-    """The run ended, and is not in the store. `time` in ms since the epoch."""
+    """A run ends without a result in the store. `time` in ms since the epoch."""
 
     time: int
     status: Status
@@ -52,7 +52,7 @@ class End:
 
 
 class StoredRun(NamedTuple):
-    """What the store has of a run."""
+    """The data of a run in the store."""
 
     reports: Sequence[Report]
     policy: bytes | None = None
@@ -60,195 +60,185 @@ class StoredRun(NamedTuple):
     tags: Mapping[str, str] = {}
 
 
-Read = Callable[[], StoredRun]
-Event = Start | Report | End | Read
+ReadStoredRun = Callable[[], StoredRun]
+Event = Start | Report | End | ReadStoredRun
 Content = bytes | Callable[[], bytes | None]
-"""A file, or what gives it when it is sent; None where there is none after all."""
+"""A file's content, or a function that makes it before the upload; None if there is no file."""
+
+
+class _Cancelled(Exception):  # noqa: N818 - no error
+    """`RunProjection.cancel` was called."""
 
 
 class RunProjection:
-    """Brings one run to MLflow. Told by any thread, sent by one."""
+    """Queues the events and artefacts of one run, and sends them to MLflow.
+
+    Any thread may add to the queue; only one thread sends. `start` or `mirror` must come first.
+    The sweep's own run has no node key and no parent.
+    """
 
     def __init__(
-        self,
-        experiment: Experiment,
-        node_key: str = "",
-        parent: KnownRun | None = None,
-        find_source: Callable[[str], str | None] = lambda node_key: None,
+        self, experiment: Experiment, node_key: str = "", parent: KnownRun | None = None
     ) -> None:
-        """Prepare; nothing is sent yet.
-
-        Args:
-            experiment: where to.
-            node_key: of the run; empty for the sweep's own.
-            parent: the run that this one is shown below.
-            find_source: run id of a node key, for the source tag; None where it has no run.
-        """
         self.node_key = node_key
         self._experiment = experiment
         self._parent = parent
-        self._find_source = find_source
-        self._start: Start | None = None
-        self._told: list[Report] = []
-        """Since the run began or went on: for its learning curve."""
+        self._start: Start
+        self._reports: list[Report] = []
+        """Reports since the last start, for the learning curve."""
         self._events: deque[Event] = deque()
         self._artefacts: dict[str, Content] = {}
         self._lock = threading.Lock()
         self._run: KnownRun | None = None
         self._last_steps: dict[str, int] = {}
-        """What MLflow has of each metric."""
-        self._over = self._completing = self._cancelled = False
+        """Last step that MLflow has of each metric."""
+        self._ended = True
+        self._marked_incomplete = self._cancelled = False
 
-    # -- told --------------------------------------------------------------------------------
+    # -- adding to the queue -----------------------------------------------------------------
 
     def start(self, start: Start) -> None:
-        """The run begins, or goes on: its reports are told from the first one on."""
+        """The run starts or is resumed; its reports follow, from the first one on."""
         with self._lock:
-            self._start, self._told, self._over = start, [], False
+            self._start, self._reports, self._ended = start, [], False
             self._events.append(start)
 
     def report(self, reports: Iterable[Report]) -> None:
-        """New values; those of steps that MLflow has are left out when they are sent."""
+        """Add reports. Values of steps that MLflow has already are skipped when sending."""
         with self._lock:
-            fresh = list(reports)
-            self._told += fresh
-            self._events += fresh
+            new = list(reports)
+            self._reports += new
+            self._events += new
 
     def end(self, end: End) -> None:
-        """The run ended, and is not in the store."""
+        """The run ends without a result in the store; draws its learning curve."""
         with self._lock:
-            start, told = self._start, list(self._told)
-            assert start is not None, "a run begins before it ends"
             self._events.append(end)
-            if told:
-                self._artefacts[names.ARTEFACT_LEARNING_CURVE] = partial(_curve, told, start.name)
-            self._told, self._over = [], True
+            self._put_learning_curve(self._reports)
+            self._reports, self._ended = [], True
 
-    def mirror(self, start: Start, read: Read) -> None:
-        """The run is in the store, from which all that MLflow has not is read when it is sent."""
+    def mirror(self, start: Start, read: ReadStoredRun) -> None:
+        """The run is in the store: `read` replaces all events that are still queued."""
         with self._lock:
-            self._start, self._told, self._over = start, [], True
+            self._start, self._reports, self._ended = start, [], True
             self._events = deque([read])
 
     def put_artefact(self, name: str, content: Content) -> None:
-        """To be uploaded, or read and uploaded. The last one of a name counts."""
+        """Add or replace the artefact `name`."""
         with self._lock:
             self._artefacts[name] = content
 
+    def _put_learning_curve(self, reports: Sequence[Report]) -> None:
+        if reports:
+            draw = partial(_learning_curve, reports, self._start.name)
+            self._artefacts[names.ARTEFACT_LEARNING_CURVE] = draw
+
+    # -- state -------------------------------------------------------------------------------
+
     @property
     def under_way(self) -> bool:
-        """Whether the run has begun and not ended."""
-        return self._start is not None and not self._over
-
-    # -- what is left ------------------------------------------------------------------------
+        """Whether the run has started and not ended."""
+        return not self._ended
 
     @property
     def run_id(self) -> str | None:
-        """The run's id in MLflow, once it is known there."""
+        """The run's id in MLflow; None until it is known."""
         return self._run.run_id if self._run else self._experiment.known_id(self.node_key)
 
     @property
     def records(self) -> int:
-        """How much of what was told is still to be sent."""
+        """Number of events in the queue."""
         return len(self._events)
 
     @property
     def artefacts(self) -> int:
-        """How many files are still to be uploaded."""
-        return len(self._artefacts) or int(self._completing)
+        """Number of artefacts in the queue."""
+        return len(self._artefacts) or int(self._marked_incomplete)
 
     @property
     def delivered(self) -> bool:
         """Whether the run has ended and MLflow has all of it."""
-        return self._over and not self.records and not self.artefacts
+        return self._ended and not self.records and not self.artefacts
 
     def cancel(self) -> None:
-        """Send nothing more after the request that is under way."""
+        """Send nothing after the current request."""
         self._cancelled = True
 
-    # -- sent --------------------------------------------------------------------------------
+    # -- sending -----------------------------------------------------------------------------
 
     def send_records(self) -> None:
-        """Send what was told, in order. Stops with MLflow's error where something fails."""
-        while events := self._next():
-            if self._cancelled or not self._send(events):
-                return
-            with self._lock:
-                # Unless the end of the run has taken their place meanwhile.
-                while events and self._events and self._events[0] is events[0]:
-                    self._events.popleft()
-                    del events[0]
+        """Send the events in order. Raises MLflow's error at the first one that fails."""
+        while not self._cancelled and (events := self._next_events()):
+            with contextlib.suppress(_Cancelled):
+                self._send(events)
+                self._remove(events)
 
     def send_artefacts(self) -> None:
-        """Upload what waits. Stops with MLflow's error where something fails."""
+        """Upload the artefacts. Raises MLflow's error at the first one that fails."""
         for name, content in list(self._artefacts.items()):
             if self._cancelled:
                 return
-            self._upload(name, content() if callable(content) else content)
+            data = content() if callable(content) else content
+            if data is not None:
+                is_policy = name == names.ARTEFACT_POLICY
+                upload = self._experiment.log_policy if is_policy else self._experiment.upload
+                upload(self.attach().run_id, name, data)
             with self._lock:
                 if self._artefacts[name] is content:
                     del self._artefacts[name]
-        if self._completing and not self._artefacts and not self._cancelled:
+        if self._marked_incomplete and not self._artefacts and not self._cancelled:
             self._experiment.delete_tag(self.attach().run_id, names.TAG_INCOMPLETE)
-            self._completing = False
+            self._marked_incomplete = False
 
     def attach(self) -> KnownRun:
-        """Find the run, or create it; with what MLflow has of it."""
+        """The run in MLflow, which is found there or created."""
         if self._run is None:
             start = self._start
-            assert start is not None, "a run is told to begin before anything is sent"
             run = self._experiment.find(self.node_key)
             if run is None:
-                tags = {**start.provenance, **start.tags, **self._nesting()}
+                tags = {**start.provenance, **start.tags, **self._parent_tag()}
                 run = self._experiment.create(self.node_key, start.name, start.time, tags)
             else:
                 self._last_steps = self._experiment.last_steps(run.run_id)
             self._run = run
         return self._run
 
-    def _next(self) -> list[Event]:
-        """The first event; neighbouring reports together, so that one request takes them."""
+    def _next_events(self) -> list[Event]:
+        """The first event, or all reports at the front of the queue, for one request."""
         with self._lock:
-            events: list[Event] = []
-            for event in self._events:
-                if events and not (isinstance(event, Report) and isinstance(events[0], Report)):
-                    break
-                events.append(event)
-            return events
+            reports = list(takewhile(lambda event: isinstance(event, Report), self._events))
+            return reports or list(islice(self._events, 1))
 
-    def _send(self, events: Sequence[Event]) -> bool:
-        """False where it was cancelled in between."""
+    def _remove(self, events: Iterable[Event]) -> None:
+        """Remove sent events from the queue, unless `mirror` has replaced them meanwhile."""
+        with self._lock:
+            for event in events:
+                if self._events and self._events[0] is event:
+                    self._events.popleft()
+
+    def _send(self, events: Sequence[Event]) -> None:
         first = events[0]
         if isinstance(first, Start):
-            return self._send_start(first)
-        if isinstance(first, End):
-            return self._send_end(first)
-        if isinstance(first, Report):
-            return self._log([event for event in events if isinstance(event, Report)])
-        return self._send_stored(first)
+            run_id = self.attach().run_id
+            tags = {**first.provenance, **first.tags, **self._parent_tag(), **self._source_tags()}
+            self._experiment.begin_run(run_id, tags, first.params)
+        elif isinstance(first, End):
+            run_id = self.attach().run_id
+            self._log([])
+            self._experiment.set_tags(run_id, {**first.tags, **self._source_tags()})
+            self._experiment.end_run(run_id, first.status, first.time)
+        elif isinstance(first, Report):
+            self._log([event for event in events if isinstance(event, Report)])
+        else:
+            self._send_stored(first)
 
-    def _send_start(self, start: Start) -> bool:
-        run_id = self.attach().run_id
-        tags = {**start.provenance, **start.tags, **self._nesting(), **self._source_tags()}
-        self._experiment.begin_run(run_id, tags, start.params)
-        return True
-
-    def _send_end(self, end: End) -> bool:
-        run_id = self.attach().run_id
-        if not self._log([]):
-            return False
-        self._experiment.set_tags(run_id, {**end.tags, **self._source_tags()})
-        self._experiment.end_run(run_id, end.status, end.time)
-        return True
-
-    def _send_stored(self, read: Read) -> bool:
+    def _send_stored(self, read: ReadStoredRun) -> None:
         known = self._experiment.find(self.node_key)
-        if self._run is None and known is not None and known.whole:
+        if self._run is None and known is not None and known.complete:
             self._run = known
             self._artefacts.clear()
-            return True
+            return
         stored = read()
-        assert self._start is not None, "mirror() sets it"
         times = [report.timestamp_ms for report in stored.reports] or [self._start.time]
         self._start = start = replace(self._start, time=times[0])
         run_id = self.attach().run_id
@@ -257,80 +247,56 @@ class RunProjection:
             tags[names.TAG_REUSED] = "true"
         tags[names.TAG_INCOMPLETE] = "its learning curve and policy are still to come"
         self._experiment.begin_run(run_id, tags, start.params)
-        if not self._log(stored.reports):
-            return False
+        self._log(stored.reports)
         self._experiment.end_run(run_id, stored.status, times[-1])
         with self._lock:
-            self._completing = True
-            if stored.reports:
-                curve = partial(_curve, stored.reports, start.name)
-                self._artefacts[names.ARTEFACT_LEARNING_CURVE] = curve
+            self._marked_incomplete = True
+            self._put_learning_curve(stored.reports)
             if stored.policy is not None:
                 self._artefacts[names.ARTEFACT_POLICY] = stored.policy
-        return True
 
-    def _log(self, reports: Sequence[Report]) -> bool:
-        run_id = self.attach().run_id
-        fresh = list(self._fresh(reports))
-        for begin in range(0, len(fresh), MAX_METRICS):
+    def _log(self, reports: Sequence[Report]) -> None:
+        """Log the settings and the values that MLflow lacks, as a resumed run repeats steps."""
+        run_id, start = self.attach().run_id, self._start
+        metrics = [metric for report in reports for metric in _metrics_of(report)]
+        # Settings follow the first report, as MLflow's page that compares runs plots the metric
+        # that was logged first: a setting there, such as q against q, would say nothing.
+        position = len(reports[0].metrics) if reports else 0
+        metrics[position:position] = [
+            Metric(name, value, start.time, 0) for name, value in start.settings.items()
+        ]
+        last, new = dict(self._last_steps), []
+        for metric in metrics:
+            if metric.step > last.get(metric.key, -1):
+                last[metric.key] = metric.step
+                new.append(metric)
+        for begin in range(0, len(new), MAX_METRICS):
             if self._cancelled:
-                return False
-            chunk = fresh[begin : begin + MAX_METRICS]
+                raise _Cancelled
+            chunk = new[begin : begin + MAX_METRICS]
             self._experiment.log_metrics(run_id, chunk)
-            self._last_steps.update((value.name, value.step) for value in chunk)
-        return True
+            self._last_steps.update((metric.key, metric.step) for metric in chunk)
 
-    def _fresh(self, reports: Sequence[Report]) -> Iterator[Value]:
-        """The values that MLflow hasn't, each once: a run that goes on repeats steps."""
-        last = dict(self._last_steps)
-        for value in self._values(reports):
-            if value.step > last.get(value.name, -1):
-                last[value.name] = value.step
-                yield value
-
-    def _values(self, reports: Sequence[Report]) -> Iterator[Value]:
-        """Settings come behind the first measurement, which MLflow then has on its axes.
-
-        Its page that compares runs takes the metric that came first: q against q says nothing.
-        """
-        for report in reports[:1]:
-            yield from _of(report)
-        assert self._start is not None, "nothing is sent of a run that was not begun"
-        for name, value in self._start.settings.items():
-            yield Value(name, value, self._start.time, 0)
-        for report in reports[1:]:
-            yield from _of(report)
-
-    def _upload(self, name: str, content: bytes | None) -> None:
-        if content is None:
-            return
-        run_id = self.attach().run_id
-        with TemporaryDirectory() as folder:
-            file = Path(folder, Path(name).name)
-            file.write_bytes(content)
-            if name == names.ARTEFACT_POLICY:
-                self._experiment.log_policy(run_id, name, file)
-            else:
-                self._experiment.upload(run_id, name, file)
-
-    def _nesting(self) -> dict[str, str]:
+    def _parent_tag(self) -> dict[str, str]:
         return {} if self._parent is None else {names.TAG_PARENT_RUN: self._parent.run_id}
 
     def _source_tags(self) -> dict[str, str]:
-        source = self._start.source_node if self._start else None
+        source = self._start.source_node
         if source is None:
             return {}
-        run_id = self._find_source(source)
+        run_id = self._experiment.known_id(source)
         known = {} if run_id is None else {names.TAG_SOURCE_RUN: run_id}
         return {names.TAG_SOURCE_NODE: source, **known}
 
 
-def _of(report: Report) -> Iterator[Value]:
-    for name, value in report.metrics.items():
-        yield Value(name, value, report.timestamp_ms, report.env_steps)
+def _metrics_of(report: Report) -> list[Metric]:
+    return [
+        Metric(name, value, report.timestamp_ms, report.env_steps)
+        for name, value in report.metrics.items()
+    ]
 
 
-def _curve(reports: Sequence[Report], title: str) -> bytes | None:
+def _learning_curve(reports: Sequence[Report], title: str) -> bytes | None:
     try:
         return learning_curve_png(reports, title=title)
     except (ValueError, RuntimeError) as error:

@@ -1,4 +1,4 @@
-"""Which code made a run: git commit and package versions, as tags."""
+"""Tags that name the code of a run: git commit and package versions."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ GIT_SECONDS = 5.0
 
 
 def provenance_tags() -> dict[str, str]:
-    """Versions of what a result depends on, and the commit of the code where it is a checkout."""
+    """Tags of the versions that a result depends on, and of the git commit of a checkout."""
     tags = {names.TAG_VERSION_PREFIX + "python": platform.python_version()}
     for package in PACKAGES:
         try:
@@ -37,10 +37,10 @@ def provenance_tags() -> dict[str, str]:
 
 
 def git_commit(file: Path) -> str | None:
-    """Commit of the repository that tracks ``file``, with ``-dirty`` where it was changed.
+    """Commit of the repository that tracks `file`, with `-dirty` if it has uncommitted changes.
 
-    None where no repository tracks it: an installed package can lie inside a checkout of
-    something else (a virtual environment in a project folder), whose commit would mislead.
+    None if no repository tracks it: the virtual environment of an installed package may lie in a
+    checkout of something else, whose commit would mislead.
     """
     folder = file.resolve().parent
     if _git(folder, "ls-files", "--error-unmatch", file.name) is None:

@@ -1,11 +1,10 @@
-"""The thread that brings runs to MLflow while the sweep goes on."""
+"""The thread that sends queued events and artefacts to MLflow while the sweep runs."""
 
 from __future__ import annotations
 
 import logging
 import random
 import threading
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from music_rllib.store.object_folder import DamagedError
@@ -15,19 +14,19 @@ from music_rllib.tracking.projection import RunProjection
 logger = logging.getLogger(__name__)
 
 GATHER_SECONDS = 0.2
-"""How long a round waits for more records, so that several go with one request."""
+"""Wait before each round, so that one request takes several reports."""
 FIRST_PAUSE = 0.5
 LONGEST_PAUSE = 30.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Pending:
-    """What MLflow does not have yet."""
+    """Counts of what MLflow does not have yet."""
 
     records: int
     artefacts: int
     error: str | None
-    """Why the last attempt failed; None while all is well."""
+    """Reason of the last failure; None if the last round succeeded."""
 
     def __bool__(self) -> bool:
         return self.records > 0 or self.artefacts > 0
@@ -35,52 +34,60 @@ class Pending:
 
 @dataclass(eq=False)
 class _Lane:
-    """A run's records, or its artefacts: one must not keep the other waiting."""
+    """Either the records or the artefacts of a run; neither waits for the other."""
 
     run: RunProjection
-    send: Callable[[], None]
+    has_artefacts: bool
     refused: str | None = None
+    """Reason of a lasting failure, after which nothing more is sent."""
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether there is anything to send that was not refused."""
+        size = self.run.artefacts if self.has_artefacts else self.run.records
+        return self.refused is None and size > 0
+
+    def send(self) -> None:
+        if self.has_artefacts:
+            self.run.send_artefacts()
+        else:
+            self.run.send_records()
 
 
 class Sender(threading.Thread):
-    """Sends every run's records in order; after a failure it pauses, longer each time, and repeats.
+    """Sends the records of each run in order, and retries with growing pauses after a failure.
 
-    A failure that can pass (server down, busy, disk full) ends the round, and the lane that met
-    it goes to the back, so that one bad run cannot keep the others waiting. After a lasting one
-    (a refused value, a deleted run, a damaged node) the lane rests until the sweep is started
-    again. A run that ended and is delivered is forgotten, so that a round costs what is under way.
+    A failure that may pass (server down or busy, disk full) ends the round, and its lane moves to
+    the end of the queue, so that one bad run does not block the others. After a lasting failure
+    (a refused value, a deleted run, a damaged node) the lane stops until the sweep is started
+    again. A run that has ended and is delivered is dropped, so the cost of a round depends only on
+    the runs under way. `store` is the public URI of MLflow's store, for messages.
     """
 
     def __init__(self, store: str) -> None:
-        """``store`` is its public name, for messages."""
         super().__init__(name="mlflow-sender", daemon=True)
         self._store = store
         self._runs: set[RunProjection] = set()
-        self._records: list[_Lane] = []
-        self._artefacts: list[_Lane] = []
+        self._lanes: list[_Lane] = []
         self._change = threading.Condition()
-        self._news = self._hurry = self._stopped = False
+        self._has_news = self._hurry = self._stopped = False
         self._failures = 0
         self._error: str | None = None
 
     def add(self, run: RunProjection) -> None:
-        """Say that a run has something new to send."""
+        """Wake the thread; call this after adding something to a run's queue."""
         with self._change:
             if run not in self._runs:
                 self._runs.add(run)
-                self._records.append(_Lane(run, run.send_records))
-                self._artefacts.append(_Lane(run, run.send_artefacts))
-            self._wake()
-
-    def _wake(self) -> None:
-        self._news = True
-        self._change.notify_all()
+                self._lanes += [_Lane(run, has_artefacts=False), _Lane(run, has_artefacts=True)]
+            self._has_news = True
+            self._change.notify_all()
 
     def pending(self) -> Pending:
-        """What is still to be sent, and why it has not been."""
+        """What MLflow does not have yet, and why."""
         with self._change:
             runs = list(self._runs)
-            refused = [lane.refused for lane in self._lanes() if lane.refused]
+            refused = [lane.refused for lane in self._lanes if lane.refused]
         return Pending(
             records=sum(run.records for run in runs),
             artefacts=sum(run.artefacts for run in runs),
@@ -88,16 +95,16 @@ class Sender(threading.Thread):
         )
 
     def flush(self, timeout: float) -> bool:
-        """Wait until all is delivered; False where it is not after ``timeout`` s or is refused."""
+        """Wait at most `timeout` s for delivery; returns whether everything is delivered."""
         with self._change:
-            self._hurry = True
-            self._wake()
-            self._change.wait_for(lambda: not self._has_work(), timeout)
+            self._hurry = self._has_news = True
+            self._change.notify_all()
+            self._change.wait_for(lambda: not any(lane.is_waiting for lane in self._lanes), timeout)
             self._hurry = False
         return not self.pending()
 
     def stop(self) -> None:
-        """End after the request that is under way."""
+        """End the thread after the current request."""
         with self._change:
             self._stopped = True
             for run in self._runs:
@@ -107,49 +114,39 @@ class Sender(threading.Thread):
     def run(self) -> None:
         """Send in rounds until stopped."""
         while self._wait_for_news():
-            done = self._round()
+            succeeded = self._send_round()
             with self._change:
-                self._news = self._news or not done
+                self._has_news = self._has_news or not succeeded
                 self._change.notify_all()
-            if not done:
+            if not succeeded:
                 self._pause()
 
     def _wait_for_news(self) -> bool:
+        """Wait until there is something to send; False when stopped."""
         with self._change:
-            self._change.wait_for(lambda: self._news or self._stopped)
+            self._change.wait_for(lambda: self._has_news or self._stopped)
             self._change.wait_for(lambda: self._hurry or self._stopped, GATHER_SECONDS)
-            self._news = False
+            self._has_news = False
             return not self._stopped
 
-    def _round(self) -> bool:
-        """Send what there is; False where a failure ended the round."""
-        for lanes in (self._records, self._artefacts):
-            with self._change:
-                waiting = [lane for lane in lanes if lane.refused is None]
-            for lane in waiting:
-                if self._stopped or not self._attempt(lane, lanes):
-                    return False
+    def _send_round(self) -> bool:
+        """Send everything in the queues; False if a failure ended the round."""
+        with self._change:
+            lanes = [lane for lane in self._lanes if lane.refused is None]
+        # All records first: artefacts are larger, and sending a stored run's records adds some.
+        for lane in sorted(lanes, key=lambda lane: lane.has_artefacts):
+            if self._stopped or not self._send_lane(lane):
+                return False
         if self._error is not None:
             logger.warning("MLflow at %s accepts again what was waiting", self._store)
         self._failures, self._error = 0, None
-        self._forget_ended()
+        self._drop_delivered()
         return True
 
-    def _forget_ended(self) -> None:
-        # Whoever tells a run something calls `add` after it: either it is seen here, or `add`
-        # comes after this.
-        with self._change:
-            self._runs = {run for run in self._runs if not run.delivered}
-            self._records = [lane for lane in self._records if lane.run in self._runs]
-            self._artefacts = [lane for lane in self._artefacts if lane.run in self._runs]
-
-    def _lanes(self) -> list[_Lane]:
-        return [*self._records, *self._artefacts]
-
-    def _attempt(self, lane: _Lane, lanes: list[_Lane]) -> bool:
+    def _send_lane(self, lane: _Lane) -> bool:
         try:
             lane.send()
-        # Whatever goes wrong here, the thread must live: what was not sent waits.
+        # The thread must survive every error; what was not sent stays in the queue.
         except Exception as error:
             reason = first_line(error)
             if is_lasting(error) or isinstance(error, DamagedError):
@@ -158,16 +155,21 @@ class Sender(threading.Thread):
                 return True
             if self._error is None:
                 logger.warning(
-                    "MLflow at %s does not accept records, they wait: %s",
-                    self._store,
-                    reason,
+                    "MLflow at %s does not accept records, they wait: %s", self._store, reason
                 )
             self._failures, self._error = self._failures + 1, reason
             with self._change:
-                lanes.remove(lane)
-                lanes.append(lane)
+                self._lanes.remove(lane)
+                self._lanes.append(lane)
             return False
         return True
+
+    def _drop_delivered(self) -> None:
+        # `add` is called after a run's queue has grown: either that is seen here, or `add` runs
+        # after this and adds the run again.
+        with self._change:
+            self._runs = {run for run in self._runs if not run.delivered}
+            self._lanes = [lane for lane in self._lanes if lane.run in self._runs]
 
     def _pause(self) -> None:
         longest = FIRST_PAUSE if self._hurry else LONGEST_PAUSE
@@ -176,9 +178,3 @@ class Sender(threading.Thread):
         with self._change:
             was_hurried = self._hurry
             self._change.wait_for(lambda: self._stopped or self._hurry > was_hurried, seconds)
-
-    def _has_work(self) -> bool:
-        """Whether something waits that was not refused. Called with the lock held."""
-        return any(lane.refused is None and lane.run.records for lane in self._records) or any(
-            lane.refused is None and lane.run.artefacts for lane in self._artefacts
-        )

@@ -1,4 +1,4 @@
-"""Where runs are logged: the tracking URI, checked, and its artefacts. Loads no MLflow."""
+"""MLflow's store: the tracking URI, the place of artefacts, a sweep's record. Loads no MLflow."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import socket
 import sys
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Self
+from typing import TYPE_CHECKING, Self
 from urllib.parse import urlsplit
 
 from music_rllib.errors import TrackingError
@@ -16,24 +16,29 @@ from music_rllib.experiment import sweep_files
 from music_rllib.redaction import redact
 from music_rllib.store.object_folder import StorageError
 
+if TYPE_CHECKING:
+    import requests
+
 CONNECT_SECONDS = 3.0
 ANSWER_SECONDS = 5.0
 _DATABASES = ("sqlite", "postgresql", "mysql", "mssql")
 _SERVERS = ("http", "https")
 _LOW_MEMORY = "MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false"
-"""Without it, a server of MLflow 3 starts job consumers of 2.5 GB, which tracking never uses."""
+"""Keeps a server of MLflow 3 from starting job consumers of 2.5 GB, which tracking never uses."""
+RECORD = "tracking/sweep.json"
+"""File of a `SweepRecord` in the sweep's folder."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrackingStore:
-    """A tracking URI and where an experiment's artefacts go."""
+    """A tracking URI, and where artefacts are kept."""
 
     uri: str
-    """For MLflow itself; may hold a password. Show :attr:`public_uri` instead."""
+    """URI for MLflow; may hold a password, so messages show `public_uri`."""
     artefact_root: str | None
-    """URI below which artefacts are kept; None where the server decides."""
+    """URI below which artefacts are kept; None if the server decides."""
     database: Path | None = None
-    """The embedded sqlite file, where there is one."""
+    """The sqlite file in the storage; None for other stores."""
 
     @property
     def public_uri(self) -> str:
@@ -42,58 +47,58 @@ class TrackingStore:
 
     @property
     def is_server(self) -> bool:
-        """Whether an MLflow server stands between us and the database."""
+        """Whether the store is an MLflow server and no database."""
         return self.uri.startswith(("http://", "https://"))
 
     def ui_command(self) -> str:
-        """What opens MLflow's pages: a command, or the address of the server."""
+        """The command that serves MLflow's pages, or the address of the server."""
         if self.is_server:
             return self.public_uri
-        arguments = [_mlflow_program(), "ui", "--backend-store-uri", self.public_uri]
+        # The plain name, unless another `mlflow` comes first on the PATH.
+        program, found = Path(sys.executable).with_name("mlflow"), shutil.which("mlflow")
+        is_plain = not program.exists() or str(program) == found
+        command = "mlflow" if is_plain else str(program)
+        arguments = [command, "ui", "--backend-store-uri", self.public_uri]
         return f"{_LOW_MEMORY} {shlex.join(arguments)}"
 
     @property
     def pages(self) -> str:
-        """The address of MLflow's pages: the server's, or that of what `ui_command` starts."""
+        """The address of MLflow's pages, on the server or once `ui_command` runs."""
         return self.public_uri.rstrip("/") if self.is_server else "http://127.0.0.1:5000"
-
-
-RECORD = "tracking/sweep.json"
-"""Of a sweep, in its folder."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SweepRecord:
-    """What a later driver must know to go on with this sweep's runs in MLflow."""
+    """What a later driver needs to continue the sweep's runs in MLflow."""
 
     sweep_name: str
     sweep_id: str
     tracking_uri: str | None
-    """Without a password; None for the sqlite file in the storage."""
+    """URI without its password; None for the sqlite file in the storage."""
 
     @classmethod
     def read(cls, storage: str, sweep_name: str) -> Self | None:
-        """The record of the sweep in the folder `sweep_name` of a storage; None where none is.
+        """The record in the folder `sweep_name` of a storage; None if there is none.
 
         Raises:
-            TrackingError: where there is one that cannot be read.
+            TrackingError: The record cannot be read.
         """
         place = f"{sweep_name}/{RECORD}"
         try:
-            found = sweep_files.read(storage, place)
-            if found is None:
+            record = sweep_files.read(storage, place)
+            if record is None:
                 return None
-            return cls(**{field.name: found[field.name] for field in fields(cls)})
+            return cls(**{field.name: record[field.name] for field in fields(cls)})
         except (StorageError, TypeError, KeyError) as error:
             raise TrackingError(
                 f"{redact(storage)}/{place} must hold a sweep's record, got: {error}"
             ) from error
 
     def write(self, storage: str) -> None:
-        """Keep the record with the sweep: in a bucket too, where a driver elsewhere goes on.
+        """Write the record to the storage, where drivers on other machines find it too.
 
         Raises:
-            TrackingError: the storage cannot be written.
+            TrackingError: The storage cannot be written.
         """
         try:
             text = sweep_files.as_json(asdict(self))
@@ -103,18 +108,22 @@ class SweepRecord:
 
 
 def resolve_store(tracking_uri: str | None, storage: str) -> TrackingStore:
-    """The store that ``mlflow.tracking_uri`` means.
+    """The store that `mlflow.tracking_uri` names.
 
     Args:
-        tracking_uri: a server (``http(s)://``), a database (``sqlite:///FILE``,
-            ``postgresql://...``), or None for a sqlite file in ``storage`` with the artefacts
-            in a folder beside it.
-        storage: the sweep's storage: a folder or a bucket URI.
+        tracking_uri: A server (`http(s)://`), a database (`sqlite:///FILE`, `postgresql://...`),
+            or None for a sqlite file in `storage`.
+        storage: The sweep's storage, a folder or a bucket URI. Artefacts are kept there, unless a
+            server keeps them.
 
     Raises:
-        TrackingError: where the URI is none of these, or is None with a bucket.
+        TrackingError: The URI is none of these, or is None although `storage` is a bucket.
     """
     folder = local_folder(storage)
+    if folder is None:
+        artefacts = f"{storage.rstrip('/')}/mlartifacts"
+    else:
+        artefacts = (folder / "mlartifacts").as_uri()
     if tracking_uri is None:
         if folder is None:
             raise TrackingError(
@@ -122,16 +131,16 @@ def resolve_store(tracking_uri: str | None, storage: str) -> TrackingStore:
                 f"got storage {redact(storage)}: a sqlite file cannot live in a bucket. "
                 "Name an MLflow server there."
             )
-        return _embedded(folder)
-    scheme = _scheme(tracking_uri)
-    if scheme in _SERVERS:
-        return TrackingStore(uri=tracking_uri, artefact_root=None)
-    root = f"{storage.rstrip('/')}/mlartifacts" if folder is None else _artefacts_in(folder)
-    return TrackingStore(uri=tracking_uri, artefact_root=root)
+        database = folder / "mlflow.db"
+        return TrackingStore(
+            uri=f"sqlite:///{database}", artefact_root=artefacts, database=database
+        )
+    is_server = _checked_scheme(tracking_uri) in _SERVERS
+    return TrackingStore(uri=tracking_uri, artefact_root=None if is_server else artefacts)
 
 
 def local_folder(storage: str) -> Path | None:
-    """``storage`` as an absolute path; None where it is a bucket."""
+    """`storage` as an absolute path; None if it is a bucket."""
     if storage.startswith("file://"):
         return Path(urlsplit(storage).path)
     if "://" in storage:
@@ -140,20 +149,17 @@ def local_folder(storage: str) -> Path | None:
 
 
 def check_reachable(store: TrackingStore) -> None:
-    """Ask a server for its health; nothing to ask of a database file.
+    """Check that the store's server answers; a database is not checked.
 
     Raises:
-        TrackingError: where no MLflow server answers within ``CONNECT_SECONDS`` and
-            ``ANSWER_SECONDS``.
+        TrackingError: No MLflow server answers in time.
     """
     if not store.is_server:
         return
     import requests
 
     try:
-        answer = requests.get(
-            f"{store.uri.rstrip('/')}/health", timeout=(CONNECT_SECONDS, ANSWER_SECONDS)
-        )
+        answer = _get(store, "health")
     except requests.RequestException as error:
         raise _unreachable(store, _reason(store, error)) from error
     if answer.status_code == 403 and "host" in answer.text.lower():
@@ -164,53 +170,49 @@ def check_reachable(store: TrackingStore) -> None:
         raise _unreachable(store, f"it answered with status {answer.status_code}")
 
 
-def version(store: TrackingStore) -> str | None:
-    """The MLflow whose pages show the store; None where a server doesn't say."""
+def mlflow_version(store: TrackingStore) -> str | None:
+    """Version of the MLflow that shows the store; None if a server does not say."""
     import mlflow
     import requests
 
     if not store.is_server:
         return mlflow.__version__
     try:
-        answer = requests.get(
-            f"{store.uri.rstrip('/')}/version", timeout=(CONNECT_SECONDS, ANSWER_SECONDS)
-        )
+        answer = _get(store, "version")
         return answer.text.strip() if answer.ok else None
     except requests.RequestException:
         return None
 
 
-def _embedded(folder: Path) -> TrackingStore:
-    database = folder / "mlflow.db"
-    return TrackingStore(
-        uri=f"sqlite:///{database}", artefact_root=_artefacts_in(folder), database=database
-    )
+def _get(store: TrackingStore, page: str) -> requests.Response:
+    import requests
+
+    url = f"{store.uri.rstrip('/')}/{page}"
+    return requests.get(url, timeout=(CONNECT_SECONDS, ANSWER_SECONDS))
 
 
-def _artefacts_in(folder: Path) -> str:
-    return (folder / "mlartifacts").as_uri()
+def _checked_scheme(uri: str) -> str:
+    """Scheme of a tracking URI.
 
-
-def _scheme(uri: str) -> str:
+    Raises:
+        TrackingError: MLflow has no such scheme, or the URI names no host.
+    """
     scheme = uri.partition("://")[0].partition("+")[0] if "://" in uri else ""
     if scheme not in (*_SERVERS, *_DATABASES):
         raise TrackingError(
             "mlflow.tracking_uri must be null (a sqlite file in the storage folder), "
             f"http(s)://HOST:PORT or a database URI ({', '.join(_DATABASES)}), got {redact(uri)!r}"
         )
-    if scheme in _SERVERS and not _names_a_host(uri):
+    try:
+        parts = urlsplit(uri)
+        names_a_host = bool(parts.hostname) and parts.port != 0
+    except ValueError:
+        names_a_host = False
+    if scheme in _SERVERS and not names_a_host:
         raise TrackingError(
             f"mlflow.tracking_uri must name a host and a numeric port, got {redact(uri)!r}"
         )
     return scheme
-
-
-def _names_a_host(uri: str) -> bool:
-    try:
-        parts = urlsplit(uri)
-        return bool(parts.hostname) and parts.port != 0
-    except ValueError:
-        return False
 
 
 def _unreachable(store: TrackingStore, reason: str) -> TrackingError:
@@ -220,7 +222,7 @@ def _unreachable(store: TrackingStore, reason: str) -> TrackingError:
     )
 
 
-def _reason(store: TrackingStore, error: Exception) -> str:
+def _reason(store: TrackingStore, error: requests.RequestException) -> str:
     import requests
 
     host = urlsplit(store.uri).hostname or ""
@@ -235,10 +237,3 @@ def _reason(store: TrackingStore, error: Exception) -> str:
     if "refused" in str(error):
         return "the connection was refused"
     return f"no connection ({redact(str(error))})"
-
-
-def _mlflow_program() -> str:
-    """The ``mlflow`` of this Python, by its plain name where that is the one on the PATH."""
-    own = Path(sys.executable).with_name("mlflow")
-    found = shutil.which("mlflow")
-    return str(own) if own.exists() and (found is None or Path(found) != own) else "mlflow"

@@ -1,8 +1,8 @@
-"""The sweep driver's one way to MLflow: tell and go on; the rest happens behind.
+"""What the sweep driver calls to log a sweep to MLflow.
 
-MLflow is a projection of what is in the store and what running runs report
-(:mod:`music_rllib.tracking.projection`): after the constructor nothing here waits for a server or
-writes to a disk, and a thread brings what is new.
+MLflow shows a projection of the store and of what running runs report. Only the constructor waits
+for a server or writes to a disk; afterwards every call only fills the queues of
+:mod:`music_rllib.tracking.projection`, which a thread (:mod:`music_rllib.tracking.sender`) sends.
 """
 
 from __future__ import annotations
@@ -33,28 +33,22 @@ from music_rllib.tracking.mlflow_client import Experiment, Status, check_metric_
 from music_rllib.tracking.projection import End, RunProjection, Start, StoredRun
 from music_rllib.tracking.provenance import provenance_tags
 from music_rllib.tracking.sender import Pending, Sender
-from music_rllib.tracking.store import (
-    SweepRecord,
-    check_reachable,
-    resolve_store,
-    version,
-)
-
-__all__ = ["Tracker"]
+from music_rllib.tracking.store import SweepRecord, check_reachable, mlflow_version, resolve_store
 
 logger = logging.getLogger(__name__)
 
 MAX_CAUSE_LENGTH = 1000
-"""Characters of why a run ended that are kept as a tag; the rest is in the run's log."""
+"""Longest tag that says why a run ended, in characters; the run's log has all of it."""
 _NODE_KEY = re.compile(r"[\w\-]+")
 
 
 class Tracker:
-    """Brings one sweep to MLflow: an experiment, a parent run, and a child run per node.
+    """Logs one sweep to MLflow: an experiment, a parent run, and a child run per node.
 
-    Opening it again on the same sweep continues the same runs: a value whose step MLflow has is
-    left out, so a run that repeats steps after a resume shows each step once.
-    Calls may come from several threads; only one process at a time can track a sweep.
+    A tracker that is opened again on the same sweep continues its runs. Values of steps that
+    MLflow has already are skipped, so a run that repeats steps after a resume shows each step once.
+    Several threads may call it, but only one process at a time may track a sweep. Methods raise
+    ValueError for names that MLflow would refuse, and for events of a run that was not started.
     """
 
     def __init__(
@@ -65,35 +59,35 @@ class Tracker:
         config: Mapping[str, object],
         tracking_uri: str | None = None,
     ) -> None:
-        """Check the store, create the experiment and the parent run, begin to send.
+        """Check the store, create the experiment and the parent run, and start the thread.
 
         Args:
-            sweep_name: also the experiment's name.
-            storage: the sweep's storage, a folder or a bucket URI.
-            config: the whole sweep's settings: params and the artefact ``config/sweep.yaml``
-                of the parent run.
-            tracking_uri: ``mlflow.tracking_uri``; None for a sqlite file in ``storage``.
+            sweep_name: Name of the sweep and of the experiment.
+            storage: The sweep's storage, a folder or a bucket URI.
+            config: All settings of the sweep; they become params and the artefact
+                `config/sweep.yaml` of the parent run.
+            tracking_uri: `mlflow.tracking_uri`; None for a sqlite file in `storage`.
 
         Raises:
-            TrackingError: where the store is not reachable or refuses, where the storage is not
-                writable, or where another process tracks this sweep.
+            TrackingError: The store is not reachable or refuses, the storage is not writable, or
+                another process tracks this sweep.
         """
         self.store = resolve_store(tracking_uri, storage)
         check_reachable(self.store)
         folder = sweep_folder(storage, sweep_name)
-        self._lock = _locked(folder / "tracking")
+        self._lock = _lock(folder / "tracking")
         self._runs: dict[str, RunProjection] = {}
         self._checked_names: set[str] = set()
-        self._left: Pending | None = None
+        self._undelivered: Pending | None = None
         self._view: dict[str, str] = {}
         self._place = f"{redact(storage)}/{sweep_name}"
         self._provenance = provenance_tags()
         try:
-            # A version before this one kept the record of a bucket's sweep on the driver's disk.
-            known = SweepRecord.read(storage, sweep_name) or SweepRecord.read(
+            # Earlier versions kept the record on the driver's disk if the storage is a bucket.
+            record = SweepRecord.read(storage, sweep_name) or SweepRecord.read(
                 str(folder.parent), folder.name
             )
-            self.sweep_id = known.sweep_id if known else uuid.uuid4().hex[:16]
+            self.sweep_id = record.sweep_id if record else uuid.uuid4().hex[:16]
             self._sweep_tags = {names.TAG_SWEEP: sweep_name, names.TAG_SWEEP_ID: self.sweep_id}
             SweepRecord(
                 sweep_name=sweep_name,
@@ -101,7 +95,7 @@ class Tracker:
                 tracking_uri=None if tracking_uri is None else self.store.public_uri,
             ).write(storage)
             self._experiment = Experiment(self.store, sweep_name, self.sweep_id)
-            self._parent = self._begin(sweep_name, config)
+            self._parent = self._parent_run(sweep_name, config)
         except BaseException:
             self._lock.release()
             raise
@@ -120,76 +114,55 @@ class Tracker:
         return self._parent.attach().run_id
 
     def start(self, run: RunInfo) -> None:
-        """A run begins, or goes on after a resume; its reports are then told from its first one on.
-
-        Raises:
-            ValueError: where a name or key is not one that MLflow accepts.
-        """
-        told = self._run(run.node_key)
-        told.start(self._as_start(run))
-        told.put_artefact(names.ARTEFACT_RUN_CONFIG, partial(_as_yaml, run.config))
-        self._sender.add(told)
+        """A run starts or is resumed; all its reports follow, from the first one on."""
+        projection = self._projection(run)
+        projection.start(self._as_start(run))
+        self._sender.add(projection)
 
     def log(self, node_key: str, reports: Sequence[Report]) -> None:
-        """Reports of a started run; values of a step that MLflow has are left out.
-
-        Raises:
-            ValueError: where the run was not started, or a metric's name is not one that MLflow
-                accepts.
-        """
-        run = self._started(node_key)
+        """Log reports of a started run."""
+        projection = self._started(node_key)
         for report in reports:
             self._check_names(report.metrics)
-        run.report(reports)
-        self._sender.add(run)
+        projection.report(reports)
+        self._sender.add(projection)
 
     def end(self, node_key: str, status: Status, tags: Mapping[str, str] | None = None) -> None:
-        """A started run ended without a result in the store; its learning curve is drawn.
+        """End a started run that has no result in the store; `tags` say why.
 
-        Args:
-            node_key: the run.
-            status: FAILED, or KILLED for one that was stopped and can go on.
-            tags: say why; their beginnings are kept.
-
-        Raises:
-            ValueError: where the run was not started.
+        A run that was stopped, and can be continued, is KILLED.
         """
-        run = self._started(node_key)
-        run.end(End(time=_now(), status=status, tags=_shortened(tags or {})))
-        self._sender.add(run)
+        projection = self._started(node_key)
+        short = {key: redact(value)[:MAX_CAUSE_LENGTH] for key, value in (tags or {}).items()}
+        projection.end(End(time=_now(), status=status, tags=short))
+        self._sender.add(projection)
 
     def mirror(self, run: RunInfo, read: Callable[[], StoredRun]) -> None:
-        """The store has a run: MLflow gets what it has not of it, now or by an earlier sweep.
+        """Log a run of the store, from this sweep or an earlier one.
 
-        Args:
-            run: as for `start`.
-            read: gives all of the run; called by another thread, unless MLflow has it.
-
-        Raises:
-            ValueError: where a name or key is not one that MLflow accepts.
+        The sending thread calls `read`, unless MLflow has all of the run already.
         """
-        told = self._run(run.node_key)
-        told.mirror(self._as_start(run), read)
-        told.put_artefact(names.ARTEFACT_RUN_CONFIG, partial(_as_yaml, run.config))
-        self._sender.add(told)
+        projection = self._projection(run)
+        projection.mirror(self._as_start(run), read)
+        self._sender.add(projection)
 
     def put_sweep_artefact(self, name: str, content: str) -> None:
-        """An artefact of the parent run."""
+        """Add or replace an artefact of the parent run."""
         self._parent.put_artefact(name, content.encode())
         self._sender.add(self._parent)
 
     def run_id(self, node_key: str) -> str | None:
-        """MLflow's id of a run; None until the server has it (see :meth:`flush`)."""
-        run = self._runs.get(node_key)
-        return None if run is None else run.run_id
+        """MLflow's id of a run; None until the server has the run."""
+        projection = self._runs.get(node_key)
+        return None if projection is None else projection.run_id
 
     def keep_view(self, content: str, versions: Sequence[str]) -> None:
-        """Have :meth:`comparison_url` open a view, where MLflow is of one of these versions.
+        """Save a view for `comparison_url`, if MLflow has one of these versions.
 
-        Another one may have another format. Never fails: the page is of use without a view.
+        Other versions may have another format. Errors are only logged: the page works without.
         """
-        found = version(self.store) or ""
-        if not found.startswith(tuple(f"{known}." for known in versions)):
+        version = mlflow_version(self.store) or ""
+        if not version.startswith(tuple(f"{known}." for known in versions)):
             return
         try:
             self._experiment.keep_view(self.sweep_id, content)
@@ -199,31 +172,27 @@ class Tracker:
             self._view = {"viewStateShareKey": self.sweep_id}
 
     def comparison_url(self) -> str:
-        """The chart page of the sweep's experiment, with the view of `keep_view`."""
+        """URL of the experiment's chart page, with the view of `keep_view`."""
         query = urlencode({"compareRunsMode": "CHART", **self._view})
         return f"{self.store.pages}/#/experiments/{self.experiment_id}/runs?{query}"
 
-    def ui_command(self) -> str:
-        """What opens MLflow's pages: a command, or a server's address."""
-        return self.store.ui_command()
-
     def pending(self) -> Pending:
-        """What MLflow does not have yet, and why; for a progress display."""
-        return self._left or self._sender.pending()
+        """What MLflow does not have yet, and why."""
+        return self._undelivered or self._sender.pending()
 
     def flush(self, timeout: float) -> bool:
-        """Wait until MLflow has everything; False where that takes more than ``timeout`` s."""
+        """Wait at most `timeout` s for delivery; returns whether everything is delivered."""
         return self._sender.flush(timeout)
 
     def close(self, status: Status = "FINISHED", timeout: float = 20.0) -> Pending:
-        """End the sweep's run, send for at most ``timeout`` s, and say what is left over.
+        """End the parent run, send for at most `timeout` s, and return what is not delivered.
 
-        Runs that were started and not finished are marked KILLED; a later sweep continues them.
-        The second call only repeats the first one's answer.
+        Runs that are under way are marked KILLED; a later sweep continues them. A second call
+        only returns the same value again.
         """
-        if self._left is None:
-            for node_key, run in self._runs.items():
-                if run.under_way:
+        if self._undelivered is None:
+            for node_key, projection in self._runs.items():
+                if projection.under_way:
                     self.end(node_key, "KILLED")
             self._parent.end(End(time=_now(), status=status))
             self._sender.add(self._parent)
@@ -231,19 +200,19 @@ class Tracker:
             self._sender.stop()
             self._sender.join(1.0)  # a request under way ends by itself, and is harmless
             self._lock.release()
-            self._left = self._sender.pending()
-        return self._left
+            self._undelivered = self._sender.pending()
+        return self._undelivered
 
     def undelivered_message(self) -> str | None:
-        """What did not arrive, and how to send it; None where all arrived."""
-        left = self.pending()
-        if not left:
+        """What was not delivered, and the command that sends it; None if all was delivered."""
+        pending = self.pending()
+        if not pending:
             return None
         command = shlex.join(["python", "-m", "music_rllib.tracking", "deliver", self._place])
         return (
-            f"{left.records} records and {left.artefacts} artefacts did not reach MLflow at "
-            f"{self.store.public_uri} ({left.error or 'there was no time left'}). The results are "
-            f"in the storage; send them with:\n  {command}"
+            f"{pending.records} records and {pending.artefacts} artefacts did not reach MLflow at "
+            f"{self.store.public_uri} ({pending.error or 'there was no time left'}). The results "
+            f"are in the storage; send them with:\n  {command}"
         )
 
     def __enter__(self) -> Self:
@@ -260,18 +229,10 @@ class Tracker:
         else:
             self.close("FAILED" if issubclass(kind, Exception) else "KILLED")
 
-    def _begin(self, sweep_name: str, config: Mapping[str, object]) -> RunProjection:
-        """The sweep's own run, found or created at once, so that runs are nested below it."""
+    def _parent_run(self, sweep_name: str, config: Mapping[str, object]) -> RunProjection:
+        """The sweep's own run. It is created at once, as its children need its id."""
         parent = RunProjection(self._experiment)
-        parent.start(
-            Start(
-                time=_now(),
-                name=sweep_name,
-                tags=self._sweep_tags,
-                provenance=self._provenance,
-                params=flat_params(config),
-            )
-        )
+        parent.start(self._as_start(RunInfo(node_key="", name=sweep_name, config=config)))
         parent.put_artefact(names.ARTEFACT_SWEEP_CONFIG, _as_yaml(config))
         try:
             parent.attach()
@@ -282,20 +243,21 @@ class Tracker:
             ) from error
         return parent
 
-    def _run(self, node_key: str) -> RunProjection:
-        if not _NODE_KEY.fullmatch(node_key):
-            raise ValueError(f"a node key is letters, digits, - and _, got {node_key!r}")
-        if node_key not in self._runs:
-            self._runs[node_key] = RunProjection(
-                self._experiment, node_key, self._parent.attach(), self._experiment.known_id
-            )
-        return self._runs[node_key]
+    def _projection(self, run: RunInfo) -> RunProjection:
+        """The projection of a run, with the artefact of its settings."""
+        key = run.node_key
+        if not _NODE_KEY.fullmatch(key):
+            raise ValueError(f"a node key is letters, digits, - and _, got {key!r}")
+        if key not in self._runs:
+            self._runs[key] = RunProjection(self._experiment, key, self._parent.attach())
+        self._runs[key].put_artefact(names.ARTEFACT_RUN_CONFIG, partial(_as_yaml, run.config))
+        return self._runs[key]
 
     def _started(self, node_key: str) -> RunProjection:
-        run = self._runs.get(node_key)
-        if run is None or not run.under_way:
+        projection = self._runs.get(node_key)
+        if projection is None or not projection.under_way:
             raise ValueError(f"start(...) must come before log and end, for node {node_key!r}")
-        return run
+        return projection
 
     def _as_start(self, run: RunInfo) -> Start:
         self._check_names(run.settings)
@@ -311,29 +273,25 @@ class Tracker:
         )
 
     def _check_names(self, metrics: Mapping[str, float]) -> None:
-        """Before MLflow would refuse all of the run's records for one name."""
+        """Check names here, as MLflow would refuse the whole request for one bad name."""
         for name in metrics.keys() - self._checked_names:
             check_metric_name(name)
             self._checked_names.add(name)
 
 
 def _now() -> int:
-    """MLflow's time: ms since the epoch."""
+    """Now, in ms since the epoch, as MLflow counts."""
     return round(time.time() * 1000)
 
 
-def _shortened(tags: Mapping[str, str]) -> dict[str, str]:
-    return {key: redact(value)[:MAX_CAUSE_LENGTH] for key, value in tags.items()}
-
-
 def _as_yaml(settings: Mapping[str, object]) -> bytes:
-    """Settings as a file, no secret in it."""
+    """Settings as a YAML file, without secrets."""
     plain = json.loads(json.dumps(without_secrets(settings), default=str))
     return str(yaml.safe_dump(plain, sort_keys=False, allow_unicode=True)).encode()
 
 
-def _locked(folder: Path) -> FileLock:
-    """Against a second process that tracks the sweep on this machine."""
+def _lock(folder: Path) -> FileLock:
+    """Lock out a second process that tracks the sweep on this machine."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock = FileLock(folder / "lock", timeout=0, thread_local=False)

@@ -32,13 +32,15 @@ from music_rllib.config.load import load_sweep
 from music_rllib.errors import TrackingError
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.location import find_sweep
+from music_rllib.experiment.run_info import RunInfo
 from music_rllib.policy import PolicyNetwork
 from music_rllib.report.location import find_sweep as find_report
 from music_rllib.store.node_store import NodeStore
 from music_rllib.store.run_record import HISTORY, Report, RunResult, last_values, to_json_lines
-from music_rllib.tracking import RunInfo, StoredRun, Tracker
 from music_rllib.tracking.cli import app
 from music_rllib.tracking.policy_model import write_model
+from music_rllib.tracking.projection import StoredRun
+from music_rllib.tracking.tracker import Tracker
 from tests.kept_sweep import kept_sweep
 
 MakeTracker = Callable[..., Tracker]
@@ -94,7 +96,7 @@ def fresh_store(tmp_path_factory: pytest.TempPathFactory) -> FreshStore:
     """Made once: MLflow's tables take seconds, copying the file does not."""
     folder = tmp_path_factory.mktemp("first")
     code = (
-        "import sys; from music_rllib.tracking import Tracker; "
+        "import sys; from music_rllib.tracking.tracker import Tracker; "
         "Tracker(sweep_name='first', storage=sys.argv[1], config={}).close()"
     )
     command = [sys.executable, "-c", code, str(folder)]
@@ -534,7 +536,8 @@ DRIVER = """
 import sys, time
 from music_rllib import names
 from music_rllib.store.run_record import Report
-from music_rllib.tracking import RunInfo, Tracker
+from music_rllib.experiment.run_info import RunInfo
+from music_rllib.tracking.tracker import Tracker
 tracker = Tracker(sweep_name="smoke", storage=sys.argv[1], config={"name": "smoke", "seeds": [0]})
 tracker.start(RunInfo(node_key="a", name="finetune/a", config={"seed": 0}))
 for step in range(1, 10_000):

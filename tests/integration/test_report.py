@@ -37,7 +37,9 @@ from music_rllib.results.data import ReportError, Sweep
 from music_rllib.results.from_mlflow import read_mlflow
 from music_rllib.results.mlflow_tables import read_tables
 from music_rllib.store.run_record import Report
-from music_rllib.tracking import StoredRun, Tracker, resolve_store
+from music_rllib.tracking.projection import StoredRun
+from music_rllib.tracking.store import resolve_store
+from music_rllib.tracking.tracker import Tracker
 
 STEPS = range(20_000, 100_001, 20_000)
 CONFIG = """
@@ -278,7 +280,7 @@ def test_the_report_is_attached_to_the_sweep_s_run(sweep_folder: Path, page: Pat
 def test_a_report_on_a_database_that_is_being_made_waits_for_its_tables(tmp_path: Path) -> None:
     """Two that make MLflow's tables at a time crash each other, the sweep too."""
     store = resolve_store(None, str(tmp_path))
-    make = "import sys; from music_rllib.tracking import Tracker; "
+    make = "import sys; from music_rllib.tracking.tracker import Tracker; "
     make += "Tracker(sweep_name='s', storage=sys.argv[1], config={}).__enter__().close('FINISHED')"
     command = [sys.executable, "-c", make, str(tmp_path)]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as sweep:

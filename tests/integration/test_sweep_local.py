@@ -17,7 +17,7 @@ from mlflow import MlflowClient
 from music_rllib import load_sweep, names
 from music_rllib.results.archive.folder import write_archive
 from music_rllib.results.from_mlflow import read_mlflow
-from music_rllib.tracking import resolve_store
+from music_rllib.tracking.store import resolve_store
 from tests.integration.conftest import listening
 
 pytestmark = pytest.mark.integration

@@ -1,4 +1,4 @@
-"""Known notices go, everything else stays."""
+"""Known notices are hidden, and everything else is shown."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LOGGER = "ray.rllib.algorithms.algorithm_config"
 
 @pytest.fixture
 def seen(caplog: pytest.LogCaptureFixture) -> Iterator[pytest.LogCaptureFixture]:
-    """What the loggers let through; Ray, once imported, keeps its records from the root logger."""
+    """Records that the logger lets through; once imported, Ray hides them from the root logger."""
     logger = logging.getLogger(LOGGER)
     logger.addHandler(caplog.handler)
     quiet.quiet_third_parties()
@@ -89,7 +89,7 @@ LOOPBACK_ONLY = quiet.LOCAL_RAY_BEYOND_LOOPBACK
 
 @pytest.fixture
 def bare(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
-    """An environment in which nothing has been chosen."""
+    """An environment without any variable of Ray or MLflow."""
     for name in list(os.environ):
         if name.startswith(("RAY_", "MLFLOW_")):
             monkeypatch.delenv(name)

@@ -1,4 +1,4 @@
-"""How many runs fit side by side, and what never fits."""
+"""How many runs a cluster can hold at once, and which it can never hold."""
 
 from __future__ import annotations
 
@@ -66,11 +66,11 @@ def test_a_machine_without_gpus() -> None:
 
 @dataclass
 class FakeCluster:
-    """What Ray says of one, without Ray."""
+    """Replaces Ray's answers about a cluster."""
 
     nodes: list[dict[str, float]]
     by_type: bool = True
-    """Whether the nodes are of an autoscaler's types."""
+    """Whether the nodes have an autoscaler's types."""
     could_add: dict[str, float] = field(default_factory=dict)
     """The largest node that the autoscaler may start."""
     asked: list[Mapping[str, float]] = field(default_factory=list)
@@ -95,7 +95,7 @@ HEAD = {"CPU": 1.0}
 def test_a_run_that_a_node_is_added_for_is_not_refused(
     settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As on AWS: a head with one CPU, and workers that come with the work."""
+    """As on AWS: a head with one CPU, and workers that are started for waiting runs."""
     fake = FakeCluster([HEAD], could_add=BIG)
     fake.put_in_place(monkeypatch)
     room = _room(Resources(**settings))
@@ -115,7 +115,7 @@ def test_what_no_node_that_may_be_added_could_hold_is_refused(
 
 
 def test_runs_wait_where_nodes_are_added_for_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One run fits; with one more waiting at most, the cluster would grow by a node at a time."""
+    """One run fits. If only one more waited, the cluster would grow by one node at a time."""
     fake = FakeCluster([HEAD])
     fake.put_in_place(monkeypatch)
     room = _room(Resources())
@@ -134,7 +134,7 @@ def test_no_more_runs_wait_than_fit_where_nothing_is_added(monkeypatch: pytest.M
         (3, {"cpu", "head"}, set(), True),
         (3, {""}, {"head"}, False),
         (0, {"head"}, {"head", "cpu"}, True),
-        # What `ray start` reports of nodes that were started by hand.
+        # Types of nodes that were started by `ray start`.
         (0, {""}, {"node_abc"}, False),
         (0, {""}, {"local.cluster.node"}, False),
         (0, set(), set(), False),
@@ -165,7 +165,7 @@ def test_an_autoscaler_is_known_by_the_types_of_its_nodes(
 def test_the_autoscalers_answer_is_waited_for(
     infeasible: list[str], placed_after: int, expected: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It says nothing at first, and of a request that can be met it never says anything."""
+    """It reports nothing at first, and never reports a feasible request."""
     looks = itertools.count(7)
 
     def state() -> autoscaler.State:
@@ -186,7 +186,7 @@ def test_impossible_amounts(settings: dict[str, Any]) -> None:
 
 
 def test_a_trial_asks_ray_for_all_of_it() -> None:
-    """The bundle of a trial is the one that was checked."""
+    """A trial reserves the bundle that was checked."""
     from music_rllib.config.load import load_sweep
     from music_rllib.experiment.plan import make_plan
     from music_rllib.sweep.driver import DEFAULT_CONFIG

@@ -1,4 +1,4 @@
-"""Handoffs: the same weights come out, and whatever was tampered with is refused."""
+"""Handoffs give back the same weights, and a changed handoff is refused."""
 
 import json
 import pickle
@@ -121,7 +121,7 @@ def test_damage_is_named(handoff: Path) -> None:
 
 
 class Bomb:
-    """Unpickling this leaves a file behind."""
+    """An object that creates a file when it is unpickled."""
 
     def __init__(self, trace: Path) -> None:
         self.trace = trace
@@ -131,7 +131,7 @@ class Bomb:
 
 
 def forge(handoff: Path, data: bytes, **changes: Any) -> None:
-    """Put `data` in place of weights, with a manifest that agrees."""
+    """Replace the weights by `data`, and change the manifest to match."""
     import hashlib
 
     manifest = json.loads((handoff / "handoff.json").read_text())

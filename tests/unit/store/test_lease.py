@@ -1,4 +1,4 @@
-"""Leases: one owner at a time, and none for ever."""
+"""A lease has one owner at a time, and expires."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
 def test_a_clock_that_jumps_an_hour_takes_no_lease_from_a_living_owner(
     place: LeaseFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Forwards and backwards: it is renewed at once, by the new time."""
+    """After a jump forwards or backwards the lease is renewed at once, by the new time."""
     mine, day, jump = Lease.of_this_process("mine"), time.time, [0.0]
     place.acquire(mine)
     monkeypatch.setattr(time, "time", lambda: day() + jump[0])
@@ -156,7 +156,7 @@ def test_a_clock_that_jumps_an_hour_takes_no_lease_from_a_living_owner(
 def test_a_lease_from_a_time_that_is_yet_to_come_holds_while_it_is_renewed(
     place: LeaseFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its owner's clock is ahead, or this one was set back after the owner died."""
+    """The owner's clock is ahead, or this clock was set back after the owner died."""
     theirs, mine = elsewhere(seconds=3700.0), Lease.of_this_process("mine")
     steady, passed = time.monotonic, [0.0]
     monkeypatch.setattr(time, "monotonic", lambda: steady() + passed[0])
@@ -221,7 +221,7 @@ def test_a_lease_is_acquired_while_its_folder_is_deleted_again_and_again(tmp_pat
 def test_a_process_is_the_same_after_the_time_of_day_was_set(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The boot, by which psutil dates processes, is an hour earlier or later then."""
+    """psutil's time of the boot, from which it computes start times, jumps by an hour too."""
     mine = Lease.of_this_process("mine")
     boot = psutil.boot_time()
     for hours in (1, -1):

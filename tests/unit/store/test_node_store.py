@@ -1,4 +1,4 @@
-"""The node store: complete or absent, on a disk and in an object store."""
+"""The node store on a disk and in an object store."""
 
 import errno
 import os
@@ -46,7 +46,7 @@ def local_store(tmp_path: Path) -> NodeStore:
 
 
 def object_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> NodeStore:
-    """The same over a file system that has no rename and no folders of its own."""
+    """A store on a file system without renames and folders, like a bucket."""
     memory = MemoryFileSystem()
     memory.store.clear()
     memory.pseudo_dirs[:] = [""]
@@ -170,7 +170,7 @@ def test_what_was_sound_is_not_read_again_and_damage_since_is_found(
         check(folders, name)
 
     monkeypatch.setattr(ObjectFolders, "check", counting)
-    # The times of the last change of a file's attributes can't be set: they count as old here.
+    # A file's ctime cannot be set to an older time, so new files must count as old here.
     monkeypatch.setattr(verified, "SETTLED_SECONDS", 0.0)
     keys = [f"{number:020d}" for number in range(3)]
     for key in keys:
@@ -202,7 +202,7 @@ def test_a_damaged_list_of_what_is_sound_costs_a_second_reading(
 
 
 def test_a_file_that_was_written_just_now_is_read_again(tmp_path: Path, produced: Path) -> None:
-    """It may be written again at what the disk calls the same time."""
+    """It may be written again without a change of its time stamp."""
     store = local_store(tmp_path)
     store.publish(KEY, produced, RESULT)
     assert store.damage([KEY]) == {}
@@ -236,7 +236,7 @@ def test_sizes_tell_without_reading(store: NodeStore, produced: Path) -> None:
 
 @pytest.mark.parametrize("mask", [0o022, 0o077, 0o007])
 def test_who_may_read_a_node_is_up_to_the_umask(tmp_path: Path, produced: Path, mask: int) -> None:
-    """Of a group that shares a storage all may read it; of a user who is alone nobody else."""
+    """So a group can share a storage, and a single user can keep it private."""
     shutil.rmtree(tmp_path / "storage", ignore_errors=True)
     before = os.umask(mask)
     try:
@@ -365,7 +365,7 @@ def test_a_damaged_checkpoint_is_skipped_aloud(tmp_path: Path) -> None:
         assert (newest.folder / "state").read_text() == "1000"
     assert len(warnings) == 1
     assert newest_name in warnings[0]
-    # The run gets there again, and this time it counts.
+    # The run saves the same step again, and this checkpoint is used.
     with work.new_checkpoint(2000) as draft:
         (draft.folder / "state").write_text("2000")
     with work.newest(warnings.append) as newest:

@@ -1,4 +1,4 @@
-"""The re-delivery command explains itself and refuses bad input (delivery: integration tests)."""
+"""Help and bad input of `tracking deliver`; integration tests cover the delivery."""
 
 from __future__ import annotations
 

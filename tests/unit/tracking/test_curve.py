@@ -1,4 +1,4 @@
-"""The learning-curve picture says what was measured, with axes that can be read."""
+"""The learning curve shows what was measured, on readable axes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The commit that is written down is the commit of our code."""
+"""The recorded commit is the commit of this package."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which URIs are accepted, and what a user reads where none answers."""
+"""Which tracking URIs are accepted, and the messages if a server does not answer."""
 
 from __future__ import annotations
 
