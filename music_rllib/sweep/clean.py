@@ -17,8 +17,6 @@ from music_rllib.store.node_store import CONTINUATIONS
 from music_rllib.store.object_folder import open_storage
 from music_rllib.store.paths import sweep_folder
 
-__all__ = ["Cleaning", "delete", "what_can_go"]
-
 Item = dict[str, Any]
 
 

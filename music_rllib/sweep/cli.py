@@ -21,8 +21,6 @@ from music_rllib.sweep.commands import (
     stop,
 )
 
-__all__ = ["COMMANDS", "EXIT_CODES", "app", "main"]
-
 COMMANDS: dict[str, tuple[Callable[..., int], str]] = {
     "run": (run.run, run.EXAMPLES),
     "plan": (plan.plan, plan.EXAMPLES),

@@ -12,8 +12,6 @@ from music_rllib.experiment.sweep_files import is_remote
 from music_rllib.redaction import redact
 from music_rllib.store.paths import sweep_folder
 
-__all__ = ["report_at_end"]
-
 PATIENCE = 900.0
 """Seconds after which the sweep ends without a report."""
 

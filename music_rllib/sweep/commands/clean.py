@@ -9,8 +9,6 @@ import typer
 from music_rllib.command_line import Json, console_for, print_json
 from music_rllib.sweep.cli_helpers import Place, Storage
 
-__all__ = ["EXAMPLES", "clean"]
-
 EXAMPLES = """\
 Examples:
   music-rllib clean results/smoke
@@ -52,20 +50,14 @@ def clean(
     from music_rllib.experiment.location import find_sweep
     from music_rllib.sweep.clean import delete, what_can_go
 
-    found = find_sweep(sweep, storage)
-    cleaning = what_can_go(found, unfinished=unfinished or everything, everything=everything)
+    location = find_sweep(sweep, storage)
+    cleaning = what_can_go(location, unfinished=unfinished or everything, everything=everything)
     going = cleaning.items
     if yes:
-        delete(found, cleaning)
+        delete(location, cleaning)
     if json:
-        print_json(
-            {
-                "sweep": found.name,
-                "deleted": yes,
-                "items": going,
-                "kept": cleaning.kept,
-            }
-        )
+        answer = {"sweep": location.name, "deleted": yes, "items": going, "kept": cleaning.kept}
+        print_json(answer)
         return 0
     console = console_for()
     for item in going:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,8 +16,6 @@ if TYPE_CHECKING:
 
     from music_rllib.policy.policy import Policy
     from music_rllib.policy.rollout import EpisodeResult
-
-__all__ = ["EXAMPLES", "evaluate"]
 
 EXAMPLES = """\
 Examples:
@@ -95,7 +94,7 @@ def evaluate(
 
 
 def _check_video(path: Path | None) -> None:
-    """Before minutes of episodes are played."""
+    """Refuse a file that can't be written, before minutes of episodes are played."""
     from music_rllib.policy.video import FORMATS
 
     if path is None:
@@ -130,8 +129,8 @@ def _document(
     from dataclasses import asdict
 
     success = [result.success for result in results if result.success is not None]
-    some = [result.success_any_step for result in results if result.success_any_step is not None]
-    moved = [r.object_displacement for r in results if r.object_displacement is not None]
+    any_step = [r.success_any_step for r in results if r.success_any_step is not None]
+    displacement = [r.object_displacement for r in results if r.object_displacement is not None]
     return {
         "run": place,
         "node_key": policy.node_key,
@@ -144,19 +143,19 @@ def _document(
         "seed": seed,
         "success_rate": _mean(success),
         "success_rate_interval": _interval(success),
-        "success_rate_any_step": _mean(some),
+        "success_rate_any_step": _mean(any_step),
         "episode_return": _mean([result.episode_return for result in results]),
-        "object_displacement": _mean(moved),
+        "object_displacement": _mean(displacement),
         "results": [asdict(result) for result in results],
     }
 
 
-def _mean(values: list[Any]) -> float | None:
+def _mean(values: Sequence[float]) -> float | None:
     return sum(values) / len(values) if values else None
 
 
 def _interval(successes: list[bool]) -> list[float] | None:
-    """Clopper and Pearson's 95 % interval: of this policy, over starts and goals."""
+    """Clopper and Pearson's 95 % interval of the policy's success rate over starts and goals."""
     from music_rllib.results.statistics import clopper_pearson
 
     if not successes:

@@ -10,8 +10,6 @@ import typer
 from music_rllib.command_line import Json, print_json
 from music_rllib.errors import BadInputError
 
-__all__ = ["INIT_EXAMPLES", "PRESETS_EXAMPLES", "SCHEMA_EXAMPLES", "init", "presets", "schema"]
-
 INIT_EXAMPLES = """\
 Examples:
   music-rllib init

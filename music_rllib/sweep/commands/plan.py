@@ -6,11 +6,9 @@ from typing import Annotated
 
 import typer
 
-from music_rllib.command_line import Json, console_for, print_json
-from music_rllib.sweep.cli_helpers import Name, Seeds, SweepStorage
-from music_rllib.sweep.commands.run import Config, Overrides, file_and_overrides
-
-__all__ = ["EXAMPLES", "plan"]
+from music_rllib.command_line import Json
+from music_rllib.sweep.cli_helpers import Config, Name, Overrides, Seeds, SweepStorage
+from music_rllib.sweep.commands.run import file_and_overrides
 
 EXAMPLES = """\
 Examples:
@@ -48,7 +46,6 @@ def plan(
 
     config, overrides = file_and_overrides(config, overrides)
     return run_sweep(
-        console_for(as_json=json),
         config,
         dry_run=True,
         measure=measure,
@@ -56,5 +53,5 @@ def plan(
         name=name,
         seeds=seeds,
         overrides=overrides,
-        answer=print_json if json else lambda document: None,
+        as_json=json,
     )

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from music_rllib.command_line import Json, console_for, print_json
-from music_rllib.sweep.cli_helpers import Place, Seeds, Storage
-from music_rllib.sweep.commands.run import AcceptChanges, RetrainDamaged
-
-__all__ = ["EXAMPLES", "resume"]
+from music_rllib.command_line import Json
+from music_rllib.sweep.cli_helpers import AcceptChanges, Place, RetrainDamaged, Seeds, Storage
 
 EXAMPLES = """\
 Examples:
@@ -33,13 +30,12 @@ def resume(
     By the configuration that it has left in its storage.
     """
     from music_rllib.experiment.location import find_sweep
-    from music_rllib.sweep.driver import resume_sweep
+    from music_rllib.sweep.driver import run_sweep
 
-    return resume_sweep(
-        console_for(as_json=json),
+    return run_sweep(
         find_sweep(sweep, storage),
         seeds=seeds,
         accept_changes=accept_changes,
         retrain_damaged=retrain_damaged,
-        answer=print_json if json else lambda document: None,
+        as_json=json,
     )

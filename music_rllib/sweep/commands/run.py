@@ -7,10 +7,16 @@ from typing import Annotated
 
 import typer
 
-from music_rllib.command_line import Json, console_for, print_json
-from music_rllib.sweep.cli_helpers import Name, Seeds, SweepStorage
-
-__all__ = ["EXAMPLES", "AcceptChanges", "Config", "Overrides", "RetrainDamaged", "run"]
+from music_rllib.command_line import Json
+from music_rllib.sweep.cli_helpers import (
+    AcceptChanges,
+    Config,
+    Name,
+    Overrides,
+    RetrainDamaged,
+    Seeds,
+    SweepStorage,
+)
 
 EXAMPLES = """\
 Examples:
@@ -26,40 +32,6 @@ Examples:
 Running a command again continues: finished runs are reused, others go on from
 their last checkpoint. With RAY_ADDRESS=HOST:PORT it runs on that Ray cluster.
 """
-
-Config = Annotated[
-    Path | None,
-    typer.Argument(
-        metavar="CONFIG",
-        help="The sweep, a YAML file. Without one, a small packaged sweep is taken.",
-        show_default=False,
-    ),
-]
-Overrides = Annotated[
-    list[str] | None,
-    typer.Argument(
-        metavar="KEY=VALUE",
-        help="Replace what the file says: a setting in every stage (tac.alpha=0.1), in one "
-        "(stages.finetune.env_steps=1e5), or a key of the file's top (seeds=5).",
-        show_default=False,
-    ),
-]
-AcceptChanges = Annotated[
-    bool,
-    typer.Option(
-        "--accept-changes",
-        help="Where settings are others than the last time under this name: train anew what they "
-        "touch. Without it the command says what would be lost, and starts nothing.",
-    ),
-]
-RetrainDamaged = Annotated[
-    bool,
-    typer.Option(
-        "--retrain-damaged",
-        help="Where finished runs are not what they were when they ended: delete them and train "
-        "them again. Without it the command names them, and starts nothing.",
-    ),
-]
 
 
 def run(
@@ -88,24 +60,23 @@ def run(
 
     config, overrides = file_and_overrides(config, overrides)
     return run_sweep(
-        console_for(as_json=json),
         config,
         dry_run=dry_run,
         storage=storage,
         name=name,
         seeds=seeds,
         overrides=overrides,
-        answer=print_json if json else lambda document: None,
         accept_changes=accept_changes,
         retrain_damaged=retrain_damaged,
         must_exist=resume,
+        as_json=json,
     )
 
 
 def file_and_overrides(
     config: Path | None, overrides: list[str] | None
 ) -> tuple[Path | None, list[str]]:
-    """The file and what replaces parts of it, also where there are only such parts."""
+    """The file and its overrides; a first argument with a `=` that is no file is an override."""
     given = list(overrides or ())
     if config is not None and "=" in str(config) and not config.exists():
         return None, [str(config), *given]

@@ -13,8 +13,6 @@ from typing import Any
 from music_rllib import names
 from music_rllib.experiment.plan import Plan
 
-__all__ = ["VERSIONS", "comparison_view"]
-
 VERSIONS = ("3.17",)
 """Of MLflow, whose pages were seen to open such a view; for others there is a plain link."""
 GROUPED = {

@@ -17,8 +17,6 @@ from music_rllib.search.ranking import best_in_words
 from music_rllib.store.node_store import TRAIN_AGAIN
 from music_rllib.sweep.views.text import clock, measured
 
-__all__ = ["status_view"]
-
 _STATES = (
     *("finished", "reused", "started", "interrupted", "waiting", "paused", "pruned"),
     *("failed", "skipped"),
@@ -26,35 +24,33 @@ _STATES = (
 _STYLES = {"finished": "green", "failed": "red", "interrupted": "yellow", "stopped": "yellow"}
 
 
-def status_view(state: Mapping[str, Any], labels: Iterable[str] = ()) -> RenderableType:
-    """Stages, trials, runs, budget, searches, failures; with the `labels` of all runs in short."""
+def status_view(state: Mapping[str, Any], labels: Iterable[str]) -> RenderableType:
+    """Stages, budget, searches, runs and failures; the `labels` of all runs shorten each label."""
     title = Text(f"Sweep {state['sweep']}: ")
     title.append(state["state"], _STYLES.get(state["state"], "bold"))
     title.append(f"  ({state['place']})", "dim")
     if "driver" not in state:
         return title
-    parts: list[RenderableType] = [title, Text(_times(state)), _stages(state)]
     label = ShortLabels.of(labels)
-    done, left = state["env_steps"]["done"], state["env_steps"]["left"]
-    budget = f"Budget: {done:,} env steps spent, {left:,} left of what is known so far"
-    if to_come := state["env_steps"].get("to_come"):
+    parts: list[RenderableType] = [title, Text(_times(state)), _stages(state)]
+    env_steps = state["env_steps"]
+    budget = (
+        f"Budget: {env_steps['done']:,} env steps spent, {env_steps['left']:,} left of what is "
+        "known so far"
+    )
+    if to_come := env_steps.get("to_come"):
         budget += f", at most {to_come:,} more that searches may ask for"
     parts.append(Text(budget))
     if state["best"] is not None:
         parts.append(Text(f"Best so far: {best_in_words(state['best'])}"))
     parts += [_search(search) for search in state["searches"]]
-    parts += [
-        Text(
-            f"{one['state']}: {label(one['run'])}  {one['env_steps']:,} / {one['budget']:,} env "
-            f"steps, {names.word_of(one['metric'])} {measured(one['metric'], one['value'])}"
-        )
-        for one in (
-            *({"state": "running"} | one for one in state["running"]),
-            *({"state": "interrupted"} | one for one in state.get("interrupted", ())),
-        )
-    ]
-    for one in state["damaged"]:
-        parts.append(Text(f"DAMAGED {label(one['run'])}: {one['cause']}", style="red"))
+    for status in ("running", "interrupted"):
+        for run in state.get(status, ()):
+            value = f"{names.word_of(run['metric'])} {measured(run['metric'], run['value'])}"
+            steps = f"{run['env_steps']:,} / {run['budget']:,} env steps"
+            parts.append(Text(f"{status}: {label(run['run'])}  {steps}, {value}"))
+    for damaged in state["damaged"]:
+        parts.append(Text(f"DAMAGED {label(damaged['run'])}: {damaged['cause']}", style="red"))
     if state["damaged"]:
         parts.append(Text(f"    {TRAIN_AGAIN}", style="dim"))
     for failure in state["failures"]:
