@@ -1,9 +1,9 @@
-"""Arguments that several commands of a sweep take."""
+"""Arguments that several commands of a sweep take, and what they name."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -11,6 +11,7 @@ from music_rllib.errors import BadInputError
 
 if TYPE_CHECKING:
     from music_rllib.config.schema import Stage, SweepConfig
+    from music_rllib.experiment.location import SweepLocation
 
 Config = Annotated[
     Path | None,
@@ -92,3 +93,11 @@ def find_stage(config: SweepConfig, name: str | None) -> Stage:
     if name not in stages:
         raise BadInputError(f"--stage must be one of {', '.join(stages)}, got {name!r}")
     return stages[name]
+
+
+def plan_nodes(location: SweepLocation) -> list[dict[str, Any]]:
+    """The nodes in a sweep's `plan.json`, as far as they are known."""
+    from music_rllib.experiment import sweep_files
+
+    nodes: list[dict[str, Any]] = (location.read(sweep_files.PLAN) or {"nodes": []})["nodes"]
+    return nodes

@@ -43,8 +43,15 @@ def export_best(sweep: Sweep, stage_name: str | None, output: Path) -> dict[str,
         StorageError: The folder can't be written.
     """
     stage = find_stage(sweep.config, stage_name)
-    best = _best(sweep, stage)
-    condition = _condition(sweep, stage, best)
+    metric = measure_of(stage, sweep.plan, sweep.results()).metric
+    best = _best(sweep, stage, metric)
+    condition = _condition(sweep, stage, best, metric)
+    if condition is None:
+        raise BadInputError(
+            f"SWEEP must have the runs of its best trial, {best['trial']} of stage {stage.name}: "
+            f"{redact(sweep.storage)} has none of them"
+        )
+    success = _condition(sweep, stage, best, names.EVAL_SUCCESS)
     by, rest = best["by"], ""
     if not condition.complete:
         rest = f", of {condition.planned} planned: no condition has all of its runs"
@@ -58,7 +65,7 @@ def export_best(sweep: Sweep, stage_name: str | None, output: Path) -> dict[str,
         "direction": best["direction"],
         "value": best["value"],
         "interval": best["interval"],
-        "success_rate": _success_rate(sweep, condition),
+        "success_rate": None if success is None else float(success.estimate().value),
         "entropies": best["entropies"],
         "on_fresh_seeds": fresh,
         "why": f"{stage.name}: {condition.label} is first by {by} on "
@@ -85,13 +92,11 @@ def export_best(sweep: Sweep, stage_name: str | None, output: Path) -> dict[str,
     return chosen | {"policies": policies}
 
 
-def _best(sweep: Sweep, stage: Stage) -> dict[str, Any]:
+def _best(sweep: Sweep, stage: Stage, metric: str) -> dict[str, Any]:
     """The best condition of a stage as plain data, with its trial if the stage is searched."""
     search = None if stage.search is None else _search_of(sweep, stage.name)
-    results = sweep.results()
-    best = best_so_far([stage], sweep.plan, results, [search] if search else [])
+    best = best_so_far([stage], sweep.plan, sweep.results(), [search] if search else [])
     if best is None:
-        metric = measure_of(stage, sweep.plan, results).metric
         needed = f"a finished run of stage {stage.name} that reported {metric}"
         if stage.search is not None:
             needed = f"a judged trial of stage {stage.name}"
@@ -101,17 +106,16 @@ def _best(sweep: Sweep, stage: Stage) -> dict[str, Any]:
     return best
 
 
-def _condition(sweep: Sweep, stage: Stage, best: Mapping[str, Any]) -> Condition:
-    """The runs of the best condition."""
-    results = sweep.results()
+def _condition(
+    sweep: Sweep, stage: Stage, best: Mapping[str, Any], metric: str
+) -> Condition | None:
+    """The runs of the best condition, with their scores by a metric; None if there are none."""
     part = "" if stage.search is None else "final" if best["on_fresh_seeds"] else "search"
-    for one in conditions(sweep.plan, results, measure_of(stage, sweep.plan, results).metric):
-        if (one.stage, one.part, dict(one.values)) == (stage.name, part, best["values"]):
-            return one
-    raise BadInputError(
-        f"SWEEP must have the runs of its best trial, {best['trial']} of stage {stage.name}: "
-        f"{redact(sweep.storage)} has none of them"
-    )
+    wanted = (stage.name, part, best["values"])
+    for condition in conditions(sweep.plan, sweep.results(), metric):
+        if (condition.stage, condition.part, dict(condition.values)) == wanted:
+            return condition
+    return None
 
 
 def _search_of(sweep: Sweep, stage: str) -> Mapping[str, Any] | None:
@@ -122,14 +126,6 @@ def _search_of(sweep: Sweep, stage: str) -> Mapping[str, Any] | None:
     then = [search for search in ended if search["stage"] == stage]
     # A search that was extended goes on after an earlier end: its present state counts.
     return next(iter(now if now and not now[0]["complete"] else [*then, *now]), None)
-
-
-def _success_rate(sweep: Sweep, best: Condition) -> float | None:
-    """The condition's success rate, whatever it is judged by; None without one."""
-    for other in conditions(sweep.plan, sweep.results(), names.EVAL_SUCCESS):
-        if (other.stage, other.part, other.values) == (best.stage, best.part, best.values):
-            return float(other.estimate().value)
-    return None
 
 
 def _middle_run(best: Condition, task: str) -> Run | None:

@@ -131,15 +131,11 @@ def _info_keys(task: Task, env: Env) -> set[str]:
     return keys
 
 
-class HardwareError(BadInputError, ValueError):
-    """A setting that this machine's hardware does not allow."""
-
-
 def check_hardware(plan: Plan) -> None:
     """Check that this machine has the hardware for the runs' precision.
 
     Raises:
-        HardwareError: It has not.
+        BadInputError: It has not.
     """
     if all(node.run.tac.precision == "float32" for node in plan.nodes):
         return
@@ -148,7 +144,7 @@ def check_hardware(plan: Plan) -> None:
     try:
         check_precision("bf16")
     except PrecisionError as error:
-        raise HardwareError(str(error)) from error
+        raise BadInputError(str(error)) from error
 
 
 def import_checkpoints(plan: Plan, store: NodeStore) -> None:

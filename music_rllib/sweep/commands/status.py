@@ -9,7 +9,7 @@ import typer
 
 from music_rllib.command_line import Json, console_for, print_json
 from music_rllib.errors import FAILED, BadInputError
-from music_rllib.sweep.cli_helpers import Place, Storage
+from music_rllib.sweep.cli_helpers import Place, Storage, plan_nodes
 
 if TYPE_CHECKING:
     from music_rllib.experiment.location import SweepLocation
@@ -60,16 +60,8 @@ def status(
     return FAILED if state.get("damaged") else 0
 
 
-def _nodes(location: SweepLocation) -> list[dict[str, Any]]:
-    """The nodes of the sweep's plan, as far as they are known."""
-    from music_rllib.experiment import sweep_files
-
-    nodes: list[dict[str, Any]] = (location.read(sweep_files.PLAN) or {"nodes": []})["nodes"]
-    return nodes
-
-
 def _labels(location: SweepLocation) -> list[str]:
-    return [node["label"] for node in _nodes(location)]
+    return [node["label"] for node in plan_nodes(location)]
 
 
 def state_of(location: SweepLocation) -> dict[str, Any]:
@@ -86,7 +78,9 @@ def state_of(location: SweepLocation) -> dict[str, Any]:
         _mark_interrupted(state)
     store = NodeStore(location.storage)
     labels = {
-        node["key"]: node["label"] for node in _nodes(location) if store.is_finished(node["key"])
+        node["key"]: node["label"]
+        for node in plan_nodes(location)
+        if store.is_finished(node["key"])
     }
     damaged = [
         {"run": labels[key], "cause": str(error)} for key, error in store.damage(labels).items()

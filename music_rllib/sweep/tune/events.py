@@ -31,7 +31,10 @@ _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 
 
 class TuneEvents(Callback):
-    """Moves nodes in the scheduler as Tune's trials go on and end, and tells the listeners."""
+    """Moves nodes in the scheduler as Tune's trials go on and end, and tells the listeners.
+
+    Tune calls it with keywords only.
+    """
 
     def __init__(
         self, scheduler: Scheduler, store: NodeStore, listeners: Iterable[Listener], failures: Path
@@ -53,24 +56,15 @@ class TuneEvents(Callback):
         # Tune pickles its callbacks into a snapshot, which nobody reads.
         return {}
 
-    def on_step_end(self, iteration: int, trials: list[Trial], **info: Any) -> None:
+    def on_step_end(self, **_: Any) -> None:
         for listener in self._listeners:
             listener.tick()
 
-    def on_trial_start(
-        self, iteration: int, trials: list[Trial], trial: Trial, **info: Any
-    ) -> None:
+    def on_trial_start(self, *, trial: Trial, **_: Any) -> None:
         for listener in self._listeners:
             listener.started(self._node(trial))
 
-    def on_trial_result(
-        self,
-        iteration: int,
-        trials: list[Trial],
-        trial: Trial,
-        result: dict[str, Any],
-        **info: Any,
-    ) -> None:
+    def on_trial_result(self, *, trial: Trial, result: dict[str, Any], **_: Any) -> None:
         node = self._node(trial)
         reports = from_json_lines(result[REPORTS].encode())
         for listener in self._listeners:
@@ -79,9 +73,7 @@ class TuneEvents(Callback):
             if reports:
                 listener.reported(node, reports)
 
-    def on_trial_complete(
-        self, iteration: int, trials: list[Trial], trial: Trial, **info: Any
-    ) -> None:
+    def on_trial_complete(self, *, trial: Trial, **_: Any) -> None:
         """The trial says that it is done: it failed, was paused, or has published its result."""
         try:
             self._complete(self._node(trial), trial)
@@ -107,21 +99,17 @@ class TuneEvents(Callback):
         for listener in self._listeners:
             listener.finished(node, result)
 
-    def on_trial_error(
-        self, iteration: int, trials: list[Trial], trial: Trial, **info: Any
-    ) -> None:
+    def on_trial_error(self, *, trial: Trial, **_: Any) -> None:
         """The trial's worker died, or never came up, and is not started again."""
         error = _error_of(trial)
         text = "".join(traceback.format_exception(error)) if error else _text_of(trial)
         text = _COLOUR.sub("", text)
         self._fail(self._node(trial), cause_of(error, text), text)
 
-    def on_trial_recover(
-        self, iteration: int, trials: list[Trial], trial: Trial, **info: Any
-    ) -> None:
+    def on_trial_recover(self, *, trial: Trial, **_: Any) -> None:
         """The trial's worker died, and another one continues the run."""
-        error = _error_of(trial)
-        cause = redact(cause_of(error, _COLOUR.sub("", _text_of(trial)))).splitlines()[0]
+        text = _COLOUR.sub("", _text_of(trial))
+        cause = redact(cause_of(_error_of(trial), text)).splitlines()[0]
         text = (
             f"{cause} Another worker goes on from the last checkpoint "
             f"({trial.run_metadata.num_failures} of {RESTARTS} times)."
@@ -163,6 +151,7 @@ def _error_of(trial: Trial) -> BaseException | None:
 
 
 def _text_of(trial: Trial) -> str:
+    """The traceback that Tune has written into a file."""
     try:
         return Path(trial.error_file).read_text(encoding="utf-8")
     except OSError as error:

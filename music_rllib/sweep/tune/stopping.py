@@ -36,6 +36,8 @@ class StopSignals(tune.Callback):
 
     A Ray that has died ends the process as well, with exit code 1: the main thread may be waiting
     for it, which Ray lets it do for a minute, or for good.
+
+    Tune calls it with keywords only.
     """
 
     def __init__(
@@ -85,7 +87,7 @@ class StopSignals(tune.Callback):
 
     # -- Tune's callbacks -----------------------------------------------------------------
 
-    def setup(self, **info: Any) -> None:
+    def setup(self, **_: Any) -> None:
         """Tune has just set its handler of SIGINT, which ends its loop: keep it for later."""
         if not self._handlers_before:
             return
@@ -103,30 +105,19 @@ class StopSignals(tune.Callback):
         if early.received is not None:
             self._stop(early.received, None)
 
-    def on_trial_start(
-        self, iteration: int, trials: list[Trial], trial: Trial, **info: Any
-    ) -> None:
+    def on_trial_start(self, *, trial: Trial, **_: Any) -> None:
         self._running.add(trial.trial_id)
 
-    def on_trial_result(
-        self,
-        iteration: int,
-        trials: list[Trial],
-        trial: Trial,
-        result: dict[str, Any],
-        **info: Any,
-    ) -> None:
+    def on_trial_result(self, *, trial: Trial, result: dict[str, Any], **_: Any) -> None:
         if result.get(STOPPED):
             self._running.discard(trial.trial_id)
 
-    def on_trial_complete(
-        self, iteration: int, trials: list[Trial], trial: Trial, **info: Any
-    ) -> None:
+    def on_trial_complete(self, *, trial: Trial, **_: Any) -> None:
         self._running.discard(trial.trial_id)
 
     on_trial_error = on_trial_recover = on_trial_complete
 
-    def on_step_end(self, iteration: int, trials: list[Trial], **info: Any) -> None:
+    def on_step_end(self, **_: Any) -> None:
         """End Tune's loop, which went round once, where everything is saved or time is up."""
         if self.received is None or self._end_loop is None:
             return
