@@ -25,21 +25,31 @@ Item = dict[str, str]
 class Cleaning:
     """What a clean would do, each item as `{"path": ..., "what": ...}`."""
 
-    going: list[Item] = field(default_factory=list)
-    """Folders in the storage."""
-    going_here: list[Item] = field(default_factory=list)
-    """Folders on this machine, of a sweep whose storage is a bucket."""
+    going: list[tuple[pafs.FileSystem, Item]] = field(default_factory=list)
+    """Folders to delete, in the storage or on this machine."""
     kept: list[Item] = field(default_factory=list)
     """What one might expect to be deleted, and why it is kept."""
 
     @property
     def items(self) -> list[Item]:
         """All that is deleted."""
-        return [*self.going, *self.going_here]
+        return [item for _, item in self.going]
 
+    def add(self, filesystem: pafs.FileSystem, path: str, what: str) -> None:
+        """Have a folder deleted."""
+        self.going.append((filesystem, {"path": path, "what": what}))
 
-def _item(path: str, what: str) -> Item:
-    return {"path": path, "what": what}
+    def keep(self, path: str, what: str) -> None:
+        """Say that something is kept."""
+        self.kept.append({"path": path, "what": what})
+
+    def delete(self) -> None:
+        """Delete the folders, a node's manifest first: half a node is none."""
+        for filesystem, item in self.going:
+            with contextlib.suppress(FileNotFoundError):
+                filesystem.delete_file(f"{item['path']}/manifest.json")
+            with contextlib.suppress(FileNotFoundError):
+                filesystem.delete_dir(item["path"])
 
 
 def what_can_go(location: SweepLocation, *, unfinished: bool, everything: bool) -> Cleaning:
@@ -75,34 +85,30 @@ def what_can_go(location: SweepLocation, *, unfinished: bool, everything: bool) 
         finished = exists(f"{result}/manifest.json")
         if key in users:
             if everything and finished:
-                what = f"result of {label}: {', '.join(users[key])} has it too"
-                cleaning.kept.append(_item(result, what))
+                cleaning.keep(result, f"result of {label}: {', '.join(users[key])} has it too")
             continue
         if exists(checkpoints):
             why = "finished" if finished else "stopped early" if key in pruned else "interrupted"
             if why != "interrupted" or unfinished:
-                cleaning.going.append(_item(checkpoints, f"checkpoints of {label}: {why}"))
+                cleaning.add(filesystem, checkpoints, f"checkpoints of {label}: {why}")
         if finished and "continuation" in node:
             last = f"{root}/{CONTINUATIONS}/{node['continuation']}"
             if exists(last):
                 what = f"last checkpoint of {label}: kept for a run with more env_steps"
-                cleaning.going.append(_item(last, what))
+                cleaning.add(filesystem, last, what)
         if everything and finished:
-            cleaning.going.append(_item(result, f"result of {label}"))
+            cleaning.add(filesystem, result, f"result of {label}")
     if everything:
-        _add_own_files(location, root, cleaning)
+        cleaning.add(filesystem, f"{root}/{location.name}", "the sweep's own files")
+        here = sweep_folder(location.storage, location.name)
+        if sweep_files.is_remote(location.storage) and here.is_dir():
+            # A study is in it: the next sweep of this name would take that for its own.
+            what = "the sweep's own files on this machine"
+            cleaning.add(pafs.LocalFileSystem(), str(here), what)
+        for storage, study in _studies(location):
+            what = f"study {study!r}: delete it with Optuna's tools where nobody needs it any more"
+            cleaning.keep(redact(storage), what)
     return cleaning
-
-
-def _add_own_files(location: SweepLocation, root: str, cleaning: Cleaning) -> None:
-    cleaning.going.append(_item(f"{root}/{location.name}", "the sweep's own files"))
-    here = sweep_folder(location.storage, location.name)
-    if sweep_files.is_remote(location.storage) and here.is_dir():
-        # A study is in it: the next sweep of this name would take that for its own.
-        cleaning.going_here.append(_item(str(here), "the sweep's own files on this machine"))
-    for storage, study in _studies(location):
-        what = f"study {study!r}: delete it with Optuna's tools where nobody needs it any more"
-        cleaning.kept.append(_item(redact(storage), what))
 
 
 def _users(location: SweepLocation, nodes: Iterable[Mapping[str, Any]]) -> dict[str, list[str]]:
@@ -153,15 +159,3 @@ def _keys_of_stage(stage: str, nodes: Mapping[str, Mapping[str, Any]]) -> set[st
             keys.add(key)
             wanted.append(nodes[key].get("input") or "")
     return keys
-
-
-def delete(location: SweepLocation, cleaning: Cleaning) -> None:
-    """Delete the folders of a cleaning, a node's manifest first: half a node is none."""
-    filesystem, _ = open_storage(location.storage)
-    folders = [(filesystem, item) for item in cleaning.going]
-    folders += [(pafs.LocalFileSystem(), item) for item in cleaning.going_here]
-    for where, item in folders:
-        with contextlib.suppress(FileNotFoundError):
-            where.delete_file(f"{item['path']}/manifest.json")
-        with contextlib.suppress(FileNotFoundError):
-            where.delete_dir(item["path"])

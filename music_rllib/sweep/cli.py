@@ -8,25 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from music_rllib.command_line import Group, add_command, new_app, run_app
-from music_rllib.sweep.commands import (
-    best,
-    clean,
-    compare,
-    evaluate,
-    files,
-    plan,
-    resume,
-    run,
-    status,
-    stop,
-)
+from music_rllib.sweep.commands import best, clean, compare, evaluate, files, run, status, stop
 
 COMMANDS: dict[str, tuple[Callable[..., int], str]] = {
-    "run": (run.run, run.EXAMPLES),
-    "plan": (plan.plan, plan.EXAMPLES),
+    "run": (run.run, run.RUN_EXAMPLES),
+    "plan": (run.plan, run.PLAN_EXAMPLES),
     "status": (status.status, status.EXAMPLES),
     "stop": (stop.stop, stop.EXAMPLES),
-    "resume": (resume.resume, resume.EXAMPLES),
+    "resume": (run.resume, run.RESUME_EXAMPLES),
     "compare": (compare.compare, compare.EXAMPLES),
     "best": (best.best, best.EXAMPLES),
     "evaluate": (evaluate.evaluate, evaluate.EXAMPLES),

@@ -1,4 +1,4 @@
-"""`clean`: delete what a sweep has left and nobody needs."""
+"""`clean`: delete checkpoints and results that nobody needs."""
 
 from __future__ import annotations
 
@@ -48,13 +48,13 @@ def clean(
     finished runs keep for longer training. An interrupted run may go on from its own.
     """
     from music_rllib.experiment.location import find_sweep
-    from music_rllib.sweep.clean import delete, what_can_go
+    from music_rllib.sweep.clean import what_can_go
 
     location = find_sweep(sweep, storage)
     cleaning = what_can_go(location, unfinished=unfinished or everything, everything=everything)
     going = cleaning.items
     if yes:
-        delete(location, cleaning)
+        cleaning.delete()
     if json:
         answer = {"sweep": location.name, "deleted": yes, "items": going, "kept": cleaning.kept}
         print_json(answer)

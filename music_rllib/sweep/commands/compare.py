@@ -1,4 +1,4 @@
-"""`compare`: conditions side by side, with intervals."""
+"""`compare`: the conditions of a stage side by side, with intervals."""
 
 from __future__ import annotations
 

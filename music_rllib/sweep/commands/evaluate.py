@@ -1,8 +1,9 @@
-"""`evaluate`: play episodes with a run's policy, count and film them."""
+"""`evaluate`: play episodes with a run's policy, count their successes, film them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -108,11 +109,8 @@ def _check_video(path: Path | None) -> None:
 def _play(policy: Policy, episodes: int, seed: int) -> list[EpisodeResult]:
     from music_rllib.policy.rollout import open_task, play
 
-    env = open_task(policy)
-    try:
+    with closing(open_task(policy)) as env:
         return list(play(policy, env, episodes, seed))
-    finally:
-        env.close()
 
 
 def _film(policy: Policy, path: Path, episodes: int, seed: int) -> None:
@@ -128,9 +126,7 @@ def _document(
 ) -> dict[str, Any]:
     from dataclasses import asdict
 
-    success = [result.success for result in results if result.success is not None]
-    any_step = [r.success_any_step for r in results if r.success_any_step is not None]
-    displacement = [r.object_displacement for r in results if r.object_displacement is not None]
+    successes = [result.success for result in results if result.success is not None]
     return {
         "run": place,
         "node_key": policy.node_key,
@@ -141,17 +137,19 @@ def _document(
         "env_steps": policy.env_steps,
         "episodes": len(results),
         "seed": seed,
-        "success_rate": _mean(success),
-        "success_rate_interval": _interval(success),
-        "success_rate_any_step": _mean(any_step),
-        "episode_return": _mean([result.episode_return for result in results]),
-        "object_displacement": _mean(displacement),
+        "success_rate": _mean(successes),
+        "success_rate_interval": _interval(successes),
+        "success_rate_any_step": _mean(result.success_any_step for result in results),
+        "episode_return": _mean(result.episode_return for result in results),
+        "object_displacement": _mean(result.object_displacement for result in results),
         "results": [asdict(result) for result in results],
     }
 
 
-def _mean(values: Sequence[float]) -> float | None:
-    return sum(values) / len(values) if values else None
+def _mean(values: Iterable[float | None]) -> float | None:
+    """The mean of those values that are there; None where there are none."""
+    numbers = [value for value in values if value is not None]
+    return sum(numbers) / len(numbers) if numbers else None
 
 
 def _interval(successes: list[bool]) -> list[float] | None:

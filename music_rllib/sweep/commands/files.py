@@ -1,4 +1,4 @@
-"""`init`, `presets` and `schema`: help with writing a sweep's file."""
+"""`init`, `presets` and `schema`: help with the writing of a sweep's file."""
 
 from __future__ import annotations
 

@@ -37,9 +37,9 @@ SHOWN_FAILURES = 20
 class StateFile(Listener):
     """Keeps `state.json` up to date, and looks for `stop.json`, in a thread of its own."""
 
-    def __init__(self, sweep: Sweep, now: Callable[[], float] = time.monotonic) -> None:
-        """Describe `sweep`; `now` is a clock in seconds."""
-        self._sweep, self._now = sweep, now
+    def __init__(self, sweep: Sweep) -> None:
+        """Describe `sweep`."""
+        self._sweep = sweep
         self.searches: Callable[[], list[dict[str, Any]]] = list
         """Returns the outcome of the sweep's searches so far."""
         self.unfinished: dict[str, RunResult] = {}
@@ -112,11 +112,11 @@ class StateFile(Listener):
         self._failures.append({"run": node.label, "cause": failure.cause, "log": str(failure.log)})
 
     def tick(self) -> None:
-        if self._now() >= self._next_update:
-            began = self._now()
+        if (began := time.monotonic()) >= self._next_update:
             self._update()
             # A large sweep takes longer to describe: never more than a few per cent of the time.
-            self._next_update = self._now() + max(self._interval, 30 * (self._now() - began))
+            ended = time.monotonic()
+            self._next_update = ended + max(self._interval, 30 * (ended - began))
 
     def headline(self) -> tuple[list[str], str | None]:
         """A line for each stage and each search's study, and the best condition so far."""

@@ -33,7 +33,7 @@ def compute(
     listeners: Sequence[Listener],
     on_stop: Callable[[], None],
     on_ray_gone: Callable[[str | None], None],
-    controller: SearchController | None = None,
+    controller: SearchController | None,
 ) -> int | None:
     """Compute the waiting nodes, and those that searches ask for.
 
@@ -69,7 +69,7 @@ def compute(
             stop_key=stopping.flag.key,
             hang_minutes=resources.hang_minutes,
         ).to_tune(),
-        **({} if controller is None else {"advance": controller.advance}),
+        advance=(lambda: False) if controller is None else controller.advance,
         stopped=lambda: stopping.received is not None,
     )
     with (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import closing
 from typing import Any
 
 from rich.table import Table
@@ -55,11 +56,8 @@ def _final_q(q: float | Linear | Piecewise | Measured, budget: int) -> float:
 
 
 def _action_dimensions(task: Task) -> int:
-    env = make_env(task.env_id, **task.env_kwargs)
-    try:
+    with closing(make_env(task.env_id, **task.env_kwargs)) as env:
         return int(env.action_space.shape[0])  # type: ignore[index]
-    finally:
-        env.close()
 
 
 def alpha_table(rows: Iterable[dict[str, Any]]) -> Table:

@@ -1,4 +1,4 @@
-"""A sweep's `state.json` as a person reads it."""
+"""The text of `status`, from a sweep's `state.json`."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ from music_rllib.search.ranking import best_in_words
 from music_rllib.store.node_store import TRAIN_AGAIN
 from music_rllib.sweep.views.text import clock, measured
 
-_STATES = (
+_STATUSES = (
     *("finished", "reused", "started", "interrupted", "waiting", "paused", "pruned"),
     *("failed", "skipped"),
 )
+"""Statuses of runs, in the order of the columns."""
 _STYLES = {"finished": "green", "failed": "red", "interrupted": "yellow", "stopped": "yellow"}
 
 
@@ -32,7 +33,7 @@ def status_view(state: Mapping[str, Any], labels: Iterable[str]) -> RenderableTy
     if "driver" not in state:
         return title
     label = ShortLabels.of(labels)
-    parts: list[RenderableType] = [title, Text(_times(state)), _stages(state)]
+    parts: list[RenderableType] = [title, Text(_driver_text(state)), _stages_table(state)]
     env_steps = state["env_steps"]
     budget = (
         f"Budget: {env_steps['done']:,} env steps spent, {env_steps['left']:,} left of what is "
@@ -43,7 +44,7 @@ def status_view(state: Mapping[str, Any], labels: Iterable[str]) -> RenderableTy
     parts.append(Text(budget))
     if state["best"] is not None:
         parts.append(Text(f"Best so far: {best_in_words(state['best'])}"))
-    parts += [_search(search) for search in state["searches"]]
+    parts += [_search_text(search) for search in state["searches"]]
     for status in ("running", "interrupted"):
         for run in state.get(status, ()):
             value = f"{names.word_of(run['metric'])} {measured(run['metric'], run['value'])}"
@@ -59,18 +60,18 @@ def status_view(state: Mapping[str, Any], labels: Iterable[str]) -> RenderableTy
     return Group(*parts)
 
 
-def _times(state: Mapping[str, Any]) -> str:
+def _driver_text(state: Mapping[str, Any]) -> str:
     driver = state["driver"]
     end = driver["ended"] or (driver["heartbeat"] if state["state"] != "running" else time.time())
     where = f"process {driver['pid']} on {driver['host']}"
     return f"{where}, {clock(end - driver['started'])} since it was last started"
 
 
-def _stages(state: Mapping[str, Any]) -> Table:
+def _stages_table(state: Mapping[str, Any]) -> Table:
     table = Table(box=None, pad_edge=False)
     table.add_column("stage")
     table.add_column("variant")
-    shown = [name for name in _STATES if any(name in stage["runs"] for stage in state["stages"])]
+    shown = [name for name in _STATUSES if any(name in stage["runs"] for stage in state["stages"])]
     for name in ("trials", "runs", *shown):
         table.add_column(name, justify="right")
     for stage in state["stages"]:
@@ -85,7 +86,7 @@ def _stages(state: Mapping[str, Any]) -> Table:
     return table
 
 
-def _search(search: Mapping[str, Any]) -> Text:
+def _search_text(search: Mapping[str, Any]) -> Text:
     lines = []
     for arm in search["arms"]:
         fixed = "".join(f" {name}={short(value)}" for name, value in arm["values"].items())
