@@ -36,11 +36,11 @@ class Cleaning:
         return [item for _, item in self.going]
 
     def add(self, filesystem: pafs.FileSystem, path: str, what: str) -> None:
-        """Have a folder deleted."""
+        """Mark a folder to be deleted."""
         self.going.append((filesystem, {"path": path, "what": what}))
 
     def keep(self, path: str, what: str) -> None:
-        """Say that something is kept."""
+        """Note what is kept, and why."""
         self.kept.append({"path": path, "what": what})
 
     def delete(self) -> None:
@@ -62,8 +62,8 @@ def what_can_go(location: SweepLocation, *, unfinished: bool, everything: bool) 
 
     Raises:
         BadInputError: The sweep is running, or another one is that shares runs with it.
-        StorageError: A record of this sweep or of another one in the storage is damaged: it is not
-            known then what that one needs.
+        StorageError: A record of this sweep or of another one in the storage is damaged, so that
+            what the sweep needs is not known.
     """
     state = location.read(sweep_files.STATE)
     if sweep_files.is_alive(state):

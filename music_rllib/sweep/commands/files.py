@@ -57,12 +57,12 @@ def presets(json: Json = False) -> int:
     """
     from music_rllib.config.reading.presets import SHIPPED, shipped_presets
 
-    found = shipped_presets()
+    shipped = shipped_presets()
     if json:
-        print_json([{"name": name, "about": about} for name, about in found.items()])
+        print_json([{"name": name, "about": about} for name, about in shipped.items()])
         return 0
-    width = max(map(len, found))
-    for name, about in found.items():
+    width = max(map(len, shipped))
+    for name, about in shipped.items():
         typer.echo(f"{name:{width}}  {about}")
     typer.echo(f"\nEach file says where its numbers come from: {SHIPPED}")
     return 0
