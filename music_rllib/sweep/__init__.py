@@ -1,1 +1,1 @@
-"""The sweeper, `python -m music_rllib.sweep`: plans, runs and reports a whole sweep with Tune."""
+"""The program `python -m music_rllib.sweep`: plans, runs and reports a whole sweep with Tune."""

@@ -1,4 +1,4 @@
-"""What of a sweep can be deleted, and the deleting."""
+"""Deletion of what a sweep has left in its storage."""
 
 from __future__ import annotations
 
@@ -16,152 +16,146 @@ from music_rllib.redaction import redact
 from music_rllib.store.node_store import CONTINUATIONS
 from music_rllib.store.object_folder import open_storage
 from music_rllib.store.paths import sweep_folder
+from music_rllib.sweep.cli_helpers import plan_nodes
 
-__all__ = ["Cleaning", "delete", "what_can_go"]
-
-Item = dict[str, Any]
+Item = dict[str, str]
 
 
 @dataclass(kw_only=True)
 class Cleaning:
-    """What a clean would do, each as `{"path": ..., "what": ...}`."""
+    """What a clean would do, each item as `{"path": ..., "what": ...}`."""
 
-    going: list[Item] = field(default_factory=list)
-    """Folders in the storage."""
-    going_here: list[Item] = field(default_factory=list)
-    """Folders on this machine, of a sweep whose storage is a bucket."""
+    going: list[tuple[pafs.FileSystem, Item]] = field(default_factory=list)
+    """Folders to delete, in the storage or on this machine."""
     kept: list[Item] = field(default_factory=list)
-    """What one might expect to go, and why it doesn't."""
+    """What one might expect to be deleted, and why it is kept."""
 
     @property
     def items(self) -> list[Item]:
-        """All that goes."""
-        return [*self.going, *self.going_here]
+        """All that is deleted."""
+        return [item for _, item in self.going]
+
+    def add(self, filesystem: pafs.FileSystem, path: str, what: str) -> None:
+        """Mark a folder to be deleted."""
+        self.going.append((filesystem, {"path": path, "what": what}))
+
+    def keep(self, path: str, what: str) -> None:
+        """Note what is kept, and why."""
+        self.kept.append({"path": path, "what": what})
+
+    def delete(self) -> None:
+        """Delete the folders, a node's manifest first: half a node is none."""
+        for filesystem, item in self.going:
+            with contextlib.suppress(FileNotFoundError):
+                filesystem.delete_file(f"{item['path']}/manifest.json")
+            with contextlib.suppress(FileNotFoundError):
+                filesystem.delete_dir(item["path"])
 
 
-def what_can_go(found: SweepLocation, *, unfinished: bool, everything: bool) -> Cleaning:
+def what_can_go(location: SweepLocation, *, unfinished: bool, everything: bool) -> Cleaning:
     """Folders that can be deleted, with the reason.
 
     Args:
-        found: The sweep.
-        unfinished: Checkpoints of interrupted runs too.
-        everything: Results and the sweep's own files too.
+        location: The sweep.
+        unfinished: Include checkpoints of interrupted runs.
+        everything: Include results and the sweep's own files.
 
     Raises:
         BadInputError: The sweep is running, or another one is that shares runs with it.
-        StorageError: A record is damaged, of another sweep in the storage too: nobody can tell
-            then what that one needs.
+        StorageError: A record of this sweep or of another one in the storage is damaged, so that
+            what the sweep needs is not known.
     """
-    state = found.read(sweep_files.STATE)
+    state = location.read(sweep_files.STATE)
     if sweep_files.is_alive(state):
         raise BadInputError(
-            f"SWEEP must not be running to be cleaned, {found.name} is: stop it first"
+            f"SWEEP must not be running to be cleaned, {location.name} is: stop it first"
         )
-    nodes = (found.read(sweep_files.PLAN) or {"nodes": []})["nodes"]
-    users = _users(found, nodes)
+    nodes = plan_nodes(location)
+    users = _users(location, nodes)
     pruned = set((state or {}).get("pruned", ()))
     cleaning = Cleaning()
-    filesystem, root = open_storage(found.storage)
+    filesystem, root = open_storage(location.storage)
+
+    def exists(path: str) -> bool:
+        return bool(filesystem.get_file_info(path).type != pafs.FileType.NotFound)
+
     for node in nodes:
         key, label = node["key"], node["label"]
-        finished = _is_there(filesystem, f"{root}/nodes/{key}/manifest.json")
+        result, checkpoints = f"{root}/nodes/{key}", f"{root}/work/{key}"
+        finished = exists(f"{result}/manifest.json")
         if key in users:
             if everything and finished:
-                what = f"result of {label}: {', '.join(users[key])} has it too"
-                cleaning.kept.append({"path": f"{root}/nodes/{key}", "what": what})
+                cleaning.keep(result, f"result of {label}: {', '.join(users[key])} has it too")
             continue
-        if _is_there(filesystem, f"{root}/work/{key}"):
-            if finished or key in pruned:
-                why = "finished" if finished else "stopped early"
-            else:
-                why = "interrupted"
+        if exists(checkpoints):
+            why = "finished" if finished else "stopped early" if key in pruned else "interrupted"
             if why != "interrupted" or unfinished:
-                what = f"checkpoints of {label}: {why}"
-                cleaning.going.append({"path": f"{root}/work/{key}", "what": what})
-        longer = f"{root}/{CONTINUATIONS}/{node['continuation']}" if "continuation" in node else ""
-        if finished and longer and _is_there(filesystem, longer):
-            what = f"last checkpoint of {label}: kept for a run with more env_steps"
-            cleaning.going.append({"path": longer, "what": what})
+                cleaning.add(filesystem, checkpoints, f"checkpoints of {label}: {why}")
+        if finished and "continuation" in node:
+            last = f"{root}/{CONTINUATIONS}/{node['continuation']}"
+            if exists(last):
+                what = f"last checkpoint of {label}: kept for a run with more env_steps"
+                cleaning.add(filesystem, last, what)
         if everything and finished:
-            cleaning.going.append({"path": f"{root}/nodes/{key}", "what": f"result of {label}"})
+            cleaning.add(filesystem, result, f"result of {label}")
     if everything:
-        _add_own_files(found, root, cleaning)
+        cleaning.add(filesystem, f"{root}/{location.name}", "the sweep's own files")
+        here = sweep_folder(location.storage, location.name)
+        if sweep_files.is_remote(location.storage) and here.is_dir():
+            # A study is in it: the next sweep of this name would take that for its own.
+            what = "the sweep's own files on this machine"
+            cleaning.add(pafs.LocalFileSystem(), str(here), what)
+        for storage, study in _studies(location):
+            what = f"study {study!r}: delete it with Optuna's tools where nobody needs it any more"
+            cleaning.keep(redact(storage), what)
     return cleaning
 
 
-def _add_own_files(found: SweepLocation, root: str, cleaning: Cleaning) -> None:
-    cleaning.going.append({"path": f"{root}/{found.name}", "what": "the sweep's own files"})
-    here = sweep_folder(found.storage, found.name)
-    if sweep_files.is_remote(found.storage) and here.is_dir():
-        # A study is in it: the next sweep of this name would take that for its own.
-        what = "the sweep's own files on this machine"
-        cleaning.going_here.append({"path": str(here), "what": what})
-    for storage, study in _studies(found):
-        what = f"study {study!r}: delete it with Optuna's tools where nobody needs it any more"
-        cleaning.kept.append({"path": redact(storage), "what": what})
-
-
-def _users(found: SweepLocation, nodes: Iterable[Mapping[str, Any]]) -> dict[str, list[str]]:
+def _users(location: SweepLocation, nodes: Iterable[Mapping[str, Any]]) -> dict[str, list[str]]:
     """Key to the names of other sweeps that have the node, or whose searches count on it.
 
     Raises:
         BadInputError: One of them is running.
     """
     mine = {node["key"]: node for node in nodes}
-    studies = _studies(found)
+    studies = _studies(location)
     users: dict[str, list[str]] = {}
-    for other in sweeps_in(found.storage):
-        if other.name == found.name:
+    for other in sweeps_in(location.storage):
+        if other.name == location.name:
             continue
-        theirs = {node["key"] for node in (other.read(sweep_files.PLAN) or {"nodes": []})["nodes"]}
+        theirs = {node["key"] for node in plan_nodes(other)}
         # A trial that only this sweep has computed is part of their study's results all the same.
         for study in studies.keys() & _studies(other).keys():
-            theirs |= _of_stage(studies[study], mine)
+            theirs |= _keys_of_stage(studies[study], mine)
         shared = theirs & mine.keys()
         if shared and sweep_files.is_alive(other.read(sweep_files.STATE)):
             raise BadInputError(
-                f"SWEEP must share no runs with a running sweep to be cleaned, {found.name} shares "
-                f"{len(shared)} with {other.name}: stop that first"
+                f"SWEEP must share no runs with a running sweep to be cleaned, {location.name} "
+                f"shares {len(shared)} with {other.name}: stop that first"
             )
         for key in shared:
             users.setdefault(key, []).append(other.name)
     return users
 
 
-def _studies(found: SweepLocation) -> dict[tuple[str, str], str]:
+def _studies(location: SweepLocation) -> dict[tuple[str, str], str]:
     """Database and name of each study that other sweeps may use too, to its stage."""
     studies = {}
-    for stage in (found.read(sweep_files.CONFIG) or {"stages": []})["stages"]:
+    for stage in (location.read(sweep_files.CONFIG) or {"stages": []})["stages"]:
         search = stage.get("search") or {}
         if search.get("storage"):
-            name = f"{search.get('study') or found.name}/{stage['name']}"
+            name = f"{search.get('study') or location.name}/{stage['name']}"
             studies[search["storage"], name] = str(stage["name"])
     return studies
 
 
-def _of_stage(stage: str, nodes: Mapping[str, Mapping[str, Any]]) -> set[str]:
+def _keys_of_stage(stage: str, nodes: Mapping[str, Mapping[str, Any]]) -> set[str]:
     """Keys of a stage's nodes and of all that they start from."""
-    found: set[str] = set()
+    keys: set[str] = set()
     wanted = [key for key, node in nodes.items() if node["label"].startswith(f"{stage}/")]
     while wanted:
         key = wanted.pop()
-        if key in nodes and key not in found:
-            found.add(key)
+        if key in nodes and key not in keys:
+            keys.add(key)
             wanted.append(nodes[key].get("input") or "")
-    return found
-
-
-def _is_there(filesystem: pafs.FileSystem, path: str) -> bool:
-    return bool(filesystem.get_file_info(path).type != pafs.FileType.NotFound)
-
-
-def delete(found: SweepLocation, cleaning: Cleaning) -> None:
-    """Delete folders, a node's manifest first: half a node is none."""
-    filesystem, _ = open_storage(found.storage)
-    places = [(filesystem, item) for item in cleaning.going]
-    places += [(pafs.LocalFileSystem(), item) for item in cleaning.going_here]
-    for there, item in places:
-        with contextlib.suppress(FileNotFoundError):
-            there.delete_file(f"{item['path']}/manifest.json")
-        with contextlib.suppress(FileNotFoundError):
-            there.delete_dir(item["path"])
+    return keys

@@ -1,4 +1,4 @@
-"""`python -m music_rllib.sweep`: the commands of a sweep; what is none of them is a file to run."""
+"""`python -m music_rllib.sweep`: the commands of a sweep, and `run` where no command is given."""
 
 from __future__ import annotations
 
@@ -8,27 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from music_rllib.command_line import Group, add_command, new_app, run_app
-from music_rllib.sweep.commands import (
-    best,
-    clean,
-    compare,
-    evaluate,
-    files,
-    plan,
-    resume,
-    run,
-    status,
-    stop,
-)
-
-__all__ = ["COMMANDS", "EXIT_CODES", "app", "main"]
+from music_rllib.sweep.commands import best, clean, compare, evaluate, files, run, status, stop
 
 COMMANDS: dict[str, tuple[Callable[..., int], str]] = {
-    "run": (run.run, run.EXAMPLES),
-    "plan": (plan.plan, plan.EXAMPLES),
+    "run": (run.run, run.RUN_EXAMPLES),
+    "plan": (run.plan, run.PLAN_EXAMPLES),
     "status": (status.status, status.EXAMPLES),
     "stop": (stop.stop, stop.EXAMPLES),
-    "resume": (resume.resume, resume.EXAMPLES),
+    "resume": (run.resume, run.RESUME_EXAMPLES),
     "compare": (compare.compare, compare.EXAMPLES),
     "best": (best.best, best.EXAMPLES),
     "evaluate": (evaluate.evaluate, evaluate.EXAMPLES),
@@ -37,7 +24,7 @@ COMMANDS: dict[str, tuple[Callable[..., int], str]] = {
     "presets": (files.presets, files.PRESETS_EXAMPLES),
     "schema": (files.schema, files.SCHEMA_EXAMPLES),
 }
-"""Name to function and examples, in the order of the help."""
+"""Name to the function and the examples of its help, in the order of the help."""
 EXIT_CODES = """\
 Exit codes: 0 all is well; 1 a run failed or Ray died, state is kept; 2 bad
 input or damaged results, nothing was started; 130 stopped by Ctrl-C, 143 by
@@ -59,22 +46,22 @@ Examples:
 
 
 class _RunsByDefault(Group):
-    """Runs a file that no command stands in front of, and the packaged one without a file."""
+    """Commands, and `run` where none is given."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Put `run` where there is no command."""
+        """Put `run` in front of arguments without a command."""
         if not args or args[0] not in {*self.commands, *ctx.help_option_names}:
-            if args and (meant := _meant(args[0], self.commands)) is not None:
+            if args and (command := _closest_command(args[0], self.commands)) is not None:
                 ctx.fail(
                     f"COMMAND must be one of {', '.join(self.commands)}, or a sweep's YAML file, "
-                    f"got {args[0]!r} (did you mean {meant!r}?)"
+                    f"got {args[0]!r} (did you mean {command!r}?)"
                 )
             args = ["run", *args]
         return super().parse_args(ctx, args)
 
 
-def _meant(word: str, commands: Iterable[str]) -> str | None:
-    """The command that a word is a mistyped form of, unless it is a file or looks like one."""
+def _closest_command(word: str, commands: Iterable[str]) -> str | None:
+    """The command that a word misspells; None for what is a file or looks like one."""
     if word.startswith("-") or {".", "/", "="} & {*word} or Path(word).exists():
         return None
     return next(iter(difflib.get_close_matches(word.lower(), commands, n=1)), None)
@@ -91,5 +78,5 @@ def sweep() -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the program with these arguments, or the process's; the exit code."""
+    """Run the program with these arguments, or with the process's own; the exit code."""
     return run_app(app, "python -m music_rllib.sweep", arguments)

@@ -1,12 +1,16 @@
-"""Arguments that several commands of a sweep take."""
+"""Arguments that several commands of a sweep take, and what they name."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-__all__ = ["Name", "Place", "Seeds", "Storage", "SweepStorage"]
+from music_rllib.errors import BadInputError
+
+if TYPE_CHECKING:
+    from music_rllib.config.schema import Stage, SweepConfig
+    from music_rllib.experiment.location import SweepLocation
 
 Place = Annotated[
     str,
@@ -20,22 +24,27 @@ Storage = Annotated[
     str | None,
     typer.Option(metavar="PLACE", help="Folder or URI of results, where SWEEP is a name."),
 ]
-SweepStorage = Annotated[
-    str | None,
-    typer.Option(
-        metavar="PLACE",
-        help="Folder, or s3:// or gs:// URI, for results; replaces the file's 'storage'. Sweeps "
-        "with the same storage share finished runs.",
-    ),
+StageName = Annotated[
+    str | None, typer.Option(metavar="STAGE", help="Of which stage; the last by default.")
 ]
-Name = Annotated[
-    str | None, typer.Option(metavar="NAME", help="Name of the sweep; replaces the file's 'name'.")
-]
-Seeds = Annotated[
-    str | None,
-    typer.Option(
-        metavar="N",
-        help="So many seeds, the file's first, or a list like 0,1,7. Those that have run are "
-        "reused; the report says how many would likely decide.",
-    ),
-]
+
+
+def find_stage(config: SweepConfig, name: str | None) -> Stage:
+    """The stage with this name; without a name, the sweep's last one.
+
+    Raises:
+        BadInputError: The sweep has no such stage.
+    """
+    stages = {stage.name: stage for stage in config.stages}
+    name = name or list(stages)[-1]
+    if name not in stages:
+        raise BadInputError(f"--stage must be one of {', '.join(stages)}, got {name!r}")
+    return stages[name]
+
+
+def plan_nodes(location: SweepLocation) -> list[dict[str, Any]]:
+    """The nodes in a sweep's `plan.json`, as far as they are known."""
+    from music_rllib.experiment import sweep_files
+
+    nodes: list[dict[str, Any]] = (location.read(sweep_files.PLAN) or {"nodes": []})["nodes"]
+    return nodes

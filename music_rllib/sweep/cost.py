@@ -1,4 +1,4 @@
-"""What a plan takes on this machine: a run of each kind is trained for some seconds."""
+"""The cost of a plan on this machine, from some seconds of training for each kind of run."""
 
 from __future__ import annotations
 
@@ -16,65 +16,64 @@ from music_rllib.config.schema import Stage, SweepConfig
 from music_rllib.experiment.plan import Plan
 from music_rllib.runtime import machine
 from music_rllib.runtime.ray_cluster import cluster
-from music_rllib.sweep.views.tables import fresh_runs, new_table, search_budget, search_runs
+from music_rllib.sweep.views.search_budget import search_budget
+from music_rllib.sweep.views.tables import new_table
 from music_rllib.sweep.views.text import clock
 from music_rllib.training.sample_run import RunSample, sample_run
 
-__all__ = ["Kind", "cost_document", "cost_table", "kinds", "measure"]
-
-BUSY = 0.75
-"""Load average per CPU above which other programs ran beside the one that measures."""
+BUSY_LOAD = 0.75
+"""Load average per CPU above which other programs have disturbed the measurement."""
 _WITHOUT_COST: dict[str, bool | set[str]] = {
     "seed": True,
     "env_steps": True,
     "tac": {"entropic_index", "alpha", "gamma", "tau", "lr", "random_steps", "target_bounds"},
     "music": {"mi_reward_weight", "lr"},
 }
-"""Settings that change what is computed, and not how much of it."""
+"""Settings that change what is computed, and not how long it takes."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Kind:
-    """Runs that cost the same."""
+    """Runs of one stage and task that cost the same."""
 
     label: str
     runs: int
-    """How many of them are left to compute; of a search at most."""
+    """Runs that are left to compute; for a search at most."""
     settings: RunSettings
     env_steps: int
-    """Of one run, on average."""
+    """Env steps of one run, on average."""
 
     @property
     def grad_updates(self) -> int:
-        """Of one run."""
+        """Gradient updates of one run."""
         learning = self.env_steps - self.settings.tac.random_steps
         return round(learning * self.settings.tac.replay_ratio)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Cost:
-    """What one run of a kind takes."""
+    """A kind of run, and what a short run of it took."""
 
     kind: Kind
     sample: RunSample
 
     @property
     def seconds(self) -> float:
-        """Of one run, from its start to its end."""
+        """Time of one whole run, from its start to its end."""
         evaluations = 1 + math.ceil(self.kind.env_steps / self.kind.settings.evaluation.interval)
         training = self.kind.env_steps / self.sample.steps_per_second
         return self.sample.start_seconds + training + evaluations * self.sample.evaluation_seconds
 
 
 def kinds(config: SweepConfig, plan: Plan, finished: Collection[str]) -> list[Kind]:
-    """The kinds of runs that are left, in the order of the plan, those of searches last."""
+    """The kinds of runs that are left: those of the plan in its order, then those of searches."""
     groups: dict[str, list[tuple[str, RunSettings]]] = {}
     for node in plan.nodes:
         if node.key not in finished:
             label = f"{node.stage}/{node.run.task.name}"
             alike = node.run.model_dump(mode="json", exclude=dict(_WITHOUT_COST))
             groups.setdefault(json.dumps([label, alike]), []).append((label, node.run))
-    found = [
+    planned = [
         Kind(
             label=group[0][0],
             runs=len(group),
@@ -83,51 +82,56 @@ def kinds(config: SweepConfig, plan: Plan, finished: Collection[str]) -> list[Ki
         )
         for group in groups.values()
     ]
-    return found + [kind for stage in config.stages for kind in searched(config, stage)]
+    return planned + [kind for stage in config.stages for kind in searched(config, stage)]
 
 
 def searched(config: SweepConfig, stage: Stage) -> Iterator[Kind]:
-    """What the search of a stage asks for at most, with what its fresh seeds start from."""
-    stages = {stage.name: stage for stage in config.stages}
+    """The runs that the search of a stage asks for at most, and what fresh seeds start from."""
     if stage.search is None:
         return
-    source = stages.get(str(stage.source.stage)) if stage.source else None
-    if source is not None and stage.search.final is not None:
+    final = stage.search.final
+    source = next((s for s in config.stages if stage.source and s.name == stage.source.stage), None)
+    if source is not None and final is not None:
         for task in source.tasks:
             settings = source.points[0].runs[task.name]
             yield Kind(
                 label=f"{source.name}/{task.name}, fresh seeds",
-                runs=stage.search.final.seeds,
+                runs=final.seeds,
                 settings=settings,
                 env_steps=settings.env_steps,
             )
-    final, budget = stage.search.final, search_budget(stage, stage.search)
-    fresh = fresh_runs(stage, stage.search) // len(stage.tasks)
-    runs = search_runs(stage, stage.search, len(config.seeds)) // len(stage.tasks) - fresh
-    longer = None if final is None else final.env_steps
+    budget = search_budget(stage, len(config.seeds))
+    runs, fresh_runs = budget.trial_runs, budget.fresh_runs
+    longer = final is not None and final.env_steps is not None
+    if not longer:
+        runs, fresh_runs = runs + fresh_runs, 0
     for task in stage.tasks:
-        settings, label = stage.points[0].runs[task.name], f"{stage.name}/{task.name}"
+        label = f"{stage.name}/{task.name}"
+        settings = stage.points[0].runs[task.name]
         yield Kind(
             label=label,
-            runs=runs if longer else runs + fresh,
+            runs=runs // len(stage.tasks),
             settings=settings,
-            env_steps=budget,
+            env_steps=budget.trial_env_steps,
         )
         if longer:
             yield Kind(
-                label=f"{label}, fresh seeds", runs=fresh, settings=settings, env_steps=longer
+                label=f"{label}, fresh seeds",
+                runs=fresh_runs // len(stage.tasks),
+                settings=settings,
+                env_steps=budget.fresh_env_steps,
             )
 
 
 def measure(
-    config: SweepConfig, found: list[Kind], say: Callable[[str], None]
+    config: SweepConfig, kinds: Collection[Kind], say: Callable[[str], None]
 ) -> tuple[list[Cost], int]:
     """Train a run of each kind for some seconds, one after the other.
 
     Args:
-        config: For the resources of a run.
-        found: The kinds, of `kinds`.
-        say: Told what is measured.
+        config: Has the resources of a run.
+        kinds: As `kinds` returns them.
+        say: Receives a line before each measurement.
 
     Returns:
         The cost of each kind, and how many runs fit at once.
@@ -139,21 +143,18 @@ def measure(
         if room.remark is not None:
             say(room.remark)
         costs = []
-        for number, kind in enumerate(found, 1):
-            say(f"measuring {number} of {len(found)}: {kind.label}")
+        for number, kind in enumerate(kinds, 1):
+            say(f"measuring {number} of {len(kinds)}: {kind.label}")
             run = kind.settings.model_copy(update={"env_steps": kind.env_steps})
-            sample = sample_run(run, config.resources)
-            costs.append(Cost(kind=kind, sample=sample))
+            costs.append(Cost(kind=kind, sample=sample_run(run, config.resources)))
         return costs, room.at_once
 
 
 def cost_table(costs: list[Cost], slots: int) -> Table:
-    """One row per kind of run, and the whole sweep's time below."""
+    """One row for each kind of run, and the whole sweep's time below."""
     document = cost_document(costs, slots)
-    table = new_table("What it takes on this machine")
-    table.add_column("stage/task", overflow="fold")
-    for name in ("runs", "env steps", "steps/s", "memory", "start", "a run", "all"):
-        table.add_column(name, justify="right", overflow="fold")
+    heads = ("stage/task", "runs", "env steps", "steps/s", "memory", "start", "a run", "all")
+    table = new_table("What it takes on this machine", heads, left=["stage/task"])
     for row in document["kinds"]:
         table.add_row(
             row["label"],
@@ -166,31 +167,40 @@ def cost_table(costs: list[Cost], slots: int) -> Table:
             clock(row["seconds"]),
         )
     at_once = "one run at a time" if slots == 1 else f"{slots} runs at a time"
-    table.caption = f"About {clock(document['seconds'])} with {at_once}, each measured by itself."
     largest = max((cost.sample.memory for cost in costs), default=0)
-    table.caption += f"\n{_memory_in_words(largest, slots)}"
+    lines = [
+        f"About {clock(document['seconds'])} with {at_once}, each measured by itself.",
+        _memory_in_words(largest, slots),
+    ]
     load = os.getloadavg()[0]
-    if load > BUSY * len(os.sched_getaffinity(0)):
-        table.caption += f"\nThe machine was busy with something else (load {load:.1f})."
+    if load > BUSY_LOAD * len(os.sched_getaffinity(0)):
+        lines.append(f"The machine was busy with something else (load {load:.1f}).")
+    table.caption = "\n".join(lines)
     table.caption_justify = "left"
     return table
 
 
 def _memory_in_words(largest: int, slots: int) -> str:
-    """What runs side by side take of this machine's memory, and how to have fewer of them."""
-    wanted, here = slots * largest / 2**30, machine.memory() / 2**30
+    """The memory that runs side by side take, and how to have fewer of them where it is too much.
+
+    Args:
+        largest: Bytes of the largest run.
+        slots: Runs at a time.
+    """
+    gib = largest / 2**30
     if machine.cluster_address() is not None:
-        return f"A run takes up to {largest / 2**30:.1f} GiB of memory."
+        return f"A run takes up to {gib:.1f} GiB of memory."
+    wanted, here = slots * gib, machine.memory() / 2**30
     if wanted <= here:
         return f"Together they take up to {wanted:.1f} of this machine's {here:.1f} GiB of memory."
     return (
         f"Together they would take {wanted:.1f} GiB of memory, of which this machine has "
-        f"{here:.1f}: set resources.memory_per_run to {math.ceil(10 * largest / 2**30) / 10:g}."
+        f"{here:.1f}: set resources.memory_per_run to {math.ceil(10 * gib) / 10:g}."
     )
 
 
 def cost_document(costs: list[Cost], slots: int) -> dict[str, Any]:
-    """The same as plain data; times in seconds."""
+    """The cost as plain data; times in seconds, memory in bytes."""
     rows: list[dict[str, Any]] = [
         {
             "label": cost.kind.label,
@@ -206,6 +216,6 @@ def cost_document(costs: list[Cost], slots: int) -> dict[str, Any]:
         }
         for cost in costs
     ]
-    alone = sum(cost.seconds * cost.kind.runs for cost in costs)
+    alone = sum(row["seconds"] for row in rows)
     longest = max((cost.seconds for cost in costs), default=0.0)
     return {"kinds": rows, "runs_at_once": slots, "seconds": max(alone / slots, longest)}

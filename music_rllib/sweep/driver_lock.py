@@ -1,4 +1,4 @@
-"""One process drives a sweep."""
+"""The lease by which only one process at a time drives a sweep."""
 
 from __future__ import annotations
 
@@ -11,43 +11,42 @@ from music_rllib.runtime.ending import end_process
 from music_rllib.store.lease import HeldLease, Lease, LeaseFile
 from music_rllib.store.object_folder import StorageError, open_storage
 
-__all__ = ["hold_driver_lock"]
-
 
 @contextlib.contextmanager
 def hold_driver_lock(sweep: Sweep, say: Callable[[str], None] = print) -> Iterator[None]:
-    """Be the one process that drives the sweep, on whatever machine, for this `with`.
+    """Hold the lease of the sweep's driver, which one process on any machine can have at a time.
 
     A process that was suspended, and finds that another one drives the sweep by now, ends at once:
     they would both write the sweep's files.
 
     Args:
-        sweep: Which one.
-        say: Told why the process ends.
+        sweep: The sweep to drive.
+        say: Receives the reason before the process ends.
 
     Raises:
-        StorageError: Another one does; or the storage can't be written.
+        StorageError: Another process has the lease, or the storage can't be written.
     """
     filesystem, root = open_storage(sweep.storage)
-    file = LeaseFile(filesystem, f"{root}/{sweep.plan.name}/driver.json")
-    lease = Lease.of_this_process(f"sweep {sweep.plan.name!r}")
+    folder, owner = f"{root}/{sweep.plan.name}", f"sweep {sweep.plan.name!r}"
+    file = LeaseFile(filesystem, f"{folder}/driver.json")
+    lease = Lease.of_this_process(owner)
     holder = file.acquire(lease)
     if holder is not None:
         raise StorageError(
-            f"{root}/{sweep.plan.name} must be used by one process at a time, and another one has "
-            f"it: {holder}. Wait for its end or stop it, or give this sweep another --name"
+            f"{folder} must be used by one process at a time, and another one has it: {holder}. "
+            "Wait for its end or stop it, or give this sweep another --name"
         )
 
     def lost() -> None:
-        again = Lease.of_this_process(f"sweep {sweep.plan.name!r}")
+        again = Lease.of_this_process(owner)
         taken_by = file.acquire(again)
         if taken_by is None:  # whoever had it has ended
             held.append(HeldLease(file, again, lost))
             return
         say(
-            f"{root}/{sweep.plan.name} has been taken over while this process was suspended, by "
-            f"{taken_by}: this one ends. See how far the sweep is with: python -m "
-            f"music_rllib.sweep status {sweep.folder}"
+            f"{folder} has been taken over while this process was suspended, by {taken_by}: this "
+            "one ends. See how far the sweep is with: python -m music_rllib.sweep status "
+            f"{sweep.folder}"
         )
         end_process(FAILED)
 

@@ -1,21 +1,21 @@
-"""What can be found out before anything is trained, so that it doesn't fail an hour later."""
+"""Checks before anything is trained, so that a sweep does not fail an hour later."""
 
 from __future__ import annotations
 
 import shutil
 from collections.abc import Set
+from contextlib import closing
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from rich.console import Console
-from rich.text import Text
 
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.envs.tasks import BUILT_IN_TASKS, Task, closest
 from music_rllib.errors import BadInputError
 from music_rllib.experiment import sweep_files
-from music_rllib.experiment.plan import Input, Plan
+from music_rllib.experiment.plan import Plan
 from music_rllib.experiment.scheduler import Scheduler, Status
 from music_rllib.experiment.session import Sweep
 from music_rllib.runtime.ending import in_time
@@ -27,31 +27,20 @@ from music_rllib.store.node_store import NodeStore
 if TYPE_CHECKING:  # the environments are heavy, and most sweeps have none of their own
     from music_rllib.envs.make import Env
 
-__all__ = [
-    "HardwareError",
-    "TaskError",
-    "check_environments",
-    "check_hardware",
-    "check_ray",
-    "check_searches",
-    "import_checkpoints",
-    "verify_inputs",
-]
-
 
 class TaskError(BadInputError, ValueError):
-    """A task whose environment can't be made, or isn't as the task says."""
+    """A task whose environment can't be made, or is not as the task describes it."""
 
 
 def check_environments(plan: Plan, hang_minutes: float | None = None) -> None:
-    """Make each user's environment once, and look whether its task fits it.
+    """Make each environment of the user's once, and check that its task describes it.
 
     Args:
-        plan: The sweep's.
-        hang_minutes: The program ends where one takes longer; None: it is waited for.
+        plan: The sweep's plan.
+        hang_minutes: The program ends where an environment takes longer; None: it waits.
 
     Raises:
-        TaskError: One doesn't; with one line per problem.
+        TaskError: A task does not fit; with one line per problem.
     """
     runs: dict[str, list[RunSettings]] = {}
     for node in plan.nodes:
@@ -62,49 +51,33 @@ def check_environments(plan: Plan, hang_minutes: float | None = None) -> None:
         hindsight = {run.replay.hindsight_episodes for run in of_task if run.replay.hindsight_k > 0}
         rule = f"environments.{name} must be made and played within resources.hang_minutes"
         with in_time(hang_minutes and 60 * hang_minutes, f"{rule}, {hang_minutes}"):
-            misfits = _misfits(of_task[0].task, hindsight)
-        problems += [f"environments.{name}: {line}" for line in misfits]
+            lines = _problems(of_task[0].task, hindsight)
+        problems += [f"environments.{name}: {line}" for line in lines]
     if problems:
         raise TaskError("\n".join(problems))
 
 
-class HardwareError(BadInputError, ValueError):
-    """A setting that this machine's hardware does not allow."""
+def _problems(task: Task, hindsight: Set[str]) -> list[str]:
+    """How the environment differs from its task.
 
-
-def check_hardware(plan: Plan) -> None:
-    """Look whether this machine can compute as the runs want it, where they are to run on it.
-
-    Raises:
-        HardwareError: It can't.
+    Args:
+        task: The task.
+        hindsight: The `replay.hindsight_episodes` of its runs; empty where none has hindsight.
     """
-    if all(node.run.tac.precision == "float32" for node in plan.nodes):
-        return
-    from music_rllib.tac.kernels.precision import PrecisionError, check_precision
-
-    try:
-        check_precision("bf16")
-    except PrecisionError as error:
-        raise HardwareError(str(error)) from error
-
-
-def _misfits(task: Task, hindsight: Set[str]) -> list[str]:
     from music_rllib.envs.make import make_env
 
     try:
         env = make_env(task.env_id, **task.env_kwargs)
     except Exception as error:  # a user's environment may raise anything
         return [f"env_id must name an environment that can be made, got {task.env_id!r}: {error}"]
-    try:
-        return _misfits_of(task, env, hindsight)
-    except Exception as error:
-        return [f"env_id must name an environment that can be played, got {error!r}"]
-    finally:
-        env.close()
+    with closing(env):
+        try:
+            return _problems_of(task, env, hindsight)
+        except Exception as error:
+            return [f"env_id must name an environment that can be played, got {error!r}"]
 
 
-def _misfits_of(task: Task, env: Env, hindsight: Set[str]) -> list[str]:
-    """What is wrong, where some runs take `hindsight` from all episodes, or from moved ones."""
+def _problems_of(task: Task, env: Env, hindsight: Set[str]) -> list[str]:
     from music_rllib.envs.make import (
         check_action_space,
         goal_reward_of,
@@ -117,7 +90,11 @@ def _misfits_of(task: Task, env: Env, hindsight: Set[str]) -> list[str]:
         size, goal_size = observation_sizes(env.observation_space)
     except ValueError as error:
         return [str(error).removeprefix("environment: ")]
-    problems = _split_outside(task, size)
+    problems = [
+        f"{name} must be < {size}, the size of the observation, got {max(indices)}"
+        for name in ("agent_indices", "surrounding_indices")
+        if (indices := getattr(task, name)) and max(indices) >= size
+    ]
     limit = env.spec.max_episode_steps if env.spec is not None else None
     if limit is not None and task.horizon > limit:
         problems.append(
@@ -142,7 +119,7 @@ def _misfits_of(task: Task, env: Env, hindsight: Set[str]) -> list[str]:
 
 
 def _info_keys(task: Task, env: Env) -> set[str]:
-    """Keys of `info` until the success key has come, in an episode of random actions."""
+    """Keys of `info` in an episode of random actions, up to the step that has the success key."""
     env.reset(seed=0)
     env.action_space.seed(0)
     keys: set[str] = set()
@@ -154,12 +131,20 @@ def _info_keys(task: Task, env: Env) -> set[str]:
     return keys
 
 
-def _split_outside(task: Task, size: int) -> list[str]:
-    return [
-        f"{name} must be < {size}, the size of the observation, got {max(indices)}"
-        for name in ("agent_indices", "surrounding_indices")
-        if (indices := getattr(task, name)) and max(indices) >= size
-    ]
+def check_hardware(plan: Plan) -> None:
+    """Check that this machine has the hardware for the runs' precision.
+
+    Raises:
+        BadInputError: It has not.
+    """
+    if all(node.run.tac.precision == "float32" for node in plan.nodes):
+        return
+    from music_rllib.tac.kernels.precision import PrecisionError, check_precision
+
+    try:
+        check_precision("bf16")
+    except PrecisionError as error:
+        raise BadInputError(str(error)) from error
 
 
 def import_checkpoints(plan: Plan, store: NodeStore) -> None:
@@ -170,37 +155,33 @@ def import_checkpoints(plan: Plan, store: NodeStore) -> None:
         StorageError: The store can't be written.
     """
     for source in plan.imports:
-        if not store.is_finished(source.key):
-            _import(source, store)
-
-
-def _import(source: Input, store: NodeStore) -> None:
-    assert source.checkpoint is not None
-    folder, manifest = open_handoff(source.checkpoint.folder)
-    read_handoff(folder, list(manifest.modules), manifest.info.task)
-    with TemporaryDirectory() as temporary:
-        target = Path(temporary, "handoff")
-        target.mkdir()
-        for file in ("handoff.json", *(module.file for module in manifest.modules.values())):
-            shutil.copyfile(folder / file, target / file)
-        store.publish(source.key, Path(temporary))
+        if store.is_finished(source.key):
+            continue
+        assert source.checkpoint is not None
+        folder, manifest = open_handoff(source.checkpoint.folder)
+        read_handoff(folder, list(manifest.modules), manifest.info.task)
+        with TemporaryDirectory() as temporary:
+            target = Path(temporary, "handoff")
+            target.mkdir()
+            for file in ("handoff.json", *(module.file for module in manifest.modules.values())):
+                shutil.copyfile(folder / file, target / file)
+            store.publish(source.key, Path(temporary))
 
 
 def verify_inputs(scheduler: Scheduler, store: NodeStore) -> None:
-    """Read what waiting nodes start from and an earlier sweep has left.
+    """Read the finished nodes from which waiting nodes start.
 
     Raises:
         DamagedError: A node isn't what its manifest says.
     """
     waiting = scheduler.having(Status.WAITING)
-    wanted = dict.fromkeys(node.input.key for node in waiting if node.input)
-    for key in wanted:
+    for key in dict.fromkeys(node.input.key for node in waiting if node.input):
         if store.is_finished(key):
             store.verify(key)
 
 
 def check_searches(opened: Sweep) -> None:
-    """Look whether the searches' studies can be opened."""
+    """Check that the studies of the searches can be opened."""
     if opened.plan.searched:
         from music_rllib.search.opening import check_studies
 
@@ -208,7 +189,7 @@ def check_searches(opened: Sweep) -> None:
 
 
 def check_ray(console: Console, opened: Sweep) -> None:
-    """Look whether Ray is there and can hold a run, unless nothing is left to compute."""
+    """Check that Ray answers and can hold a run, unless nothing is left to compute."""
     begun = (opened.folder / sweep_files.CONFIG).is_file()
     if opened.scheduler.complete and (begun or not opened.plan.searched):
         return
@@ -217,6 +198,6 @@ def check_ray(console: Console, opened: Sweep) -> None:
     from music_rllib.runtime.ray_cluster import check_fits
 
     if remark := check_fits(opened.config.resources):
-        console.print(Text(remark, style="yellow"), soft_wrap=True)
+        console.print(remark, style="yellow", soft_wrap=True)
     early.install()  # Ray has set a handler of its own
     early.check()

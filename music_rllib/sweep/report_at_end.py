@@ -1,4 +1,4 @@
-"""The report at a sweep's end: made by the report's own program, kept with the sweep's run."""
+"""The report at a sweep's end, made by the report's own program."""
 
 from __future__ import annotations
 
@@ -12,10 +12,8 @@ from music_rllib.experiment.sweep_files import is_remote
 from music_rllib.redaction import redact
 from music_rllib.store.paths import sweep_folder
 
-__all__ = ["report_at_end"]
-
-PATIENCE = 900.0
-"""Seconds after which the sweep ends without a report."""
+TIMEOUT_SECONDS = 900.0
+"""After this time the sweep ends without a report."""
 
 
 def report_at_end(storage: str, name: str, tracking_uri: str | None, config: Path) -> str | None:
@@ -25,14 +23,14 @@ def report_at_end(storage: str, name: str, tracking_uri: str | None, config: Pat
     its results are kept.
 
     Args:
-        storage: the sweep's, a folder or a bucket's URI.
-        name: the sweep's.
-        tracking_uri: of its MLflow, password included; None for the file in the storage.
-        config: the sweep's YAML file, whose environments are filmed.
+        storage: Folder or URI of a bucket.
+        name: The sweep's name.
+        tracking_uri: MLflow's, password included; None for the file in the storage.
+        config: The sweep's YAML file, whose environments are filmed.
 
     Returns:
-        Where the page and its picture are, for the user; None where `MUSIC_RLLIB_REPORT=off` says
-        that nobody wants them.
+        The places of the page and its picture, or why there is no report, as a message; None where
+        `MUSIC_RLLIB_REPORT=off` asks for no report.
     """
     if os.environ.get(names.VARIABLE_REPORT, "").lower() in {"off", "0", "no", "false"}:
         return None
@@ -52,18 +50,15 @@ def report_at_end(storage: str, name: str, tracking_uri: str | None, config: Pat
             env=environment,
             capture_output=True,
             text=True,
-            timeout=PATIENCE,
+            timeout=TIMEOUT_SECONDS,
             check=False,
         )
     except (OSError, subprocess.TimeoutExpired) as error:
-        return _no_report(redact(str(error)), storage, name)
-    lines = (done.stdout if done.returncode == 0 else done.stderr).strip().splitlines()
-    if done.returncode or not lines:
-        return _no_report(lines[-1] if lines else f"it ended with {done.returncode}", storage, name)
-    kept = 2 if lines[-1].startswith("Picture: ") else 1
-    return "\n".join(lines[-kept:])
-
-
-def _no_report(reason: str, storage: str, name: str) -> str:
+        reason = redact(str(error))
+    else:
+        lines = (done.stdout if done.returncode == 0 else done.stderr).strip().splitlines()
+        if done.returncode == 0 and lines:
+            return "\n".join(lines[-2 if lines[-1].startswith("Picture: ") else -1 :])
+        reason = lines[-1] if lines else f"it ended with {done.returncode}"
     place = f"{redact(storage)}/{name}"
     return f"No report: {reason}. Make it with: python -m music_rllib.report {place}"

@@ -1,4 +1,4 @@
-"""A sweep's searches while it is driven: opened with what earlier results lead to, and closed."""
+"""The searches of a sweep that is being driven: opened before its runs, kept after them."""
 
 from __future__ import annotations
 
@@ -16,13 +16,11 @@ from music_rllib.sweep.listeners.screen import Display
 from music_rllib.sweep.listeners.state_file import StateFile
 from music_rllib.tracking.tracker import Tracker
 
-__all__ = ["begin_searches", "end_searches"]
-
 
 def begin_searches(
     opened: Sweep, display: Display, mlflow_log: MlflowListener, state_file: StateFile
 ) -> SearchController:
-    """The sweep's searches, as far as earlier results lead."""
+    """Open the searches, recall their earlier trials, and plan the first runs."""
 
     def reused(node: Node) -> None:
         mlflow_log.finished(node)
@@ -32,11 +30,7 @@ def begin_searches(
     for line in learnings(searches):
         display.say(line)
     controller = SearchController(
-        opened,
-        searches,
-        reused=reused,
-        pruned=mlflow_log.pruned,
-        say=display.say,
+        opened, searches, reused=reused, pruned=mlflow_log.pruned, say=display.say
     )
     state_file.searches = lambda: outcome(controller, thorough=False)
     controller.recall()
@@ -47,12 +41,11 @@ def begin_searches(
 def end_searches(
     opened: Sweep, controller: SearchController, tracker: Tracker
 ) -> list[dict[str, Any]]:
-    """Keep what came of the searches, in the sweep's folder and in MLflow."""
+    """Stop the searches, and keep their outcome in the sweep's folder and in MLflow."""
     controller.stop()
-    found = outcome(controller)
-    if not found:
-        return found
-    text = as_json(found)
-    tracker.put_sweep_artefact(names.ARTEFACT_SEARCH, text)
-    keep(opened, SEARCH, text)
-    return found
+    searches = outcome(controller)
+    if searches:
+        text = as_json(searches)
+        tracker.put_sweep_artefact(names.ARTEFACT_SEARCH, text)
+        keep(opened, SEARCH, text)
+    return searches

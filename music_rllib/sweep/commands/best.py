@@ -8,9 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from music_rllib.command_line import Json, console_for, print_json
-from music_rllib.sweep.cli_helpers import Place, Storage
-
-__all__ = ["EXAMPLES", "best"]
+from music_rllib.sweep.cli_helpers import Place, StageName, Storage
 
 EXAMPLES = """\
 Examples:
@@ -25,9 +23,7 @@ Examples:
 def best(
     sweep: Place,
     storage: Storage = None,
-    stage: Annotated[
-        str | None, typer.Option(metavar="STAGE", help="Of which stage; the last by default.")
-    ] = None,
+    stage: StageName = None,
     output: Annotated[
         Path | None,
         typer.Option(
@@ -46,8 +42,7 @@ def best(
     from music_rllib.experiment.location import find_sweep
     from music_rllib.sweep.export import export_best
 
-    found = find_sweep(sweep, storage)
-    opened = found.open()
+    opened = find_sweep(sweep, storage).open()
     chosen = export_best(opened, stage, output or opened.folder / "best")
     if json:
         print_json(chosen)
@@ -55,19 +50,19 @@ def best(
     console = console_for()
     console.print(chosen["why"], soft_wrap=True)
     if chosen["entropies"]:
-        console.print(_entropies(chosen["entropies"]), soft_wrap=True)
+        console.print(_entropies_text(chosen["entropies"]), soft_wrap=True)
     for policy in chosen["policies"]:
         console.print(f"{policy['task']}: {policy['folder']}", soft_wrap=True)
     return 0
 
 
-def _entropies(found: dict[str, Any]) -> str:
+def _entropies_text(entropies: dict[str, Any]) -> str:
     from music_rllib import names
     from music_rllib.results.comparison import with_interval
 
     words = {names.SHANNON_ENTROPY: "Shannon entropy (nats)", names.ENTROPY: "S_q"}
     texts = (
-        f"{words[metric]} {with_interval(one['value'], one['interval'])}"
-        for metric, one in found.items()
+        f"{words[metric]} {with_interval(entropy['value'], entropy['interval'])}"
+        for metric, entropy in entropies.items()
     )
     return f"its policies at the end: {', '.join(texts)}"

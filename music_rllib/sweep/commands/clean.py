@@ -1,4 +1,4 @@
-"""`clean`: delete what a sweep has left and nobody needs."""
+"""`clean`: delete checkpoints and results that nobody needs."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ import typer
 
 from music_rllib.command_line import Json, console_for, print_json
 from music_rllib.sweep.cli_helpers import Place, Storage
-
-__all__ = ["EXAMPLES", "clean"]
 
 EXAMPLES = """\
 Examples:
@@ -50,22 +48,16 @@ def clean(
     finished runs keep for longer training. An interrupted run may go on from its own.
     """
     from music_rllib.experiment.location import find_sweep
-    from music_rllib.sweep.clean import delete, what_can_go
+    from music_rllib.sweep.clean import what_can_go
 
-    found = find_sweep(sweep, storage)
-    cleaning = what_can_go(found, unfinished=unfinished or everything, everything=everything)
+    location = find_sweep(sweep, storage)
+    cleaning = what_can_go(location, unfinished=unfinished or everything, everything=everything)
     going = cleaning.items
     if yes:
-        delete(found, cleaning)
+        cleaning.delete()
     if json:
-        print_json(
-            {
-                "sweep": found.name,
-                "deleted": yes,
-                "items": going,
-                "kept": cleaning.kept,
-            }
-        )
+        answer = {"sweep": location.name, "deleted": yes, "items": going, "kept": cleaning.kept}
+        print_json(answer)
         return 0
     console = console_for()
     for item in going:

@@ -1,23 +1,20 @@
-"""`compare`: conditions side by side, with intervals."""
+"""`compare`: the conditions of a stage side by side, with intervals."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from music_rllib.command_line import Json, console_for, print_json
 from music_rllib.errors import BadInputError
-from music_rllib.sweep.cli_helpers import Place, Storage
+from music_rllib.sweep.cli_helpers import Place, StageName, Storage, find_stage
 
 if TYPE_CHECKING:
-    from music_rllib.experiment.plan import Plan
     from music_rllib.results.comparison import Final, Scope
     from music_rllib.results.from_store import Condition
-    from music_rllib.store.run_record import RunResult
-
-__all__ = ["EXAMPLES", "compare"]
+    from music_rllib.results.statistics import Estimate
 
 EXAMPLES = """\
 Examples:
@@ -43,9 +40,7 @@ IN_THE_SEARCH = "Trials were chosen by these runs, so their order is biased: fre
 def compare(
     sweep: Place,
     storage: Storage = None,
-    stage: Annotated[
-        str | None, typer.Option(metavar="STAGE", help="Of which stage; the last by default.")
-    ] = None,
+    stage: StageName = None,
     metric: Annotated[
         str | None,
         typer.Option(
@@ -75,30 +70,33 @@ def compare(
     from music_rllib.search.ranking import measure_of
     from music_rllib.sweep.views.compare import compare_view
 
-    found = find_sweep(sweep, storage)
-    opened = found.open()
-    stages = {stage.name: stage for stage in opened.config.stages}
-    stage = stage or list(stages)[-1]
-    if stage not in stages:
-        raise BadInputError(f"--stage must be one of {', '.join(stages)}, got {stage!r}")
+    location = find_sweep(sweep, storage)
+    opened = location.open()
+    settings = find_stage(opened.config, stage)
     results = opened.results()
-    measure = measure_of(stages[stage], opened.plan, results)
-    # Without a word about it, each task is judged by its own.
-    given, metric = metric, metric or (measure.metric if stages[stage].search else None)
+    measure = measure_of(settings, opened.plan, results)
+    # Where no metric is given and nothing is searched, each task has its own.
+    given, metric = metric, metric or (measure.metric if settings.search else None)
     maximised = not minimize and (measure.maximised or metric != measure.metric)
-    found_ = [one for one in conditions(opened.plan, results, metric) if one.stage == stage]
-    if not found_ and results and given is not None:
+
+    def of_stage(name: str | None) -> list[Condition]:
+        every = conditions(opened.plan, results, name)
+        return [condition for condition in every if condition.stage == settings.name]
+
+    compared = of_stage(metric)
+    if not compared and results and given is not None:
         known = sorted({name for result in results.values() for name in result.metrics})
         if given not in known:
             raise BadInputError(f"--metric must be one of {', '.join(known)}, got {given!r}")
-    read = {metric, *(task.primary_metric for one in opened.config.stages for task in one.tasks)}
-    stored = results_of(opened, {names.EVAL_EPISODES, *filter(None, read)})
-    study = study_of(stored, stage, metric=given, maximised=maximised or given is None)
-    entropies = _entropies(opened.plan, results, stage)
-    groups = [group for scope in scopes(found_) for group in _groups(scope, maximised, entropies)]
+    metrics = {task.primary_metric for each in opened.config.stages for task in each.tasks}
+    metrics |= {names.EVAL_EPISODES, *filter(None, [metric])}
+    stored = results_of(opened, metrics)
+    study = study_of(stored, settings.name, metric=given, maximised=maximised or given is None)
+    entropies = _entropies({name: scopes(of_stage(name)) for name in names.ENTROPIES})
+    groups = [group for scope in scopes(compared) for group in _groups(scope, maximised, entropies)]
     document = {
-        "sweep": found.name,
-        "stage": stage,
+        "sweep": location.name,
+        "stage": settings.name,
         "metric": metric or measure.metric,
         "direction": "maximize" if maximised else "minimize",
         "groups": groups,
@@ -113,46 +111,44 @@ def compare(
 
 
 Entropies = Mapping[tuple[str, str, str], dict[str, dict[str, Any]]]
-"""By scope, part and condition: of each entropy, value and interval at the end."""
+"""Scope, part and condition to each entropy's value and interval at the end."""
 
 
-def _entropies(plan: Plan, results: Mapping[str, RunResult], stage: str) -> Entropies:
-    from music_rllib import names
-    from music_rllib.results.from_store import conditions, scopes
-
-    found: dict[tuple[str, str, str], dict[str, dict[str, Any]]] = {}
-    for metric in names.ENTROPIES:
-        of_stage = [one for one in conditions(plan, results, metric) if one.stage == stage]
-        for scope in scopes(of_stage):
+def _entropies(scopes: Mapping[str, Iterable[Scope[Condition]]]) -> Entropies:
+    entropies: dict[tuple[str, str, str], dict[str, dict[str, Any]]] = {}
+    for metric, of_metric in scopes.items():
+        for scope in of_metric:
             for final in scope.finals:
-                one, ends = final.condition, final.estimate
-                found.setdefault((scope.name, one.part, one.label), {})[metric] = {
-                    "value": final.value,
-                    "interval": [float(ends.lower), float(ends.upper)],
-                }
-    return found
+                key = (scope.name, final.condition.part, final.condition.label)
+                value = {"value": final.value, "interval": _ends(final.estimate)}
+                entropies.setdefault(key, {})[metric] = value
+    return entropies
+
+
+def _ends(estimate: Estimate) -> list[float]:
+    return [float(estimate.lower), float(estimate.upper)]
 
 
 def _groups(
     scope: Scope[Condition], maximised: bool, entropies: Entropies
 ) -> Iterator[dict[str, Any]]:
-    """What is compared on a task; apart from it the runs that a search's trials were chosen by."""
+    """The conditions that are compared in a scope, and those of the search apart from them."""
     from music_rllib.results.comparison import verdict
 
     fresh = any(final.condition.part == "final" for final in scope.compared)
-    chosen = [final for final in scope.finals if final not in scope.compared]
-    parts = (
+    searched = [final for final in scope.finals if final not in scope.compared]
+    groups = (
         (scope.compared, "on fresh seeds" if fresh else "", verdict(scope, maximised=maximised)),
-        (chosen, "in the search", [IN_THE_SEARCH]),
+        (searched, "in the search", [IN_THE_SEARCH]),
     )
-    for finals, part, said in parts:
+    for finals, part, sentences in groups:
         if finals:
             yield {
                 "part": part,
                 "tasks": scope.name,
                 "metric": scope.metric,
                 "conditions": list(_rows(scope, finals, maximised, entropies)),
-                "verdict": " ".join(said),
+                "verdict": " ".join(sentences),
             }
 
 
@@ -162,36 +158,36 @@ def _rows(
     maximised: bool,
     entropies: Entropies,
 ) -> Iterator[dict[str, Any]]:
-    """The best first, each with what tells it from the best."""
+    """Conditions with the best first, each with its difference from the best."""
     from music_rllib.results.statistics import difference
 
     ordered = sorted(finals, key=lambda final: final.value, reverse=maximised)
     best = ordered[0]
     for final in ordered:
-        one, estimate = final.condition, final.estimate
+        condition = final.condition
         row = {
-            "stage": one.stage,
-            "values": dict(one.values),
-            "label": one.label,
-            "on_fresh_seeds": one.part == "final",
+            "stage": condition.stage,
+            "values": dict(condition.values),
+            "label": condition.label,
+            "on_fresh_seeds": condition.part == "final",
             "value": final.value,
-            "interval": [float(estimate.lower), float(estimate.upper)],
+            "interval": _ends(final.estimate),
             "seeds": final.scores.mean(axis=1).tolist(),
             "runs": final.runs,
-            "planned": len(one.seeds) * scope.tasks,
+            "planned": len(condition.seeds) * scope.tasks,
             "gap": None,
             "gap_interval": None,
             "best_is_better_with": None,
             "p_value": None,
-            "entropies": entropies.get((scope.name, one.part, one.label), {}),
+            "entropies": entropies.get((scope.name, condition.part, condition.label), {}),
         }
         pair = next((p for p in scope.comparisons if {p.first, p.second} == {best, final}), None)
         if pair is not None:
-            gap = difference(best.estimate, estimate)
+            gap = difference(best.estimate, final.estimate)
             higher = float(pair.estimate.value)
             row |= {
                 "gap": float(gap.value),
-                "gap_interval": [float(gap.lower), float(gap.upper)],
+                "gap_interval": _ends(gap),
                 "best_is_better_with": higher if (pair.first is best) == maximised else 1 - higher,
                 "p_value": pair.p_value,
             }

@@ -1,7 +1,9 @@
-"""`evaluate`: play episodes with a run's policy, count and film them."""
+"""`evaluate`: play episodes with a run's policy, count their successes, film them."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,8 +17,6 @@ if TYPE_CHECKING:
 
     from music_rllib.policy.policy import Policy
     from music_rllib.policy.rollout import EpisodeResult
-
-__all__ = ["EXAMPLES", "evaluate"]
 
 EXAMPLES = """\
 Examples:
@@ -95,7 +95,7 @@ def evaluate(
 
 
 def _check_video(path: Path | None) -> None:
-    """Before minutes of episodes are played."""
+    """Refuse a file that can't be written, before minutes of episodes are played."""
     from music_rllib.policy.video import FORMATS
 
     if path is None:
@@ -109,11 +109,8 @@ def _check_video(path: Path | None) -> None:
 def _play(policy: Policy, episodes: int, seed: int) -> list[EpisodeResult]:
     from music_rllib.policy.rollout import open_task, play
 
-    env = open_task(policy)
-    try:
+    with closing(open_task(policy)) as env:
         return list(play(policy, env, episodes, seed))
-    finally:
-        env.close()
 
 
 def _film(policy: Policy, path: Path, episodes: int, seed: int) -> None:
@@ -129,9 +126,7 @@ def _document(
 ) -> dict[str, Any]:
     from dataclasses import asdict
 
-    success = [result.success for result in results if result.success is not None]
-    some = [result.success_any_step for result in results if result.success_any_step is not None]
-    moved = [r.object_displacement for r in results if r.object_displacement is not None]
+    successes = [result.success for result in results if result.success is not None]
     return {
         "run": place,
         "node_key": policy.node_key,
@@ -142,21 +137,23 @@ def _document(
         "env_steps": policy.env_steps,
         "episodes": len(results),
         "seed": seed,
-        "success_rate": _mean(success),
-        "success_rate_interval": _interval(success),
-        "success_rate_any_step": _mean(some),
-        "episode_return": _mean([result.episode_return for result in results]),
-        "object_displacement": _mean(moved),
+        "success_rate": _mean(successes),
+        "success_rate_interval": _interval(successes),
+        "success_rate_any_step": _mean(result.success_any_step for result in results),
+        "episode_return": _mean(result.episode_return for result in results),
+        "object_displacement": _mean(result.object_displacement for result in results),
         "results": [asdict(result) for result in results],
     }
 
 
-def _mean(values: list[Any]) -> float | None:
-    return sum(values) / len(values) if values else None
+def _mean(values: Iterable[float | None]) -> float | None:
+    """The mean of those values that are there; None where there are none."""
+    numbers = [value for value in values if value is not None]
+    return sum(numbers) / len(numbers) if numbers else None
 
 
 def _interval(successes: list[bool]) -> list[float] | None:
-    """Clopper and Pearson's 95 % interval: of this policy, over starts and goals."""
+    """Clopper and Pearson's 95 % interval of the policy's success rate over starts and goals."""
     from music_rllib.results.statistics import clopper_pearson
 
     if not successes:

@@ -1,4 +1,4 @@
-"""`init`, `presets` and `schema`: help with writing a sweep's file."""
+"""`init`, `presets` and `schema`: help with the writing of a sweep's file."""
 
 from __future__ import annotations
 
@@ -9,8 +9,6 @@ import typer
 
 from music_rllib.command_line import Json, print_json
 from music_rllib.errors import BadInputError
-
-__all__ = ["INIT_EXAMPLES", "PRESETS_EXAMPLES", "SCHEMA_EXAMPLES", "init", "presets", "schema"]
 
 INIT_EXAMPLES = """\
 Examples:
@@ -59,12 +57,12 @@ def presets(json: Json = False) -> int:
     """
     from music_rllib.config.reading.presets import SHIPPED, shipped_presets
 
-    found = shipped_presets()
+    shipped = shipped_presets()
     if json:
-        print_json([{"name": name, "about": about} for name, about in found.items()])
+        print_json([{"name": name, "about": about} for name, about in shipped.items()])
         return 0
-    width = max(map(len, found))
-    for name, about in found.items():
+    width = max(map(len, shipped))
+    for name, about in shipped.items():
         typer.echo(f"{name:{width}}  {about}")
     typer.echo(f"\nEach file says where its numbers come from: {SHIPPED}")
     return 0

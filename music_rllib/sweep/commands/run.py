@@ -1,4 +1,4 @@
-"""`run`: train every run of a sweep."""
+"""`run`, `plan` and `resume`: train a sweep, show what it would train, continue it."""
 
 from __future__ import annotations
 
@@ -7,12 +7,10 @@ from typing import Annotated
 
 import typer
 
-from music_rllib.command_line import Json, console_for, print_json
-from music_rllib.sweep.cli_helpers import Name, Seeds, SweepStorage
+from music_rllib.command_line import Json
+from music_rllib.sweep.cli_helpers import Place, Storage
 
-__all__ = ["EXAMPLES", "AcceptChanges", "Config", "Overrides", "RetrainDamaged", "run"]
-
-EXAMPLES = """\
+RUN_EXAMPLES = """\
 Examples:
   music-rllib run my.yaml
   music-rllib run my.yaml tac.alpha=0.1 seeds=5 env_steps=1e6
@@ -25,6 +23,26 @@ Examples:
 
 Running a command again continues: finished runs are reused, others go on from
 their last checkpoint. With RAY_ADDRESS=HOST:PORT it runs on that Ray cluster.
+"""
+PLAN_EXAMPLES = """\
+Examples:
+  music-rllib plan my.yaml
+  music-rllib plan my.yaml --seeds 12
+      what it would take with 12 seeds; finished runs count as done
+  music-rllib plan my.yaml env_steps=1e6 --measure
+      how long it would take here: some seconds of training for each kind of run
+  music-rllib plan my.yaml --json
+      every run known beforehand with its key, the same on every machine
+"""
+RESUME_EXAMPLES = """\
+Examples:
+  music-rllib resume results/smoke
+      no file needed: the configuration is in the storage
+  music-rllib resume results/smoke --seeds 10
+      extended by seeds: only the new ones are trained
+  ray job submit --working-dir . -- \\
+    python -m music_rllib.sweep resume s3://bucket/sweeps/smoke
+      in a new job, after the head of a cluster has died
 """
 
 Config = Annotated[
@@ -42,6 +60,25 @@ Overrides = Annotated[
         help="Replace what the file says: a setting in every stage (tac.alpha=0.1), in one "
         "(stages.finetune.env_steps=1e5), or a key of the file's top (seeds=5).",
         show_default=False,
+    ),
+]
+SweepStorage = Annotated[
+    str | None,
+    typer.Option(
+        metavar="PLACE",
+        help="Folder, or s3:// or gs:// URI, for results; replaces the file's 'storage'. Sweeps "
+        "with the same storage share finished runs.",
+    ),
+]
+Name = Annotated[
+    str | None, typer.Option(metavar="NAME", help="Name of the sweep; replaces the file's 'name'.")
+]
+Seeds = Annotated[
+    str | None,
+    typer.Option(
+        metavar="N",
+        help="So many seeds, the file's first, or a list like 0,1,7. Those that have run are "
+        "reused; the report says how many would likely decide.",
     ),
 ]
 AcceptChanges = Annotated[
@@ -86,26 +123,84 @@ def run(
     """Train every run of a sweep and log them to MLflow."""
     from music_rllib.sweep.driver import run_sweep
 
-    config, overrides = file_and_overrides(config, overrides)
+    config, overrides = _file_and_overrides(config, overrides)
     return run_sweep(
-        console_for(as_json=json),
         config,
         dry_run=dry_run,
         storage=storage,
         name=name,
         seeds=seeds,
         overrides=overrides,
-        answer=print_json if json else lambda document: None,
         accept_changes=accept_changes,
         retrain_damaged=retrain_damaged,
         must_exist=resume,
+        as_json=json,
     )
 
 
-def file_and_overrides(
+def plan(
+    config: Config = None,
+    overrides: Overrides = None,
+    storage: SweepStorage = None,
+    name: Name = None,
+    seeds: Seeds = None,
+    measure: Annotated[
+        bool,
+        typer.Option(
+            "--measure",
+            help="Train each kind of run for some seconds on this machine, and say how long all "
+            "of what is left would take on it.",
+        ),
+    ] = False,
+    json: Json = False,
+) -> int:
+    """Check a sweep's file and show what it would run.
+
+    No run is started. What its `analysis` states is kept as an analysis plan in the sweep's folder.
+    """
+    from music_rllib.sweep.driver import run_sweep
+
+    config, overrides = _file_and_overrides(config, overrides)
+    return run_sweep(
+        config,
+        dry_run=True,
+        measure=measure,
+        storage=storage,
+        name=name,
+        seeds=seeds,
+        overrides=overrides,
+        as_json=json,
+    )
+
+
+def resume(
+    sweep: Place,
+    storage: Storage = None,
+    seeds: Seeds = None,
+    accept_changes: AcceptChanges = False,
+    retrain_damaged: RetrainDamaged = False,
+    json: Json = False,
+) -> int:
+    """Go on with a sweep that was stopped or killed.
+
+    By the configuration that it has left in its storage.
+    """
+    from music_rllib.experiment.location import find_sweep
+    from music_rllib.sweep.driver import run_sweep
+
+    return run_sweep(
+        find_sweep(sweep, storage),
+        seeds=seeds,
+        accept_changes=accept_changes,
+        retrain_damaged=retrain_damaged,
+        as_json=json,
+    )
+
+
+def _file_and_overrides(
     config: Path | None, overrides: list[str] | None
 ) -> tuple[Path | None, list[str]]:
-    """The file and what replaces parts of it, also where there are only such parts."""
+    """The file and its overrides; a first argument with a `=` that is no file is an override."""
     given = list(overrides or ())
     if config is not None and "=" in str(config) and not config.exists():
         return None, [str(config), *given]

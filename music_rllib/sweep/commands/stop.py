@@ -11,8 +11,6 @@ from music_rllib.command_line import Json, console_for, print_json
 from music_rllib.errors import FAILED
 from music_rllib.sweep.cli_helpers import Place, Storage
 
-__all__ = ["EXAMPLES", "stop"]
-
 EXAMPLES = """\
 Examples:
   music-rllib stop results/smoke
@@ -42,20 +40,20 @@ def stop(
     from music_rllib.experiment.location import find_sweep
     from music_rllib.sweep.commands.status import state_of
 
-    found = find_sweep(sweep, storage)
+    location = find_sweep(sweep, storage)
+    name = location.name
     console = console_for(as_json=json)
-    state = state_of(found)["state"]
-    asked = state == "running"
-    if asked:
-        sweep_files.write(found.storage, f"{found.name}/{sweep_files.STOP}", '{"stop": true}')
+    state = state_of(location)["state"]
+    was_running = state == "running"
+    if was_running:
+        sweep_files.write(location.storage, f"{name}/{sweep_files.STOP}", '{"stop": true}')
         deadline = time.monotonic() + wait
         while state == "running" and time.monotonic() < deadline:
             time.sleep(0.5)
-            state = state_of(found)["state"]
-        stopped = state != "running"
-        console.print(f"{found.name}: {'has stopped' if stopped else 'was told to stop'}")
+            state = state_of(location)["state"]
+        console.print(f"{name}: {'was told to stop' if state == 'running' else 'has stopped'}")
     else:
-        console.print(f"{found.name}: is not running ({state})")
+        console.print(f"{name}: is not running ({state})")
     if json:
-        print_json({"sweep": found.name, "was_running": asked, "state": state})
+        print_json({"sweep": name, "was_running": was_running, "state": state})
     return FAILED if state == "running" and wait > 0 else 0

@@ -1,1 +1,1 @@
-"""Who is told what happens in a sweep: the screen, MLflow, Prometheus, the state file."""
+"""Listeners to the events of a sweep: the screen, MLflow, Prometheus, the state file."""

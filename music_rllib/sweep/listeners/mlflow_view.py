@@ -1,7 +1,7 @@
-"""How MLflow's chart page shows a sweep: the link at its end opens this view of the runs.
+"""The view of MLflow's chart page that the link at the end of a sweep opens.
 
 MLflow keeps what its *Save view* makes as a tag of the experiment, and opens it by the tag's key
-(`?viewStateShareKey=KEY`). That format is MLflow's own: it is read out of the pages of `VERSIONS`.
+(`?viewStateShareKey=KEY`). That format is MLflow's own: it was read out of the pages of `VERSIONS`.
 """
 
 from __future__ import annotations
@@ -13,27 +13,25 @@ from typing import Any
 from music_rllib import names
 from music_rllib.experiment.plan import Plan
 
-__all__ = ["VERSIONS", "comparison_view"]
-
 VERSIONS = ("3.17",)
-"""Of MLflow, whose pages were seen to open such a view; for others there is a plain link."""
+"""Versions of MLflow whose pages open such a view; others get a plain link."""
 GROUPED = {
     "tac.entropic_index": names.TAG_ENTROPIC_INDEX,
     "tac.alpha": names.TAG_ALPHA,
     "music.mi_reward_weight": names.TAG_MI_REWARD_WEIGHT,
 }
-"""Setting -> the tag by which its values are told apart."""
+"""Setting to the tag that holds its value."""
 METRICS = (names.EVAL_RETURN, names.SHANNON_ENTROPY, names.ENTROPY, names.MI_BOUND)
-"""After the tasks' own."""
-OPEN, FOLDED = "comparison", "folded-"
+"""Charts after those of the tasks' primary metrics."""
+OPEN_SECTION = "comparison"
 
 
 def comparison_view(plan: Plan, sweep_id: str, now: float) -> str:
-    """The view of a sweep's last stage: a line per condition, its metric first, the rest folded.
+    """The view of a sweep's last stage: a line per condition, its primary metric first.
 
     Args:
-        plan: The sweep's.
-        sweep_id: As its runs are tagged with it.
+        plan: The sweep's plan.
+        sweep_id: The value of its runs' tag `sweep_id`.
         now: Seconds since the epoch.
     """
     runs = [node.run for node in plan.nodes]
@@ -98,7 +96,7 @@ def _card(kind: str, uuid: str) -> dict[str, Any]:
     return {
         "type": kind,
         "uuid": uuid,
-        "metricSectionId": OPEN,
+        "metricSectionId": OPEN_SECTION,
         "runsCountToCompare": 100,
         "deleted": False,
         "isGenerated": False,
@@ -106,8 +104,9 @@ def _card(kind: str, uuid: str) -> dict[str, Any]:
 
 
 def _sections() -> Iterator[dict[str, Any]]:
-    """MLflow makes one of each group of metrics; what is there already stays as it is."""
-    yield {"uuid": OPEN, "name": "Comparison", "display": True, "isReordered": True, "columns": 2}
+    """The comparison, and folded what MLflow would unfold: a section for each group of metrics."""
+    section = {"uuid": OPEN_SECTION, "name": "Comparison", "display": True, "isReordered": True}
+    yield section | {"columns": 2}
     for group in (*names.GROUPS, "Model metrics", "System metrics"):
-        section = {"uuid": f"{FOLDED}{group}", "name": group, "display": False}
+        section = {"uuid": f"folded-{group}", "name": group, "display": False}
         yield section | {"isReordered": False}

@@ -1,8 +1,8 @@
-"""A sweep's own numbers for Prometheus, beside Ray's, by `ray.util.metrics`.
+"""Gauges of a sweep for Prometheus, exported beside Ray's own by `ray.util.metrics`.
 
 The driver exports them and not the workers: a worker's gauges vanish with it, and a finished run's
-success rate would with them. Ray forgets a gauge that is not set again, so all are, regularly.
-`dashboards/` has what scrapes and shows them.
+success rate would with them. Ray forgets a gauge that is not set again, so each is set regularly.
+`dashboards/` has the files that scrape and show them.
 """
 
 from __future__ import annotations
@@ -23,18 +23,20 @@ from music_rllib.store.files import write_atomically
 from music_rllib.store.run_record import Report, RunResult
 from music_rllib.tracking.sender import Pending
 
-__all__ = ["GAUGES", "TARGETS", "PrometheusListener"]
-
 TARGETS = ".prometheus"
-"""Folder beside the sweeps' own: NAME.json says where this Ray's metrics are. Prometheus' file_sd
-reads it, and wants all of them in one folder."""
+"""Folder beside the sweeps' own, whose NAME.json has the addresses of this Ray's metrics.
+Prometheus' file_sd wants the files of all sweeps in one folder."""
 SET_SECONDS = 2.0
 KEPT = 100
-"""Runs that are over and still shown, the newest ones: what is exported every few seconds must not
-grow with a sweep of thousands."""
-RUN_TAGS = ("sweep", "stage", "variant", "task", "q", "seed", "run")
-SWEEP_TAGS = ("sweep",)
-
+"""Runs that are over and still exported, the newest ones: what is exported every few seconds must
+not grow with a sweep of thousands."""
+_RUN_TAGS = ("sweep", "stage", "variant", "task", "q", "seed", "run")
+_SWEEP_GAUGES = {
+    "music_runs": ("sweep", "state"),
+    "music_undelivered_records": ("sweep",),
+    "music_undelivered_artefacts": ("sweep",),
+}
+"""Gauges of a whole sweep to their tags; all others are of a run."""
 _METRICS = {
     "music_success_rate": names.EVAL_SUCCESS,
     "music_success_rate_any_step": names.EVAL_SUCCESS_ANY,
@@ -60,11 +62,11 @@ GAUGES = {
     "music_undelivered_records": "Records that MLflow has not received yet.",
     "music_undelivered_artefacts": "Artefacts that MLflow has not received yet.",
 }
-"""Name, before Ray's `ray_`, to what it means."""
+"""Name, to which Ray adds `ray_` in front, to its description."""
 
 
 class PrometheusListener(Listener):
-    """Sets every gauge of a sweep every few seconds."""
+    """Sets every gauge of a sweep, every few seconds."""
 
     def __init__(
         self,
@@ -74,66 +76,70 @@ class PrometheusListener(Listener):
         folder: Path,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Say beside the sweep's `folder` where Prometheus finds them; `now` is in seconds."""
+        """Export the gauges of a sweep.
+
+        Args:
+            sweep: Its name.
+            scheduler: Has the statuses of its nodes.
+            pending: Returns what MLflow has not received yet.
+            folder: The sweep's own; the addresses for Prometheus are written beside it.
+            now: A clock in seconds.
+        """
         self._sweep = sweep
         self._scheduler = scheduler
         self._pending = pending
         self._targets = folder.parent / TARGETS / f"{folder.name}.json"
         self._now = now
-        self._next = 0.0
+        self._next_set = 0.0
         self._gauges: dict[str, Any] = {}
         self._values: dict[str, tuple[dict[str, str], dict[str, float]]] = {}
         """Node key to tags and values by gauge."""
-        self._last: dict[str, Report] = {}
+        self._last_report: dict[str, Report] = {}
         self._ended: dict[str, None] = {}
-        """Node keys, in the order in which they ended."""
+        """Keys of nodes that are over, in the order in which they ended."""
 
     def reported(self, node: Node, reports: list[Report]) -> None:
-        """Keep the newest values."""
         self._ended.pop(node.key, None)
         _, values = self._values.setdefault(node.key, (self._tags(node), {}))
         for report in reports:
             for gauge, metric in _METRICS.items():
                 if metric in report.metrics:
                     values[gauge] = report.metrics[metric]
-            before = self._last.get(node.key)
+            before = self._last_report.get(node.key)
             if before is not None and report.seconds > before.seconds:
                 for gauge, metric in _RATES.items():
                     if metric in report.metrics and metric in before.metrics:
                         done = report.metrics[metric] - before.metrics[metric]
                         values[gauge] = done / (report.seconds - before.seconds)
-            self._last[node.key] = report
+            self._last_report[node.key] = report
 
     def finished(self, node: Node, result: RunResult) -> None:
-        """It trains no more."""
-        self._over(node)
+        self._end(node)
 
     def failed(self, node: Node, failure: Failure) -> None:
-        """It trains no more."""
-        self._over(node)
+        self._end(node)
 
     def paused(self, node: Node) -> None:
-        """It trains no more, or goes on some time."""
-        self._over(node)
+        self._end(node)
 
     def tick(self) -> None:
-        """Set them again, now and then."""
-        if self._now() < self._next:
+        if self._now() < self._next_set:
             return
-        self._next = self._now() + SET_SECONDS
-        # Whatever Ray's metrics say: training goes on.
+        self._next_set = self._now() + SET_SECONDS
+        # An error of Ray's metrics must not end the sweep.
         with contextlib.suppress(Exception):
             self._set_all()
 
     def close(self) -> None:
-        """Ray ends, and with it what could be scraped."""
+        """Remove the addresses: with Ray, what could be scraped ends."""
         with contextlib.suppress(OSError):
             self._targets.unlink(missing_ok=True)
 
-    def _over(self, node: Node) -> None:
+    def _end(self, node: Node) -> None:
+        """Keep the last values of a run that does not train now, with rates of 0."""
         _, values = self._values.setdefault(node.key, (self._tags(node), {}))
         values.update(dict.fromkeys(_RATES, 0.0))
-        self._last.pop(node.key, None)
+        self._last_report.pop(node.key, None)
         self._ended[node.key] = None
         while len(self._ended) > KEPT:
             oldest = next(iter(self._ended))
@@ -152,33 +158,29 @@ class PrometheusListener(Listener):
 
     def _set_all(self) -> None:
         if not self._gauges:
-            self._open()
+            self._create_gauges()
         for tags, values in self._values.values():
             for gauge, value in values.items():
                 self._gauges[gauge].set(value, tags=tags)
+        tags = {"sweep": self._sweep}
         for status in Status:
-            tags = {"sweep": self._sweep, "state": status.value}
-            self._gauges["music_runs"].set(len(self._scheduler.having(status)), tags=tags)
-        pending, tags = self._pending(), {"sweep": self._sweep}
+            count = len(self._scheduler.having(status))
+            self._gauges["music_runs"].set(count, tags=tags | {"state": status.value})
+        pending = self._pending()
         self._gauges["music_undelivered_records"].set(pending.records, tags=tags)
         self._gauges["music_undelivered_artefacts"].set(pending.artefacts, tags=tags)
 
-    def _open(self) -> None:
+    def _create_gauges(self) -> None:
+        """Create the gauges in Ray, and write the addresses where Prometheus looks for them."""
         import ray
         from ray.util.metrics import Gauge
 
         self._gauges = {
-            name: Gauge(name, description=text, tag_keys=_tag_keys(name))
+            name: Gauge(name, description=text, tag_keys=_SWEEP_GAUGES.get(name, _RUN_TAGS))
             for name, text in GAUGES.items()
         }
         nodes = [node for node in ray.nodes() if node["Alive"] and node["MetricsExportPort"]]
-        found = [f"{node['NodeManagerAddress']}:{node['MetricsExportPort']}" for node in nodes]
-        entry = {"labels": {"job": "music_rllib", "sweep_name": self._sweep}, "targets": found}
+        targets = [f"{node['NodeManagerAddress']}:{node['MetricsExportPort']}" for node in nodes]
+        entry = {"labels": {"job": "music_rllib", "sweep_name": self._sweep}, "targets": targets}
         self._targets.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(self._targets, json.dumps([entry], indent=1).encode())
-
-
-def _tag_keys(name: str) -> tuple[str, ...]:
-    if name == "music_runs":
-        return (*SWEEP_TAGS, "state")
-    return SWEEP_TAGS if name.startswith("music_undelivered") else RUN_TAGS

@@ -1,10 +1,9 @@
-"""A running sweep on the screen: a live table on a terminal, plain lines elsewhere."""
+"""The progress of a sweep on the screen: a live table on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from types import TracebackType
 from typing import Self
 
 from rich.console import Console, Group
@@ -17,19 +16,19 @@ from music_rllib.experiment.plan import Node, Plan
 from music_rllib.experiment.scheduler import Scheduler, Status
 from music_rllib.labels import ShortLabels
 from music_rllib.store.run_record import Report, RunResult
-from music_rllib.sweep.views.tables import ROOMY, new_table
+from music_rllib.sweep.views.tables import new_table
 from music_rllib.sweep.views.text import clock, evaluated_in_words, measured, percent
 from music_rllib.training.throughput import Throughput
 
-__all__ = ["Display"]
-
 REFRESH_SECONDS = 0.5
 QUIET_SECONDS = 30.0
-"""Without a terminal, a line at least this often for each run, if it has something new."""
+"""Without a terminal, a run that has something new has a line at least this often."""
+WIDE = 76
+"""Columns of a screen from which on the live table shows all that it can."""
 
 
 class Display(Listener):
-    """Shows what runs, how fast, how long still; keeps a line of what ended."""
+    """Shows which runs train, their speed and the time left; prints a line for each that ends."""
 
     def __init__(
         self,
@@ -50,42 +49,37 @@ class Display(Listener):
             | {task.name for stage in plan.searched for task in stage.tasks},
         )
         self.headline: Callable[[], tuple[list[str], str | None]] = lambda: ([], None)
-        """Gives where each stage stands, and the best so far, in words."""
+        """Returns a line for each stage and search, and the best condition so far."""
         self._best: str | None = None
-        self._ended: dict[str, int] = {}
-        """Environment steps that runs had spent which were interrupted, stopped early or failed."""
+        """The best condition that was printed last."""
+        self._spent: dict[str, int] = {}
+        """Env steps of runs that were interrupted, stopped early or failed."""
         self._running: dict[str, tuple[Node, Throughput]] = {}
-        self._said: dict[str, float] = {}
+        self._printed: dict[str, float] = {}
+        """Node key to the time of the last line about its progress."""
         self._refreshed = self._headed = self._began
-        self._live = (
-            Live(console=console, auto_refresh=False, transient=True)
-            if console.is_terminal
-            else None
-        )
+        self._live = Live(console=console, auto_refresh=False, transient=True)
 
     def __enter__(self) -> Self:
-        if self._live:
+        if self._console.is_terminal:
             self._live.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if self._live:
-            self._live.stop()
+    def __exit__(self, *_: object) -> None:
+        self._live.stop()
 
     def say(self, text: str, style: str = "") -> None:
-        """A line that stays."""
+        """Print a line that stays."""
         passed = clock(self._now() - self._began)
         self._console.print(Text(f"[{passed:>6}] {text}", style=style), soft_wrap=True)
 
+    def _say_of(self, node: Node, text: str, style: str = "") -> None:
+        self.say(f"{self.short(node.label)}: {text}", style)
+
     def started(self, node: Node) -> None:
-        self._ended.pop(node.key, None)
+        self._spent.pop(node.key, None)
         self._running[node.key] = (node, self._new_throughput(node))
-        self.say(f"{self.short(node.label)}: started")
+        self._say_of(node, "started")
 
     def _new_throughput(self, node: Node) -> Throughput:
         return Throughput(node.run.env_steps, node.run.tac.random_steps, self._now())
@@ -93,18 +87,16 @@ class Display(Listener):
     def reported(self, node: Node, reports: list[Report]) -> None:
         _, throughput = self._running.setdefault(node.key, (node, self._new_throughput(node)))
         throughput.hear(reports, self._now())
+        if self._console.is_terminal or throughput.env_steps >= node.run.env_steps:
+            return  # the table shows it, or the line of `finished` will
         evaluated = any(names.EVAL_EPISODES in report.metrics for report in reports)
-        quiet = self._now() - self._said.get(node.key, self._began) >= QUIET_SECONDS
-        if self._live is None and (evaluated or quiet) and not self._is_over(node, throughput):
-            self._said[node.key] = self._now()
-            self.say(f"{self.short(node.label)}: {self._progress_in_words(node, throughput)}")
-
-    @staticmethod
-    def _is_over(node: Node, throughput: Throughput) -> bool:
-        return throughput.env_steps >= node.run.env_steps  # `finished` says it better
+        last = self._printed.get(node.key, self._began)
+        if evaluated or self._now() - last >= QUIET_SECONDS:
+            self._printed[node.key] = self._now()
+            self._say_of(node, self._progress_text(node, throughput))
 
     def noted(self, node: Node, text: str) -> None:
-        self.say(f"{self.short(node.label)}: {text}")
+        self._say_of(node, text)
 
     def remarked(self, text: str) -> None:
         self.say(text, "yellow")
@@ -112,23 +104,17 @@ class Display(Listener):
     def finished(self, node: Node, result: RunResult) -> None:
         self._running.pop(node.key, None)
         evaluated = evaluated_in_words(node.run.task, result.metrics)
-        self.say(
-            f"{self.short(node.label)}: finished, {evaluated}, "
-            f"{result.env_steps:,} env steps in {clock(result.seconds)}",
-            "green",
-        )
+        cost = f"{result.env_steps:,} env steps in {clock(result.seconds)}"
+        self._say_of(node, f"finished, {evaluated}, {cost}", "green")
 
     def failed(self, node: Node, failure: Failure) -> None:
         self._leave(node)
         cause = failure.cause.replace("\n", "\n" + " " * 13)
-        self.say(f"{self.short(node.label)}: FAILED: {cause}", "red")
+        self._say_of(node, f"FAILED: {cause}", "red")
         self.say(f"    whole traceback: {failure.log}")
 
     def skipped(self, node: Node, because: Node) -> None:
-        self.say(
-            f"{self.short(node.label)}: skipped, it starts from {self.short(because.label)}",
-            "yellow",
-        )
+        self._say_of(node, f"skipped, it starts from {self.short(because.label)}", "yellow")
 
     def paused(self, node: Node) -> None:
         self._leave(node)
@@ -137,37 +123,38 @@ class Display(Listener):
         self._leave(node)
 
     def _leave(self, node: Node) -> None:
-        """What an unfinished run has spent is spent."""
-        if (found := self._running.pop(node.key, None)) is not None:
-            self._ended[node.key] = found[1].env_steps
+        """Keep the env steps that an unfinished run has spent."""
+        if (running := self._running.pop(node.key, None)) is not None:
+            _, throughput = running
+            self._spent[node.key] = throughput.env_steps
 
     def tick(self) -> None:
         now = self._now()
-        if self._live is None and now - self._headed >= QUIET_SECONDS:
+        if self._console.is_terminal:
+            if now - self._refreshed >= REFRESH_SECONDS:
+                self._refreshed = now
+                self._live.update(self._view(), refresh=True)
+        elif now - self._headed >= QUIET_SECONDS:
             self._headed = now
             _, best = self.headline()
             if best is not None and best != self._best:
                 self._best = best
                 self.say(best)
-        if self._live and self._now() - self._refreshed >= REFRESH_SECONDS:
-            self._refreshed = self._now()
-            self._live.update(self._view(), refresh=True)
 
     def _view(self) -> Group:
-        width = self._console.width
-        table = new_table("", ["running"], ["env steps"])
-        for name in ["steps/s"] * (width >= ROOMY) + ["left", "evaluated"]:
-            table.add_column(name, justify="right", overflow="fold")
+        wide = self._console.width >= WIDE
+        heads = ("running", "env steps", *["steps/s"] * wide, "left", "evaluated")
+        table = new_table("", heads, left=["running"])
         for node, throughput in self._running.values():
             rate, metric = throughput.steps_per_second, node.run.task.primary_metric
             done = f"{throughput.env_steps:,} / {throughput.budget:,}"
-            if width < ROOMY:
+            if not wide:
                 done = percent(throughput.env_steps / throughput.budget)
             value = measured(metric, throughput.metrics.get(metric))
             table.add_row(
                 self.short(node.label),
                 done if throughput.env_steps else "preparing",
-                *["-" if rate is None else f"{rate:.0f}"] * (width >= ROOMY),
+                *["-" if rate is None else f"{rate:.0f}"] * wide,
                 clock(throughput.seconds_left(self._now())),
                 "-" if value == "-" else f"{names.word_of(metric)} {value}",
             )
@@ -180,7 +167,7 @@ class Display(Listener):
         done = self._scheduler.having(Status.FINISHED, Status.REUSED)
         steps = sum(node.run.env_steps for node in done)
         steps += sum(throughput.env_steps for _, throughput in self._running.values())
-        steps += sum(self._ended.values())
+        steps += sum(self._spent.values())
         text = (
             f"{len(done)} of {len(self._plan.nodes)} runs done, "
             f"{steps:,} of {self._plan.env_steps:,} env steps, "
@@ -190,17 +177,20 @@ class Display(Listener):
         return text if left is None else f"{text}, about {clock(left)} left"
 
     def _seconds_left(self) -> float | None:
-        """As if what waits went as fast as what runs, and never waited for each other."""
+        """Time left if waiting runs train as fast as running ones, and never wait for each other.
+
+        None before every running run has a speed.
+        """
         running = [throughput for _, throughput in self._running.values()]
-        rates = [rate for one in running if (rate := one.steps_per_second) is not None]
+        rates = [rate for run in running if (rate := run.steps_per_second) is not None]
         if not rates or len(rates) < len(running):
             return None
         to_do = self._scheduler.having(Status.WAITING, Status.STARTED)
-        steps = sum(node.run.env_steps for node in to_do) - sum(one.env_steps for one in running)
-        left = [one.seconds_left(self._now()) or 0.0 for one in running]
+        steps = sum(node.run.env_steps for node in to_do) - sum(run.env_steps for run in running)
+        left = [run.seconds_left(self._now()) or 0.0 for run in running]
         return max(steps / sum(rates), *left)
 
-    def _progress_in_words(self, node: Node, throughput: Throughput) -> str:
+    def _progress_text(self, node: Node, throughput: Throughput) -> str:
         parts = [f"{throughput.env_steps:,} of {throughput.budget:,} env steps"]
         rate, left = throughput.steps_per_second, throughput.seconds_left(self._now())
         if rate is not None:

@@ -1,1 +1,1 @@
-"""The one place that knows Ray Tune: the plan's nodes as trials of one Tune run."""
+"""The one place that uses Ray Tune: the plan's nodes are trials of one Tune run."""

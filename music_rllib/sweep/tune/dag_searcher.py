@@ -1,4 +1,4 @@
-"""A Tune searcher that hands out the nodes of a plan as their inputs are published."""
+"""A Tune searcher that suggests the nodes of a plan as soon as their inputs are published."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ from ray.tune.search import Searcher
 from music_rllib.experiment.plan import Node
 from music_rllib.experiment.scheduler import Scheduler
 
-__all__ = ["DagSearcher"]
-
 
 class DagSearcher(Searcher):
     """Suggests each waiting node once, when it can run.
@@ -21,7 +19,7 @@ class DagSearcher(Searcher):
     node only waits for one that is being computed. `FINISHED` makes it ask no more. Failures never
     stop the others.
 
-    Nothing of this is restored from Tune's snapshots; the node store says what is finished.
+    Nothing of this is restored from Tune's snapshots: the node store has what is finished.
     """
 
     def __init__(
@@ -31,13 +29,14 @@ class DagSearcher(Searcher):
         advance: Callable[[], bool] = lambda: False,
         stopped: Callable[[], bool] = lambda: False,
     ) -> None:
-        """Hand out the nodes in `scheduler`.
+        """Suggest the nodes of `scheduler`.
 
         Args:
-            scheduler: Where they are.
-            config_of: Makes a Tune config of a node.
-            advance: Lets a search put more in the scheduler; whether more may come later.
-            stopped: Whether nothing more is to be handed out.
+            scheduler: Has the nodes and their statuses.
+            config_of: Makes the Tune config of a node.
+            advance: Lets the searches add nodes to the scheduler; returns whether they may add
+                more later.
+            stopped: Returns whether nothing more is to be suggested.
         """
         super().__init__()
         self._scheduler = scheduler
@@ -60,13 +59,13 @@ class DagSearcher(Searcher):
     def on_trial_complete(
         self, trial_id: str, result: dict[str, Any] | None = None, error: bool = False
     ) -> None:
-        """Nothing: the callback, which is told afterwards with the cause, moves the node.
+        """Do nothing: the callback `TuneEvents`, which has the cause, moves the node.
 
-        Tune informs it before it asks for the next suggestion.
+        Tune calls it before it asks for the next suggestion.
         """
 
     def save_to_dir(self, checkpoint_dir: str, session_str: str = "default") -> None:
-        """Leave nothing behind."""
+        """Save nothing."""
 
     def __getstate__(self) -> dict[str, Any]:
         # Tune pickles the searcher into its snapshot, which nobody reads.

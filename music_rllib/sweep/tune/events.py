@@ -1,4 +1,4 @@
-"""Tune's callbacks become what happens to nodes, told to whoever listens."""
+"""Turns Tune's callbacks into events of nodes, for the scheduler and the listeners."""
 
 from __future__ import annotations
 
@@ -22,29 +22,31 @@ from music_rllib.store.run_record import from_json_lines
 from music_rllib.training.failure_reason import cause_of
 from music_rllib.training.hang_watch import RECORD
 from music_rllib.training.job import NodeJob
-from music_rllib.training.worker import (
-    CAUSE,
-    NOTES,
-    PAUSED,
-    REPORTS,
-    TRACEBACK,
-)
-
-__all__ = ["RESTARTS", "TuneEvents"]
+from music_rllib.training.worker import CAUSE, NOTES, PAUSED, REPORTS, TRACEBACK
 
 RESTARTS = 3
-"""So often a run whose worker died is started again; one that raises an error fails at once."""
+"""How often a run whose worker died is started again; one that raises an error fails at once."""
 
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 
 
 class TuneEvents(Callback):
-    """Moves nodes in the scheduler as Tune's trials go, and tells the listeners."""
+    """Moves nodes in the scheduler as Tune's trials go on and end, and tells the listeners.
+
+    Tune calls it with keywords only.
+    """
 
     def __init__(
         self, scheduler: Scheduler, store: NodeStore, listeners: Iterable[Listener], failures: Path
     ) -> None:
-        """Write tracebacks into the folder `failures`."""
+        """Listen to Tune.
+
+        Args:
+            scheduler: Has the nodes and their statuses.
+            store: Has the results of finished nodes.
+            listeners: Receive the events of runs.
+            failures: Folder for the tracebacks of failed runs.
+        """
         self._scheduler = scheduler
         self._store = store
         self._listeners = list(listeners)
@@ -54,27 +56,15 @@ class TuneEvents(Callback):
         # Tune pickles its callbacks into a snapshot, which nobody reads.
         return {}
 
-    def on_step_end(self, iteration: int, trials: list[Trial], **info: Any) -> None:
-        """Tune's loop went round once."""
+    def on_step_end(self, **_: Any) -> None:
         for listener in self._listeners:
             listener.tick()
 
-    def on_trial_start(
-        self, iteration: int, trials: list[Trial], trial: Trial, **info: Any
-    ) -> None:
-        """The trial's actor is up."""
+    def on_trial_start(self, *, trial: Trial, **_: Any) -> None:
         for listener in self._listeners:
             listener.started(self._node(trial))
 
-    def on_trial_result(
-        self,
-        iteration: int,
-        trials: list[Trial],
-        trial: Trial,
-        result: dict[str, Any],
-        **info: Any,
-    ) -> None:
-        """The trial made a step."""
+    def on_trial_result(self, *, trial: Trial, result: dict[str, Any], **_: Any) -> None:
         node = self._node(trial)
         reports = from_json_lines(result[REPORTS].encode())
         for listener in self._listeners:
@@ -83,17 +73,14 @@ class TuneEvents(Callback):
             if reports:
                 listener.reported(node, reports)
 
-    def on_trial_complete(
-        self, iteration: int, trials: list[Trial], trial: Trial, **info: Any
-    ) -> None:
-        """The trial says that it is done; the store has the last word."""
+    def on_trial_complete(self, *, trial: Trial, **_: Any) -> None:
+        """The trial says that it is done: it failed, was paused, or has published its result."""
         try:
-            self._completed(trial)
+            self._complete(self._node(trial), trial)
         finally:
-            _let_go(trial)
+            _free(trial)
 
-    def _completed(self, trial: Trial) -> None:
-        node = self._node(trial)
+    def _complete(self, node: Node, trial: Trial) -> None:
         if (cause := trial.last_result.get(CAUSE)) is not None:
             self._fail(node, cause, trial.last_result[TRACEBACK])
             return
@@ -112,21 +99,17 @@ class TuneEvents(Callback):
         for listener in self._listeners:
             listener.finished(node, result)
 
-    def on_trial_error(
-        self, iteration: int, trials: list[Trial], trial: Trial, **info: Any
-    ) -> None:
-        """The trial's worker died, or never came up, and was not to be started again."""
+    def on_trial_error(self, *, trial: Trial, **_: Any) -> None:
+        """The trial's worker died, or never came up, and is not started again."""
         error = _error_of(trial)
         text = "".join(traceback.format_exception(error)) if error else _text_of(trial)
         text = _COLOUR.sub("", text)
         self._fail(self._node(trial), cause_of(error, text), text)
 
-    def on_trial_recover(
-        self, iteration: int, trials: list[Trial], trial: Trial, **info: Any
-    ) -> None:
-        """The trial's worker died, and another one goes on."""
-        error = _error_of(trial)
-        cause = redact(cause_of(error, _COLOUR.sub("", _text_of(trial)))).splitlines()[0]
+    def on_trial_recover(self, *, trial: Trial, **_: Any) -> None:
+        """The trial's worker died, and another one continues the run."""
+        text = _COLOUR.sub("", _text_of(trial))
+        cause = redact(cause_of(_error_of(trial), text)).splitlines()[0]
         text = (
             f"{cause} Another worker goes on from the last checkpoint "
             f"({trial.run_metadata.num_failures} of {RESTARTS} times)."
@@ -138,6 +121,7 @@ class TuneEvents(Callback):
             listener.noted(node, text)
 
     def _fail(self, node: Node, cause: str, text: str) -> None:
+        """Keep the traceback `text` in a file, fail the node, and skip what depends on it."""
         # An environment may say anything, its database's password too.
         cause, text = redact(cause), redact(text)
         log = self._failures / f"{re.sub(r'[^A-Za-z0-9._=,-]+', '_', node.label)}-{node.key}.txt"
@@ -158,9 +142,8 @@ class TuneEvents(Callback):
 
 def _error_of(trial: Trial) -> BaseException | None:
     """The exception, from the file that this very process has just written."""
-    path = Path(trial.pickled_error_file)
     try:
-        error = cloudpickle.loads(path.read_bytes())
+        error = cloudpickle.loads(Path(trial.pickled_error_file).read_bytes())
     except Exception:
         # Not every exception survives pickling; its text is there in any case.
         return None
@@ -168,14 +151,15 @@ def _error_of(trial: Trial) -> BaseException | None:
 
 
 def _text_of(trial: Trial) -> str:
+    """The traceback that Tune has written into a file."""
     try:
         return Path(trial.error_file).read_text(encoding="utf-8")
     except OSError as error:
         return f"The cause is unknown: {error}"
 
 
-def _let_go(trial: Trial) -> None:
-    """Tune keeps every trial; of one that is done nobody needs averages and reported lines."""
-    known = trial.run_metadata
-    known.metric_analysis, known.metric_n_steps = {}, {}
-    known.last_result = {**known.last_result, REPORTS: "", NOTES: []}
+def _free(trial: Trial) -> None:
+    """Empty what a trial that is done has reported: Tune keeps every trial, and nobody reads it."""
+    metadata = trial.run_metadata
+    metadata.metric_analysis, metadata.metric_n_steps = {}, {}
+    metadata.last_result = {**metadata.last_result, REPORTS: "", NOTES: []}

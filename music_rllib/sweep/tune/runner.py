@@ -1,4 +1,4 @@
-"""Runs a sweep: what is left of its plan as trials of one Tune run, and what came of it."""
+"""Computes the runs of a sweep as trials of one Tune run."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from ray import tune
@@ -28,40 +27,33 @@ from music_rllib.training.worker import RunTrainable
 if TYPE_CHECKING:
     from music_rllib.search.controller import SearchController
 
-__all__ = ["Outcome", "compute"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Outcome:
-    """How computing ended."""
-
-    stopped_by: int | None
-    """The signal that stopped it; None if it went to its end."""
-
 
 def compute(
     sweep: Sweep,
     listeners: Sequence[Listener],
     on_stop: Callable[[], None],
     on_ray_gone: Callable[[str | None], None],
-    controller: SearchController | None = None,
-) -> Outcome:
+    controller: SearchController | None,
+) -> int | None:
     """Compute the waiting nodes, and those that searches ask for.
 
     Args:
-        sweep: Its scheduler says afterwards what became of each node.
-        listeners: Are told what happens.
+        sweep: Afterwards, its scheduler has the status of each node.
+        listeners: Receive the events of runs.
         on_stop: Called, in a signal handler, when the user asks to stop.
         on_ray_gone: Called, in a thread, before the process ends because Ray has: with the cause,
             or None where the user's signal has ended that as well.
         controller: The searches; None where there are none.
+
+    Returns:
+        The signal that stopped the sweep; None if everything was computed.
 
     Raises:
         ClusterError: Ray can't be reached or can't hold a run.
     """
     resources = sweep.config.resources
     grace = sweep.config.checkpoints.grace_seconds
-    stopping = StopSignals(on_stop, grace, on_ray_gone=on_ray_gone)
+    stopping = StopSignals(on_stop, grace, on_ray_gone)
     events = TuneEvents(sweep.scheduler, sweep.store, listeners, sweep.folder / "failures")
     searcher = DagSearcher(
         sweep.scheduler,
@@ -77,33 +69,33 @@ def compute(
             stop_key=stopping.flag.key,
             hang_minutes=resources.hang_minutes,
         ).to_tune(),
-        **({} if controller is None else {"advance": controller.advance}),
+        advance=(lambda: False) if controller is None else controller.advance,
         stopped=lambda: stopping.received is not None,
     )
     with (
         cluster(resources) as room,
-        _tune_folder(sweep) as place,
+        _tune_folder(sweep) as folder,
         _quiet_tune(room.waiting),
         stopping,
     ):
-        for listener in listeners:
-            if room.remark is not None:
+        if room.remark is not None:
+            for listener in listeners:
                 listener.remarked(room.remark)
         tuner = tune.Tuner(
             RunTrainable,
             tune_config=tune.TuneConfig(
                 search_alg=searcher,
-                # As many as the searcher says; -1 is without an end.
+                # As many as the searcher suggests; -1 is without an end.
                 num_samples=-1 if controller else len(sweep.scheduler.having(Status.WAITING)),
                 trial_name_creator=_trial_name,
                 trial_dirname_creator=_trial_name,
             ),
             run_config=tune.RunConfig(
                 name="tune",
-                storage_path=place,
+                storage_path=folder,
                 verbose=0,
                 callbacks=[events, stopping],
-                # For workers that die; one that raises says so in its result.
+                # For workers that die; one that raises has the error in its result.
                 failure_config=tune.FailureConfig(max_failures=RESTARTS),
                 # Checkpoints are the trainable's own; Tune's would hold nothing.
                 checkpoint_config=tune.CheckpointConfig(checkpoint_at_end=False),
@@ -111,7 +103,7 @@ def compute(
         )
         tuner.fit()
     done = sweep.scheduler.complete and (controller is None or controller.over)
-    return Outcome(stopped_by=None if done else stopping.received)
+    return None if done else stopping.received
 
 
 def _trial_name(trial: Trial) -> str:
@@ -121,11 +113,13 @@ def _trial_name(trial: Trial) -> str:
 
 @contextlib.contextmanager
 def _tune_folder(sweep: Sweep) -> Iterator[str]:
-    """Where all nodes of the cluster can write what Tune wants to write and nobody reads."""
+    """A folder for the files of Tune, which nobody reads; all machines of the cluster reach it."""
     if cluster_address() is None:
         # Not in the storage: a full one must not end the runs that have no need of it.
-        with tempfile.TemporaryDirectory(prefix="music-tune-", ignore_cleanup_errors=True) as place:
-            yield place
+        with tempfile.TemporaryDirectory(
+            prefix="music-tune-", ignore_cleanup_errors=True
+        ) as folder:
+            yield folder
         return
     if "://" in sweep.storage:
         yield f"{sweep.storage.rstrip('/')}/{sweep.plan.name}"
@@ -134,51 +128,47 @@ def _tune_folder(sweep: Sweep) -> Iterator[str]:
     shutil.rmtree(sweep.folder / "tune", ignore_errors=True)
 
 
-class _Expected(logging.Filter):
-    """What Tune says when it is stopped or a trial failed; the sweep says it itself."""
-
-    BEGINNINGS = (
-        "Stop signal received",
-        "Experiment has been interrupted",
-        "Trials did not complete",
-        "Could not fetch metrics",
-        "Failed to fetch metrics",
-    )
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        return not record.getMessage().startswith(self.BEGINNINGS)
+_LOGGERS = ("ray.tune.tune", "ray.tune.analysis.experiment_analysis")
+_EXPECTED_MESSAGES = (
+    "Stop signal received",
+    "Experiment has been interrupted",
+    "Trials did not complete",
+    "Could not fetch metrics",
+    "Failed to fetch metrics",
+)
+"""Beginnings of what Tune logs when it is stopped or a trial failed: the sweep says it itself."""
 
 
-class _quiet_tune:  # noqa: N801
-    """Settings that Tune takes from the environment only, for one run, and its log filtered."""
+def _is_news(record: logging.LogRecord) -> bool:
+    return not record.getMessage().startswith(_EXPECTED_MESSAGES)
 
-    LOGGERS = ("ray.tune.tune", "ray.tune.analysis.experiment_analysis")
 
-    def __init__(self, waiting: int) -> None:
-        self._settings = {
-            # Trials that wait for an actor: as many as can run start side by side, and an
-            # autoscaler adds nodes for those that wait.
-            "TUNE_MAX_PENDING_TRIALS_PG": str(waiting),
-            "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",
-            "TUNE_PRINT_ALL_TRIAL_ERRORS": "0",
-            # Relative paths in a user's environment keep their meaning.
-            "RAY_CHDIR_TO_TRIAL_DIR": "0",
-            # Nobody reads Tune's snapshots.
-            "TUNE_GLOBAL_CHECKPOINT_S": "3600",
-        }
-        self._filter = _Expected()
+@contextlib.contextmanager
+def _quiet_tune(waiting: int) -> Iterator[None]:
+    """Set what Tune reads from the environment only, and filter its log.
 
-    def __enter__(self) -> None:
-        self._before = {name: os.environ.get(name) for name in self._settings}
-        os.environ.update(self._settings)
-        for name in self.LOGGERS:
-            logging.getLogger(name).addFilter(self._filter)
-
-    def __exit__(self, *_: object) -> None:
-        for name, value in self._before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
-        for name in self.LOGGERS:
-            logging.getLogger(name).removeFilter(self._filter)
+    Args:
+        waiting: Trials that may wait for an actor: as many as can run start side by side, and an
+            autoscaler adds nodes for those that wait.
+    """
+    settings = {
+        "TUNE_MAX_PENDING_TRIALS_PG": str(waiting),
+        "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",
+        "TUNE_PRINT_ALL_TRIAL_ERRORS": "0",
+        # Relative paths in a user's environment keep their meaning.
+        "RAY_CHDIR_TO_TRIAL_DIR": "0",
+        # Nobody reads Tune's snapshots.
+        "TUNE_GLOBAL_CHECKPOINT_S": "3600",
+    }
+    before = {name: os.environ[name] for name in settings if name in os.environ}
+    os.environ.update(settings)
+    for name in _LOGGERS:
+        logging.getLogger(name).addFilter(_is_news)
+    try:
+        yield
+    finally:
+        for name in settings:
+            os.environ.pop(name, None)
+        os.environ.update(before)
+        for name in _LOGGERS:
+            logging.getLogger(name).removeFilter(_is_news)

@@ -1,13 +1,13 @@
-"""What a sweep's controls make of alpha at each q, and what follows measurements, for its plan."""
+"""Rows of the plan for alpha that is scaled by q, and for settings that follow a measurement."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import closing
 from typing import Any
 
 from rich.table import Table
 
-from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.tac_settings import MatchedAlpha, NormalisedAlpha, alpha_at, in_words
 from music_rllib.envs.make import make_env
 from music_rllib.envs.tasks import Task
@@ -15,65 +15,55 @@ from music_rllib.experiment.plan import Node, Plan
 from music_rllib.schedules import QUANTITIES, Linear, Measured, Piecewise, value_at
 from music_rllib.sweep.views.tables import new_table
 
-__all__ = ["adaptive_rows", "adaptive_text", "alpha_rows", "alpha_table"]
-
 
 def alpha_rows(plan: Plan) -> list[dict[str, Any]]:
-    """One for each stage, control and q: alpha at the start and at the end of a run.
+    """Alpha at the start and at the end of a run, for each stage, scaled alpha and q.
 
-    Only of what depends on q: a learned alpha is not known beforehand, and a plain one is as given.
+    Plain and learned alphas have no row: a plain one is as given, a learned one is not known yet.
     """
-    scaled = [node for node in plan.nodes if _is_scaled(node.run)]
-    # The joint entropy's scale depends on how many dimensions there are; otherwise any number does.
+    scaled = [
+        node
+        for node in plan.nodes
+        if isinstance(node.run.tac.alpha, MatchedAlpha | NormalisedAlpha)
+    ]
+    # Only the joint entropy's scale depends on the number of dimensions of an action.
     joint = {n.run.task.name: n.run.task for n in scaled if n.run.tac.entropy_form == "joint"}
-    actions = {name: _action_size(task) for name, task in joint.items()}
-    rows = [_row(node, actions.get(node.run.task.name, 1)) for node in scaled]
+    dimensions = {name: _action_dimensions(task) for name, task in joint.items()}
+    rows = [_alpha_row(node, dimensions.get(node.run.task.name, 1)) for node in scaled]
     unique = {tuple(row.values()): row for row in rows}
     return sorted(unique.values(), key=lambda row: (row["stage"], row["alpha"], row["q_at_start"]))
 
 
-def _is_scaled(run: RunSettings) -> bool:
-    return isinstance(run.tac.alpha, MatchedAlpha | NormalisedAlpha)
-
-
-def _row(node: Node, actions: int) -> dict[str, Any]:
+def _alpha_row(node: Node, action_dimensions: int) -> dict[str, Any]:
     tac, budget = node.run.tac, node.run.env_steps
-    q_at_start, q_at_end = (
-        value_at(tac.entropic_index, 0, budget),
-        _last(tac.entropic_index, budget),
-    )
+    q_at_start = value_at(tac.entropic_index, 0, budget)
+    q_at_end = _final_q(tac.entropic_index, budget)
     return {
         "stage": node.stage,
         "alpha": in_words(tac.alpha),
         "q": in_words(tac.entropic_index),
         "q_at_start": q_at_start,
-        "at_start": alpha_at(tac, q_at_start, 0, budget, actions),
-        "at_end": alpha_at(tac, q_at_end, budget, budget, actions),
+        "at_start": alpha_at(tac, q_at_start, 0, budget, action_dimensions),
+        "at_end": alpha_at(tac, q_at_end, budget, budget, action_dimensions),
     }
 
 
-def _last(q: float | Linear | Piecewise | Measured, budget: int) -> float:
-    """At the run's end; of one that follows a measurement, at the other end of its points."""
+def _final_q(q: float | Linear | Piecewise | Measured, budget: int) -> float:
+    """The q at the end of a run; one that follows a measurement ends at its last point."""
     if isinstance(q, Measured):
         return q.points[-1 if q.follows == "success_rate" else 0][1]
     return value_at(q, budget, budget)
 
 
-def _action_size(task: Task) -> int:
-    env = make_env(task.env_id, **task.env_kwargs)
-    try:
+def _action_dimensions(task: Task) -> int:
+    with closing(make_env(task.env_id, **task.env_kwargs)) as env:
         return int(env.action_space.shape[0])  # type: ignore[index]
-    finally:
-        env.close()
 
 
 def alpha_table(rows: Iterable[dict[str, Any]]) -> Table:
-    """For the screen."""
-    table = new_table("α at each q")
-    for name in ("stage", "alpha"):
-        table.add_column(name, overflow="fold")
-    for name in ("q", "α at the start", "at the end"):
-        table.add_column(name, justify="right", overflow="fold")
+    """`alpha_rows` as a table."""
+    heads = ("stage", "alpha", "q", "α at the start", "at the end")
+    table = new_table("α at each q", heads, left=heads[:2])
     for row in rows:
         numbers = (f"{row['at_start']:.4g}", f"{row['at_end']:.4g}")
         table.add_row(row["stage"], row["alpha"], row["q"], *numbers)
@@ -81,7 +71,7 @@ def alpha_table(rows: Iterable[dict[str, Any]]) -> Table:
 
 
 def adaptive_rows(plan: Plan) -> list[dict[str, Any]]:
-    """One for each stage and setting that follows what is measured, with its points."""
+    """The settings of each stage that follow a measurement, with their points."""
     rows = [
         {"stage": node.stage, "setting": name} | setting.model_dump(mode="json")
         for node in plan.nodes

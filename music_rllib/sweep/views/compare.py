@@ -1,4 +1,4 @@
-"""`compare` as a table."""
+"""The answer of `compare` as tables."""
 
 from __future__ import annotations
 
@@ -16,55 +16,50 @@ from music_rllib.results.comparison import with_interval
 from music_rllib.sweep.views.tables import new_table, seeds_in_words
 from music_rllib.sweep.views.text import percent
 
-__all__ = ["compare_view"]
-
 
 def compare_view(document: Mapping[str, Any]) -> RenderableType:
-    """One table for each group of conditions that may be compared."""
+    """The answer, the comparisons, and a table for each group of conditions."""
     if not document["groups"]:
         return Text(f"Stage {document['stage']} of {document['sweep']} has no finished run yet.")
     parts: list[RenderableType] = [*map(Text, document["answer"]), Text()]
     if document["comparisons"]:
-        parts.append(_comparisons(document))
+        parts.append(_comparisons_table(document["comparisons"]))
     if document["conditions"]:
-        parts.append(_primary(document))
+        parts.append(_areas_table(document["conditions"]))
     for group in document["groups"]:
-        parts += [_table(document, group), Text(group["verdict"])]
+        parts += [_group_table(document["stage"], group), Text(group["verdict"])]
         if any(row["entropies"] for row in group["conditions"]):
-            parts.append(_entropies(group))
+            parts.append(_entropies_table(group))
     return Group(*parts)
 
 
-def _comparisons(document: Mapping[str, Any]) -> Table:
-    rows = document["comparisons"]
-    table = new_table("Comparisons")
-    for name in ("first - second", *_task(rows), "difference, 95 %", "p", "verdict", "planned"):
-        table.add_column(name, overflow="fold")
+def _comparisons_table(rows: Sequence[Mapping[str, Any]]) -> Table:
+    task = _task_column(rows)
+    heads = ("first - second", *task, "difference, 95 %", "p", "verdict", "planned")
+    table = new_table("Comparisons", heads, left=heads)
     for row in rows:
-        within = row["verdict"] == "equivalent"
-        p_value = row["p_equivalent_holm"] if within else row["p_value_holm"]
+        equivalent = row["verdict"] == "equivalent"
+        p_value = row["p_equivalent_holm"] if equivalent else row["p_value_holm"]
         table.add_row(
             f"{row['first']} - {row['second']}",
-            *(row[name] for name in _task(rows)),
+            *(row[name] for name in task),
             with_interval(row["difference"], (row["lower"], row["upper"])),
             f"{p_value:.2g}",
-            f"{row['verdict']} (within {row['margin']:g})" if within else row["verdict"],
+            f"{row['verdict']} (within {row['margin']:g})" if equivalent else row["verdict"],
             "yes" if row["planned"] else "no",
         )
     return table
 
 
-def _primary(document: Mapping[str, Any]) -> Table:
-    rows = document["conditions"]
+def _areas_table(rows: Sequence[Mapping[str, Any]]) -> Table:
     measure = " or ".join(dict.fromkeys(row["measure"] for row in rows))
-    title = f"Area under the learning curve: {measure}"
-    table = new_table(title)
-    for name in ("condition", *_task(rows), "mean, 95 %", "each seed", "runs"):
-        table.add_column(name, justify="left" if name == "condition" else "right", overflow="fold")
+    task = _task_column(rows)
+    heads = ("condition", *task, "mean, 95 %", "each seed", "runs")
+    table = new_table(f"Area under the learning curve: {measure}", heads, left=["condition"])
     for row in rows:
         table.add_row(
             row["condition"],
-            *(row[name] for name in _task(rows)),
+            *(row[name] for name in task),
             with_interval(row["value"], (row["lower"], row["upper"])),
             seeds_in_words(list(row["by_seed"].values())),
             f"{row['seeds']} of {row['runs']}",
@@ -72,21 +67,12 @@ def _primary(document: Mapping[str, Any]) -> Table:
     return table
 
 
-def _table(document: Mapping[str, Any], group: Mapping[str, Any]) -> Table:
+def _group_table(stage: str, group: Mapping[str, Any]) -> Table:
     rows = group["conditions"]
-    title = f"{group['metric']} of {document['stage']} on {group['tasks']} {group['part']}".strip()
-    table = new_table(title)
+    title = f"{group['metric']} of {stage} on {group['tasks']} {group['part']}".strip()
     settings = dict.fromkeys(name for row in rows for name in row["values"])
-    for name in (
-        *_heads(settings),
-        "mean, 95 %",
-        "each seed",
-        "runs",
-        "gap, 95 %",
-        "P(first\nis better)",
-        "p",
-    ):
-        table.add_column(name, justify="right", overflow="fold")
+    numbers = ("mean, 95 %", "each seed", "runs", "gap, 95 %", "P(first\nis better)", "p")
+    table = new_table(title, (*_setting_heads(settings), *numbers))
     for row in rows:
         table.add_row(
             *(short(row["values"][name]) if name in row["values"] else "-" for name in settings),
@@ -100,26 +86,24 @@ def _table(document: Mapping[str, Any], group: Mapping[str, Any]) -> Table:
     return table
 
 
-def _entropies(group: Mapping[str, Any]) -> Table:
-    table = Table(title=f"Entropy of the policies at the end on {group['tasks']}")
-    table.title_justify = "left"
+def _entropies_table(group: Mapping[str, Any]) -> Table:
+    title = f"Entropy of the policies at the end on {group['tasks']}"
+    table = Table(title=title, title_justify="left")
     for name in ("condition", "Shannon, nats, 95 %", "S_q, 95 %"):
         table.add_column(name, justify="left" if name == "condition" else "right")
     for row in group["conditions"]:
-        found = [row["entropies"].get(metric) for metric in names.ENTROPIES]
-        cells = (
-            "-" if one is None else with_interval(one["value"], one["interval"]) for one in found
-        )
+        entropies = [row["entropies"].get(metric) for metric in names.ENTROPIES]
+        cells = ("-" if e is None else with_interval(e["value"], e["interval"]) for e in entropies)
         table.add_row(row["label"], *cells)
     return table
 
 
-def _task(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The column of tasks, where there are several."""
+def _task_column(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The head of the column of tasks, where there are several."""
     return ["task"] if len({row["task"] for row in rows}) > 1 else []
 
 
-def _heads(settings: Iterable[str]) -> list[str]:
-    """Columns' heads, as labels call the settings, or whole where that would be ambiguous."""
+def _setting_heads(settings: Iterable[str]) -> list[str]:
+    """Settings as labels call them, or by their whole names where that would be ambiguous."""
     brief = [symbol(name) for name in settings]
     return brief if len(set(brief)) == len(brief) else list(settings)

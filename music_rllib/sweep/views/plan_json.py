@@ -9,13 +9,11 @@ from music_rllib.experiment.changes import Changes
 from music_rllib.experiment.session import Sweep, plan_document
 from music_rllib.redaction import redact
 from music_rllib.sweep.views.alpha import adaptive_rows, alpha_rows
-from music_rllib.sweep.views.tables import search_runs
-
-__all__ = ["plan_answer"]
+from music_rllib.sweep.views.search_budget import search_budget
 
 
-def plan_answer(opened: Sweep, changes: Changes | None = None) -> dict[str, Any]:
-    """The plan as plain data."""
+def plan_answer(opened: Sweep, changes: Changes | None) -> dict[str, Any]:
+    """The plan of a sweep, with what has changed since the sweep ran last."""
     config = opened.config
     searches = [
         {
@@ -24,15 +22,15 @@ def plan_answer(opened: Sweep, changes: Changes | None = None) -> dict[str, Any]
             "sampler": stage.search.sampler,
             "studies": len(stage.search.arms()),
             "trials": stage.search.count,
-            "runs_at_most": search_runs(stage, stage.search, len(config.seeds)),
+            "runs_at_most": search_budget(stage, len(config.seeds)).runs,
             "space": stage.search.model_dump(mode="json", by_alias=True)["space"],
         }
         for stage in config.stages
         if stage.search is not None
     ]
+    finished = opened.finished
     nodes = [
-        node | {"finished": node["key"] in opened.finished}
-        for node in plan_document(opened)["nodes"]
+        node | {"finished": node["key"] in finished} for node in plan_document(opened)["nodes"]
     ]
     return {
         "sweep": config.name,

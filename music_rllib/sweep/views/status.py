@@ -1,4 +1,4 @@
-"""A sweep's `state.json` as a person reads it."""
+"""The text of `status`, from a sweep's `state.json`."""
 
 from __future__ import annotations
 
@@ -17,44 +17,41 @@ from music_rllib.search.ranking import best_in_words
 from music_rllib.store.node_store import TRAIN_AGAIN
 from music_rllib.sweep.views.text import clock, measured
 
-__all__ = ["status_view"]
-
-_STATES = (
+_STATUSES = (
     *("finished", "reused", "started", "interrupted", "waiting", "paused", "pruned"),
     *("failed", "skipped"),
 )
+"""Statuses of runs, in the order of the columns."""
 _STYLES = {"finished": "green", "failed": "red", "interrupted": "yellow", "stopped": "yellow"}
 
 
-def status_view(state: Mapping[str, Any], labels: Iterable[str] = ()) -> RenderableType:
-    """Stages, trials, runs, budget, searches, failures; with the `labels` of all runs in short."""
+def status_view(state: Mapping[str, Any], labels: Iterable[str]) -> RenderableType:
+    """Stages, budget, searches, runs and failures; the `labels` of all runs shorten each label."""
     title = Text(f"Sweep {state['sweep']}: ")
     title.append(state["state"], _STYLES.get(state["state"], "bold"))
     title.append(f"  ({state['place']})", "dim")
     if "driver" not in state:
         return title
-    parts: list[RenderableType] = [title, Text(_times(state)), _stages(state)]
     label = ShortLabels.of(labels)
-    done, left = state["env_steps"]["done"], state["env_steps"]["left"]
-    budget = f"Budget: {done:,} env steps spent, {left:,} left of what is known so far"
-    if to_come := state["env_steps"].get("to_come"):
+    parts: list[RenderableType] = [title, Text(_driver_text(state)), _stages_table(state)]
+    env_steps = state["env_steps"]
+    budget = (
+        f"Budget: {env_steps['done']:,} env steps spent, {env_steps['left']:,} left of what is "
+        "known so far"
+    )
+    if to_come := env_steps.get("to_come"):
         budget += f", at most {to_come:,} more that searches may ask for"
     parts.append(Text(budget))
     if state["best"] is not None:
         parts.append(Text(f"Best so far: {best_in_words(state['best'])}"))
-    parts += [_search(search) for search in state["searches"]]
-    parts += [
-        Text(
-            f"{one['state']}: {label(one['run'])}  {one['env_steps']:,} / {one['budget']:,} env "
-            f"steps, {names.word_of(one['metric'])} {measured(one['metric'], one['value'])}"
-        )
-        for one in (
-            *({"state": "running"} | one for one in state["running"]),
-            *({"state": "interrupted"} | one for one in state.get("interrupted", ())),
-        )
-    ]
-    for one in state["damaged"]:
-        parts.append(Text(f"DAMAGED {label(one['run'])}: {one['cause']}", style="red"))
+    parts += [_search_text(search) for search in state["searches"]]
+    for status in ("running", "interrupted"):
+        for run in state.get(status, ()):
+            value = f"{names.word_of(run['metric'])} {measured(run['metric'], run['value'])}"
+            steps = f"{run['env_steps']:,} / {run['budget']:,} env steps"
+            parts.append(Text(f"{status}: {label(run['run'])}  {steps}, {value}"))
+    for damaged in state["damaged"]:
+        parts.append(Text(f"DAMAGED {label(damaged['run'])}: {damaged['cause']}", style="red"))
     if state["damaged"]:
         parts.append(Text(f"    {TRAIN_AGAIN}", style="dim"))
     for failure in state["failures"]:
@@ -63,18 +60,18 @@ def status_view(state: Mapping[str, Any], labels: Iterable[str] = ()) -> Rendera
     return Group(*parts)
 
 
-def _times(state: Mapping[str, Any]) -> str:
+def _driver_text(state: Mapping[str, Any]) -> str:
     driver = state["driver"]
     end = driver["ended"] or (driver["heartbeat"] if state["state"] != "running" else time.time())
     where = f"process {driver['pid']} on {driver['host']}"
     return f"{where}, {clock(end - driver['started'])} since it was last started"
 
 
-def _stages(state: Mapping[str, Any]) -> Table:
+def _stages_table(state: Mapping[str, Any]) -> Table:
     table = Table(box=None, pad_edge=False)
     table.add_column("stage")
     table.add_column("variant")
-    shown = [name for name in _STATES if any(name in stage["runs"] for stage in state["stages"])]
+    shown = [name for name in _STATUSES if any(name in stage["runs"] for stage in state["stages"])]
     for name in ("trials", "runs", *shown):
         table.add_column(name, justify="right")
     for stage in state["stages"]:
@@ -89,7 +86,7 @@ def _stages(state: Mapping[str, Any]) -> Table:
     return table
 
 
-def _search(search: Mapping[str, Any]) -> Text:
+def _search_text(search: Mapping[str, Any]) -> Text:
     lines = []
     for arm in search["arms"]:
         fixed = "".join(f" {name}={short(value)}" for name, value in arm["values"].items())

@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from music_rllib import names
 from music_rllib.envs.tasks import Task
 
-__all__ = ["clock", "evaluated_in_words", "measured", "percent"]
-
 
 def percent(value: float | None) -> str:
     """`35 %`, or `-` for None."""

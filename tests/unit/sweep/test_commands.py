@@ -616,3 +616,25 @@ def test_what_a_search_has_asked_for_before_is_verified_too(tmp_path: Path) -> N
     (tmp_path / "results/nodes" / node.key / "handoff/handoff.json").write_text("{ }")
     with pytest.raises(DamagedError, match=rf"{node.label}: .*handoff\.json must have 2 bytes"):
         opened(storage, tmp_path, stages=stages, seeds=[0])
+
+
+def test_a_search_asks_for_no_more_once_its_finalists_run(tmp_path: Path) -> None:
+    """What its trials have not used of their budget, since some were stopped early, is not run."""
+    search = {
+        "space": {"tac.lr": {"float": [1e-4, 1e-2]}},
+        "trials": 4,
+        "final": {"trials": 1, "seeds": 2},
+    }
+    stages = [{"name": "train", "variant": "tac", "search": search}]
+    storage = str(tmp_path / "results")
+    sweep = opened(storage, tmp_path, stages=stages, seeds=[0])
+
+    def env_steps_to_come() -> Any:
+        with StateFile(sweep) as state_file:
+            state_file.end("stopped")
+        return sweep_files.read(storage, "mine/state.json")["env_steps"]["to_come"]
+
+    sweep.plan.add_trial("train", 0, {"tac.lr": 1e-3}, [0], "trial0")
+    assert env_steps_to_come() == (3 + 2) * 4000
+    sweep.plan.add_trial("train", 0, {"tac.lr": 1e-3}, [1000, 1001], "final0")
+    assert env_steps_to_come() == 0

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import yaml
-from rich.console import Console
+from rich.console import Console, RenderableType
 
 from music_rllib import names
 from music_rllib.config.load import load_sweep
@@ -45,11 +45,15 @@ DOCUMENT: dict[str, Any] = {
 }
 
 
+def loaded(folder: Path, **changes: Any) -> SweepConfig:
+    path = folder / "s.yaml"
+    path.write_text(yaml.safe_dump(DOCUMENT | changes, sort_keys=False))
+    return load_sweep(path)
+
+
 @pytest.fixture
 def config(tmp_path: Path) -> SweepConfig:
-    path = tmp_path / "s.yaml"
-    path.write_text(yaml.safe_dump(DOCUMENT, sort_keys=False))
-    return load_sweep(path)
+    return loaded(tmp_path)
 
 
 @pytest.fixture
@@ -62,23 +66,25 @@ def screen(*, terminal: bool = False) -> tuple[Console, io.StringIO]:
     return Console(file=text, width=200, highlight=False, force_terminal=terminal), text
 
 
+def shown(view: RenderableType) -> str:
+    console, text = screen()
+    console.print(view)
+    return text.getvalue()
+
+
 def report(env_steps: int, seconds: float, **metrics: float) -> Report:
     return Report(env_steps=env_steps, seconds=seconds, timestamp_ms=0, metrics=metrics)
 
 
 def test_the_plan_counts_runs_budgets_and_what_is_finished(config: SweepConfig, plan: Plan) -> None:
-    console, text = screen()
-    console.print(plan_view(config, plan, {plan.nodes[0].key}))
-    rows = {line.split()[0]: line.split()[1:] for line in text.getvalue().splitlines()}
+    text = shown(plan_view(config, plan, {plan.nodes[0].key}))
+    rows = {line.split()[0]: line.split()[1:] for line in text.splitlines()}
     assert rows["finetune"] == ["2", "4", "5,000", "20,000", "0"]
     assert rows["pretrain"][-1] == "1"
-    assert (
-        "finetune: music-r on FetchPush from pretrain, 2 seeds\n  tac.entropic_index: 1, 1.5"
-        in (text.getvalue())
-    )
-    assert "6 runs, 24,000 env steps in all, 1 finished earlier and reused, 22,000 env steps" in (
-        text.getvalue()
-    )
+    stage = "finetune: music-r on FetchPush from pretrain, 2 seeds\n  tac.entropic_index: 1, 1.5"
+    summary = "6 runs, 24,000 env steps in all, 1 finished earlier and reused, 22,000 env steps"
+    assert stage in text
+    assert summary in text
 
 
 def test_the_plan_shows_what_a_control_makes_of_alpha_at_each_q(tmp_path: Path) -> None:
@@ -98,9 +104,7 @@ def test_the_plan_shows_what_a_control_makes_of_alpha_at_each_q(tmp_path: Path) 
         },
         {"name": "plain", "variant": "tac", "grid": {"tac.alpha": [0.05, 0.1]}},
     ]
-    path = tmp_path / "s.yaml"
-    path.write_text(yaml.safe_dump(DOCUMENT | {"stages": stages}, sort_keys=False))
-    rows = alpha_rows(make_plan(load_sweep(path)))
+    rows = alpha_rows(make_plan(loaded(tmp_path, stages=stages)))
     # G = q^(-1/2) (sqrt(2 pi) sigma)^(1-q) at q = 2, and of four dimensions its fourth power.
     pressure = 2**-0.5 / ((2 * math.pi) ** 0.5 * 0.1)
     assert [(row["stage"], row["q"]) for row in rows] == [
@@ -110,19 +114,14 @@ def test_the_plan_shows_what_a_control_makes_of_alpha_at_each_q(tmp_path: Path) 
     ]
     assert [row["at_start"] for row in rows] == pytest.approx([0.05, 0.05 / pressure, 0.05])
     assert rows[2]["at_end"] == pytest.approx(0.05 / pressure**4)
-    console, text = screen()
-    console.print(alpha_table(rows))
-    assert "0.05 matched at 0.1" in text.getvalue()
+    assert "0.05 matched at 0.1" in shown(alpha_table(rows))
 
 
 def test_the_plan_says_what_follows_what_is_measured(tmp_path: Path) -> None:
     q = {"follows": "success_rate", "points": [[0.2, 2.0], [0.9, 1.0]], "monotone": True}
     alpha = {"value": 0.05, "matched_width": 0.1}
     stage = {"name": "her", "variant": "tac", "grid": {"tac.entropic_index": [q, 1.0]}}
-    path = tmp_path / "s.yaml"
-    document = DOCUMENT | {"stages": [stage | {"tac": {"alpha": alpha}}]}
-    path.write_text(yaml.safe_dump(document, sort_keys=False))
-    plan = make_plan(load_sweep(path))
+    plan = make_plan(loaded(tmp_path, stages=[stage | {"tac": {"alpha": alpha}}]))
     assert [adaptive_text(row) for row in adaptive_rows(plan)] == [
         "her: tac.entropic_index follows the success rate: 2 at 0.2, 1 at 0.9; never goes back"
     ]
@@ -139,11 +138,9 @@ def test_results_have_a_row_per_run_whatever_became_of_it(plan: Plan) -> None:
     metrics = {names.EVAL_SUCCESS: 0.25, names.EVAL_SUCCESS_ANY: 0.5, names.MI_REWARD: -0.5}
     metrics |= {names.SHANNON_ENTROPY: 0.29, names.ENTROPY: -0.121}
     result = RunResult(label="x", env_steps=2000, seconds=125, metrics=metrics)
-    console, text = screen()
     runs = {plan.nodes[1].key: "0123456789abcdef"}
     given = (plan, scheduler.__getitem__, {plan.nodes[1].key: result}, runs.get)
-    console.print(results_table(*given))
-    rows = [line.split() for line in text.getvalue().splitlines()[3:]]
+    rows = [line.split() for line in shown(results_table(*given)).splitlines()[3:]]
     assert rows[1] == [
         "pretrain/seed1", "25", "%", "50", "%", "-0.50", "0.29", "-0.12", "2,000", "2:05",
         "01234567", "reused",
@@ -153,7 +150,7 @@ def test_results_have_a_row_per_run_whatever_became_of_it(plan: Plan) -> None:
     ]  # fmt: skip
     assert rows[4][0] == "finetune/q=1.5,alpha=0.1/seed0"
     narrow = results_table(*given, width=64)
-    assert console.measure(narrow).maximum <= 64
+    assert Console(width=200).measure(narrow).maximum <= 64
     assert [str(column.header) for column in narrow.columns][-2:] == ["entropy,\nnats", "state"]
     assert "MLflow run" in str(narrow.caption)
 
@@ -235,22 +232,22 @@ def test_a_terminal_shows_a_live_table(plan: Plan) -> None:
     scheduler, time = Scheduler(plan, finished=()), Clock()
     with Display(console, plan, scheduler, time) as display:
         play(display, plan, scheduler, time)
-        shown = text.getvalue()
-    assert "1,000 / 2,000" in shown
-    assert "100" in shown
-    assert "20 %" in shown
-    assert "0 of 6 runs done, 1,000 of 24,000 env steps, 0:12 passed" in shown
+        live = text.getvalue()
+    assert "1,000 / 2,000" in live
+    assert "100" in live
+    assert "20 %" in live
+    assert "0 of 6 runs done, 1,000 of 24,000 env steps, 0:12 passed" in live
     # What is left is 1,000 steps of this run and two of 5,000, at 100 a second.
-    assert "about 1:50 left" in shown
+    assert "about 1:50 left" in live
+
+
+REACHER = {"Reacher": {"env_id": "Reacher-v5", "horizon": 50, "success_key": None}}
 
 
 def test_tasks_without_success_are_shown_by_their_return(tmp_path: Path) -> None:
-    path = tmp_path / "s.yaml"
-    task = {"env_id": "Reacher-v5", "horizon": 50, "success_key": None}
-    stage = {"name": "train", "variant": "tac"}
-    both = {"environments": {"Reacher": task}, "tasks": ["Reacher", "FetchReach"]}
-    path.write_text(yaml.safe_dump(DOCUMENT | both | {"stages": [stage], "seeds": [0]}))
-    config = load_sweep(path)
+    stages = [{"name": "train", "variant": "tac"}]
+    tasks = ["Reacher", "FetchReach"]
+    config = loaded(tmp_path, environments=REACHER, tasks=tasks, stages=stages, seeds=[0])
     plan = make_plan(config)
     metrics = {names.EVAL_RETURN: -5.25, names.EVAL_EPISODES: 5.0}
     success = {names.EVAL_SUCCESS: 0.5, names.EVAL_RETURN: -20.0}
@@ -268,35 +265,24 @@ def test_tasks_without_success_are_shown_by_their_return(tmp_path: Path) -> None
         result = RunResult(label="x", env_steps=2000, seconds=20, metrics=metrics)
         display.finished(plan.nodes[0], result)
     assert "finished, return -5.25, 2,000 env steps" in text.getvalue()
-    console, text = screen()
-    console.print(plan_view(config, plan, set()))
-    assert "Reacher (return), FetchReach" in text.getvalue()
+    assert "Reacher (return), FetchReach" in shown(plan_view(config, plan, set()))
     results = {
         node.key: RunResult(label="x", env_steps=2000, seconds=20, metrics=found)
         for node, found in zip(plan.nodes, (metrics, success), strict=True)
     }
-    console, text = screen()
     finished = Scheduler(plan, finished=list(results))
-    console.print(results_table(plan, finished.__getitem__, results, lambda _: None))
-    rows = [line.split()[1:-4] for line in text.getvalue().splitlines()[3:]]
+    table = results_table(plan, finished.__getitem__, results, lambda _: None)
+    rows = [line.split()[1:-4] for line in shown(table).splitlines()[3:]]
     assert rows == [["-", "-", "-5.25"], ["50", "%", "-", "-20"]]
-
-
-LONG = {
-    "environments": {"Reacher": {"env_id": "Reacher-v5", "horizon": 50, "success_key": None}},
-    "tasks": ["Reacher", "FetchPickAndPlace"],
-    "seeds": [0, 1],
-}
 
 
 @pytest.mark.parametrize("width", [80, 60])
 def test_no_cell_is_cut(tmp_path: Path, width: int) -> None:
     """What is shown in wide columns is all there in narrow ones, if it must be on several lines."""
-    path = tmp_path / "s.yaml"
     grid = {"tac.entropic_index": [1.0, 1.5], "tac.alpha": [0.05, 0.1]}
     stage = {"name": "train-all-of-it", "variant": "tac", "env_steps": 1_000_000, "grid": grid}
-    path.write_text(yaml.safe_dump(DOCUMENT | LONG | {"stages": [stage]}))
-    config = load_sweep(path)
+    tasks = ["Reacher", "FetchPickAndPlace"]
+    config = loaded(tmp_path, environments=REACHER, tasks=tasks, stages=[stage])
     plan = make_plan(config)
     metrics = {names.EVAL_RETURN: -1234.5, names.EVAL_SUCCESS: 0.25, names.EVAL_SUCCESS_ANY: 0.5}
     result = RunResult(label="x", env_steps=1_000_000, seconds=40_000, metrics=metrics)
@@ -314,10 +300,9 @@ def test_no_cell_is_cut(tmp_path: Path, width: int) -> None:
     console.print(plan_view(config, plan, set()))
     results = {node.key: result for node in plan.nodes[:3]}
     console.print(results_table(plan, scheduler.__getitem__, results, lambda _: None, width))
-    shown = text.getvalue()
-    assert "…" not in shown
+    assert "…" not in text.getvalue()
     for word in ("25 %", "-1234", "interrupted", "1,000,000", "seed1"):
-        assert word in shown, shown
+        assert word in text.getvalue()
 
 
 def test_what_a_failed_run_has_spent_stays_spent(plan: Plan) -> None:

@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 
 from music_rllib.config.load import load_sweep
+from music_rllib.errors import BadInputError
 from music_rllib.experiment.plan import make_plan
-from music_rllib.sweep.preflight import HardwareError, check_hardware
+from music_rllib.sweep.preflight import check_hardware
 from music_rllib.tac.kernels import precision
 from music_rllib.tac.kernels.precision import PrecisionError, check_precision
 from music_rllib.tac.networks import Critics, Perceptron
@@ -65,5 +66,5 @@ def test_a_local_sweep_in_bf16_is_refused_before_it_starts(
         "name: fast\ntasks: [FetchReach]\ndefaults: {tac: {precision: bf16}}\n"
         "stages: [{name: train, variant: tac}]\n"
     )
-    with pytest.raises(HardwareError, match="this CPU has none of amx_bf16, avx512_bf16, bf16"):
+    with pytest.raises(BadInputError, match="this CPU has none of amx_bf16, avx512_bf16, bf16"):
         check_hardware(make_plan(load_sweep(file)))
