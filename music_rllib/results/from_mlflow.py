@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from mlflow.entities import Metric, Run
     from sqlalchemy import Connection
 
-__all__ = ["attach", "download_policy", "read_mlflow"]
 
 RUNS_PER_PAGE = 1000
 REQUESTS_AT_ONCE = 8

@@ -15,8 +15,6 @@ from music_rllib.results.comparison import Scope, scopes_of
 from music_rllib.results.statistics import Array, Estimate
 from music_rllib.store.run_record import RunResult
 
-__all__ = ["Condition", "conditions", "entropies", "scopes"]
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Condition:

@@ -19,8 +19,6 @@ from music_rllib import names
 from music_rllib.limits import MOST_JSON_BYTES, read_regular
 from music_rllib.results.data import RunRecord
 
-__all__ = ["FoundRuns", "read_tables"]
-
 
 class FoundRuns(NamedTuple):
     """A sweep's own run and those of its nodes."""

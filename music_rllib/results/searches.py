@@ -7,8 +7,6 @@ from typing import Any
 
 from pydantic import BaseModel, JsonValue, TypeAdapter
 
-__all__ = ["checked_searches"]
-
 
 class _Trial(BaseModel):
     number: int

@@ -32,8 +32,6 @@ from music_rllib.results.claims.plan import as_document, checked_plans
 from music_rllib.results.data import Column, ReportError, RunRecord, Sweep
 from music_rllib.results.searches import checked_searches
 
-__all__ = ["Format", "is_archive", "read_archive", "write_archive"]
-
 Format = Literal["csv", "parquet"]
 VERSION = 1
 _HEADER, _SEARCHES, _PLANS = "sweep.json", "search.json", "analysis_plan.json"

@@ -12,8 +12,6 @@ from music_rllib.experiment.plan import Plan
 from music_rllib.results.claims.plan import PlanVersion
 from music_rllib.results.data import Column, History, Sweep, joined
 
-__all__ = ["merged", "of_plan"]
-
 FINISHED = "FINISHED"
 _Place = tuple[Sweep, int]
 """A run: the export that has it, and its position there."""

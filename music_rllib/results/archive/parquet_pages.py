@@ -19,8 +19,6 @@ from music_rllib.limits import (
     MOST_UNPACKED_PER_BYTE,
 )
 
-__all__ = ["check_pages"]
-
 _ENCODINGS = {0: "PLAIN", 2: "PLAIN_DICTIONARY", 3: "RLE", 8: "RLE_DICTIONARY"}
 """Those that Arrow writes unless asked. Others hold long texts in next to nothing."""
 _UNPACKED, _PACKED = 2, 3

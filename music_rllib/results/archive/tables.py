@@ -19,8 +19,6 @@ from music_rllib.limits import (
 )
 from music_rllib.results.archive.parquet_pages import check_pages
 
-__all__ = ["read_table", "write_table"]
-
 _FREE_ROWS = 100_000
 """Rows that a file of any size may have."""
 _FIRST_BYTES = 1 << 20

@@ -14,8 +14,6 @@ from music_rllib.results.comparison import ALL_TASKS, interval_text, number, p_t
 from music_rllib.results.conditions import FRESH, SEEDS
 from music_rllib.results.data import Sweep
 
-__all__ = ["answer", "in_words", "planned_in_words"]
-
 MOST_CLAIMS = 4
 """In sentences of their own; the others are in the table."""
 

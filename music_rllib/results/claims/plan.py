@@ -21,9 +21,6 @@ from music_rllib.config.schema import Stage, SweepConfig
 from music_rllib.config.tac_settings import in_words
 from music_rllib.store.files import content_key
 
-__all__ = ["AnalysisPlan", "PlanVersion", "analysis_plan", "as_document", "as_markdown"]
-__all__ += ["checked_plans", "with_plan"]
-
 MARGIN_OF_A_RATE = 0.05
 """Where nobody states another."""
 _PRIMARY = {

@@ -11,8 +11,6 @@ from music_rllib.results.claims.study import Claim, Mean
 from music_rllib.results.comparison import number
 from music_rllib.results.statistics import MAX_SEEDS, SIGNIFICANCE
 
-__all__ = ["seeds_needed"]
-
 FEWEST_SEEDS = 3
 """From two, the spread may be ten times too small."""
 

@@ -21,8 +21,6 @@ from music_rllib.results.claims.plan import (
 )
 from music_rllib.store.object_folder import StorageError
 
-__all__ = ["PLANS_TO_READ", "plans_in", "record_plan"]
-
 PLANS, PLANS_TO_READ = "analysis_plan.json", "analysis_plan.md"
 
 

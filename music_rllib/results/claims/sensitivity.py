@@ -11,8 +11,6 @@ from music_rllib.results.claims.study import Mean
 from music_rllib.results.conditions import Values
 from music_rllib.results.statistics import Array, Estimate
 
-__all__ = ["AlphaLine", "alpha_sensitivity"]
-
 ALPHA = "α"
 
 

@@ -25,8 +25,6 @@ from music_rllib.results.conditions import SEEDS, Condition, Stage, find_stages
 from music_rllib.results.data import Sweep
 from music_rllib.results.statistics import Array, Estimate
 
-__all__ = ["Claim", "Mean", "Study", "study_of"]
-
 MARGIN = 0.05
 """Of a success rate, where nobody says another."""
 MOST_CONDITIONS = 6

@@ -6,8 +6,6 @@ from typing import Any
 
 from music_rllib.results.claims.study import Claim, Mean, Study, label_of
 
-__all__ = ["claim_rows", "mean_rows", "study_data"]
-
 
 def mean_rows(study: Study) -> list[dict[str, Any]]:
     """The primary metric of each condition on each task, and each of its seeds."""

@@ -15,8 +15,6 @@ from music_rllib.results.claims.record import plans_in
 from music_rllib.results.data import Points, RunRecord, Sweep, columns
 from music_rllib.store.run_record import Report
 
-__all__ = ["read_storage", "results_of"]
-
 _STATUS = {"finished": "FINISHED", "stopped": "KILLED", "failed": "FAILED"}
 """A sweep's, as MLflow calls them."""
 

@@ -18,7 +18,6 @@ from music_rllib.results.data import Column, Sweep, joined
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-__all__ = ["Frames", "frames_of", "load_sweep"]
 
 _SETTINGS = {
     "q": names.SETTING_ENTROPIC_INDEX,
