@@ -1,4 +1,4 @@
-"""How many seeds would decide what is not decided yet, from the spread of the primary metric."""
+"""Number of seeds that would decide what is undecided, from the spread of the primary metric."""
 
 from __future__ import annotations
 
@@ -12,42 +12,42 @@ from music_rllib.results.comparison import number
 from music_rllib.results.statistics import MAX_SEEDS, SIGNIFICANCE
 
 FEWEST_SEEDS = 3
-"""From two, the spread may be ten times too small."""
+"""Least number of seeds whose spread counts; that of two may be ten times too small."""
 
 
 def seeds_needed(claims: Sequence[Claim], means: Sequence[Mean], family: int) -> str | None:
-    """In a sentence; None without a margin or where no spread is known.
+    """A sentence about the seeds; None without a margin or where no spread is known.
 
-    Nothing is said from what is within the margin of a ceiling or floor, where seeds differ less
-    than elsewhere.
+    Conditions within the margin of a ceiling or floor are left out: their seeds differ less than
+    those of others.
 
     Args:
-        claims: whose spread counts.
-        means: of the conditions.
-        family: comparisons that are tested together; the first of them has 5 % / family by Holm's
-            method.
+        claims: claims whose spread counts.
+        means: primary metric of the conditions.
+        family: number of comparisons that are tested together; by Holm's method the first of them
+            has a level of 5 % / family.
     """
-    stated = [one for one in claims if one.margin is not None]
-    if not stated:
+    margin = max((claim.margin for claim in claims if claim.margin is not None), default=None)
+    if margin is None:
         return None
-    margin = max(one.margin for one in stated if one.margin is not None)
-    if means and all(_at_a_bound(one, margin) for one in means):
+    if means and all(_at_a_bound(mean, margin) for mean in means):
         return (
             f"All are within {margin:g} of the ceiling or the floor, where seeds differ less than "
             "elsewhere: their spread does not tell how many would be needed."
         )
-    bounded = {(one.condition.label, one.task) for one in means if _at_a_bound(one, margin)}
+    bounded = {(mean.condition.label, mean.task) for mean in means if _at_a_bound(mean, margin)}
     clear = [
-        one
-        for one in stated
-        if np.isfinite(one.contrast.spread)
-        and min(one.contrast.seeds) >= FEWEST_SEEDS
-        and not {(one.first, one.task), (one.second, one.task)} & bounded
+        claim.contrast
+        for claim in claims
+        if claim.margin is not None
+        and np.isfinite(claim.contrast.spread)
+        and min(claim.contrast.seeds) >= FEWEST_SEEDS
+        and not {(claim.first, claim.task), (claim.second, claim.task)} & bounded
     ]
     if not clear:
         return None
-    paired = all(one.contrast.paired for one in clear)
-    spread = float(np.sqrt(np.mean([float(one.contrast.spread) ** 2 for one in clear])))
+    paired = all(contrast.paired for contrast in clear)
+    spread = float(np.sqrt(np.mean([float(contrast.spread) ** 2 for contrast in clear])))
     level = SIGNIFICANCE / family
     shown = seeds_for_difference(margin, spread, paired=paired, level=level)
     alike = seeds_for_equivalence(margin, spread, paired=paired, level=level)

@@ -12,7 +12,6 @@ from hypothesis.extra import numpy as st_numpy
 from scipy import stats
 
 from music_rllib.results.claims import contrasts as c
-
 from music_rllib.results.claims.contrasts import Verdict
 from music_rllib.results.claims.scores import area_under_curve
 from music_rllib.results.statistics import Array, Estimate
