@@ -22,7 +22,8 @@ class ReportError(BadInputError):
     """There is nothing to report on; names the place and what to do."""
 
 
-class Column(NamedTuple):
+@dataclass(frozen=True)
+class Column:
     """N values of one metric, sorted by run and step, at most one for each run and step."""
 
     run: Ints
@@ -44,7 +45,8 @@ class Column(NamedTuple):
         return self.select(slice(begin, end))
 
 
-_NO_VALUES = Column(*(np.empty(0, kind) for kind in (np.int64, np.int64, np.float64, np.int64)))
+_NONE = np.empty(0, np.int64)
+_NO_VALUES = Column(run=_NONE, step=_NONE, value=np.empty(0), time=_NONE)
 
 History = Mapping[str, Column]
 """Metric name to column."""

@@ -111,12 +111,12 @@ def contrast(
 
     half = stats.t.ppf(1 - SIGNIFICANCE / 2, freedom) * np.where(tied, np.nan, error)
     lower, upper = value - half, value + half
+    if apart is not None:
+        lower, upper = np.where(tied, apart.lower, lower), np.where(tied, apart.upper, upper)
     p_equivalent = None
     if margin is not None:
         p_equivalent = np.maximum(p_greater(margin + value), p_greater(margin - value))
-    if apart is not None:
-        lower, upper = np.where(tied, apart.lower, lower), np.where(tied, apart.upper, upper)
-        if margin is not None:
+        if apart is not None:
             beyond = (apart.lower <= -margin) | (apart.upper >= margin)
             p_equivalent = np.where(tied & beyond, 1.0, p_equivalent)
     return Contrast(
