@@ -7,7 +7,7 @@ threshold take every run as far as it went: one that failed or is still running 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -123,17 +123,13 @@ def _analyse(sweep: Sweep, stage: Stage) -> StageAnalysis:
         if metric == names.EVAL_SUCCESS
         for threshold in THRESHOLDS
     ]
-    waits = [
-        wait
-        for task, threshold in cells
-        for condition in stage.conditions
-        if (wait := _wait(sweep, condition, task, threshold)) is not None
-    ]
     groups = {condition.label: condition.runs for condition in stage.compared}
     return StageAnalysis(
         stage=stage,
         scopes=scopes,
-        waits=tuple(waits),
+        waits=tuple(
+            wait for task, threshold in cells for wait in _waits(sweep, stage, task, threshold)
+        ),
         races=tuple(
             race for task, threshold in cells for race in races(sweep, task, groups, threshold)
         ),
@@ -179,20 +175,20 @@ def _final_scores(sweep: Sweep, condition: Condition, metrics: Mapping[str, str]
     return np.array(list(rows.values())).reshape(len(rows), len(tasks))
 
 
-def _wait(sweep: Sweep, condition: Condition, task: str, threshold: float) -> Wait | None:
-    waits = waits_of(sweep, task, condition.runs, threshold)
-    if waits is None:
-        return None
-    lower, upper = median_wait_interval(waits)
-    return Wait(
-        condition=condition,
-        task=task,
-        threshold=threshold,
-        waits=waits,
-        median=median_wait(waits),
-        lower=lower,
-        upper=upper,
-    )
+def _waits(sweep: Sweep, stage: Stage, task: str, threshold: float) -> Iterator[Wait]:
+    for condition in stage.conditions:
+        waits = waits_of(sweep, task, condition.runs, threshold)
+        if waits is not None:
+            lower, upper = median_wait_interval(waits)
+            yield Wait(
+                condition=condition,
+                task=task,
+                threshold=threshold,
+                waits=waits,
+                median=median_wait(waits),
+                lower=lower,
+                upper=upper,
+            )
 
 
 def curve(sweep: Sweep, condition: Condition, task: str, metric: str) -> Curve | None:

@@ -67,12 +67,16 @@ class Stage:
     runs: tuple[int, ...]
 
     @property
+    def is_search(self) -> bool:
+        return any(name == SEEDS for one in self.conditions for name, _ in one.others)
+
+    @property
     def compared(self) -> tuple[Condition, ...]:
         """Conditions that may be compared: of a search only those on fresh seeds.
 
         The best of a search's trials is best by selection, too, on the seeds that chose it.
         """
-        if not any(name == SEEDS for one in self.conditions for name, _ in one.others):
+        if not self.is_search:
             return self.conditions
         return tuple(one for one in self.conditions if (SEEDS, FRESH) in one.others)
 

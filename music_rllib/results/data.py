@@ -105,12 +105,12 @@ class RunRecord:
     name: str
     status: str
     """Status in MLflow's words: RUNNING, FINISHED, FAILED, KILLED, SCHEDULED."""
-    started: int | None
+    started: int | None = None
     """Start in ms since the epoch."""
-    ended: int | None
+    ended: int | None = None
     """End in ms since the epoch."""
-    params: Mapping[str, str] = field(repr=False)
-    tags: Mapping[str, str] = field(repr=False)
+    params: Mapping[str, str] = field(default_factory=dict, repr=False)
+    tags: Mapping[str, str] = field(default_factory=dict, repr=False)
 
     @property
     def is_finished(self) -> bool:

@@ -5,17 +5,25 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
+import numpy as np
+
 from music_rllib import names
-from music_rllib.results.claims.contrasts import Verdict
+from music_rllib.results.claims.contrasts import (
+    Verdict,
+    seeds_for_difference,
+    seeds_for_equivalence,
+)
 from music_rllib.results.claims.plan import AnalysisPlan, is_controlled
-from music_rllib.results.claims.power import seeds_needed
-from music_rllib.results.claims.study import Claim, Study, label_of
+from music_rllib.results.claims.study import Claim, Mean, Study, label_of
 from music_rllib.results.comparison import ALL_TASKS, interval_text, number, p_text
-from music_rllib.results.conditions import FRESH, SEEDS, Stage
+from music_rllib.results.conditions import Stage
 from music_rllib.results.data import Sweep
+from music_rllib.results.statistics import MAX_SEEDS, SIGNIFICANCE
 
 MOST_CLAIMS = 4
 """Number of claims with a sentence of their own; the others are in the table."""
+FEWEST_SEEDS = 3
+"""Least number of seeds whose spread counts; that of two may be ten times too small."""
 
 
 def answer(sweep: Sweep, study: Study) -> list[str]:
@@ -116,13 +124,9 @@ def _seeds(study: Study, shown: Sequence[Claim]) -> str:
     elif shown:
         paired = [one.contrast.paired for one in shown]
         text += ", compared in pairs" if all(paired) else ", not all of them shared"
-    if study.stage is not None and _has_fresh_seeds(study.stage):
+    if study.stage is not None and study.stage.is_search:
         text += ", fresh ones that no setting was chosen by"
     return f"{text}; {finished} of {runs} runs are finished."
-
-
-def _has_fresh_seeds(stage: Stage) -> bool:
-    return any((SEEDS, FRESH) in condition.others for condition in stage.compared)
 
 
 def _control(sweep: Sweep, study: Study, stage: Stage) -> str:
@@ -132,7 +136,7 @@ def _control(sweep: Sweep, study: Study, stage: Stage) -> str:
         return version.plan.control
     alphas = {sweep.runs[one.runs[0]].tags.get(names.TAG_ALPHA, "") for one in stage.compared}
     words = sorted(alphas)
-    if _has_fresh_seeds(stage):
+    if stage.is_search:
         return f"settings were searched on other seeds; α is {', '.join(words)}"
     if len(words) > 1:
         return f"α varies beside q ({', '.join(words)})"
@@ -140,3 +144,56 @@ def _control(sweep: Sweep, study: Study, stage: Stage) -> str:
     if same_q or is_controlled(words[0]):
         return f"α {words[0]}"
     return f"none, one α ({words[0]}) for all: policies of different q differ in entropy"
+
+
+def seeds_needed(claims: Sequence[Claim], means: Sequence[Mean], family: int) -> str | None:
+    """A sentence about the seeds; None without a margin or where no spread is known.
+
+    Conditions within the margin of a ceiling or floor are left out: their seeds differ less than
+    those of others.
+
+    Args:
+        claims: claims whose spread counts.
+        means: primary metric of the conditions.
+        family: number of comparisons that are tested together; by Holm's method the first of them
+            has a level of 5 % / family.
+    """
+    margin = max((claim.margin for claim in claims if claim.margin is not None), default=None)
+    if margin is None:
+        return None
+    if means and all(_at_a_bound(mean, margin) for mean in means):
+        return (
+            f"All are within {margin:g} of the ceiling or the floor, where seeds differ less than "
+            "elsewhere: their spread does not tell how many would be needed."
+        )
+    bounded = {(mean.condition.label, mean.task) for mean in means if _at_a_bound(mean, margin)}
+    clear = [
+        claim.contrast
+        for claim in claims
+        if claim.margin is not None
+        and np.isfinite(claim.contrast.spread)
+        and min(claim.contrast.seeds) >= FEWEST_SEEDS
+        and not {(claim.first, claim.task), (claim.second, claim.task)} & bounded
+    ]
+    if not clear:
+        return None
+    paired = all(contrast.paired for contrast in clear)
+    spread = float(np.sqrt(np.mean([float(contrast.spread) ** 2 for contrast in clear])))
+    level = SIGNIFICANCE / family
+    shown = _seeds_text(seeds_for_difference(margin, spread, paired=paired, level=level))
+    alike = _seeds_text(seeds_for_equivalence(margin, spread, paired=paired, level=level))
+    pairs = "paired seeds" if paired else "single seeds"
+    return (
+        f"Differences of {pairs} spread by {number(spread)} (standard deviation): a difference of "
+        f"{margin:g} shows with 80 % chance from {shown} on, equivalence within it from {alike} on "
+        "where there is none."
+    )
+
+
+def _at_a_bound(mean: Mean, margin: float) -> bool:
+    value = float(mean.estimate.value)
+    return mean.measure.is_rate and not margin <= value <= 1 - margin
+
+
+def _seeds_text(needed: int | None) -> str:
+    return f"more than {MAX_SEEDS} seeds" if needed is None else f"{needed} seeds"
