@@ -138,7 +138,7 @@ class RunRecord:
 
     @property
     def entropic_index(self) -> str:
-        """Q in words: `1.5`, or `1 to 2` for a schedule."""
+        """Entropic index in words: `1.5`, or `1 to 2` for a schedule."""
         return self.tags.get(names.TAG_ENTROPIC_INDEX, "")
 
     @property

@@ -194,9 +194,10 @@ def seeds_for_difference(
     Returns:
         The number; None where `MAX_SEEDS` are not enough.
     """
+    groups = 1 if paired else 2
     return fewest_seeds(
         lambda seeds: power_of_t_test(
-            _freedom(seeds, paired), difference / spread * np.sqrt(seeds), level
+            groups * (seeds - 1), difference / spread * np.sqrt(seeds), level
         )
     )
 
@@ -210,7 +211,7 @@ def seeds_for_equivalence(
     """
 
     def power(seeds: Array) -> Array:
-        freedom = _freedom(seeds, paired)
+        freedom = (1 if paired else 2) * (seeds - 1)
         critical = stats.t.ppf(1 - level, freedom)
         missed = stats.nct.cdf(critical, freedom, margin / spread * np.sqrt(seeds))
         # Both tests have to reject; the chance that one of them does not is twice that of either.
@@ -218,8 +219,3 @@ def seeds_for_equivalence(
         return np.asarray(1 - 2 * np.nan_to_num(missed, nan=0.0))
 
     return fewest_seeds(power)
-
-
-def _freedom(seeds: Array, paired: bool) -> Array:
-    """Degrees of freedom of a test of so many seeds of each condition."""
-    return (seeds - 1) * (1 if paired else 2)

@@ -88,7 +88,7 @@ def test_a_plans_runs_are_found_in_other_sweeps_exports(tmp_path: Path) -> None:
 def test_runs_of_an_earlier_version_are_found_where_there_are_none_of_a_later_one(
     tmp_path: Path,
 ) -> None:
-    """Of a run and of what starts from it; each says which version it is of."""
+    """Runs and runs that start from them have the version of the algorithm as a tag."""
     file = tmp_path / "sweep.yaml"
     file.write_text(
         "{name: mine, tasks: [FetchPush], seeds: [0, 1], stages: [{name: u, variant: music-u},"
