@@ -1,1 +1,1 @@
-"""What a sweep's runs say, in numbers and words: the one place, whoever asks. Knows no Ray."""
+"""Statistics and claims of a sweep's runs, in numbers and in sentences; loads no Ray."""

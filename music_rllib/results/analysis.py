@@ -1,14 +1,13 @@
-"""What a sweep's runs say, in numbers: every stage's, on each of its tasks.
+"""Statistics of every stage of a sweep, on each of its tasks.
 
-Only finished runs have a final score, the last evaluation's, of their task's primary metric. Curves
-and steps to a threshold take every run as far as it went: one that failed or is still running is
-censored there.
+A final score is the primary metric of a finished run's last evaluation. Curves and steps to a
+threshold take every run as far as it went: one that failed or is still running is censored there.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -29,12 +28,10 @@ from music_rllib.results.time_to_threshold import (
     waits_of,
 )
 
-__all__ = ["Curve", "Entropies", "StageAnalysis", "Wait", "analyse", "analyse_stages", "curve"]
-
 THRESHOLDS = (0.5, 0.85)
-"""Success rates whose first evaluation is looked for; the paper's Figure 4 has 85 %."""
+"""Success rates that steps are counted to; the paper's Figure 4 has 85 %."""
 CURVE_POINTS = 101
-"""More cannot be told apart in a figure."""
+"""Largest number of points of a curve; more cannot be told apart in a figure."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,11 +42,10 @@ class Wait:
     task: str
     threshold: float
     waits: Waits
-    """Of each run."""
     median: float
-    """Infinite where fewer than half of the runs got there."""
+    """Median over the runs; infinite where fewer than half of them reached the rate."""
     lower: float
-    """NaN where there are too few runs for an interval."""
+    """Lower end of its interval; NaN, as `upper`, where there are too few runs."""
     upper: float
 
     @property
@@ -63,21 +59,21 @@ class Wait:
 
 @dataclass(frozen=True, kw_only=True)
 class Curve:
-    """A metric of a condition on a task against environment steps."""
+    """Learning curve of a condition on a task."""
 
     condition: Condition
     steps: Array
-    """`[points]`."""
+    """`[points]` environment steps."""
     values: Array
-    """`[R, points]`, NaN where a run had not begun or had ended."""
+    """`[R, points]` of a metric, NaN before a run's first and after its last evaluation."""
     estimate: Estimate
-    """`[points]`."""
+    """`[points]`, mean over the runs."""
     runs: Ints
-    """`[points]`: how many runs there are that far."""
+    """`[points]`, number of runs that have a value."""
 
 
 class Entropies(NamedTuple):
-    """How random policies are at the end, means over finished runs; None where there is no entropy.
+    """Entropies of a condition's policies at the end, means over finished runs; None without one.
 
     S_q has the run's own q and form, so that its values at different q are not to be compared.
     """
@@ -88,26 +84,26 @@ class Entropies(NamedTuple):
 
     @property
     def numbers(self) -> list[float]:
-        """Mean and ends of both, NaN where there is none."""
-        ends = ((one.value, one.lower, one.upper) if one else (np.nan,) * 3 for one in self)
-        return [float(end) for three in ends for end in three]
+        """Mean and both ends of the interval of each entropy; NaN where there is none."""
+        triples = ((one.value, one.lower, one.upper) if one else (np.nan,) * 3 for one in self)
+        return [float(number) for triple in triples for number in triple]
 
 
 @dataclass(frozen=True, kw_only=True)
 class StageAnalysis:
-    """All numbers of one stage."""
+    """Statistics of one stage."""
 
     stage: Stage
     scopes: tuple[Scope[Condition], ...]
     waits: tuple[Wait, ...]
     races: tuple[Race, ...]
-    """Of each pair of conditions, to each threshold."""
+    """Comparisons of each pair of conditions, for each threshold."""
     entropies: Mapping[tuple[str, Condition], Entropies]
-    """By scope and condition."""
+    """Entropies by scope and condition."""
 
 
 def analyse(sweep: Sweep) -> list[StageAnalysis]:
-    """The numbers of each stage."""
+    """The statistics of each stage."""
     return [_analyse(sweep, stage) for stage in find_stages(sweep)]
 
 
@@ -116,8 +112,8 @@ def _analyse(sweep: Sweep, stage: Stage) -> StageAnalysis:
     scopes = scopes_of(
         metrics,
         [
-            (one, _final_scores(sweep, one, metrics), sweep.episodes(one.runs))
-            for one in stage.conditions
+            (condition, _final_scores(sweep, condition, metrics), sweep.episodes(condition.runs))
+            for condition in stage.conditions
         ],
         stage.compared,
     )
@@ -127,19 +123,16 @@ def _analyse(sweep: Sweep, stage: Stage) -> StageAnalysis:
         if metric == names.EVAL_SUCCESS
         for threshold in THRESHOLDS
     ]
-    waits = [
-        wait
-        for task, threshold in cells
-        for condition in stage.conditions
-        if (wait := _wait(sweep, condition, task, threshold)) is not None
-    ]
     groups = {condition.label: condition.runs for condition in stage.compared}
-    found = [race for task, threshold in cells for race in races(sweep, task, groups, threshold)]
     return StageAnalysis(
         stage=stage,
         scopes=scopes,
-        waits=tuple(waits),
-        races=tuple(found),
+        waits=tuple(
+            wait for task, threshold in cells for wait in _waits(sweep, stage, task, threshold)
+        ),
+        races=tuple(
+            race for task, threshold in cells for race in races(sweep, task, groups, threshold)
+        ),
         entropies={
             (scope.name, final.condition): _entropies(sweep, final.condition, stage, scope.name)
             for scope in scopes
@@ -151,26 +144,22 @@ def _analyse(sweep: Sweep, stage: Stage) -> StageAnalysis:
 def _entropies(sweep: Sweep, condition: Condition, stage: Stage, scope: str) -> Entropies:
     tasks = stage.tasks if scope == ALL_TASKS else (scope,)
     runs = tuple(run for run in condition.runs if sweep.runs[run].task in tasks)
-    found = []
+    estimates = []
     for metric in (names.SHANNON_ENTROPY, names.ENTROPY):
         scores = _final_scores(sweep, replace(condition, runs=runs), dict.fromkeys(tasks, metric))
-        there = scores[~np.isnan(scores).any(axis=1)]
-        found.append(st.estimate(there) if len(there) else None)
-    return Entropies(*found)
+        complete = scores[~np.isnan(scores).any(axis=1)]
+        estimates.append(st.estimate(complete) if len(complete) else None)
+    return Entropies(*estimates)
 
 
 def analyse_stages(sweep: Sweep, stages: Sequence[Stage]) -> StageAnalysis | None:
-    """Stages that train for the task against each other, over the conditions that all have.
-
-    Returns:
-        None where there is nothing to compare.
-    """
+    """Stages compared with each other (:func:`stage_by_stage`); None where there is nothing to."""
     together = stage_by_stage(sweep, stages)
     return None if together is None else _analyse(sweep, together)
 
 
 def _final_scores(sweep: Sweep, condition: Condition, metrics: Mapping[str, str]) -> Array:
-    """`[seeds, T]` last values of finished runs, NaN where there is none."""
+    """Last values of finished runs, `[seeds, T]`, NaN where there is none."""
     tasks = list(metrics)
     rows: dict[tuple[str, int], Array] = {}
     seen: Counter[tuple[str, str]] = Counter()
@@ -181,35 +170,32 @@ def _final_scores(sweep: Sweep, condition: Condition, metrics: Mapping[str, str]
         seen[record.seed, record.task] += 1
         row = rows.setdefault(key, np.full(len(tasks), np.nan))
         score = sweep.final(run, metrics[record.task])
-        if record.status == "FINISHED" and score is not None:
+        if record.is_finished and score is not None:
             row[tasks.index(record.task)] = score
     return np.array(list(rows.values())).reshape(len(rows), len(tasks))
 
 
-def _wait(sweep: Sweep, condition: Condition, task: str, threshold: float) -> Wait | None:
-    waits = waits_of(sweep, task, condition.runs, threshold)
-    if waits is None:
-        return None
-    lower, upper = median_wait_interval(waits)
-    return Wait(
-        condition=condition,
-        task=task,
-        threshold=threshold,
-        waits=waits,
-        median=median_wait(waits),
-        lower=lower,
-        upper=upper,
-    )
+def _waits(sweep: Sweep, stage: Stage, task: str, threshold: float) -> Iterator[Wait]:
+    for condition in stage.conditions:
+        waits = waits_of(sweep, task, condition.runs, threshold)
+        if waits is not None:
+            lower, upper = median_wait_interval(waits)
+            yield Wait(
+                condition=condition,
+                task=task,
+                threshold=threshold,
+                waits=waits,
+                median=median_wait(waits),
+                lower=lower,
+                upper=upper,
+            )
 
 
 def curve(sweep: Sweep, condition: Condition, task: str, metric: str) -> Curve | None:
-    """Mean over the runs at each step, each run as far as it went.
+    """Learning curve of a condition on a task; None where no run has the metric.
 
-    Runs that were evaluated at other steps are read between their own points by straight lines,
-    never before their first or after their last.
-
-    Returns:
-        None where no run has the metric.
+    Where a run was not evaluated at a step of the others, its value lies on the straight line
+    between its own evaluations; before the first and after the last of them it has none.
     """
     runs = [run for run in condition.runs if sweep.runs[run].task == task]
     series = [pair for run in runs if len((pair := sweep.finite(run, metric))[0])]
@@ -219,7 +205,7 @@ def curve(sweep: Sweep, condition: Condition, task: str, metric: str) -> Curve |
     if len(grid) > CURVE_POINTS:
         grid = grid[np.linspace(0, len(grid) - 1, CURVE_POINTS).round().astype(int)]
     values = np.stack(
-        [np.interp(grid, steps, found, left=np.nan, right=np.nan) for steps, found in series]
+        [np.interp(grid, steps, own, left=np.nan, right=np.nan) for steps, own in series]
     )
     return Curve(
         condition=condition,

@@ -1,7 +1,7 @@
-"""Conditions held against each other, in numbers and in words: the same ones whoever asks.
+"""Comparisons of conditions in numbers and in sentences.
 
 `compare`, the report, its tables and the results page all go through :func:`scopes_of` and
-:func:`verdict`. A winner is named only where the evidence is there.
+:func:`verdict`, so that they say the same. A winner is named only on evidence.
 """
 
 from __future__ import annotations
@@ -18,23 +18,19 @@ from music_rllib import names
 from music_rllib.results import statistics as st
 from music_rllib.results.statistics import SIGNIFICANCE, Array, Estimate
 
-__all__ = ["ALL_TASKS", "GAP", "SHOW_SEEDS_BELOW", "Comparison", "Final", "Scope", "each_seed"]
-__all__ += ["interval_text", "number", "p_text", "scopes_of", "verdict"]
-
 ALL_TASKS = "all tasks"
 GAP = 0.1
-"""In a rate, which a reader would want to be able to see where nobody says another."""
-POWER = 0.8
+"""Default difference in a rate that a reader would want to be able to see."""
 _AVERAGED = {*names.EVAL_RATES, *names.ENTROPIES}
-"""Over tasks: metrics that have the same unit on each."""
+"""Metrics that have the same unit on every task, so that they can be averaged over tasks."""
 SHOW_SEEDS_BELOW = 10
-"""So few are shown one by one."""
-NAMED = 3
-"""Rivals in a sentence, where there are many."""
+"""Number of seeds from which on they are not shown one by one."""
+_MOST_RIVALS = 3
+"""Number of rivals that a sentence names, where there are many."""
 
 
 class Labelled(Protocol):
-    """What is compared."""
+    """A condition with a label."""
 
     @property
     def label(self) -> str: ...
@@ -45,11 +41,11 @@ C = TypeVar("C", bound=Labelled)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Final(Generic[C]):
-    """How a condition ended."""
+    """Final scores of a condition."""
 
     condition: C
     scores: Array = field(repr=False)
-    """`[seeds, T]` of the seeds that have finished on every task of the scope."""
+    """`[seeds, T]`, of the seeds that have finished on every task of the scope."""
     estimate: Estimate
 
     @property
@@ -67,40 +63,41 @@ class Final(Generic[C]):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Comparison(Generic[C]):
-    """Whether one condition's finished runs are better than another's."""
+    """Comparison of the final scores of two conditions."""
 
     first: Final[C]
     second: Final[C]
     estimate: Estimate
     """Probability that a run of `first` ends higher than one of `second`, ties half."""
     p_value: float
-    """Of the exact permutation test, adjusted for the scope's other comparisons (Holm)."""
+    """p-value of the exact permutation test, with Holm's correction over the scope."""
 
     @property
     def gap(self) -> Estimate:
-        """How much higher `first` is in the mean."""
+        """Mean of `first` minus that of `second`."""
         return st.difference(self.first.estimate, self.second.estimate)
 
     @property
     def decided(self) -> bool:
-        """Evidence: relabelling the runs seldom makes such a gap."""
+        """Whether so large a difference seldom comes by chance."""
         return self.p_value < SIGNIFICANCE
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scope(Generic[C]):
-    """Conditions on one task, or on all of them together."""
+    """Conditions on one task, or on all tasks together."""
 
     name: str
+    """The task, or `ALL_TASKS`."""
     metric: str
-    """`names.*`, of which the last value counts."""
+    """Metric whose last value is the score."""
     tasks: int
     finals: tuple[Final[C], ...]
-    """Of the conditions with a seed that has finished on every task in the scope."""
+    """Scores of the conditions with a seed that has finished on every task of the scope."""
     compared: tuple[Final[C], ...]
-    """Those that may be held against each other: of a search the ones on fresh seeds."""
+    """Scores of those that may be compared: of a search, conditions on fresh seeds."""
     comparisons: tuple[Comparison[C], ...]
-    """Each pair of `compared` once, the later one against the earlier."""
+    """Comparison of each pair of `compared`, a later condition against an earlier one."""
 
 
 def scopes_of(
@@ -108,15 +105,15 @@ def scopes_of(
     conditions: Sequence[tuple[C, Array, float]],
     may_be_compared: Collection[C],
 ) -> tuple[Scope[C], ...]:
-    """The numbers on each task, before them those over all tasks where these have a unit in common.
+    """A scope for each task, after one over all tasks where these have a unit in common.
 
     Args:
-        metrics: task to the metric that its T scores are last values of.
+        metrics: task to the metric of its scores, for T tasks.
         conditions: each with its scores `[seeds, T]`, NaN for what has not finished, and its
             evaluation episodes, infinite where they are not known. Seeds that have not finished on
             every task of a scope are left out of it: otherwise a task could weigh more in one
             condition than in another.
-        may_be_compared: which of them.
+        may_be_compared: conditions that are compared with each other.
     """
     columns = [(task, metric, [column]) for column, (task, metric) in enumerate(metrics.items())]
     if len(columns) > 1 and len(set(metrics.values())) == 1 and columns[0][1] in _AVERAGED:
@@ -168,11 +165,11 @@ def _scope(
 
 
 def verdict(scope: Scope[C], gap: float = GAP, *, maximised: bool = True) -> list[str]:
-    """Sentences about one scope: who is ahead, or why nobody is, and what would tell.
+    """Sentences about one scope: the condition that is ahead, or why none is, and seeds needed.
 
     Args:
-        scope: with its comparisons.
-        gap: in a rate, which the reader would want to be able to see.
+        scope: conditions and their comparisons.
+        gap: difference in a rate that the reader would want to be able to see.
         maximised: whether more of the metric is better.
     """
     where = "over all tasks together" if scope.name == ALL_TASKS else f"on {scope.name}"
@@ -185,16 +182,18 @@ def verdict(scope: Scope[C], gap: float = GAP, *, maximised: bool = True) -> lis
         ]
     if len(scope.compared) == 1:
         only = scope.compared[0]
-        return [f"Only one condition has finished {where}, so nothing is compared: {_said(only)}."]
-    lonely = [final for final in scope.compared if final.seeds < 2]
-    if lonely:
-        every = len(lonely) == len(scope.compared)
-        which = "every condition" if every else _names(lonely)
-        have = "have" if len(lonely) > 1 and not every else "has"
+        return [
+            f"Only one condition has finished {where}, so nothing is compared: {_in_words(only)}."
+        ]
+    single = [final for final in scope.compared if final.seeds < 2]
+    if single:
+        every = len(single) == len(scope.compared)
+        which = "every condition" if every else _labels(single)
+        have = "have" if len(single) > 1 and not every else "has"
         return [
             f"No winner {where}: {which} {have} a single seed, so there is no interval and no "
             f"evidence. {_direction(maximised).capitalize()} so far is "
-            f"{_said(_best(scope.compared, maximised)[0])}."
+            f"{_in_words(_best(scope.compared, maximised)[0])}."
         ]
     if len({float(score) for final in scope.compared for score in final.scores.ravel()}) == 1:
         return [
@@ -205,7 +204,7 @@ def verdict(scope: Scope[C], gap: float = GAP, *, maximised: bool = True) -> lis
 
 
 def _best(finals: Sequence[Final[C]], maximised: bool) -> list[Final[C]]:
-    """Those with the best mean, which may be several."""
+    """The conditions with the best mean; several where they tie."""
     sign = 1.0 if maximised else -1.0
     best = max(sign * final.value for final in finals)
     return [final for final in finals if np.isclose(sign * final.value, best, atol=1e-9)]
@@ -213,17 +212,17 @@ def _best(finals: Sequence[Final[C]], maximised: bool) -> list[Final[C]]:
 
 def _ranking(scope: Scope[C], where: str, maximised: bool) -> str:
     best, *level = _best(scope.compared, maximised)
-    own = [
+    pairs = [
         pair
         for pair in scope.comparisons
         if best in (pair.first, pair.second) and not {pair.first, pair.second} & set(level)
     ]
     # A mean may be better although most runs are worse: that is no evidence for it.
-    undecided = [pair for pair in own if not (pair.decided and _agrees(pair, best, maximised))]
+    undecided = [pair for pair in pairs if not (pair.decided and _agrees(pair, best, maximised))]
     if not undecided and not level:
-        worst = max(pair.p_value for pair in own)
+        worst = max(pair.p_value for pair in pairs)
         return (
-            f"{best.condition.label} is ahead {where}: {_said(best)}. So large a gap comes by "
+            f"{best.condition.label} is ahead {where}: {_in_words(best)}. So large a gap comes by "
             f"chance with {p_text(worst)} at most (permutation test, Holm's correction)."
         )
     gaps = []
@@ -232,9 +231,9 @@ def _ranking(scope: Scope[C], where: str, maximised: bool) -> str:
         gap = st.difference(best.estimate, rival.estimate)
         text = f"{rival.condition.label} ({number(gap.value)}, {interval_text(gap)}; "
         gaps.append((abs(float(gap.value)), f"{text}{p_text(pair.p_value)})"))
-    lead = f"{_said(best)} is {_direction(maximised)}"
+    lead = f"{_in_words(best)} is {_direction(maximised)}"
     if level:
-        lead = f"{_names([best, *level])} are level at {number(best.value)}"
+        lead = f"{_labels([best, *level])} are level at {number(best.value)}"
     if not gaps:
         return f"No winner {where}: {lead}."
     most = sorted(final.seeds for final in scope.compared)[-2:]
@@ -243,26 +242,28 @@ def _ranking(scope: Scope[C], where: str, maximised: bool) -> str:
 
 
 def _nearest(gaps: Sequence[tuple[float, str]]) -> list[str]:
-    """All texts of gaps, or of many those of the smallest and how many more there are."""
-    if len(gaps) <= NAMED + 1:
+    """Texts of all gaps, or of many those of the smallest ones and the number of the others."""
+    if len(gaps) <= _MOST_RIVALS + 1:
         return [text for _, text in gaps]
-    nearest = sorted(range(len(gaps)), key=lambda position: gaps[position][0])[:NAMED]
-    return [*(gaps[position][1] for position in sorted(nearest)), f"{len(gaps) - NAMED} others"]
+    smallest = sorted(gaps, key=lambda gap: gap[0])[:_MOST_RIVALS]
+    texts = [text for size, text in gaps if (size, text) in smallest]
+    return [*texts, f"{len(gaps) - _MOST_RIVALS} others"]
 
 
 def _agrees(pair: Comparison[C], best: Final[C], maximised: bool) -> bool:
+    """Whether most runs of `best` are better than those of its rival."""
     higher = pair.estimate.value > 0.5
     return bool(higher == (pair.first is best) if maximised else higher == (pair.second is best))
 
 
 def _least_p(scope: Scope[C], first: int, second: int) -> float:
-    """The least that an adjusted p-value of so many seeds against so many can be."""
+    """The least adjusted p-value that these numbers of seeds can have."""
     relabellings: int = comb(first + second, first) ** scope.tasks
     return len(scope.comparisons) * 2 / relabellings
 
 
 def _how_many_seeds(scope: Scope[C], gap: float) -> list[str]:
-    """Where something is undecided: the seeds that would likely decide it."""
+    """A sentence about the seeds that would likely decide what is undecided."""
     if all(pair.decided for pair in scope.comparisons):
         return []
     is_rate = scope.metric in names.EVAL_RATES
@@ -283,13 +284,13 @@ def _how_many_seeds(scope: Scope[C], gap: float) -> list[str]:
     differ = f"Seeds of the same condition differ by {number(spread)} (standard deviation)"
     seeds = min(final.seeds for final in scope.compared)
     if not is_rate:
-        least = st.least_difference(seeds, spread, tasks=scope.tasks, power=POWER)
+        least = st.least_difference(seeds, spread, tasks=scope.tasks)
         return [
             f"{differ}. With {seeds} seeds per condition a difference of {number(least)} is seen "
-            f"with {POWER * 100:.0f} % chance (t test, one comparison)."
+            f"with {st.POWER * 100:.0f} % chance (t test, one comparison)."
         ]
-    needed = st.seeds_to_decide(gap, spread, tasks=scope.tasks, power=POWER)
-    # Below these no permutation test could decide anything.
+    needed = st.seeds_to_decide(gap, spread, tasks=scope.tasks)
+    # With fewer seeds no permutation test could decide anything.
     fewest = next(n for n in count(2) if _least_p(scope, n, n) < SIGNIFICANCE)
     if needed is None:
         outcome = "more than 1000 seeds per condition would be needed"
@@ -297,20 +298,20 @@ def _how_many_seeds(scope: Scope[C], gap: float) -> list[str]:
         outcome = f"the {seeds} seeds per condition that there are would mostly show it"
     else:
         outcome = (
-            f"about {needed} seeds per condition would show it with {POWER * 100:.0f} % chance, "
-            f"{needed - seeds} more than now"
+            f"about {needed} seeds per condition would show it with {st.POWER * 100:.0f} % "
+            f"chance, {needed - seeds} more than now"
         )
     return [f"{differ}. For a difference of {gap:.2f}, {outcome} (t test, one comparison)."]
 
 
 def number(value: float | Array) -> str:
-    """Returns of hundreds need no fractions."""
+    """A value in short: two decimals, or none from 100 on."""
     value = float(value)
     return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.2f}"
 
 
 def with_interval(value: float | None, ends: Sequence[float | None] | None) -> str:
-    """`0.45 [0.3, 0.6]`; without the ends where a single run has none."""
+    """`0.45 [0.3, 0.6]`, or `0.45` without an interval."""
     if value is None:
         return "-"
     low, high = ends or (None, None)
@@ -320,7 +321,7 @@ def with_interval(value: float | None, ends: Sequence[float | None] | None) -> s
 
 
 def interval_text(estimate: Estimate) -> str:
-    """`0.62 to 0.81`, or that there is none."""
+    """`0.62 to 0.81`, or `no interval`."""
     if not estimate.has_interval:
         return "no interval"
     return f"{number(estimate.lower)} to {number(estimate.upper)}"
@@ -332,7 +333,7 @@ def p_text(p_value: float) -> str:
 
 
 def each_seed(final: Final[C]) -> list[float]:
-    """Every seed's score, mean over the tasks, the lowest first; empty where there are many."""
+    """Rising scores of the seeds, means over the tasks; empty where there are many seeds."""
     return sorted(final.scores.mean(axis=1).tolist()) if final.seeds < SHOW_SEEDS_BELOW else []
 
 
@@ -340,7 +341,7 @@ def _direction(maximised: bool) -> str:
     return "highest" if maximised else "lowest"
 
 
-def _said(final: Final[C]) -> str:
+def _in_words(final: Final[C]) -> str:
     seeds = "1 seed" if final.seeds == 1 else f"{final.seeds} seeds"
     return (
         f"{final.condition.label} with {number(final.value)} "
@@ -348,7 +349,7 @@ def _said(final: Final[C]) -> str:
     )
 
 
-def _names(finals: Iterable[Final[C]]) -> str:
+def _labels(finals: Iterable[Final[C]]) -> str:
     return _and([final.condition.label for final in finals])
 
 

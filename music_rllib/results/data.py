@@ -1,8 +1,8 @@
-"""One sweep as a report sees it: its runs, and every metric as tidy columns."""
+"""The runs of one sweep with the values of their metrics, from whatever source they were read."""
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -15,17 +15,6 @@ from music_rllib.errors import BadInputError
 from music_rllib.results.claims.plan import PlanVersion
 from music_rllib.results.statistics import Array
 
-__all__ = [
-    "Column",
-    "History",
-    "Points",
-    "ReportError",
-    "RunRecord",
-    "Sweep",
-    "columns",
-    "joined",
-]
-
 Ints = NDArray[np.int64]
 
 
@@ -33,9 +22,9 @@ class ReportError(BadInputError):
     """There is nothing to report on; names the place and what to do."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Column:
-    """One metric of all runs; N values, sorted by run and step, each (run, step) once."""
+    """N values of one metric, sorted by run and step, at most one for each run and step."""
 
     run: Ints
     """`[N]` positions in `Sweep.runs`."""
@@ -46,6 +35,18 @@ class Column:
     time: Ints
     """`[N]` ms since the epoch."""
 
+    def select(self, which: slice | NDArray[Any]) -> Column:
+        """The values at these positions, or under this mask."""
+        return Column(self.run[which], self.step[which], self.value[which], self.time[which])
+
+    def of_run(self, run: int) -> Column:
+        """The values of one run."""
+        begin, end = np.searchsorted(self.run, [run, run + 1])
+        return self.select(slice(begin, end))
+
+
+_NONE = np.empty(0, np.int64)
+_NO_VALUES = Column(run=_NONE, step=_NONE, value=np.empty(0), time=_NONE)
 
 History = Mapping[str, Column]
 """Metric name to column."""
@@ -61,35 +62,32 @@ class Points(NamedTuple):
 
 
 def columns(runs: Iterable[Points]) -> dict[str, Column]:
-    """Columns from one `Points` per run, in the runs' order.
+    """Columns from one `Points` per run, in the order of the runs.
 
     Of several values of a metric at one step of a run, the one logged last counts.
     """
-    parts: dict[str, list[Column]] = {}
+    parts: defaultdict[str, list[Column]] = defaultdict(list)
     for position, points in enumerate(runs):
-        steps, times = (np.asarray(part, dtype=np.int64) for part in points[1:3])
-        values = np.asarray(points.values, dtype=np.float64)
+        of_run = Column(
+            run=np.full(len(points.metrics), position, dtype=np.int64),
+            step=np.asarray(points.steps, dtype=np.int64),
+            value=np.asarray(points.values, dtype=np.float64),
+            time=np.asarray(points.times, dtype=np.int64),
+        )
         begin = 0
         for metric, count in Counter(points.metrics).items():
-            part = np.arange(begin, begin + count)
+            part = of_run.select(slice(begin, begin + count))
             begin += count
-            last = np.append(np.diff(steps[part]) != 0, True)
-            if not last.all():
-                part = part[np.lexsort((times[part], steps[part]))]
-            chosen = part[last]
-            parts.setdefault(metric, []).append(
-                Column(
-                    run=np.full(len(chosen), position, dtype=np.int64),
-                    step=steps[chosen],
-                    value=values[chosen],
-                    time=times[chosen],
-                )
-            )
-    return {metric: joined(found) for metric, found in parts.items()}
+            is_last = np.append(np.diff(part.step) != 0, True)
+            if not is_last.all():
+                part = part.select(np.lexsort((part.time, part.step)))
+            parts[metric].append(part.select(is_last))
+    return {metric: joined(of_metric) for metric, of_metric in parts.items()}
 
 
 def joined(parts: Sequence[Column]) -> Column:
-    """The values of one part after those of the other; at least one part."""
+    """The values of all parts, one part after the other."""
+    parts = parts or [_NO_VALUES]
     return Column(
         run=np.concatenate([part.run for part in parts]),
         step=np.concatenate([part.step for part in parts]),
@@ -103,15 +101,20 @@ class RunRecord:
     """One run of the sweep."""
 
     run_id: str
-    """MLflow's."""
+    """Id of the run in MLflow."""
     name: str
     status: str
-    """MLflow's: RUNNING, FINISHED, FAILED, KILLED, SCHEDULED."""
-    started: int | None
-    """ms since the epoch, as is `ended`."""
-    ended: int | None
-    params: Mapping[str, str] = field(repr=False)
-    tags: Mapping[str, str] = field(repr=False)
+    """Status in MLflow's words: RUNNING, FINISHED, FAILED, KILLED, SCHEDULED."""
+    started: int | None = None
+    """Start in ms since the epoch."""
+    ended: int | None = None
+    """End in ms since the epoch."""
+    params: Mapping[str, str] = field(default_factory=dict, repr=False)
+    tags: Mapping[str, str] = field(default_factory=dict, repr=False)
+
+    @property
+    def is_finished(self) -> bool:
+        return self.status == "FINISHED"
 
     @property
     def node_key(self) -> str:
@@ -135,7 +138,7 @@ class RunRecord:
 
     @property
     def entropic_index(self) -> str:
-        """In words: `1.5`, or `1 to 2` for a schedule."""
+        """Entropic index in words: `1.5`, or `1 to 2` for a schedule."""
         return self.tags.get(names.TAG_ENTROPIC_INDEX, "")
 
     @property
@@ -144,13 +147,13 @@ class RunRecord:
 
     @property
     def budget(self) -> int | None:
-        """Environment steps that it is to train for."""
+        """Environment steps that the run is to train for."""
         text = self.params.get("env_steps", "")
         return int(text) if text.isdecimal() and len(text) < 19 else None
 
     @property
     def seconds(self) -> float | None:
-        """From its start to its end, pauses included."""
+        """Time from start to end, pauses included."""
         if self.started is None or self.ended is None:
             return None
         return (self.ended - self.started) / 1000
@@ -161,49 +164,49 @@ class Sweep:
     """Everything that a report needs of one sweep."""
 
     name: str
-    status: str
-    """Of the sweep's own run in MLflow."""
-    run_id: str
-    experiment_id: str
-    started: int | None
-    source: str
-    """Where MLflow keeps it: a URI without a password."""
-    tags: Mapping[str, str] = field(repr=False)
-    config: str | None = field(repr=False)
+    status: str = ""
+    """Status of the sweep's own run in MLflow."""
+    run_id: str = ""
+    experiment_id: str = ""
+    started: int | None = None
+    source: str = ""
+    """Place that the sweep was read from, such as MLflow's URI without a password."""
+    tags: Mapping[str, str] = field(default_factory=dict, repr=False)
+    config: str | None = field(default=None, repr=False)
     """The configuration as YAML; None where it was not kept."""
     runs: Sequence[RunRecord] = field(repr=False)
     history: History = field(repr=False)
     searches: Sequence[Mapping[str, Any]] = field(default=(), repr=False)
-    """What its searches found: trials, importance, ranking; as their driver keeps it."""
+    """Content of `search.json`: trials, importance and ranking of each search."""
     plans: Sequence[PlanVersion] = field(default=(), repr=False)
-    """Versions of its analysis plan, in the order of their times."""
+    """Versions of the analysis plan, in the order of their times."""
+
+    def column(self, run: int, metric: str) -> Column:
+        """The values of a metric of `runs[run]`; empty where it has none."""
+        return self.history.get(metric, _NO_VALUES).of_run(run)
 
     def series(self, run: int, metric: str) -> tuple[Ints, Array]:
         """Steps and values of a metric of `runs[run]`, `[points]` each; empty where it has none."""
-        found = self.history.get(metric)
-        if found is None:
-            return np.empty(0, dtype=np.int64), np.empty(0)
-        begin, end = np.searchsorted(found.run, [run, run + 1])
-        return found.step[begin:end], found.value[begin:end]
+        column = self.column(run, metric)
+        return column.step, column.value
 
     def finite(self, run: int, metric: str) -> tuple[Array, Array]:
-        """`series` without NaN and infinities, steps as numbers."""
+        """`series` without NaN and infinities, with the steps as floats."""
         steps, values = self.series(run, metric)
-        there = np.isfinite(values)
-        return steps[there].astype(float), values[there]
+        is_finite = np.isfinite(values)
+        return steps[is_finite].astype(float), values[is_finite]
 
     def seconds_at(self, run: int) -> tuple[Array, Array]:
         """Steps of a run's evaluations, and seconds since its start, pauses included."""
         record = self.runs[run]
-        found = self.history.get(self.primary_metric(record.task))
-        if found is None or record.started is None:
+        if record.started is None:
             return np.empty(0), np.empty(0)
-        begin, end = np.searchsorted(found.run, [run, run + 1])
-        return found.step[begin:end].astype(float), (found.time[begin:end] - record.started) / 1000
+        column = self.column(run, self.primary_metric(record.task))
+        return column.step.astype(float), (column.time - record.started) / 1000
 
     def final(self, run: int, metric: str) -> float | None:
-        """A run's last value of a metric; None where it has none, or NaN."""
-        values = self.series(run, metric)[1]
+        """The last value of a metric of `runs[run]`; None where it has none, or NaN."""
+        values = self.column(run, metric).value
         return float(values[-1]) if len(values) and not np.isnan(values[-1]) else None
 
     def on(self, task: str) -> list[int]:
@@ -211,26 +214,20 @@ class Sweep:
         return [position for position, run in enumerate(self.runs) if run.task == task]
 
     def primary_metric(self, task: str) -> str:
-        """What the runs of a task are judged by."""
+        """The metric that the runs of a task are judged by."""
         keys = (run.params.get("task.success_key", "") for run in self.runs if run.task == task)
         return names.primary_metric(next(keys, ""))
 
     def episodes(self, runs: Iterable[int]) -> float:
-        """Of the last evaluation, mean of `runs`; infinite where it is not known."""
-        found = [self.final(run, names.EVAL_EPISODES) for run in runs]
-        known = [episodes for episodes in found if episodes is not None]
+        """Mean number of episodes of the runs' last evaluations; infinite where none is known."""
+        counts = [self.final(run, names.EVAL_EPISODES) for run in runs]
+        known = [count for count in counts if count is not None]
         return float(np.mean(known)) if known else np.inf
 
     def last_step(self, run: int) -> int:
         """Environment steps that `runs[run]` is known to have done."""
-        return max(
-            (
-                int(steps[-1])
-                for metric in self.history
-                if len(steps := self.series(run, metric)[0])
-            ),
-            default=0,
-        )
+        steps = (self.column(run, metric).step for metric in self.history)
+        return max((int(of_metric[-1]) for of_metric in steps if len(of_metric)), default=0)
 
     def url(self, run_id: str) -> str | None:
         """The page of a run, where a server shows it."""

@@ -1,8 +1,8 @@
-"""A sweep out of MLflow, in bulk.
+"""A sweep read from MLflow in bulk.
 
 MLflow's client answers one metric of one run at a time, some milliseconds each: minutes for a
-large sweep. Where the store is a database, the values are read from its `metrics` table instead
-(the same since MLflow 1.0; everything else goes through the client).
+large sweep. Where the store is a database, the values are read from its `metrics` table instead,
+which is the same since MLflow 1.0; everything else goes through the client.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from music_rllib.errors import BadInputError
 from music_rllib.limits import MOST_JSON_BYTES, read_json, read_regular
 from music_rllib.results.claims.plan import checked_plans
 from music_rllib.results.data import Column, Points, ReportError, RunRecord, Sweep, columns
-from music_rllib.results.mlflow_tables import FoundRuns, read_tables
+from music_rllib.results.mlflow_tables import SweepRuns, read_tables, sweep_tags
 from music_rllib.results.searches import checked_searches
 from music_rllib.tracking.store import TrackingStore, check_reachable
 
@@ -35,15 +35,14 @@ if TYPE_CHECKING:
     from mlflow.entities import Metric, Run
     from sqlalchemy import Connection
 
-__all__ = ["attach", "download_policy", "read_mlflow"]
 
 RUNS_PER_PAGE = 1000
 REQUESTS_AT_ONCE = 8
 READERS = 4
-"""More would wait for one disk."""
+"""Largest number of processes that read the values; more would wait for one disk."""
 TABLES_SECONDS = 60.0
 _LARGEST = float(np.finfo(np.float64).max)
-"""What MLflow's databases hold in place of infinity."""
+"""Number that MLflow's databases hold in place of infinity."""
 
 
 def read_mlflow(
@@ -57,42 +56,38 @@ def read_mlflow(
     """Read the newest sweep of this name.
 
     Args:
-        store: where it was logged.
-        name: of the sweep, which is that of its experiment.
+        store: MLflow's store.
+        name: the sweep's name, which is that of its experiment.
         sweep_id: tells sweeps of the same name apart; None for the one that began last.
-        metrics: which ones to read; None for all.
-        processes: that read the values.
+        metrics: names of the metrics to read; None for all.
+        processes: processes that read the values ahead.
 
     Raises:
         ReportError: where there is no such sweep.
         TrackingError: where the store does not answer.
     """
-    ahead = _begun(processes, store, sweep_id, metrics)
+    ahead = _read_values_ahead(processes, store, sweep_id, metrics)
     file = _sqlite_file(store)
     try:
         if file is not None and file.is_file() and (found := read_tables(file, name, sweep_id)):
-            run_ids = [run.run_id for run in found.children]
-            return _sweep(store, name, found, _from_databases(store, run_ids, metrics, ahead))
+            return _sweep(store, name, found, _from_database(store, found, metrics, ahead))
         client = _open(store)
         experiment_id, parent = _parent(client, store, name, sweep_id)
         runs = _search(client, experiment_id, {names.TAG_PARENT_RUN: parent.run_id})
+        artefact = functools.partial(_artefact, client, parent.run_id)
+        found = SweepRuns(experiment_id, parent, [_record(run) for run in runs], artefact)
         if store.is_server:
             history = columns(_from_server(client, runs, metrics))
         else:
-            history = _from_databases(store, [r.info.run_id for r in runs], metrics, ahead)
-        artefact = functools.partial(_artefact, client, parent.run_id)
-        found = FoundRuns(experiment_id, parent, [_record(run) for run in runs], artefact)
+            history = _from_database(store, found, metrics, ahead)
         return _sweep(store, name, found, history)
     except BadInputError:
         raise
     except Exception as error:
-        raise ReportError(
-            f"MLflow at {store.public_uri} must answer questions about the sweep {name!r}, "
-            f"it answered: {_first_line(error)}"
-        ) from error
+        raise _refusal(store, f"answer questions about the sweep {name!r}", error) from error
 
 
-def _sweep(store: TrackingStore, name: str, found: FoundRuns, history: dict[str, Column]) -> Sweep:
+def _sweep(store: TrackingStore, name: str, found: SweepRuns, history: dict[str, Column]) -> Sweep:
     parent, artefact = found.parent, found.artefact
     return Sweep(
         name=name,
@@ -111,7 +106,7 @@ def _sweep(store: TrackingStore, name: str, found: FoundRuns, history: dict[str,
 
 
 def attach(store: TrackingStore, run_id: str, folder: Path, name: str, note: str) -> None:
-    """Keep the files of `folder` as artefacts of a run, below `name`, and `note` on its page.
+    """Log the files of `folder` as artefacts of a run, below `name`, and show `note` on its page.
 
     Raises:
         ReportError: where MLflow does not take them.
@@ -122,24 +117,30 @@ def attach(store: TrackingStore, run_id: str, folder: Path, name: str, note: str
         client.log_artifacts(run_id, str(folder), name)
         client.set_tag(run_id, names.TAG_NOTE, note)
     except Exception as error:
-        raise ReportError(
-            f"MLflow at {store.public_uri} must take the report, it answered: {_first_line(error)}"
-        ) from error
+        raise _refusal(store, "take the report", error) from error
+
+
+def _refusal(store: TrackingStore, rule: str, error: Exception) -> ReportError:
+    from music_rllib.tracking.mlflow_client import first_line  # with MLflow, which is loaded by now
+
+    return ReportError(
+        f"MLflow at {store.public_uri} must {rule}, it answered: {first_line(error)}"
+    )
 
 
 def download_policy(
     store: TrackingStore, experiment_id: str, run_id: str, folder: Path
 ) -> Path | None:
-    """The file of the policy that is logged as a run's model, in `folder`; None without one."""
+    """Download the policy that is logged as a run's model into `folder`; None without one."""
     client = _open(store)
     import mlflow
 
-    found = client.search_logged_models(
+    models = client.search_logged_models(
         [experiment_id], f"tags.`{names.TAG_SOURCE_RUN}` = '{run_id}'", max_results=1
     )
-    if not found or found[0].status != "READY":
+    if not models or models[0].status != "READY":
         return None
-    place = f"{found[0].artifact_location}/artifacts/{names.ARTEFACT_POLICY}"
+    place = f"{models[0].artifact_location}/artifacts/{names.ARTEFACT_POLICY}"
     return Path(
         mlflow.artifacts.download_artifacts(
             artifact_uri=place, dst_path=str(folder), tracking_uri=store.uri
@@ -148,7 +149,7 @@ def download_policy(
 
 
 def _open(store: TrackingStore) -> MlflowClient:
-    """A client of a store that exists: MLflow itself would make a new, empty file."""
+    """A client of a store that exists; for another, MLflow would make a new, empty file."""
     file = _sqlite_file(store)
     if file is not None and not file.is_file():
         raise ReportError(
@@ -169,12 +170,6 @@ def _open(store: TrackingStore) -> MlflowClient:
     return MlflowClient(store.uri)
 
 
-def _first_line(error: Exception) -> str:
-    from music_rllib.tracking.mlflow_client import first_line  # with MLflow, which is loaded by now
-
-    return first_line(error)
-
-
 def _sqlite_file(store: TrackingStore) -> Path | None:
     if not store.uri.startswith("sqlite"):
         return None
@@ -184,17 +179,14 @@ def _sqlite_file(store: TrackingStore) -> Path | None:
 def _parent(
     client: MlflowClient, store: TrackingStore, name: str, sweep_id: str | None
 ) -> tuple[str, RunRecord]:
-    """The experiment's id, and the sweep's own run in it."""
+    """The id of the sweep's experiment, and the sweep's own run."""
     experiment = client.get_experiment_by_name(name)
     if experiment is None:
         others = sorted(e.name for e in client.search_experiments() if e.name != "Default")
         there = f"It has: {', '.join(others)}." if others else "It has none."
         raise ReportError(f"{name!r} must be a sweep in MLflow at {store.public_uri}. {there}")
     experiment_id = str(experiment.experiment_id)
-    tags = {names.TAG_KIND: names.KIND_SWEEP}
-    if sweep_id is not None:
-        tags[names.TAG_SWEEP_ID] = sweep_id
-    parents = _search(client, experiment_id, tags)
+    parents = _search(client, experiment_id, sweep_tags(sweep_id))
     if not parents:
         which = "" if sweep_id is None else f" with the id {sweep_id}"
         raise ReportError(
@@ -206,21 +198,17 @@ def _parent(
 
 def _search(client: MlflowClient, experiment_id: str, tags: Mapping[str, str]) -> list[Run]:
     """All runs with these tags, in the order in which they began."""
+    from mlflow.utils import get_results_from_paginated_fn
+
     wanted = " and ".join(f"tags.`{key}` = '{value}'" for key, value in tags.items())
-    found: list[Run] = []
-    token = None
-    while True:
-        page = client.search_runs(
-            [experiment_id],
-            wanted,
-            max_results=RUNS_PER_PAGE,
-            order_by=["attributes.start_time ASC"],
-            page_token=token,
-        )
-        found += page
-        token = page.token
-        if not token:
-            return found
+    order = ["attributes.start_time ASC"]
+    runs: list[Run] = get_results_from_paginated_fn(  # type: ignore[no-untyped-call]
+        lambda most, token: client.search_runs(
+            [experiment_id], wanted, max_results=most, order_by=order, page_token=token
+        ),
+        RUNS_PER_PAGE,
+    )
+    return runs
 
 
 def _record(run: Run) -> RunRecord:
@@ -246,30 +234,31 @@ def _artefact(client: MlflowClient, run_id: str, name: str) -> str | None:
             return None
 
 
-def _from_databases(
+def _from_database(
     store: TrackingStore,
-    run_ids: Sequence[str],
+    found: SweepRuns,
     metrics: Collection[str] | None,
     ahead: Sequence[Future[dict[str, Points]]],
 ) -> dict[str, Column]:
+    """The metrics of the runs; values that were not read ahead are read now."""
     known: dict[str, Points] = {}
     with contextlib.suppress(Exception):  # then it is read here, with a message if that fails
         for part in ahead:
             known |= part.result()
+    run_ids = [run.run_id for run in found.children]
     with _database(store.uri) as connection:
         return columns(
-            known[run] if run in known else _from_database(connection, run, metrics)
-            for run in run_ids
+            known[run] if run in known else _values(connection, run, metrics) for run in run_ids
         )
 
 
-def _begun(
+def _read_values_ahead(
     processes: Executor | None,
     store: TrackingStore,
     sweep_id: str | None,
     metrics: Collection[str] | None,
 ) -> list[Future[dict[str, Points]]]:
-    """The values of a sweep that is known by its id, being read; nothing where they can't be."""
+    """Begin to read the values of a sweep with a known id; empty where they can't be read."""
     file = _sqlite_file(store)
     absent = file is not None and not file.is_file()
     if processes is None or sweep_id is None or store.is_server or absent:
@@ -277,17 +266,17 @@ def _begun(
     parts = min(len(os.sched_getaffinity(0)), READERS)
     try:
         return [
-            processes.submit(_read_ahead, store.uri, sweep_id, metrics, part, parts)
+            processes.submit(_values_of_share, store.uri, sweep_id, metrics, part, parts)
             for part in range(parts)
         ]
     except BrokenExecutor:
         return []
 
 
-def _read_ahead(
+def _values_of_share(
     uri: str, sweep_id: str, metrics: Collection[str] | None, part: int, parts: int
 ) -> dict[str, Points]:
-    """The values of a share of a sweep's runs, by the runs' ids."""
+    """The values of every `parts`th run of a sweep from run number `part` on, by run id."""
     import sqlalchemy as sql
 
     tags = sql.table("tags", *map(sql.column, ("run_uuid", "key", "value")))
@@ -301,7 +290,7 @@ def _read_ahead(
     )
     with _database(uri) as connection:
         run_ids = connection.execute(runs).scalars().all()
-        return {one: _from_database(connection, one, metrics) for one in run_ids[part::parts]}
+        return {run_id: _values(connection, run_id, metrics) for run_id in run_ids[part::parts]}
 
 
 @contextlib.contextmanager
@@ -316,8 +305,8 @@ def _database(uri: str) -> Iterator[Connection]:
         engine.dispose()
 
 
-def _from_database(connection: Connection, run_id: str, metrics: Collection[str] | None) -> Points:
-    """Of one run, in an order that the table's index has."""
+def _values(connection: Connection, run_id: str, metrics: Collection[str] | None) -> Points:
+    """The values of one run, in an order that the table's index has."""
     import sqlalchemy as sql
 
     plain = ("run_uuid", "key", "step", "timestamp", "value")
@@ -338,14 +327,14 @@ _ROW = np.dtype([("metric", "O"), ("step", "i8"), ("time", "i8"), ("value", "f8"
 
 
 def _points(rows: Iterable[Sequence[Any]]) -> Points:
-    """(metric, step, time, value) rows, sorted by the first two; a value of None is NaN."""
-    found = np.fromiter(rows, dtype=_ROW)  # while they are read: lists of them take twice as long
-    values = found["value"]
+    """Points from (metric, step, time, value) rows, sorted by the first two; None is NaN."""
+    table = np.fromiter(rows, dtype=_ROW)  # while they are read: lists of them take twice as long
+    values = table["value"]
     values[np.abs(values) == _LARGEST] *= np.inf
-    counts = Counter(found["metric"].tolist())
+    counts = Counter(table["metric"].tolist())
     # One string of each name: those of the rows are as many objects, which processes would send.
     metrics = [metric for metric, count in counts.items() for _ in range(count)]
-    return Points(metrics, found["step"], found["time"], values)
+    return Points(metrics, table["step"], table["time"], values)
 
 
 def _from_server(
@@ -357,10 +346,10 @@ def _from_server(
         for metric in run.data.metrics
         if metrics is None or metric in metrics
     ]
-    found: dict[str, list[Metric]] = {run.info.run_id: [] for run in runs}
+    by_run: dict[str, list[Metric]] = {run.info.run_id: [] for run in runs}
     with ThreadPoolExecutor(REQUESTS_AT_ONCE) as pool:
         histories = pool.map(lambda pair: client.get_metric_history(*pair), wanted)
         for (run_id, _), history in zip(wanted, histories, strict=True):
-            found[run_id] += history
-    for points in found.values():
+            by_run[run_id] += history
+    for points in by_run.values():
         yield _points(sorted((p.key, p.step, p.timestamp, p.value) for p in points))

@@ -1,13 +1,10 @@
-"""A sweep's `search.json` checked: it may come from anybody."""
+"""Check of a sweep's `search.json`, which may come from anybody."""
 
 from __future__ import annotations
 
-from functools import cache
 from typing import Any
 
 from pydantic import BaseModel, JsonValue, TypeAdapter
-
-__all__ = ["checked_searches"]
 
 
 class _Trial(BaseModel):
@@ -42,7 +39,7 @@ class _Objective(BaseModel):
 
 
 class _Search(BaseModel):
-    """What is read of a search; there is more."""
+    """The fields of a search that are read; there are more."""
 
     stage: str
     mode: str
@@ -52,25 +49,22 @@ class _Search(BaseModel):
     ranking: list[_Ranked] | None
 
 
-@cache
-def _searches() -> TypeAdapter[list[_Search]]:
-    return TypeAdapter(list[_Search])
-
-
 def checked_searches(document: Any) -> list[dict[str, Any]]:
     """The searches of a `search.json`, which may come from anybody.
 
     Raises:
-        ValueError: It is something else.
+        ValueError: The document is something else.
     """
-    _searches().validate_python(document)
+    TypeAdapter(list[_Search]).validate_python(document)
     searches: list[dict[str, Any]] = document
     for search in searches:
-        aims = len(search["objectives"])
-        for row in [t for arm in search["arms"] for t in arm["trials"]] + (search["ranking"] or []):
+        objectives, ranking = len(search["objectives"]), search["ranking"] or []
+        for row in [trial for arm in search["arms"] for trial in arm["trials"]] + ranking:
             for name in ("objective", "interval", "fresh"):
-                if row.get(name) and len(row[name]) != aims:
-                    raise ValueError(f"{name} must have {aims} entries, it has {len(row[name])}")
-        if any("failure" not in row and not row.get("scores") for row in search["ranking"] or []):
+                if row.get(name) and len(row[name]) != objectives:
+                    raise ValueError(
+                        f"{name} must have {objectives} entries, it has {len(row[name])}"
+                    )
+        if any("failure" not in row and not row.get("scores") for row in ranking):
             raise ValueError("ranking must have scores where it has no failure")
     return searches

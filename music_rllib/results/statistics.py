@@ -1,8 +1,8 @@
-"""What may be said from a few seeds: estimates whose intervals cover, comparisons, seeds needed.
+"""Statistics of few seeds: estimates with intervals that cover, comparisons, seeds needed.
 
 Shapes: R runs (seeds) of one condition on each of T tasks. `scores` is `[R, T]` or, for curves,
 `[R, T, points]`, and NaN marks a run that does not exist, so tasks may have different numbers of
-runs. Nothing here is random: the same scores give the same numbers, whoever asks.
+runs. Nothing here is random: the same scores always give the same numbers.
 
 The estimate is the mean: over each task's runs, then over the tasks. The interquartile mean that
 Agarwal et al. 2021 (https://arxiv.org/abs/2108.13264) show is another quantity with each number of
@@ -13,7 +13,7 @@ is held by `tests/unit/results/test_coverage.py` and listed in docs/reports.md.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from math import lcm
@@ -22,32 +22,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import optimize, stats
 
-__all__ = [
-    "SIGNIFICANCE",
-    "Array",
-    "Estimate",
-    "clopper_pearson",
-    "difference",
-    "estimate",
-    "holm",
-    "improvement",
-    "improvement_p_value",
-    "interval",
-    "least_difference",
-    "performance_profile",
-    "pooled_spread",
-    "power_of",
-    "probability_of_improvement",
-    "seeds_to_decide",
-]
-
 Array = NDArray[np.float64]
 
 SIGNIFICANCE = 0.05
-_TAIL = 0.025
-"""Of a 95 % interval, on either side."""
+POWER = 0.8
+"""Chance with which a difference is to be seen."""
 MAX_SEEDS = 1000
-"""Beyond it, "how many seeds" is answered with "more than anyone will run"."""
+"""Largest number of seeds that is looked for; more are more than anyone will run."""
+_TAIL = 0.025
+"""Probability on either side of a 95 % interval."""
 _NO_SPREAD = 1e-12
 """Variances below it are rounding errors: the seeds tie."""
 
@@ -68,7 +51,7 @@ class Estimate:
 
 
 def estimate(scores: Array, episodes: float | None = None) -> Estimate:
-    """Mean over the runs of each task, and over the tasks, with its 95 % interval.
+    """Mean over the runs of each task and then over the tasks, with its 95 % interval.
 
     Tasks are strata: only the spread between runs of the same task counts. The degrees of freedom
     of their pooled variance are Welch and Satterthwaite's. See :func:`interval` for its ends.
@@ -79,7 +62,7 @@ def estimate(scores: Array, episodes: float | None = None) -> Estimate:
             episodes), infinite where that is not known; None where it is no rate.
 
     Returns:
-        Scalars, or `[points]`; NaN ends where a task has fewer than two runs.
+        Scalars, or `[points]`; the ends are NaN where a task has fewer than two runs.
     """
     runs = np.sum(~np.isnan(scores), axis=0)
     of_task = _ratio(np.nansum(scores, axis=0), runs)
@@ -112,12 +95,12 @@ def interval(
 
     Args:
         value: the mean.
-        variance: of it.
+        variance: that of the mean.
         freedom: degrees of freedom of `variance`; 0 or NaN: no interval.
-        episodes: behind `value` in all, where it is a rate; None where it is no rate.
+        episodes: number of all episodes behind a rate; None for a metric that is no rate.
 
     Returns:
-        NaN ends also where the runs tie and nothing else tells how sure that is.
+        The interval; its ends are NaN also where the runs tie and there are no episodes to go by.
     """
     value, variance, freedom = (
         np.asarray(part, dtype=float) for part in np.broadcast_arrays(value, variance, freedom)
@@ -138,8 +121,8 @@ def clopper_pearson(share: ArrayLike, trials: ArrayLike) -> tuple[Array, Array]:
     """Exact 95 % interval of a probability from the share of successes (1934).
 
     Args:
-        share: of `trials`.
-        trials: need not be whole; NaN or infinite: no interval.
+        share: successes by trials.
+        trials: number, which need not be whole; NaN or infinite: no interval.
     """
     share, trials = (np.asarray(part, float) for part in np.broadcast_arrays(share, trials))
     trials = np.where(np.isfinite(trials), trials, np.nan)
@@ -150,7 +133,7 @@ def clopper_pearson(share: ArrayLike, trials: ArrayLike) -> tuple[Array, Array]:
 
 
 def difference(x: Estimate, y: Estimate) -> Estimate:
-    """`x - y` of independent estimates, its interval put together from theirs.
+    """`x - y` of independent estimates, with an interval made from theirs.
 
     "Method of variance estimates recovery" (Zou and Donner 2008): it keeps their asymmetry.
     """
@@ -170,7 +153,7 @@ def performance_profile(scores: Array, thresholds: Array) -> Estimate:
         thresholds: `[points]`.
 
     Returns:
-        `[points]`, with exact intervals of a share of so many runs.
+        `[points]`, with the exact interval of a share at each.
     """
     there = scores[~np.isnan(scores)]
     above = np.mean(there[:, np.newaxis] > thresholds, axis=0)
@@ -194,8 +177,9 @@ def probability_of_improvement(x: Array, y: Array) -> Estimate:
     It holds the estimate against the variance that each probability would have, so that runs that
     are all apart do not look certain. Statistics in Medicine 25, 559-573.
     """
-    value = improvement(x, y)
-    sizes = [wins.shape for wins in _wins(x, y)]
+    tasks = _wins(x, y)
+    value = float(np.mean([np.mean(wins) for wins in tasks]))
+    sizes = [wins.shape for wins in tasks]
     if min(map(min, sizes)) < 2:
         return Estimate(value=np.asarray(value), lower=np.array(np.nan), upper=np.array(np.nan))
     quantile = stats.t.ppf(1 - _TAIL, sum(a + b - 2 for a, b in sizes))
@@ -220,7 +204,7 @@ def probability_of_improvement(x: Array, y: Array) -> Estimate:
 
 
 def improvement_p_value(x: Array, y: Array) -> float:
-    """How often relabelled runs differ as much as x and y do: an exact two-sided permutation test.
+    """p-value of an exact two-sided permutation test of whether x and y differ.
 
     The statistic is `improvement`; labels are permuted within each task. Unlike an interval from
     two or three runs it cannot overstate: with 3 runs against 3 it never falls below .1.
@@ -229,7 +213,8 @@ def improvement_p_value(x: Array, y: Array) -> float:
     unit = lcm(*(2 * len(a) * len(b) for a, b in tasks))
     total = np.ones(1)
     for a, b in tasks:
-        chances = _doubled_u(np.concatenate([a, b]), len(a))
+        doubled_ranks = np.sort(2 * stats.rankdata([*a, *b])).astype(int)  # ties have halves
+        chances = _chances(tuple(doubled_ranks.tolist()), len(a))
         spaced = np.zeros(unit + 1)
         spaced[:: unit // (len(chances) - 1)] = chances
         total = np.convolve(total, spaced)
@@ -238,15 +223,12 @@ def improvement_p_value(x: Array, y: Array) -> float:
     return float(min(1.0, total[extreme].sum()))
 
 
-def _doubled_u(values: Array, size: int) -> Array:
-    """Chances of twice Mann and Whitney's U, `[2 m n + 1]`, of `size` values drawn by lot."""
-    ranks = np.sort(2 * stats.rankdata(values)).astype(int)  # ties have halves
-    return _chances(tuple(ranks.tolist()), size)
-
-
 @lru_cache(maxsize=256)
 def _chances(ranks: tuple[int, ...], size: int) -> Array:
-    """Of each sum of `size` of the doubled ranks, which are the same for all pairs without ties."""
+    """Chances of twice Mann and Whitney's U, `[2 m n + 1]`, for `size` ranks drawn by lot.
+
+    They are kept, because all pairs of equal sizes without ties have the same ranks.
+    """
     ways = np.zeros((size + 1, sum(ranks) + 1))
     ways[0, 0] = 1
     for rank in ranks:
@@ -274,50 +256,59 @@ def pooled_spread(groups: Sequence[Array]) -> float | None:
     Returns:
         None where no condition has two runs of the same task.
     """
-    squares, freedom = 0.0, 0
-    for scores in groups:
-        for task in range(scores.shape[1]):
-            values = _there(scores[:, task])
-            if len(values) > 1:
-                squares += float(np.sum((values - values.mean()) ** 2))
-                freedom += len(values) - 1
+    columns = [_there(column) for scores in groups for column in scores.T]
+    freedom = sum(len(column) - 1 for column in columns if len(column))
+    squares = sum(float(np.sum((column - column.mean()) ** 2)) for column in columns if len(column))
     return float(np.sqrt(squares / freedom)) if freedom else None
 
 
-def power_of(
-    seeds: int, difference: float, spread: float, *, tasks: int = 1, alpha: float = 0.05
-) -> float:
+def power_of(seeds: ArrayLike, difference: float, spread: float, *, tasks: int = 1) -> Array:
     """Chance that a two-sided t test tells two conditions apart.
 
     Args:
-        seeds: of each condition on each task, >= 2.
+        seeds: number for each condition and task, >= 2.
         difference: between the conditions' means.
         spread: standard deviation between seeds (:func:`pooled_spread`), > 0.
-        tasks: whose differences are averaged.
-        alpha: chance of seeing a difference where there is none.
+        tasks: number of tasks over which the difference is averaged.
+
+    Returns:
+        The chance in the shape of `seeds`.
     """
-    freedom = 2 * tasks * (seeds - 1)
+    seeds = np.asarray(seeds, dtype=float)
     shift = abs(difference) / spread * np.sqrt(seeds * tasks / 2)
-    critical = stats.t.ppf(1 - alpha / 2, freedom)
-    missed = stats.nct.cdf(critical, freedom, shift) - stats.nct.cdf(-critical, freedom, shift)
+    return power_of_t_test(2 * tasks * (seeds - 1), shift)
+
+
+def power_of_t_test(freedom: Array, shift: Array, level: float = SIGNIFICANCE) -> Array:
+    """Chance that a two-sided t test is significant.
+
+    Args:
+        freedom: degrees of freedom.
+        shift: expected value of the statistic, > 0.
+        level: chance of seeing a difference where there is none.
+    """
+    critical = stats.t.ppf(1 - level / 2, freedom)
     # Far from the centre scipy's cdf is NaN where it would be 0.
-    return float(1 - np.nan_to_num(missed, nan=0.0))
+    below, above = (
+        np.nan_to_num(stats.nct.cdf(end, freedom, shift), nan=0.0) for end in (-critical, critical)
+    )
+    return np.asarray(1 - (above - below))
 
 
-def seeds_to_decide(
-    difference: float,
-    spread: float,
-    *,
-    tasks: int = 1,
-    power: float = 0.8,
-    alpha: float = 0.05,
-) -> int | None:
-    """Seeds for each condition and task with which `difference` is seen with chance `power`.
+def fewest_seeds(power: Callable[[Array], Array]) -> int | None:
+    """The least number of seeds with a `power` of 80 %; None where `MAX_SEEDS` are not enough."""
+    seeds = np.arange(2.0, MAX_SEEDS + 1)  # one seed never decides
+    enough = power(seeds) >= POWER
+    return int(seeds[enough.argmax()]) if enough.any() else None
+
+
+def seeds_to_decide(difference: float, spread: float, *, tasks: int = 1) -> int | None:
+    """Seeds for each condition and task that show `difference` with a chance of 80 %.
 
     Arguments are those of :func:`power_of`.
 
     Returns:
-        None where `MAX_SEEDS` are not enough.
+        The number; None where `MAX_SEEDS` are not enough.
 
     Raises:
         ValueError: where `difference` or `spread` is not > 0.
@@ -325,25 +316,15 @@ def seeds_to_decide(
     for name, value in (("difference", difference), ("spread", spread)):
         if not value > 0:
             raise ValueError(f"{name} must be > 0, got {value}")
-
-    def decides(seeds: int) -> bool:
-        return power_of(seeds, difference, spread, tasks=tasks, alpha=alpha) >= power
-
-    if not decides(MAX_SEEDS):
-        return None
-    low, high = 1, MAX_SEEDS  # one seed never decides
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (low, middle) if decides(middle) else (middle, high)
-    return high
+    return fewest_seeds(lambda seeds: power_of(seeds, difference, spread, tasks=tasks))
 
 
-def least_difference(seeds: int, spread: float, *, tasks: int = 1, power: float = 0.8) -> float:
-    """The difference that `seeds` show with chance `power`; see :func:`power_of`, its inverse."""
+def least_difference(seeds: int, spread: float, *, tasks: int = 1) -> float:
+    """The difference that `seeds` show with a chance of 80 %: the inverse of :func:`power_of`."""
     low, high = 0.0, 100 * spread  # two seeds show 17 standard deviations
     return float(
         optimize.brentq(
-            lambda gap: power_of(seeds, gap, spread, tasks=tasks) - power, low, high, rtol=1e-6
+            lambda gap: power_of(seeds, gap, spread, tasks=tasks) - POWER, low, high, rtol=1e-6
         )
     )
 
@@ -367,7 +348,7 @@ def _there(values: ArrayLike) -> Array:
 
 
 def _ratio(total: ArrayLike, count: ArrayLike) -> Array:
-    """NaN where `count` is not > 0."""
+    """`total / count`; NaN where `count` is not > 0."""
     total, count = (np.asarray(part, dtype=float) for part in np.broadcast_arrays(total, count))
     out: Array = np.full(total.shape, np.nan)
     np.divide(total, count, out=out, where=count > 0)

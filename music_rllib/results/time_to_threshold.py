@@ -1,14 +1,14 @@
-"""Steps to a threshold, where some runs never get there, and who gets there sooner.
+"""Steps to a threshold, which some runs never reach, and comparisons of who reaches it sooner.
 
 A run that ends below the threshold is *censored*: all that is known is that it would have taken
 more than its steps. Leaving it out would make the worst setting look fast, so the median is Kaplan
-and Meier's (1958), which is infinite where fewer than half would have got there. Final success says
-nothing of who is sooner where all end alike.
+and Meier's (1958), which is infinite where fewer than half would have got there. Where all runs end
+alike, final success does not tell which of them is sooner.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -21,68 +21,65 @@ from music_rllib.results import statistics as st
 from music_rllib.results.data import Sweep
 from music_rllib.results.statistics import SIGNIFICANCE, Array, Estimate
 
-__all__ = [
-    "FEWEST_FOR_INTERVAL",
-    "Race",
-    "Waits",
-    "first_passage",
-    "median_wait",
-    "median_wait_interval",
-    "races",
-    "waits_of",
-]
-
 FEWEST_FOR_INTERVAL = 5
-"""For an interval of the median: with five runs it covers 93.75 %, with four 87.5 %."""
+"""Least number of runs for an interval of the median, which covers 93.75 %; of four 87.5 %."""
 _COVERAGE = 0.93
 
 
 @dataclass(frozen=True, kw_only=True)
 class Waits:
-    """How long each of R runs took."""
+    """Steps that each of R runs took to a threshold."""
 
     steps: Array
-    """`[R]` environment steps: to the threshold, or to the run's last evaluation."""
+    """`[R]` environment steps to the threshold, or to the last evaluation of a run below it."""
     reached: NDArray[np.bool_]
-    """`[R]`; False: censored."""
+    """`[R]`, whether the run reached the threshold; False: it is censored."""
 
 
 def first_passage(steps: Array, values: Array, threshold: float) -> tuple[float, bool] | None:
-    """Steps of the first evaluation with `value >= threshold`, or of the last one with False.
+    """Steps of the first evaluation with `value >= threshold`, and True.
 
     Args:
         steps: `[points]`, rising.
-        values: `[points]`; NaN never reaches anything.
-        threshold: in the values' unit.
+        values: `[points]`; NaN is below every threshold.
+        threshold: in the unit of `values`.
 
     Returns:
-        None for a run that was never evaluated.
+        Steps of the last evaluation and False where none is; None for a run without evaluations.
     """
     if not len(steps):
         return None
-    there = np.flatnonzero(values >= threshold)
-    return (float(steps[there[0]]), True) if len(there) else (float(steps[-1]), False)
+    above = np.flatnonzero(values >= threshold)
+    return (float(steps[above[0]]), True) if len(above) else (float(steps[-1]), False)
 
 
 def waits_of(sweep: Sweep, task: str, runs: Sequence[int], threshold: float) -> Waits | None:
-    """How long the runs of a task took to a success rate; None where none was evaluated."""
-    passages = [
-        passage
-        for run in runs
-        if sweep.runs[run].task == task
-        and (passage := first_passage(*sweep.finite(run, names.EVAL_SUCCESS), threshold))
-    ]
+    """Steps of a task's runs to a success rate; None where none was evaluated."""
+    passages = [passage for _, *passage in _passages(sweep, task, runs, threshold)]
     if not passages:
         return None
     steps, reached = zip(*passages, strict=True)
     return Waits(steps=np.array(steps), reached=np.array(reached))
 
 
-def median_wait(waits: Waits) -> float:
-    """First number of steps by which half the runs are there; infinite where that is not known.
+def _passages(
+    sweep: Sweep, task: str, runs: Sequence[int], threshold: float
+) -> Iterator[tuple[int, float, bool]]:
+    """Position and :func:`first_passage` of each run on a task that was evaluated."""
+    for run in runs:
+        if sweep.runs[run].task == task:
+            passage = first_passage(*sweep.finite(run, names.EVAL_SUCCESS), threshold)
+            if passage is not None:
+                yield run, *passage
 
-    NaN without runs. Where a run is censored at the same step at which another gets there, it
-    counts as still waiting at that step.
+
+def median_wait(waits: Waits) -> float:
+    """Steps by which half of the runs have reached the threshold.
+
+    A run that is censored at a step at which another one arrives counts as waiting at that step.
+
+    Returns:
+        The steps; infinite where fewer than half arrive, NaN without runs.
     """
     if not len(waits.steps):
         return np.nan
@@ -97,13 +94,13 @@ def median_wait(waits: Waits) -> float:
 
 
 def median_wait_interval(waits: Waits) -> tuple[float, float]:
-    """Interval of the median by the runs' order alone, which covers 93 % or more.
+    """Interval of the median from the order of the runs, with a coverage of 93 % or more.
 
     Whatever the distribution, n runs are all below its median with chance 1/2^n. A censored run
     counts at its last step for the lower end and never for the upper one.
 
     Returns:
-        NaN from fewer than `FEWEST_FOR_INTERVAL`, of which not even the outermost cover.
+        Both ends; NaN for fewer than `FEWEST_FOR_INTERVAL` runs.
     """
     runs = len(waits.steps)
     outside = 2 * stats.binom.cdf(np.arange(runs), runs, 0.5)
@@ -117,20 +114,21 @@ def median_wait_interval(waits: Waits) -> tuple[float, float]:
 
 @dataclass(frozen=True, kw_only=True)
 class Race:
-    """Whether runs of one group get to a success rate before those of another."""
+    """Comparison of how soon the runs of two groups reach a success rate."""
 
     task: str
     threshold: float
     first: str
     second: str
     runs: tuple[int, int]
-    """How many of either group are compared."""
+    """Number of compared runs of each group."""
     reached: bool
-    """Whether any of them got there; otherwise there is nothing to compare."""
+    """Whether any of them reached it; otherwise there is nothing to compare."""
     estimate: Estimate
-    """Probability that a run of `first` is there before one of `second`, ties half."""
+    """Probability that a run of `first` is sooner than one of `second`, ties half."""
     p_value: float
-    """Of the permutation test, adjusted for the task's other pairs at this threshold (Holm)."""
+    """p-value of the permutation test, with Holm's correction over the task's pairs that reached
+    this threshold."""
 
     @property
     def decided(self) -> bool:
@@ -141,33 +139,37 @@ class Race:
 def races(
     sweep: Sweep, task: str, groups: Mapping[str, Sequence[int]], threshold: float
 ) -> tuple[Race, ...]:
-    """Every pair of groups once, a later group against an earlier one.
+    """Comparison of each pair of groups, a later group against an earlier one.
 
-    A run that has used up its budget without getting there is later than every one that has got
-    there, and as late as another that has not.
+    A run that ended below the threshold is later than every run that reached it, and ties with the
+    others that did not.
 
     Args:
         sweep: the runs.
-        task: whose runs are compared.
+        task: task of the runs that are compared.
         groups: name to positions in `sweep.runs`.
         threshold: success rate at the last step of evaluation episodes.
     """
-    found = {name: _earliness(sweep, task, runs, threshold) for name, runs in groups.items()}
-    there = [name for name in groups if len(found[name])]
-    pairs = [(second, first) for first, second in combinations(there, 2)]
-    reached = [bool(np.isfinite(np.concatenate([found[a], found[b]])).any()) for a, b in pairs]
-    raw = [st.improvement_p_value(found[a], found[b]) for a, b in pairs]
-    # A pair of which nobody got there is no test that could have come out otherwise.
-    adjusted = iter(st.holm([p for p, any_ in zip(raw, reached, strict=True) if any_]))
+    earliness = {name: _earliness(sweep, task, runs, threshold) for name, runs in groups.items()}
+    known = [name for name in groups if len(earliness[name])]
+    pairs = [(second, first) for first, second in combinations(known, 2)]
+    reached = [bool(np.isfinite([*earliness[a], *earliness[b]]).any()) for a, b in pairs]
+    # A pair without a run that reached the threshold could not have come out otherwise: no test.
+    p_values = [
+        st.improvement_p_value(earliness[a], earliness[b])
+        for (a, b), any_ in zip(pairs, reached, strict=True)
+        if any_
+    ]
+    adjusted = iter(st.holm(p_values))
     return tuple(
         Race(
             task=task,
             threshold=threshold,
             first=a,
             second=b,
-            runs=(len(found[a]), len(found[b])),
+            runs=(len(earliness[a]), len(earliness[b])),
             reached=any_,
-            estimate=st.probability_of_improvement(found[a], found[b]),
+            estimate=st.probability_of_improvement(earliness[a], earliness[b]),
             p_value=next(adjusted) if any_ else 1.0,
         )
         for (a, b), any_ in zip(pairs, reached, strict=True)
@@ -175,17 +177,13 @@ def races(
 
 
 def _earliness(sweep: Sweep, task: str, runs: Sequence[int], threshold: float) -> Array:
-    """`[R, 1]` minus the steps to the threshold, minus infinity for runs that ended below it.
+    """Minus the steps to the threshold, `[R, 1]`; minus infinity for runs that ended below it.
 
-    A run that is not finished and not there yet could still be the sooner one: it is left out.
+    A run that is not finished and below the threshold could still be the sooner: it is left out.
     """
-    earliness = []
-    for run in runs:
-        passage = first_passage(*sweep.finite(run, names.EVAL_SUCCESS), threshold)
-        if sweep.runs[run].task != task or passage is None:
-            continue
-        if passage[1]:
-            earliness.append(-passage[0])
-        elif sweep.runs[run].status == "FINISHED":
-            earliness.append(-np.inf)
+    earliness = [
+        -steps if reached else -np.inf
+        for run, steps, reached in _passages(sweep, task, runs, threshold)
+        if reached or sweep.runs[run].is_finished
+    ]
     return np.array(earliness, dtype=float).reshape(-1, 1)

@@ -17,7 +17,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -29,13 +29,10 @@ from music_rllib.config.problems import shown
 from music_rllib.limits import MOST_JSON_BYTES, MOST_YAML_BYTES, read_json, read_regular
 from music_rllib.results.archive.tables import read_table, write_table
 from music_rllib.results.claims.plan import as_document, checked_plans
-from music_rllib.results.data import Column, ReportError, RunRecord, Sweep
+from music_rllib.results.data import Column, ReportError, RunRecord, Sweep, joined
 from music_rllib.results.searches import checked_searches
 
-__all__ = ["Format", "is_archive", "read_archive", "write_archive"]
-
 Format = Literal["csv", "parquet"]
-VERSION = 1
 _HEADER, _SEARCHES, _PLANS = "sweep.json", "search.json", "analysis_plan.json"
 _OWN_FIELDS = ("name", "status", "run_id", "experiment_id", "started", "source", "tags", "config")
 _RUN_FIELDS = ("run_id", "name", "status", "started", "ended")
@@ -44,7 +41,7 @@ _RUNS = {
     **dict.fromkeys(("run_id", "name", "status"), pa.string()),
     **dict.fromkeys(("started", "ended"), pa.int64()),
 }
-"""What a run must have; every other column is text."""
+"""Columns of the table of runs; every other column is text."""
 _METRICS = {
     "run": pa.int64(),
     "metric": pa.string(),
@@ -52,16 +49,16 @@ _METRICS = {
     "value": pa.float64(),
     "time_ms": pa.int64(),
 }
-
+"""Columns of the table of metrics."""
 
 _PLACES = re.compile(r"^(?P<name>storage: | *tracking_uri: )(?P<place>.+)$", re.MULTILINE)
 _LOCAL = re.compile(r"(sqlite:///)/(?:.*/)?([^/]+/[^/]+)|(?:file://)?/(?:.*/)?([^/]+)/*")
 
 
 def _without_folders(place: str) -> str:
-    """`place` without what leads to it on this machine; servers, buckets and relative paths stay.
+    """`place` without the folders above it; servers, buckets and relative paths stay.
 
-    Of a sqlite file its folder is kept, as it is with the default storage: `results/mlflow.db`.
+    A sqlite file keeps its folder, as it is with the default storage: `results/mlflow.db`.
     """
     local = _LOCAL.fullmatch(place)
     return local.expand(r"\1\2\3") if local else place
@@ -75,29 +72,27 @@ def is_archive(folder: Path) -> bool:
 def write_archive(sweep: Sweep, folder: Path, file_format: Format = "parquet") -> None:
     """Write `sweep` into `folder`; a sweep that was exported there before is replaced.
 
-    An export is what one publishes, so it doesn't say in which folder of a machine the sweep was.
+    An export may be published, so it does not tell in which folder of a machine the sweep was.
 
     Raises:
         ReportError: where the folder is not writable.
     """
-    header: dict[str, Any] = {"version": VERSION, "format": file_format}
+    header: dict[str, Any] = {"version": 1, "format": file_format}
     header |= {name: getattr(sweep, name) for name in _OWN_FIELDS}
-    header |= {"source": _without_folders(sweep.source)}
+    header["source"] = _without_folders(sweep.source)
     if sweep.config is not None:
         header["config"] = _PLACES.sub(
             lambda found: found["name"] + _without_folders(found["place"]), sweep.config
         )
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for stale in get_args(Format):
-            for table in ("runs", "metrics"):
-                (folder / f"{table}.{stale}").unlink(missing_ok=True)
+        tables = [f"{table}.{kind}" for table in ("runs", "metrics") for kind in get_args(Format)]
+        for stale in (*tables, _SEARCHES, _PLANS):
+            (folder / stale).unlink(missing_ok=True)
         write_table(_runs_table(sweep.runs), folder / f"runs.{file_format}")
         write_table(_metrics_table(sweep), folder / f"metrics.{file_format}")
-        (folder / _SEARCHES).unlink(missing_ok=True)
         if sweep.searches:
             _write_json([_without_place(found) for found in sweep.searches], folder / _SEARCHES)
-        (folder / _PLANS).unlink(missing_ok=True)
         if sweep.plans:
             _write_json(as_document(sweep.plans), folder / _PLANS)
         _write_json(header, folder / _HEADER)
@@ -154,7 +149,7 @@ def _read_json(file: Path) -> Any:
 
 
 def _reason(error: Exception) -> str:
-    """In one line: of several findings the first."""
+    """The reason in one line; of several findings the first."""
     if isinstance(error, ValidationError):
         finding = error.errors(include_url=False)[0]
         place = ".".join(str(part) for part in finding["loc"])
@@ -185,26 +180,22 @@ def _runs_table(runs: Sequence[RunRecord]) -> pa.Table:
 
 
 def _wide(prefix: str, rows: Sequence[Mapping[str, str]]) -> dict[str, Any]:
-    keys: Iterable[str] = sorted({key for row in rows for key in row})
+    keys = sorted({key for row in rows for key in row})
     return {prefix + key: pa.array([row.get(key) for row in rows], pa.string()) for key in keys}
 
 
 def _metrics_table(sweep: Sweep) -> pa.Table:
-    columns = sweep.history
-    metric = [pa.repeat(name, len(found.run)) for name, found in columns.items()]
+    every = joined(list(sweep.history.values()))
+    metric = [pa.repeat(name, len(column.run)) for name, column in sweep.history.items()]
     return pa.table(
         {
-            "run": _concatenated([found.run for found in columns.values()], np.int64),
+            "run": every.run,
             "metric": pa.chunked_array(metric, pa.string()),
-            "env_steps": _concatenated([found.step for found in columns.values()], np.int64),
-            "value": _concatenated([found.value for found in columns.values()], np.float64),
-            "time_ms": _concatenated([found.time for found in columns.values()], np.int64),
+            "env_steps": every.step,
+            "value": every.value,
+            "time_ms": every.time,
         }
     )
-
-
-def _concatenated(parts: Sequence[Any], dtype: type) -> Any:
-    return np.concatenate(parts) if parts else np.empty(0, dtype=dtype)
 
 
 def _records(table: pa.Table) -> list[RunRecord]:
@@ -229,18 +220,13 @@ def _narrow(prefix: str, row: Mapping[str, Any]) -> dict[str, str]:
 def _history(table: pa.Table, runs: int) -> dict[str, Column]:
     metrics = table["metric"].combine_chunks().dictionary_encode()
     codes = metrics.indices.to_numpy(zero_copy_only=False)
-    run, step, value, time = (
-        table[name].to_numpy() for name in ("run", "env_steps", "value", "time_ms")
-    )
+    every = Column(*(table[name].to_numpy() for name in ("run", "env_steps", "value", "time_ms")))
+    run = every.run
     if len(run) and not 0 <= run.min() <= run.max() < runs:
         raise ValueError(f"a metric's run must be one of {runs}, got {run.min()} to {run.max()}")
-    order = np.lexsort((step, run, codes))
-    names_of = metrics.dictionary.to_pylist()
-    ends = np.searchsorted(codes[order], np.arange(len(names_of) + 1))
-    history = {}
-    for code, name in enumerate(names_of):
-        chosen = order[ends[code] : ends[code + 1]]
-        history[name] = Column(
-            run=run[chosen], step=step[chosen], value=value[chosen], time=time[chosen]
-        )
-    return history
+    order = np.lexsort((every.step, run, codes))
+    ends = np.searchsorted(codes[order], np.arange(len(metrics.dictionary) + 1))
+    return {
+        name: every.select(order[ends[code] : ends[code + 1]])
+        for code, name in enumerate(metrics.dictionary.to_pylist())
+    }

@@ -1,4 +1,4 @@
-"""The pages of a Parquet file, measured before anything unpacks them.
+"""Checks of a Parquet file's pages before anything unpacks them.
 
 A page's header says what the page unpacks to, and a compressed one of a few kilobytes may say
 gigabytes. Arrow believes it, and neither reads the headers alone nor takes a limit for them.
@@ -19,24 +19,23 @@ from music_rllib.limits import (
     MOST_UNPACKED_PER_BYTE,
 )
 
-__all__ = ["check_pages"]
-
 _ENCODINGS = {0: "PLAIN", 2: "PLAIN_DICTIONARY", 3: "RLE", 8: "RLE_DICTIONARY"}
-"""Those that Arrow writes unless asked. Others hold long texts in next to nothing."""
+"""Encodings that Arrow writes unless asked. Others hold long texts in next to nothing."""
 _UNPACKED, _PACKED = 2, 3
+"""Fields of a page header: the sizes of the page."""
 _ENCODING_OF = {5: 2, 7: 2, 8: 4}
-"""In a header: the description of a data page, dictionary or newer data page, and its encoding."""
+"""Field that describes a data page, dictionary or newer data page, to its field of the encoding."""
 
 
 def check_pages(data: memoryview, metadata: parquet.FileMetaData) -> None:
-    """Check what a file's pages unpack to, and that its row groups have the rows of the file.
+    """Check the sizes that a file's pages unpack to, and that its row groups have all its rows.
 
     Args:
-        data: The file.
-        metadata: From its footer, which may lie.
+        data: Content of the file.
+        metadata: Metadata from its footer, which may lie.
 
     Raises:
-        ValueError: It is beyond a limit, or damaged; says how.
+        ValueError: The file is beyond a limit, or damaged; says how.
     """
     groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
     rows = sum(group.num_rows for group in groups)
@@ -57,7 +56,7 @@ def check_pages(data: memoryview, metadata: parquet.FileMetaData) -> None:
 
 
 def _pages(data: memoryview, column: parquet.ColumnChunkMetaData) -> Iterator[int]:
-    """Bytes that each page of a column unpacks to."""
+    """Number of bytes that each page of a column unpacks to."""
     at = column.data_page_offset
     if column.has_dictionary_page and 0 < column.dictionary_page_offset < at:
         at = column.dictionary_page_offset
@@ -83,7 +82,7 @@ def _pages(data: memoryview, column: parquet.ColumnChunkMetaData) -> Iterator[in
 
 
 def _struct(data: memoryview, at: int) -> tuple[dict[int, Any], int]:
-    """A Thrift struct's fields, integers and structs by number, and where it ends."""
+    """The integer and struct fields of a Thrift struct by number, and the position of its end."""
     fields: dict[int, Any] = {}
     number = 0
     while head := data[at]:

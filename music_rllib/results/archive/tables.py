@@ -1,4 +1,4 @@
-"""Tables of an exported sweep as files, CSV or Parquet, which may come from strangers."""
+"""Tables of an exported sweep as CSV or Parquet files, which may come from strangers."""
 
 from __future__ import annotations
 
@@ -19,17 +19,15 @@ from music_rllib.limits import (
 )
 from music_rllib.results.archive.parquet_pages import check_pages
 
-__all__ = ["read_table", "write_table"]
-
 _FREE_ROWS = 100_000
-"""Rows that a file of any size may have."""
+"""Number of rows that a file of any size may have."""
 _FIRST_BYTES = 1 << 20
-"""In which a CSV file's first line ends."""
+"""Number of bytes in which a CSV file's first line ends."""
 _MAY_BE_EMPTY = ("started", "ended")
 
 
 def write_table(table: pa.Table, file: Path) -> None:
-    """Write it, as its ending says."""
+    """Write a table in the format of the file's ending."""
     if file.suffix == ".csv":
         csv.write_csv(table, file)
     else:
@@ -39,16 +37,16 @@ def write_table(table: pa.Table, file: Path) -> None:
 
 
 def read_table(file: Path, kinds: Mapping[str, pa.DataType]) -> pa.Table:
-    """Read a table and check it against a schema, before it takes memory where that can be.
+    """Read a table and check it against a schema, as far as possible before it takes memory.
 
     Args:
-        file: `.csv`, or Parquet.
-        kinds: The columns that there must be, by name; others are text.
+        file: A `.csv` or Parquet file.
+        kinds: Types of the columns that there must be, by name; others are text.
 
     Raises:
-        OSError: It can't be read.
-        ValueError: It is another table, or a larger one than its file can hold.
-        pyarrow.ArrowException: It is damaged.
+        OSError: The file can't be read.
+        ValueError: The table has other columns, or is larger than its file can hold.
+        pyarrow.ArrowException: The file is damaged.
     """
     with open_regular(file) as source:
         head, size = source.read(_FIRST_BYTES), os.fstat(source.fileno()).st_size
@@ -82,7 +80,7 @@ def _check_size(rows: int, columns: int, size: int) -> None:
 
 
 def _check_texts(table: pa.Table) -> None:
-    """Long texts that a dictionary repeats would be as many copies."""
+    """Check the length of all texts: long ones that a dictionary repeats become as many copies."""
     total = 0
     for column in table.columns:
         for chunk in column.chunks:

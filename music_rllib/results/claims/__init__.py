@@ -1,1 +1,1 @@
-"""What a study may claim: its primary metric, tests, the plan made before it, and the answer."""
+"""Claims of a study: its primary metric, tests, the plan made before it, and the answer."""

@@ -1,50 +1,59 @@
-"""The first lines of a report: what was asked, the answer with its interval, seeds and control."""
+"""The first sentences of a report: question, answer with its interval, seeds and control."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
 
-from music_rllib import names
-from music_rllib.results.claims.contrasts import Verdict
-from music_rllib.results.claims.plan import AnalysisPlan
-from music_rllib.results.claims.power import seeds_needed
-from music_rllib.results.claims.study import Claim, Study, label_of
-from music_rllib.results.comparison import ALL_TASKS, interval_text, number, p_text
-from music_rllib.results.conditions import FRESH, SEEDS
-from music_rllib.results.data import Sweep
+import numpy as np
 
-__all__ = ["answer", "in_words", "planned_in_words"]
+from music_rllib import names
+from music_rllib.results.claims.contrasts import (
+    Verdict,
+    seeds_for_difference,
+    seeds_for_equivalence,
+)
+from music_rllib.results.claims.plan import AnalysisPlan, is_controlled
+from music_rllib.results.claims.study import Claim, Mean, Study, label_of
+from music_rllib.results.comparison import ALL_TASKS, interval_text, number, p_text
+from music_rllib.results.conditions import Stage
+from music_rllib.results.data import Sweep
+from music_rllib.results.statistics import MAX_SEEDS, SIGNIFICANCE
 
 MOST_CLAIMS = 4
-"""In sentences of their own; the others are in the table."""
+"""Number of claims with a sentence of their own; the others are in the table."""
+FEWEST_SEEDS = 3
+"""Least number of seeds whose spread counts; that of two may be ten times too small."""
 
 
 def answer(sweep: Sweep, study: Study) -> list[str]:
     """At most ten sentences on a sweep, for its report and `compare`."""
-    said = [_asked(study)]
+    planned = planned_in_words(study)
+    sentences = [f"{planned[0].upper()}{planned[1:]}."]
+    if study.question is not None:
+        sentences = [f"Asked: {study.question} ({planned})."]
     if study.stage is None or not study.means:
-        return [*said, "No run that may be compared has finished yet."]
-    shown = [one for one in study.claims if one.task == ALL_TASKS] or list(study.claims)
-    mark = bool(study.planned)  # otherwise the first line says it of all
-    said += [f"{in_words(one)}{_after(one) if mark else ''}." for one in shown[:MOST_CLAIMS]]
+        return [*sentences, "No run that may be compared has finished yet."]
+    shown = [claim for claim in study.claims if claim.task == ALL_TASKS] or list(study.claims)
+    sentences += [f"{in_words(claim)}." for claim in shown[:MOST_CLAIMS]]
     if not shown and study.afterwards:
-        said.append("Nothing that was planned can be tested yet; what was not is in the table.")
+        text = "Nothing that was planned can be tested yet; what was not is in the table."
+        sentences.append(text)
     elif not shown:
         only = study.means[0]
-        said.append(
+        sentences.append(
             f"Nothing is compared: {label_of(only.condition)} has {only.measure.words} of "
             f"{number(only.estimate.value)} (95 % {interval_text(only.estimate)})."
         )
-    if rest := [one for one in study.claims if one not in shown[:MOST_CLAIMS]]:
-        counts = Counter(one.verdict for one in rest)
-        found = ", ".join(f"{n} {verdict}" for verdict, n in counts.items())
-        said.append(f"Of {len(rest)} more comparisons: {found}.")
-    said += [_counted(study, shown), _seeds(study, shown), f"Control: {_control(sweep, study)}."]
-    if any(one.verdict is Verdict.UNDECIDED for one in study.claims):
-        said += filter(None, [seeds_needed(shown, study.means, len(study.claims))])
-    said += [f"Not tested: {text}." for text in study.untested[:1]]
-    return said
+    if rest := [claim for claim in study.claims if claim not in shown[:MOST_CLAIMS]]:
+        counts = Counter(claim.verdict for claim in rest)
+        verdicts = ", ".join(f"{n} {verdict}" for verdict, n in counts.items())
+        sentences.append(f"Of {len(rest)} more comparisons: {verdicts}.")
+    sentences += [_counted(study, shown), _seeds(study, shown)]
+    sentences.append(f"Control: {_control(sweep, study, study.stage)}.")
+    if any(claim.verdict is Verdict.UNDECIDED for claim in study.claims):
+        sentences += filter(None, [seeds_needed(shown, study.means, len(study.claims))])
+    return [*sentences, *(f"Not tested: {text}." for text in study.untested[:1])]
 
 
 def planned_in_words(study: Study) -> str:
@@ -66,31 +75,20 @@ def planned_in_words(study: Study) -> str:
 
 
 def _changed(before: AnalysisPlan, after: AnalysisPlan) -> list[str]:
-    """Parts of a plan that a later version has otherwise, such as more seeds."""
+    """Fields that a later version of a plan has changed, such as the seeds."""
     known, now = before.model_dump(), after.model_dump()
     return [name.replace("_", " ") for name in known if known[name] != now[name]]
-
-
-def _asked(study: Study) -> str:
-    text = planned_in_words(study)
-    if study.question is None:
-        return f"{text[0].upper()}{text[1:]}."
-    return f"Asked: {study.question} ({text})."
 
 
 def in_words(claim: Claim) -> str:
     """`q = 1.5 against q = 1 on FetchPush: superior by 0.12 (95 % 0.05 to 0.19; p = 0.002)`."""
     difference = claim.contrast.difference
-    gap = (
-        f"{float(difference.value):+.2f}"
-        if abs(difference.value) < 100
-        else number(difference.value)
-    )
-    ends = "no interval"
+    is_small = abs(difference.value) < 100
+    gap = f"{float(difference.value):+.2f}" if is_small else number(difference.value)
+    ends = interval_text(difference)
     if difference.has_interval:
-        ends = f"95 % {interval_text(difference)}"
-    tested = p_text(claim.p_value)
-    verdict = str(claim.verdict)
+        ends = f"95 % {ends}"
+    tested, verdict = p_text(claim.p_value), str(claim.verdict)
     if claim.verdict is Verdict.EQUIVALENT:
         verdict = f"equivalent within {claim.margin:g}"
         tested = p_text(claim.p_equivalent if claim.p_equivalent is not None else 1.0)
@@ -101,10 +99,6 @@ def in_words(claim: Claim) -> str:
         f"{claim.first} against {claim.second} {where}{mean}: {verdict}, {gap} ({ends}; {tested})"
         f"{held}"
     )
-
-
-def _after(claim: Claim) -> str:
-    return "" if claim.planned else " (not planned)"
 
 
 def _counted(study: Study, shown: Sequence[Claim]) -> str:
@@ -130,29 +124,76 @@ def _seeds(study: Study, shown: Sequence[Claim]) -> str:
     elif shown:
         paired = [one.contrast.paired for one in shown]
         text += ", compared in pairs" if all(paired) else ", not all of them shared"
-    if study.stage is not None and any((SEEDS, FRESH) in c.others for c in study.stage.compared):
+    if study.stage is not None and study.stage.is_search:
         text += ", fresh ones that no setting was chosen by"
     return f"{text}; {finished} of {runs} runs are finished."
 
 
-def _control(sweep: Sweep, study: Study) -> str:
+def _control(sweep: Sweep, study: Study, stage: Stage) -> str:
     """What is done for different q to be compared fairly."""
     version = study.plan or study.latest
     if version is not None:
         return version.plan.control
-    assert study.stage is not None, "the caller has looked"
-    compared = study.stage.compared
-    alphas = {
-        label_of(one): sweep.runs[run].tags.get(names.TAG_ALPHA, "")
-        for one in compared
-        for run in one.runs[:1]
-    }
-    words = sorted(set(alphas.values()))
-    if any((SEEDS, FRESH) in one.others for one in compared):
+    alphas = {sweep.runs[one.runs[0]].tags.get(names.TAG_ALPHA, "") for one in stage.compared}
+    words = sorted(alphas)
+    if stage.is_search:
         return f"settings were searched on other seeds; α is {', '.join(words)}"
     if len(words) > 1:
         return f"α varies beside q ({', '.join(words)})"
-    same_q = len({one.entropic_index for one in compared}) == 1
-    if same_q or any(word in words[0] for word in ("matched", "learned", "normalised")):
+    same_q = len({condition.entropic_index for condition in stage.compared}) == 1
+    if same_q or is_controlled(words[0]):
         return f"α {words[0]}"
     return f"none, one α ({words[0]}) for all: policies of different q differ in entropy"
+
+
+def seeds_needed(claims: Sequence[Claim], means: Sequence[Mean], family: int) -> str | None:
+    """A sentence about the seeds; None without a margin or where no spread is known.
+
+    Conditions within the margin of a ceiling or floor are left out: their seeds differ less than
+    those of others.
+
+    Args:
+        claims: claims whose spread counts.
+        means: primary metric of the conditions.
+        family: number of comparisons that are tested together; by Holm's method the first of them
+            has a level of 5 % / family.
+    """
+    margin = max((claim.margin for claim in claims if claim.margin is not None), default=None)
+    if margin is None:
+        return None
+    if means and all(_at_a_bound(mean, margin) for mean in means):
+        return (
+            f"All are within {margin:g} of the ceiling or the floor, where seeds differ less than "
+            "elsewhere: their spread does not tell how many would be needed."
+        )
+    bounded = {(mean.condition.label, mean.task) for mean in means if _at_a_bound(mean, margin)}
+    clear = [
+        claim.contrast
+        for claim in claims
+        if claim.margin is not None
+        and np.isfinite(claim.contrast.spread)
+        and min(claim.contrast.seeds) >= FEWEST_SEEDS
+        and not {(claim.first, claim.task), (claim.second, claim.task)} & bounded
+    ]
+    if not clear:
+        return None
+    paired = all(contrast.paired for contrast in clear)
+    spread = float(np.sqrt(np.mean([float(contrast.spread) ** 2 for contrast in clear])))
+    level = SIGNIFICANCE / family
+    shown = _seeds_text(seeds_for_difference(margin, spread, paired=paired, level=level))
+    alike = _seeds_text(seeds_for_equivalence(margin, spread, paired=paired, level=level))
+    pairs = "paired seeds" if paired else "single seeds"
+    return (
+        f"Differences of {pairs} spread by {number(spread)} (standard deviation): a difference of "
+        f"{margin:g} shows with 80 % chance from {shown} on, equivalence within it from {alike} on "
+        "where there is none."
+    )
+
+
+def _at_a_bound(mean: Mean, margin: float) -> bool:
+    value = float(mean.estimate.value)
+    return mean.measure.is_rate and not margin <= value <= 1 - margin
+
+
+def _seeds_text(needed: int | None) -> str:
+    return f"more than {MAX_SEEDS} seeds" if needed is None else f"{needed} seeds"

@@ -1,4 +1,4 @@
-"""One condition against another: their difference, its tests, and what they decide.
+"""Contrasts of two conditions: their difference, its tests, and what these decide.
 
 Shapes: `x` and `y` are `[seeds]`, or `[seeds, draws]` for many studies at once (simulations); the
 results have the shape of the draws. Conditions that share their seeds share initial weights,
@@ -15,46 +15,48 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from math import comb
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
-from music_rllib.results.statistics import MAX_SEEDS, SIGNIFICANCE, Array, Estimate, holm
-
-__all__ = ["Contrast", "Verdict", "contrast", "decide", "seeds_for_difference"]
-__all__ += ["seeds_for_equivalence", "verdict_of"]
+from music_rllib.results.statistics import (
+    SIGNIFICANCE,
+    Array,
+    Estimate,
+    fewest_seeds,
+    holm,
+    power_of_t_test,
+)
 
 _TIED = 1e-6
 """Standard deviations below it are rounding errors: the seeds tie."""
 
 
 class Verdict(StrEnum):
-    """What a comparison came to; each wrong one has a chance of at most 5 %."""
+    """Outcome of a comparison; each wrong one has a chance of at most 5 %."""
 
     SUPERIOR = "superior"
     WORSE = "worse"
     EQUIVALENT = "equivalent"
-    """Within the margin, whether or not there is some difference."""
+    """The difference is within the margin, whether or not there is some."""
     UNDECIDED = "undecided"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Contrast:
-    """`x - y`."""
+    """The difference `x - y` and its tests."""
 
     difference: Estimate
-    """Of the means, with its 95 % interval."""
+    """Difference of the means, with its 95 % interval."""
     p_value: Array
-    """Two-sided, of no difference; 1 where there are too few seeds for a test."""
+    """Two-sided p-value of no difference; 1 where there are too few seeds for a test."""
     p_equivalent: Array | None
-    """Of a difference of the margin or more; None without a margin."""
+    """p-value of a difference of the margin or more; None without a margin."""
     spread: Array
     """Standard deviation of a difference between single seeds; NaN where it is not known."""
     paired: bool
     seeds: tuple[int, int]
-    """Of `x` and `y`; the pairs where it is paired."""
+    """Number of seeds of `x` and of `y`."""
 
 
 def contrast(
@@ -70,11 +72,11 @@ def contrast(
     Args:
         x: `[m]` or `[m, draws]`, a score for each seed.
         y: `[n]` or `[n, draws]`; with `paired` of the same seeds in the same order.
-        paired: whether they are.
+        paired: whether seeds are compared in pairs.
         margin: > 0, below which a difference does not matter; None: equivalence is not tested.
-        apart: interval of the difference by what is known of each condition alone, such as its
-            evaluation episodes; it stands where all seeds tie, and equivalence is not claimed
-            beyond it.
+        apart: the difference, with an interval from what is known of each condition alone, such as
+            its evaluation episodes. Where all seeds tie this interval stands, and equivalence is
+            not claimed beyond it.
 
     Raises:
         ValueError: `margin` is not > 0, or pairs are incomplete.
@@ -86,86 +88,70 @@ def contrast(
     x, y = np.asarray(x, float), np.asarray(y, float)
     value = np.asarray(x.mean(axis=0) - y.mean(axis=0))
     if min(len(x), len(y)) < 2:
-        nothing, one = np.full(value.shape, np.nan), np.ones(value.shape)
+        unknown, certain = np.full(value.shape, np.nan), np.ones(value.shape)
         return Contrast(
-            difference=Estimate(value=value, lower=nothing, upper=nothing),
-            p_value=one,
-            p_equivalent=None if margin is None else one,
-            spread=nothing,
+            difference=Estimate(value=value, lower=unknown, upper=unknown),
+            p_value=certain,
+            p_equivalent=None if margin is None else certain,
+            spread=unknown,
             paired=paired,
             seeds=(len(x), len(y)),
         )
-    test = _Student(x, y, paired)
-    tied = test.spread < _TIED
-    exact = _Relabelled(len(x), len(y), paired)
-    half = stats.t.ppf(1 - SIGNIFICANCE / 2, test.freedom) * np.where(tied, np.nan, test.error)
+    spread, error, freedom = _student(x, y, paired)
+    tied = spread < _TIED
+    # Ways to relabel tied seeds, none but one of which is as far apart: of pairs each difference
+    # may have the other sign, of groups each choice of seeds counts.
+    ways = 2 ** len(x) if paired else comb(len(x) + len(y), len(x))
+
+    def p_greater(difference: Array) -> Array:
+        """One-sided p-value of a mean difference as large as this one."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            student = stats.t.sf(difference / error, freedom)
+        return np.where(tied, np.where(difference > _TIED, 1 / ways, 1.0), student)
+
+    half = stats.t.ppf(1 - SIGNIFICANCE / 2, freedom) * np.where(tied, np.nan, error)
     lower, upper = value - half, value + half
-    p_value = np.where(tied, exact.two_sided(value), 2 * test.greater(np.abs(value)))
     if apart is not None:
         lower, upper = np.where(tied, apart.lower, lower), np.where(tied, apart.upper, upper)
     p_equivalent = None
     if margin is not None:
-        p_equivalent = np.where(
-            tied,
-            np.maximum(exact.greater(value + margin), exact.greater(margin - value)),
-            np.maximum(test.greater(margin + value), test.greater(margin - value)),
-        )
+        p_equivalent = np.maximum(p_greater(margin + value), p_greater(margin - value))
         if apart is not None:
             beyond = (apart.lower <= -margin) | (apart.upper >= margin)
             p_equivalent = np.where(tied & beyond, 1.0, p_equivalent)
     return Contrast(
         difference=Estimate(value=value, lower=lower, upper=upper),
-        p_value=p_value,
+        p_value=np.minimum(1.0, 2 * p_greater(np.abs(value))),
         p_equivalent=p_equivalent,
-        spread=np.where(tied, np.nan, test.spread),
+        spread=np.where(tied, np.nan, spread),
         paired=paired,
         seeds=(len(x), len(y)),
     )
 
 
-class _Student:
+def _student(x: Array, y: Array, paired: bool) -> tuple[Array, Array, Array]:
     """Student's test of pairs, or Welch's, along the seeds.
 
     As scipy's `ttest_rel` and `ttest_ind`, which warn where a condition has no spread.
+
+    Returns:
+        Standard deviation of a difference, standard error of its mean, degrees of freedom.
     """
-
-    def __init__(self, x: Array, y: Array, paired: bool) -> None:
-        samples = [x - y] if paired else [x, y]
-        variances = np.stack([np.var(one, axis=0, ddof=1) for one in samples])
-        sizes = np.reshape([len(one) for one in samples], (-1, *[1] * (variances.ndim - 1)))
-        parts = variances / sizes
-        squares = (parts**2 / (sizes - 1)).sum(axis=0)
-        self.spread, self.error = np.sqrt(variances.sum(axis=0)), np.sqrt(parts.sum(axis=0))
-        with np.errstate(invalid="ignore"):
-            self.freedom = parts.sum(axis=0) ** 2 / squares
-
-    def greater(self, difference: Array) -> Array:
-        """One-sided p-value of a mean difference as large as this one."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(stats.t.sf(difference / self.error, self.freedom))
-
-
-class _Relabelled:
-    """The permutation test where all differences are the same: no relabelling but one is as far.
-
-    Of pairs each sign may be the other one, 2^n ways; of groups each choice of seeds counts.
-    """
-
-    def __init__(self, m: int, n: int, paired: bool) -> None:
-        self._ways = 2**m if paired else comb(m + n, m)
-
-    def two_sided(self, difference: Array) -> Array:
-        return np.where(np.abs(difference) < _TIED, 1.0, min(1.0, 2 / self._ways))
-
-    def greater(self, difference: Array) -> Array:
-        return np.where(difference > _TIED, 1 / self._ways, 1.0)
+    samples = [x - y] if paired else [x, y]
+    variances = np.stack([np.var(sample, axis=0, ddof=1) for sample in samples])
+    sizes = np.reshape([len(sample) for sample in samples], (-1, *[1] * (variances.ndim - 1)))
+    parts = variances / sizes
+    squares = (parts**2 / (sizes - 1)).sum(axis=0)
+    with np.errstate(invalid="ignore"):
+        freedom = parts.sum(axis=0) ** 2 / squares
+    return np.sqrt(variances.sum(axis=0)), np.sqrt(parts.sum(axis=0)), freedom
 
 
 def verdict_of(difference: float, p_value: float, p_equivalent: float | None) -> Verdict:
-    """What adjusted p-values decide.
+    """The verdict from adjusted p-values.
 
-    A difference that is surely within the margin is one that does not matter, so that equivalence
-    goes before a difference that is surely there.
+    A difference that is surely within the margin does not matter, so equivalence goes before a
+    difference that is surely there.
     """
     if p_equivalent is not None and p_equivalent < SIGNIFICANCE:
         return Verdict.EQUIVALENT
@@ -183,12 +169,12 @@ def decide(contrasts: Sequence[Contrast]) -> list[tuple[float, float | None, Ver
     p_values = holm([float(one.p_value) for one in contrasts])
     tested = [float(one.p_equivalent) for one in contrasts if one.p_equivalent is not None]
     adjusted = iter(holm(tested))
-    found = []
+    decisions = []
     for one, p_value in zip(contrasts, p_values, strict=True):
         p_equivalent = None if one.p_equivalent is None else next(adjusted)
         verdict = verdict_of(float(one.difference.value), p_value, p_equivalent)
-        found.append((p_value, p_equivalent, verdict))
-    return found
+        decisions.append((p_value, p_equivalent, verdict))
+    return decisions
 
 
 # Seeds needed -------------------------------------------------------------------------------------
@@ -206,16 +192,14 @@ def seeds_for_difference(
         level: of the two-sided test; with Holm's correction the first of k has 5 % / k.
 
     Returns:
-        None where `MAX_SEEDS` are not enough.
+        The number; None where `MAX_SEEDS` are not enough.
     """
-
-    def power(seeds: NDArray[np.int64]) -> Array:
-        freedom, shift = _student(seeds, difference, spread, paired)
-        critical = stats.t.ppf(1 - level / 2, freedom)
-        # The other tail, below -critical, has a share that no number of seeds turns on.
-        return np.asarray(stats.nct.sf(critical, freedom, shift))
-
-    return _fewest(power)
+    groups = 1 if paired else 2
+    return fewest_seeds(
+        lambda seeds: power_of_t_test(
+            groups * (seeds - 1), difference / spread * np.sqrt(seeds), level
+        )
+    )
 
 
 def seeds_for_equivalence(
@@ -226,25 +210,12 @@ def seeds_for_equivalence(
     Arguments are those of :func:`seeds_for_difference`; `level` is that of either one-sided test.
     """
 
-    def power(seeds: NDArray[np.int64]) -> Array:
-        freedom, shift = _student(seeds, margin, spread, paired)
+    def power(seeds: Array) -> Array:
+        freedom = (1 if paired else 2) * (seeds - 1)
         critical = stats.t.ppf(1 - level, freedom)
+        missed = stats.nct.cdf(critical, freedom, margin / spread * np.sqrt(seeds))
         # Both tests have to reject; the chance that one of them does not is twice that of either.
-        return np.asarray(1 - 2 * stats.nct.cdf(critical, freedom, shift))
+        # Far from the centre scipy's cdf is NaN where it would be 0.
+        return np.asarray(1 - 2 * np.nan_to_num(missed, nan=0.0))
 
-    return _fewest(power)
-
-
-def _student(
-    seeds: NDArray[np.int64], difference: float, spread: float, paired: bool
-) -> tuple[Array, Array]:
-    """Degrees of freedom, and how far from 0 the statistic is expected."""
-    freedom = np.asarray((seeds - 1.0) * (1 if paired else 2))
-    return freedom, np.asarray(difference / spread * np.sqrt(seeds), dtype=float)
-
-
-def _fewest(power: Any) -> int | None:
-    seeds = np.arange(2, MAX_SEEDS + 1)
-    # Far from the centre scipy's tails are NaN where they would be certain.
-    enough = np.nan_to_num(power(seeds), nan=1.0) >= 0.8
-    return int(seeds[enough.argmax()]) if enough.any() else None
+    return fewest_seeds(power)

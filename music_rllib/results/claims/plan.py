@@ -1,9 +1,9 @@
-"""An analysis plan: what is asked and how it will be decided, kept before the runs.
+"""Analysis plans: a question and how it will be decided, recorded before the runs.
 
-Every version is kept with the time at which it was recorded, so that a report can tell what was
-planned from what was thought of afterwards: a plan that was recorded after the first of its runs
-had finished is none. The hash is that of the plan alone: the same section of a sweep's file has
-the same one on every machine, and can be cited, or committed, before anything runs.
+Every version is kept with the time at which it was recorded, so that a report can tell planned
+comparisons from later ones: a plan that was recorded after the first of its runs had finished does
+not count. The hash is that of the plan alone: the same section of a sweep's file has the same hash
+on every machine, and can be cited, or committed, before anything runs.
 """
 
 from __future__ import annotations
@@ -21,11 +21,8 @@ from music_rllib.config.schema import Stage, SweepConfig
 from music_rllib.config.tac_settings import in_words
 from music_rllib.store.files import content_key
 
-__all__ = ["AnalysisPlan", "PlanVersion", "analysis_plan", "as_document", "as_markdown"]
-__all__ += ["checked_plans", "with_plan"]
-
 MARGIN_OF_A_RATE = 0.05
-"""Where nobody states another."""
+"""Default margin of a success rate."""
 _PRIMARY = {
     "auc": "area under the learning curve of {metric}: its mean over the budget, by the trapezoid "
     "rule over environment steps",
@@ -38,7 +35,6 @@ _TEST = (
 )
 MOST_VERSIONS = 1000
 
-
 Line = Annotated[str, Field(max_length=100_000, pattern=r"^[^\x00-\x1f\x7f]*$")]
 """A plan may come from strangers: without control characters, which a terminal would obey."""
 
@@ -48,19 +44,19 @@ class _Strict(BaseModel):
 
 
 class AnalysisPlan(_Strict):
-    """What is asked, and everything that decides it."""
+    """A question, and everything that decides it."""
 
     question: Line | None
     hypotheses: tuple[Line, ...] = Field(min_length=1, max_length=50, strict=False)
     stage: Line
-    """Whose conditions are compared, where a hypothesis names no other."""
+    """Stage of the conditions, where a hypothesis names no other."""
     metric: Literal["auc", "final"]
     primary_metric: Line
-    """The same in words."""
+    """`metric` in words."""
     margin: float | None = Field(gt=0)
     seeds: Line
     control: Line
-    """What is done for q to be compared fairly."""
+    """What is done for different q to be compared fairly."""
     budget: dict[Line, int]
     """Environment steps over which runs are compared, by task."""
     test: Line
@@ -73,18 +69,22 @@ class AnalysisPlan(_Strict):
 
     @property
     def stages(self) -> frozenset[str]:
-        """Those that the hypotheses are about."""
-        sides = [side for text in self.hypotheses for side in Hypothesis.of(text)[1:3]]
-        return frozenset(side.get("stage", self.stage) for side in sides)
+        """Names of the stages that the hypotheses are about."""
+        return _stages_of(self.hypotheses, self.stage)
 
     @property
     def hash(self) -> str:
-        """Of its content."""
+        """Hash of the content."""
         return content_key(self.model_dump(mode="json"))
 
 
+def _stages_of(hypotheses: Sequence[str], default: str) -> frozenset[str]:
+    sides = [side for text in hypotheses for side in Hypothesis.of(text)[1:3]]
+    return frozenset(side.get("stage", default) for side in sides)
+
+
 class PlanVersion(_Strict):
-    """A plan as it was at one time."""
+    """A plan as it was recorded at one time."""
 
     version: int = Field(ge=1)
     recorded_ms: int = Field(ge=0, lt=2**47)
@@ -111,7 +111,7 @@ def checked_plans(document: Any) -> tuple[PlanVersion, ...]:
     """Versions from plain data that may come from strangers, in the order of their times.
 
     Raises:
-        ValueError: it is none, or a plan is not what was recorded.
+        ValueError: the data are something else, or a plan is not what was recorded.
     """
     if not isinstance(document, list) or len(document) > MOST_VERSIONS:
         raise ValueError(f"must be a list of at most {MOST_VERSIONS} versions of a plan")
@@ -127,7 +127,7 @@ def as_document(versions: Sequence[PlanVersion]) -> list[dict[str, Any]]:
 def with_plan(
     versions: Sequence[PlanVersion], plan: AnalysisPlan, now_ms: int
 ) -> tuple[PlanVersion, ...]:
-    """`versions`, and this one as a new version unless it is the last one's."""
+    """`versions`, and `plan` as a new version unless the last version has it."""
     if versions and versions[-1].hash == plan.hash:
         return tuple(versions)
     new = PlanVersion(version=len(versions) + 1, recorded_ms=now_ms, hash=plan.hash, plan=plan)
@@ -135,7 +135,7 @@ def with_plan(
 
 
 def as_markdown(name: str, versions: Sequence[PlanVersion]) -> str:
-    """For readers, the newest version first."""
+    """The versions for readers, the newest first."""
     parts = [f"# Analysis plan of {name}\n"]
     for one in reversed(versions):
         content = one.plan.model_dump(mode="json", exclude_none=True)
@@ -156,11 +156,7 @@ def analysis_plan(config: SweepConfig) -> AnalysisPlan | None:
     if analysis is None:
         return None
     default = analysis.stage or config.stages[-1].name
-    about = {
-        side.get("stage", default)
-        for text in analysis.hypotheses
-        for side in Hypothesis.of(text)[1:3]
-    }
+    about = _stages_of(analysis.hypotheses, default)
     stages = [stage for stage in config.stages if stage.name in about]
     metrics = sorted({task.primary_metric for stage in stages for task in stage.tasks})
     margin = analysis.margin
@@ -173,18 +169,18 @@ def analysis_plan(config: SweepConfig) -> AnalysisPlan | None:
         metric=analysis.metric,
         primary_metric=_PRIMARY[analysis.metric].format(metric=" or ".join(metrics)),
         margin=margin,
-        seeds=_each(stages, {stage.name: _seeds(stage, config.seeds) for stage in stages}),
-        control=_each(stages, {stage.name: _control(stage) for stage in stages}),
+        seeds=_of_each({stage.name: _seeds(stage, config.seeds) for stage in stages}),
+        control=_of_each({stage.name: _control(stage) for stage in stages}),
         budget=_budget(stages),
         test=_TEST,
     )
 
 
-def _each(stages: Sequence[Stage], said: Mapping[str, str]) -> str:
-    """Of each stage, unless all have the same."""
-    if len(set(said.values())) == 1:
-        return said[stages[0].name]
-    return "; ".join(f"{name}: {text}" for name, text in said.items())
+def _of_each(texts: Mapping[str, str]) -> str:
+    """The text of each stage, or one text where all stages have the same."""
+    if len(set(texts.values())) == 1:
+        return next(iter(texts.values()))
+    return "; ".join(f"{name}: {text}" for name, text in texts.items())
 
 
 def _seeds(stage: Stage, seeds: Sequence[int]) -> str:
@@ -203,12 +199,16 @@ def _control(stage: Stage) -> str:
     words = sorted({in_words(run.tac.alpha) for p in stage.points for run in p.runs.values()})
     if len(words) > 1:
         return f"α varied: {', '.join(words)}; differences are means over it"
-    control = any(word in words[0] for word in ("matched", "learned", "normalised"))
-    return f"α {words[0]}" if control else f"none: one α of {words[0]} for all"
+    return f"α {words[0]}" if is_controlled(words[0]) else f"none: one α of {words[0]} for all"
+
+
+def is_controlled(alpha: str) -> bool:
+    """Whether α, in words, adapts so that policies of different q may be compared."""
+    return any(word in alpha for word in ("matched", "learned", "normalised"))
 
 
 def _budget(stages: Sequence[Stage]) -> dict[str, int]:
-    """What is compared over: the least of any stage, of runs on fresh seeds where it searches."""
+    """Least budget of a task in any stage; of a search that of its runs on fresh seeds."""
     budget: dict[str, int] = {}
     for stage in stages:
         final = stage.search.final if stage.search else None

@@ -1,4 +1,4 @@
-"""A sweep's analysis plan in its folder: recorded before anything runs, each change as a version.
+"""Record of a sweep's analysis plan in its folder: made before any run, each change a version.
 
 `analysis_plan.json` holds the versions, `analysis_plan.md` is the same for readers.
 """
@@ -21,16 +21,14 @@ from music_rllib.results.claims.plan import (
 )
 from music_rllib.store.object_folder import StorageError
 
-__all__ = ["PLANS_TO_READ", "plans_in", "record_plan"]
-
 PLANS, PLANS_TO_READ = "analysis_plan.json", "analysis_plan.md"
 
 
 def plans_in(storage: str, name: str) -> tuple[PlanVersion, ...]:
-    """Versions of a sweep's plan, the oldest first; none where none was recorded.
+    """Versions of a sweep's plan, the oldest first; empty where none was recorded.
 
     Raises:
-        StorageError: They can't be read, or are not what was recorded.
+        StorageError: The versions can't be read, or are not what was recorded.
     """
     document = read(storage, f"{name}/{PLANS}")
     try:
@@ -44,10 +42,10 @@ def plans_in(storage: str, name: str) -> tuple[PlanVersion, ...]:
 
 
 def record_plan(sweep: Sweep) -> Sequence[PlanVersion]:
-    """Keep the plan of the sweep's file, as a new version if it is not the last one's; all of them.
+    """Keep the plan of the sweep's file, as a new version where it changed; return all versions.
 
     Raises:
-        StorageError: It can't be kept, or earlier versions can't be read.
+        StorageError: The plan can't be kept, or earlier versions can't be read.
     """
     before = plans_in(sweep.storage, sweep.config.name)
     plan = analysis_plan(sweep.config)

@@ -1,4 +1,10 @@
-"""A score for each seed: what the runs of a condition are compared by."""
+"""A score for each seed: what the runs of a condition are compared by.
+
+A study's primary metric is the area under the learning curve: the mean of a metric over the budget.
+It counts how soon and how high alike. Steps to a threshold are biased early where an evaluation is
+noisy (an agent at 85 % passes "90 % of 50 episodes" in 22 % of its evaluations), and final values
+say nothing where all runs end at the ceiling.
+"""
 
 from __future__ import annotations
 
@@ -8,31 +14,27 @@ from dataclasses import dataclass
 import numpy as np
 
 from music_rllib import names
-from music_rllib.results.claims.area import area_under_curve
 from music_rllib.results.conditions import Condition
 from music_rllib.results.data import Sweep
-
-__all__ = ["Measure", "Scores", "ended_first", "measure_on", "scores_of"]
-
-FINISHED = "FINISHED"
+from music_rllib.results.statistics import Array
 
 
 @dataclass(frozen=True, kw_only=True)
 class Measure:
-    """What counts of a run."""
+    """The number that a run is compared by."""
 
     kind: str
     """`auc`: the area under the curve of `metric` over the budget, its mean; `final`: its last
     value."""
     metric: str
     horizon: float
-    """Environment steps of the area: the smallest budget of what is compared; NaN for tasks
-    together, each of which has its own."""
+    """Environment steps of the area, the smallest budget of what is compared; NaN for several
+    tasks with a horizon each."""
     maximised: bool = True
 
     @property
     def is_rate(self) -> bool:
-        """Whether it is a share of episodes, within 0 and 1."""
+        """Whether it is a share of episodes, between 0 and 1."""
         return self.metric in names.EVAL_RATES
 
     @property
@@ -47,24 +49,24 @@ class Measure:
 
 @dataclass(frozen=True, kw_only=True)
 class Scores:
-    """Of one condition on one task."""
+    """Scores of one condition on one task."""
 
     by_seed: Mapping[str, float]
-    """Of the runs that have finished."""
+    """Scores of the finished runs."""
     episodes: float
-    """Evaluation episodes behind each, mean of the runs; infinite where they are not known."""
+    """Evaluation episodes behind a score, mean of the runs; infinite where they are not known."""
 
 
 def measure_on(
     sweep: Sweep, task: str, runs: Sequence[int], kind: str, metric: str | None = None
 ) -> Measure:
-    """What the runs on a task are compared by, over a budget that each of them has."""
-    metric = metric or sweep.primary_metric(task)
+    """The measure of the runs on a task, over a budget that each of them has."""
     budgets = [
         float(sweep.runs[run].budget or sweep.last_step(run))
         for run in runs
         if sweep.runs[run].task == task
     ]
+    metric = metric or sweep.primary_metric(task)
     return Measure(kind=kind, metric=metric, horizon=min(budgets, default=0.0))
 
 
@@ -77,7 +79,7 @@ def scores_of(sweep: Sweep, condition: Condition, task: str, measure: Measure) -
     by_seed, episodes = {}, []
     for run in condition.runs:
         record = sweep.runs[run]
-        if record.task != task or record.status != FINISHED:
+        if record.task != task or not record.is_finished:
             continue
         steps, values = sweep.finite(run, measure.metric)
         score, evaluations = values[-1] if len(values) else np.nan, 1
@@ -86,23 +88,43 @@ def scores_of(sweep: Sweep, condition: Condition, task: str, measure: Measure) -
             evaluations = int(np.sum(steps <= measure.horizon))
         if not np.isnan(score):
             by_seed[record.seed] = float(score)
-            found = sweep.final(run, names.EVAL_EPISODES)
-            episodes.append(np.inf if found is None else found * evaluations)
+            of_one = sweep.final(run, names.EVAL_EPISODES)
+            episodes.append(np.inf if of_one is None else of_one * evaluations)
     return Scores(by_seed=by_seed, episodes=float(np.mean(episodes)) if episodes else np.inf)
 
 
-def ended_first(sweep: Sweep, runs: Sequence[int]) -> float:
-    """When the first of the finished runs had its last evaluation, ms since the epoch.
+def area_under_curve(steps: Array, values: Array, horizon: float) -> float:
+    """Mean of a learning curve over environment steps 0 to `horizon`, by the trapezoid rule.
 
-    Infinite before any has finished. A run that was taken over from another sweep counts when that
-    one computed it.
+    Before the first evaluation the curve has that one's value; a budget of 100 steps that ends
+    between two evaluations is cut there.
+
+    Args:
+        steps: `[points]` of the evaluations, rising.
+        values: `[points]`, finite.
+        horizon: environment steps, > 0.
+
+    Returns:
+        The mean in the metric's unit; NaN for a run without an evaluation at `horizon` or later,
+        as the rest of its curve is not known.
+    """
+    if not len(steps) or steps[-1] < horizon:
+        return float("nan")
+    inside = steps[(steps > 0) & (steps < horizon)]
+    at = np.concatenate([[0.0], inside, [horizon]])
+    return float(np.trapezoid(np.interp(at, steps, values), at) / horizon)
+
+
+def ended_first(sweep: Sweep, runs: Sequence[int]) -> float:
+    """Time of the earliest last evaluation among finished runs, in ms since the epoch.
+
+    The time is infinite before any run has finished. A run that was taken over from another sweep
+    counts when that sweep computed it.
     """
     ends = []
     for run in runs:
         record = sweep.runs[run]
-        column = sweep.history.get(sweep.primary_metric(record.task))
-        if record.status == FINISHED and column is not None:
-            begin, end = np.searchsorted(column.run, [run, run + 1])
-            if end > begin:
-                ends.append(float(column.time[end - 1]))
+        times = sweep.column(run, sweep.primary_metric(record.task)).time
+        if record.is_finished and len(times):
+            ends.append(float(times[-1]))
     return min(ends, default=np.inf)

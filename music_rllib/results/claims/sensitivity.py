@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from music_rllib.results.claims.study import Mean
-from music_rllib.results.conditions import Values
+from music_rllib.results.conditions import ALPHA, Values
 from music_rllib.results.statistics import Array, Estimate
-
-__all__ = ["AlphaLine", "alpha_sensitivity"]
-
-ALPHA = "α"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,7 +20,7 @@ class AlphaLine:
     task: str
     entropic_index: str
     others: Values
-    """What else they have in common that tells them from other lines."""
+    """Other settings that tell the line from the others."""
     means: tuple[Mean, ...]
     alphas: Array
     """`[points]`."""
@@ -33,7 +30,7 @@ class AlphaLine:
 
 def alpha_sensitivity(means: Sequence[Mean]) -> list[AlphaLine]:
     """Lines of at least two values of α; a condition whose α is no number is on none."""
-    groups: dict[tuple[str, str, Values], list[tuple[float, Mean]]] = {}
+    groups: defaultdict[tuple[str, str, Values], list[tuple[float, Mean]]] = defaultdict(list)
     for mean in means:
         others = dict(mean.condition.others)
         try:
@@ -41,24 +38,23 @@ def alpha_sensitivity(means: Sequence[Mean]) -> list[AlphaLine]:
         except ValueError:
             continue
         key = (mean.task, mean.condition.entropic_index, tuple(others.items()))
-        groups.setdefault(key, []).append((alpha, mean))
+        groups[key].append((alpha, mean))
     return [_line(*key, points) for key, points in groups.items() if len(points) > 1]
 
 
 def _line(
     task: str, entropic_index: str, others: Values, points: Sequence[tuple[float, Mean]]
 ) -> AlphaLine:
-    ordered = sorted(points, key=lambda point: point[0])
-    found = [mean.estimate for _, mean in ordered]
+    alphas, means = zip(*sorted(points, key=lambda point: point[0]), strict=True)
+    value, lower, upper = (
+        np.array([float(getattr(mean.estimate, end)) for mean in means])
+        for end in ("value", "lower", "upper")
+    )
     return AlphaLine(
         task=task,
         entropic_index=entropic_index,
         others=others,
-        means=tuple(mean for _, mean in ordered),
-        alphas=np.array([alpha for alpha, _ in ordered]),
-        estimate=Estimate(
-            value=np.array([float(one.value) for one in found]),
-            lower=np.array([float(one.lower) for one in found]),
-            upper=np.array([float(one.upper) for one in found]),
-        ),
+        means=means,
+        alphas=np.array(alphas),
+        estimate=Estimate(value=value, lower=lower, upper=upper),
     )

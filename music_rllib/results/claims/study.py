@@ -1,4 +1,4 @@
-"""What a sweep's runs say of hypotheses: those planned before the runs, and those thought of since.
+"""Claims of a study: tests of hypotheses that were planned before the runs, and of later ones.
 
 Each condition's runs give a score for each seed, which comparisons take seed by seed
 (:mod:`~music_rllib.results.claims.contrasts`). Planned comparisons are one family for Holm's
@@ -18,21 +18,20 @@ from music_rllib.config.analysis import Hypothesis
 from music_rllib.results import statistics as st
 from music_rllib.results.claims.contrasts import Contrast, Verdict, contrast, decide
 from music_rllib.results.claims.match import alike_in_the_rest, in_words, matching
-from music_rllib.results.claims.plan import PlanVersion
+from music_rllib.results.claims.plan import MARGIN_OF_A_RATE, PlanVersion
 from music_rllib.results.claims.scores import Measure, Scores, ended_first, measure_on, scores_of
 from music_rllib.results.comparison import ALL_TASKS
 from music_rllib.results.conditions import SEEDS, Condition, Stage, find_stages
 from music_rllib.results.data import Sweep
 from music_rllib.results.statistics import Array, Estimate
 
-__all__ = ["Claim", "Mean", "Study", "study_of"]
+Cells = Sequence[tuple[Condition, Condition]]
+"""Pairs of conditions that are alike in the rest."""
 
-MARGIN = 0.05
-"""Of a success rate, where nobody says another."""
 MOST_CONDITIONS = 6
-"""So many are compared each with each; more of them, each with the reference."""
+"""Number of conditions up to which each is compared with each; more, with a reference."""
 FEWEST_SHARED = 2
-"""Seeds, for pairs."""
+"""Least number of shared seeds for a comparison in pairs."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,20 +41,21 @@ class Claim:
     first: str
     second: str
     task: str
-    """`ALL_TASKS` for their mean."""
+    """The task, or `ALL_TASKS` for their mean."""
     measure: Measure
     margin: float | None
-    """Within which a difference does not matter; None: none was stated."""
+    """Difference below which it does not matter; None where none was stated."""
     contrast: Contrast
-    p_value: float
-    """Adjusted for what is shown beside it, as is `p_equivalent`."""
-    p_equivalent: float | None
-    verdict: Verdict
-    planned: bool
+    p_value: float = 1.0
+    """Adjusted p-value of no difference; it and the fields below are set by :func:`_decided`."""
+    p_equivalent: float | None = None
+    """Adjusted p-value of no equivalence; None without a margin."""
+    verdict: Verdict = Verdict.UNDECIDED
+    planned: bool = False
     """Whether it was stated before the first of its runs had finished."""
     hypothesis: Hypothesis | None = None
     cells: int = 1
-    """Pairs of conditions, alike in the rest, over which it is the mean."""
+    """Number of pairs of conditions, alike in the rest, over which it is the mean."""
 
     @property
     def confirmed(self) -> bool | None:
@@ -80,27 +80,30 @@ class Mean:
     estimate: Estimate
     scores: Scores = field(repr=False)
     runs: int
-    """Planned or begun, of which the finished ones have scores."""
+    """Number of runs that are planned or begun; the finished ones have scores."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Study:
-    """All that is claimed of one stage, and of the hypotheses."""
+    """All claims of one stage and of the hypotheses."""
 
     stage: Stage | None
-    """None where nothing has begun."""
+    """None where no run has begun."""
     plan: PlanVersion | None
-    """The last version that was there before the first of its runs had finished; None: none was."""
+    """The last version recorded before the first of its runs had finished; None without one."""
     latest: PlanVersion | None
+    """The last version; None without a plan."""
     means: tuple[Mean, ...]
     planned: tuple[Claim, ...]
+    """Claims of the hypotheses of `plan`."""
     afterwards: tuple[Claim, ...]
+    """Other claims: hypotheses that are only in `latest`, and other pairs of the stage."""
     untested: tuple[str, ...]
     """Hypotheses that can't be tested, with the reason."""
 
     @property
     def question(self) -> str | None:
-        """The plan's; its hypotheses where it has none; None without a plan."""
+        """The plan's question, or its hypotheses where it has none; None without a plan."""
         version = self.plan or self.latest
         if version is None:
             return None
@@ -108,18 +111,17 @@ class Study:
 
     @property
     def claims(self) -> tuple[Claim, ...]:
-        """What answers the study's question: what was planned, or where nothing was, all there is.
+        """Claims that answer the question: the planned ones, or without a plan all there are.
 
-        Nothing, while nothing that was planned can be tested: the rest is no substitute for it.
+        While no planned claim can be tested there are none: other claims are no substitute.
         """
-        waits = self.plan is not None and bool(self.plan.plan.hypotheses)
-        return self.planned if self.planned or waits else self.afterwards
+        return self.planned if self.plan is not None else self.afterwards
 
 
 def study_of(
     sweep: Sweep, stage: str | None = None, *, metric: str | None = None, maximised: bool = True
 ) -> Study:
-    """Test what was planned, and what else there is to compare in a stage.
+    """Test the planned hypotheses, and compare the other conditions of a stage.
 
     Args:
         sweep: its runs, with the metrics that are read.
@@ -128,7 +130,7 @@ def study_of(
         metric: of those; None: each task's primary one.
         maximised: whether more of `metric` is better.
     """
-    stages = {one.name: one for one in find_stages(sweep)}
+    stages = {found.name: found for found in find_stages(sweep)}
     latest = sweep.plans[-1] if sweep.plans else None
     plan = _planned(sweep, stages)
     chosen = stages.get(stage or (latest.plan.stage if latest else ""))
@@ -136,39 +138,44 @@ def study_of(
         chosen = next((s for s in reversed(stages.values()) if s.has_task_reward), None)
     untested: list[str] = []
     planned = list(_of_plan(sweep, stages, plan, (), untested)) if plan else []
-    known = plan.plan.hypotheses if plan and latest and _same_test(plan, latest) else ()
-    later = list(_of_plan(sweep, stages, latest, known, untested)) if latest != plan else []
-    measured = {} if chosen is None else _measures(sweep, chosen, metric, maximised)
-    margin = latest.plan.margin if latest else None
-    seen = {(one.first, one.second, one.task) for one in (*planned, *later)}
-    pairs = [] if chosen is None else list(_pairs_of(sweep, chosen, measured, margin))
-    pairs = [
-        one
-        for one in pairs
-        if not {(one.first, one.second, one.task), (one.second, one.first, one.task)} & seen
-    ]
+    afterwards: list[Claim] = []
+    if latest is not None and latest != plan:
+        known = plan.plan.hypotheses if plan and _same_test(plan, latest) else ()
+        afterwards += _of_plan(sweep, stages, latest, known, untested)
+    means: list[Mean] = []
+    if chosen is not None:
+        runs = [run for condition in chosen.compared for run in condition.runs]
+        measures = {
+            task: replace(measure_on(sweep, task, runs, "auc", metric), maximised=maximised)
+            for task in chosen.tasks
+        }
+        means += _means(sweep, chosen, measures)
+        margin = latest.plan.margin if latest else None
+        seen = {(frozenset((one.first, one.second)), one.task) for one in (*planned, *afterwards)}
+        pairs = [(label_of(x), label_of(y), [(x, y)]) for x, y in _pairs(chosen.compared)]
+        afterwards += [
+            claim
+            for claim in _claims(sweep, pairs, measures, margin)
+            if (frozenset((claim.first, claim.second)), claim.task) not in seen
+        ]
     return Study(
         stage=chosen,
         plan=plan,
         latest=latest,
-        means=() if chosen is None else tuple(_means(sweep, chosen, measured)),
+        means=tuple(means),
         planned=_decided(planned, planned=True),
-        afterwards=_decided([*later, *pairs], planned=False),
+        afterwards=_decided(afterwards, planned=False),
         untested=tuple(dict.fromkeys(untested)),
     )
 
 
 def _planned(sweep: Sweep, stages: Mapping[str, Stage]) -> PlanVersion | None:
-    """The last version of the plan that did not know of a result."""
+    """The last version of the plan that was recorded before any result."""
     for version in reversed(sweep.plans):
-        runs = [run for name in version.plan.stages for run in _runs(stages, name)]
+        runs = [run for name in version.plan.stages & stages.keys() for run in stages[name].runs]
         if version.recorded_ms < ended_first(sweep, runs):
             return version
     return None
-
-
-def _runs(stages: Mapping[str, Stage], name: str) -> Sequence[int]:
-    return stages[name].runs if name in stages else ()
 
 
 def _same_test(one: PlanVersion, other: PlanVersion) -> bool:
@@ -178,107 +185,80 @@ def _same_test(one: PlanVersion, other: PlanVersion) -> bool:
 def _of_plan(
     sweep: Sweep,
     stages: Mapping[str, Stage],
-    version: PlanVersion | None,
+    version: PlanVersion,
     known: Sequence[str],
     untested: list[str],
 ) -> Iterator[Claim]:
-    """The claims of a plan's hypotheses, but for those that are `known`; not decided yet."""
-    for text in version.plan.hypotheses if version else ():
-        if version is None or text in known:
+    """The undecided claims of a plan's hypotheses without the `known` ones; fills `untested`."""
+    for text in version.plan.hypotheses:
+        if text in known:
             continue
         hypothesis = Hypothesis.of(text)
-        first, second = (
-            matching(sweep, stages, side, version.plan.stage)
-            for side in (hypothesis.first, hypothesis.second)
-        )
+        sides = (hypothesis.first, hypothesis.second)
+        first, second = (matching(sweep, stages, side, version.plan.stage) for side in sides)
         cells = alike_in_the_rest(first, second, hypothesis)
         if isinstance(cells, str):
             untested.append(f"{text}: {cells}")
             continue
-        found = list(_claims(sweep, cells, version.plan.metric, version.plan.margin, hypothesis))
-        if not found:
+        runs = [run for pair in cells for condition in pair for run in condition.runs]
+        measures = {
+            task: measure_on(sweep, task, runs, version.plan.metric)
+            for task in dict.fromkeys(sweep.runs[run].task for run in runs)
+        }
+        labelled = (in_words(hypothesis.first), in_words(hypothesis.second), cells)
+        claims = list(_claims(sweep, [labelled], measures, version.plan.margin))
+        if not claims:
             untested.append(f"{text}: no seed has finished in both conditions")
-        yield from found
+        yield from (replace(claim, hypothesis=hypothesis) for claim in claims)
 
 
 def _claims(
     sweep: Sweep,
-    cells: Sequence[tuple[Condition, Condition]],
-    kind: str,
+    comparisons: Sequence[tuple[str, str, Cells]],
+    measures: Mapping[str, Measure],
     margin: float | None,
-    hypothesis: Hypothesis,
 ) -> Iterator[Claim]:
-    conditions = [one for pair in cells for one in pair]
-    tasks = list(dict.fromkeys(sweep.runs[r].task for one in conditions for r in one.runs))
-    runs = [run for one in conditions for run in one.runs]
-    measures = {task: measure_on(sweep, task, runs, kind) for task in tasks}
-    label = tuple(in_words(side) for side in (hypothesis.first, hypothesis.second))
-    for name, own in _scopes(measures):
-        columns = [
-            [scores_of(sweep, pair[side], task, m) for pair in cells for task, m in own.items()]
-            for side in (0, 1)
-        ]
-        one = _claim(columns, _common(own), margin)
-        if one is not None:
-            yield replace(
-                one,
-                first=label[0],
-                second=label[1],
-                task=name,
-                hypothesis=hypothesis,
-                cells=len(cells),
-            )
+    """Undecided claims over all tasks, and on each, of two labels and the cells that they name."""
+    for scope, own in _scopes(measures):
+        measure, *others = own.values()
+        if any(other.horizon != measure.horizon for other in others):
+            measure = replace(measure, horizon=np.nan)
+        is_success = measure.metric == names.EVAL_SUCCESS
+        own_margin = MARGIN_OF_A_RATE if margin is None and is_success else margin
+        for first, second, cells in comparisons:
+            columns = [
+                [scores_of(sweep, pair[side], task, m) for pair in cells for task, m in own.items()]
+                for side in (0, 1)
+            ]
+            tested = _contrast(*columns, is_rate=measure.is_rate, margin=own_margin)
+            if tested is not None:
+                yield Claim(
+                    first=first,
+                    second=second,
+                    task=scope,
+                    measure=measure,
+                    margin=own_margin,
+                    contrast=tested,
+                    cells=len(cells),
+                )
 
 
-def _measures(
-    sweep: Sweep, stage: Stage, metric: str | None, maximised: bool
-) -> dict[str, Measure]:
-    """Of each task, over the smallest budget of what may be compared."""
-    runs = [run for one in stage.compared for run in one.runs]
-    return {
-        task: replace(measure_on(sweep, task, runs, "auc", metric), maximised=maximised)
-        for task in stage.tasks
-    }
-
-
-def _scopes(measures: Mapping[str, Measure]) -> Iterator[tuple[str, dict[str, Measure]]]:
+def _scopes(measures: Mapping[str, Measure]) -> Iterator[tuple[str, Mapping[str, Measure]]]:
     """All tasks together, where they have a unit in common, and each by itself."""
     if len(measures) > 1 and all(one.is_rate for one in measures.values()):
-        yield ALL_TASKS, dict(measures)
+        yield ALL_TASKS, measures
     for task, one in measures.items():
         yield task, {task: one}
 
 
-def _common(measures: Mapping[str, Measure]) -> Measure:
-    """What a scope's tasks have in common."""
-    first, *others = measures.values()
-    if all(one.horizon == first.horizon for one in others):
-        return first
-    return replace(first, horizon=np.nan)
-
-
-def _pairs_of(
-    sweep: Sweep, stage: Stage, measures: Mapping[str, Measure], margin: float | None
-) -> Iterator[Claim]:
-    for name, own in _scopes(measures):
-        for first, second in _pairs(stage.compared):
-            columns = [
-                [scores_of(sweep, side, task, m) for task, m in own.items()]
-                for side in (first, second)
-            ]
-            one = _claim(columns, _common(own), margin)
-            if one is not None:
-                yield replace(one, first=label_of(first), second=label_of(second), task=name)
-
-
 def label_of(condition: Condition) -> str:
-    """Without which seeds a search used: only fresh ones are compared."""
+    """The condition's label without the seeds of a search: only fresh ones are compared."""
     others = tuple(pair for pair in condition.others if pair[0] != SEEDS)
     return replace(condition, others=others).label
 
 
 def _pairs(conditions: Sequence[Condition]) -> list[tuple[Condition, Condition]]:
-    """Each with each, a later one against an earlier one; of many each with its reference.
+    """Pairs of a later condition and an earlier one; of many conditions, each and its reference.
 
     The reference is the condition alike in the rest with q = 1, or with the smallest q.
     """
@@ -294,60 +274,52 @@ def _pairs(conditions: Sequence[Condition]) -> list[tuple[Condition, Condition]]
     ]
 
 
-def _claim(
-    columns: Sequence[Sequence[Scores]], measure: Measure, margin: float | None
-) -> Claim | None:
-    """Two sides, of which each column is a task or one of several alike pairs; not decided yet."""
-    if margin is None and measure.metric == names.EVAL_SUCCESS:
-        margin = MARGIN
-    sides = [_complete(scores) for scores in columns]
+def _contrast(
+    first: Sequence[Scores], second: Sequence[Scores], *, is_rate: bool, margin: float | None
+) -> Contrast | None:
+    """The contrast of two sides; None where one has no seed that has finished everywhere.
+
+    Args:
+        first: scores on each task of each of several pairs that are alike in the rest.
+        second: scores of the other side.
+        is_rate: whether they are rates, whose episodes tell how sure seeds that tie are.
+        margin: difference below which it does not matter.
+    """
+    sides = [_complete(first), _complete(second)]
     if not (sides[0] and sides[1]):
         return None
     shared = [seed for seed in sides[0] if seed in sides[1]]
-    most = max(map(len, sides))
-    paired = len(shared) >= FEWEST_SHARED and 2 * len(shared) >= most
+    paired = len(shared) >= FEWEST_SHARED and 2 * len(shared) >= max(map(len, sides))
     if paired:
         sides = [{seed: side[seed] for seed in shared} for side in sides]
     matrices = [np.array(list(side.values())) for side in sides]
     apart = None
-    if measure.is_rate:
-        episodes = [np.mean([scores.episodes for scores in side]) for side in columns]
-        apart = st.difference(
-            *(st.estimate(m, float(n)) for m, n in zip(matrices, episodes, strict=True))
-        )
+    if is_rate:
+        episodes = [float(np.mean([one.episodes for one in side])) for side in (first, second)]
+        apart = st.difference(*map(st.estimate, matrices, episodes))
     x, y = (matrix.mean(axis=1) for matrix in matrices)
-    return Claim(
-        first="",
-        second="",
-        task="",
-        measure=measure,
-        margin=margin,
-        contrast=contrast(x, y, paired=paired, margin=margin, apart=apart),
-        p_value=1.0,
-        p_equivalent=None,
-        verdict=Verdict.UNDECIDED,
-        planned=False,
-    )
+    return contrast(x, y, paired=paired, margin=margin, apart=apart)
 
 
 def _complete(columns: Sequence[Scores]) -> dict[str, Array]:
-    """Of each seed that has finished in every column its scores there."""
+    """The scores of each seed that has finished in every column."""
     seeds = [seed for seed in columns[0].by_seed if all(seed in c.by_seed for c in columns)]
     return {seed: np.array([c.by_seed[seed] for c in columns]) for seed in seeds}
 
 
 def _decided(claims: Sequence[Claim], *, planned: bool) -> tuple[Claim, ...]:
+    """The claims with adjusted p-values and verdicts, as one family."""
     opposite = {Verdict.SUPERIOR: Verdict.WORSE, Verdict.WORSE: Verdict.SUPERIOR}
     return tuple(
         replace(
-            one,
+            claim,
             p_value=p_value,
             p_equivalent=p_equivalent,
-            verdict=verdict if one.measure.maximised else opposite.get(verdict, verdict),
+            verdict=verdict if claim.measure.maximised else opposite.get(verdict, verdict),
             planned=planned,
         )
-        for one, (p_value, p_equivalent, verdict) in zip(
-            claims, decide([one.contrast for one in claims]), strict=True
+        for claim, (p_value, p_equivalent, verdict) in zip(
+            claims, decide([claim.contrast for claim in claims]), strict=True
         )
     )
 

@@ -1,4 +1,4 @@
-"""What a storage holds of a sweep, as `results` takes it; it is what MLflow has."""
+"""A sweep read from its storage, as it would be read from MLflow."""
 
 from __future__ import annotations
 
@@ -15,10 +15,8 @@ from music_rllib.results.claims.record import plans_in
 from music_rllib.results.data import Points, RunRecord, Sweep, columns
 from music_rllib.store.run_record import Report
 
-__all__ = ["read_storage", "results_of"]
-
 _STATUS = {"finished": "FINISHED", "stopped": "KILLED", "failed": "FAILED"}
-"""A sweep's, as MLflow calls them."""
+"""Outcome of a sweep's driver to the status in MLflow."""
 
 
 def read_storage(place: str, storage: str) -> Sweep:
@@ -34,50 +32,41 @@ def read_storage(place: str, storage: str) -> Sweep:
     opened = found.open()
     state = found.read(sweep_files.STATE) or {"driver": {"outcome": "running"}, "failures": ()}
     failures = {failure["run"]: failure["cause"] for failure in state["failures"]}
-    read = results_of(opened)
+    sweep = results_of(opened)
     return replace(
-        read,
+        sweep,
         status=_STATUS.get(state["driver"]["outcome"], "RUNNING"),
         source=redact(found.storage),
         config=opened.config.text,
         runs=[
-            _failed(run, failures[run.name]) if run.name in failures else run for run in read.runs
+            run  # it may have been finished since it failed
+            if run.is_finished or run.name not in failures
+            else replace(
+                run, status="FAILED", tags={**run.tags, names.TAG_FAILURE: failures[run.name]}
+            )
+            for run in sweep.runs
         ],
     )
 
 
 def results_of(sweep: session.Sweep, metrics: Collection[str] | None = None) -> Sweep:
-    """Its runs, the finished ones with these metrics, or all.
+    """The runs of a sweep; the finished ones with these metrics, or with all.
 
     Raises:
         DamagedError: A run has no readable history.
-        StorageError: Its plan can't be read.
+        StorageError: The analysis plan can't be read.
     """
     nodes, finished = sweep.plan.nodes, sweep.finished
     histories = [sweep.store.history(node.key) if node.key in finished else [] for node in nodes]
     return Sweep(
         name=sweep.config.name,
-        status="",
-        run_id="",
-        experiment_id="",
-        started=None,
-        source="",
-        tags={},
-        config=None,
-        runs=[_record(node, found) for node, found in zip(nodes, histories, strict=True)],
+        runs=[_record(node, history) for node, history in zip(nodes, histories, strict=True)],
         history=columns(
-            _points(found, run_info(node).settings, metrics)
-            for node, found in zip(nodes, histories, strict=True)
+            _points(history, run_info(node).settings, metrics)
+            for node, history in zip(nodes, histories, strict=True)
         ),
         plans=plans_in(sweep.storage, sweep.config.name),
     )
-
-
-def _failed(run: RunRecord, cause: str) -> RunRecord:
-    """A run that failed, unless it has been finished since."""
-    if run.status == "FINISHED":
-        return run
-    return replace(run, status="FAILED", tags={**run.tags, names.TAG_FAILURE: cause})
 
 
 def _record(node: Node, history: list[Report]) -> RunRecord:
@@ -98,6 +87,7 @@ def _record(node: Node, history: list[Report]) -> RunRecord:
 def _points(
     history: list[Report], settings: Mapping[str, float], metrics: Collection[str] | None
 ) -> Points:
+    """The values of a run's reports and, at step 0, those of its settings."""
     began = min((report.timestamp_ms for report in history), default=0)
     logged = [(name, 0, began, value) for name, value in settings.items() if history]
     logged += [
@@ -106,5 +96,4 @@ def _points(
         for metric, value in report.metrics.items()
     ]
     rows = sorted(row for row in logged if metrics is None or row[0] in metrics)
-    named, steps, times, values = zip(*rows, strict=True) if rows else ((), (), (), ())
-    return Points(list(named), list(steps), list(times), list(values))
+    return Points(*zip(*rows, strict=True)) if rows else Points((), (), (), ())

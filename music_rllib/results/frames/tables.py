@@ -1,4 +1,4 @@
-"""A sweep as pandas frames: the same columns from a storage, from MLflow and from an export."""
+"""A sweep as pandas frames, with the same columns from a storage, from MLflow or an export."""
 
 from __future__ import annotations
 
@@ -13,20 +13,17 @@ from music_rllib import names
 from music_rllib.results.analysis import analyse
 from music_rllib.results.archive.folder import is_archive, read_archive
 from music_rllib.results.conditions import find_stages
-from music_rllib.results.data import Column, Sweep, joined
+from music_rllib.results.data import Sweep, joined
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-__all__ = ["Frames", "frames_of", "load_sweep"]
 
 _SETTINGS = {
     "q": names.SETTING_ENTROPIC_INDEX,
     "alpha": names.SETTING_ALPHA,
     "mi_reward_weight": names.SETTING_MI_REWARD_WEIGHT,
 }
-_SAID_ALREADY = ("env_steps", "seed", "variant")
-"""Params that have a column of their own."""
 _RUN_COLUMNS = {
     **dict.fromkeys(("name", "stage", "variant", "task", "condition"), "str"),
     "seed": "Int64",
@@ -52,23 +49,17 @@ _CONDITION_COLUMNS = {
     "q": "float64",
     "metric": "str",
     **dict.fromkeys(("seeds", "runs"), "int64"),
-    **dict.fromkeys(("mean", "lower", "upper"), "float64"),
-    **dict.fromkeys(_ENTROPIES, "float64"),
+    **dict.fromkeys(("mean", "lower", "upper", *_ENTROPIES), "float64"),
 }
-
-
-_NOTHING = Column(
-    run=np.empty(0, int), step=np.empty(0, int), value=np.empty(0), time=np.empty(0, int)
-)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Frames:
-    """One sweep; docs/reports.md describes the columns."""
+    """The frames of one sweep; docs/reports.md describes the columns."""
 
     name: str
     runs: pd.DataFrame = field(repr=False)
-    """A row for each run, by its `key`: what it is, its settings, how it ended."""
+    """A row for each run, by its `key`: its names, its settings, its last values."""
     curves: pd.DataFrame = field(repr=False)
     """A row for each value of a metric: `key`, `metric`, `env_steps`, `value`, `time`."""
     conditions: pd.DataFrame = field(repr=False)
@@ -85,21 +76,22 @@ def load_sweep(
             folder that `report --export` wrote, or a sweep's name.
         tracking_uri: read the sweep of that name from this MLflow instead
             (`sqlite:///results/mlflow.db`, `http://mlflow:5000`).
-        storage: where a name is looked for.
+        storage: storage of a sweep that is given by its name.
 
     Raises:
-        ReportError: there is no such sweep, or what is there is not one.
-        StorageError: its storage can't be read, or finished runs in it are damaged.
+        ReportError: there is no such sweep, or the folder holds something else.
+        StorageError: the storage can't be read, or finished runs in it are damaged.
         TrackingError: MLflow does not answer.
     """
     place = str(place)
+    folder = Path(place).expanduser()
     if tracking_uri is not None:
         from music_rllib.results.from_mlflow import read_mlflow
         from music_rllib.tracking.store import resolve_store
 
-        return frames_of(read_mlflow(resolve_store(tracking_uri, storage), Path(place).name))
-    if "://" not in place and is_archive(Path(place).expanduser()):
-        return frames_of(read_archive(Path(place).expanduser()))
+        return frames_of(read_mlflow(resolve_store(tracking_uri, storage), folder.name))
+    if "://" not in place and is_archive(folder):
+        return frames_of(read_archive(folder))
     from music_rllib.results.frames.from_storage import read_storage
 
     return frames_of(read_storage(place, storage))
@@ -117,11 +109,11 @@ def frames_of(sweep: Sweep) -> Frames:
 
 
 def _runs(sweep: Sweep, keys: list[str]) -> pd.DataFrame:
-    condition = {
-        run: one.label
+    labels = {
+        run: condition.label
         for stage in find_stages(sweep)
-        for one in stage.conditions
-        for run in one.runs
+        for condition in stage.conditions
+        for run in condition.runs
     }
     rows = []
     for position, run in enumerate(sweep.runs):
@@ -129,7 +121,7 @@ def _runs(sweep: Sweep, keys: list[str]) -> pd.DataFrame:
         rows.append(
             {
                 **{name: getattr(run, name) for name in ("name", "stage", "variant", "task")},
-                "condition": condition[position],
+                "condition": labels[position],
                 "seed": run.seed,
                 **{name: sweep.final(position, setting) for name, setting in _SETTINGS.items()},
                 "status": run.status,
@@ -138,7 +130,7 @@ def _runs(sweep: Sweep, keys: list[str]) -> pd.DataFrame:
                 "last_step": sweep.last_step(position),
                 "budget": run.budget,
                 "primary_metric": metric,
-                "score": sweep.final(position, metric) if run.status == "FINISHED" else None,
+                "score": sweep.final(position, metric) if run.is_finished else None,
                 "shannon_entropy": sweep.final(position, names.SHANNON_ENTROPY),
                 "tsallis_entropy": sweep.final(position, names.ENTROPY),
                 "source": run.tags.get(names.TAG_SOURCE_NODE),
@@ -146,14 +138,17 @@ def _runs(sweep: Sweep, keys: list[str]) -> pd.DataFrame:
             }
         )
     frame = _frame(rows, _RUN_COLUMNS)
-    params = sorted({name for run in sweep.runs for name in run.params} - {*_SAID_ALREADY})
-    settings = {name: _typed([run.params.get(name) for run in sweep.runs]) for name in params}
+    # Some params have a column of their own already.
+    params = {name for run in sweep.runs for name in run.params} - {"env_steps", "seed", "variant"}
+    settings = {
+        name: _typed([run.params.get(name) for run in sweep.runs]) for name in sorted(params)
+    }
     frame = pd.concat([frame, pd.DataFrame(settings, index=frame.index)], axis=1)
     return frame.set_index(pd.Index(keys, name="key", dtype="str"))
 
 
 def _typed(texts: list[str | None]) -> Any:
-    """Numbers where all of them are."""
+    """A column of numbers where all texts are numbers, else of texts."""
     try:
         return pd.to_numeric(pd.Series(texts))
     except ValueError:
@@ -161,12 +156,16 @@ def _typed(texts: list[str | None]) -> Any:
 
 
 def _curves(sweep: Sweep, keys: list[str]) -> pd.DataFrame:
-    found = list(sweep.history.values())
-    every = joined(found) if found else _NOTHING
-    metrics = np.repeat(np.array(list(sweep.history), str), [len(one.run) for one in found])
-    key = pd.Series(keys, dtype="str").take(every.run.astype(int))
-    columns = {"key": key.array, "metric": metrics, "env_steps": every.step, "value": every.value}
-    return _frame({**columns, "time": every.time}, _CURVE_COLUMNS)
+    every = joined(list(sweep.history.values()))
+    counts = [len(column.run) for column in sweep.history.values()]
+    rows = {
+        "key": pd.Series(keys, dtype="str").take(every.run).array,
+        "metric": np.repeat(np.array(list(sweep.history), str), counts),
+        "env_steps": every.step,
+        "value": every.value,
+        "time": every.time,
+    }
+    return _frame(rows, _CURVE_COLUMNS)
 
 
 def _conditions(sweep: Sweep) -> Iterator[dict[str, Any]]:
@@ -174,31 +173,26 @@ def _conditions(sweep: Sweep) -> Iterator[dict[str, Any]]:
         stage = analysis.stage
         for scope in analysis.scopes:
             for final in scope.finals:
-                setting = sweep.final(final.condition.runs[0], names.SETTING_ENTROPIC_INDEX)
+                condition = final.condition
+                entropies = analysis.entropies[scope.name, condition].numbers
                 yield {
                     "stage": stage.name,
                     "variant": stage.variant,
                     "task": scope.name,
-                    "condition": final.condition.label,
-                    "q": setting,
+                    "condition": condition.label,
+                    "q": sweep.final(condition.runs[0], names.SETTING_ENTROPIC_INDEX),
                     "metric": scope.metric,
                     "seeds": final.seeds,
                     "runs": final.runs,
                     "mean": final.value,
                     "lower": float(final.estimate.lower),
                     "upper": float(final.estimate.upper),
-                    **dict(
-                        zip(
-                            _ENTROPIES,
-                            analysis.entropies[scope.name, final.condition].numbers,
-                            strict=True,
-                        )
-                    ),
+                    **dict(zip(_ENTROPIES, entropies, strict=True)),
                 }
 
 
 def _frame(rows: Any, columns: dict[str, str]) -> pd.DataFrame:
-    """With these columns and types, whatever the rows hold, and without any."""
+    """A frame with these columns and types, whatever the rows hold, even without rows."""
     frame = pd.DataFrame(rows, columns=list(columns))
     for name, kind in columns.items():
         column = frame[name]

@@ -12,8 +12,8 @@ from hypothesis.extra import numpy as st_numpy
 from scipy import stats
 
 from music_rllib.results.claims import contrasts as c
-from music_rllib.results.claims.area import area_under_curve
 from music_rllib.results.claims.contrasts import Verdict
+from music_rllib.results.claims.scores import area_under_curve
 from music_rllib.results.statistics import Array, Estimate
 
 DRAWS = 4000
@@ -25,7 +25,7 @@ Study = tuple[Array, Array]
 
 
 def study(effect: float, seeds: int, rng: np.random.Generator, *, paired: bool) -> Study:
-    """Mean success over the budget of two conditions, `[seeds, draws]`; a seed's share is common.
+    """Mean success over the budget of two conditions, `[seeds, draws]`, which share their seeds.
 
     Each is a mean of 20 evaluations of 50 episodes, around curves that differ in height.
     """
@@ -38,7 +38,7 @@ def study(effect: float, seeds: int, rng: np.random.Generator, *, paired: bool) 
 
 
 def verdicts(found: c.Contrast) -> dict[Verdict, float]:
-    """How often each comes, of single comparisons."""
+    """Share of each verdict among single comparisons."""
     assert found.p_equivalent is not None
     triples = zip(found.difference.value, found.p_value, found.p_equivalent, strict=True)
     decided = [c.verdict_of(*map(float, triple)) for triple in triples]
@@ -66,7 +66,7 @@ def test_rates_of_error_and_coverage_are_nominal(
 
 
 def test_a_planted_effect_is_decided_rightly(rng: np.random.Generator) -> None:
-    """With the seeds that the power statement asks for, each true answer comes in 80 %."""
+    """With the number of seeds that the power functions give, 80 % of studies are right."""
     spread = float(np.hypot(SPREAD, np.sqrt(2 * 0.25 / 1000)))  # and that of the evaluations
     seeds = c.seeds_for_difference(0.1, spread, paired=True)
     assert seeds is not None

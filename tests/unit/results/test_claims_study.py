@@ -12,11 +12,10 @@ import pytest
 from music_rllib import names
 from music_rllib.report.figures.draw import files
 from music_rllib.report.study import study_csv, study_drawings
-from music_rllib.results.claims.answer import answer
+from music_rllib.results.claims.answer import answer, seeds_needed
 from music_rllib.results.claims.contrasts import Verdict
 from music_rllib.results.claims.plan import AnalysisPlan, PlanVersion, checked_plans, with_plan
 from music_rllib.results.claims.plan import as_document as plans_as_document
-from music_rllib.results.claims.power import seeds_needed
 from music_rllib.results.claims.sensitivity import alpha_sensitivity
 from music_rllib.results.claims.study import Study, study_of
 from music_rllib.results.claims.tables import study_data
@@ -26,7 +25,7 @@ BUDGET = 10_000
 STEPS = np.arange(1000, BUDGET + 1, 1000)
 EPISODES = 50
 DONE = 1_000_000
-"""When runs end, ms."""
+"""Time of every evaluation in ms."""
 
 
 def plan(*hypotheses: str, margin: float | None = 0.05, **changes: Any) -> AnalysisPlan:
@@ -45,10 +44,6 @@ def plan(*hypotheses: str, margin: float | None = 0.05, **changes: Any) -> Analy
     return AnalysisPlan(**fields | changes)
 
 
-def recorded(one: AnalysisPlan, at: int, *earlier: PlanVersion) -> tuple[PlanVersion, ...]:
-    return with_plan(earlier, one, at)
-
-
 def run(
     settings: Mapping[str, str],
     seed: int,
@@ -57,7 +52,7 @@ def run(
     task: str = "FetchPush",
     **tags: str,
 ) -> tuple[RunRecord, Points]:
-    """A curve that rises to twice its mean, `height`, seen through evaluation episodes."""
+    """A run whose success rate, over evaluation episodes, rises to twice its mean `height`."""
     rates = np.clip(2 * height * STEPS / BUDGET, 0, 1)
     values = list(rng.binomial(EPISODES, rates) / EPISODES)
     points = Points(
@@ -67,16 +62,14 @@ def run(
         [float(EPISODES)] * len(STEPS) + values,
     )
     stage = tags.pop("stage", "train")
-    label = ",".join(settings.values())
+    key = f"{stage}{','.join(settings.values())}{task}{seed}{tags}"
     record = RunRecord(
-        run_id=f"{stage}{label}{task}{seed}{tags}",
+        run_id=key,
         name="",
         status="FINISHED",
-        started=0,
-        ended=DONE,
         params={"env_steps": str(BUDGET), "task.success_key": "is_success", **settings},
         tags={
-            names.TAG_NODE_KEY: f"{stage}{label}{task}{seed}{tags}",
+            names.TAG_NODE_KEY: key,
             names.TAG_STAGE: stage,
             names.TAG_TASK: task,
             names.TAG_SEED: str(seed),
@@ -90,21 +83,14 @@ def run(
 
 
 def sweep_of(runs: Sequence[tuple[RunRecord, Points]], plans: Sequence[PlanVersion] = ()) -> Sweep:
-    return Sweep(
-        **dict.fromkeys(("name", "status", "run_id", "experiment_id", "source"), "s"),  # type: ignore[arg-type]
-        started=0,
-        tags={},
-        config=None,
-        runs=[record for record, _ in runs],
-        history=columns(points for _, points in runs),
-        plans=plans,
-    )
+    records, histories = [record for record, _ in runs], columns(points for _, points in runs)
+    return Sweep(name="s", runs=records, history=histories, plans=plans)
 
 
 def study(
     heights: Mapping[str, float], seeds: int, rng: np.random.Generator, spread: float = 0.03
 ) -> list[tuple[RunRecord, Points]]:
-    """A run for each q and seed; what a seed brings along is shared."""
+    """A run for each q and seed; the conditions share a part of each seed's success."""
     shared = rng.normal(0, 0.05, seeds)
     return [
         run({"tac.entropic_index": q}, seed, height + shared[seed] + rng.normal(0, spread), rng)
@@ -113,7 +99,7 @@ def study(
     ]
 
 
-BEFORE = recorded(plan("q = 1.5 against q = 1"), at=DONE - 1)
+BEFORE = with_plan((), plan("q = 1.5 against q = 1"), DONE - 1)
 
 
 @pytest.fixture
@@ -194,7 +180,7 @@ def test_while_the_plan_waits_for_its_runs_nothing_else_is_its_answer(
 
 def test_a_plan_that_is_younger_than_a_result_is_none(rng: np.random.Generator) -> None:
     runs = study({"1": 0.2, "1.5": 0.4}, 8, rng)
-    late = recorded(plan("q = 1.5 better than q = 1"), at=DONE)
+    late = with_plan((), plan("q = 1.5 better than q = 1"), DONE)
     found = study_of(sweep_of(runs, late))
     assert (found.plan, found.planned) == (None, ())
     (claim,) = found.afterwards
@@ -209,8 +195,8 @@ def test_a_plan_that_changes_after_a_result_keeps_what_was_planned(
     rng: np.random.Generator,
 ) -> None:
     runs = study({"1": 0.2, "1.5": 0.4}, 8, rng)
-    first = recorded(plan("q = 1.5 worse than q = 1"), at=5)
-    both = recorded(plan("q = 1.5 better than q = 1", margin=0.3), DONE + 1, *first)
+    first = with_plan((), plan("q = 1.5 worse than q = 1"), 5)
+    both = with_plan(first, plan("q = 1.5 better than q = 1", margin=0.3), DONE + 1)
     found = study_of(sweep_of(runs, both))
     assert [(one.margin, one.confirmed) for one in found.planned] == [(0.05, False)]
     assert [(one.margin, one.confirmed) for one in found.afterwards] == [(0.3, False)]
@@ -228,11 +214,11 @@ def test_settings_that_a_hypothesis_leaves_open_are_averaged(rng: np.random.Gene
     (claim,) = study_of(sweep_of(runs, BEFORE)).planned
     assert (claim.cells, claim.contrast.seeds) == (2, (5, 5))
     assert float(claim.contrast.difference.value) == pytest.approx(0.1, abs=0.03)
-    one = recorded(plan("q = 1.5, alpha = 0.1 against q = 1, alpha = 0.01"), at=5)
+    one = with_plan((), plan("q = 1.5, alpha = 0.1 against q = 1, alpha = 0.01"), 5)
     (claim,) = study_of(sweep_of(runs, one)).planned
     assert (claim.cells, claim.first) == (1, "q = 1.5, α = 0.1")
     assert float(claim.contrast.difference.value) == pytest.approx(0.3, abs=0.03)
-    vague = recorded(plan("q = 1.5, alpha = 0.1 against q = 1"), at=5)
+    vague = with_plan((), plan("q = 1.5, alpha = 0.1 against q = 1"), 5)
     assert "it must name more" in study_of(sweep_of(runs, vague)).untested[0]
 
 
@@ -303,7 +289,7 @@ def test_stages_are_compared_where_a_hypothesis_names_them(rng: np.random.Genera
         for stage, height in (("her", 0.2), ("music", 0.4))
         for seed in range(5)
     ]
-    one = recorded(plan("stage = music better than stage = her", stage="music"), at=5)
+    one = with_plan((), plan("stage = music better than stage = her", stage="music"), 5)
     (claim,) = study_of(sweep_of(runs, one)).planned
     assert claim.confirmed is True
 
@@ -358,7 +344,7 @@ def test_as_plain_data_it_has_every_seed(rng: np.random.Generator) -> None:
 
 def test_a_plan_is_kept_once_and_each_change_is_a_version() -> None:
     one, other = plan("q = 2 against q = 1"), plan("q = 2 worse than q = 1")
-    versions = recorded(other, 7, *recorded(one, 6, *recorded(one, 5)))
+    versions = with_plan(with_plan(with_plan((), one, 5), one, 6), other, 7)
     assert [(v.version, v.recorded_ms, v.plan) for v in versions] == [(1, 5, one), (2, 7, other)]
     assert checked_plans(plans_as_document(versions)) == versions
     assert one.hash != other.hash
@@ -370,7 +356,7 @@ def test_a_plan_has_no_control_characters() -> None:
 
 
 def test_a_plan_that_was_edited_is_refused() -> None:
-    document = plans_as_document(recorded(plan("q = 2 against q = 1"), 5))
+    document = plans_as_document(with_plan((), plan("q = 2 against q = 1"), 5))
     document[0]["plan"]["margin"] = 0.2
     with pytest.raises(ValueError, match="the hash that it was recorded with"):
         checked_plans(document)

@@ -1,4 +1,4 @@
-"""Frames of a sweep: what they hold, and that an export says the same."""
+"""Frames of a sweep: their content, and that an export gives the same."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_a_sweep_without_runs_has_empty_frames_of_the_same_types() -> None:
 
 
 def test_the_notebook_still_says_what_it_shows(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its code cells one after the other, their results as text."""
+    """Every code cell is run, and its result compared as text."""
     monkeypatch.chdir(DOCS)
     mpl.use("Agg")
     notebook = json.loads((DOCS / "first_results.ipynb").read_text(encoding="utf-8"))
@@ -87,7 +87,7 @@ def test_the_notebook_still_says_what_it_shows(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_of_several_values_at_a_step_the_one_logged_last_counts() -> None:
-    """In whatever order a database gives them."""
+    """The order of rows in a database is arbitrary."""
     points = Points(
         ("loss", "loss", "loss", "success"), (10, 20, 20, 20), (1, 9, 5, 3), (0.1, 0.2, 0.3, 0.4)
     )

@@ -1,7 +1,6 @@
-"""Sittings put together: no run twice, none lost, and each with its own numbers."""
+"""Merged exports: no run twice, none lost, and each with its own numbers."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -14,15 +13,12 @@ from music_rllib.version import ALGORITHM_VERSION
 
 
 def sweep(*runs: tuple[str, str, list[float]], run_id: str = "s") -> Sweep:
-    """(node, status, values at steps 0, 1, ...) each."""
+    """A sweep of runs, each as (node, status, values at steps 0, 1, ...)."""
     records = [
         RunRecord(
             run_id=f"{run_id}-{node}",
             name=node,
             status=status,
-            started=0,
-            ended=1,
-            params={},
             tags={names.TAG_NODE_KEY: node},
         )
         for node, status, _ in runs
@@ -31,19 +27,11 @@ def sweep(*runs: tuple[str, str, list[float]], run_id: str = "s") -> Sweep:
         Points(["m"] * len(values), list(range(len(values))), [0] * len(values), values)
         for _, _, values in runs
     ]
-    own: dict[str, Any] = {"name": "n", "status": "FINISHED", "experiment_id": "1", "started": 0}
-    return Sweep(
-        **own,
-        run_id=run_id,
-        source="x",
-        tags={},
-        config=None,
-        runs=records,
-        history=columns(points),
-    )
+    return Sweep(name="n", run_id=run_id, runs=records, history=columns(points))
 
 
-def told(found: Sweep) -> dict[str, tuple[str, list[float]]]:
+def values_of(found: Sweep) -> dict[str, tuple[str, list[float]]]:
+    """Run id and values of each node."""
     return {
         run.node_key: (run.run_id, list(found.series(i, "m")[1]))
         for i, run in enumerate(found.runs)
@@ -56,7 +44,7 @@ def test_runs_of_both_sittings_are_there_once_with_their_own_values() -> None:
         ("d", "FINISHED", [5, 6]), ("b", "FINISHED", [3, 7]), ("c", "FAILED", [0]), run_id="t"
     )
     found = merged(first, second)
-    assert told(found) == {
+    assert values_of(found) == {
         "a": ("s-a", [1, 2]),
         "b": ("t-b", [3, 7]),
         "c": ("s-c", [4]),
@@ -67,11 +55,11 @@ def test_runs_of_both_sittings_are_there_once_with_their_own_values() -> None:
 
 def test_an_unfinished_run_is_the_later_one_and_merging_again_changes_nothing() -> None:
     first, second = sweep(("a", "FAILED", [1])), sweep(("a", "RUNNING", []), run_id="t")
-    assert told(merged(first, second)) == {"a": ("t-a", [])}
+    assert values_of(merged(first, second)) == {"a": ("t-a", [])}
     whole = sweep(("a", "FINISHED", [1]), ("b", "FINISHED", [2]))
-    assert told(merged(whole, whole)) == told(whole)
+    assert values_of(merged(whole, whole)) == values_of(whole)
     empty = sweep()
-    assert told(merged(empty, whole)) == told(merged(whole, empty)) == told(whole)
+    assert values_of(merged(empty, whole)) == values_of(merged(whole, empty)) == values_of(whole)
     assert np.all(np.diff(merged(whole, whole).history["m"].run) >= 0)
 
 
@@ -89,7 +77,7 @@ def test_a_plans_runs_are_found_in_other_sweeps_exports(tmp_path: Path) -> None:
     ]
     found = of_plan(plan, exports)
     assert found is not None
-    assert told(found) == {keys[0]: ("t-" + keys[0], [4]), keys[4]: ("s-" + keys[4], [1, 2])}
+    assert values_of(found) == {keys[0]: ("t-" + keys[0], [4]), keys[4]: ("s-" + keys[4], [1, 2])}
     assert [(run.name, run.stage, run.tags[names.TAG_TRIAL]) for run in found.runs] == [
         ("first/FetchPush/tac.entropic_index=1/seed0", "first", "0"),
         ("first/FetchPush/tac.entropic_index=2/seed1", "first", "1"),
@@ -100,7 +88,7 @@ def test_a_plans_runs_are_found_in_other_sweeps_exports(tmp_path: Path) -> None:
 def test_runs_of_an_earlier_version_are_found_where_there_are_none_of_a_later_one(
     tmp_path: Path,
 ) -> None:
-    """Of a run and of what starts from it; each says which version it is of."""
+    """Runs and runs that start from them have the version of the algorithm as a tag."""
     file = tmp_path / "sweep.yaml"
     file.write_text(
         "{name: mine, tasks: [FetchPush], seeds: [0, 1], stages: [{name: u, variant: music-u},"

@@ -54,7 +54,7 @@ def test_a_metric_without_bounds_has_student_s_interval(values: np.ndarray) -> N
 
 
 def test_tasks_are_strata() -> None:
-    """Not the distance between tasks counts, but the spread of each one's runs."""
+    """The spread of each task's runs counts, and not the distance between tasks."""
     near, far = np.array([[0.0, 0.0], [1.0, 1.0]]), np.array([[0.0, 100.0], [1.0, 101.0]])
     a, b = s.estimate(near), s.estimate(far)
     assert b.value - a.value == 50

@@ -1,4 +1,4 @@
-"""Who gets there sooner: against lifelines of known order, and against Mann and Whitney."""
+"""Comparisons of steps to a threshold: with known orders, and with Mann and Whitney's test."""
 
 from __future__ import annotations
 
@@ -18,16 +18,8 @@ Runs = list[tuple[str, int | None]]
 
 def sweep_of(runs: Runs) -> Sweep:
     records = [
-        RunRecord(
-            run_id=str(i),
-            name=str(i),
-            status=status,
-            started=0,
-            ended=1,
-            params={},
-            tags={names.TAG_TASK: "Push", names.TAG_NODE_KEY: str(i)},
-        )
-        for i, (status, _) in enumerate(runs)
+        RunRecord(run_id="", name="", status=status, tags={names.TAG_TASK: "Push"})
+        for status, _ in runs
     ]
     steps = list(range(BUDGET + 1))
     curves = [[1.0 if at is not None and step >= at else 0.0 for step in steps] for _, at in runs]
@@ -35,18 +27,7 @@ def sweep_of(runs: Runs) -> Sweep:
         Points([names.EVAL_SUCCESS] * len(steps), steps, [0] * len(steps), curve)
         for curve in curves
     ]
-    return Sweep(
-        name="n",
-        status="FINISHED",
-        run_id="s",
-        experiment_id="1",
-        started=0,
-        source="x",
-        tags={},
-        config=None,
-        runs=records,
-        history=columns(points),
-    )
+    return Sweep(name="n", runs=records, history=columns(points))
 
 
 def race(first: Runs, second: Runs) -> tuple[Race, ...]:
