@@ -93,7 +93,7 @@ def in_words(claim: Claim) -> str:
         verdict = f"equivalent within {claim.margin:g}"
         tested = p_text(claim.p_equivalent if claim.p_equivalent is not None else 1.0)
     where = "over all tasks" if claim.task == ALL_TASKS else f"on {claim.task}"
-    mean = f", mean of {claim.cells} alike in the rest" if claim.cells > 1 else ""
+    mean = f", averaged over {claim.cells} settings" if claim.cells > 1 else ""
     held = {True: ", as expected", False: ", not as expected", None: ""}[claim.confirmed]
     return (
         f"{claim.first} against {claim.second} {where}{mean}: {verdict}, {gap} ({ends}; {tested})"
