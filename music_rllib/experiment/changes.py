@@ -12,7 +12,7 @@ from music_rllib.config.schema import SweepConfig
 from music_rllib.experiment.continuation import budget_settings, continued_from
 from music_rllib.experiment.plan import Node
 from music_rllib.experiment.session import Sweep
-from music_rllib.experiment.sweep_files import keep_locally
+from music_rllib.experiment.sweep_files import write
 from music_rllib.labels import ShortLabels, in_runs
 from music_rllib.store.node_store import NodeStore, steps_of
 from music_rllib.store.object_folder import StorageError
@@ -68,7 +68,8 @@ def keep_settings(sweep: Sweep) -> None:
         }
         for node in sweep.plan.nodes
     }
-    keep_locally(sweep, FILE, json.dumps({"algorithm": ALGORITHM_VERSION, "runs": runs}, indent=1))
+    document = {"algorithm": ALGORITHM_VERSION, "runs": runs}
+    write(str(sweep.folder), FILE, json.dumps(document, indent=1))
 
 
 def check_begun(config: SweepConfig) -> None:
@@ -104,16 +105,16 @@ def changes_since(sweep: Sweep) -> Changes | None:
         if old is None or old["key"] == node.key or old["key"] in keys:
             continue
         differences = list(_differences(old["settings"], node.run.model_dump(mode="json")))
-        longer = (
+        is_longer = (
             len(differences) == 1
             and old["source"] == node.source_key
             and old["settings"]["env_steps"] < node.run.env_steps
         )
-        if longer and continued_from(sweep.store, node) is not None:
+        if is_longer and continued_from(sweep.store, node) is not None:
             continue
         counts.update(differences)
         if (progress := _progress(sweep.store, old["key"])) is not None:
-            why = _why_not_longer(node) if longer and progress == FINISHED else ""
+            why = _why_not_longer(node) if is_longer and progress == FINISHED else ""
             lost.append(f"{short(node.label)}: {progress}{why}")
     if not lost:
         return None

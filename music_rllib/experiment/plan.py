@@ -156,15 +156,11 @@ class Plan:
     ) -> list[Run]:
         """Add the runs of a searched stage's trial and of what it starts from, if they are new.
 
-        Args:
-            stage: The stage's name.
-            trial: The trial's number.
-            values: Dotted settings; those of its source as `STAGE:setting`.
-            seeds: The seeds of its runs.
-            part: The trial's name in labels.
+        The `values` are dotted settings, those of the source `STAGE:setting`; `part` is the trial's
+        name in labels.
 
         Returns:
-            Its runs, those with the same seed together.
+            The trial's runs, those with the same seed together.
 
         Raises:
             ConfigError: The values make no valid settings.
@@ -274,13 +270,9 @@ def short(value: Any) -> str:
 def node_key(run: RunSettings, source: str | None, algorithm: str | None = None) -> str:
     """Key of the node that computes `run` from the weights of node `source`.
 
-    Depends on all that determines the numbers and on nothing else: not on names, on where things
-    are stored, on MLflow or on resources. The same on every machine.
-
-    Args:
-        run: The settings.
-        source: Key of the node that the run starts from, if any.
-        algorithm: Version of what is computed; None: this one.
+    It depends on all that determines the numbers and on nothing else: not on names, on where things
+    are stored, on MLflow or on resources. It is the same on every machine. Without `algorithm`, it
+    is that of this version of the algorithm.
     """
     content = {"run": run.identity(), "source": source, "algorithm": algorithm or ALGORITHM_VERSION}
     return content_key(content)

@@ -27,7 +27,8 @@ class Status(StrEnum):
     """It is computed no further: its trial was stopped early, or failed."""
 
 
-_DONE = (Status.FINISHED, Status.REUSED)
+DONE = (Status.FINISHED, Status.REUSED)
+LOST = (Status.FAILED, Status.SKIPPED)
 
 
 class Scheduler:
@@ -86,7 +87,7 @@ class Scheduler:
     def _input_is_there(self, node: Node) -> bool:
         if node.input is None or node.input.checkpoint is not None:
             return True
-        return self._status[node.input.key] in _DONE
+        return self._status[node.input.key] in DONE
 
     def want(self, node: Node, until: int | None, *, finished: bool) -> None:
         """Add a node that a search asks for, or let one that is there be computed further.
@@ -98,7 +99,7 @@ class Scheduler:
         """
         key = node.key
         if key not in self._nodes:
-            lost = node.input is not None and self._is_lost(node.input.key)
+            lost = node.input is not None and self._status.get(node.input.key) in LOST
             waiting = Status.SKIPPED if lost else Status.WAITING
             self._add(node, Status.REUSED if finished else waiting)
             if until is not None:
@@ -124,9 +125,6 @@ class Scheduler:
         self._nodes[node.key] = node
         self._status[node.key] = status
         self.changes += 1
-
-    def _is_lost(self, key: str) -> bool:
-        return self._status.get(key) in (Status.FAILED, Status.SKIPPED)
 
     def until(self, key: str) -> int | None:
         """Environment steps up to which the node is to be computed for now; None: to its end."""

@@ -12,7 +12,7 @@ from typing import Any
 from music_rllib.config.schema import SweepConfig
 from music_rllib.experiment.continuation import continuation_key
 from music_rllib.experiment.plan import Plan
-from music_rllib.experiment.scheduler import Scheduler, Status
+from music_rllib.experiment.scheduler import DONE, Scheduler
 from music_rllib.experiment.sweep_files import CONFIG, PLAN, as_json, keep, read
 from music_rllib.labels import ShortLabels
 from music_rllib.redaction import redact, without_secrets
@@ -37,7 +37,7 @@ class Sweep:
     @property
     def finished(self) -> set[str]:
         """Keys of the nodes that have a result."""
-        return {node.key for node in self.scheduler.having(Status.FINISHED, Status.REUSED)}
+        return {node.key for node in self.scheduler.having(*DONE)}
 
     def results(self) -> dict[str, RunResult]:
         """Results of the finished nodes, by key."""
@@ -54,13 +54,7 @@ def open_sweep(
 ) -> Sweep:
     """Open the storage, and find the runs in it that are finished and undamaged.
 
-    Args:
-        config: The sweep's configuration.
-        plan: Its plan.
-        storage: Absolute folder, or URI.
-        folder: Folder of the sweep's own files, on this machine.
-        remove_damaged: Called with a message about each damaged run, which is deleted; None:
-            damaged runs are an error.
+    With `remove_damaged`, damaged runs are deleted, and it is called with a message about each.
 
     Raises:
         StorageError: The storage can't be reached, or finished runs in it are damaged.

@@ -59,23 +59,9 @@ def keep(sweep: Sweep, name: str, text: str) -> None:
     Raises:
         StorageError: It can't be written.
     """
-    keep_locally(sweep, name, text)
+    write(str(sweep.folder), name, text)
     if is_remote(sweep.storage):
         write(sweep.storage, f"{sweep.config.name}/{name}", text)
-
-
-def keep_locally(sweep: Sweep, name: str, text: str) -> None:
-    """Write a file of the sweep on this machine.
-
-    Raises:
-        StorageError: It can't be written.
-    """
-    try:
-        sweep.folder.mkdir(parents=True, exist_ok=True)
-        write_atomically(sweep.folder / name, text.encode())
-    except OSError as error:
-        place = error.filename or sweep.folder
-        raise StorageError(f"{place} must be writable: {error.strerror}") from error
 
 
 def is_remote(storage: str) -> bool:
@@ -84,7 +70,7 @@ def is_remote(storage: str) -> bool:
 
 
 def write(storage: str, path: str, text: str) -> None:
-    """Write a file below a storage, whole or not at all.
+    """Write a file below a folder or URI, whole or not at all.
 
     Raises:
         StorageError: It can't be written.
@@ -99,7 +85,8 @@ def write(storage: str, path: str, text: str) -> None:
         with filesystem.open_output_stream(target) as sink:
             sink.write(text.encode())
     except OSError as error:
-        raise StorageError(f"{target} must be writable: {error}") from error
+        place = error.filename or target
+        raise StorageError(f"{place} must be writable: {error.strerror or error}") from error
 
 
 _STATE_KEYS = {"sweep", "driver", "stages", "env_steps", "running", "best", "searches", "failures"}
