@@ -12,7 +12,7 @@ from music_rllib.config.schema import SweepConfig
 from music_rllib.experiment.continuation import budget_settings, continued_from
 from music_rllib.experiment.plan import Node
 from music_rllib.experiment.session import Sweep
-from music_rllib.experiment.sweep_files import write
+from music_rllib.experiment.sweep_files import write_locally
 from music_rllib.labels import ShortLabels, in_runs
 from music_rllib.store.node_store import NodeStore, steps_of
 from music_rllib.store.object_folder import StorageError
@@ -69,7 +69,7 @@ def keep_settings(sweep: Sweep) -> None:
         for node in sweep.plan.nodes
     }
     document = {"algorithm": ALGORITHM_VERSION, "runs": runs}
-    write(str(sweep.folder), FILE, json.dumps(document, indent=1))
+    write_locally(sweep.folder / FILE, json.dumps(document, indent=1))
 
 
 def check_begun(config: SweepConfig) -> None:

@@ -59,7 +59,7 @@ def keep(sweep: Sweep, name: str, text: str) -> None:
     Raises:
         StorageError: It can't be written.
     """
-    write(str(sweep.folder), name, text)
+    write_locally(sweep.folder / name, text)
     if is_remote(sweep.storage):
         write(sweep.storage, f"{sweep.config.name}/{name}", text)
 
@@ -69,24 +69,37 @@ def is_remote(storage: str) -> bool:
     return "://" in storage and not storage.startswith("file://")
 
 
+def write_locally(path: Path, text: str) -> None:
+    """Write a file on this machine, whole or not at all.
+
+    Raises:
+        StorageError: It can't be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, text.encode())
+    except OSError as error:
+        place = error.filename or path.parent
+        raise StorageError(f"{place} must be writable: {error.strerror}") from error
+
+
 def write(storage: str, path: str, text: str) -> None:
-    """Write a file below a folder or URI, whole or not at all.
+    """Write a file below a storage, whole or not at all.
 
     Raises:
         StorageError: It can't be written.
     """
     filesystem, root = open_storage(storage)
     target = f"{root}/{path}"
+    if not is_remote(storage):
+        write_locally(Path(target), text)
+        return
     try:
         filesystem.create_dir(target.rpartition("/")[0], recursive=True)
-        if not is_remote(storage):
-            write_atomically(Path(target), text.encode())
-            return
         with filesystem.open_output_stream(target) as sink:
             sink.write(text.encode())
     except OSError as error:
-        place = error.filename or target
-        raise StorageError(f"{place} must be writable: {error.strerror or error}") from error
+        raise StorageError(f"{target} must be writable: {error}") from error
 
 
 _STATE_KEYS = {"sweep", "driver", "stages", "env_steps", "running", "best", "searches", "failures"}
