@@ -1,1 +1,1 @@
-"""Experiments: typed configuration, the plan of nodes, their store, and handoffs between them."""
+"""The plan of a sweep's runs, their scheduler, and the sweep's own files."""

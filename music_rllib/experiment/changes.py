@@ -1,4 +1,4 @@
-"""What has changed in a sweep since it was last run, and which results that leaves behind."""
+"""How a sweep's settings differ from those it was last run with, and which results that costs."""
 
 from __future__ import annotations
 
@@ -12,14 +12,12 @@ from music_rllib.config.schema import SweepConfig
 from music_rllib.experiment.continuation import budget_settings, continued_from
 from music_rllib.experiment.plan import Node
 from music_rllib.experiment.session import Sweep
-from music_rllib.labels import ShortLabels
-from music_rllib.store.files import write_atomically
+from music_rllib.experiment.sweep_files import write_locally
+from music_rllib.labels import ShortLabels, in_runs
 from music_rllib.store.node_store import NodeStore, steps_of
 from music_rllib.store.object_folder import StorageError
 from music_rllib.store.paths import resolve_storage, sweep_folder
 from music_rllib.version import ALGORITHM_VERSION
-
-__all__ = ["Changes", "changes_since", "check_begun", "keep_settings", "longer"]
 
 FILE = "settings.json"
 FINISHED = "is finished"
@@ -32,19 +30,18 @@ class Changes:
     """How a sweep differs from the last one of its name."""
 
     name: str
-    what: tuple[str, ...]
+    differences: tuple[str, ...]
     """`tac.lr: 0.001 -> 0.0003 (4 runs)`, one line each."""
     lost: tuple[str, ...]
-    """Runs that have something which the changed sweep has no use for, and what."""
+    """Runs with results or checkpoints that the changed sweep does not use, and which they are."""
 
     def __str__(self) -> str:
-        one = len(self.lost) == 1
-        runs, have = ("1 run", "it has") if one else (f"{len(self.lost)} runs", "they have")
+        have = "it has" if len(self.lost) == 1 else "they have"
         return "\n".join(
             (
                 f"the configuration of sweep {self.name!r} has changed since it was last run:",
-                *_indented(self.what),
-                f"{runs} would be trained anew, and not use what {have}:",
+                *_indented(self.differences),
+                f"{in_runs(len(self.lost))} would be trained anew, and not use what {have}:",
                 *_indented(self.lost),
                 "Choose: --accept-changes does that (the old results stay in the storage), "
                 "--name NEW keeps both sweeps, the old configuration uses what is there.",
@@ -58,28 +55,28 @@ def _indented(lines: tuple[str, ...]) -> list[str]:
 
 
 def keep_settings(sweep: Sweep) -> None:
-    """Remember what `changes_since` compares with.
+    """Write the settings that `changes_since` compares with into the sweep's folder.
 
     Raises:
         StorageError: The sweep's folder can't be written.
     """
-    runs = {node.label: {"key": node.key, **_settings(node)} for node in sweep.plan.nodes}
-    path = sweep.folder / FILE
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(
-            path, json.dumps({"algorithm": ALGORITHM_VERSION, "runs": runs}, indent=1).encode()
-        )
-    except OSError as error:
-        place = error.filename or path
-        raise StorageError(f"{place} must be writable: {error.strerror}") from error
+    runs = {
+        node.label: {
+            "key": node.key,
+            "settings": node.run.model_dump(mode="json"),
+            "source": node.source_key,
+        }
+        for node in sweep.plan.nodes
+    }
+    document = {"algorithm": ALGORITHM_VERSION, "runs": runs}
+    write_locally(sweep.folder / FILE, json.dumps(document, indent=1))
 
 
 def check_begun(config: SweepConfig) -> None:
-    """Whether there is a sweep to go on with.
+    """Refuse to resume a sweep that was never run.
 
     Raises:
-        StorageError: There is none of this name.
+        StorageError: There is no sweep of this name in the storage.
     """
     folder = sweep_folder(resolve_storage(config.storage)[0], config.name)
     if not (folder / FILE).is_file():
@@ -88,84 +85,77 @@ def check_begun(config: SweepConfig) -> None:
         )
 
 
-def _settings(node: Node) -> dict[str, Any]:
-    return {
-        "settings": node.run.model_dump(mode="json"),
-        "source": node.source_key,
-    }
-
-
 def changes_since(sweep: Sweep) -> Changes | None:
-    """What the last run of this sweep has made and this one has no use for; None: nothing.
+    """What the last run of this sweep computed and this one does not use; None: nothing.
 
-    Runs that are new, or that aren't asked for any more, are no such change.
+    Runs that are new, or that are not in the plan any more, do not count.
     """
     try:
         before = json.loads((sweep.folder / FILE).read_bytes())
         runs: Mapping[str, Any] = before["runs"]
         algorithm = before["algorithm"]
     except (OSError, ValueError, KeyError, TypeError):
-        return None  # the first time, or nothing that tells
+        return None  # the first run of the sweep, or an unreadable file
     keys = {node.key for node in sweep.plan.nodes}
     short = ShortLabels.of(node.label for node in sweep.plan.nodes)
-    what: Counter[str] = Counter()
+    counts: Counter[str] = Counter()
     lost = []
     for node in sweep.plan.nodes:
-        was = runs.get(node.label)
-        if was is None or was["key"] == node.key or was["key"] in keys:
+        old = runs.get(node.label)
+        if old is None or old["key"] == node.key or old["key"] in keys:
             continue
-        differences = list(_differences(was["settings"], node.run.model_dump(mode="json")))
-        extends = _extends(was, node) and len(differences) == 1
-        if extends and continued_from(sweep.store, node) is not None:
+        differences = list(_differences(old["settings"], node.run.model_dump(mode="json")))
+        is_longer = (
+            len(differences) == 1
+            and old["source"] == node.source_key
+            and old["settings"]["env_steps"] < node.run.env_steps
+        )
+        if is_longer and continued_from(sweep.store, node) is not None:
             continue
-        what.update(differences)
-        if (has := _what_there_is(sweep.store, was["key"])) is not None:
-            why = _why_not_longer(node) if extends and has == FINISHED else ""
-            lost.append(f"{short(node.label)}: {has}{why}")
+        counts.update(differences)
+        if (progress := _progress(sweep.store, old["key"])) is not None:
+            why = _why_not_longer(node) if is_longer and progress == FINISHED else ""
+            lost.append(f"{short(node.label)}: {progress}{why}")
     if not lost:
         return None
-    lines = [f"{line} ({count} run{'s' * (count > 1)})" for line, count in what.items()]
+    lines = [f"{line} ({in_runs(count)})" for line, count in counts.items()]
     if algorithm != ALGORITHM_VERSION:
         lines.append(f"version of the algorithm: {algorithm} -> {ALGORITHM_VERSION}")
     return Changes(
-        name=sweep.plan.name, what=tuple(lines or ["what it starts from"]), lost=tuple(lost)
+        name=sweep.plan.name,
+        differences=tuple(lines or ["what it starts from"]),
+        lost=tuple(lost),
     )
 
 
 def longer(sweep: Sweep) -> list[str]:
-    """A line about runs that go on where finished ones with fewer `env_steps` have ended."""
+    """A line about runs that continue finished ones with fewer `env_steps`, if there are any."""
     if not sweep.store.has_continuations():
         return []
     left = [node for node in sweep.plan.nodes if node.key not in sweep.finished]
-    found = [steps for node in left if (steps := continued_from(sweep.store, node)) is not None]
-    if not found:
+    steps = [done for node in left if (done := continued_from(sweep.store, node)) is not None]
+    if not steps:
         return []
-    runs = "1 run goes" if len(found) == 1 else f"{len(found)} runs go"
+    go = "goes" if len(steps) == 1 else "go"
     return [
-        f"{runs} on from the end of a finished one with fewer env_steps: {sum(found):,} env "
-        "steps less to train."
+        f"{in_runs(len(steps))} {go} on from the end of a finished one with fewer env_steps: "
+        f"{sum(steps):,} env steps less to train."
     ]
 
 
-def _extends(was: Mapping[str, Any], node: Node) -> bool:
-    source = node.source_key
-    return bool(was["source"] == source and was["settings"]["env_steps"] < node.run.env_steps)
-
-
 def _why_not_longer(node: Node) -> str:
-    """Why a run with more `env_steps` doesn't go on where the shorter one has ended."""
+    """Why a run with more `env_steps` does not continue from the end of the shorter one."""
     if settings := budget_settings(node.run):
         return f"; {' and '.join(settings)} would have had other values with the new env_steps"
     return "; it has kept no checkpoint of its end (checkpoints.finished_mb)"
 
 
-def _what_there_is(store: NodeStore, key: str) -> str | None:
+def _progress(store: NodeStore, key: str) -> str | None:
+    """How far a run is, in words; None where nothing of it is kept."""
     if store.is_finished(key):
         return FINISHED
     checkpoints = store.work_folder(key).names()
-    if not checkpoints:
-        return None
-    return f"is at {steps_of(checkpoints[-1]):,} env steps"
+    return f"is at {steps_of(checkpoints[-1]):,} env steps" if checkpoints else None
 
 
 def _differences(before: Any, after: Any, place: str = "") -> Iterator[str]:

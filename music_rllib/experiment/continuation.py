@@ -1,4 +1,4 @@
-"""Longer training goes on where a run with a smaller budget has ended."""
+"""Longer training continues from the end of a run with a smaller budget."""
 
 from __future__ import annotations
 
@@ -11,14 +11,12 @@ from music_rllib.experiment.plan import Node, node_key
 from music_rllib.schedules import Linear
 from music_rllib.store.node_store import NodeStore, steps_of
 
-__all__ = ["budget_settings", "continuation_key", "continued_from", "is_continuable"]
-
 REPORT_INTERVAL = 1_000
 """Environment steps between two reports, where evaluations are not more frequent."""
 
 
 def continuation_key(run: RunSettings, source: str | None) -> str:
-    """Key of all runs that differ from this one in their budget alone."""
+    """Key that all runs share which differ in their budget alone."""
     return node_key(run.model_copy(update={"env_steps": 0}), source)
 
 
@@ -40,10 +38,10 @@ def _values(value: object) -> Iterator[object]:
 
 
 def is_continuable(run: RunSettings) -> bool:
-    """Whether a longer run comes through the very state in which this one ends.
+    """Whether a longer run passes through the very state in which this one ends.
 
-    It doesn't where a schedule spans the budget, nor where the last evaluation or report is one
-    that only the end of the budget asks for.
+    It does not where a schedule spans the budget, nor where the last evaluation or report is due
+    only because the budget ends.
     """
     interval = run.evaluation.interval
     even = not run.env_steps % interval and not run.env_steps % min(interval, REPORT_INTERVAL)
@@ -51,9 +49,9 @@ def is_continuable(run: RunSettings) -> bool:
 
 
 def continued_from(store: NodeStore, node: Node) -> int | None:
-    """Environment steps of the shorter run from whose end `node` would go on; None: of none."""
-    key = continuation_key(node.run, node.source_key)
+    """Environment steps of the shorter run from whose end `node` would continue; None: of none."""
     if budget_settings(node.run):
         return None
+    key = continuation_key(node.run, node.source_key)
     steps = [steps_of(name) for name in store.continuation(key).names()]
     return max((count for count in steps if count < node.run.env_steps), default=None)

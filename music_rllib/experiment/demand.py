@@ -1,7 +1,8 @@
-"""What runs need at least, by their settings alone, against what a machine has.
+"""The memory and time that runs need at least, by their settings alone.
 
-A lower bound of memory: what is left out (the interpreter, buffers, an environment's own) is there
-whatever the settings are. Observations count as far as a task's split tells their size.
+The bound of memory leaves out what is there whatever the settings are: the interpreter, its
+libraries, an environment's own data. An observation counts as far as the task's split of it into
+agent and surroundings reaches.
 """
 
 from __future__ import annotations
@@ -20,24 +21,26 @@ from music_rllib.runtime import machine as local
 if TYPE_CHECKING:
     from music_rllib.experiment.session import Sweep
 
-__all__ = ["DemandError", "Machine", "check_demand", "check_memory", "long_runs"]
-
 FLOAT = 4
+"""Bytes of a number."""
 STEPS_PER_SECOND = 50_000
 """Environment steps of a process that simulates as fast as any does."""
 UPDATES_PER_SECOND = 10_000
 """Gradient updates of small networks on the fastest hardware."""
 LONG_DAYS = 60
-"""A run that takes longer at these rates was hardly meant."""
+"""A run that takes longer at these rates is probably a mistake."""
 ENVIRONMENT_BYTES = 10_000
-"""Of one sub-environment; MuJoCo's take a hundred times that."""
+"""Memory of one sub-environment; MuJoCo's take a hundred times that."""
 
 CERTAIN_BYTES = 2 * 2**30
-"""Memory that a cluster's nodes are not asked for."""
+"""Memory that every node of a cluster is assumed to have."""
+
+Demand = tuple[str, object, int]
+"""A dotted setting, its value, and the bytes or seconds that it causes."""
 
 
 class DemandError(BadInputError, ValueError):
-    """A run that no machine at hand can hold."""
+    """A run that no available machine can hold."""
 
 
 @dataclass(frozen=True)
@@ -46,20 +49,20 @@ class Machine:
 
     name: str
     memory: int
-    """Bytes that it has."""
+    """Its memory in bytes."""
     claimable: int
     """Bytes that its system grants one process at once, used or not."""
 
 
 def check_demand(sweep: Sweep) -> list[str]:
-    """Look whether the runs that are left can be held in memory, and would ever end.
+    """Check that the unfinished runs fit into memory.
 
     Returns:
-        What a person should know who may have meant something else.
+        Warnings about runs that would take months or years.
 
     Raises:
-        DemandError: One of them can't be held.
-        ClusterError: The cluster that would say so can't be reached.
+        DemandError: A run does not fit.
+        ClusterError: The cluster whose memory counts can't be reached.
     """
     runs = [(node.stage, node.run) for node in sweep.plan.nodes if node.key not in sweep.finished]
     for stage in sweep.config.stages:
@@ -73,9 +76,9 @@ def check_demand(sweep: Sweep) -> list[str]:
 
 
 def _cluster_machine(address: str, sweep: Sweep, runs: list[tuple[str, RunSettings]]) -> Machine:
-    """The largest node, where it matters and no larger one may be added."""
+    """The cluster's largest node; it is only asked for its memory where the runs need much."""
     name = "the cluster's largest node"
-    address_space = 2**47
+    address_space = 2**47  # bytes: no limit
     most = max((least_memory(run) for _, run in runs), default=0)
     if most <= CERTAIN_BYTES:
         return Machine(name, CERTAIN_BYTES, address_space)
@@ -88,17 +91,17 @@ def _cluster_machine(address: str, sweep: Sweep, runs: list[tuple[str, RunSettin
 
 def least_memory(run: RunSettings) -> int:
     """Bytes that a run needs at least."""
-    return sum(amount for _, _, amount in _parts(run))
+    return sum(amount for _, _, amount in _memory(run))
 
 
 def check_memory(runs: Iterable[tuple[str, RunSettings]], machine: Machine) -> None:
-    """Look whether each of `runs`, with the names of their stages, fits by itself.
+    """Check that each of `runs`, given with the names of their stages, fits on `machine` alone.
 
     Raises:
-        DemandError: One doesn't; names the setting that asks for most, and both amounts.
+        DemandError: A run does not fit; the message names the setting that needs most.
     """
     for stage, run in runs:
-        setting, value, amount = max(_parts(run), key=lambda part: part[2])
+        setting, value, amount = max(_memory(run), key=lambda demand: demand[2])
         has, limit = "the memory of", machine.memory
         if least_memory(run) <= limit:
             # The replay's array is claimed whole, and costs memory as it fills.
@@ -115,12 +118,12 @@ def check_memory(runs: Iterable[tuple[str, RunSettings]], machine: Machine) -> N
 
 def long_runs(runs: Iterable[tuple[str, RunSettings]]) -> Iterator[str]:
     """One line per stage and task whose runs would take months or years on any hardware."""
-    said = set()
+    seen = set()
     for stage, run in runs:
-        setting, value, seconds = max(_seconds(run), key=lambda part: part[2])
+        setting, value, seconds = max(_seconds(run), key=lambda demand: demand[2])
         days = seconds // 86_400
-        if days >= LONG_DAYS and (stage, run.task.name) not in said:
-            said.add((stage, run.task.name))
+        if days >= LONG_DAYS and (stage, run.task.name) not in seen:
+            seen.add((stage, run.task.name))
             years = days // 365
             time = f"{_number(years)} years" if years > 1 else f"{days} days"
             yield (
@@ -129,8 +132,8 @@ def long_runs(runs: Iterable[tuple[str, RunSettings]]) -> Iterator[str]:
             )
 
 
-def _seconds(run: RunSettings) -> Iterator[tuple[str, object, int]]:
-    """Setting, value and the seconds that come with it."""
+def _seconds(run: RunSettings) -> Iterator[Demand]:
+    """Seconds that a run takes at least, by setting."""
     evaluation = run.evaluation
     evaluations = 1 - (-run.env_steps // evaluation.interval)
     yield "env_steps", run.env_steps, run.env_steps // STEPS_PER_SECOND
@@ -141,8 +144,8 @@ def _seconds(run: RunSettings) -> Iterator[tuple[str, object, int]]:
     yield "tac.replay_ratio", ratio, updates // UPDATES_PER_SECOND if ratio > 1 else 0
 
 
-def _parts(run: RunSettings) -> Iterator[tuple[str, object, int]]:
-    """Setting, value and the bytes that come with it."""
+def _memory(run: RunSettings) -> Iterator[Demand]:
+    """Bytes that a run needs at least, by setting."""
     tac, replay, music, horizon = run.tac, run.replay, run.music, run.task.horizon
     row, observation = _row_bytes(run.task), _observation(run.task)
     yield "tac.hidden_sizes", tac.hidden_sizes, FLOAT * _network_numbers(run, observation)
@@ -163,31 +166,32 @@ def _parts(run: RunSettings) -> Iterator[tuple[str, object, int]]:
 
 
 def _row_bytes(task: Task) -> int:
-    """Of a transition: what is observed, an action, its reward and whether it was the last."""
+    """Bytes of a transition: observation, action, reward, and whether it was the last."""
     return FLOAT * (_observation(task) + 3)
 
 
 def _network_numbers(run: RunSettings, observation: int) -> int:
-    """Weights with gradients and Adam's two moments, and averaged weights."""
+    """Numbers of all networks: weights, gradients, Adam's two moments, and target networks."""
     tac = run.tac
-    policy = _weights(observation, tac.hidden_sizes, 1)
-    critics = _weights(observation + 1, tac.hidden_sizes, 1)
+    policy = _weights(observation, tac.hidden_sizes)
+    critics = _weights(observation + 1, tac.hidden_sizes)
     if tac.policy == "stochastic":
         critics *= 2
     if tac.bootstrap == "value":
-        value = averaged = _weights(observation, tac.hidden_sizes, 1)
+        value = target = _weights(observation, tac.hidden_sizes)
     else:
-        value, averaged = 0, critics
-    return 4 * (policy + critics + value) + averaged
+        value, target = 0, critics
+    return 4 * (policy + critics + value) + target
 
 
-def _weights(inputs: int, hidden_sizes: tuple[int, ...], outputs: int) -> int:
-    sizes = [inputs, *hidden_sizes, outputs]
+def _weights(inputs: int, hidden_sizes: tuple[int, ...]) -> int:
+    """Weights and biases of a multilayer perceptron with one output."""
+    sizes = [inputs, *hidden_sizes, 1]
     return sum((fan_in + 1) * fan_out for fan_in, fan_out in pairwise(sizes))
 
 
 def _observation(task: Task) -> int:
-    """As far as the task says."""
+    """Numbers of an observation, as far as the task's indices tell."""
     return 1 + max((*task.agent_indices, *task.surrounding_indices), default=0)
 
 

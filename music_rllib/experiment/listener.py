@@ -1,4 +1,4 @@
-"""Who is told what happens in a sweep: the screen, MLflow. Knows no Ray."""
+"""The interface of what follows a sweep's events: the screen, MLflow, searches. Knows no Ray."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ from typing import NamedTuple
 
 from music_rllib.experiment.plan import Node
 from music_rllib.store.run_record import Report, RunResult
-
-__all__ = ["Failure", "Listener"]
 
 
 class Failure(NamedTuple):
@@ -21,19 +19,19 @@ class Failure(NamedTuple):
 
 
 class Listener:
-    """Told in the driver's loop, so it must be quick and must not raise."""
+    """Receives a sweep's events in the driver's loop, so it must be quick and must not raise."""
 
     def started(self, node: Node) -> None:
-        """A worker has begun."""
+        """A worker has begun to compute the node."""
 
     def reported(self, node: Node, reports: list[Report]) -> None:
-        """New reports; after a restart, those of the checkpoint once more."""
+        """The node has new reports; after a restart, those of its checkpoint once more."""
 
     def noted(self, node: Node, text: str) -> None:
-        """Something that a person should know, but no failure."""
+        """A message about the node that is no failure."""
 
     def remarked(self, text: str) -> None:
-        """The same of the whole sweep."""
+        """A message about the whole sweep."""
 
     def finished(self, node: Node, result: RunResult) -> None:
         """The node is in the store."""
@@ -45,10 +43,10 @@ class Listener:
         """The node won't be computed, because another one failed."""
 
     def paused(self, node: Node) -> None:
-        """The node is computed as far as its trial is looked at next."""
+        """The node is computed up to its trial's rung."""
 
     def pruned(self, node: Node, reason: str) -> None:
         """The node isn't computed any further, because its trial was stopped early."""
 
     def tick(self) -> None:
-        """Some time has passed; often."""
+        """The driver's loop went round once."""

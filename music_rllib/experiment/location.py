@@ -1,4 +1,4 @@
-"""What a user means by SWEEP: a folder, a URI, a name in a storage, or a YAML file."""
+"""The sweep that a command's SWEEP argument names: by a folder, a URI, a name, or a YAML file."""
 
 from __future__ import annotations
 
@@ -16,22 +16,20 @@ from music_rllib.experiment.session import Sweep, open_sweep
 from music_rllib.redaction import redact
 from music_rllib.store.paths import check_answers, resolve_storage, sweep_folder
 
-__all__ = ["SweepLocation", "find_sweep"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class SweepLocation:
-    """A sweep that has been started at some time."""
+    """A sweep that was started before."""
 
     storage: str
     """Absolute folder, or URI."""
     name: str
 
     def read(self, file: str) -> Any:
-        """One of its records; None where it isn't there.
+        """The content of one of its files; None where there is no such file.
 
         Raises:
-            StorageError: It is damaged.
+            StorageError: The file is damaged.
         """
         return sweep_files.read(self.storage, f"{self.name}/{file}")
 
@@ -48,7 +46,7 @@ class SweepLocation:
             return load_sweep(path, storage=self.storage, seeds=seeds)
 
     def open(self) -> Sweep:
-        """With its plan, searched trials among it, and what is finished."""
+        """The sweep with its plan, which includes the searched trials, and its finished runs."""
         config = self.config()
         plan = make_plan(config)
         for trial in (self.read(sweep_files.PLAN) or {}).get("trials", ()):
@@ -59,28 +57,28 @@ class SweepLocation:
 
     @property
     def place(self) -> str:
-        """For messages."""
+        """Its folder or URI, for messages."""
         return f"{redact(self.storage)}/{self.name}"
 
 
 def find_sweep(place: str, storage: str | None) -> SweepLocation:
-    """The sweep that a user means.
+    """The started sweep that `place` names.
 
     Raises:
         BadInputError: There is none.
     """
-    found = _found(place, storage)
-    check_answers(found.storage)
-    if found.read(sweep_files.CONFIG) is None:
-        others = ", ".join(_others(found.storage)) or "none"
+    location = _locate(place, storage)
+    check_answers(location.storage)
+    if location.read(sweep_files.CONFIG) is None:
         raise BadInputError(
             f"SWEEP must be a sweep that was started, got {redact(place)}: there is no "
-            f"{found.place}/{sweep_files.CONFIG} (sweeps there: {others})"
+            f"{location.place}/{sweep_files.CONFIG} (sweeps there: {_names(location.storage)})"
         )
-    return found
+    return location
 
 
-def _found(place: str, storage: str | None) -> SweepLocation:
+def _locate(place: str, storage: str | None) -> SweepLocation:
+    """Where the sweep would be, whether it is there or not."""
     if not place or storage == "":
         raise BadInputError(f"{'--storage' if place else 'SWEEP'} must not be empty, got ''")
     if place.endswith((".yaml", ".yml")):
@@ -90,22 +88,22 @@ def _found(place: str, storage: str | None) -> SweepLocation:
     if storage is None and "://" in place:
         above, _, name = place.rpartition("/")
         return SweepLocation(storage=above, name=name)
-    if storage is None and Path(place).expanduser().is_dir():
+    if storage is None:
         folder = Path(place).expanduser().absolute()
-        return SweepLocation(storage=str(folder.parent), name=folder.name)
-    if storage is None and "/" in place:
-        folder = Path(place).expanduser().absolute()
-        others = ", ".join(_others(str(folder.parent))) or "none"
-        raise BadInputError(
-            f"SWEEP must be the folder of a sweep, a sweep's name or its YAML file, got {place}: "
-            f"there is no folder {folder} (sweeps beside it: {others})"
-        )
+        if folder.is_dir():
+            return SweepLocation(storage=str(folder.parent), name=folder.name)
+        if "/" in place:
+            raise BadInputError(
+                f"SWEEP must be the folder of a sweep, a sweep's name or its YAML file, got "
+                f"{place}: there is no folder {folder} (sweeps beside it: "
+                f"{_names(str(folder.parent))})"
+            )
     return SweepLocation(storage=resolve_storage(storage or "results")[0], name=place)
 
 
-def _others(storage: str) -> list[str]:
-    """Names of sweeps in a storage."""
-    return sorted(other.name for other in sweeps_in(storage))
+def _names(storage: str) -> str:
+    """Names of the sweeps in a storage, in words."""
+    return ", ".join(sorted(sweep.name for sweep in sweeps_in(storage))) or "none"
 
 
 def sweeps_in(storage: str) -> list[SweepLocation]:
@@ -118,9 +116,9 @@ def sweeps_in(storage: str) -> list[SweepLocation]:
     selector = pafs.FileSelector(root, allow_not_found=True)
     names = [info.base_name for info in filesystem.get_file_info(selector) if not info.is_file]
     plans = [f"{root}/{name}/{sweep_files.PLAN}" for name in names]
-    found = filesystem.get_file_info(plans) if plans else []
+    infos = filesystem.get_file_info(plans) if plans else []
     return [
         SweepLocation(storage=storage, name=name)
-        for name, plan in zip(names, found, strict=True)
+        for name, plan in zip(names, infos, strict=True)
         if plan.is_file
     ]

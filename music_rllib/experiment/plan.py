@@ -7,30 +7,29 @@ within a sweep and between sweeps.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from music_rllib.config.run_settings import RunSettings
-from music_rllib.config.schema import Checkpoint, Point, Source, Stage, SweepConfig
+from music_rllib.config.schema import Checkpoint, Source, Stage, SweepConfig
 from music_rllib.config.search.check import of_stage, stages_in
 from music_rllib.envs.tasks import Task
 from music_rllib.store.files import content_key
 from music_rllib.version import ALGORITHM_VERSION
 
-__all__ = ["Input", "Node", "Plan", "Run", "make_plan", "node_key"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Input:
-    """Where a node gets the modules that its variant wants handed over."""
+    """Where a node gets the network weights that it starts from."""
 
     key: str
     """A node of the plan, or the node that holds an imported checkpoint."""
     task: Task
-    """Task that the modules were trained on."""
+    """Task that the networks were trained on."""
     checkpoint: Checkpoint | None = None
-    """What to import as `key`; None: it is a node of the plan."""
+    """The checkpoint to import as `key`; None: `key` is a node of the plan."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,14 +40,14 @@ class Run:
     trial: int
     """Position in the stage: its sources' trials times the points of its grid."""
     values: Mapping[str, Any]
-    """What tells the trial from its siblings: dotted setting to value; `pretrain:tac.alpha` is a
-    value that it has from its source."""
+    """The settings that differ between the stage's trials: dotted setting to value;
+    `pretrain:tac.alpha` is a value of its source."""
     task: str
     seed: int
     key: str
-    """The node that computes it."""
+    """Key of the node that computes it."""
     part: str = ""
-    """Of a searched stage: `trial7`, or `final7` on fresh seeds."""
+    """In a searched stage `trial7`, or `final7` on fresh seeds."""
 
     @property
     def label(self) -> str:
@@ -66,41 +65,50 @@ class Node:
     run: RunSettings
     input: Input | None
     stage: str
-    """Of the first run that wants it, as are `trial` and `label`."""
+    """Stage of the first run that it computes; `trial`, `label`, `part` and `values` are that run's
+    too."""
     trial: int
     label: str
     part: str = ""
     values: Mapping[str, Any] = field(default_factory=dict, compare=False)
-    """As those of the run."""
 
     @property
     def source_key(self) -> str | None:
-        """Of the node whose networks it starts from."""
+        """Key of the node whose networks it starts from."""
         return self.input.key if self.input else None
 
 
 class Plan:
-    """All that a sweep asks for; searched stages get their runs as their trials are chosen."""
+    """All runs of a sweep; those of searched stages are added as their trials are chosen."""
 
     def __init__(
         self, name: str, seeds: Sequence[int] = (), *, algorithm: str | None = None
     ) -> None:
-        """An empty plan of a sweep with these seeds, under this or an `algorithm` of its own."""
+        """An empty plan, with keys of this version of the algorithm or of a given one."""
         self.name = name
         self.seeds = tuple(seeds)
         self.algorithm = algorithm or ALGORITHM_VERSION
-        self.runs: list[Run] = []
-        self.trials: list[dict[str, Any]] = []
-        """What `add_trial` was called with, each once, as plain data."""
-        self._asked: set[str] = set()
-        self._known: set[tuple[str, str]] = set()
+        self._runs: dict[tuple[str, str], Run] = {}
+        """By label and key."""
+        self._trials: dict[str, dict[str, Any]] = {}
         self._nodes: dict[str, Node] = {}
         self._by_cell: dict[tuple[str, int, str, int], Run] = {}
+        """Runs of stages without a search, by stage, trial, task and seed."""
         self._stages: dict[str, Stage] = {}
 
     @property
-    def nodes(self) -> Sequence[Node]:
-        """In an order in which every node comes after its input."""
+    def runs(self) -> list[Run]:
+        """All runs, in the order in which they were planned."""
+        return list(self._runs.values())
+
+    @property
+    def trials(self) -> list[dict[str, Any]]:
+        """The arguments of each call of `add_trial`, each once, as plain data."""
+        return list(self._trials.values())
+
+    @property
+    def nodes(self) -> list[Node]:
+        """All nodes, every one after its input."""
         return list(self._nodes.values())
 
     @property
@@ -111,82 +119,71 @@ class Plan:
     @property
     def env_steps(self) -> int:
         """Environment steps of training, over all nodes."""
-        return sum(node.run.env_steps for node in self.nodes)
+        return sum(node.run.env_steps for node in self._nodes.values())
 
     @property
     def imports(self) -> tuple[Input, ...]:
         """Checkpoints from outside that nodes start from, each once."""
-        inputs = {node.input.key: node.input for node in self.nodes if node.input}
+        inputs = {node.input.key: node.input for node in self._nodes.values() if node.input}
         return tuple(source for source in inputs.values() if source.checkpoint)
 
-    def add_stage(self, stage: Stage, *, alone: bool = True) -> None:
-        """Plan a stage whose source, if it is a stage, is planned already.
+    def node(self, key: str) -> Node:
+        """The node with this key."""
+        return self._nodes[key]
+
+    def add_stage(self, stage: Stage, *, with_runs: bool) -> None:
+        """Add a stage whose source, if it is a stage, is in the plan already.
 
         Args:
-            stage: One without a search has its runs planned, another one is only made known.
-            alone: Whether it has runs of its own, and not only those that trials start from.
+            stage: The runs of a searched stage are left to `add_trial`.
+            with_runs: Whether a stage without a search has runs besides those that trials start
+                from.
         """
         self._stages[stage.name] = stage
-        if stage.search is not None or not alone:
+        if stage.search is not None or not with_runs:
             return
-        trial = 0
-        for source_trial in self._source_trials(stage.source):
-            for point in stage.points:
-                for task in stage.tasks:
-                    for seed in self.seeds:
-                        self._add_run(stage, trial, source_trial, point, task, seed)
-                trial += 1
+        points = itertools.product(self._source_trials(stage.source), stage.points)
+        for trial, (source_trial, point) in enumerate(points):
+            for task, seed in itertools.product(stage.tasks, self.seeds):
+                node_input, inherited = self._input(stage.source, source_trial, task, seed)
+                settings = point.runs[task.name].model_copy(update={"seed": seed})
+                values = {**inherited, **point.values}
+                run = self._add_run(stage, trial, values, settings, node_input)
+                self._by_cell[stage.name, trial, task.name, seed] = run
 
     def add_trial(
         self, stage: str, trial: int, values: Mapping[str, Any], seeds: Sequence[int], part: str
     ) -> list[Run]:
-        """Plan a trial of a searched stage, with what it starts from; what is there stays.
+        """Add the runs of a searched stage's trial and of what it starts from, if they are new.
 
-        Args:
-            stage: The stage's name.
-            trial: The trial's number.
-            values: Dotted settings; those of its source as `STAGE:setting`.
-            seeds: To run it with.
-            part: What the trial is called in labels.
+        The `values` are dotted settings, those of the source `STAGE:setting`; `part` is the trial's
+        name in labels.
 
         Returns:
-            Its runs, those with the same seed together.
+            The trial's runs, those with the same seed together.
 
         Raises:
-            ConfigError: The values make no sound settings.
+            ConfigError: The values make no valid settings.
         """
         searched = self._stages[stage]
-        point = searched.resolve(_own(values))
+        point = searched.resolve({k: value for k, value in values.items() if ":" not in k})
         final = searched.search.final if searched.search else None
         budget = {}
         if final is not None and final.env_steps is not None and part.startswith("final"):
             budget = {"env_steps": final.env_steps}
         runs = []
-        for seed in seeds:
-            for task in searched.tasks:
-                node_input = self._trial_input(searched.source, values, task, seed)
-                settings = point.runs[task.name].model_copy(update={"seed": seed, **budget})
-                run = Run(
-                    stage=stage,
-                    trial=trial,
-                    values=dict(values),
-                    task=task.name,
-                    seed=seed,
-                    key=self._key(settings, node_input),
-                    part=part,
-                )
-                self._add(run, settings, node_input)
-                runs.append(run)
-        asked = {
+        for seed, task in itertools.product(seeds, searched.tasks):
+            node_input = self._trial_input(searched.source, values, task, seed)
+            settings = point.runs[task.name].model_copy(update={"seed": seed, **budget})
+            runs.append(self._add_run(searched, trial, values, settings, node_input, part))
+        arguments = {
             "stage": stage,
             "trial": trial,
             "values": dict(values),
             "seeds": list(seeds),
             "part": part,
         }
-        if repr(asked) not in self._asked:
-            self._asked.add(repr(asked))
-            self.trials.append(asked)
+        self._trials.setdefault(repr(arguments), arguments)
         return runs
 
     def _trial_input(
@@ -197,24 +194,30 @@ class Plan:
             return self._input(source, 0, task, seed)[0]
         task = source.task or task
         stage = self._stages[source.stage]
-        theirs = of_stage(values, stage.name)
+        source_values = of_stage(values, stage.name)
         node_input = self._trial_input(stage.source, values, task, seed)
-        settings = stage.resolve(theirs).runs[task.name].model_copy(update={"seed": seed})
-        run = Run(
-            stage=stage.name,
-            trial=0,
-            values=theirs,
-            task=task.name,
-            seed=seed,
-            key=self._key(settings, node_input),
-        )
-        self._add(run, settings, node_input)
+        settings = stage.resolve(source_values).runs[task.name].model_copy(update={"seed": seed})
+        run = self._add_run(stage, 0, source_values, settings, node_input)
         return Input(key=run.key, task=task)
 
-    def _add(self, run: Run, settings: RunSettings, node_input: Input | None) -> None:
-        if (run.label, run.key) not in self._known:
-            self._known.add((run.label, run.key))
-            self.runs.append(run)
+    def _add_run(
+        self,
+        stage: Stage,
+        trial: int,
+        values: Mapping[str, Any],
+        settings: RunSettings,
+        node_input: Input | None,
+        part: str = "",
+    ) -> Run:
+        run = Run(
+            stage=stage.name,
+            trial=trial,
+            values=dict(values),
+            task=settings.task.name,
+            seed=settings.seed,
+            key=node_key(settings, node_input.key if node_input else None, self.algorithm),
+            part=part,
+        )
         node = Node(
             key=run.key,
             run=settings,
@@ -225,41 +228,20 @@ class Plan:
             part=run.part,
             values=run.values,
         )
+        self._runs.setdefault((run.label, run.key), run)
         self._nodes.setdefault(run.key, node)
-
-    def _key(self, settings: RunSettings, node_input: Input | None) -> str:
-        return node_key(settings, node_input.key if node_input else None, self.algorithm)
-
-    def node(self, key: str) -> Node:
-        """The node with this key."""
-        return self._nodes[key]
+        return run
 
     def _source_trials(self, source: Source | None) -> list[int]:
-        """Each trial of a source stage gives one to every point: two grids multiply."""
+        """Trials of a source stage: each gives one to every point, so that two grids multiply."""
         if source is None or source.stage is None:
             return [0]
-        return sorted({run.trial for run in self.runs if run.stage == source.stage})
-
-    def _add_run(
-        self, stage: Stage, trial: int, source_trial: int, point: Point, task: Task, seed: int
-    ) -> None:
-        settings = point.runs[task.name].model_copy(update={"seed": seed})
-        node_input, values = self._input(stage.source, source_trial, task, seed)
-        run = Run(
-            stage=stage.name,
-            trial=trial,
-            values={**values, **point.values},
-            task=task.name,
-            seed=seed,
-            key=self._key(settings, node_input),
-        )
-        self._by_cell[stage.name, trial, task.name, seed] = run
-        self._add(run, settings, node_input)
+        return sorted({run.trial for run in self._runs.values() if run.stage == source.stage})
 
     def _input(
         self, source: Source | None, source_trial: int, task: Task, seed: int
     ) -> tuple[Input | None, dict[str, Any]]:
-        """What a run starts from, and what its source's trial was told apart by."""
+        """What a run starts from, and the values of the source's trial."""
         if source is None:
             return None, {}
         task = source.task or task
@@ -272,10 +254,6 @@ class Plan:
             for name, value in run.values.items()
         }
         return Input(key=run.key, task=task), values
-
-
-def _own(values: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in values.items() if ":" not in name}
 
 
 def short(value: Any) -> str:
@@ -292,33 +270,21 @@ def short(value: Any) -> str:
 def node_key(run: RunSettings, source: str | None, algorithm: str | None = None) -> str:
     """Key of the node that computes `run` from the weights of node `source`.
 
-    Depends on all that determines the numbers and on nothing else: not on names, on where things
-    are stored, on MLflow or on resources. The same on every machine.
-
-    Args:
-        run: The settings.
-        source: Key of the node that the run starts from, if any.
-        algorithm: Version of what is computed; None: this one.
+    It depends on all that determines the numbers and on nothing else: not on names, on where things
+    are stored, on MLflow or on resources. It is the same on every machine. Without `algorithm`, it
+    is that of this version of the algorithm.
     """
     content = {"run": run.identity(), "source": source, "algorithm": algorithm or ALGORITHM_VERSION}
     return content_key(content)
 
 
 def make_plan(config: SweepConfig, *, algorithm: str | None = None) -> Plan:
-    """Lay out a valid sweep, with the keys of this or of an earlier version of the algorithm."""
+    """The plan of a valid sweep, with keys of this or of a given version of the algorithm."""
     plan = Plan(config.name, config.seeds, algorithm=algorithm)
-    varied = {
-        stage.source.stage
-        for stage in config.stages
-        if stage.search is not None and stage.source is not None
-        if stage.source.stage in stages_in(stage.search)
-    }
-    used = {
-        stage.source.stage
-        for stage in config.stages
-        if stage.source is not None and stage.source.stage not in (varied if stage.search else ())
-    }
+    sources = [(stage.search, stage.source.stage) for stage in config.stages if stage.source]
+    varied = {source for search, source in sources if search and source in stages_in(search)}
+    used = {source for search, source in sources if not (search and source in varied)}
     for stage in config.stages:
         # A stage that only trials start from, each with settings of its own for it, has no others.
-        plan.add_stage(stage, alone=stage.name not in varied - used)
+        plan.add_stage(stage, with_runs=stage.name not in varied - used)
     return plan

@@ -1,4 +1,4 @@
-"""A node as MLflow shows it."""
+"""The name, tags and parameters of a node's run in MLflow."""
 
 from __future__ import annotations
 
@@ -15,19 +15,17 @@ from music_rllib.schedules import Linear, Measured, Piecewise, value_at
 from music_rllib.store.files import content_key
 from music_rllib.version import ALGORITHM_VERSION
 
-__all__ = ["RunInfo", "run_info", "run_name"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class RunInfo:
     """One run of the sweep, as MLflow shows it."""
 
     node_key: str
-    """The node's content hash; the run is found again by it."""
+    """The node's content hash, by which the run is found again."""
     name: str
-    """Shown in MLflow's lists, for example ``q=1.5 seed 0 FetchPush finetune``."""
+    """The name in MLflow's lists, for example ``q=1.5 seed 0 FetchPush finetune``."""
     config: Mapping[str, object]
-    """Everything that determines the run: becomes params and the artefact ``config/run.yaml``."""
+    """All settings of the run: MLflow's params, and the artefact ``config/run.yaml``."""
     tags: Mapping[str, object] = field(default_factory=dict)
     """``names.TAG_*`` to values; None is left out."""
     settings: Mapping[str, float] = field(default_factory=dict)
@@ -40,19 +38,19 @@ _SHORT = {"tac.entropic_index": "q", "music.mi_reward_weight": "weight"}
 
 
 def run_name(node: Node) -> str:
-    """What differs between runs, then what they are runs of: `q=1.5 seed 0 FetchPush finetune`."""
-    last = Counter(name.rpartition(".")[2] for name in node.values)
+    """What differs between runs first, then task and stage: `q=1.5 seed 0 FetchPush finetune`."""
+    counts = Counter(name.rpartition(".")[2] for name in node.values)
     parts = []
     for name, value in sorted(node.values.items(), key=lambda item: item[0] not in _SHORT):
-        end = name.rpartition(".")[2]
-        shown = _SHORT.get(name, end if last[end] == 1 and ":" not in name else name)
+        last = name.rpartition(".")[2]
+        shown = _SHORT.get(name, last if counts[last] == 1 and ":" not in name else name)
         parts.append(f"{shown}={short(value)}")
     seed = f"seed {node.run.seed}"
     return " ".join(filter(None, (*parts, seed, node.run.task.name, node.stage, node.part)))
 
 
 def run_info(node: Node) -> RunInfo:
-    """A node as MLflow shows it."""
+    """How MLflow shows a node."""
     run = node.run
     config: dict[str, Any] = run.model_dump(mode="json")
     q, alpha, weight = run.tac.entropic_index, run.tac.alpha, run.music.mi_reward_weight
@@ -88,8 +86,9 @@ def _at_start(
     value: float | Linear | Piecewise | Measured | LearnedAlpha | MatchedAlpha | NormalisedAlpha,
     run: RunSettings,
 ) -> float:
+    """A setting's number at environment step 0."""
     if isinstance(value, LearnedAlpha):
         return value.initial
-    # As it was set: alpha at q = 1. What becomes of it at q is a metric of the run.
+    # The number in the settings, which is alpha at q = 1. Its value at q is a metric of the run.
     given = value.value if isinstance(value, MatchedAlpha | NormalisedAlpha) else value
     return value_at(given, 0, run.env_steps)

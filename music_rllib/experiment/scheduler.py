@@ -1,4 +1,4 @@
-"""Who waits for whom: the state of every node of a plan while a sweep runs. Knows no Ray."""
+"""The state of every node of a plan while a sweep runs, and which node is next. Knows no Ray."""
 
 from __future__ import annotations
 
@@ -7,43 +7,42 @@ from enum import StrEnum
 
 from music_rllib.experiment.plan import Node, Plan
 
-__all__ = ["Scheduler", "Status"]
-
 
 class Status(StrEnum):
-    """Where a node stands."""
+    """The state of a node."""
 
     WAITING = "waiting"
-    """For its input, or for its turn."""
+    """It waits for its input, or for its turn."""
     STARTED = "started"
-    """Handed out to be computed."""
+    """It is handed out to be computed."""
     FINISHED = "finished"
     REUSED = "reused"
-    """Was in the store before this sweep started."""
+    """It was in the store before this sweep started."""
     FAILED = "failed"
     SKIPPED = "skipped"
     """What it starts from failed or was skipped."""
     PAUSED = "paused"
-    """Computed as far as its trial is looked at next, and kept."""
+    """It is computed up to its trial's rung, and kept."""
     PRUNED = "pruned"
-    """Not wanted any further: its trial was stopped early, or failed."""
+    """It is computed no further: its trial was stopped early, or failed."""
 
 
-_DONE = frozenset({Status.FINISHED, Status.REUSED})
+DONE = (Status.FINISHED, Status.REUSED)
+LOST = (Status.FAILED, Status.SKIPPED)
 
 
 class Scheduler:
     """The nodes of a plan and their states."""
 
     def __init__(self, plan: Plan, finished: Collection[str]) -> None:
-        """Start with the nodes whose keys are in `finished` done, and all others waiting."""
+        """All nodes of `plan`: those with a key in `finished` are done, the others wait."""
         self._nodes = {node.key: node for node in plan.nodes}
         seeds = list(dict.fromkeys(node.run.seed for node in plan.nodes))
         by_seed = sorted(self._nodes.values(), key=lambda node: seeds.index(node.run.seed))
         self._turns = {node.key: turn for turn, node in enumerate(by_seed)}
         self._until: dict[str, int] = {}
         self.changes = 0
-        """Grows whenever something changes."""
+        """Number of changes of state so far."""
         self._status = {
             key: Status.REUSED if key in finished else Status.WAITING for key in self._nodes
         }
@@ -70,14 +69,15 @@ class Scheduler:
 
     @property
     def complete(self) -> bool:
-        """Whether nothing is waiting or being computed."""
+        """Whether no node waits or is being computed."""
         return self.all_handed_out and Status.STARTED not in self._status.values()
 
     def next_ready(self) -> Node | None:
-        """The waiting node whose input is there and whose turn it is.
+        """The waiting node whose input is done and whose turn it is; None where there is none.
 
-        All of a seed before the next seed, so that a sweep that is cut can compare its settings;
-        within a seed in the order of the plan, and what a search adds in the order it is added.
+        All nodes of a seed come before those of the next seed, so that a sweep that is cut can
+        compare its settings; within a seed they come in the order of the plan. Nodes that a search
+        has added come last, in the order in which they were added.
         """
         ready = (node for node in self.having(Status.WAITING) if self._input_is_there(node))
         return min(
@@ -87,25 +87,23 @@ class Scheduler:
     def _input_is_there(self, node: Node) -> bool:
         if node.input is None or node.input.checkpoint is not None:
             return True
-        return self._status[node.input.key] in _DONE
+        return self._status[node.input.key] in DONE
 
     def want(self, node: Node, until: int | None, *, finished: bool) -> None:
-        """The search asks for a node, or for more of it.
+        """Add a node that a search asks for, or let one that is there be computed further.
 
         Args:
-            node: It, and what it starts from must be in the scheduler already.
-            until: As far as so many environment steps; None: to its end.
-            finished: Whether it is in the store; of importance for a node that is new here.
+            node: The node, after the node that it starts from.
+            until: Environment steps up to which it is to be computed; None: to its end.
+            finished: Whether a node that is new here is in the store.
         """
         key = node.key
         if key not in self._nodes:
-            self._nodes[key] = node
-            self._status[key] = Status.REUSED if finished else Status.WAITING
+            lost = node.input is not None and self._status.get(node.input.key) in LOST
+            waiting = Status.SKIPPED if lost else Status.WAITING
+            self._add(node, Status.REUSED if finished else waiting)
             if until is not None:
                 self._until[key] = until
-            self.changes += 1
-            if not finished and node.input is not None and self._is_lost(node.input.key):
-                self._status[key] = Status.SKIPPED
             return
         before = self._until.get(key)
         if until is None:
@@ -116,46 +114,45 @@ class Scheduler:
         if self._status[key] is Status.PRUNED or (self._status[key] is Status.PAUSED and further):
             if self._status[key] is Status.PRUNED and until is not None:
                 self._until[key] = until
-            self._status[key] = Status.WAITING
-            self.changes += 1
+            self._move(key, self._status[key], Status.WAITING)
 
     def recall(self, node: Node, *, finished: bool) -> None:
-        """A node of a trial that ended earlier: nothing is to be computed."""
+        """Add a node of a trial that ended earlier, which is not to be computed."""
         if node.key not in self._nodes:
-            self._nodes[node.key] = node
-            self._status[node.key] = Status.REUSED if finished else Status.PRUNED
-            self.changes += 1
+            self._add(node, Status.REUSED if finished else Status.PRUNED)
 
-    def _is_lost(self, key: str) -> bool:
-        return self._status.get(key) in (Status.FAILED, Status.SKIPPED)
+    def _add(self, node: Node, status: Status) -> None:
+        self._nodes[node.key] = node
+        self._status[node.key] = status
+        self.changes += 1
 
     def until(self, key: str) -> int | None:
-        """As far as the node is to be computed for now; None: to its end."""
+        """Environment steps up to which the node is to be computed for now; None: to its end."""
         return self._until.get(key)
 
     def pause(self, key: str, env_steps: int) -> None:
-        """The node has been computed that far; it waits again if more is wanted by now."""
+        """Record that the node is computed that far; it waits again if more is wanted by now."""
         until = self._until.get(key)
         more = until is None or until > env_steps
         self._move(key, Status.STARTED, Status.WAITING if more else Status.PAUSED)
 
     def withdraw(self, key: str) -> bool:
-        """The node isn't wanted any more; whether that changes anything."""
+        """Compute the node no further; False where it is not waiting or paused."""
         if self._status[key] not in (Status.WAITING, Status.PAUSED):
             return False
         self._move(key, self._status[key], Status.PRUNED)
         return True
 
     def start(self, key: str) -> None:
-        """The node is handed out."""
+        """Record that the node is handed out."""
         self._move(key, Status.WAITING, Status.STARTED)
 
     def finish(self, key: str) -> None:
-        """The node is in the store."""
+        """Record that the node is in the store."""
         self._move(key, Status.STARTED, Status.FINISHED)
 
     def fail(self, key: str) -> list[Node]:
-        """The node failed; those that depend on it are skipped, and returned."""
+        """Record that the node failed; the nodes that depend on it are skipped, and returned."""
         self._move(key, Status.STARTED, Status.FAILED)
         dependants = list(self._dependants({key}))
         for node in dependants:

@@ -1,4 +1,4 @@
-"""A planned sweep with its storage open: what is done, and what it leaves about itself."""
+"""A planned sweep with its storage open: its finished runs, and the record of its plan."""
 
 from __future__ import annotations
 
@@ -12,15 +12,13 @@ from typing import Any
 from music_rllib.config.schema import SweepConfig
 from music_rllib.experiment.continuation import continuation_key
 from music_rllib.experiment.plan import Plan
-from music_rllib.experiment.scheduler import Scheduler, Status
+from music_rllib.experiment.scheduler import DONE, Scheduler
 from music_rllib.experiment.sweep_files import CONFIG, PLAN, as_json, keep, read
 from music_rllib.labels import ShortLabels
 from music_rllib.redaction import redact, without_secrets
 from music_rllib.store.node_store import NodeStore, damage_in_words
 from music_rllib.store.object_folder import DamagedError, StorageError
 from music_rllib.store.run_record import RunResult
-
-__all__ = ["Sweep", "keep_record", "open_sweep", "plan_document"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,18 +31,18 @@ class Sweep:
     """Absolute folder, or URI."""
     store: NodeStore
     folder: Path
-    """The sweep's own files, on this machine."""
+    """Folder of the sweep's own files, on this machine."""
     scheduler: Scheduler
 
     @property
     def finished(self) -> set[str]:
         """Keys of the nodes that have a result."""
-        return {node.key for node in self.scheduler.having(Status.FINISHED, Status.REUSED)}
+        return {node.key for node in self.scheduler.having(*DONE)}
 
     def results(self) -> dict[str, RunResult]:
-        """Node key to result, for the finished ones."""
-        found = {key: self.store.result(key) for key in self.finished}
-        return {key: result for key, result in found.items() if result is not None}
+        """Results of the finished nodes, by key."""
+        results = {key: self.store.result(key) for key in self.finished}
+        return {key: result for key, result in results.items() if result is not None}
 
 
 def open_sweep(
@@ -54,14 +52,9 @@ def open_sweep(
     folder: Path,
     remove_damaged: Callable[[str], None] | None = None,
 ) -> Sweep:
-    """Open the storage, and see what is finished already and is what it was.
+    """Open the storage, and find the runs in it that are finished and undamaged.
 
-    Args:
-        config: The sweep.
-        plan: Of the same.
-        storage: Absolute folder, or URI.
-        folder: The sweep's own files, on this machine.
-        remove_damaged: Delete finished runs that are damaged, and tell this about each.
+    With `remove_damaged`, damaged runs are deleted, and it is called with a message about each.
 
     Raises:
         StorageError: The storage can't be reached, or finished runs in it are damaged.
@@ -87,7 +80,7 @@ def open_sweep(
 
 
 def _labels(config: SweepConfig, plan: Plan, storage: str) -> dict[str, str]:
-    """Key to label of what the sweep may reuse: also what its searches have asked for before."""
+    """Labels of all nodes that the sweep may reuse, by key; also those of earlier trials."""
     labels = {
         source.key: f"handoff {source.checkpoint.folder}"
         for source in plan.imports
@@ -97,13 +90,13 @@ def _labels(config: SweepConfig, plan: Plan, storage: str) -> dict[str, str]:
     labels |= {node.key: short(node.label) for node in plan.nodes}
     if plan.searched:
         with contextlib.suppress(StorageError):  # the sweep writes it anew
-            known = read(storage, f"{config.name}/{PLAN}") or {"nodes": []}
-            labels = {node["key"]: node["label"] for node in known["nodes"]} | labels
+            earlier = read(storage, f"{config.name}/{PLAN}") or {"nodes": []}
+            labels = {node["key"]: node["label"] for node in earlier["nodes"]} | labels
     return labels
 
 
 def plan_document(sweep: Sweep) -> dict[str, Any]:
-    """The runs, those of searches as far as they are chosen."""
+    """The content of `plan.json`: all nodes, those of searches as far as they are chosen."""
     nodes = [
         {
             "key": node.key,
@@ -123,14 +116,14 @@ def keep_record(sweep: Sweep) -> None:
     Raises:
         StorageError: The folder can't be written.
     """
-    given = [f"# {argument}  (command line)\n" for argument in sweep.config.arguments]
-    keep(sweep, "sweep.yaml", redact("".join(given) + sweep.config.text))
+    arguments = [f"# {argument}  (command line)\n" for argument in sweep.config.arguments]
+    keep(sweep, "sweep.yaml", redact("".join(arguments) + sweep.config.text))
     keep(sweep, CONFIG, as_json(_configuration(sweep.config)))
     keep(sweep, PLAN, as_json(plan_document(sweep)))
 
 
 def _configuration(config: SweepConfig) -> dict[str, Any]:
-    """All of it, without secrets, and with paths that mean the same from anywhere."""
+    """The whole configuration, without secrets and with absolute paths."""
     document: dict[str, Any] = json.loads(as_json(without_secrets(config.document)))
     for stage in document["stages"]:
         source = stage.get("init_from")

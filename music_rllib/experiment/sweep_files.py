@@ -1,15 +1,16 @@
-"""A sweep's small files, below `<storage>/<name>`: in a bucket too, where other machines read them.
+"""A sweep's small files below `<storage>/<name>`, in a bucket too, where other machines read them.
 
-`config.json` is the whole configuration, `plan.json` the runs known beforehand, `search.json` what
-came of its searches, `state.json` how far it is.
+`config.json` is the whole configuration, `plan.json` the runs known beforehand, `search.json` the
+results of its searches, `state.json` its progress.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Set
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,25 +22,11 @@ from music_rllib.store.object_folder import StorageError, open_storage
 if TYPE_CHECKING:
     from music_rllib.experiment.session import Sweep
 
-__all__ = [
-    "CONFIG",
-    "PLAN",
-    "SEARCH",
-    "STATE",
-    "STOP",
-    "as_json",
-    "is_alive",
-    "keep",
-    "plain",
-    "read",
-    "remove",
-]
-
 CONFIG, PLAN, SEARCH, STATE = "config.json", "plan.json", "search.json", "state.json"
 STOP = "stop.json"
-"""Asks the driver to stop."""
+"""Its presence asks the driver to stop."""
 SILENCE_SECONDS = 90.0
-"""After so long a driver on another machine counts as dead."""
+"""A driver on another machine counts as dead when its last heartbeat is older."""
 
 
 def is_alive(state: Mapping[str, Any] | None) -> bool:
@@ -53,7 +40,7 @@ def is_alive(state: Mapping[str, Any] | None) -> bool:
 
 
 def plain(value: Any) -> Any:
-    """JSON has no NaN: null in its place."""
+    """`value` as JSON can hold it: null in place of NaN and infinity."""
     if isinstance(value, dict):
         return {str(key): plain(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):
@@ -62,7 +49,7 @@ def plain(value: Any) -> Any:
 
 
 def as_json(document: Any) -> str:
-    """As it is kept."""
+    """The text of a sweep's JSON file."""
     return json.dumps(plain(document), indent=1, ensure_ascii=False, default=str)
 
 
@@ -72,19 +59,28 @@ def keep(sweep: Sweep, name: str, text: str) -> None:
     Raises:
         StorageError: It can't be written.
     """
-    try:
-        sweep.folder.mkdir(parents=True, exist_ok=True)
-        write_atomically(sweep.folder / name, text.encode())
-    except OSError as error:
-        place = error.filename or sweep.folder
-        raise StorageError(f"{place} must be writable: {error.strerror}") from error
+    write_locally(sweep.folder / name, text)
     if is_remote(sweep.storage):
         write(sweep.storage, f"{sweep.config.name}/{name}", text)
 
 
 def is_remote(storage: str) -> bool:
-    """Whether the sweep's folder isn't in its storage."""
+    """Whether a storage is a bucket, so that the sweep's folder on this machine is not in it."""
     return "://" in storage and not storage.startswith("file://")
+
+
+def write_locally(path: Path, text: str) -> None:
+    """Write a file on this machine, whole or not at all.
+
+    Raises:
+        StorageError: It can't be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, text.encode())
+    except OSError as error:
+        place = error.filename or path.parent
+        raise StorageError(f"{place} must be writable: {error.strerror}") from error
 
 
 def write(storage: str, path: str, text: str) -> None:
@@ -95,11 +91,11 @@ def write(storage: str, path: str, text: str) -> None:
     """
     filesystem, root = open_storage(storage)
     target = f"{root}/{path}"
+    if not is_remote(storage):
+        write_locally(Path(target), text)
+        return
     try:
         filesystem.create_dir(target.rpartition("/")[0], recursive=True)
-        if not is_remote(storage):
-            write_atomically(Path(target), text.encode())
-            return
         with filesystem.open_output_stream(target) as sink:
             sink.write(text.encode())
     except OSError as error:
@@ -107,61 +103,46 @@ def write(storage: str, path: str, text: str) -> None:
 
 
 _STATE_KEYS = {"sweep", "driver", "stages", "env_steps", "running", "best", "searches", "failures"}
-_DRIVER_KEYS = {
-    "pid",
-    "host",
-    "machine",
-    "process_started",
-    "started",
-    "heartbeat",
-    "ended",
-    "outcome",
-}
+_PROCESS_KEYS = {"pid", "host", "machine", "process_started"}
+_DRIVER_KEYS = _PROCESS_KEYS | {"started", "heartbeat", "ended", "outcome"}
 
 
-def _is_plan(document: Any) -> bool:
-    nodes = document.get("nodes") if isinstance(document, dict) else None
-    return isinstance(nodes, list) and all(
-        isinstance(node, dict) and {"key", "label"} <= node.keys() for node in nodes
-    )
+def _has(document: Any, keys: Set[str]) -> bool:
+    return isinstance(document, dict) and document.keys() >= keys
 
 
-def _is_state(document: Any) -> bool:
-    driver = document.get("driver") if isinstance(document, dict) else None
-    return (
-        isinstance(driver, dict)
-        and document.keys() >= _STATE_KEYS
-        and (driver.keys() >= _DRIVER_KEYS)
-    )
-
-
-def _is_config(document: Any) -> bool:
-    return isinstance(document, dict) and _is_list_of_mappings(document.get("stages"))
-
-
-def _is_list_of_mappings(document: Any) -> bool:
-    return isinstance(document, list) and all(isinstance(one, dict) for one in document)
+def _is_list_with(document: Any, keys: Set[str] = frozenset()) -> bool:
+    return isinstance(document, list) and all(_has(item, keys) for item in document)
 
 
 _SOUND: dict[str, Callable[[Any], bool]] = {
-    CONFIG: _is_config,
-    PLAN: _is_plan,
-    STATE: _is_state,
-    SEARCH: _is_list_of_mappings,
+    CONFIG: lambda document: _has(document, {"stages"}) and _is_list_with(document["stages"]),
+    PLAN: lambda document: (
+        _has(document, {"nodes"}) and _is_list_with(document["nodes"], {"key", "label"})
+    ),
+    STATE: lambda document: _has(document, _STATE_KEYS) and _has(document["driver"], _DRIVER_KEYS),
+    SEARCH: _is_list_with,
 }
-"""Whether a record has what its readers count on."""
+"""File name to a check that its content has what its readers rely on."""
 
 
 def read(storage: str, path: str) -> Any:
-    """The content of a JSON file below a storage; None where there is none.
+    """The content of a JSON file below a storage; None where there is no such file.
 
     Raises:
-        StorageError: It can't be read, or isn't the record that its name says.
+        StorageError: It can't be read, or its content is not what its name says.
     """
-    document = _read(storage, path)
+    filesystem, root = open_storage(storage)
+    target = f"{root}/{path}"
+    try:
+        with filesystem.open_input_stream(target) as stream:
+            document = json.loads(stream.read())
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        raise StorageError(f"{target} must be a readable JSON file: {error}") from error
     name = path.rpartition("/")[2]
     if document is not None and name in _SOUND and not _SOUND[name](document):
-        target = f"{open_storage(storage)[1]}/{path}"
         raise StorageError(
             f"{target} must be a sweep's {name.removesuffix('.json')} as its driver writes it, got "
             f"{shown(document)}: running the sweep again writes it anew"
@@ -169,22 +150,8 @@ def read(storage: str, path: str) -> Any:
     return document
 
 
-def _read(storage: str, path: str) -> Any:
-    filesystem, root = open_storage(storage)
-    target = f"{root}/{path}"
-    try:
-        with filesystem.open_input_stream(target) as stream:
-            return json.loads(stream.read())
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError) as error:
-        raise StorageError(f"{target} must be a readable JSON file: {error}") from error
-
-
 def remove(storage: str, path: str) -> None:
     """Delete a file below a storage, if it is there."""
     filesystem, root = open_storage(storage)
-    try:
+    with contextlib.suppress(FileNotFoundError):
         filesystem.delete_file(f"{root}/{path}")
-    except FileNotFoundError:
-        return

@@ -1,4 +1,4 @@
-"""What a trial is worth: one number from its runs, and whether it may be stopped early.
+"""The value of a trial, made of its runs' scores, and whether the trial is stopped early.
 
 Shapes: `scores` is `[seeds, tasks]`, one number per run.
 """
@@ -18,16 +18,15 @@ from music_rllib.results import statistics as st
 from music_rllib.results.statistics import Array, Estimate
 from music_rllib.store.run_record import Report
 
-__all__ = ["Verdict", "aggregate", "interval", "prune", "score"]
-
 
 def score(objective: Objective, history: Sequence[Report], budget: int) -> float:
-    """A run's number.
+    """The score of a run.
 
     Args:
-        objective: What to read.
+        objective: The metric, and how it is read.
         history: The run's reports, as far as they count.
-        budget: Environment steps of the whole run, for a threshold that is never reached.
+        budget: Environment steps of the whole run: the score where `steps_to` a threshold is read
+            that is never reached.
 
     Raises:
         ValueError: The run never reported the metric, or reported NaN.
@@ -57,7 +56,7 @@ def score(objective: Objective, history: Sequence[Report], budget: int) -> float
 
 
 def aggregate(objective: Objective, scores: Array) -> float:
-    """A trial's number from those of its runs, `[seeds, tasks]`."""
+    """The value of a trial with the scores `[seeds, tasks]`."""
     match objective.aggregate:
         case "iqm":
             return float(stats.trim_mean(scores, 0.25, axis=None))
@@ -69,13 +68,15 @@ def aggregate(objective: Objective, scores: Array) -> float:
     return float(by_task.min() if objective.maximised else by_task.max())
 
 
-def interval(objective: Objective, scores: Array, episodes: int | None = None) -> Estimate:
-    """A trial's number with its 95 % interval; NaN ends for a single run.
+def aggregates(objectives: Sequence[Objective], scores: Sequence[Array]) -> list[float]:
+    """The value of a trial by each objective, from its scores by each."""
+    return [aggregate(*pair) for pair in zip(objectives, scores, strict=True)]
 
-    Args:
-        objective: What counts.
-        scores: Of the trial's runs, `[seeds, tasks]`.
-        episodes: Of an evaluation, where it is known.
+
+def interval(objective: Objective, scores: Array, episodes: int | None = None) -> Estimate:
+    """The value of a trial with its 95 % interval; NaN ends for a single run.
+
+    `episodes` are those of one evaluation, where they are known.
     """
     is_rate = objective.metric in names.EVAL_RATES and objective.read != "steps_to"
     if objective.aggregate == "worst_task":
@@ -98,7 +99,7 @@ class Verdict:
 
     stop: bool
     reason: str
-    """In words, with the numbers that decided."""
+    """A sentence with the numbers that decided."""
 
 
 def prune(
@@ -112,29 +113,30 @@ def prune(
 ) -> Verdict:
     """Whether a trial that has reached a rung is stopped there.
 
-    It goes on if it is in the best part of those that have reached the rung, and it goes on too if
-    its interval reaches the best of them: then its place may be bad luck. The interval is that of a
-    mean over as many runs as the aggregate hangs on, with the spread between seeds that earlier
-    trials have in common: a few runs of one trial tell little about theirs.
+    It goes on if it is in the best part of those that have reached the rung, and also if its
+    interval reaches the value of the best one: then its rank may be bad luck. The interval is that
+    of a mean over as many runs as the aggregate depends on, with the spread between seeds pooled
+    over this and the earlier trials: a few runs of one trial tell little about it.
 
     Args:
-        objective: What counts.
-        pruning: The rules.
-        scores: The trial's runs so far, `[seeds, tasks]`.
-        others: Trial number to the same of each earlier trial that reached this rung.
-        whole: Trial number to all runs of each earlier trial that went to its end; they tell the
-            spread of those with a single seed at this rung.
-        place: The rung in words.
+        objective: The objective.
+        pruning: The settings.
+        scores: The trial's scores so far, `[seeds, tasks]`.
+        others: Trial number to the scores at this rung of each earlier trial that reached it.
+        whole: Trial number to the scores of each earlier trial that went to its end; they tell the
+            spread of a trial with a single seed at this rung.
+        place: The rung in words, for the reason.
     """
     sign = 1.0 if objective.maximised else -1.0
-    mine = sign * aggregate(objective, scores)
-    theirs = {number: sign * aggregate(objective, values) for number, values in others.items()}
-    if not theirs:
+    own = sign * aggregate(objective, scores)
+    earlier = {number: sign * aggregate(objective, values) for number, values in others.items()}
+    if not earlier:
         return Verdict(stop=False, reason=f"{place}: the first to get there")
-    ranked = sorted([*theirs.values(), mine], reverse=True)
+    ranked = sorted([*earlier.values(), own], reverse=True)
     kept = max(1, math.ceil(pruning.keep * len(ranked)))
-    bar, best = ranked[kept - 1], max(theirs.values())
-    if mine >= bar:
+    leader = max(earlier, key=lambda number: earlier[number])
+    bar, best = ranked[kept - 1], earlier[leader]
+    if own >= bar:
         return Verdict(stop=False, reason=f"{place}: among the best {kept} of {len(ranked)}")
     # A seed that is at this rung and at the end too must not count as two.
     known = [
@@ -142,19 +144,18 @@ def prune(
         for number, values in others.items()
     ]
     half = _half_width(objective, scores, known, pruning.confidence)
-    ends = f"[{sign * mine - half:.4g}, {sign * mine + half:.4g}]"
-    if mine + half >= best:
+    ends = f"[{sign * own - half:.4g}, {sign * own + half:.4g}]"
+    if own + half >= best:
         return Verdict(
             stop=False,
             reason=f"{place}: its interval {ends} reaches the best trial's {sign * best:.4g}",
         )
-    number = max(theirs, key=lambda other: theirs[other])
     return Verdict(
         stop=True,
         reason=(
-            f"{place}: {sign * mine:.4g} is not among the best {kept} of {len(ranked)} (from "
+            f"{place}: {sign * own:.4g} is not among the best {kept} of {len(ranked)} (from "
             f"{sign * bar:.4g} on), and its {100 * pruning.confidence:.0f} % interval {ends} does "
-            f"not reach the {sign * best:.4g} of trial {number}"
+            f"not reach the {sign * best:.4g} of trial {leader}"
         ),
     )
 
@@ -162,7 +163,7 @@ def prune(
 def _half_width(
     objective: Objective, scores: Array, others: Sequence[Array], confidence: float
 ) -> float:
-    """Of the interval around a trial's number; infinite where no two seeds tell the spread."""
+    """Half the width of a trial's interval; infinite where no trial has two seeds."""
     squares, freedom = 0.0, 0
     for values in (scores, *others):
         squares += float(np.sum((values - values.mean(axis=0)) ** 2))
@@ -175,9 +176,9 @@ def _half_width(
 
 
 def _runs_behind(objective: Objective, scores: Array) -> float:
-    """How many runs a mean must have to vary as much as the aggregate does, at the least.
+    """Number of runs whose mean varies as much as the aggregate does, at least.
 
-    It is as if the tasks were far apart, as success rates of easy and hard ones are: then the worst
+    The tasks are taken to be far apart, as success rates of easy and hard ones are: then the worst
     task is one of them, the median is that of one, and the middle half is half of them.
     """
     seeds, runs = len(scores), int(scores.size)

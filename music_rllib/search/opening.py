@@ -1,4 +1,4 @@
-"""A sweep's searches opened: their studies, where they are, and what they learn from."""
+"""The searches of a sweep, opened: their studies, storages and rungs."""
 
 from __future__ import annotations
 
@@ -11,64 +11,54 @@ from music_rllib.config.search.check import most_env_steps
 from music_rllib.config.search.settings import Rung, SearchSettings, WarmStart
 from music_rllib.experiment.plan import node_key
 from music_rllib.experiment.session import Sweep
-from music_rllib.search.storage import (
-    known_studies,
-    open_studies,
-    same_database,
-)
+from music_rllib.search.storage import known_studies, names_of, open_studies, same_database
 from music_rllib.search.study import Study
 from music_rllib.search.trials import Arm, Search
 from music_rllib.search.warm_start import no_study_error
 
-__all__ = ["check_studies", "learnings", "open_searches"]
-
 STUDY_FILE = "study.db"
-"""In the sweep's folder."""
+"""File in the sweep's folder."""
 
 
 def check_studies(sweep: Sweep) -> None:
-    """Reach the databases that searches name, and look for the studies that they learn from.
+    """Check that the searches' databases and the studies that they learn from are there.
 
-    Nothing is made there, so that a sweep that is only planned leaves nothing.
+    Nothing is made, so that a sweep that is only planned leaves nothing.
 
     Raises:
-        StorageError: One can't be used, or there is no such study.
+        StorageError: A database can't be used, or there is no such study.
     """
     above: list[tuple[str, str]] = []
     for stage in sweep.plan.searched:
         settings = stage.search
         assert settings is not None
-        base, own = _base(sweep, stage), settings.storage or str(sweep.folder / STUDY_FILE)
+        base, storage = _base(sweep, stage), _storage(sweep, settings)
         # The sweep's folder need not be there yet.
-        mine = known_studies(own) if settings.storage or Path(own).exists() else []
-        if settings.warm_start is not None:
-            _check_warm_start(settings.warm_start, base, own, mine, above)
-        above.append((base, own))
+        known = known_studies(storage) if settings.storage or Path(storage).exists() else []
+        # A study that is there has learnt already.
+        is_made = any(name.startswith((f"{base} @", f"{base}/")) for name in known)
+        if settings.warm_start is not None and not is_made:
+            place = settings.warm_start.storage or storage
+            # The studies of earlier stages are made before this one's.
+            made = [name for name, other in above if same_database(other, place)]
+            _check_warm_start(settings.warm_start, known, made)
+        above.append((base, storage))
 
 
 def _base(sweep: Sweep, stage: Stage) -> str:
-    """What its studies' names begin with."""
+    """The beginning of the names of a stage's studies."""
     assert stage.search is not None
     return f"{stage.search.study or sweep.config.name}/{stage.name}"
 
 
-def _check_warm_start(
-    warm: WarmStart, base: str, own: str, mine: Sequence[str], above: Sequence[tuple[str, str]]
-) -> None:
-    """Look for the study to learn from.
+def _storage(sweep: Sweep, settings: SearchSettings) -> str:
+    return settings.storage or str(sweep.folder / STUDY_FILE)
 
-    Args:
-        warm: Names it.
-        base: What the names of the search's own studies begin with.
-        own: The search's storage.
-        mine: The studies in it.
-        above: `base` and `own` of the stages above.
-    """
-    if any(name.startswith((f"{base} @", f"{base}/")) for name in mine):
-        return  # it has learnt already, and looks no more
-    known = mine if warm.storage is None else known_studies(warm.storage, must_exist=True)
-    # Those of the stages above are made before this one's.
-    made = [name for name, place in above if same_database(place, warm.storage or own)]
+
+def _check_warm_start(warm: WarmStart, known: Sequence[str], made: Sequence[str]) -> None:
+    """Check that the study to learn from is there, or has one of the beginnings `made`."""
+    if warm.storage is not None:
+        known = names_of(open_studies(warm.storage, warm_start=True))
     if any(name.startswith(warm.study) for name in known):
         return
     if not any(name.startswith(warm.study) or warm.study.startswith(name) for name in made):
@@ -76,7 +66,7 @@ def _check_warm_start(
 
 
 def open_searches(sweep: Sweep) -> list[Search]:
-    """Open or make the studies of a sweep's searched stages.
+    """Open the studies of a sweep's searched stages, which are made where they are missing.
 
     Raises:
         StorageError: A study's storage can't be used.
@@ -88,42 +78,37 @@ def _open_search(sweep: Sweep, stage: Stage) -> Search:
     settings = stage.search
     assert settings is not None
     sweep.folder.mkdir(parents=True, exist_ok=True)
-    storage = open_studies(settings.storage or str(sweep.folder / STUDY_FILE))
-    arms = [
-        Arm(
-            values=values,
-            position=position,
-            study=Study(
-                storage,
-                _base(sweep, stage),
-                settings,
-                _determined_by(sweep, stage),
-                arm=values,
-                # The sweep's folder is locked by this process, and the file is in it.
-                alone=settings.storage is None,
-            ),
+    storage = open_studies(_storage(sweep, settings))
+    search = Search(stage=stage, settings=settings, rungs=_rungs(sweep, stage, settings))
+    for position, values in enumerate(settings.arms()):
+        study = Study(
+            storage,
+            _base(sweep, stage),
+            settings,
+            _determined_by(sweep, stage),
+            arm=values,
+            # The sweep's folder is locked by this process, and the file is in it.
+            alone=settings.storage is None,
         )
-        for position, values in enumerate(settings.arms())
-    ]
-    return Search(stage=stage, settings=settings, arms=arms, rungs=_rungs(sweep, stage, settings))
+        search.arms.append(Arm(search=search, values=values, study=study, position=position))
+    return search
 
 
 def learnings(searches: Sequence[Search]) -> list[str]:
-    """From what each study with a warm start learns, in a line."""
+    """One line for each study with a warm start, with the studies that it learns from."""
     return [
-        f"{search.stage.name}{''.join(f' {name}={value}' for name, value in arm.values.items())}: "
-        f"{learnt}"
+        f"{arm.label}: {arm.study.learnt}"
         for search in searches
         for arm in search.arms
-        if (learnt := arm.study.learnt)
+        if arm.study.learnt
     ]
 
 
 def _rungs(sweep: Sweep, stage: Stage, settings: SearchSettings) -> tuple[Rung, ...]:
-    """Where a trial is looked at, its end last."""
+    """The rungs of a trial; the last one is its end."""
     seeds, env_steps = len(sweep.plan.seeds), most_env_steps(settings, stage.points)
     end = Rung(seeds=seeds)
-    found = [
+    rungs = [
         Rung(
             seeds=rung.seeds or seeds,
             # The whole budget is the end of a run, where nothing is paused.
@@ -131,28 +116,25 @@ def _rungs(sweep: Sweep, stage: Stage, settings: SearchSettings) -> tuple[Rung, 
         )
         for rung in (settings.pruning.rungs if settings.pruning else ())
     ]
-    return (*dict.fromkeys(rung for rung in found if rung != end), end)
+    return (*dict.fromkeys(rung for rung in rungs if rung != end), end)
 
 
 def _determined_by(sweep: Sweep, stage: Stage) -> dict[str, Any]:
-    """What the stage's runs have in common, beside what is searched."""
+    """Plain data of what the stage's runs have in common, apart from what is searched."""
     (point,) = stage.points
     source = stage.source
-    above = next(
-        (one for one in sweep.config.stages if source is not None and one.name == source.stage),
-        None,
+    source_runs = next(
+        (
+            above.points[0].runs
+            for above in sweep.config.stages
+            if source is not None and above.name == source.stage
+        ),
+        {},
     )
+    checkpoint = source.checkpoint if source is not None else None
     return {
         "seeds": list(sweep.plan.seeds),
         "runs": {task: node_key(run, None) for task, run in point.runs.items()},
-        "source": {
-            task: node_key(run, None)
-            for task, run in (above.points[0].runs if above else {}).items()
-        },
-        "checkpoint": source.checkpoint.manifest.content_hash
-        if source is not None and source.checkpoint is not None
-        else None,
+        "source": {task: node_key(run, None) for task, run in source_runs.items()},
+        "checkpoint": None if checkpoint is None else checkpoint.manifest.content_hash,
     }
-
-
-# --- what came of them -------------------------------------------------------------------------

@@ -1,7 +1,7 @@
-"""Which condition of a stage is the best, and by what: a search's own judgement where there is one.
+"""The best condition of a stage, and the measure that it is best by.
 
-A search is read here as the plain data that `searches.outcome` makes of it, so that a sweep can be
-judged from its files alone, without its study's database.
+Searches are read here as the plain data that `summary.outcome` makes of them, so that a sweep can
+be judged from its files alone, without its studies' databases.
 """
 
 from __future__ import annotations
@@ -23,26 +23,24 @@ from music_rllib.results.from_store import Condition, conditions, entropies
 from music_rllib.search.objective import interval
 from music_rllib.store.run_record import RunResult
 
-__all__ = ["Leader", "Measure", "best_in_words", "best_of", "best_so_far", "leader", "measure_of"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Measure:
-    """What tells good runs from bad ones: the last value of a metric."""
+    """The metric whose last value ranks the runs of a stage."""
 
     metric: str
     maximised: bool = True
 
     @property
     def word(self) -> str:
-        """For a line of text."""
+        """The metric's name in a sentence."""
         return names.word_of(self.metric)
 
 
 def measure_of(stage: Stage, plan: Plan, results: Mapping[str, RunResult]) -> Measure:
-    """What a stage is judged by where nobody says: its search's metric, else its tasks' own.
+    """A stage's measure: the metric of its search, else that of its tasks.
 
-    An objective may read what is no run's last value, as the budget is.
+    The metric of a search is not taken where no run has reported it, as with the budget.
     """
     if stage.search is not None:
         objective = stage.search.objectives[0]
@@ -62,15 +60,15 @@ class Leader:
     trial: int
     values: Mapping[str, Any]
     value: float
-    """Of the first objective."""
+    """Its value by the first objective."""
     scores: Sequence[Sequence[float]]
-    """The same of its runs, `[seeds, tasks]`."""
+    """The scores of its runs by the first objective, `[seeds, tasks]`."""
     fresh: bool
-    """On the fresh seeds of the final ranking, which are what counts once all are there."""
+    """Whether they are those of the final ranking, on fresh seeds."""
 
 
 def leader(search: Mapping[str, Any]) -> Leader | None:
-    """The best of a search's trials by its own judgement; None before one is judged."""
+    """The best trial of a search: the final ranking's once it is complete, else the best so far."""
     for row in search["ranking"] if search["complete"] else ():
         if "failure" not in row:
             return Leader(
@@ -84,23 +82,23 @@ def leader(search: Mapping[str, Any]) -> Leader | None:
     if not best:
         return None
     sign = 1.0 if search["objectives"][0]["direction"] == "maximize" else -1.0
-    first = max(best, key=lambda trial: sign * float(trial["objective"][0]))
+    trial = max(best, key=lambda trial: sign * float(trial["objective"][0]))
     return Leader(
-        trial=first["number"],
-        values=first["values"],
-        value=first["objective"][0],
-        scores=first["scores"][0],
+        trial=trial["number"],
+        values=trial["values"],
+        value=trial["objective"][0],
+        scores=trial["scores"][0],
         fresh=False,
     )
 
 
-def best_of(found: Iterable[Condition], measure: Measure) -> Condition | None:
-    """The best by its mean, of those that have all their runs if there are any."""
-    numbers = [(float(one.estimate().value), one) for one in found]
-    numbers = [(number, one) for number, one in numbers if math.isfinite(number)]
-    numbers = [pair for pair in numbers if pair[1].complete] or numbers
+def best_of(candidates: Iterable[Condition], measure: Measure) -> Condition | None:
+    """The condition with the best mean, among those that have all their runs if there are any."""
+    pairs = [(float(condition.estimate().value), condition) for condition in candidates]
+    pairs = [pair for pair in pairs if math.isfinite(pair[0])]
+    pairs = [pair for pair in pairs if pair[1].complete] or pairs
     sign = 1.0 if measure.maximised else -1.0
-    return max(numbers, key=lambda pair: sign * pair[0], default=(0.0, None))[1]
+    return max(pairs, key=lambda pair: sign * pair[0], default=(0.0, None))[1]
 
 
 def best_so_far(
@@ -109,24 +107,20 @@ def best_so_far(
     results: Mapping[str, RunResult],
     searches: Sequence[Mapping[str, Any]],
 ) -> dict[str, Any] | None:
-    """The best condition of the last stage that has one, as plain data.
+    """The best condition of the last of `stages` that has one, as plain data.
 
-    Args:
-        stages: Those that count, in the sweep's order.
-        plan: The sweep's plan.
-        results: Node key to result.
-        searches: What came of the sweep's searches so far.
+    `results` are by node key, and `searches` is the `outcome` of the sweep's searches so far.
     """
     by_stage = {search["stage"]: search for search in searches}
     for stage in reversed(stages):
         if stage.search is None:
-            found = _best_condition(stage, plan, results)
+            best, part = _best_condition(stage, plan, results), ""
         else:
-            found = _best_trial(stage, stage.search, by_stage.get(stage.name))
-        if found is not None:
-            part = "" if stage.search is None else "final" if found["on_fresh_seeds"] else "search"
-            random = entropies(plan, results, stage.name, part, found["values"])
-            return found | {"entropies": random}
+            best = _best_trial(stage, stage.search, by_stage.get(stage.name))
+            part = "final" if best and best["on_fresh_seeds"] else "search"
+        if best is not None:
+            random = entropies(plan, results, stage.name, part, best["values"])
+            return best | {"entropies": random}
     return None
 
 
@@ -134,19 +128,19 @@ def _best_condition(
     stage: Stage, plan: Plan, results: Mapping[str, RunResult]
 ) -> dict[str, Any] | None:
     measure = measure_of(stage, plan, results)
-    found = conditions(plan, results, measure.metric)
-    best = best_of((one for one in found if one.stage == stage.name), measure)
+    candidates = conditions(plan, results, measure.metric)
+    best = best_of((c for c in candidates if c.stage == stage.name), measure)
     if best is None:
         return None
-    ends = best.estimate()
+    estimate = best.estimate()
     return {
         "stage": stage.name,
         "values": dict(best.values),
         "by": measure.word,
         "metric": measure.metric,
         "direction": "maximize",
-        "value": float(ends.value),
-        "interval": [float(ends.lower), float(ends.upper)],
+        "value": float(estimate.value),
+        "interval": [float(estimate.lower), float(estimate.upper)],
         "runs": best.planned if best.complete else len(best.runs),
         "planned": best.planned,
         "on_fresh_seeds": False,
@@ -156,29 +150,29 @@ def _best_condition(
 def _best_trial(
     stage: Stage, settings: SearchSettings, search: Mapping[str, Any] | None
 ) -> dict[str, Any] | None:
-    first = None if search is None else leader(search)
-    if first is None:
+    best = None if search is None else leader(search)
+    if best is None:
         return None
     objective = settings.objectives[0]
-    ends = interval(objective, np.asarray(first.scores, float), stage.evaluation_episodes)
+    estimate = interval(objective, np.asarray(best.scores, float), stage.evaluation_episodes)
     direction = "maximize" if objective.maximised else "minimize"
-    runs = int(np.size(first.scores))
+    runs = int(np.size(best.scores))
     return {
         "stage": stage.name,
-        "values": dict(first.values),
+        "values": dict(best.values),
         "by": f"{objective.label} ({direction})",
         "metric": objective.metric,
         "direction": direction,
-        "value": first.value,
-        "interval": [float(ends.lower), float(ends.upper)],
+        "value": best.value,
+        "interval": [float(estimate.lower), float(estimate.upper)],
         "runs": runs,
         "planned": runs,
-        "on_fresh_seeds": first.fresh,
+        "on_fresh_seeds": best.fresh,
     }
 
 
 def best_in_words(best: Mapping[str, Any]) -> str:
-    """`best_so_far` in a line."""
+    """The result of `best_so_far` in a line."""
     values = ", ".join(f"{symbol(name)} = {short(value)}" for name, value in best["values"].items())
     number = with_interval(best["value"], best["interval"])
     runs, planned = best["runs"], best.get("planned", best["runs"])

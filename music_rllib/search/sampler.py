@@ -1,4 +1,4 @@
-"""Which point comes next: a function of the settings, the trial's number and earlier results.
+"""The points of trials: a function of the settings, the trial's number and earlier results.
 
 Each trial has a sampler of its own, seeded by the study's seed and the trial's number, which sees
 the results of exactly the trials up to `number - concurrent`. So it doesn't matter in which order
@@ -12,7 +12,6 @@ import hashlib
 import json
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import optuna
@@ -29,33 +28,13 @@ from optuna.trial import FrozenTrial, TrialState, create_trial
 from music_rllib.config.problems import same
 from music_rllib.config.search.settings import SearchSettings
 from music_rllib.config.search.space import Choice, Dimension, FloatRange, IntRange
-
-__all__ = ["Proposal", "Proposer", "as_proposal", "decoded", "seed_of"]
+from music_rllib.search.study_record import VALUES
 
 DIGITS = 6
 """Significant digits of a proposed number: more would make a point's hash depend on the last bit of
 a machine's logarithm."""
 
 optuna.logging.set_verbosity(optuna.logging.WARNING)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Proposal:
-    """A trial's point."""
-
-    values: Mapping[str, Any]
-    """Dotted setting to value."""
-    params: Mapping[str, Any]
-    """The same as Optuna keeps it: mappings and lists as JSON text."""
-    distributions: Mapping[str, BaseDistribution]
-    system_attrs: Mapping[str, Any] = field(default_factory=dict)
-    """What the sampler wants to find again."""
-
-
-def seed_of(seed: int, number: int) -> int:
-    """The seed of trial `number`'s sampler."""
-    digest = hashlib.sha256(f"{seed}/{number}".encode()).digest()
-    return int.from_bytes(digest[:4], "big")
 
 
 class Proposer:
@@ -75,8 +54,8 @@ class Proposer:
 
     def propose(
         self, number: int, judged: Sequence[FrozenTrial], running: Sequence[FrozenTrial]
-    ) -> Proposal:
-        """The point of trial `number`.
+    ) -> FrozenTrial:
+        """A waiting trial at the point of trial `number`.
 
         Args:
             number: The trial's number, from 0.
@@ -84,7 +63,7 @@ class Proposer:
             running: The trials after those and before `number`, whose points are known.
         """
         if self._grid:
-            return as_proposal(self._settings.space, self._grid[number])
+            return trial_at(self._settings.space, self._grid[number])
         study = optuna.create_study(
             directions=[
                 "maximize" if o.maximised else "minimize" for o in self._settings.objectives
@@ -112,22 +91,14 @@ class Proposer:
                     values[name] = _suggest(trial, name, dimension)
                     if name in given and isinstance(dimension, FloatRange):
                         values[name] = float(given[name])  # not rounded: a person wrote it
-        proposal = as_proposal(self._settings.space, values)
-        kept = {
-            key: value
-            for key, value in study.get_trials(deepcopy=False)[-1].system_attrs.items()
-            if key != "fixed_params"
-        }
-        return Proposal(
-            values=proposal.values,
-            params=proposal.params,
-            distributions=proposal.distributions,
-            system_attrs=kept,
-        )
+        system_attrs = dict(study.get_trials(deepcopy=False)[-1].system_attrs)
+        system_attrs.pop("fixed_params", None)
+        return trial_at(self._settings.space, values, system_attrs=system_attrs)
 
     def _sampler(self, number: int) -> BaseSampler:
         settings = self._settings
-        seed = seed_of(settings.seed, number)
+        digest = hashlib.sha256(f"{settings.seed}/{number}".encode()).digest()
+        seed = int.from_bytes(digest[:4], "big")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ExperimentalWarning)
             match settings.sampler:
@@ -151,12 +122,20 @@ class Proposer:
         return RandomSampler(seed=seed)
 
 
-def as_proposal(space: Mapping[str, Dimension], values: Mapping[str, Any]) -> Proposal:
-    """A given point as a proposal."""
-    return Proposal(
-        values=dict(values),
+def trial_at(
+    space: Mapping[str, Dimension],
+    values: Mapping[str, Any],
+    judged: Sequence[float] | None = None,
+    system_attrs: Mapping[str, Any] | None = None,
+) -> FrozenTrial:
+    """A trial at a point: complete with the objective values `judged`, or else waiting."""
+    return create_trial(
+        state=TrialState.WAITING if judged is None else TrialState.COMPLETE,
+        values=judged,
         params=_encoded(space, values),
         distributions={name: _distribution(space[name]) for name in values},
+        user_attrs={VALUES: dict(values)},
+        system_attrs=dict(system_attrs or {}),
     )
 
 
@@ -184,11 +163,11 @@ def _suggest(trial: optuna.Trial, name: str, dimension: Dimension) -> Any:
             return trial.suggest_int(name, low, high, log=dimension.log, step=dimension.step)
         case Choice():
             chosen = trial.suggest_categorical(name, [_plain(value) for value in dimension.choice])
-            return decoded(dimension, chosen)
+            return next(v for v in dimension.choice if _json(_plain(v)) == _json(chosen))
 
 
 def _plain(value: Any) -> Any:
-    """As Optuna's categories are: scalars as they are, anything else as JSON text."""
+    """A value as a category of Optuna: scalars as they are, anything else as JSON text."""
     return value if value is None or isinstance(value, bool | int | float | str) else _json(value)
 
 
@@ -197,18 +176,10 @@ def _json(value: Any) -> str:
 
 
 def _encoded(space: Mapping[str, Dimension], values: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: _param(space[name], value) for name, value in values.items()}
-
-
-def _param(dimension: Dimension, value: Any) -> Any:
-    if isinstance(dimension, Choice):
-        # As the choice spells it: Optuna must find 1 among [1.0, 1.5].
-        return _plain(next(one for one in dimension.choice if same(one, value)))
-    return value
-
-
-def decoded(dimension: Dimension, param: Any) -> Any:
-    """The value behind one of Optuna's params."""
-    if isinstance(dimension, Choice):
-        return next(value for value in dimension.choice if _json(_plain(value)) == _json(param))
-    return param
+    """A point in Optuna's form."""
+    params = dict(values)
+    for name, value in values.items():
+        if isinstance(dimension := space[name], Choice):
+            # As the choice spells it: Optuna must find 1 among [1.0, 1.5].
+            params[name] = _plain(next(v for v in dimension.choice if same(v, value)))
+    return params

@@ -1,4 +1,4 @@
-"""The databases that Optuna's studies are in: opened, and looked into without a trace."""
+"""The databases of Optuna's studies."""
 
 from __future__ import annotations
 
@@ -19,84 +19,56 @@ from sqlalchemy.exc import ArgumentError, IntegrityError, ProgrammingError, SQLA
 from music_rllib.redaction import redact
 from music_rllib.store.object_folder import StorageError
 
-__all__ = [
-    "DATABASE_ERRORS",
-    "known_studies",
-    "open_older",
-    "open_studies",
-    "same_database",
-    "studies_of",
-]
-
 DATABASE_ERRORS = (StorageInternalError, SQLAlchemyError)
-"""A database that doesn't answer, or not now."""
+"""Errors of a database that doesn't answer, or not now."""
+SETTING, WARM_SETTING = "search.storage", "search.warm_start.storage"
 
 
-def open_studies(
-    url: str, *, setting: str = "search.storage", must_exist: bool = False
-) -> BaseStorage:
-    """Open Optuna's storage.
+def open_studies(url: str, *, warm_start: bool = False) -> BaseStorage:
+    """Open the storage of a search, which is made where it is missing, or of a warm start.
 
     Args:
         url: SQLAlchemy's URL, or the path of a sqlite file. PostgreSQL's password comes from
             `PGPASSWORD` or a password file.
-        setting: Where the user has named it, for messages.
-        must_exist: Change nothing: refuse a sqlite file that isn't there, or has no studies in it.
+        warm_start: The storage must have studies, and nothing is changed in it.
 
     Raises:
-        StorageError: The database can't be reached.
+        StorageError: The database can't be reached, or must have studies and does not.
     """
+    setting = WARM_SETTING if warm_start else SETTING
     with _saying_what_is_wrong(url, setting):
         parsed = _parsed(url, setting)
         file = _file_of(parsed)
-        if must_exist and file is not None and not file.is_file():
+        if warm_start and file is not None and not file.is_file():
             raise StorageError(f"{setting} must be an sqlite file that is there, got {redact(url)}")
-        if must_exist and not _has_studies(parsed):
+        if warm_start and not _has_studies(parsed):
             raise StorageError(f"{setting} must be a database with studies, got {redact(url)}")
-        database = _with_tables(parsed, make=not must_exist)
+        database = _with_tables(parsed, make=not warm_start)
         storage = get_storage(database)  # with a cache of ended trials
         # Optuna leaves its connections open, of which Python >= 3.13 warns.
         weakref.finalize(storage, database.engine.dispose)
         return storage
 
 
-def open_older(url: str) -> BaseStorage:
-    """Open the storage of a warm start, which must be there.
-
-    Raises:
-        StorageError: It isn't, or can't be reached.
-    """
-    return open_studies(url, setting="search.warm_start.storage", must_exist=True)
-
-
-def known_studies(url: str, *, must_exist: bool = False) -> list[str]:
-    """Names of the studies in a search's database, or a warm start's; nothing is changed there.
+def known_studies(url: str) -> list[str]:
+    """Names of the studies in a search's database, the oldest first; nothing is changed there.
 
     Args:
-        url: As for `open_studies`.
-        must_exist: It is a warm start's.
-
-    Returns:
-        The oldest first; none where the database is still to be made.
+        url: As for `open_studies`; the database may be missing.
 
     Raises:
         StorageError: It can't be reached, or made.
     """
-    if must_exist:
-        return [one.study_name for one in studies_of(open_older(url))]
-    setting = "search.storage"
-    with _saying_what_is_wrong(url, setting):
-        parsed = _parsed(url, setting)
+    with _saying_what_is_wrong(url, SETTING):
+        parsed = _parsed(url, SETTING)
         file = _file_of(parsed)
         if file is not None and not file.exists():
             if not os.access(file.absolute().parent, os.W_OK | os.X_OK):
                 raise StorageError(
-                    f"{setting} must be in a folder that can be written, got {redact(url)}"
+                    f"{SETTING} must be in a folder that can be written, got {redact(url)}"
                 )
             return []
-        if not _has_studies(parsed):
-            return []
-        return [one.study_name for one in studies_of(open_studies(url))]
+        return names_of(open_studies(url)) if _has_studies(parsed) else []
 
 
 def _has_studies(url: URL) -> bool:
@@ -108,8 +80,13 @@ def _has_studies(url: URL) -> bool:
 
 
 def studies_of(storage: BaseStorage) -> list[Any]:
-    """The oldest first."""
-    return sorted(storage.get_all_studies(), key=lambda one: int(one._study_id))
+    """All studies in a storage, the oldest first."""
+    return sorted(storage.get_all_studies(), key=lambda study: int(study._study_id))
+
+
+def names_of(storage: BaseStorage) -> list[str]:
+    """Names of all studies in a storage, the oldest first."""
+    return [study.study_name for study in studies_of(storage)]
 
 
 def same_database(one: str, other: str) -> bool:
@@ -153,11 +130,16 @@ def _engine_options(url: URL) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def _saying_what_is_wrong(url: str, setting: str) -> Iterator[None]:
+    """Turn errors of the database into one that names the setting.
+
+    Raises:
+        StorageError: The database can't be used.
+    """
     try:
         yield
+    except StorageError:
+        raise
     except (*DATABASE_ERRORS, ArgumentError, ImportError, RuntimeError) as error:
-        if isinstance(error, StorageError):
-            raise
         cause = str(error.__cause__ or error).strip().splitlines()[0]
         raise StorageError(
             f"{setting} must be a database that can be used, got {redact(url)}: {redact(cause)}"

@@ -1,8 +1,8 @@
-"""A study in Optuna's storage: which trials there are, who judges which, what came of them.
+"""A study in Optuna's storage: its trials, the drivers that judge them, and their results.
 
-Trials are laid out beforehand as waiting ones, and a driver claims the lowest by an atomic change
-of its state: none is lost or judged twice, whatever the number of drivers. A driver says from time
-to time that it is alive; the trials of one that has fallen silent are put back.
+Trials are created beforehand as waiting ones, and a driver claims the lowest by an atomic change
+of its state: none is lost or judged twice, whatever the number of drivers. Each driver records
+regularly that it is alive; the trials of one that has fallen silent are put back.
 """
 
 from __future__ import annotations
@@ -25,36 +25,20 @@ from optuna.trial import FrozenTrial, TrialState, create_trial
 
 from music_rllib.config.search.settings import SearchSettings
 from music_rllib.experiment.plan import short
-from music_rllib.search.sampler import Proposal, Proposer
+from music_rllib.search import study_record as record
+from music_rllib.search.sampler import Proposer, trial_at
 from music_rllib.search.storage import studies_of
-from music_rllib.search.study_record import (
-    ARM,
-    BASE,
-    FINGERPRINT,
-    LEARNT,
-    OWNER,
-    POINTS,
-    PRIOR,
-    REASON,
-    SCORES,
-    SEARCH,
-    SETTINGS,
-    VALUES,
-    Identity,
-    as_data,
-    fits,
-    from_data,
-)
+from music_rllib.search.study_record import Identity, fits
 from music_rllib.search.warm_start import warm_start
 from music_rllib.store.files import content_key
 
-__all__ = ["Study"]
-
 LEASE_SECONDS = 120.0
-"""After so long without a sign of life a driver on another machine counts as dead."""
+"""A driver on another machine counts as dead when its last sign of life is older."""
 SIGN_SECONDS = 20.0
+"""Time between two signs of life."""
 
 DRIVER = "driver:"
+"""Beginning of the study attribute with a driver's last sign of life."""
 
 
 class Study:
@@ -70,15 +54,15 @@ class Study:
         arm: Mapping[str, Any],
         alone: bool,
     ) -> None:
-        """Open or make the study.
+        """Open the study, which is made where it is missing.
 
         Args:
-            storage: Where it is.
-            base: Its search's name, `sweep/stage`.
-            settings: How it is searched.
-            determined_by: What else determines its values, as plain data.
+            storage: The storage that it is in.
+            base: Name of its search, `sweep/stage`.
+            settings: Settings of its search.
+            determined_by: Plain data of what else determines its values.
             arm: The compared values that are its own, if there are any.
-            alone: No other driver can be at work: whatever is running was left by a dead one.
+            alone: No other driver can be at work: running trials were left by a dead one.
         """
         self.settings = settings
         self._storage = storage
@@ -90,70 +74,74 @@ class Study:
         )
         self._alone = alone
         self._me = f"{socket.gethostname()}:{os.getpid()}:{uuid.uuid4().hex[:8]}"
-        self._id, points, prior = self._open()
-        self._proposer = Proposer(settings, points, prior)
+        self._id = self._find_or_make()
+        attributes = self._storage.get_study_user_attrs(self._id)
+        self.prior = [
+            trial_at(settings.space, data["values"], data["judged"])
+            for data in attributes.get(record.PRIOR, [])
+        ]
+        """Trials of older studies that it learns from."""
+        self.learnt = str(attributes.get(record.LEARNT, ""))
+        """From which trials of which studies it learns, in words; empty if from none."""
+        self._proposer = Proposer(settings, attributes[record.POINTS], self.prior)
         self._signed = 0.0
-        self._known: list[FrozenTrial] | None = None
+        self._trials: list[FrozenTrial] | None = None
         self._given: set[int] = set()
-        """Numbers of the trials that `claim` has given out."""
-        self.lay_out()
+        """Numbers of the trials that `claim` has returned."""
+        for _ in range(len(self._all_trials()), settings.count):
+            self._storage.create_new_trial(self._id, create_trial(state=TrialState.WAITING))
         # Before it claims anything: a driver that opens the study then would take it for dead.
         self._storage.set_study_user_attr(self._id, f"{DRIVER}{self._me}", time.time())
         self.release_the_dead()
 
     # -- making it ---------------------------------------------------------------------------
 
-    def _open(self) -> tuple[int, list[dict[str, Any]], list[FrozenTrial]]:
+    def _find_or_make(self) -> int:
+        """The study's id in the storage."""
         try:
-            return self._once_made(self._storage.get_study_id_from_name(self.identity.name))
+            study = self._storage.get_study_id_from_name(self.name)
         except KeyError:
-            pass  # it is to be made
-        directions = [
-            StudyDirection.MAXIMIZE if one.maximised else StudyDirection.MINIMIZE
-            for one in self.settings.objectives
-        ]
-        # All but the name must be there before another driver sees the study: prepared first.
-        contents = self._contents()
-        try:
-            study = self._storage.create_new_study(directions, study_name=self.identity.name)
-        except DuplicatedStudyError:
-            return self._once_made(self._storage.get_study_id_from_name(self.identity.name))
-        return self._fill(study, contents)
-
-    def _contents(self) -> dict[str, Any]:
-        """What is kept with a new study: from then on it holds, whatever becomes of older ones."""
-        prior, learnt = warm_start(self._storage, self.settings, self.identity, self._arm)
-        return {
-            FINGERPRINT: self.identity.fingerprint,
-            BASE: self.identity.base,
-            SEARCH: self.identity.search,
-            ARM: self._arm,
-            SETTINGS: _of_study(self.settings),
-            PRIOR: [as_data(trial) for trial in prior],
-            LEARNT: learnt,
-            POINTS: [*self.settings.points_to_evaluate, *self._taken_over()],
-        }
-
-    def _fill(
-        self, study: int, contents: Mapping[str, Any]
-    ) -> tuple[int, list[dict[str, Any]], list[FrozenTrial]]:
-        for key, value in contents.items():  # the points are the last: they say that all is there
-            self._storage.set_study_user_attr(study, key, value)
-        prior = [from_data(data, self.settings) for data in contents[PRIOR]]
-        return study, contents[POINTS], prior
-
-    def _once_made(self, study: int) -> tuple[int, list[dict[str, Any]], list[FrozenTrial]]:
+            # All but the name must be there before another driver sees the study: prepared first.
+            attributes = self._new_attributes()
+            directions = [
+                StudyDirection.MAXIMIZE if objective.maximised else StudyDirection.MINIMIZE
+                for objective in self.settings.objectives
+            ]
+            try:
+                study = self._storage.create_new_study(directions, study_name=self.name)
+            except DuplicatedStudyError:
+                study = self._storage.get_study_id_from_name(self.name)
+            else:
+                self._set_attributes(study, attributes)
+                return study
         for _ in range(100):
-            attributes = self._storage.get_study_user_attrs(study)
-            if POINTS in attributes:
-                prior = [from_data(data, self.settings) for data in attributes[PRIOR]]
-                return study, attributes[POINTS], prior
+            if record.POINTS in self._storage.get_study_user_attrs(study):
+                return study
             time.sleep(0.1)
         # Its maker died in between: nothing has been searched with it yet.
-        return self._fill(study, self._contents())
+        self._set_attributes(study, self._new_attributes())
+        return study
 
-    def _taken_over(self) -> list[dict[str, Any]]:
-        """Points of the newest study of the same name that was judged otherwise: they come first.
+    def _new_attributes(self) -> dict[str, Any]:
+        """Attributes of a new study: they hold from then on, whatever becomes of older studies."""
+        prior, learnt = warm_start(self._storage, self.settings, self.identity, self._arm)
+        return {
+            record.FINGERPRINT: self.identity.fingerprint,
+            record.BASE: self.identity.base,
+            record.SEARCH: self.identity.search,
+            record.ARM: self._arm,
+            record.SETTINGS: _of_study(self.settings),
+            record.PRIOR: prior,
+            record.LEARNT: learnt,
+            record.POINTS: [*self.settings.points_to_evaluate, *self._earlier_points()],
+        }
+
+    def _set_attributes(self, study: int, attributes: Mapping[str, Any]) -> None:
+        for key, value in attributes.items():  # the points last: they say that all is there
+            self._storage.set_study_user_attr(study, key, value)
+
+    def _earlier_points(self) -> list[dict[str, Any]]:
+        """Points of the newest study of the same name with other settings, to be judged first.
 
         Their runs are in the store, so that a study extended by seeds, or by a finer or wider
         space, pays only for what is new.
@@ -161,37 +149,30 @@ class Study:
         if self.settings.sampler == "grid":
             return []
         older = [
-            one
-            for one in studies_of(self._storage)
-            if one.user_attrs.get(BASE) == self.identity.base
-            and one.study_name != self.identity.name
+            study._study_id
+            for study in studies_of(self._storage)
+            if study.user_attrs.get(record.BASE) == self.identity.base
+            if study.study_name != self.name
         ]
         if not older:
             return []
+        trials = self._storage.get_all_trials(older[-1], deepcopy=False)
+        points = [
+            trial.user_attrs.get(record.VALUES) for trial in trials if trial.state.is_finished()
+        ]
         given = [json.dumps(point, sort_keys=True) for point in self.settings.points_to_evaluate]
-        points = []
-        for trial in self._storage.get_all_trials(older[-1]._study_id, deepcopy=False):
-            values = trial.user_attrs.get(VALUES)
-            if (
-                trial.state.is_finished()
-                and values
-                and fits(values, self.settings)
-                and json.dumps(values, sort_keys=True) not in given
-            ):
-                points.append(values)
-        return points
+        return [
+            point
+            for point in points
+            if point and fits(point, self.settings)
+            if json.dumps(point, sort_keys=True) not in given
+        ]
 
-    def lay_out(self) -> None:
-        """Make the trials that aren't there yet, waiting."""
-        there = len(self._storage.get_all_trials(self._id, deepcopy=False))
-        for _ in range(there, self.settings.count):
-            self._storage.create_new_trial(self._id, create_trial(state=TrialState.WAITING))
-
-    # -- looking at it -----------------------------------------------------------------------
+    # -- reading it --------------------------------------------------------------------------
 
     @property
     def name(self) -> str:
-        """In the storage."""
+        """Its name in the storage."""
         return self.identity.name
 
     def trials(self) -> list[FrozenTrial]:
@@ -199,26 +180,23 @@ class Study:
 
         As they were at the last `refresh`, or at this driver's last change.
         """
-        if self._known is None:
-            found = self._storage.get_all_trials(self._id, deepcopy=False)
-            self._known = sorted(found, key=lambda one: one.number)[: self.settings.count]
-        return self._known
+        if self._trials is None:
+            trials = sorted(self._all_trials(), key=lambda trial: trial.number)
+            self._trials = trials[: self.settings.count]
+        return self._trials
+
+    def _all_trials(self) -> list[FrozenTrial]:
+        return self._storage.get_all_trials(self._id, deepcopy=False)
 
     def refresh(self) -> None:
-        """Look again at what other drivers have done."""
-        self._known = None
+        """Let `trials` read the storage again, where other drivers may have changed it."""
+        self._trials = None
 
-    @property
-    def prior(self) -> int:
-        """Trials of an older study that it learns from."""
-        return len(self._storage.get_study_user_attrs(self._id).get(PRIOR, []))
+    def as_optuna(self) -> optuna.Study:
+        """The study as an object of Optuna, for its analyses."""
+        return optuna.load_study(study_name=self.name, storage=self._storage)
 
-    @property
-    def learnt(self) -> str:
-        """From which trials of which studies it learns, in words; empty if from none."""
-        return str(self._storage.get_study_user_attrs(self._id).get(LEARNT, ""))
-
-    # -- working on it -----------------------------------------------------------------------
+    # -- judging its trials ------------------------------------------------------------------
 
     def claim(self) -> FrozenTrial | None:
         """The next trial to judge, with its point; None where there is none, or none yet.
@@ -226,58 +204,56 @@ class Study:
         A trial's point depends on those before it, so it is only claimed when they are far enough.
         """
         trials = self.trials()
-        trial = next((one for one in trials if self._is_free(one)), None)
+        trial = next((trial for trial in trials if self._is_free(trial)), None)
         if trial is None:
             return None
         lag = trial.number - self.settings.concurrent
         judged = trials[: lag + 1] if lag >= 0 else []
         between = trials[len(judged) : trial.number]
-        if not all(one.state.is_finished() for one in judged):
+        if not all(other.state.is_finished() for other in judged):
             return None
-        if not all(VALUES in one.user_attrs for one in between):
+        if not all(record.VALUES in other.user_attrs for other in between):
             return None
         self.refresh()
         if trial.state is TrialState.WAITING:
             if not self._storage.set_trial_state_values(trial._trial_id, TrialState.RUNNING):
                 return None  # another driver was faster
-            self._set(trial, OWNER, self._me)
-        if VALUES not in trial.user_attrs:
-            self._keep(trial, self._proposer.propose(trial.number, judged, between))
-        found = self._storage.get_trial(trial._trial_id)
+            self._set(trial, record.OWNER, self._me)
+        if record.VALUES not in trial.user_attrs:
+            proposal = self._proposer.propose(trial.number, judged, between)
+            for name, distribution in proposal.distributions.items():
+                internal = distribution.to_internal_repr(proposal.params[name])
+                self._storage.set_trial_param(trial._trial_id, name, internal, distribution)
+            for key, attribute in proposal.system_attrs.items():
+                self._storage.set_trial_system_attr(trial._trial_id, key, attribute)
+            self._set(trial, record.VALUES, proposal.user_attrs[record.VALUES])
+        claimed = self._storage.get_trial(trial._trial_id)
         self._given.add(trial.number)
-        return found
+        return claimed
 
     def _is_free(self, trial: FrozenTrial) -> bool:
         """Whether nobody has it, or this driver claimed it as the database went away."""
         if trial.state is TrialState.RUNNING:
-            mine = trial.user_attrs.get(OWNER) == self._me
+            mine = trial.user_attrs.get(record.OWNER) == self._me
             return mine and trial.number not in self._given
         return trial.state is TrialState.WAITING
 
-    def _keep(self, trial: FrozenTrial, proposal: Proposal) -> None:
-        for name, distribution in proposal.distributions.items():
-            internal = distribution.to_internal_repr(proposal.params[name])
-            self._storage.set_trial_param(trial._trial_id, name, internal, distribution)
-        for key, value in proposal.system_attrs.items():
-            self._storage.set_trial_system_attr(trial._trial_id, key, value)
-        self._set(trial, VALUES, dict(proposal.values))
-
     def report(self, trial: FrozenTrial, rung: int, value: float | None, scores: Any) -> None:
-        """Keep what a trial was worth at a rung, if one number says it, and its runs' numbers."""
-        kept = dict(self._storage.get_trial(trial._trial_id).user_attrs.get(SCORES, {}))
+        """Keep a trial's scores at a rung, and its value there if it has only one objective."""
+        kept = dict(self._storage.get_trial(trial._trial_id).user_attrs.get(record.SCORES, {}))
         with contextlib.suppress(UpdateFinishedTrialError):  # as in `end`
-            self._set(trial, SCORES, kept | {str(rung): scores})
+            self._set(trial, record.SCORES, kept | {str(rung): scores})
             if value is not None:
                 self._storage.set_trial_intermediate_value(trial._trial_id, rung, value)
 
     def end(
         self, trial: FrozenTrial, state: TrialState, values: Sequence[float] | None, reason: str
     ) -> None:
-        """Keep what became of a trial; if somebody has done so already, theirs stays."""
+        """Keep the end of a trial; if another driver has done so already, theirs stays."""
         # Taken over while this driver was silent, and judged already: by the same rules, the same.
         with contextlib.suppress(UpdateFinishedTrialError):
             if reason:
-                self._set(trial, REASON, reason)
+                self._set(trial, record.REASON, reason)
             self.refresh()
             self._storage.set_trial_state_values(trial._trial_id, state, values)
 
@@ -287,9 +263,9 @@ class Study:
 
     # -- drivers -----------------------------------------------------------------------------
 
-    def sign(self, now: float | None = None) -> None:
-        """Say, from time to time, that this driver is alive, and put back what dead ones hold."""
-        now = time.time() if now is None else now
+    def sign(self) -> None:
+        """Record regularly that this driver is alive, and put the trials of dead ones back."""
+        now = time.time()
         if abs(now - self._signed) >= SIGN_SECONDS:  # the clock may be set back
             self._signed = now
             self._storage.set_study_user_attr(self._id, f"{DRIVER}{self._me}", now)
@@ -297,14 +273,14 @@ class Study:
                 self.release_the_dead(now)
 
     def release_the_dead(self, now: float | None = None) -> None:
-        """Put trials of drivers that are no more back among the waiting ones."""
+        """Put the trials of dead drivers back among the waiting ones."""
         now = time.time() if now is None else now
         self.refresh()
         trials = self.trials()
         # Looked at after the trials: whoever had claimed one by then had signed before.
         signs = self._storage.get_study_user_attrs(self._id)
         for trial in trials:
-            owner = trial.user_attrs.get(OWNER, "")
+            owner = trial.user_attrs.get(record.OWNER, "")
             if trial.state is not TrialState.RUNNING or owner == self._me:
                 continue
             if not owner and not self._alone:
@@ -318,19 +294,15 @@ class Study:
         self.refresh()
 
     def release(self) -> None:
-        """Put what this driver holds back: it stops."""
+        """Put this driver's trials back among the waiting ones."""
         for trial in self.trials():
-            if trial.state is TrialState.RUNNING and trial.user_attrs.get(OWNER) == self._me:
+            if trial.state is TrialState.RUNNING and trial.user_attrs.get(record.OWNER) == self._me:
                 self._storage.set_trial_state_values(trial._trial_id, TrialState.WAITING)
         self.refresh()
 
-    def as_optuna(self) -> optuna.Study:
-        """For Optuna's own analyses."""
-        return optuna.load_study(study_name=self.name, storage=self._storage)
-
 
 def _is_dead(owner: str) -> bool:
-    """Whether a driver of this very machine is gone."""
+    """Whether a driver was a process of this machine, and has ended."""
     host, _, rest = owner.partition(":")
     pid = rest.partition(":")[0]
     return host == socket.gethostname() and pid.isdigit() and not psutil.pid_exists(int(pid))
@@ -338,8 +310,8 @@ def _is_dead(owner: str) -> bool:
 
 def _of_study(settings: SearchSettings) -> dict[str, Any]:
     """Settings that determine points and values: not how many trials, nor where they are kept."""
-    aside = {"trials", "final", "study", "storage", "warm_start", "compare", "mode"}
-    found = settings.model_dump(mode="json", by_alias=True, exclude=aside)
+    excluded = {"trials", "final", "study", "storage", "warm_start", "compare", "mode"}
+    document = settings.model_dump(mode="json", by_alias=True, exclude=excluded)
     if settings.warm_start is not None:
-        found["warm_start"] = settings.warm_start.study
-    return found
+        document["warm_start"] = settings.warm_start.study
+    return document

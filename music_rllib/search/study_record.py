@@ -1,4 +1,4 @@
-"""What a study keeps of itself and of its trials in Optuna's storage, and by which keys."""
+"""The attributes that a study and its trials have in Optuna's storage."""
 
 from __future__ import annotations
 
@@ -6,57 +6,31 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from optuna.trial import FrozenTrial, create_trial
-
 from music_rllib.config.search.settings import SearchSettings
-from music_rllib.search.sampler import as_proposal
 
-__all__ = [
-    "ARM",
-    "BASE",
-    "FINGERPRINT",
-    "LEARNT",
-    "OWNER",
-    "POINTS",
-    "PRIOR",
-    "REASON",
-    "SCORES",
-    "SEARCH",
-    "SETTINGS",
-    "VALUES",
-    "Identity",
-    "as_data",
-    "fits",
-    "from_data",
-]
-
-FINGERPRINT, SETTINGS, POINTS, PRIOR, LEARNT, BASE, SEARCH, ARM = (
-    "music_rllib:fingerprint",
-    "music_rllib:settings",
-    "music_rllib:points",
-    "music_rllib:prior",
-    "music_rllib:learnt",
-    "music_rllib:base",
-    "music_rllib:search",
-    "music_rllib:arm",
-)
+# Of a study.
+FINGERPRINT, SETTINGS = "music_rllib:fingerprint", "music_rllib:settings"
+POINTS, PRIOR = "music_rllib:points", "music_rllib:prior"
+LEARNT, BASE = "music_rllib:learnt", "music_rllib:base"
+SEARCH, ARM = "music_rllib:search", "music_rllib:arm"
+# Of a trial.
 OWNER, VALUES, REASON, SCORES = "owner", "values", "reason", "scores"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Identity:
-    """What makes a study this study."""
+    """The names and hashes that tell a study from others."""
 
     base: str
-    """`sweep/stage`, with the compared values behind it."""
+    """`sweep/stage`, followed by the compared values."""
     fingerprint: str
-    """Hash of all that determines its points and values."""
+    """Hash of everything that determines the study's points and values."""
     search: str
-    """The same for all compared values: theirs are the studies of one search."""
+    """Name and hash of the search, which the studies of all compared values share."""
 
     @property
     def name(self) -> str:
-        """In the storage."""
+        """The study's name in the storage."""
         return f"{self.base} @{self.fingerprint}"
 
 
@@ -64,29 +38,9 @@ def fits(values: Mapping[str, Any], settings: SearchSettings) -> bool:
     """Whether a point lies in the space."""
     seen: dict[str, Any] = {}
     for name, dimension in settings.space.items():
-        if not dimension.applies(seen):
-            if name in values:
-                return False
-            continue
-        if name not in values:
+        exists = dimension.applies(seen)
+        if exists != (name in values) or (exists and not dimension.contains(values[name])):
             return False
-        if not dimension.contains(values[name]):
-            return False
-        seen[name] = values[name]
+        if exists:
+            seen[name] = values[name]
     return len(seen) == len(values)
-
-
-def as_data(trial: FrozenTrial) -> dict[str, Any]:
-    """What `from_data` makes the trial of again, as JSON."""
-    return {"values": trial.user_attrs[VALUES], "judged": list(trial.values or [])}
-
-
-def from_data(data: Mapping[str, Any], settings: SearchSettings) -> FrozenTrial:
-    """A trial of an older study, without what its sampler kept: that may be a pickle."""
-    proposal = as_proposal(settings.space, data["values"])
-    return create_trial(
-        values=list(data["judged"]),
-        params=dict(proposal.params),
-        distributions=dict(proposal.distributions),
-        user_attrs={VALUES: dict(data["values"])},
-    )

@@ -1,4 +1,4 @@
-"""What came of a sweep's searches, as plain data."""
+"""The results of a sweep's searches, as plain data."""
 
 from __future__ import annotations
 
@@ -13,29 +13,21 @@ from music_rllib.config.search.settings import SearchSettings
 from music_rllib.redaction import redact
 from music_rllib.results.statistics import improvement
 from music_rllib.search.controller import SearchController
-from music_rllib.search.objective import aggregate, interval
-from music_rllib.search.storage import (
-    DATABASE_ERRORS,
-)
+from music_rllib.search.objective import aggregates, interval
+from music_rllib.search.storage import DATABASE_ERRORS
 from music_rllib.search.study import Study
 from music_rllib.search.study_record import REASON, SCORES, VALUES
-from music_rllib.search.trials import Arm, Finalist, Search, ranked
-
-__all__ = ["outcome"]
+from music_rllib.search.trials import Arm, Array, Finalist, Search, ranked
 
 IMPORTANCE_TRIALS = 4
-"""Judged trials from which on the importance of settings is estimated."""
+"""Completed trials that an estimate of the settings' importance needs."""
 
 
 def outcome(controller: SearchController, *, thorough: bool = True) -> list[dict[str, Any]]:
-    """The searches' state as plain data, for files, tables and MLflow.
+    """The state of each search as plain data, for files, tables and MLflow.
 
-    Args:
-        controller: It.
-        thorough: With intervals and importance, which take a while.
-
-    Returns:
-        Nothing where the database does not answer: what counts is in the node store.
+    Intervals and importance, which take a while, are only in a `thorough` one. The list is empty
+    where the database does not answer: the results are in the node store too.
     """
     try:
         return [_search(search, thorough) for search in controller.searches]
@@ -45,21 +37,21 @@ def outcome(controller: SearchController, *, thorough: bool = True) -> list[dict
 
 def _search(search: Search, thorough: bool) -> dict[str, Any]:
     settings = search.settings
-    arms = [_arm(search, arm, thorough) for arm in search.arms]
-    finalists = [one for arm in search.arms for one in arm.finalists or ()]
     return {
         "stage": search.stage.name,
         "mode": settings.mode,
         "sampler": settings.sampler,
         "objectives": [
-            {"name": one.label, "direction": "maximize" if one.maximised else "minimize"}
-            for one in settings.objectives
+            {
+                "name": objective.label,
+                "direction": "maximize" if objective.maximised else "minimize",
+            }
+            for objective in settings.objectives
         ],
         "storage": None if settings.storage is None else redact(settings.storage),
-        "arms": arms,
-        "ranking": _ranking(search, finalists) if thorough else _order(settings, finalists),
-        "complete": all(one.scores is not None or one.failure for one in finalists)
-        and all(arm.finalists is not None for arm in search.arms),
+        "arms": [_arm(search, arm, thorough) for arm in search.arms],
+        "ranking": _ranking(search, thorough),
+        "complete": search.over,
     }
 
 
@@ -70,7 +62,7 @@ def _arm(search: Search, arm: Arm, thorough: bool) -> dict[str, Any]:
     return {
         "values": dict(arm.values),
         "study": arm.study.name,
-        "learnt_from": arm.study.prior,
+        "learnt_from": len(arm.study.prior),
         "judged": states.count("COMPLETE"),
         "pruned": states.count("PRUNED"),
         "failed": states.count("FAIL"),
@@ -78,7 +70,7 @@ def _arm(search: Search, arm: Arm, thorough: bool) -> dict[str, Any]:
         "trials": [_trial(search, arm, trial, thorough) for trial in trials],
         "best": best[0].number if best else None,
         "front": [t.number for t in best] if len(search.settings.objectives) > 1 else [],
-        "importance": importance(arm.study, search.settings) if thorough else {},
+        "importance": _importance(arm.study, search.settings) if thorough else {},
     }
 
 
@@ -94,7 +86,7 @@ _STATES = {
 def _trial(search: Search, arm: Arm, trial: FrozenTrial, thorough: bool) -> dict[str, Any]:
     scores = trial.user_attrs.get(SCORES, {})
     last = scores[max(scores, key=int)] if scores else None
-    found = {
+    document = {
         "number": trial.number,
         "state": _STATES[trial.state],
         "values": {**arm.values, **trial.user_attrs.get(VALUES, {})},
@@ -103,100 +95,74 @@ def _trial(search: Search, arm: Arm, trial: FrozenTrial, thorough: bool) -> dict
         "reason": trial.user_attrs.get(REASON),
     }
     if thorough and trial.state is TrialState.COMPLETE and last:
-        found["interval"] = _interval(search, last)
-    return found
+        document["interval"] = _intervals(search, last)
+    return document
 
 
-def _interval(search: Search, scores: Sequence[Any]) -> list[list[float]]:
+def _intervals(search: Search, scores: Sequence[Any]) -> list[list[float]]:
     """Ends of each objective's 95 % interval over seeds; NaN where a single run has none."""
-    return [
-        [float(found.lower), float(found.upper)]
-        for found in (
-            interval(objective, np.asarray(of_objective), search.stage.evaluation_episodes)
-            for objective, of_objective in zip(search.settings.objectives, scores, strict=True)
-        )
+    estimates = [
+        interval(objective, np.asarray(of_objective), search.stage.evaluation_episodes)
+        for objective, of_objective in zip(search.settings.objectives, scores, strict=True)
     ]
+    return [[float(estimate.lower), float(estimate.upper)] for estimate in estimates]
 
 
-def importance(study: Study, settings: SearchSettings) -> dict[str, float]:
-    """Share of the objective's variance that each setting accounts for (fANOVA), the largest first.
+def _importance(study: Study, settings: SearchSettings) -> dict[str, float]:
+    """Share of the first objective's variance by setting (fANOVA), the largest first.
 
-    Empty where too few trials have been judged, or all are worth the same; for several objectives
-    it is that of the first.
+    Empty where too few trials are complete, or all have the same value.
     """
     judged = [trial for trial in study.trials() if trial.state is TrialState.COMPLETE]
     if len(judged) < IMPORTANCE_TRIALS or len({trial.values[0] for trial in judged}) < 2:
         return {}
     if all(len({str(t.params.get(name)) for t in judged}) < 2 for name in settings.space):
         return {}
-    optuna_study = study.as_optuna()
-    evaluator = optuna.importance.FanovaImportanceEvaluator(seed=settings.seed)
     try:
-        found = optuna.importance.get_param_importances(
-            optuna_study,
-            evaluator=evaluator,
+        shares = optuna.importance.get_param_importances(
+            study.as_optuna(),
+            evaluator=optuna.importance.FanovaImportanceEvaluator(seed=settings.seed),
             target=lambda trial: float(trial.values[0]),
         )
     except (ValueError, RuntimeError):  # no setting that all trials have, or no variance
         return {}
-    return {name: float(share) for name, share in found.items()}
+    return {name: float(share) for name, share in shares.items()}
 
 
-def _order(settings: SearchSettings, finalists: Sequence[Finalist]) -> list[dict[str, Any]]:
-    """The ranking without what takes a while: intervals and comparisons."""
-    rows: list[dict[str, Any]] = [
-        {
-            "trial": one.number,
-            "values": dict(one.values),
-            "fresh": [
-                aggregate(objective, scores)
-                for objective, scores in zip(settings.objectives, one.scores, strict=True)
-            ],
-            "scores": [scores.tolist() for scores in one.scores],
-        }
-        for one in finalists
-        if one.scores is not None
-    ]
-    return sorted(rows, key=lambda row: row["fresh"][0], reverse=settings.objectives[0].maximised)
-
-
-def _ranking(search: Search, finalists: Sequence[Finalist]) -> list[dict[str, Any]]:
+def _ranking(search: Search, thorough: bool) -> list[dict[str, Any]]:
     """Finalists by their values on fresh seeds, the best first, each compared with the best."""
-    settings, episodes = search.settings, search.stage.evaluation_episodes
-    done = [one for one in finalists if one.scores is not None]
-    maximised = settings.objectives[0].maximised
-    rows = []
-    for finalist in done:
-        assert finalist.scores is not None
-        found = [
-            interval(objective, scores, episodes)
-            for objective, scores in zip(settings.objectives, finalist.scores, strict=True)
-        ]
-        rows.append(
-            {
-                "trial": finalist.number,
-                "values": dict(finalist.values),
-                "searched": list(finalist.searched),
-                "fresh": [float(one.value) for one in found],
-                "interval": [[float(one.lower), float(one.upper)] for one in found],
-                "selection_bias": [
-                    searched - float(one.value)
-                    for searched, one in zip(finalist.searched, found, strict=True)
-                ],
-                "scores": [scores.tolist() for scores in finalist.scores],
-                "nodes": [run.key for run in finalist.runs],
-            }
-        )
-    rows.sort(key=lambda row: row["fresh"][0], reverse=maximised)  # type: ignore[index]
-    if rows:
-        best = np.asarray(rows[0]["scores"][0])  # type: ignore[index]
-        for row in rows[1:]:
-            mine = np.asarray(row["scores"][0])  # type: ignore[index]
-            better = improvement(best, mine)
-            row["best_is_better_with"] = better if maximised else 1 - better
-    rows.extend(
-        {"trial": failed.number, "values": dict(failed.values), "failure": failed.failure}
-        for failed in finalists
-        if failed.failure
-    )
-    return rows
+    finalists = [finalist for arm in search.arms for finalist in arm.finalists or ()]
+    maximised = search.settings.objectives[0].maximised
+    rows = [_finalist(search, f, f.scores, thorough) for f in finalists if f.scores is not None]
+    rows.sort(key=lambda row: row["fresh"][0], reverse=maximised)
+    if not thorough:
+        return rows
+    for row in rows[1:]:
+        better = improvement(np.asarray(rows[0]["scores"][0]), np.asarray(row["scores"][0]))
+        row["best_is_better_with"] = better if maximised else 1 - better
+    failed = [finalist for finalist in finalists if finalist.failure]
+    return rows + [
+        {"trial": finalist.number, "values": dict(finalist.values), "failure": finalist.failure}
+        for finalist in failed
+    ]
+
+
+def _finalist(
+    search: Search, finalist: Finalist, scores: Sequence[Array], thorough: bool
+) -> dict[str, Any]:
+    fresh = aggregates(search.settings.objectives, scores)
+    row = {
+        "trial": finalist.number,
+        "values": dict(finalist.values),
+        "fresh": fresh,
+        "scores": [of_objective.tolist() for of_objective in scores],
+    }
+    if thorough:
+        pairs = zip(finalist.searched, fresh, strict=True)
+        row |= {
+            "searched": list(finalist.searched),
+            "interval": _intervals(search, scores),
+            "selection_bias": [searched - value for searched, value in pairs],
+            "nodes": [run.key for run in finalist.runs],
+        }
+    return row

@@ -1,4 +1,4 @@
-"""A search's trials while it goes on, and their order."""
+"""The state of a sweep's searches: their studies, trials and finalists."""
 
 from __future__ import annotations
 
@@ -15,22 +15,19 @@ from music_rllib.config.schema import Stage
 from music_rllib.config.search.settings import Rung, SearchSettings
 from music_rllib.experiment.plan import Run
 from music_rllib.search.study import Study
+from music_rllib.search.study_record import VALUES
 from music_rllib.store.run_record import Report
-
-__all__ = ["Active", "Arm", "Finalist", "Search", "in_words", "ranked", "up_to"]
 
 Array = NDArray[np.float64]
 
 
 @dataclass
 class Active:
-    """A trial that this driver judges."""
+    """A trial that this driver runs."""
 
     trial: FrozenTrial
-    values: Mapping[str, Any]
-    """With the compared ones."""
     runs: list[Run] = field(default_factory=list)
-    """Of the rung that it is on."""
+    """The runs up to its rung."""
     rung: int = 0
 
 
@@ -40,29 +37,18 @@ class Finalist:
 
     number: int
     values: Mapping[str, Any]
+    """Its point, with the compared values."""
     searched: tuple[float, ...]
-    """Its values in the search."""
+    """Its objective values in the search."""
     runs: list[Run]
     scores: list[Array] | None = None
-    """For each objective `[seeds, tasks]` on fresh seeds; None before all are there."""
+    """For each objective `[seeds, tasks]` on fresh seeds; None before all runs are there."""
     failure: str = ""
-
-
-@dataclass
-class Arm:
-    """One study: of one compared value, or the only one."""
-
-    values: Mapping[str, Any]
-    study: Study
-    position: int
-    active: dict[int, Active] = field(default_factory=dict)
-    finalists: list[Finalist] | None = None
-    """None before the study is over."""
 
     @property
     def over(self) -> bool:
-        """Whether every trial has ended, whoever has judged it."""
-        return all(trial.state.is_finished() for trial in self.study.trials())
+        """Whether it has its scores, or can't have them."""
+        return self.scores is not None or bool(self.failure)
 
 
 @dataclass
@@ -71,44 +57,77 @@ class Search:
 
     stage: Stage
     settings: SearchSettings
-    arms: list[Arm]
     rungs: tuple[Rung, ...]
-    """The last one is the end."""
+    """The last one is the end of a trial."""
+    arms: list[Arm] = field(default_factory=list)
+
+    @property
+    def over(self) -> bool:
+        """Whether its ranking is complete, or can't be."""
+        return all(
+            arm.finalists is not None and all(finalist.over for finalist in arm.finalists)
+            for arm in self.arms
+        )
+
+
+@dataclass
+class Arm:
+    """One study of a search: that of one compared value, or the only one."""
+
+    search: Search = field(repr=False)
+    values: Mapping[str, Any]
+    """The compared values."""
+    study: Study
+    position: int
+    active: dict[int, Active] = field(default_factory=dict)
+    """Trial number to trial."""
+    finalists: list[Finalist] | None = None
+    """None before the study has ended."""
+
+    @property
+    def label(self) -> str:
+        """`finetune tac.alpha=0.1`, for messages."""
+        stage = self.search.stage.name
+        return " ".join((stage, *(f"{name}={value}" for name, value in self.values.items())))
+
+    @property
+    def ended(self) -> bool:
+        """Whether every trial has ended, in whichever driver."""
+        return all(trial.state.is_finished() for trial in self.study.trials())
+
+    def point(self, trial: FrozenTrial) -> dict[str, Any]:
+        """A trial's point, with the compared values."""
+        return {**self.values, **trial.user_attrs[VALUES]}
 
 
 def up_to(history: Sequence[Report], until: int | None) -> list[Report]:
-    """Reports up to the first evaluation from `until` environment steps on."""
+    """Reports up to the first evaluation from environment step `until` on."""
     if until is None:
         return list(history)
-    found = []
-    for report in history:
-        found.append(report)
-        if report.env_steps >= until and names.EVAL_EPISODES in report.metrics:
-            break
-    return found
+    ends = (
+        count
+        for count, report in enumerate(history, 1)
+        if report.env_steps >= until and names.EVAL_EPISODES in report.metrics
+    )
+    return list(history[: next(ends, None)])
 
 
 def ranked(settings: SearchSettings, trials: Sequence[FrozenTrial]) -> list[FrozenTrial]:
-    """Judged trials, the best first; of several objectives the Pareto front, by the first one."""
-    judged = [trial for trial in trials if trial.state is TrialState.COMPLETE and trial.values]
+    """Completed trials, the best first; for several objectives the Pareto front, by the first."""
+    complete = [trial for trial in trials if trial.state is TrialState.COMPLETE and trial.values]
     signs = [1.0 if objective.maximised else -1.0 for objective in settings.objectives]
 
     def goodness(trial: FrozenTrial) -> tuple[float, ...]:
         return tuple(sign * value for sign, value in zip(signs, trial.values, strict=True))
 
     if len(signs) > 1:
-        judged = [
+        complete = [
             trial
-            for trial in judged
-            if not any(_dominates(goodness(other), goodness(trial)) for other in judged)
+            for trial in complete
+            if not any(_dominates(goodness(other), goodness(trial)) for other in complete)
         ]
-    return sorted(judged, key=lambda trial: (*(-part for part in goodness(trial)), trial.number))
+    return sorted(complete, key=lambda trial: (*(-part for part in goodness(trial)), trial.number))
 
 
 def _dominates(one: tuple[float, ...], other: tuple[float, ...]) -> bool:
     return one != other and all(a >= b for a, b in zip(one, other, strict=True))
-
-
-def in_words(values: Mapping[str, Any]) -> str:
-    """`tac.alpha=0.1 tac.entropic_index=2 `, for the beginning of a line."""
-    return "".join(f"{name}={value} " for name, value in values.items())

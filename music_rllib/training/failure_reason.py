@@ -1,4 +1,4 @@
-"""Why a run failed, in a line or two."""
+"""The cause of a run's failure, in one or two lines."""
 
 from __future__ import annotations
 
@@ -7,26 +7,24 @@ import re
 import psutil
 from ray.exceptions import RayActorError, RayError, RayTaskError
 
-__all__ = ["cause_of"]
-
 _DETAIL = re.compile(r"Worker exit detail: (.*?)(?: Some common causes include|$)", re.MULTILINE)
 _PLACE = re.compile(r"^\s*(pid|ip): (\S+)$", re.MULTILINE)
 
 
 def cause_of(error: BaseException | None, text: str, limit: int = 300) -> str:
-    """One or two lines that say why.
+    """One or two lines that name the cause of a failure.
 
     Args:
-        error: What Ray raised in the driver, if that could be read.
-        text: Its traceback, of which the last line is taken otherwise.
-        limit: Characters per line.
+        error: The exception that Ray raised in the driver; None where it could not be read.
+        text: Its traceback, whose last line names the cause then.
+        limit: Most characters per line.
     """
     if isinstance(error, RayTaskError) and isinstance(error.cause, BaseException):
         error = error.cause
     if error is None:
         lines = _non_empty(text)[-1:]
     elif isinstance(error, RayActorError):
-        lines = _death(str(error))
+        lines = _cause_of_death(str(error))
     elif isinstance(error, RayError):
         lines = _non_empty(str(error))[:2]
     elif isinstance(error, MemoryError):
@@ -38,7 +36,7 @@ def cause_of(error: BaseException | None, text: str, limit: int = 300) -> str:
 
 
 def _memory() -> str:
-    """What there is where this is asked, which is in the worker."""
+    """Memory of the worker, which is the process that calls this, and of its machine."""
     memory, own = psutil.virtual_memory(), psutil.Process().memory_info().rss
     return (
         f"The process had {own / 2**30:.1f} GiB, {memory.available / 2**30:.1f} of the machine's "
@@ -51,8 +49,8 @@ def _non_empty(text: str) -> list[str]:
     return [line for line in text.splitlines() if line.strip()]
 
 
-def _death(text: str) -> list[str]:
-    """A worker process that is gone, or never came up because its first task raised."""
+def _cause_of_death(text: str) -> list[str]:
+    """The cause of a worker process that died, or whose first task raised."""
     if "creation task" in text:
         return _non_empty(text)[-1:]
     place = ", ".join(f"{name} {value}" for name, value in _PLACE.findall(text))

@@ -1,9 +1,9 @@
-"""Ends a worker whose environment hangs, and keeps where: from a process of its own beside it.
+"""A process that kills a worker whose environment hangs, and records the worker's stack.
 
 The watching process loads nothing but a bare Python. When one call of `step()` or `reset()` lasts
 too long, it makes the worker write its stack, which `faulthandler` does without Python's lock, puts
-that into the run's work folder, and kills the worker. The one that is started in its place finds it
-there and fails the run.
+that into the run's work folder, and kills the worker. The worker that is started in its place finds
+the record and fails the run.
 """
 
 from __future__ import annotations
@@ -19,30 +19,28 @@ import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-__all__ = ["HangError", "HangWatch", "check_hung"]
-
 RECORD = "hung.txt"
-"""In a run's work folder: the attempt that hung, for how many seconds, and the stack."""
+"""File in a run's work folder: the attempt that hung, the seconds it hung, and the stack."""
 LOOKS = 20
-"""So often the watching process looks in the time that a call may take."""
+"""Looks of the watching process in the time that a call may take."""
 LONGEST_PAUSE, DUMP_SECONDS = 5.0, 5.0
 
 
 class HangError(RuntimeError):
-    """An environment that did not return; with the stack that it hangs in."""
+    """An environment that did not return; the message has the stack in which it hangs."""
 
 
 class HangWatch:
-    """The worker's side: has itself watched until `end`."""
+    """The worker's side: it is watched until `end`."""
 
     def __init__(self, seconds: float, storage: str, key: str, attempt: str) -> None:
-        """Be ended where a call of an environment lasts longer.
+        """Start the watching process.
 
         Args:
-            seconds: How long.
-            storage: Where the record of it goes, below `work/<key>`.
-            key: The run's.
-            attempt: Tells the record from those of earlier sweeps.
+            seconds: Longest duration of one call of the environment.
+            storage: The record is written into its folder `work/<key>`.
+            key: The run's key.
+            attempt: Name that tells the record from those of earlier sweeps.
 
         Raises:
             OSError: The watching process can't be started.
@@ -68,11 +66,11 @@ class HangWatch:
         )
 
     def end(self) -> None:
-        """Be watched no more."""
+        """End the watching process."""
         import faulthandler
 
         assert self._process.stdin is not None
-        self._process.stdin.close()  # that is what it looks for
+        self._process.stdin.close()  # it ends at that
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(timeout=5.0)
         self._calls.unshare()
@@ -82,20 +80,20 @@ class HangWatch:
 
 
 def check_hung(record: str | None, attempt: str, what: str) -> None:
-    """Look at what a work folder has of a worker that hung.
+    """Fail if a worker hung in this attempt.
 
     Args:
         record: The content of the record; None where there is none.
-        attempt: What it must be of: in a later sweep, the environment may be mended.
+        attempt: Records of other attempts do not count: the environment may be mended since.
         what: The environment, for the message.
 
     Raises:
-        HangError: The worker before this one hung; with where.
+        HangError: The worker before this one hung.
     """
     if record is None:
         return
-    of_attempt, seconds, stack = (*record.split("\n", 2), "", "")[:3]
-    if of_attempt != attempt:
+    recorded_attempt, seconds, stack = (*record.split("\n", 2), "", "")[:3]
+    if recorded_attempt != attempt:
         return
     raise HangError(
         f"environment {what} has not returned from {_call_in(stack)} for {float(seconds):g} s "
@@ -104,12 +102,12 @@ def check_hung(record: str | None, attempt: str, what: str) -> None:
 
 
 def _innermost(stack: str) -> str:
-    """The line that the thread which plays is in, as `faulthandler` writes it."""
-    for thread in stack.split("\n\n"):
-        if "env_runner.py" in thread:
-            lines = [line.strip() for line in thread.splitlines() if line.startswith("  File ")]
-            return lines[0] if lines else "a place that is not known"
-    return "a place that is not known"
+    """The innermost line of the thread that plays, as `faulthandler` writes it."""
+    threads = [thread for thread in stack.split("\n\n") if "env_runner.py" in thread]
+    lines = [
+        line.strip() for line in "".join(threads[:1]).splitlines() if line.startswith("  File ")
+    ]
+    return lines[0] if lines else "a place that is not known"
 
 
 def _call_in(stack: str) -> str:
@@ -122,7 +120,7 @@ def _call_in(stack: str) -> str:
 
 
 def main() -> None:
-    """Watch the process of these arguments until it ends, or hangs."""
+    """Watch the process that the arguments name until it ends, or hangs."""
     pid, seconds, calls, stack, storage, record, attempt = sys.argv[1:]
     if not _hangs(int(pid), float(seconds), Path(calls)):
         return
@@ -139,8 +137,8 @@ def main() -> None:
 def _hangs(pid: int, seconds: float, calls: Path) -> bool:
     """Wait until one call has lasted so long; False where the watched process ends before that.
 
-    What counts is how often it was seen in the same call: a machine that slept, or a worker that
-    was stopped, has not hung for that time.
+    The time is counted in looks that find it in the same call: while the machine slept, or the
+    worker was stopped, it has not hung.
     """
     pause = min(seconds / LOOKS, LONGEST_PAUSE)
     seen, stalled = 0, 0.0

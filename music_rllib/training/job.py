@@ -11,8 +11,6 @@ from music_rllib.config.schema import Checkpoints
 from music_rllib.envs.tasks import Task
 from music_rllib.experiment.plan import Node
 
-__all__ = ["NodeJob"]
-
 
 class NodeJob(BaseModel):
     """All that a worker needs to compute a node."""
@@ -25,45 +23,26 @@ class NodeJob(BaseModel):
     source_key: str | None
     source_task: Task | None
     storage: str
+    """Absolute folder, or URI."""
     cpus: int
     gpus: float = 0.0
     memory: int = 0
     """Bytes that are reserved; 0: memory is not counted."""
     until: int | None = None
-    """Stop at the first evaluation from so many environment steps on, to be continued; None: go on
-    to the end."""
+    """The run is paused at the first evaluation from this environment step on; None: it goes on to
+    its end."""
     checkpoints: Checkpoints = Checkpoints()
     sweep: str = ""
     """Name of the sweep, for messages."""
     stop_key: str | None = None
-    """Where to look whether to stop; None: nowhere."""
+    """Key of the flag that stops the worker; None: nothing does."""
     hang_minutes: float | None = None
-    """How long a call of the environment may last; None: as long as it likes."""
+    """Longest duration of one call of the environment; None: there is no limit."""
 
     @classmethod
-    def of(
-        cls,
-        node: Node,
-        storage: str,
-        cpus: int,
-        *,
-        gpus: float = 0.0,
-        memory: int = 0,
-        until: int | None = None,
-        checkpoints: Checkpoints | None = None,
-        sweep: str = "",
-        stop_key: str | None = None,
-        hang_minutes: float | None = None,
-    ) -> NodeJob:
-        """The job that computes `node` in the storage at this URI on so many CPUs."""
+    def of(cls, node: Node, storage: str, cpus: int, **options: Any) -> NodeJob:
+        """The job that computes `node` in this storage; `options` are the fields with defaults."""
         return cls(
-            gpus=gpus,
-            memory=memory,
-            until=until,
-            checkpoints=checkpoints or Checkpoints(),
-            sweep=sweep,
-            stop_key=stop_key,
-            hang_minutes=hang_minutes,
             key=node.key,
             label=node.label,
             run=node.run,
@@ -71,10 +50,11 @@ class NodeJob(BaseModel):
             source_task=node.input.task if node.input else None,
             storage=storage,
             cpus=cpus,
+            **options,
         )
 
     def to_tune(self) -> dict[str, Any]:
-        """As a Tune config; text, so that Tune doesn't look for search spaces in it."""
+        """The job as a Tune config; as text, so that Tune finds no search spaces in it."""
         return {"job": self.model_dump_json()}
 
     @classmethod

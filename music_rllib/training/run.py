@@ -28,8 +28,6 @@ from music_rllib.tac.env_runner import DISPLACEMENT, MOVED, SUCCESS_ANY, SUCCESS
 from music_rllib.tac.kernels.compiled import learn
 from music_rllib.tac.normaliser import for_another_run
 
-__all__ = ["Paused", "TrainingRun", "algorithm_config"]
-
 _NEVER = 10**9
 _TRAJECTORIES = "trajectories.safetensors"
 
@@ -62,14 +60,14 @@ def algorithm_config(run: RunSettings) -> TACConfig:
     )
     config.replay(moved_distance=run.task.moved_distance, **dict(run.replay))
     config.success_key = run.task.success_key
-    # Evaluations are asked for by `TrainingRun`, at given environment steps.
+    # `TrainingRun` evaluates, at given environment steps.
     config.evaluation(
         evaluation_interval=_NEVER,
         evaluation_duration=run.evaluation.episodes,
         evaluation_duration_unit="episodes",
         evaluation_config=TACConfig.overrides(explore=False),
     )
-    # One iteration is one episode in every sub-environment; reports are put together here.
+    # One iteration is one episode in every sub-environment; a report covers several.
     config.reporting(min_sample_timesteps_per_iteration=1)
     config.debugging(seed=run.seed)
     return config
@@ -83,12 +81,12 @@ class TrainingRun:
     """Trains one run to its budget.
 
     Args:
-        run: the settings.
-        handoff: weights to start from, by module name (`TAC.set_network_weights`).
-        gpus: more than 0: the networks train on a GPU.
+        run: The settings.
+        handoff: Weights to start from, by module name (`TAC.set_network_weights`).
+        gpus: The networks train on a GPU where it is more than 0.
 
     Raises:
-        ValueError: settings or weights that do not fit the environment.
+        ValueError: Settings or weights do not fit the environment.
     """
 
     def __init__(
@@ -101,7 +99,7 @@ class TrainingRun:
         config = algorithm_config(run)
         if gpus:
             config.learners(num_gpus_per_learner=gpus)
-        with warnings.catch_warnings():  # of the settings: the sweep has given them, once
+        with warnings.catch_warnings():  # the sweep has warned of its settings, once
             warnings.filterwarnings("ignore", "target_bounds ")
             self.algorithm: TAC = config.build_algo()
         if handoff:
@@ -111,9 +109,9 @@ class TrainingRun:
         self._begun = False
         """Whether the policy has been evaluated as it was before any training."""
         self._rounds: defaultdict[str, list[float]] = defaultdict(list)
-        """What has been measured since the last report."""
+        """Metrics of the training iterations since the last report."""
         self._segments: list[Segment] = []
-        """Files of this run's checkpoints that hold trajectories."""
+        """Files of trajectories in this run's checkpoints."""
         self._process = psutil.Process()
         self._process.cpu_percent()  # the first call only starts the measurement
 
@@ -129,26 +127,26 @@ class TrainingRun:
 
     @property
     def will_compile(self) -> bool:
-        """Whether its first update takes longer, as the first one on a machine does."""
+        """Whether its first update compiles, as the first one on a machine does."""
         return not self._gpus and self.run.tac.precision == "float32" and not is_kept(learn)
 
     def advance(self, pause: Callable[[], bool] = lambda: False) -> dict[str, float]:
-        """Trains until the next report is due; the first one is an evaluation at step 0.
+        """Train until the next report is due; the first one is an evaluation at step 0.
 
         Args:
-            pause: asked often; where it says so, training pauses at once.
+            pause: Called often; training pauses at once where it returns True.
 
         Returns:
-            Means since the last report, by the names of `tracking.names`; evaluation metrics
-            where an evaluation was due. Metrics that do not exist yet are left out.
+            Means since the last report, by the names of `music_rllib.names`, and evaluation metrics
+            where an evaluation is due. Metrics that do not exist yet are left out.
 
         Raises:
-            Paused: as it was asked to. `save` keeps what has been measured so far, so that the
+            Paused: `pause` returned True. `save` keeps what has been measured so far, so that the
                 report will be as if there had been no pause.
         """
         if not self._begun:
             self._begun = True
-            return self.evaluate() | self._counters() | self._system()
+            return self.evaluate() | self._status()
         interval = self.run.evaluation.interval
         evaluation_at = _next_multiple(self.env_steps, interval)
         report_at = _next_multiple(self.env_steps, min(interval, REPORT_INTERVAL))
@@ -162,43 +160,39 @@ class TrainingRun:
         self._rounds.clear()
         if self.env_steps >= evaluation_at or self.finished:
             metrics |= self.evaluate()
-        return metrics | self._counters() | self._system()
+        return metrics | self._status()
 
     def evaluate(self) -> dict[str, float]:
-        """Deterministic episodes with fresh goals; the same ones for every run of this seed."""
+        """Metrics of deterministic episodes with fresh goals, the same in every run of a seed."""
         results = self.algorithm.evaluate()[ENV_RUNNER_RESULTS]
         metrics = {name: float(results[key]) for key, name in _EVALUATION.items() if key in results}
         return metrics | {names.EVAL_EPISODES: float(self.run.evaluation.episodes)}
 
-    def _counters(self) -> dict[str, float]:
+    def _status(self) -> dict[str, float]:
         return {
             names.ENV_STEPS: float(self.env_steps),
             names.GRAD_UPDATES: float(self.algorithm.grad_updates),
-        }
-
-    def _system(self) -> dict[str, float]:
-        return {
             names.SYSTEM_CPU: self._process.cpu_percent(),
             names.SYSTEM_MEMORY: self._process.memory_info().rss / 2**20,
         }
 
     def modules(self) -> dict[str, dict[str, NDArray[Any]]]:
-        """Plain weights of every network, by module name, as a handoff carries them."""
+        """Weights of every network, by module name, as a handoff carries them."""
         return self.algorithm.get_network_weights()
 
     @property
     def spaces(self) -> Spaces:
-        """What the environment observes and takes."""
-        pair = self.algorithm.env_runner.get_spaces()[DEFAULT_MODULE_ID]
-        return Spaces.of(*pair)
+        """The environment's observation and action spaces."""
+        return Spaces.of(*self.algorithm.env_runner.get_spaces()[DEFAULT_MODULE_ID])
 
-    def save(self, draft: Draft) -> None:
-        """Writes everything that `restore` needs to continue exactly from here.
+    def save(self, draft: Draft, *, alone: bool = False) -> None:
+        """Write everything that `restore` needs to continue exactly from here.
 
-        Of the replay, only trajectories that no earlier checkpoint of this run has.
+        Of the replay, these are the trajectories that no earlier checkpoint of this run has, or all
+        of them for a checkpoint that stands `alone`.
 
         Raises:
-            StorageError: the storage cannot be written.
+            StorageError: The storage cannot be written.
         """
 
         def write(label: str, arrays: Mapping[str, NDArray[Any]]) -> str:
@@ -207,7 +201,7 @@ class TrainingRun:
             return name
 
         replay = self.algorithm.replay
-        self._segments = new_segments(replay, self._segments, write)
+        self._segments = new_segments(replay, [] if alone else self._segments, write)
         draft.needs = [segment.name for segment in self._segments]
         state = {
             "algorithm": self.algorithm.get_state(not_components=TAC.REPLAY),
@@ -218,34 +212,27 @@ class TrainingRun:
         }
         write_state(draft.folder, state)
 
-    def restore(self, saved: Saved) -> None:
-        """Continues from what `save` wrote. Only before the first `advance`.
+    def restore(self, saved: Saved, *, foreign: bool = False) -> None:
+        """Continue from what `save` wrote. Only before the first `advance`.
+
+        After the checkpoint of another, `foreign` run, the next `save` writes all trajectories.
 
         Raises:
-            StateError: it is no checkpoint.
-            ValueError: it is one of other settings.
+            StateError: It is no checkpoint.
+            ValueError: It has other settings.
         """
         state = read_state(saved.folder)
         self.algorithm.set_state(state["algorithm"])
-        self._segments = [Segment(*segment) for segment in state["segments"]]
+        segments = [Segment(*segment) for segment in state["segments"]]
         load_segments(
             self.algorithm.replay,
             state["replay"],
-            self._segments,
+            segments,
             lambda name: read_arrays(saved.parts[name] / _TRAJECTORIES),
         )
+        self._segments = [] if foreign else segments
         self._rounds = defaultdict(list, state["rounds"])
         self._begun = state.get("begun", True)  # older checkpoints are all of begun runs
-
-    def save_alone(self, draft: Draft) -> None:
-        """As `save`, with all trajectories: a checkpoint that shares nothing with earlier ones."""
-        self._segments = []
-        self.save(draft)
-
-    def restore_foreign(self, saved: Saved) -> None:
-        """As `restore`, from another run's checkpoint: the next `save` writes all trajectories."""
-        self.restore(saved)
-        self._segments = []
 
     @property
     def replay_mb(self) -> float:
@@ -253,12 +240,12 @@ class TrainingRun:
         return self.algorithm.replay.used_nbytes / 2**20
 
     def close(self) -> None:
-        """Releases environments and networks."""
+        """Release environments and networks."""
         self.algorithm.stop()
 
 
 def _means(rounds: Mapping[str, list[float]]) -> dict[str, float]:
-    """Of what was measured in some rounds; the bound on fresh trajectories by their steps."""
+    """Means over training iterations; the bound on fresh trajectories is weighted by steps."""
     metrics = {name: float(np.mean(values)) for name, values in rounds.items()}
     if (steps := metrics.pop(HELD_OUT_STEPS, None)) is not None:
         weights = np.array(rounds[HELD_OUT_STEPS]) / steps
@@ -271,7 +258,7 @@ def _next_multiple(steps: int, interval: int) -> int:
 
 
 def _training_metrics(result: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
-    """Of an RLlib result, what is ours, by its public name."""
+    """The metrics that a report takes from an RLlib result, by their public names."""
     episodes = result.get(ENV_RUNNER_RESULTS, {})
     for key, name in _TRAINING.items():
         if key in episodes:

@@ -1,4 +1,4 @@
-"""What a run takes: one trains for some seconds in a process of its own, as a sweep's runs do."""
+"""The time and memory that a run takes, measured on one that trains for some seconds."""
 
 from __future__ import annotations
 
@@ -13,30 +13,28 @@ from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.schema import Resources
 from music_rllib.training.run import TrainingRun
 
-__all__ = ["RunSample", "sample_run"]
-
 SECONDS = 4.0
-"""So long a run is trained at least, after a round that warms up."""
+"""Shortest duration of the measured training, after one iteration that warms up."""
 
 
 class RunSample(NamedTuple):
-    """Measured of one run."""
+    """Measurements of one run."""
 
     start_seconds: float
-    """From asking for a process to its first environment steps."""
+    """Time from the request for a process to its first environment steps."""
     steps_per_second: float
-    """Environment steps, while it learns."""
+    """Environment steps per second of training."""
     evaluation_seconds: float
-    """Of one evaluation."""
+    """Duration of one evaluation."""
     memory: int
-    """Bytes that are its own at its end, the replay filled; libraries are shared among runs."""
+    """Bytes of the process at the run's end, without the libraries that all runs share."""
 
 
 def sample_run(run: RunSettings, resources: Resources) -> RunSample:
-    """Trains a run for some seconds in a worker of the Ray that is connected.
+    """Train a run for some seconds in a worker of the connected Ray.
 
     Raises:
-        ValueError: settings that do not fit the environment.
+        ValueError: The settings do not fit the environment.
     """
     bundle = resources.bundle
     options = {"num_cpus": bundle["CPU"], "num_gpus": bundle.get("GPU", 0.0)}
@@ -53,17 +51,17 @@ def sample_run(run: RunSettings, resources: Resources) -> RunSample:
 
 
 class _Worker:
-    """A run in a process."""
+    """Ray actor that trains the run."""
 
     def start(self, run: RunSettings, gpus: float) -> None:
-        """Until its first environment steps."""
-        # Steps that teach nothing are many times cheaper than the others, and soon over.
+        """Build the run and make its first environment steps."""
+        # Random steps, without updates, are many times faster than the others, and soon over.
         tac = run.tac.model_copy(update={"random_steps": 0})
         self._training = TrainingRun(run.model_copy(update={"tac": tac}), gpus=gpus)
         self._training.algorithm.env_runner.sample(num_episodes=1)
 
     def train(self) -> tuple[float, float, int]:
-        """Steps a second, seconds of an evaluation, and bytes."""
+        """The last three numbers of a `RunSample`."""
         training = self._training
         training.algorithm.train()
         first, began = training.env_steps, time.perf_counter()

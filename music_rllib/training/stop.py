@@ -1,7 +1,7 @@
-"""A word from the driver to all its workers: stop.
+"""A flag by which the driver stops all its workers.
 
-It is kept by Ray itself, so that it needs no shared disk and is gone with the cluster. Workers look
-in a thread, and see it while they train.
+It is kept in Ray's own key-value store, so that it needs no shared disk and is gone with the
+cluster. Workers poll it in a thread while they train.
 """
 
 from __future__ import annotations
@@ -9,8 +9,6 @@ from __future__ import annotations
 import threading
 
 from ray.experimental import internal_kv
-
-__all__ = ["StopFlag", "StopWatch"]
 
 LOOK_SECONDS = 0.3
 _NAMESPACE = b"music_rllib"
@@ -20,15 +18,15 @@ class StopFlag:
     """The driver's side."""
 
     def __init__(self, key: str) -> None:
-        """A flag that is unlike any other by its `key`."""
+        """The flag with this unique `key`."""
         self.key = key
 
     def set(self) -> None:
-        """Tell all workers. Only where Ray is connected."""
+        """Stop all workers. Only where Ray is connected."""
         internal_kv._internal_kv_put(self.key, "stop", namespace=_NAMESPACE)
 
     def clear(self) -> None:
-        """Leave nothing behind in a cluster that goes on."""
+        """Remove the flag from a cluster that goes on."""
         internal_kv._internal_kv_del(self.key, namespace=_NAMESPACE)
 
 
@@ -36,7 +34,7 @@ class StopWatch:
     """A worker's side."""
 
     def __init__(self, key: str | None) -> None:
-        """Look at the flag `key` from now on; never where it is None."""
+        """Poll the flag `key` from now on; nothing where it is None."""
         self._key = key
         self._asked, self._ended = threading.Event(), threading.Event()
         if key is not None:
@@ -47,7 +45,7 @@ class StopWatch:
         return self._asked.is_set()
 
     def end(self) -> None:
-        """Look no more."""
+        """Stop polling."""
         self._ended.set()
 
     def _look(self) -> None:

@@ -1,4 +1,4 @@
-"""How fast a run goes, and how long it still takes. Knows no Ray and no screen."""
+"""The speed of a run, and its remaining time. Knows no Ray and no screen."""
 
 from __future__ import annotations
 
@@ -7,17 +7,18 @@ from collections.abc import Iterable
 
 from music_rllib.store.run_record import Report, last_values
 
-__all__ = ["Throughput"]
-
 
 class Throughput:
-    """What is known of one running run."""
+    """Progress of one run, by its reports."""
 
     def __init__(self, budget: int, warm_up: int, now: float) -> None:
-        """A run of `budget` env steps, of which it doesn't learn in the first `warm_up`.
+        """Follow a run that begins now.
 
-        Those are many times faster than the others, and say nothing about how long it takes.
-        `now` is when it began, in seconds on any clock.
+        Args:
+            budget: Its environment steps.
+            warm_up: Of those, the first ones without learning. They are many times faster than the
+                others, and so are left out of the estimate.
+            now: Seconds on any clock.
         """
         self.budget = budget
         self._warm_up = warm_up
@@ -25,10 +26,10 @@ class Throughput:
         self.metrics: dict[str, float] = {}
         """The last value of each metric."""
         self._recent: deque[Report] = deque(maxlen=6)
-        self._heard = now
+        self._updated = now
 
     def hear(self, reports: Iterable[Report], now: float) -> None:
-        """Take up new reports."""
+        """Add new reports."""
         reports = list(reports)
         for report in reports:
             if report.env_steps <= self._warm_up:
@@ -36,11 +37,11 @@ class Throughput:
             self._recent.append(report)
             self.env_steps = report.env_steps
         self.metrics |= last_values(reports)
-        self._heard = now
+        self._updated = now
 
     @property
     def steps_per_second(self) -> float | None:
-        """Over the last few reports; None before the first one after the warm-up."""
+        """Speed over the last few reports; None before the first one after the warm-up."""
         if self.env_steps <= self._warm_up:
             return None
         first, last = self._recent[0], self._recent[-1]
@@ -50,8 +51,8 @@ class Throughput:
         return steps / seconds if seconds > 0 else None
 
     def seconds_left(self, now: float) -> float | None:
-        """Estimated; None before the first report."""
+        """Estimated remaining time; None where the speed is not known yet."""
         rate = self.steps_per_second
         if rate is None:
             return None
-        return max((self.budget - self.env_steps) / rate - (now - self._heard), 0.0)
+        return max((self.budget - self.env_steps) / rate - (now - self._updated), 0.0)

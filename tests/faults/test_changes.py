@@ -64,7 +64,7 @@ def test_what_changed_and_what_it_leaves_behind(
     sweep_document["defaults"]["tac"]["lr"] = 0.01
     changes = changes_since(opened(tmp_path, sweep_document))
     assert changes is not None
-    assert changes.what == ("tac.lr: 0.001 -> 0.01 (3 runs)",)
+    assert changes.differences == ("tac.lr: 0.001 -> 0.01 (3 runs)",)
     assert set(changes.lost) == {
         "pretrain/seed0: is finished",
         f"finetune/{begun_values}/seed0: is at 800 env steps",
@@ -86,7 +86,7 @@ def test_more_env_steps_are_no_change_where_finished_runs_can_be_gone_on_from(
     sweep_document["defaults"]["env_steps"] = 2000
     changes = changes_since(opened(tmp_path, sweep_document))
     assert changes is not None
-    assert changes.what == ("env_steps: 1200 -> 2000 (1 run)",)
+    assert changes.differences == ("env_steps: 1200 -> 2000 (1 run)",)
     assert changes.lost == (
         "seed0: is finished; it has kept no checkpoint of its end (checkpoints.finished_mb)",
     )
@@ -126,7 +126,7 @@ def test_a_new_version_of_the_algorithm_is_named(
     monkeypatch.setattr(changes_module, "ALGORITHM_VERSION", "next")
     changes = changes_since(opened(tmp_path, sweep_document))
     assert changes is not None
-    (line,) = changes.what
+    (line,) = changes.differences
     assert line.startswith("version of the algorithm: ")
     assert line.endswith(" -> next")
 

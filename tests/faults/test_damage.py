@@ -19,6 +19,7 @@ import pytest
 
 from music_rllib.config.schema import Checkpoints
 from music_rllib.envs.tasks import Task
+from music_rllib.store import lease as lease_module
 from music_rllib.store.lease import Lease
 from music_rllib.store.node_store import NodeStore
 from music_rllib.training.job import NodeJob
@@ -203,6 +204,22 @@ def test_a_run_that_somebody_else_computes_is_waited_for(
     last = trial.train()
     assert last["done"]
     assert len(last["reports"].splitlines()) == 4
+    trial.stop()
+
+
+def test_a_dead_owner_whose_clock_was_ahead_is_not_waited_for_until_then(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node = job(tmp_path, settings("tac"))
+    theirs = Lease.of_this_process("sweep 'other'", 3600.0).model_copy(
+        update={"machine": "another", "host": "far-away", "pid": 77}
+    )
+    assert NodeStore(str(tmp_path)).work_folder(node.key).lease.acquire(theirs) is None
+    monkeypatch.setattr(lease_module, "EXPIRES_SECONDS", 1.0)
+    trial = RunTrainable(config=node.to_tune())
+    waiting, *_, last = (trial.train() for _ in range(4))
+    assert "waits, as it is being computed by sweep 'other'" in waiting[NOTES][0]
+    assert last["reports"], "it computes"
     trial.stop()
 
 

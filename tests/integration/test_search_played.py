@@ -511,7 +511,7 @@ def test_a_comparison_learns_for_each_value_from_trials_with_it(tmp_path: Path) 
     driver = searched(tmp_path, COMPARED | warm, name="warm", seeds=[0])
     theirs = before.outcome()["arms"]
     for number, arm in enumerate(driver.outcome()["arms"]):
-        prior = driver.controller.searches[0].arms[number].study._open()[2]
+        prior = driver.controller.searches[0].arms[number].study.prior
         assert [list(trial.values) for trial in prior] == [
             trial["objective"] for trial in theirs[number]["trials"]
         ]

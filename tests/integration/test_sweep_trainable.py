@@ -135,7 +135,7 @@ def test_music_f_begins_with_the_agent_that_it_was_handed(tmp_path: Path) -> Non
     compute(source)
     node = job(tmp_path, settings("music-f"), source)
     trial = RunTrainable(config=node.to_tune())
-    begun = trial._begin(NodeStore(str(tmp_path)))
+    begun = trial._begin()
     folder = Path(NodeStore(str(tmp_path)).path(source.key))
     expected = read_handoff(folder, handed_over(node.run), POINT)
     assert set(expected) == {"policy", "critics", "value", "value_target", "normaliser"}
