@@ -9,30 +9,23 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from music_rllib import names
+from music_rllib.report.figures.choice import Drawing
 from music_rllib.results.analysis import StageAnalysis
+from music_rllib.results.conditions import SIDE_BY_SIDE
 from music_rllib.results.data import Sweep
-
-__all__ = [
-    "Table",
-    "finals_table",
-    "improvement_table",
-    "note",
-    "races_table",
-    "runs_table",
-    "waits_table",
-]
+from music_rllib.results.statistics import Estimate
 
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
-    """One CSV file."""
+    """The content of one CSV file."""
 
     name: str
     columns: Sequence[str]
     rows: Sequence[Sequence[object]]
 
     def to_csv(self) -> str:
-        """With a header; NaN is `nan`, infinity `inf`."""
+        """The rows below a header; NaN is `nan`, infinity `inf`."""
         buffer = io.StringIO()
         writer = csv.writer(buffer, lineterminator="\n")
         writer.writerow(self.columns)
@@ -40,8 +33,12 @@ class Table:
         return buffer.getvalue()
 
 
+def _numbers(estimate: Estimate) -> tuple[float, float, float]:
+    return float(estimate.value), float(estimate.lower), float(estimate.upper)
+
+
 def finals_table(analyses: Iterable[StageAnalysis]) -> Table:
-    """How each condition ended, and each of its seeds: means over the tasks."""
+    """Final values of each condition and of each of its seeds, means over the tasks."""
     return Table(
         name="final",
         columns=(
@@ -58,9 +55,7 @@ def finals_table(analyses: Iterable[StageAnalysis]) -> Table:
                 final.condition.label,
                 final.runs,
                 final.seeds,
-                final.value,
-                float(final.estimate.lower),
-                float(final.estimate.upper),
+                *_numbers(final.estimate),
                 " ".join(f"{score:g}" for score in final.scores.mean(axis=1)),
                 *analysis.entropies[scope.name, final.condition].numbers,
             )
@@ -72,27 +67,27 @@ def finals_table(analyses: Iterable[StageAnalysis]) -> Table:
 
 
 def note(analyses: Iterable[StageAnalysis], run_id: str, figure: str | None) -> str:
-    """The last stage's conditions and the report's first figure, in Markdown for MLflow's page.
+    """The last stage's final values and the report's first figure, in Markdown for MLflow's page.
 
     Args:
-        analyses: Of the sweep's stages.
-        run_id: Of the sweep's own run.
-        figure: An artefact of it; None where nothing is drawn.
+        analyses: The analyses of the sweep's stages.
+        run_id: The MLflow id of the sweep's own run.
+        figure: The path of an artefact of that run; None if nothing is drawn.
     """
     columns = ("tasks", "condition", "seeds", "metric", "mean", "lower", "upper")
     final = finals_table(list(analyses)[-1:])
-    cells = [[str(row[final.columns.index(name)]) for name in columns] for row in _rounded(final)]
-    lines = [f"| {' | '.join(map(_escaped, row))} |" for row in (columns, *cells)]
+    chosen = [final.columns.index(name) for name in columns]
+    rows = [[_cell_text(row[column]) for column in chosen] for row in final.rows]
+    lines = [f"| {' | '.join(map(_escaped, row))} |" for row in (columns, *rows)]
     lines.insert(1, "|---" * len(columns) + "|")
     if figure is not None:
-        # MLflow's pages and artefacts have one origin.
+        # MLflow serves its pages and its artefacts from the same origin.
         lines += ["", f"![{figure}](get-artifact?path={figure}&run_uuid={run_id})"]
     return "\n".join(lines)
 
 
-def _rounded(table: Table) -> Iterable[list[object]]:
-    for row in table.rows:
-        yield [f"{value:.3g}" if isinstance(value, float) else value for value in row]
+def _cell_text(value: object) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
 def _escaped(text: str) -> str:
@@ -113,10 +108,8 @@ def improvement_table(analyses: Iterable[StageAnalysis]) -> Table:
                 scope.name,
                 pair.first.condition.label,
                 pair.second.condition.label,
-                float(pair.estimate.value),
-                float(pair.estimate.lower),
-                float(pair.estimate.upper),
-                *(float(end) for end in (pair.gap.value, pair.gap.lower, pair.gap.upper)),
+                *_numbers(pair.estimate),
+                *_numbers(pair.gap),
                 pair.p_value,
                 pair.decided,
             )
@@ -128,7 +121,7 @@ def improvement_table(analyses: Iterable[StageAnalysis]) -> Table:
 
 
 def waits_table(analyses: Iterable[StageAnalysis]) -> Table:
-    """Environment steps to each success rate."""
+    """Environment steps that each condition needs to each success rate."""
     return Table(
         name="steps_to_threshold",
         columns=(
@@ -147,8 +140,8 @@ def waits_table(analyses: Iterable[StageAnalysis]) -> Table:
                 wait.lower,
                 wait.upper,
                 " ".join(
-                    f"{steps:.0f}" if there else f">{steps:.0f}"
-                    for steps, there in zip(wait.waits.steps, wait.waits.reached, strict=True)
+                    f"{'' if reached else '>'}{steps:.0f}"
+                    for steps, reached in zip(wait.waits.steps, wait.waits.reached, strict=True)
                 ),
             )
             for analysis in analyses
@@ -158,7 +151,7 @@ def waits_table(analyses: Iterable[StageAnalysis]) -> Table:
 
 
 def races_table(analyses: Iterable[StageAnalysis]) -> Table:
-    """Who gets to each success rate sooner, by pairs of conditions."""
+    """Probability that one condition reaches a success rate sooner than another, by pairs."""
     return Table(
         name="probability_sooner",
         columns=(
@@ -172,9 +165,7 @@ def races_table(analyses: Iterable[StageAnalysis]) -> Table:
                 race.threshold,
                 race.first,
                 race.second,
-                float(race.estimate.value),
-                float(race.estimate.lower),
-                float(race.estimate.upper),
+                *_numbers(race.estimate),
                 race.p_value,
                 race.decided,
                 race.reached,
@@ -186,7 +177,7 @@ def races_table(analyses: Iterable[StageAnalysis]) -> Table:
 
 
 def runs_table(sweep: Sweep) -> Table:
-    """Every run."""
+    """Every run of the sweep, with its last evaluation and entropies."""
     return Table(
         name="runs",
         columns=(
@@ -212,5 +203,31 @@ def runs_table(sweep: Sweep) -> Table:
                 *(sweep.final(position, metric) for metric in names.ENTROPIES),
             )
             for position, run in enumerate(sweep.runs)
+        ],
+    )
+
+
+def curves_table(drawings: Iterable[Drawing]) -> Table:
+    """The points of all learning curves; stages side by side have none but those of each stage."""
+    return Table(
+        name="curves",
+        columns=(
+            *("stage", "task", "condition", "metric", "env_steps", "runs"),
+            *("mean", "lower", "upper"),
+        ),
+        rows=[
+            (drawing.stage, task, curve.condition.label, drawing.metric.name, *point)
+            for drawing in drawings
+            if drawing.metric is not None and drawing.stage != SIDE_BY_SIDE
+            for task, curves in drawing.curves.items()
+            for curve in curves
+            for point in zip(
+                curve.steps.astype(int).tolist(),
+                curve.runs.tolist(),
+                curve.estimate.value.tolist(),
+                curve.estimate.lower.tolist(),
+                curve.estimate.upper.tolist(),
+                strict=True,
+            )
         ],
     )

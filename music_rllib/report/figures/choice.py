@@ -16,7 +16,7 @@ from music_rllib.report.figures.importance import (
     parallel_panel,
     sensitivity_panels,
 )
-from music_rllib.report.figures.palette import BARS, Style, style_of, styles_by_stage, styles_of
+from music_rllib.report.figures.palette import BARS, Style, styles_by_stage, styles_of
 from music_rllib.report.figures.plots import (
     METRICS,
     Legend,
@@ -32,30 +32,13 @@ from music_rllib.results.comparison import SHOW_SEEDS_BELOW, Scope
 from music_rllib.results.conditions import Condition, Stage, side_by_side
 from music_rllib.results.data import Sweep
 
-__all__ = [
-    "AGAINST_ENTROPY",
-    "COST",
-    "CURVES",
-    "FINALS",
-    "GROUPS",
-    "INFLUENCE",
-    "PERFORMANCE",
-    "PRIMARY",
-    "PROFILES",
-    "Drawing",
-    "drawings_of_stages",
-    "named_by_stage",
-    "slug",
-    "stage_drawings",
-]
-
 FINALS = {names.EVAL_SUCCESS: "Final success rate", names.EVAL_RETURN: "Final return"}
 PROFILES = "Performance profile"
 AGAINST_ENTROPY = "Performance against entropy"
 PERFORMANCE, EXPLORATION, INFORMATION = "Performance", "Exploration", "Information"
 SETTINGS, COST = "Settings", "Cost"
 GROUPS = (PERFORMANCE, EXPLORATION, INFORMATION, SETTINGS, COST)
-"""Headings of the page."""
+"""Headings of the page, in their order."""
 _GROUP_OF = {
     names.EVAL_DISPLACEMENT: EXPLORATION,
     names.ENTROPY: EXPLORATION,
@@ -64,16 +47,19 @@ _GROUP_OF = {
     names.MI_REWARD: INFORMATION,
 }
 INFLUENCE = ("Sensitivity", "Importance of settings", "Parallel coordinates")
-CURVES = tuple(metric.title for metric in METRICS)
-PRIMARY = CURVES[:2]
-"""Of what tasks are judged by: success, or the return."""
-OF_ALL_STAGES = (*METRICS[:2], *(one for one in METRICS if one.name == names.EVAL_DISPLACEMENT))
-"""What is drawn of all stages together: it shows an effect before the first success, too."""
+PRIMARY = tuple(metric.title for metric in METRICS[:2])
+"""Titles of the curves of primary metrics: success rate and return."""
+OF_ALL_STAGES = tuple(
+    metric
+    for metric in METRICS
+    if metric.title in PRIMARY or metric.name == names.EVAL_DISPLACEMENT
+)
+"""Curves that are drawn of all stages together; displacement shows an effect before success."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Drawing:
-    """One figure of one stage: a panel per task, and its values as a table."""
+    """One figure of one stage: a panel per task, a legend and a caption."""
 
     stage: str
     title: str
@@ -81,35 +67,31 @@ class Drawing:
     panels: tuple[Panel, ...]
     legend: Legend
     group: str = PERFORMANCE
-    """Under which heading of the page it stands."""
+    """The heading of the page under which it stands."""
     metric: Metric | None = None
-    """Of curves: what is drawn against environment steps."""
+    """The metric that learning curves show; None for other figures."""
     curves: Mapping[str, Sequence[Curve]] = field(default_factory=dict)
-    """By task."""
-    values: tuple[tuple[object, ...], ...] = ()
-    """(stage, task, condition, metric, env_steps, runs, mean, lower, upper) rows."""
+    """The learning curves of each task."""
 
     @property
     def name(self) -> str:
-        """Of its files, and of its place in the page."""
+        """The name of its files without their suffix, and its id in the page."""
         return slug(f"{self.stage}-{self.title}")
 
 
 def slug(text: str) -> str:
-    """`text` as a file name."""
+    """`text` as a file name: lower-case letters and digits, joined by hyphens."""
     return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")
 
 
 def stage_drawings(sweep: Sweep, analysis: StageAnalysis) -> Iterator[Drawing]:
-    """The figures for which there is something to draw or to compare."""
-    stage = _shown(sweep, analysis.stage)
-    found = _all_curves(sweep, stage)
+    """The figures of one stage for which there is something to draw or to compare."""
+    stage = _without_trials(sweep, analysis.stage)
+    curves = _all_curves(sweep, stage, METRICS)
     for metric in METRICS:
-        drawing = _curves(stage, metric, found, styles_of(stage.conditions))
-        if drawing is not None:
-            yield drawing
-    of_shown = [replace(s, finals=s.compared) if s.compared else s for s in analysis.scopes]
-    scopes = [scope for scope in of_shown if len(scope.finals) > 1]
+        yield from _curves(stage, metric, curves, styles_of(stage.conditions))
+    scopes = [replace(s, finals=s.compared) if s.compared else s for s in analysis.scopes]
+    scopes = [scope for scope in scopes if len(scope.finals) > 1]
     for metric_name, title in FINALS.items():
         yield from _finals(stage, title, [one for one in scopes if one.metric == metric_name])
     yield from _against_entropy(sweep, stage)
@@ -117,128 +99,108 @@ def stage_drawings(sweep: Sweep, analysis: StageAnalysis) -> Iterator[Drawing]:
         yield from _influence(sweep, analysis)
 
 
-def _shown(sweep: Sweep, stage: Stage) -> Stage:
-    """Of a search only what is ranked, as soon as there is any: its trials are too many to see."""
+def _without_trials(sweep: Sweep, stage: Stage) -> Stage:
+    """The stage, or the ranked conditions of a search if there are any: its trials are too many."""
     if stage.compared in ((), stage.conditions):
         return stage
-    seeds = {sweep.runs[run].seed for one in stage.compared for run in one.runs}
-    return replace(
-        stage,
-        conditions=stage.compared,
-        seeds=tuple(seed for seed in stage.seeds if seed in seeds),
-    )
+    seeds = {sweep.runs[run].seed for condition in stage.compared for run in condition.runs}
+    ranked = tuple(seed for seed in stage.seeds if seed in seeds)
+    return replace(stage, conditions=stage.compared, seeds=ranked)
 
 
 def _finals(stage: Stage, title: str, scopes: Sequence[Scope[Condition]]) -> Iterator[Drawing]:
     if not scopes:
         return
-    legend = _legend(stage)
     yield Drawing(
         stage=stage.name,
         title=title,
         caption="Large marks: mean; bars: 95 % intervals; small ticks: single runs.",
         panels=tuple(finals_panel(scope, stage.conditions) for scope in scopes),
-        legend=legend,
+        legend=_legend(stage),
     )
     runs = [final.scores.shape[0] for scope in scopes for final in scope.finals]
     readable = len(stage.conditions) <= MOST_CONDITIONS and max(runs) > 1
     if scopes[0].metric not in names.EVAL_RATES or not readable:
-        return  # single runs' bands are as high as the figure, and those of many are one
+        return  # bands of single runs fill the figure, and those of many conditions overlap
     yield Drawing(
         stage=stage.name,
         title=PROFILES,
         caption="Share of finished runs that end above each success rate, with 95 % bands. A line "
         "that is above another everywhere is better at every standard.",
         panels=tuple(profile_panel(scope, stage.conditions) for scope in scopes),
-        legend=legend,
+        legend=_legend(stage),
     )
 
 
 def _against_entropy(sweep: Sweep, stage: Stage) -> Iterator[Drawing]:
-    """Colour by q alone: what else varies moves the points along."""
-    by_q = {c.entropic_index: style_of(c, stage.conditions) for c in stage.conditions}
+    by_q = _styles_by_q(stage)
+    # Other settings move the points, so that colour stands for q alone.
     styles = {condition: by_q[condition.entropic_index] for condition in stage.conditions}
-    found = (entropy_panel(sweep, task, styles) for task in stage.tasks)
-    panels = tuple(panel for panel in found if panel is not None)
-    if panels and len(stage.conditions) > 1:
+    panels = [entropy_panel(sweep, task, styles) for task in stage.tasks]
+    if any(panels) and len(stage.conditions) > 1:
         yield Drawing(
             stage=stage.name,
             title=AGAINST_ENTROPY,
             caption="One point for each finished run. Where the values of q lie on one curve, the "
             "entropy explains what they end at; where they differ at the same entropy, q does.",
-            panels=panels,
-            legend=[(f"q = {q}", style._replace(line="solid")) for q, style in by_q.items()],
+            panels=tuple(filter(None, panels)),
+            legend=_legend_by_q(stage),
         )
 
 
 def drawings_of_stages(sweep: Sweep, stages: Sequence[Stage]) -> Iterator[Drawing]:
-    """What all stages that train for the task come to, together; none for a single one."""
+    """Curves of all stages that train for the task, together; none for a single stage."""
     together = side_by_side(stages)
     if together is None:
         return
-    found = _all_curves(sweep, together, OF_ALL_STAGES)
+    curves = _all_curves(sweep, together, OF_ALL_STAGES)
     styles = styles_by_stage(together.conditions)
+    legend = [(named_by_stage(condition), style) for condition, style in styles.items()]
     for metric in OF_ALL_STAGES:
-        drawing = _curves(together, metric, found, styles)
-        if drawing is not None:
-            legend = [(named_by_stage(condition), style) for condition, style in styles.items()]
-            # Each stage's own drawing has the values.
-            yield replace(drawing, legend=legend, values=())
+        for drawing in _curves(together, metric, curves, styles):
+            yield replace(drawing, legend=legend)
 
 
 def named_by_stage(condition: Condition) -> str:
-    """`music-r, q = 1.5`: of all stages together."""
+    """The label of a condition of all stages together: `music-r, q = 1.5`."""
     (_, stage), *others = condition.others
     rest = replace(condition, others=tuple(others))
     return f"{stage}, {rest.label}"
 
 
 def _all_curves(
-    sweep: Sweep, stage: Stage, metrics: Sequence[Metric] = METRICS
+    sweep: Sweep, stage: Stage, metrics: Sequence[Metric]
 ) -> dict[tuple[str, str], list[Curve]]:
-    """By metric and task; the return of those tasks only that are judged by it."""
+    """By metric and task; the return of only those tasks that are judged by it."""
     curves: dict[tuple[str, str], list[Curve]] = {}
     for metric, task, condition in product(metrics, stage.tasks, stage.conditions):
         if metric.name == names.EVAL_RETURN != sweep.primary_metric(task):
             continue
-        one = curve(sweep, condition, task, metric.name)
-        if one is not None:
-            curves.setdefault((metric.name, task), []).append(one)
+        found = curve(sweep, condition, task, metric.name)
+        if found is not None:
+            curves.setdefault((metric.name, task), []).append(found)
     return curves
 
 
 def _curves(
     stage: Stage,
     metric: Metric,
-    found: Mapping[tuple[str, str], list[Curve]],
+    curves: Mapping[tuple[str, str], list[Curve]],
     styles: Mapping[Condition, Style],
-) -> Drawing | None:
-    panels, values = [], []
-    shown = {task: found[metric.name, task] for task in stage.tasks if (metric.name, task) in found}
-    for task, curves in shown.items():
-        panels.append(curve_panel(metric, task, curves, styles))
-        for one in curves:
-            head = (stage.name, task, one.condition.label, metric.name)
-            values += [(*head, *row) for row in _rows(one)]
-    if not panels:
-        return None
-    return Drawing(
-        stage=stage.name,
-        title=metric.title,
-        caption=_caption(stage, metric),
-        panels=tuple(panels),
-        legend=_legend(stage),
-        group=_GROUP_OF.get(metric.name, PERFORMANCE),
-        metric=metric,
-        curves=shown,
-        values=tuple(values),
-    )
-
-
-def _rows(one: Curve) -> Iterator[tuple[object, ...]]:
-    columns = (one.steps, one.runs, one.estimate.value, one.estimate.lower, one.estimate.upper)
-    for step, runs, *numbers in zip(*columns, strict=True):
-        yield int(step), int(runs), *(float(number) for number in numbers)
+) -> Iterator[Drawing]:
+    """The learning curves of a metric, if there are any."""
+    by_task = {t: curves[metric.name, t] for t in stage.tasks if (metric.name, t) in curves}
+    if by_task:
+        yield Drawing(
+            stage=stage.name,
+            title=metric.title,
+            caption=_caption(stage, metric),
+            panels=tuple(curve_panel(metric, t, found, styles) for t, found in by_task.items()),
+            legend=_legend(stage),
+            group=_GROUP_OF.get(metric.name, PERFORMANCE),
+            metric=metric,
+            curves=by_task,
+        )
 
 
 def _caption(stage: Stage, metric: Metric) -> str:
@@ -256,22 +218,29 @@ def _caption(stage: Stage, metric: Metric) -> str:
 
 
 def _legend(stage: Stage) -> Legend:
-    return [(c.label, style_of(c, stage.conditions)) for c in stage.conditions]
+    return [(condition.label, style) for condition, style in styles_of(stage.conditions).items()]
+
+
+def _styles_by_q(stage: Stage) -> dict[str, Style]:
+    return {c.entropic_index: style for c, style in styles_of(stage.conditions).items()}
+
+
+def _legend_by_q(stage: Stage) -> Legend:
+    styles = _styles_by_q(stage)
+    return [(f"q = {q}", style._replace(line="solid")) for q, style in styles.items()]
 
 
 def _influence(sweep: Sweep, analysis: StageAnalysis) -> Iterator[Drawing]:
-    """What the settings do, where more than q varies."""
+    """The effect of settings, where more than q varies."""
     stage = analysis.stage
-    by_q = {c.entropic_index: style_of(c, stage.conditions) for c in stage.conditions}
-    found = importances(sweep, analysis)
-    per_task = [(t, [one for one in found if one.task == t]) for t in stage.tasks]
+    shares = importances(sweep, analysis)
     parallel = [parallel_panel(scope, stage.conditions) for scope in analysis.scopes]
-    lines = [(f"q = {q}", style._replace(line="solid")) for q, style in by_q.items()]
+    by_q = _legend_by_q(stage)
     bars = [(n, Style(BARS[n == CHANCE], "s", "solid")) for n in ("setting", CHANCE)]
     drawings = (
-        (sensitivity_panels(analysis), _SENSITIVITY, lines),
-        ([importance_panel(task, some) for task, some in per_task if some], _IMPORTANCE, bars),
-        ([panel for panel in parallel if panel is not None], _PARALLEL, lines),
+        (sensitivity_panels(analysis), _SENSITIVITY, by_q),
+        ([importance_panel(*item) for item in shares.items()], _IMPORTANCE, bars),
+        ([panel for panel in parallel if panel is not None], _PARALLEL, by_q),
     )
     for title, (panels, caption, legend) in zip(INFLUENCE, drawings, strict=True):
         if panels:

@@ -24,6 +24,7 @@ from music_rllib.report.figures.palette import DARK, LIGHT, colour_of, marker_of
 from music_rllib.report.figures.processes import drawing_processes
 from music_rllib.report.limitations import planned_runs
 from music_rllib.report.page import Report, render
+from music_rllib.report.tables import curves_table
 from music_rllib.results.analysis import THRESHOLDS, analyse
 from music_rllib.results.comparison import Scope, verdict
 from music_rllib.results.conditions import SIDE_BY_SIDE, Condition, find_stages, stage_by_stage
@@ -532,7 +533,7 @@ def test_a_task_without_success_is_judged_by_its_return_everywhere() -> None:
     drawn = {drawing.title: drawing for drawing in report.drawings}
     assert list(drawn) == ["Return", "Final return"]
     assert "return of an episode" in render(report)
-    assert {row[3] for row in drawn["Return"].values} == {names.EVAL_RETURN}
+    assert {row[3] for row in curves_table(report.drawings).rows} == {names.EVAL_RETURN}
     assert not report.analyses[0].waits, "there is no success rate to wait for"
     assert row_of(render(report), "Reacher", "q = 1.5", "return") == [
         *("-5.00", "-5.98 to -4.02", "-6.00 -5.50 -5.00 -4.50 -4.00", "5", "5")
@@ -714,7 +715,7 @@ def test_importance_with_many_seeds_is_found_in_seconds() -> None:
             for seed in range(30)
         ]
     )
-    shares = {one.setting: one.share for one in importances(sweep, analyse(sweep)[0])}
+    (shares,) = importances(sweep, analyse(sweep)[0]).values()
     assert max(shares, key=lambda name: shares[name]) == "q"
     assert 0 < shares[CHANCE] < 0.2
 
@@ -722,7 +723,7 @@ def test_importance_with_many_seeds_is_found_in_seconds() -> None:
 def test_what_matters_is_found_and_drawn() -> None:
     report = report_on(grid_of_settings())
     (analysis,) = report.analyses
-    shares = {one.setting: one.share for one in importances(report.sweep, analysis)}
+    (shares,) = importances(report.sweep, analysis).values()
     assert set(shares) == {"q", "α", "MI weight", CHANCE}
     assert shares["q"] > 0.8
     assert shares["MI weight"] < 0.05
