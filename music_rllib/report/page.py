@@ -22,7 +22,7 @@ from music_rllib.report.figures.choice import (
 )
 from music_rllib.report.figures.draw import Figures
 from music_rllib.report.figures.importance import FEWEST_RUNS, varied
-from music_rllib.report.pieces import DASH, Figure, Panels, TextTable, document
+from music_rllib.report.pieces import DASH, TextTable, document
 from music_rllib.report.study import study_tables
 from music_rllib.report.videos import Films
 from music_rllib.report.web.charts import chart_data
@@ -79,7 +79,7 @@ def render(report: Report, *, live: bool = False) -> str:
     """
     sweep = report.sweep
     data = chart_data(sweep, report.drawings)
-    numbers = {stage["name"]: number for number, stage in enumerate(data["stages"])}
+    stages = [stage["name"] for stage in data["stages"]]
     answer_lines = _answer(report)
     # The claims stand in large letters, and how runs were counted below them in small ones.
     counted = (i for i, line in enumerate(answer_lines) if line.startswith("Counted:"))
@@ -93,8 +93,10 @@ def render(report: Report, *, live: bool = False) -> str:
         asked=_question(report),
         said=answer_lines[:claims],
         about=answer_lines[claims:],
-        large=_large_figure(report, numbers),
-        groups=list(_groups(report, numbers)),
+        numbers={stage: number for number, stage in enumerate(stages)},
+        pictures=report.figures.pictures,
+        large=_large_figure(report, stages),
+        groups=list(_groups(report)),
         differences=[table for table in report.differences if table.rows],
         searches=[search_section(search) for search in sweep.searches],
         films=report.films,
@@ -174,14 +176,15 @@ def _answer(report: Report) -> list[str]:
 # Figures ----------------------------------------------------------------------------------------
 
 
-def _large_figure(report: Report, numbers: Mapping[str, int]) -> Figure | None:
+def _large_figure(report: Report, stages: Sequence[str]) -> Mapping[str, Any] | None:
     """Learning curves of the primary metrics: of all stages together, or of the last stage."""
-    stages = [stage for stage in numbers if stage == SIDE_BY_SIDE] or list(numbers)[-1:]
-    drawings = [d for d in report.drawings if d.stage in stages and d.title in PRIMARY]
-    return _figure(report, "Learning curves", drawings, numbers, metric="") if drawings else None
+    shown = [stage for stage in stages if stage == SIDE_BY_SIDE] or stages[-1:]
+    drawings = [d for d in report.drawings if d.stage in shown and d.title in PRIMARY]
+    # The reader selects its metric.
+    return {**_figure("Learning curves", drawings), "metric": ""} if drawings else None
 
 
-def _groups(report: Report, numbers: Mapping[str, int]) -> Iterable[Mapping[str, Any]]:
+def _groups(report: Report) -> Iterable[Mapping[str, Any]]:
     """Figures, tables and remarks under each heading that has any."""
     stages = {drawing.stage for drawing in report.drawings if drawing.stage != SIDE_BY_SIDE}
     analyses = [*filter(None, [report.together]), *report.analyses]
@@ -201,7 +204,7 @@ def _groups(report: Report, numbers: Mapping[str, int]) -> Iterable[Mapping[str,
             if drawing.group == group and not in_large:
                 by_title.setdefault(drawing.title, []).append(drawing)
         content = {
-            "figures": [_figure(report, *item, numbers) for item in by_title.items()],
+            "figures": [_figure(*item) for item in by_title.items()],
             "tables": [table for table in tables.get(group, ()) if table.rows],
             "said": remarks.get(group, []),
         }
@@ -209,35 +212,19 @@ def _groups(report: Report, numbers: Mapping[str, int]) -> Iterable[Mapping[str,
             yield {"title": group, **content}
 
 
-def _figure(
-    report: Report,
-    title: str,
-    drawings: Sequence[Drawing],
-    numbers: Mapping[str, int],
-    metric: str | None = None,
-) -> Figure:
-    if metric is None and drawings[0].metric is not None:
-        metric = drawings[0].metric.name
-    pictures = report.figures.pictures
-    return Figure(
-        name=slug(title),
-        title=title,
-        caption=drawings[-1].caption,
-        metric=metric,
-        stages=[
-            Panels(
-                name=drawing.name,
-                stage=drawing.stage if len(drawings) > 1 else "",
-                number=numbers.get(drawing.stage, -1),
-                legend=drawing.legend,
-                panels=[
-                    (f"{drawing.title}, {panel.title}", panel.title, svg)
-                    for panel, svg in zip(drawing.panels, pictures[drawing.name], strict=True)
-                ],
-            )
-            for drawing in drawings
-        ],
-    )
+def _figure(title: str, drawings: Sequence[Drawing]) -> Mapping[str, Any]:
+    """A figure of one or more stages; the page's script draws the curves of its metric."""
+    metric = drawings[0].metric
+    panels = sum(len(drawing.panels) for drawing in drawings)
+    return {
+        "name": slug(title),
+        "title": title,
+        "caption": drawings[-1].caption,
+        "metric": None if metric is None else metric.name,
+        "drawings": drawings,
+        # A CSS class for the number of columns that it spans.
+        "span": ("one", "two", "three")[min(panels, 3) - 1],
+    }
 
 
 def _remarks(report: Report) -> Iterable[Sequence[str]]:

@@ -13,7 +13,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from jinja2.utils import htmlsafe_json_dumps
 
-from music_rllib.report.figures.palette import DASHES, Style
+from music_rllib.report.figures.palette import DASHES
 from music_rllib.results.comparison import interval_text, number
 from music_rllib.results.statistics import Estimate
 
@@ -80,38 +80,6 @@ def _cell(value: object) -> Cell:
     if isinstance(value, Cell):
         return value
     return Cell(text=str(value), kind="number" if isinstance(value, int | float) else "")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Panels:
-    """The static panels of one stage in a figure, shown where no script runs."""
-
-    name: str
-    stage: str
-    """Name of the stage; empty where the figure has a single stage."""
-    number: int
-    """Index of the stage in the script's data; -1 if it has none of the stage."""
-    legend: Sequence[tuple[str, Style]]
-    panels: Sequence[tuple[str, str, str]]
-    """(description, title, SVG element) of each panel."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Figure:
-    """A figure of the page: a title, the panels of one or more stages and a caption."""
-
-    name: str
-    title: str
-    caption: str
-    metric: str | None
-    """Metric whose curves the script draws; empty: the one that the reader selects."""
-    stages: Sequence[Panels]
-
-    @property
-    def span(self) -> str:
-        """CSS class for the number of page columns that it spans."""
-        panels = sum(len(stage.panels) for stage in self.stages)
-        return ("one", "two", "three")[min(panels, 3) - 1]
 
 
 _PAGES = Environment(

@@ -78,11 +78,11 @@ def study_csv(study: Study) -> Iterator[Table]:
     means = [row | {"by_seed": _seed_scores(row["by_seed"])} for row in mean_rows(study)]
     claims = [row | {"seeds": " ".join(map(str, row["seeds"]))} for row in claim_rows(study)]
     for name, rows in (("area_under_curve", means), ("comparisons", claims)):
-        columns = list(rows[0]) if rows else []
+        columns = " ".join(rows[0]) if rows else ""
         yield Table(name=name, columns=columns, rows=[list(row.values()) for row in rows])
     yield Table(
         name="alpha_sensitivity",
-        columns=("task", "entropic_index", "others", "alpha", "mean", "lower", "upper", "seeds"),
+        columns="task entropic_index others alpha mean lower upper seeds",
         rows=[
             (
                 line.task,

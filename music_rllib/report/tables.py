@@ -21,14 +21,15 @@ class Table:
     """The content of one CSV file."""
 
     name: str
-    columns: Sequence[str]
+    columns: str
+    """Names of the columns, separated by spaces."""
     rows: Sequence[Sequence[object]]
 
     def to_csv(self) -> str:
         """The rows below a header; NaN is `nan`, infinity `inf`."""
         buffer = io.StringIO()
         writer = csv.writer(buffer, lineterminator="\n")
-        writer.writerow(self.columns)
+        writer.writerow(self.columns.split())
         writer.writerows(self.rows)
         return buffer.getvalue()
 
@@ -41,12 +42,9 @@ def finals_table(analyses: Iterable[StageAnalysis]) -> Table:
     """Final values of each condition and of each of its seeds, means over the tasks."""
     return Table(
         name="final",
-        columns=(
-            *("stage", "tasks", "metric", "condition", "runs", "seeds", "mean", "lower", "upper"),
-            "each_seed",
-            *("shannon_entropy", "shannon_entropy_lower", "shannon_entropy_upper"),
-            *("tsallis_entropy", "tsallis_entropy_lower", "tsallis_entropy_upper"),
-        ),
+        columns="stage tasks metric condition runs seeds mean lower upper each_seed "
+        "shannon_entropy shannon_entropy_lower shannon_entropy_upper tsallis_entropy "
+        "tsallis_entropy_lower tsallis_entropy_upper",
         rows=[
             (
                 analysis.stage.name,
@@ -76,7 +74,7 @@ def note(analyses: Iterable[StageAnalysis], run_id: str, figure: str | None) -> 
     """
     columns = ("tasks", "condition", "seeds", "metric", "mean", "lower", "upper")
     final = finals_table(list(analyses)[-1:])
-    chosen = [final.columns.index(name) for name in columns]
+    chosen = [final.columns.split().index(name) for name in columns]
     rows = [[_cell_text(row[column]) for column in chosen] for row in final.rows]
     lines = [f"| {' | '.join(map(_escaped, row))} |" for row in (columns, *rows)]
     lines.insert(1, "|---" * len(columns) + "|")
@@ -98,10 +96,8 @@ def improvement_table(analyses: Iterable[StageAnalysis]) -> Table:
     """Probability of improvement of each pair of conditions."""
     return Table(
         name="probability_of_improvement",
-        columns=(
-            *("stage", "tasks", "first", "second", "probability_first_higher", "lower", "upper"),
-            *("gap", "gap_lower", "gap_upper", "p_value_holm", "decided"),
-        ),
+        columns="stage tasks first second probability_first_higher lower upper gap gap_lower "
+        "gap_upper p_value_holm decided",
         rows=[
             (
                 analysis.stage.name,
@@ -124,10 +120,7 @@ def waits_table(analyses: Iterable[StageAnalysis]) -> Table:
     """Environment steps that each condition needs to each success rate."""
     return Table(
         name="steps_to_threshold",
-        columns=(
-            *("stage", "task", "condition", "threshold", "runs", "reached"),
-            *("median_env_steps", "lower", "upper", "each_run"),
-        ),
+        columns="stage task condition threshold runs reached median_env_steps lower upper each_run",
         rows=[
             (
                 analysis.stage.name,
@@ -154,10 +147,8 @@ def races_table(analyses: Iterable[StageAnalysis]) -> Table:
     """Probability that one condition reaches a success rate sooner than another, by pairs."""
     return Table(
         name="probability_sooner",
-        columns=(
-            *("stage", "task", "threshold", "first", "second", "probability_first_sooner"),
-            *("lower", "upper", "p_value_holm", "decided", "reached"),
-        ),
+        columns="stage task threshold first second probability_first_sooner lower upper "
+        "p_value_holm decided reached",
         rows=[
             (
                 analysis.stage.name,
@@ -180,11 +171,8 @@ def runs_table(sweep: Sweep) -> Table:
     """Every run of the sweep, with its last evaluation and entropies."""
     return Table(
         name="runs",
-        columns=(
-            *("run_id", "name", "stage", "task", "entropic_index", "seed", "status", "env_steps"),
-            *("budget", "seconds", "success_rate", "episode_return", "failure"),
-            *("shannon_entropy", "tsallis_entropy"),
-        ),
+        columns="run_id name stage task entropic_index seed status env_steps budget seconds "
+        "success_rate episode_return failure shannon_entropy tsallis_entropy",
         rows=[
             (
                 run.run_id,
@@ -211,10 +199,7 @@ def curves_table(drawings: Iterable[Drawing]) -> Table:
     """The points of all learning curves; stages side by side have none but those of each stage."""
     return Table(
         name="curves",
-        columns=(
-            *("stage", "task", "condition", "metric", "env_steps", "runs"),
-            *("mean", "lower", "upper"),
-        ),
+        columns="stage task condition metric env_steps runs mean lower upper",
         rows=[
             (drawing.stage, task, curve.condition.label, drawing.metric.name, *point)
             for drawing in drawings

@@ -1,4 +1,4 @@
-"""Whether it is q or the entropy that it leaves: how runs ended against how random they were."""
+"""Final values of runs against their policy's entropy: whether q or the entropy explains them."""
 
 from __future__ import annotations
 
@@ -12,14 +12,12 @@ from music_rllib.report.figures.plots import RATE_LIMITS, Panel, belongs
 from music_rllib.results.conditions import Condition
 from music_rllib.results.data import Sweep
 
-__all__ = ["entropy_panel"]
-
 
 def entropy_panel(sweep: Sweep, task: str, styles: Mapping[Condition, Style]) -> Panel | None:
-    """A point for each finished run on the task: what it ended at, over its Shannon entropy then.
+    """A point for each finished run on the task: its final value over its final Shannon entropy.
 
     Returns:
-        None where fewer than two runs have an entropy.
+        None if fewer than two runs have an entropy.
     """
     metric = sweep.primary_metric(task)
     is_rate = metric in names.EVAL_RATES

@@ -48,7 +48,7 @@ TARGET = 0.85
 """Success rate that Figure 4 of the paper waits for."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Metric:
     """A metric that has learning curves."""
 
@@ -62,33 +62,14 @@ class Metric:
 
 RATE_LIMITS = (-0.03, 1.03)
 METRICS = (
-    Metric(
-        name=names.EVAL_SUCCESS,
-        title="Success rate",
-        axis="success rate",
-        limits=RATE_LIMITS,
-        target=TARGET,
-    ),
-    Metric(name=names.EVAL_RETURN, title="Return", axis="return of an episode"),
-    Metric(
-        name=names.EVAL_SUCCESS_ANY,
-        title="Success at any step",
-        axis="success at any step",
-        limits=RATE_LIMITS,
-    ),
-    Metric(
-        name=names.EVAL_DISPLACEMENT,
-        title="Object displacement",
-        axis="object displacement (m)",
-    ),
-    Metric(name=names.MI_BOUND, title="Mutual-information bound", axis="MI bound (nats)"),
-    Metric(name=names.MI_REWARD, title="Mutual-information reward", axis="MI reward per step"),
-    Metric(name=names.ENTROPY, title="Tsallis entropy of the policy", axis="Tsallis entropy"),
-    Metric(
-        name=names.SHANNON_ENTROPY,
-        title="Shannon entropy of the policy",
-        axis="Shannon entropy (nats)",
-    ),
+    Metric(names.EVAL_SUCCESS, "Success rate", "success rate", RATE_LIMITS, TARGET),
+    Metric(names.EVAL_RETURN, "Return", "return of an episode"),
+    Metric(names.EVAL_SUCCESS_ANY, "Success at any step", "success at any step", RATE_LIMITS),
+    Metric(names.EVAL_DISPLACEMENT, "Object displacement", "object displacement (m)"),
+    Metric(names.MI_BOUND, "Mutual-information bound", "MI bound (nats)"),
+    Metric(names.MI_REWARD, "Mutual-information reward", "MI reward per step"),
+    Metric(names.ENTROPY, "Tsallis entropy of the policy", "Tsallis entropy"),
+    Metric(names.SHANNON_ENTROPY, "Shannon entropy of the policy", "Shannon entropy (nats)"),
 )
 
 

@@ -1,4 +1,4 @@
-// What the reader may choose: conditions, tasks, metric, x axis, smoothing; and the order of tables.
+// The reader's controls: conditions, tasks, metric, x axis and smoothing of curves; sorting of tables.
 "use strict";
 
 const X_AXES = {
@@ -10,7 +10,7 @@ const X_AXES = {
 const choice = { stage: 0, metric: "", x: "steps", smooth: 1, conditions: new Set(), tasks: new Set() };
 let data = JSON.parse(document.getElementById("data").textContent);
 
-/** Mean over the `width` nearest points; what is missing stays so. */
+/** Means over the `width` nearest points; missing values stay missing. */
 function smoothed(values, width) {
   if (width <= 1) return values;
   const half = (width - 1) / 2;
@@ -26,7 +26,7 @@ function timeUnit(curves) {
   return last >= 7200 ? [3600, "h"] : last >= 120 ? [60, "min"] : [1, "s"];
 }
 
-/** The curves of one panel as they are to be drawn; none where nothing is chosen or known. */
+/** The selected curves of one panel, with the selected x axis and smoothing. */
 function chosen(stage, metric, task) {
   const found = (data.curves[stage]?.[metric] ?? []).filter((curve) => curve.task === task);
   const kept = found.filter((curve) => !choice.conditions.has(data.stages[stage].conditions[curve.condition].key));
@@ -63,7 +63,7 @@ function drawNow(box) {
   if (panel) drawPanel(box, { ...panel, ...chosen(panel.stage, panel.metric.name, panel.task) });
 }
 
-/** One box per stage and task; they are drawn as soon as they are near the window. */
+/** Makes a box per stage and task, which is drawn when it comes near the window. */
 function fill(parent, wanted) {
   const boxes = wanted.filter(({ stage, task }) => !choice.tasks.has(data.stages[stage].tasks[task]));
   while (parent.children.length > boxes.length) parent.lastChild.remove();
