@@ -79,7 +79,7 @@ def render(report: Report, *, live: bool = False) -> str:
     """
     sweep = report.sweep
     data = chart_data(sweep, report.drawings)
-    stages = [stage["name"] for stage in data["stages"]]
+    numbers = {stage["name"]: number for number, stage in enumerate(data["stages"])}
     answer_lines = _answer(report)
     # The claims stand in large letters, and how runs were counted below them in small ones.
     counted = (i for i, line in enumerate(answer_lines) if line.startswith("Counted:"))
@@ -93,9 +93,9 @@ def render(report: Report, *, live: bool = False) -> str:
         asked=_question(report),
         said=answer_lines[:claims],
         about=answer_lines[claims:],
-        numbers={stage: number for number, stage in enumerate(stages)},
+        numbers=numbers,
         pictures=report.figures.pictures,
-        large=_large_figure(report, stages),
+        large=_large_figure(report, list(numbers)),
         groups=list(_groups(report)),
         differences=[table for table in report.differences if table.rows],
         searches=[search_section(search) for search in sweep.searches],
@@ -131,9 +131,10 @@ def _facts(report: Report) -> Sequence[tuple[str, object]]:
 
 def _main_analysis(report: Report) -> StageAnalysis | None:
     """Stages against each other, or the last stage that trains for the task, or the last one."""
+    if report.together is not None or not report.analyses:
+        return report.together
     with_task = [one for one in report.analyses if one.stage.has_task_reward]
-    last = (with_task or report.analyses)[-1:]
-    return report.together or next(iter(last), None)
+    return (with_task or report.analyses)[-1]
 
 
 def _question(report: Report) -> str:
@@ -188,9 +189,9 @@ def _groups(report: Report) -> Iterable[Mapping[str, Any]]:
     """Figures, tables and remarks under each heading that has any."""
     stages = {drawing.stage for drawing in report.drawings if drawing.stage != SIDE_BY_SIDE}
     analyses = [*filter(None, [report.together]), *report.analyses]
-    tables: dict[str, Sequence[TextTable]] = {
-        PERFORMANCE: study_tables(report.study)
-        + (performance_tables(analyses) if analyses else []),
+    performance = performance_tables(analyses) if analyses else []
+    tables = {
+        PERFORMANCE: [*study_tables(report.study), *performance],
         COST: [budget(report.sweep, report.analyses), failures(report.sweep)],
     }
     remarks = {PERFORMANCE: list(_remarks(report)), SETTINGS: list(_not_drawn(report))}
@@ -198,10 +199,8 @@ def _groups(report: Report) -> Iterable[Mapping[str, Any]]:
         by_title: dict[str, list[Drawing]] = {}
         for drawing in report.drawings:
             # The large figure has the primary metrics of its stages.
-            in_large = drawing.title in PRIMARY and (
-                drawing.stage == SIDE_BY_SIDE or len(stages) < 2
-            )
-            if drawing.group == group and not in_large:
+            is_large = drawing.stage == SIDE_BY_SIDE or len(stages) < 2
+            if drawing.group == group and not (is_large and drawing.title in PRIMARY):
                 by_title.setdefault(drawing.title, []).append(drawing)
         content = {
             "figures": [_figure(*item) for item in by_title.items()],

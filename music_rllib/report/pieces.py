@@ -1,4 +1,4 @@
-"""Tables and figures of the page as data, which `web/page.html` renders with all text escaped."""
+"""Tables of the page as data, and the page itself, whose template escapes all texts."""
 
 from __future__ import annotations
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 from itertools import product
 
 from music_rllib import names
-from music_rllib.report.figures.entropy import entropy_panel
 from music_rllib.report.figures.importance import (
     CHANCE,
     importance_panel,
@@ -23,6 +22,7 @@ from music_rllib.report.figures.plots import (
     Metric,
     Panel,
     curve_panel,
+    entropy_panel,
     finals_panel,
     profile_panel,
 )

@@ -1,4 +1,4 @@
-"""Panels of learning curves, final values and performance profiles (the paper's Figures 4 to 7).
+"""Panels of learning curves, final values, profiles and entropies (the paper's Figures 4 to 7).
 
 A *panel* shows one task; its function `draw` draws it on given axes.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 import textwrap
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -25,6 +25,7 @@ from music_rllib.results import statistics as st
 from music_rllib.results.analysis import Curve
 from music_rllib.results.comparison import SHOW_SEEDS_BELOW, Final, Scope, interval_text, number
 from music_rllib.results.conditions import Condition
+from music_rllib.results.data import Sweep
 from music_rllib.results.statistics import Array, Estimate
 
 Legend = Sequence[tuple[str, Style]]
@@ -106,7 +107,7 @@ def curve_panel(
         axes.set_ylim(axes.get_ylim())
         for curve, artists in zip(curves, drawn, strict=True):
             band = _band(axes, curve.steps, curve.estimate, styles[curve.condition].colour)
-            belongs([*artists, band], numbers[curve.condition], curve.condition.label)
+            mark_condition([*artists, band], numbers[curve.condition], curve.condition.label)
         axes.set_xlim(left=0.0)
         axes.set_ylabel(metric.axis)
         axes.set_xlabel("environment steps")
@@ -135,7 +136,7 @@ def profile_panel(scope: Scope[Condition], siblings: tuple[Condition, ...]) -> P
                 thresholds, profile.value, where="post", color=colour, linestyle=line, linewidth=1.8
             )
             band = _band(axes, thresholds, profile, colour, step="post")
-            belongs([*lines, band], siblings.index(final.condition), final.condition.label)
+            mark_condition([*lines, band], siblings.index(final.condition), final.condition.label)
         axes.set_xlabel("final success rate τ")
         axes.set_ylabel("share of runs above τ")
         axes.set_xlim(-0.02, 1.02)
@@ -163,10 +164,49 @@ def finals_panel(scope: Scope[Condition], siblings: tuple[Condition, ...]) -> Pa
             artists = _draw_final(axes, row, final, styles[final.condition], label)
             result = f"{number(final.value)}, {interval_text(final.estimate)}"
             title = f"{final.condition.label}: {result}"
-            belongs(artists, siblings.index(final.condition), title)
+            mark_condition(artists, siblings.index(final.condition), title)
         axes.set_xlabel("final success rate" if is_rate else f"final {names.word_of(scope.metric)}")
 
     return Panel(title=scope.name, draw=draw, height=height)
+
+
+def entropy_panel(sweep: Sweep, task: str, styles: Mapping[Condition, Style]) -> Panel | None:
+    """A point for each finished run on the task: its final value over its final Shannon entropy.
+
+    Returns:
+        None if fewer than two runs have an entropy.
+    """
+    metric = sweep.primary_metric(task)
+    is_rate = metric in names.EVAL_RATES
+    points = {
+        condition: [
+            (entropy, score)
+            for run in condition.runs
+            if sweep.runs[run].task == task
+            and sweep.runs[run].status == "FINISHED"
+            and (entropy := sweep.final(run, names.SHANNON_ENTROPY)) is not None
+            and (score := sweep.final(run, metric)) is not None
+        ]
+        for condition in styles
+    }
+    if sum(map(len, points.values())) < 2:
+        return None
+
+    def draw(axes: Axes) -> None:
+        for place, (condition, pairs) in enumerate(points.items()):
+            style = styles[condition]
+            entropies, scores = zip(*pairs, strict=True) if pairs else ((), ())
+            marks = axes.plot(
+                entropies, scores, style.marker,
+                color=style.colour, markersize=6, alpha=0.75, mew=0,
+            )  # fmt: skip
+            mark_condition(marks, place, condition.label)
+        axes.set_xlabel("Shannon entropy at the end (nats)")
+        axes.set_ylabel("final success rate" if is_rate else f"final {names.word_of(metric)}")
+        if is_rate:
+            axes.set_ylim(*RATE_LIMITS)
+
+    return Panel(title=task, draw=draw)
 
 
 def labelled_rows(labels: Sequence[str]) -> tuple[list[str], float]:
@@ -221,7 +261,8 @@ def _draw_curve(
     if 1 < len(curve.values) < SHOW_SEEDS_BELOW:
         artists += axes.plot(curve.steps, curve.values.T, color=colour, linewidth=0.6, alpha=0.55)
     whole = curve.runs == curve.runs.max()
-    for (covers, thick), parts in _stretches(np.column_stack([curve.steps, value]), rank, whole):
+    stretches = _stretches(np.column_stack([curve.steps, value]), rank, whole)
+    for (covers, thick), parts in stretches.items():
         dash = (0.0, (_DASH, _DASH * covers)) if covers else line
         width = 1.8 if thick else 0.8
         lines = LineCollection(parts, colors=colour, linestyles=[dash], linewidths=width, zorder=2)
@@ -240,9 +281,7 @@ def _draw_curve(
     return artists
 
 
-def _stretches(
-    points: Array, rank: Array, whole: Array
-) -> Iterator[tuple[tuple[int, bool], list[Array]]]:
+def _stretches(points: Array, rank: Array, whole: Array) -> dict[tuple[int, bool], list[Array]]:
     """Parts of a curve by the number of curves they cover and by whether every run counts there."""
     covers = np.minimum(rank[:-1], rank[1:])
     changes = np.flatnonzero((np.diff(covers) != 0) | (whole[1:-1] != whole[2:])) + 1
@@ -252,7 +291,7 @@ def _stretches(
         if first < last:
             key = (int(covers[first]), bool(whole[first + 1]))
             stretches.setdefault(key, []).append(points[first : last + 1])
-    yield from stretches.items()
+    return stretches
 
 
 def _band(
@@ -295,7 +334,7 @@ def row_label(axes: Axes, height: float, label: str) -> Artist:
     )
 
 
-def belongs(artists: Sequence[Artist], condition: int, title: str) -> None:
+def mark_condition(artists: Sequence[Artist], condition: int, title: str) -> None:
     """Mark artists as a condition's, by its number: the page shows and hides them by it."""
     for artist in artists:
         artist.set_gid(f"condition-{condition}-{title}")

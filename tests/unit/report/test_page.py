@@ -23,7 +23,7 @@ from music_rllib.report.figures.importance import CHANCE, importances, varied
 from music_rllib.report.figures.palette import DARK, LIGHT, colour_of, marker_of
 from music_rllib.report.figures.processes import drawing_processes
 from music_rllib.report.limitations import planned_runs
-from music_rllib.report.page import Report, render
+from music_rllib.report.page import render
 from music_rllib.report.tables import curves_table
 from music_rllib.results.analysis import THRESHOLDS, analyse
 from music_rllib.results.comparison import Scope, verdict
@@ -114,10 +114,6 @@ def compared(finals: Mapping[str, Sequence[float]], **changes: str) -> Sweep:
     )
 
 
-def report_on(sweep: Sweep) -> Report:
-    return build_report(sweep)
-
-
 def first_scope(sweep: Sweep) -> Scope[Condition]:
     return analyse(sweep)[0].scopes[0]
 
@@ -193,7 +189,7 @@ def test_the_spread_at_a_bound_promises_nothing(finals: dict[str, list[float]], 
 
 def test_a_threshold_that_nobody_reaches_is_said_to_be_that() -> None:
     sweep = compared({"1": [0.3, 0.4], "1.5": [0.6, 0.7]})
-    page = render(report_on(sweep))
+    page = render(build_report(sweep))
     assert row_of(page, "FetchPush", "q = 1.5 before q = 1", "85 %") == [
         *("–", "not reached by either", "–", "no")
     ]
@@ -245,7 +241,7 @@ def test_of_a_search_the_ranking_is_drawn_as_soon_as_there_is_one() -> None:
     fresh = [(q, seed, "final1", 0.6) for q in ("1", "1.2") for seed in (7, 8)]
 
     def drawn(sweep: Sweep) -> set[str]:
-        (curves, *_) = report_on(sweep).drawings
+        (curves, *_) = build_report(sweep).drawings
         return {label for label, _ in curves.legend}
 
     assert drawn(searched(*TRIALS)) == {f"q = {q}, seeds = search" for q in ("1", "1.2", "1.4")}
@@ -258,7 +254,7 @@ def test_how_random_policies_are_stands_beside_what_they_ended_at() -> None:
     values = [value for q in entropies for value in entropies[q]]
     shannon = columns([Points([names.SHANNON_ENTROPY], [last], [0], [value]) for value in values])
     sweep = replace(sweep, history={**sweep.history, **shannon})
-    report = report_on(sweep)
+    report = build_report(sweep)
     row = row_of(render(report), "FetchPush", "q = 2", "0.30")
     # Student's: .1/sqrt(3) times 4.303.
     assert row == ["0.05 to 0.55", "–", "–"]
@@ -442,7 +438,7 @@ SWEEPS: dict[str, Callable[[], tuple[Sweep, Sequence[str]]]] = {
 @pytest.mark.parametrize("state", SWEEPS)
 def test_any_state_of_a_sweep_has_a_page(state: str) -> None:
     sweep, expected = SWEEPS[state]()
-    shown = Page(render(report_on(sweep)))
+    shown = Page(render(build_report(sweep)))
     for words in expected:
         assert words in shown.text
     assert not shown.fetched
@@ -493,9 +489,9 @@ def hostile() -> Sweep:
 
 
 def test_a_script_in_any_text_of_a_sweep_is_shown_as_text() -> None:
-    made = replace(report_on(hostile()), command=SCRIPT, missing=[SCRIPT])
+    made = replace(build_report(hostile()), command=SCRIPT, missing=[SCRIPT])
     page = render(made)
-    shown, harmless = Page(page), Page(render(report_on(grid_of_settings())))
+    shown, harmless = Page(page), Page(render(build_report(grid_of_settings())))
     assert shown.tags <= harmless.tags | {"nav", "a", "pre"}
     assert not shown.handlers
     assert not shown.fetched
@@ -526,7 +522,7 @@ def returning(finals: Mapping[str, Sequence[float]], task: str = "Reacher") -> S
 
 def test_a_task_without_success_is_judged_by_its_return_everywhere() -> None:
     sweep = returning({"1": [-9, -8, -7, -9.5, -8.5], "1.5": [-5, -4, -6, -4.5, -5.5]})
-    report = report_on(sweep)
+    report = build_report(sweep)
     shown = Page(render(report))
     assert "Nothing was evaluated" not in shown.text
     assert "q = 1.5 is ahead on Reacher: q = 1.5 with -5.00 (-5.98 to -4.02, 5 seeds)" in shown.text
@@ -556,7 +552,7 @@ def test_tasks_with_and_without_success_stand_side_by_side_and_are_not_averaged(
         for position in range(len(sweep.runs)):
             steps, values = sweep.series(position, metric)
             points.append(Points([metric] * len(steps), list(steps), list(steps), list(values)))
-    report = report_on(sweep_of(list(zip(runs, points, strict=True))))
+    report = build_report(sweep_of(list(zip(runs, points, strict=True))))
     (analysis,) = report.analyses
     assert [(scope.name, scope.metric) for scope in analysis.scopes] == [
         ("FetchPush", names.EVAL_SUCCESS),
@@ -582,7 +578,7 @@ def of_stages(*stages: str) -> Sweep:
 
 
 def test_stages_that_train_for_the_task_are_drawn_side_by_side() -> None:
-    report = report_on(of_stages(*STAGES))
+    report = build_report(of_stages(*STAGES))
     (drawing,) = [one for one in report.drawings if one.stage == SIDE_BY_SIDE]
     named = [(label, style.colour, style.line) for label, style in drawing.legend]
     assert [label for label, _, _ in named] == [
@@ -594,7 +590,7 @@ def test_stages_that_train_for_the_task_are_drawn_side_by_side() -> None:
     page = render(report)
     assert f'id="{drawing.name}"' in page
     for one in (of_stages("pretrain", "plain"), of_stages("plain")):
-        assert SIDE_BY_SIDE not in {drawing.stage for drawing in report_on(one).drawings}
+        assert SIDE_BY_SIDE not in {drawing.stage for drawing in build_report(one).drawings}
 
 
 def test_stages_race_over_the_conditions_that_all_of_them_have() -> None:
@@ -607,7 +603,7 @@ def test_stages_race_over_the_conditions_that_all_of_them_have() -> None:
             for seed in range(2)
         ]
     )
-    report = report_on(sweep)
+    report = build_report(sweep)
     # To 50 %: 200,000 / final / 2 steps, the next evaluation; q = 2 has nobody to race with.
     assert report.together is not None
     (race,) = [race for race in report.together.races if race.threshold == 0.5]
@@ -644,7 +640,7 @@ def test_stages_are_compared_over_what_both_have_on_each_task() -> None:
 
 
 def test_a_legend_stays_inside_its_figure() -> None:
-    report = report_on(of_stages(*STAGES))
+    report = build_report(of_stages(*STAGES))
     (drawing,) = [one for one in report.drawings if one.stage == SIDE_BY_SIDE]
     for panels in (drawing.panels, drawing.panels * 2, drawing.panels * 3):
         figure = drawn_figure(panels, drawing.legend, TEXT_WIDTH, 8.0)
@@ -662,7 +658,7 @@ def test_figures_of_an_earlier_report_go_and_the_same_sweep_is_the_same_file(
         stale = tmp_path / name / "figures" / "old-stage-success-rate.png"
         stale.parent.mkdir(parents=True)
         stale.touch()
-        write_report(report_on(compared({"1": [0.5]})), tmp_path / name)
+        write_report(build_report(compared({"1": [0.5]})), tmp_path / name)
         figures = sorted((tmp_path / name / "figures").iterdir())
         assert [path.name for path in figures] == [
             f"{figure}{ending}"
@@ -675,10 +671,10 @@ def test_figures_of_an_earlier_report_go_and_the_same_sweep_is_the_same_file(
 
 def test_runs_link_to_a_server_s_pages() -> None:
     sweep = compared({"1": [0.5]})
-    assert '<a href="http' not in render(report_on(sweep))
+    assert '<a href="http' not in render(build_report(sweep))
     served = Sweep(**{**sweep.__dict__, "source": "http://mlflow:5000"})
     assert f'<a href="http://mlflow:5000/#/experiments/1/runs/{sweep.runs[0].run_id}">' in (
-        render(report_on(served))
+        render(build_report(served))
     )
 
 
@@ -721,7 +717,7 @@ def test_importance_with_many_seeds_is_found_in_seconds() -> None:
 
 
 def test_what_matters_is_found_and_drawn() -> None:
-    report = report_on(grid_of_settings())
+    report = build_report(grid_of_settings())
     (analysis,) = report.analyses
     (shares,) = importances(report.sweep, analysis).values()
     assert set(shares) == {"q", "α", "MI weight", CHANCE}
@@ -746,16 +742,16 @@ def test_one_varied_setting_gives_a_line_and_the_page_says_what_is_not_drawn() -
             for t in tags
         ]
     )
-    drawn = {drawing.title for drawing in report_on(lines).drawings}
+    drawn = {drawing.title for drawing in build_report(lines).drawings}
     assert "Sensitivity" in drawn
     assert not drawn & set(INFLUENCE[1:])
-    only_q = Page(render(report_on(compared({"1": [0.5, 0.6], "2": [0.6, 0.7]})))).text
+    only_q = Page(render(build_report(compared({"1": [0.5, 0.6], "2": [0.6, 0.7]})))).text
     assert "Not drawn: sensitivity, importance of settings, parallel coordinates" in only_q
     assert "This stage varies q;" in only_q
 
 
 def test_figures_are_the_same_drawn_here_and_in_other_processes() -> None:
-    drawings = report_on(compared({"1": [0.5, 0.6], "1.5": [0.6, 0.7]})).drawings[:2]
+    drawings = build_report(compared({"1": [0.5, 0.6], "1.5": [0.6, 0.7]})).drawings[:2]
     with drawing_processes() as processes:
         drawn = []
         for figures in (Figures(), Figures(processes)):
@@ -766,7 +762,7 @@ def test_figures_are_the_same_drawn_here_and_in_other_processes() -> None:
 
 
 def test_figures_are_drawn_here_where_the_processes_were_killed() -> None:
-    drawings = report_on(compared({"1": [0.5, 0.6], "1.5": [0.6, 0.7]})).drawings
+    drawings = build_report(compared({"1": [0.5, 0.6], "1.5": [0.6, 0.7]})).drawings
     with drawing_processes() as processes:
         assert processes is not None
         early = Figures(processes)
@@ -780,7 +776,7 @@ def test_figures_are_drawn_here_where_the_processes_were_killed() -> None:
 
 
 def test_files_show_characters_that_their_short_font_has_not() -> None:
-    drawing = report_on(compared({"1": [0.5, 0.6]}, task="Ж")).drawings[0]
+    drawing = build_report(compared({"1": [0.5, 0.6]}, task="Ж")).drawings[0]
     drawn = files(drawing.panels, drawing.legend)  # matplotlib warns where no font has it
     assert drawn[".pdf"].count(b"/FontFile2") == 2
 
@@ -788,7 +784,7 @@ def test_files_show_characters_that_their_short_font_has_not() -> None:
 def test_labels_of_rows_stand_beside_the_axis_in_a_browser_too() -> None:
     """In an SVG a browser leaves out the spaces that a text begins with."""
     long = {"1": [0.5, 0.6], "1.5 (" + 5 * "a schedule with many words, " + ")": [0.6, 0.7]}
-    pictures = report_on(compared(long)).figures.pictures
+    pictures = build_report(compared(long)).figures.pictures
     texts = re.findall(r"<text ([^>]*)>([^<]*)", pictures["finetune-final-success-rate"][0])
     labels = [(place, text) for place, text in texts if "q = " in text or "words" in text]
     assert len(labels) > 2
@@ -798,7 +794,7 @@ def test_labels_of_rows_stand_beside_the_axis_in_a_browser_too() -> None:
 
 
 def test_conditions_of_almost_the_same_colour_have_other_lines_and_markers() -> None:
-    drawing = report_on(compared({"1": [0.5, 0.6], "1.07177": [0.6, 0.7], "1.5": [0.6, 0.7]}))
+    drawing = build_report(compared({"1": [0.5, 0.6], "1.07177": [0.6, 0.7], "1.5": [0.6, 0.7]}))
     lines = [style.line for _, style in drawing.drawings[0].legend]
     assert lines == ["solid", "dashed", "solid"]
     markers = [style.marker for _, style in drawing.drawings[0].legend]
@@ -807,7 +803,7 @@ def test_conditions_of_almost_the_same_colour_have_other_lines_and_markers() -> 
 
 def test_a_condition_of_a_search_looks_the_same_in_every_figure() -> None:
     fresh = [(q, seed, "final1", 0.6) for q in ("1", "1.2", "1.4") for seed in (7, 8)]
-    drawings = report_on(searched(*TRIALS, ("1.15", 0, "trial3", 0.1), *fresh)).drawings
+    drawings = build_report(searched(*TRIALS, ("1.15", 0, "trial3", 0.1), *fresh)).drawings
     lines = {drawing.title: [style.line for _, style in drawing.legend] for drawing in drawings}
     curves, areas = lines["Success rate"], lines["Performance profile of the area under the curve"]
     assert curves == areas
