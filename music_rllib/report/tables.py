@@ -201,10 +201,10 @@ def curves_table(drawings: Iterable[Drawing]) -> Table:
         name="curves",
         columns="stage task condition metric env_steps runs mean lower upper",
         rows=[
-            (drawing.stage, task, curve.condition.label, drawing.metric.name, *point)
+            (drawing.stage, curve.task, curve.condition.label, drawing.metric.name, *point)
             for drawing in drawings
             if drawing.metric is not None and drawing.stage != SIDE_BY_SIDE
-            for task, curves in drawing.curves.items()
+            for curves in drawing.curves.values()
             for curve in curves
             for point in zip(
                 curve.steps.astype(int).tolist(),

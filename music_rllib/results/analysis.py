@@ -66,6 +66,7 @@ class Curve:
     """A metric of a condition on a task against environment steps."""
 
     condition: Condition
+    task: str
     steps: Array
     """`[points]`."""
     values: Array
@@ -223,6 +224,7 @@ def curve(sweep: Sweep, condition: Condition, task: str, metric: str) -> Curve |
     )
     return Curve(
         condition=condition,
+        task=task,
         steps=grid,
         values=values,
         estimate=st.estimate(

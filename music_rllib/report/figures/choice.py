@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
@@ -18,6 +19,7 @@ from music_rllib.report.figures.importance import (
 from music_rllib.report.figures.palette import BARS, Style, styles_by_stage, styles_of
 from music_rllib.report.figures.plots import (
     METRICS,
+    MOST_BANDS,
     Legend,
     Metric,
     Panel,
@@ -28,8 +30,8 @@ from music_rllib.report.figures.plots import (
 )
 from music_rllib.results.analysis import Curve, StageAnalysis, curve
 from music_rllib.results.claims.study import MOST_CONDITIONS
-from music_rllib.results.comparison import SHOW_SEEDS_BELOW, Scope
-from music_rllib.results.conditions import Condition, Stage, side_by_side
+from music_rllib.results.comparison import SHOW_SEEDS_BELOW, Final, Scope
+from music_rllib.results.conditions import SIDE_BY_SIDE, Condition, Stage, side_by_side
 from music_rllib.results.data import Sweep
 
 FINALS = {names.EVAL_SUCCESS: "Final success rate", names.EVAL_RETURN: "Final return"}
@@ -57,9 +59,13 @@ OF_ALL_STAGES = tuple(
 """Curves that are drawn of all stages together; displacement shows an effect before success."""
 
 
+MOST_FACETS = 8
+"""Largest number of panels that the curves of one task are spread over."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Drawing:
-    """One figure of one stage: a panel per task, a legend and a caption."""
+    """One figure of one stage: its panels, a legend and a caption."""
 
     stage: str
     title: str
@@ -71,12 +77,19 @@ class Drawing:
     metric: Metric | None = None
     """The metric that learning curves show; None for other figures."""
     curves: Mapping[str, Sequence[Curve]] = field(default_factory=dict)
-    """The learning curves of each task."""
+    """The learning curves of each panel, by its title."""
+    facets: Facets | None = None
+    """How conditions are spread over the panels of learning curves and of profiles."""
 
     @property
     def name(self) -> str:
         """The name of its files without their suffix, and its id in the page."""
         return slug(f"{self.stage}-{self.title}")
+
+    @property
+    def legend_is_of_conditions(self) -> bool:
+        """Whether each entry of the legend is one condition of the stage."""
+        return self.facets is not None and len(self.legend) == len(self.facets.styles)
 
 
 def slug(text: str) -> str:
@@ -87,9 +100,7 @@ def slug(text: str) -> str:
 def stage_drawings(sweep: Sweep, analysis: StageAnalysis) -> Iterator[Drawing]:
     """The figures of one stage for which there is something to draw or to compare."""
     stage = _without_trials(sweep, analysis.stage)
-    curves = _all_curves(sweep, stage, METRICS)
-    for metric in METRICS:
-        yield from _curves(stage, metric, curves, styles_of(stage.conditions))
+    yield from _curves(sweep, stage, METRICS)
     scopes = [replace(s, finals=s.compared) if s.compared else s for s in analysis.scopes]
     scopes = [scope for scope in scopes if len(scope.finals) > 1]
     for metric_name, title in FINALS.items():
@@ -115,9 +126,10 @@ def _finals(stage: Stage, title: str, scopes: Sequence[Scope[Condition]]) -> Ite
         stage=stage.name,
         title=title,
         caption="Large marks: mean; bars: 95 % intervals; small ticks: single runs.",
-        panels=tuple(finals_panel(scope, stage.conditions) for scope in scopes),
-        legend=_legend(stage),
+        panels=tuple(panel for scope in scopes for panel in _finals_panels(stage, scope)),
+        legend=[],  # each row has its label
     )
+    facets = Facets.of(stage)
     runs = [final.scores.shape[0] for scope in scopes for final in scope.finals]
     readable = len(stage.conditions) <= MOST_CONDITIONS and max(runs) > 1
     if scopes[0].metric not in names.EVAL_RATES or not readable:
@@ -128,8 +140,19 @@ def _finals(stage: Stage, title: str, scopes: Sequence[Scope[Condition]]) -> Ite
         caption="Share of finished runs that end above each success rate, with 95 % bands. A line "
         "that is above another everywhere is better at every standard.",
         panels=tuple(profile_panel(scope, stage.conditions) for scope in scopes),
-        legend=_legend(stage),
+        legend=[(condition.label, style) for condition, style in facets.styles.items()],
+        facets=facets,
     )
+
+
+def _finals_panels(stage: Stage, scope: Scope[Condition]) -> Iterator[Panel]:
+    facets = Facets.of(stage)
+    labels = {condition: facets.label(condition) for condition in stage.conditions}
+    panels: dict[str, list[Final[Condition]]] = {}
+    for final in scope.finals:
+        panels.setdefault(facets.title(scope.name, final.condition), []).append(final)
+    for title, shown in panels.items():
+        yield finals_panel(title, scope, shown, facets.styles, labels)
 
 
 def _against_entropy(sweep: Sweep, stage: Stage) -> Iterator[Drawing]:
@@ -151,14 +174,8 @@ def _against_entropy(sweep: Sweep, stage: Stage) -> Iterator[Drawing]:
 def drawings_of_stages(sweep: Sweep, stages: Sequence[Stage]) -> Iterator[Drawing]:
     """Curves of all stages that train for the task, together; none for a single stage."""
     together = side_by_side(stages)
-    if together is None:
-        return
-    curves = _all_curves(sweep, together, OF_ALL_STAGES)
-    styles = styles_by_stage(together.conditions)
-    legend = [(named_by_stage(condition), style) for condition, style in styles.items()]
-    for metric in OF_ALL_STAGES:
-        for drawing in _curves(together, metric, curves, styles):
-            yield replace(drawing, legend=legend)
+    if together is not None:
+        yield from _curves(sweep, together, OF_ALL_STAGES)
 
 
 def named_by_stage(condition: Condition) -> str:
@@ -168,44 +185,94 @@ def named_by_stage(condition: Condition) -> str:
     return f"{stage}, {rest.label}"
 
 
-def _all_curves(
-    sweep: Sweep, stage: Stage, metrics: Sequence[Metric]
-) -> dict[tuple[str, str], list[Curve]]:
-    """By metric and task; the return of only those tasks that are judged by it."""
-    curves: dict[tuple[str, str], list[Curve]] = {}
-    for metric, task, condition in product(metrics, stage.tasks, stage.conditions):
-        if metric.name == names.EVAL_RETURN != sweep.primary_metric(task):
-            continue
-        found = curve(sweep, condition, task, metric.name)
-        if found is not None:
-            curves.setdefault((metric.name, task), []).append(found)
-    return curves
+@dataclass(frozen=True)
+class Facets:
+    """How a stage's conditions are spread over the panels of a figure."""
+
+    setting: str
+    """The setting whose values have panels of their own; empty: the panels are tasks."""
+    styles: Mapping[Condition, Style]
+    """Of all conditions of the stage; the same in each panel."""
+
+    @classmethod
+    def of(cls, stage: Stage) -> Facets:
+        """One panel for a task, unless it would have too many conditions."""
+        setting = facet_of(stage.conditions)
+        rest = {condition: _without(condition, setting) for condition in stage.conditions}
+        styles_of_all = styles_by_stage if stage.name == SIDE_BY_SIDE else styles_of
+        styles = styles_of_all(tuple(dict.fromkeys(rest.values())))
+        return cls(setting, {condition: styles[rest[condition]] for condition in rest})
+
+    def title(self, task: str, condition: Condition) -> str:
+        """The title of a condition's panel."""
+        value = dict(condition.others).get(self.setting)
+        return f"{task}, {self.setting} = {value}" if self.setting else task
+
+    def label(self, condition: Condition) -> str:
+        """What a condition is called in its panel, whose title says the rest."""
+        rest = _without(condition, self.setting)
+        by_stage = any(name == "stage" for name, _ in rest.others)
+        return named_by_stage(rest) if by_stage else rest.label
 
 
-def _curves(
-    stage: Stage,
-    metric: Metric,
-    curves: Mapping[tuple[str, str], list[Curve]],
-    styles: Mapping[Condition, Style],
-) -> Iterator[Drawing]:
-    """The learning curves of a metric, if there are any."""
-    by_task = {t: curves[metric.name, t] for t in stage.tasks if (metric.name, t) in curves}
-    if by_task:
-        yield Drawing(
-            stage=stage.name,
-            title=metric.title,
-            caption=_caption(stage, metric),
-            panels=tuple(curve_panel(metric, t, found, styles) for t, found in by_task.items()),
-            legend=_legend(stage),
-            group=_GROUP_OF.get(metric.name, PERFORMANCE),
-            metric=metric,
-            curves=by_task,
-        )
+def _without(condition: Condition, setting: str) -> Condition:
+    others = tuple(pair for pair in condition.others if pair[0] != setting)
+    return replace(condition, others=others, runs=())
 
 
-def _caption(stage: Stage, metric: Metric) -> str:
+def facet_of(conditions: Sequence[Condition]) -> str:
+    """The setting that spreads conditions over panels where one has too many of them; else empty.
+
+    Of the settings that leave few enough panels, the one with the fewest conditions in a panel.
+    """
+    if len(conditions) <= MOST_CONDITIONS:
+        return ""
+    values: dict[str, list[str]] = {}
+    for condition in conditions:
+        for name, value in condition.others:
+            values.setdefault(name, []).append(value)
+    most = {
+        name: max(Counter(found).values())
+        for name, found in values.items()
+        if name != "stage" and len(found) == len(conditions) and 1 < len(set(found)) <= MOST_FACETS
+    }
+    return min(most, key=lambda name: most[name], default="")
+
+
+def _curves(sweep: Sweep, stage: Stage, metrics: Sequence[Metric]) -> Iterator[Drawing]:
+    """The learning curves of a stage, of each metric that it has."""
+    facets = Facets.of(stage)
+    labels = {facets.label(condition): style for condition, style in facets.styles.items()}
+    for metric in metrics:
+        panels: dict[str, list[Curve]] = {}
+        for task, condition in product(stage.tasks, stage.conditions):
+            if metric.name == names.EVAL_RETURN != sweep.primary_metric(task):
+                continue  # the return is drawn of those tasks only that are judged by it
+            found = curve(sweep, condition, task, metric.name)
+            if found is not None:
+                panels.setdefault(facets.title(task, condition), []).append(found)
+        if panels:
+            yield Drawing(
+                stage=stage.name,
+                title=metric.title,
+                caption=_caption(stage, metric, max(map(len, panels.values()))),
+                panels=tuple(
+                    curve_panel(metric, title, curves, facets.styles)
+                    for title, curves in panels.items()
+                ),
+                legend=list(labels.items()),
+                group=_GROUP_OF.get(metric.name, PERFORMANCE),
+                metric=metric,
+                curves=panels,
+                facets=facets,
+            )
+
+
+def _caption(stage: Stage, metric: Metric, lines: int) -> str:
     seeds = len(stage.seeds)
-    if seeds == 1:
+    if lines > MOST_BANDS:
+        band = f"Mean over up to {seeds} seeds, without bands, which would hide each other."
+    elif seeds == 1:
         band = "A single seed: each line is one run, and there is no band."
     else:
         band = f"Mean over up to {seeds} seeds with its 95 % band."
@@ -215,10 +282,6 @@ def _caption(stage: Stage, metric: Metric) -> str:
     thin = "A line is thin where some of its runs had ended."
     target = "" if metric.target is None else f" Dotted: {metric.target * 100:.0f} %."
     return f"{band} {thin}{target}"
-
-
-def _legend(stage: Stage) -> Legend:
-    return [(condition.label, style) for condition, style in styles_of(stage.conditions).items()]
 
 
 def _styles_by_q(stage: Stage) -> dict[str, Style]:

@@ -40,6 +40,8 @@ SAME = 0.008
 """Share of the axis within which lines cover each other."""
 _DASH = 2.5
 """Length of the dashes of lines that cover others, in line widths."""
+MOST_BANDS = 8
+"""Largest number of lines in a panel that have bands and lines of single seeds."""
 _MOST_RANKS = 9
 _CROWDED = 10
 """Largest number of lines whose dashes tell how many others they cover; of more, one kind does."""
@@ -96,18 +98,23 @@ def curve_panel(
     epochs = max(float(curve.steps[-1]) for curve in curves) >= EPOCH
     ranks = _ranks(curves, metric)
     numbers = {condition: number for number, condition in enumerate(styles)}
+    with_bands = len(curves) <= MOST_BANDS
 
     def draw(axes: Axes) -> None:
         drawn = [
-            _draw_curve(axes, curve, styles[curve.condition], rank, at / len(curves))
+            _draw_curve(
+                axes, curve, styles[curve.condition], rank, at / len(curves), seeds=with_bands
+            )
             for at, (curve, rank) in enumerate(zip(curves, ranks, strict=True))
         ]
         axes.autoscale_view()
         # Limits are those of the lines: a band of two seeds may be many times as wide.
         axes.set_ylim(axes.get_ylim())
         for curve, artists in zip(curves, drawn, strict=True):
-            band = _band(axes, curve.steps, curve.estimate, styles[curve.condition].colour)
-            mark_condition([*artists, band], numbers[curve.condition], curve.condition.label)
+            if with_bands:
+                colour = styles[curve.condition].colour
+                artists.append(_band(axes, curve.steps, curve.estimate, colour))
+            mark_condition(artists, numbers[curve.condition], curve.condition.label)
         axes.set_xlim(left=0.0)
         axes.set_ylabel(metric.axis)
         axes.set_xlabel("environment steps")
@@ -145,29 +152,38 @@ def profile_panel(scope: Scope[Condition], siblings: tuple[Condition, ...]) -> P
     return Panel(title=scope.name, draw=draw)
 
 
-def finals_panel(scope: Scope[Condition], siblings: tuple[Condition, ...]) -> Panel:
-    """The final value of each condition with its interval, and a mark for every run."""
+def finals_panel(
+    title: str,
+    scope: Scope[Condition],
+    shown: Sequence[Final[Condition]],
+    styles: Mapping[Condition, Style],
+    labels: Mapping[Condition, str],
+) -> Panel:
+    """The final values of `shown`, some of `scope`, with their intervals and a mark for every run.
+
+    Panels of the same scope have the same axis.
+    """
     is_rate = scope.metric in names.EVAL_RATES
-    styles = styles_of(siblings)
-    labels, height = labelled_rows([final.condition.label for final in scope.finals])
+    numbers = {condition: number for number, condition in enumerate(styles)}
+    rows, height = labelled_rows([labels[final.condition] for final in shown])
 
     def draw(axes: Axes) -> None:
         scores = np.concatenate([final.scores.ravel() for final in scope.finals])
         # Intervals of two or three returns may be many times as wide as the runs' range.
         room = 0.5 * (np.ptp(scores) or 1.0)
         limits = RATE_LIMITS if is_rate else (scores.min() - room, scores.max() + room)
-        axes.set_ylim(len(scope.finals) - 0.5, -0.75)
+        axes.set_ylim(len(shown) - 0.5, -0.75)
         axes.set_xlim(*limits)
         axes.locator_params(axis="x", nbins=6)
-        rules_behind_rows(axes, len(scope.finals))
-        for row, (final, label) in enumerate(zip(scope.finals, labels, strict=True)):
+        rules_behind_rows(axes, len(shown))
+        for row, (final, label) in enumerate(zip(shown, rows, strict=True)):
             artists = _draw_final(axes, row, final, styles[final.condition], label)
             result = f"{number(final.value)}, {interval_text(final.estimate)}"
-            title = f"{final.condition.label}: {result}"
-            mark_condition(artists, siblings.index(final.condition), title)
+            text = f"{final.condition.label}: {result}"
+            mark_condition(artists, numbers[final.condition], text)
         axes.set_xlabel("final success rate" if is_rate else f"final {names.word_of(scope.metric)}")
 
-    return Panel(title=scope.name, draw=draw, height=height)
+    return Panel(title=title, draw=draw, height=height)
 
 
 def entropy_panel(sweep: Sweep, task: str, styles: Mapping[Condition, Style]) -> Panel | None:
@@ -248,17 +264,17 @@ def _ranks(curves: Sequence[Curve], metric: Metric) -> list[Array]:
 
 
 def _draw_curve(
-    axes: Axes, curve: Curve, style: Style, rank: Array, stagger: float
+    axes: Axes, curve: Curve, style: Style, rank: Array, stagger: float, *, seeds: bool
 ) -> list[Artist]:
     """Draw a line: thick where every run counts, thin from where the first one ended.
 
-    Few seeds have lines of their own. Where lines coincide the later ones are dashed, so that each
-    earlier one shows in the gaps.
+    With `seeds`, few of them have lines of their own. Where lines coincide the later ones are
+    dashed, so that each earlier one shows in the gaps.
     """
     colour, marker, line = style.colour, style.marker, style.stroke
     value = curve.estimate.value
     artists: list[Artist] = []
-    if 1 < len(curve.values) < SHOW_SEEDS_BELOW:
+    if seeds and 1 < len(curve.values) < SHOW_SEEDS_BELOW:
         artists += axes.plot(curve.steps, curve.values.T, color=colour, linewidth=0.6, alpha=0.55)
     whole = curve.runs == curve.runs.max()
     stretches = _stretches(np.column_stack([curve.steps, value]), rank, whole)

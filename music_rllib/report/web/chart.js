@@ -2,7 +2,7 @@
 // A curve: {label, colour, dash, x, mean, lower, upper, runs, seeds}; null stands for NaN.
 "use strict";
 
-const FONT = 12, LETTER = 6.9, SAME = 0.008, DASH = 7;
+const MOST_BANDS = 8, FONT = 12, LETTER = 6.9, SAME = 0.008, DASH = 7;
 
 function element(name, attributes, parent, text) {
   const isSvg = ["svg", "g", "path", "line", "rect", "text", "clipPath", "circle"].includes(name);
@@ -130,7 +130,8 @@ function drawPanel(box, { title, curves, metric, xLabel }) {
 
 function drawCurves(parent, curves, px, py, height) {
   const at = (curve, values) => values.map((v, i) => (v === null ? null : [px(curve.x[i]), py(v)]));
-  for (const curve of curves) {
+  // Bands of more lines hide each other; intervals are read beside the pointer.
+  for (const curve of curves.length <= MOST_BANDS ? curves : []) {
     const there = curve.x.map((_, i) => curve.lower[i] !== null && curve.upper[i] !== null);
     if (there.filter(Boolean).length > 1) {
       const keep = (values) => at(curve, values).filter((_, i) => there[i]);

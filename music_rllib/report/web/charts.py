@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from music_rllib import names
-from music_rllib.report.figures.choice import Drawing, named_by_stage
+from music_rllib.report.figures.choice import Drawing, Facets
 from music_rllib.report.figures.palette import DASHES
 from music_rllib.report.figures.plots import EPOCH
 from music_rllib.results.analysis import Curve
@@ -55,34 +55,41 @@ def chart_data(sweep: Sweep, drawings: Sequence[Drawing]) -> dict[str, Any]:
     }
 
 
-def _tasks(drawings: Sequence[Drawing]) -> list[str]:
-    return list(dict.fromkeys(task for drawing in drawings for task in drawing.curves))
+def _facets(drawing: Drawing) -> Facets:
+    assert drawing.facets is not None, "learning curves have them"
+    return drawing.facets
+
+
+def _panels(drawings: Sequence[Drawing]) -> list[str]:
+    return list(dict.fromkeys(panel for drawing in drawings for panel in drawing.curves))
 
 
 def _stage(name: str, drawings: Sequence[Drawing]) -> dict[str, Any]:
-    tasks = _tasks(drawings)
+    panels = _panels(drawings)
     together = name == SIDE_BY_SIDE
+    facets = _facets(drawings[0])
     return {
         "name": name,
         "together": together,
-        "tasks": tasks,
-        "primary": [_primary(task, drawings) for task in tasks],
+        "panels": panels,
+        "faceted": bool(facets.setting),
+        "primary": [_primary(panel, drawings) for panel in panels],
         "conditions": [
             {
-                "label": label,
+                "label": (label := facets.label(condition)),
                 # Labels of all stages together begin with the stage: a condition has one key.
                 "key": label if together else f"{name}, {label}",
                 "colour": style.colour,
                 "dash": DASHES[style.line],
             }
-            for label, style in drawings[0].legend
+            for condition, style in facets.styles.items()
         ],
     }
 
 
-def _primary(task: str, drawings: Sequence[Drawing]) -> str:
+def _primary(panel: str, drawings: Sequence[Drawing]) -> str:
     """The return, which is drawn only for tasks that are judged by it, or success."""
-    drawn = [d.metric.name for d in drawings if d.metric is not None and task in d.curves]
+    drawn = [d.metric.name for d in drawings if d.metric is not None and panel in d.curves]
     primary = (names.EVAL_RETURN, names.EVAL_SUCCESS)
     return next((metric for metric in primary if metric in drawn), drawn[0])
 
@@ -91,19 +98,16 @@ def _curves(
     sweep: Sweep, drawing: Drawing, drawings: Sequence[Drawing], known: KnownAxes
 ) -> list[Mapping[str, Any]]:
     """The curves of one of a stage's `drawings`."""
-    tasks, labels = _tasks(drawings), [label for label, _ in drawings[0].legend]
+    panels, conditions = _panels(drawings), list(_facets(drawing).styles)
     curves: list[Mapping[str, Any]] = []
-    for task, found in drawing.curves.items():
+    for panel, found in drawing.curves.items():
         for curve in found:
-            condition = curve.condition
-            together = drawing.stage == SIDE_BY_SIDE
-            label = named_by_stage(condition) if together else condition.label
             few = 1 < len(curve.values) < SHOW_SEEDS_BELOW
             curves.append(
                 {
-                    "task": tasks.index(task),
-                    "condition": labels.index(label),
-                    **_x_axes(sweep, task, curve, known),
+                    "panel": panels.index(panel),
+                    "condition": conditions.index(curve.condition),
+                    **_x_axes(sweep, curve, known),
                     "mean": _plain(curve.estimate.value),
                     "lower": _plain(curve.estimate.lower),
                     "upper": _plain(curve.estimate.upper),
@@ -114,9 +118,9 @@ def _curves(
     return curves
 
 
-def _x_axes(sweep: Sweep, task: str, curve: Curve, known: KnownAxes) -> Mapping[str, Any]:
+def _x_axes(sweep: Sweep, curve: Curve, known: KnownAxes) -> Mapping[str, Any]:
     """Steps, and means over the runs of the updates and the seconds until these steps."""
-    runs = tuple(run for run in curve.condition.runs if sweep.runs[run].task == task)
+    runs = tuple(run for run in curve.condition.runs if sweep.runs[run].task == curve.task)
     key = (runs, curve.steps.tobytes())
     if key not in known:
         updates = (sweep.finite(run, names.GRAD_UPDATES) for run in runs)
