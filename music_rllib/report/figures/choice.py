@@ -171,7 +171,7 @@ def named_by_stage(condition: Condition) -> str:
 def _all_curves(
     sweep: Sweep, stage: Stage, metrics: Sequence[Metric]
 ) -> dict[tuple[str, str], list[Curve]]:
-    """By metric and task; the return of only those tasks that are judged by it."""
+    """Curves by metric and task, with the return of only those tasks that are judged by it."""
     curves: dict[tuple[str, str], list[Curve]] = {}
     for metric, task, condition in product(metrics, stage.tasks, stage.conditions):
         if metric.name == names.EVAL_RETURN != sweep.primary_metric(task):
