@@ -1,4 +1,4 @@
-"""From a sweep to its report on disk: the page, its figures and its numbers."""
+"""Computes the report of a sweep and writes the page, its figures and its numbers."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ class Report:
     films: Films | None = None
     """None if no videos were asked for."""
     differences: Sequence[TextTable] = ()
-    """Of two sweeps side by side: how settings and results differ."""
+    """Tables of how settings and results of two sweeps side by side differ."""
 
     @property
     def drawings(self) -> Sequence[Drawing]:
@@ -90,9 +90,9 @@ def render(report: Report, *, live: bool = False) -> str:
         name=sweep.name,
         facts=_facts(report),
         missing=report.missing,
-        asked=_question(report),
-        said=answer_lines[:claims],
-        about=answer_lines[claims:],
+        question=_question(report),
+        answer=answer_lines[:claims],
+        counting=answer_lines[claims:],
         numbers=numbers,
         pictures=report.figures.pictures,
         large=_large_figure(report, list(numbers)),
@@ -205,7 +205,7 @@ def _groups(report: Report) -> Iterable[Mapping[str, Any]]:
         content = {
             "figures": [_figure(*item) for item in by_title.items()],
             "tables": [table for table in tables.get(group, ()) if table.rows],
-            "said": remarks.get(group, []),
+            "remarks": remarks.get(group, []),
         }
         if any(content.values()):
             yield {"title": group, **content}

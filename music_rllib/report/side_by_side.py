@@ -22,9 +22,9 @@ MOST_VALUES = 6
 
 def side_by_side(first: Sweep, second: Sweep) -> Sweep:
     """All runs of both sweeps; stage names begin with the sweep, so that stages are compared."""
-    one, other = _titles(first, second)
-    both = merged(_renamed(first, one), _renamed(second, other))
-    return replace(both, name=f"{one} and {other}", config=None, plans=(), searches=())
+    titles = _titles(first, second)
+    both = merged(_renamed(first, titles[0]), _renamed(second, titles[1]))
+    return replace(both, name=" and ".join(titles), config=None, plans=(), searches=())
 
 
 def _titles(first: Sweep, second: Sweep) -> tuple[str, str]:

@@ -39,7 +39,7 @@ TREES = 32
 MOST_LEVELS = 4
 """Largest number of values of a setting without numbers that is treated as a choice."""
 MOST_PANELS = 12
-"""Of sensitivity; if there would be more, only those of all tasks together are drawn."""
+"""Largest number of sensitivity panels; if there are more, those of single tasks are left out."""
 
 
 def settings_of(condition: Condition) -> dict[str, str]:

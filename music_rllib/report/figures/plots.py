@@ -365,6 +365,7 @@ def legend_handles(legend: Legend) -> list[Line2D]:
 
 
 def _add_epochs(axes: Axes) -> None:
-    above = axes.secondary_xaxis("top", functions=(lambda x: x / EPOCH, lambda x: x * EPOCH))
+    scales = (lambda steps: np.divide(steps, EPOCH), lambda epochs: np.multiply(epochs, EPOCH))
+    above = axes.secondary_xaxis("top", functions=scales)
     above.set_xlabel("epochs of 80 000 steps", fontsize="small", labelpad=2)
     above.tick_params(labelsize="small", pad=1)

@@ -2,7 +2,7 @@
 // A curve: {label, colour, dash, x, mean, lower, upper, runs, seeds}; null stands for NaN.
 "use strict";
 
-const MOST_BANDS = 8, FONT = 12, LETTER = 6.9, SAME = 0.008, DASH = 7;
+const MOST_BANDS = 8, LETTER = 6.9, SAME = 0.008, DASH = 7;
 
 function element(name, attributes, parent, text) {
   const isSvg = ["svg", "g", "path", "line", "rect", "text", "clipPath", "circle"].includes(name);

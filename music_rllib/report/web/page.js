@@ -92,7 +92,6 @@ function drawAll() {
       ...one,
       title: [!large && several ? data.stages[one.stage].name : "", one.name].filter(Boolean).join(" · "),
     })));
-    parent.classList.toggle("single", wanted.length === 1);
     figure.classList.add("drawn");
   }
   for (const part of document.querySelectorAll("[data-stage] [data-condition]")) {
