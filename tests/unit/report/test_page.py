@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -14,6 +15,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from matplotlib.collections import PolyCollection
 
 from music_rllib import names
 from music_rllib.report.build import build_report, write_report
@@ -867,3 +869,42 @@ def test_a_colour_depends_on_q_alone() -> None:
     assert len({colour_of(str(q)) for q in np.arange(0.5, 3.01, 0.25)}) == 11
     grid = ("1", "1.25", "1.5", "1.75", "2")
     assert len({marker_of(q) for q in grid}) == len(grid)
+
+
+def test_a_grid_of_many_conditions_has_a_panel_for_each_value_of_the_setting_beside_q() -> None:
+    alphas, indices = ("0.01", "0.1", "1"), ("1", "1.5", "2")
+    sweep = sweep_of(
+        [
+            (one_run(q, seed, params={"tac.alpha": alpha}, alpha=alpha), climbing(0.5))
+            for q, alpha, seed in product(indices, alphas, range(2))
+        ]
+    )
+    report = build_report(sweep)
+    (analysis,) = report.analyses
+    assert len(analysis.stage.conditions) == 9
+    titles = [f"FetchPush, α = {alpha}" for alpha in alphas]
+    for title in ("Success rate", "Final success rate"):
+        (drawing,) = [one for one in report.drawings if one.title == title]
+        assert [panel.title for panel in drawing.panels] == titles
+    curves = {row[:3] for row in curves_table(report.drawings).rows}
+    assert curves == {
+        ("finetune", "FetchPush", f"q = {q}, α = {alpha}") for q, alpha in product(indices, alphas)
+    }
+    page = re.search(r'<script[^>]*id="data"[^>]*>(.*?)</script>', render(report))
+    assert page is not None
+    data = json.loads(page.group(1))
+    (drawn,) = data["stages"]
+    assert drawn["panels"] == titles
+    # One switch and one colour for a q, whichever panel it is in.
+    switches = {one["key"]: one["colour"] for one in drawn["conditions"]}
+    assert list(switches) == [f"finetune, q = {q}" for q in indices]
+
+
+def test_lines_of_more_conditions_than_bands_can_be_told_apart_have_none() -> None:
+    many = compared({f"1.{n}": [0.5, 0.6] for n in range(1, 10)})
+    few = compared({f"1.{n}": [0.5, 0.6] for n in range(1, 9)})
+    for sweep, has_bands in ((many, False), (few, True)):
+        (drawing,) = [d for d in build_report(sweep).drawings if d.title == "Success rate"]
+        assert ("95 % band" in drawing.caption) is has_bands
+        axes = drawn_figure(drawing.panels, [], TEXT_WIDTH, 8.0).axes[0]
+        assert any(isinstance(one, PolyCollection) for one in axes.collections) is has_bands
