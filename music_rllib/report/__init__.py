@@ -1,1 +1,1 @@
-"""Reports of sweeps: read from MLflow or from an exported folder, never through Ray."""
+"""Reports of sweeps, read from MLflow or from an exported folder, without Ray."""

@@ -1,14 +1,15 @@
-"""From a sweep to its report on disk: the page, its figures and its numbers."""
+"""Computes the report of a sweep and writes the page, its figures and its numbers."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
+from itertools import chain
 from pathlib import Path
 
 from music_rllib import names
 from music_rllib.envs.tasks import Task
-from music_rllib.report.figures.choice import Drawing, drawings_of_stages, stage_drawings
+from music_rllib.report.figures.choice import drawings_of_stages, stage_drawings
 from music_rllib.report.figures.draw import Figures, files, stale_files
 from music_rllib.report.figures.overview import overview
 from music_rllib.report.figures.plots import METRICS
@@ -18,6 +19,7 @@ from music_rllib.report.side_by_side import difference_tables
 from music_rllib.report.study import study_csv, study_drawings
 from music_rllib.report.tables import (
     Table,
+    curves_table,
     finals_table,
     improvement_table,
     races_table,
@@ -31,11 +33,9 @@ from music_rllib.results.comparison import GAP
 from music_rllib.results.data import ReportError, Sweep
 from music_rllib.tracking.store import TrackingStore
 
-__all__ = ["PAGE", "PICTURE", "WANTED", "build_report", "write_report"]
-
 PAGE = "report.html"
 PICTURE = "overview"
-"""The figure that shows the whole sweep."""
+"""File name of the figure that shows the whole sweep."""
 WANTED = (
     *(metric.name for metric in METRICS),
     names.EVAL_EPISODES,
@@ -43,9 +43,6 @@ WANTED = (
     names.GRAD_UPDATES,
 )
 """Metrics that a report reads."""
-_CURVE_COLUMNS = (
-    *("stage", "task", "condition", "metric", "env_steps", "runs", "mean", "lower", "upper"),
-)
 
 
 def build_report(
@@ -62,29 +59,31 @@ def build_report(
     live: bool = False,
     processes: Executor | None = None,
 ) -> Report:
-    """Compute and arrange everything.
+    """Compute the report of a sweep: numbers, figures, videos and notes.
 
     Args:
-        sweep: with the metrics of `WANTED`.
-        difference: in success rate, which the reader would want to be able to see.
-        undelivered: runs of which MLflow does not have everything yet.
-        damaged: which finished runs are damaged in the storage, in words.
-        command: that makes this report.
-        store: where the sweep is logged, with its policies.
-        video_seed: of the filmed episodes; None: no videos.
-        environments: of tasks that may be made for videos, beside the known ones.
-        beside: the two that `sweep` puts side by side.
-        live: the sweep is running, and the page says how far it is.
-        processes: that draw for the page and for files, from `drawing_processes`.
+        sweep: the sweep, with the metrics of `WANTED`.
+        difference: the smallest difference in success rate that matters to the reader.
+        undelivered: the number of finished runs that are not yet complete in MLflow.
+        damaged: a sentence about finished runs that are damaged in the storage, if there are any.
+        command: the command that makes this report.
+        store: the MLflow store that has the policies to film.
+        video_seed: the seed of filmed episodes; None: no videos.
+        environments: tasks of the user that may be filmed, beside the built-in ones.
+        beside: the two sweeps that `sweep` puts side by side.
+        live: whether the sweep is running, so that runs to come are not reported as missing.
+        processes: worker processes that draw the figures, from `drawing_processes`.
     """
     figures = Figures(processes)
     analyses = analyse(sweep)
     stages = [analysis.stage for analysis in analyses]
-    for analysis in analyses:
-        for drawing in stage_drawings(sweep, analysis):
-            figures.add(drawing)
     study = study_of(sweep)
-    for drawing in (*drawings_of_stages(sweep, stages), *study_drawings(study)):
+    # One by one: a process draws each while the next is computed.
+    for drawing in chain(
+        *(stage_drawings(sweep, analysis) for analysis in analyses),
+        drawings_of_stages(sweep, stages),
+        study_drawings(study),
+    ):
         figures.add(drawing)
     return Report(
         sweep=sweep,
@@ -108,26 +107,24 @@ def write_report(report: Report, folder: Path) -> Path:
     Figures of an earlier report that this one does not have are removed.
 
     Returns:
-        The page.
+        The path of the page.
 
     Raises:
-        ReportError: where the folder is not writable.
+        ReportError: if the folder is not writable.
     """
-    figures, tables = folder / "figures", folder / "tables"
+    page, figures, tables = folder / PAGE, folder / "figures", folder / "tables"
     try:
-        for part in (figures, tables):
-            part.mkdir(parents=True, exist_ok=True)
-        page = folder / PAGE
+        for subfolder in (figures, tables):
+            subfolder.mkdir(parents=True, exist_ok=True)
         page.write_text(render(report), encoding="utf-8")
-        here = [file.name for file in figures.iterdir()]
-        for stale in stale_files({drawing.name for drawing in report.drawings}, here):
+        present = [file.name for file in figures.iterdir()]
+        for stale in stale_files({drawing.name for drawing in report.drawings}, present):
             (figures / stale).unlink()
-        if panels := overview(report.sweep, [one.stage for one in report.analyses]):
-            for ending, content in files(panels, []).items():
-                (figures / f"{PICTURE}{ending}").write_bytes(content)
-        for name, drawn in report.figures.files():
-            for ending, content in drawn.items():
-                (figures / f"{name}{ending}").write_bytes(content)
+        panels = overview(report.sweep, [analysis.stage for analysis in report.analyses])
+        picture = [(PICTURE, files(panels, []))] if panels else []
+        for name, contents in chain(picture, report.figures.files()):
+            for suffix, content in contents.items():
+                (figures / f"{name}{suffix}").write_bytes(content)
         if report.films is not None and report.films.films:
             (folder / "videos").mkdir(exist_ok=True)
             for film in report.films.films:
@@ -140,16 +137,11 @@ def write_report(report: Report, folder: Path) -> Path:
 
 
 def _tables(report: Report) -> Iterable[Table]:
-    pairs = [*report.analyses, *([report.together] if report.together else [])]
+    with_stages = [*report.analyses, *filter(None, [report.together])]
     yield from study_csv(report.study)
     yield finals_table(report.analyses)
     yield waits_table(report.analyses)
-    yield races_table(pairs)
-    yield improvement_table(pairs)
+    yield races_table(with_stages)
+    yield improvement_table(with_stages)
     yield runs_table(report.sweep)
-    yield _curves_table(report.drawings)
-
-
-def _curves_table(drawings: Iterable[Drawing]) -> Table:
-    rows = [row for drawing in drawings for row in drawing.values]
-    return Table(name="curves", columns=_CURVE_COLUMNS, rows=rows)
+    yield curves_table(report.drawings)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -18,8 +18,7 @@ from music_rllib.errors import FAILED
 if TYPE_CHECKING:
     from music_rllib.report.location import ReportSource
     from music_rllib.report.page import Report
-
-__all__ = ["EXAMPLES", "app", "main", "report"]
+    from music_rllib.results.data import Sweep
 
 EXAMPLES = """\
 Examples:
@@ -43,7 +42,7 @@ is no such sweep.
 
 
 class TableFormat(StrEnum):
-    """Of exported tables."""
+    """The format of exported tables."""
 
     csv = "csv"
     parquet = "parquet"
@@ -132,44 +131,29 @@ def report(
     """
     from music_rllib.results.comparison import GAP
 
-    gap = GAP if difference is None else difference
+    def find(place: str, **options: Any) -> ReportSource:
+        from music_rllib.report.location import find_sweep
+
+        return find_sweep(place, storage=storage, tracking_uri=tracking_uri, **options)
+
+    place, gap = sweeps[0], GAP if difference is None else difference
     if len(sweeps) > 1:
-        _beside(sweeps, storage, tracking_uri, output, alone=serve or attach or bool(export))
+        _beside(find, sweeps, output, alone=serve or attach or export is not None)
     elif export is not None:
-        _export(sweeps[0], storage, tracking_uri, export, format_, add=add)
+        _export(find(place).sweep, export, format_, add=add)
     elif serve:
-        _serve(sweeps[0], storage, tracking_uri, gap, port)
+        _serve(find, place, storage, gap, port)
     else:
-        return _report(
-            sweeps[0],
-            storage,
-            tracking_uri,
-            output,
-            gap,
-            seed,
-            videos=videos,
-            env=env,
-            attach=attach,
-        )
+        return _report(find, place, output, gap, seed if videos else None, env, attach=attach)
     return 0
 
 
-def _export(
-    place: str,
-    storage: str,
-    tracking_uri: str | None,
-    folder: Path,
-    table_format: TableFormat,
-    *,
-    add: bool,
-) -> None:
+def _export(sweep: Sweep, folder: Path, table_format: TableFormat, *, add: bool) -> None:
     from music_rllib.labels import in_runs
-    from music_rllib.report.location import find_sweep
     from music_rllib.results.archive.folder import is_archive, read_archive, write_archive
     from music_rllib.results.archive.merge import merged
     from music_rllib.results.data import ReportError
 
-    sweep = find_sweep(place, storage=storage, tracking_uri=tracking_uri).sweep
     if add and is_archive(folder):
         earlier = read_archive(folder)
         if earlier.name != sweep.name:
@@ -184,76 +168,65 @@ def _export(
 
 
 def _report(
+    find: Callable[..., ReportSource],
     place: str,
-    storage: str,
-    tracking_uri: str | None,
     output: Path | None,
     difference: float,
-    seed: int,
-    *,
-    videos: bool,
+    video_seed: int | None,
     env: Path | None,
+    *,
     attach: bool,
 ) -> int:
     from music_rllib.report.figures.processes import drawing_processes
 
+    # The processes load their modules while this one loads its own.
     with drawing_processes() as processes:
         from music_rllib.config.load import declared_tasks
         from music_rllib.redaction import for_people, redact
         from music_rllib.report.build import PICTURE, WANTED, build_report, write_report
-        from music_rllib.report.location import find_sweep
         from music_rllib.results.comparison import verdict
 
-        found = find_sweep(
-            place,
-            storage=storage,
-            tracking_uri=tracking_uri,
-            metrics=WANTED,
-            processes=processes,
-        )
-        made = build_report(
-            found.sweep,
+        source = find(place, metrics=WANTED, processes=processes)
+        report = build_report(
+            source.sweep,
             difference=difference,
-            undelivered=found.undelivered,
-            damaged=found.damaged,
-            store=found.store,
-            video_seed=seed if videos else None,
+            undelivered=source.undelivered,
+            damaged=source.damaged,
+            store=source.store,
+            video_seed=video_seed,
             environments=() if env is None else declared_tasks(env),
             command=_command(),
             processes=processes,
         )
-        page = write_report(made, output or found.folder / "report")
-    for note in made.missing:
+        page = write_report(report, output or source.folder / "report")
+    for note in report.missing:
         typer.echo(f"missing: {for_people(note)}")
-    for analysis in made.analyses:
+    for analysis in report.analyses:
         for line in verdict(analysis.scopes[0], difference):
             typer.echo(for_people(f"{analysis.stage.name}: {line}"))
     if attach:
-        _attach(found, page.parent, made)
+        _attach(source, page.parent, report)
     typer.echo(f"Report: {page.absolute()}")
     picture = page.parent / "figures" / f"{PICTURE}.png"
     if picture.exists():
         typer.echo(f"Picture: {picture.absolute()}")
-    if found.damaged is not None:
-        typer.echo(f"error: {redact(found.damaged)}", err=True)
+    if source.damaged is not None:
+        typer.echo(f"error: {redact(source.damaged)}", err=True)
         return FAILED
     return 0
 
 
 def _command() -> str:
+    """This command without secrets."""
     from music_rllib.redaction import redact
 
     return redact(shlex.join([*called_as(), *sys.argv[1:]]))
 
 
 def _beside(
-    places: Sequence[str],
-    storage: str,
-    tracking_uri: str | None,
-    output: Path | None,
-    *,
-    alone: bool,
+    find: Callable[..., ReportSource], places: Sequence[str], output: Path | None, *, alone: bool
 ) -> None:
+    """Write a report of two sweeps; `alone`: an option was given that takes a single sweep."""
     from music_rllib.report.figures.processes import drawing_processes
     from music_rllib.results.data import ReportError
 
@@ -264,68 +237,66 @@ def _beside(
     with drawing_processes() as processes:
         from music_rllib.report.build import WANTED, build_report, write_report
         from music_rllib.report.figures.choice import slug
-        from music_rllib.report.location import find_sweep
         from music_rllib.report.side_by_side import side_by_side
 
-        found = [
-            find_sweep(place, storage=storage, tracking_uri=tracking_uri, metrics=WANTED)
-            for place in places
-        ]
-        first, second = (one.sweep for one in found)
-        made = build_report(
+        sources = [find(place, metrics=WANTED) for place in places]
+        first, second = (source.sweep for source in sources)
+        report = build_report(
             side_by_side(first, second),
             beside=(first, second),
             command=_command(),
             processes=processes,
         )
-        page = write_report(made, output or found[0].folder / f"report-beside-{slug(second.name)}")
+        folder = output or sources[0].folder / f"report-beside-{slug(second.name)}"
+        page = write_report(report, folder)
     typer.echo(f"Report: {page.absolute()}")
 
 
 def _serve(
-    place: str, storage: str, tracking_uri: str | None, difference: float, port: int
+    find: Callable[..., ReportSource], place: str, storage: str, difference: float, port: int
 ) -> None:
-    from music_rllib.experiment import location
+    from music_rllib.experiment.location import find_sweep
     from music_rllib.report.build import WANTED, build_report
     from music_rllib.report.live.server import LivePage, make_server, serve
     from music_rllib.report.live.state import Progress
-    from music_rllib.report.location import find_sweep
     from music_rllib.report.page import render
     from music_rllib.store.paths import sweep_folder
 
-    sweep = location.find_sweep(place, None if Path(place).exists() else storage)
+    sweep = find_sweep(place, None if Path(place).exists() else storage)
     progress = Progress(sweep)
 
-    def make() -> str:
-        found = find_sweep(place, storage=storage, tracking_uri=tracking_uri, metrics=WANTED)
-        made = build_report(
-            found.sweep,
+    def make_page() -> str:
+        source = find(place, metrics=WANTED)
+        report = build_report(
+            source.sweep,
             difference=difference,
-            undelivered=found.undelivered,
+            undelivered=source.undelivered,
             command=_command(),
             live=progress.is_running(),
         )
-        return render(made, live=True)
+        return render(report, live=True)
 
     folder = sweep_folder(sweep.storage, sweep.name)
-    page = LivePage(make, progress)
+    page = LivePage(make_page, progress)
     serve(make_server(page, sweep, folder, port), page, typer.echo)
 
 
-def _attach(found: ReportSource, folder: Path, made: Report) -> None:
+def _attach(source: ReportSource, folder: Path, report: Report) -> None:
+    """Keep the report, in `folder`, with the sweep's run in MLflow."""
     from music_rllib.redaction import for_people
     from music_rllib.report.tables import note
     from music_rllib.results.data import ReportError
     from music_rllib.results.from_mlflow import attach
 
-    if found.store is None:
+    if source.store is None:
         raise ReportError("--attach needs a sweep that is read from MLflow, got an exported one")
-    last = made.analyses[-1].stage.name if made.analyses else ""
-    shown = sorted((d.name for d in made.drawings), key=lambda name: not name.startswith(last))
-    figure = f"report/figures/{shown[0]}.png" if shown else None
-    text = note(made.analyses, found.sweep.run_id, figure)
-    attach(found.store, found.sweep.run_id, folder, "report", text)
-    where = found.sweep.url(found.sweep.run_id) or f"run {found.sweep.run_id}"
+    sweep, analyses = source.sweep, report.analyses
+    last = analyses[-1].stage.name if analyses else ""
+    drawn = sorted((d.name for d in report.drawings), key=lambda name: not name.startswith(last))
+    figure = f"report/figures/{drawn[0]}.png" if drawn else None
+    text = note(analyses, sweep.run_id, figure)
+    attach(source.store, sweep.run_id, folder, "report", text)
+    where = sweep.url(sweep.run_id) or f"run {sweep.run_id}"
     typer.echo(for_people(f"Attached to the sweep's run in MLflow: {where}"))
 
 
@@ -334,5 +305,5 @@ add_command(app, "report", report, EXAMPLES)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run `python -m music_rllib.report`; its exit code."""
+    """Run `python -m music_rllib.report` and return its exit code."""
     return run_app(app, "python -m music_rllib.report", arguments)

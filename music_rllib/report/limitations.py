@@ -1,10 +1,10 @@
-"""What a report cannot say, and why: everything that is not there, in words."""
+"""What a report cannot show, and why, in sentences."""
 
 from __future__ import annotations
 
 import tempfile
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from music_rllib import names
@@ -12,9 +12,8 @@ from music_rllib.labels import ShortLabels, in_runs
 from music_rllib.results.analysis import StageAnalysis
 from music_rllib.results.data import Sweep
 
-__all__ = ["missing", "planned_runs"]
-
 SHOWN = 5
+"""Largest number of labels in a sentence."""
 _STATES = {
     "RUNNING": "still running (or killed without a word)",
     "SCHEDULED": "waiting to begin",
@@ -26,9 +25,9 @@ _STATES = {
 def missing(
     sweep: Sweep, analyses: Sequence[StageAnalysis], undelivered: int, *, live: bool = False
 ) -> list[str]:
-    """One sentence for each thing that is missing; nothing of what a `live` sweep has yet to do."""
+    """A sentence for everything that is missing, without the runs to come of a `live` sweep."""
     if live:
-        return _missing_evidence(sweep, analyses)
+        return list(_missing_evidence(sweep, analyses))
     return [
         *_missing_runs(sweep),
         *_missing_evidence(sweep, analyses),
@@ -37,11 +36,11 @@ def missing(
 
 
 def planned_runs(config: str) -> tuple[str, ...] | None:
-    """Names of the runs that a sweep's configuration asks for.
+    """Names of the runs that a sweep's configuration plans.
 
     Returns:
-        None where that cannot be told here: the configuration is one of another version, or starts
-        from files that are not on this machine.
+        None if they are unknown: the configuration is from another version, or it starts from
+        files that are not on this machine.
     """
     from music_rllib.config.load import load_sweep
     from music_rllib.config.problems import ConfigError
@@ -58,23 +57,22 @@ def planned_runs(config: str) -> tuple[str, ...] | None:
     return tuple(node.label for node in plan.nodes)
 
 
-def _missing_runs(sweep: Sweep) -> list[str]:
-    notes = []
+def _missing_runs(sweep: Sweep) -> Iterator[str]:
     if not sweep.runs:
-        notes.append("No run has begun, so there is nothing to draw or compare.")
+        yield "No run has begun, so there is nothing to draw or compare."
     planned = None if sweep.config is None else planned_runs(sweep.config)
     known = {run.name for run in sweep.runs}
     waiting = [name for name in planned or () if name not in known]
     if waiting:
         short = ShortLabels.of(planned or ())
-        notes.append(f"{in_runs(len(waiting))} not begun: {_some([*map(short, waiting)])}.")
+        yield f"{in_runs(len(waiting))} not begun: {_listed([*map(short, waiting)])}."
     states = Counter(run.status for run in sweep.runs)
-    notes += [f"{in_runs(states[s])} {words}." for s, words in _STATES.items() if states[s]]
-    return notes
+    for state, text in _STATES.items():
+        if states[state]:
+            yield f"{in_runs(states[state])} {text}."
 
 
-def _missing_evidence(sweep: Sweep, analyses: Sequence[StageAnalysis]) -> list[str]:
-    notes = []
+def _missing_evidence(sweep: Sweep, analyses: Sequence[StageAnalysis]) -> Iterator[str]:
     unevaluated = [
         f"{task} ({names.word_of(metric)})"
         for task in dict.fromkeys(run.task for run in sweep.runs)
@@ -82,34 +80,31 @@ def _missing_evidence(sweep: Sweep, analyses: Sequence[StageAnalysis]) -> list[s
         and not any(len(sweep.series(i, metric)[0]) for i in sweep.on(task))
     ]
     if unevaluated:
-        notes.append(f"Nothing was evaluated yet on {_some(unevaluated)}.")
+        yield f"Nothing was evaluated yet on {_listed(unevaluated)}."
     for analysis in analyses:
         stage = analysis.stage
-        unfinished = [c.label for c in stage.conditions if not _finished(sweep, c.runs)]
+        unfinished = [
+            condition.label
+            for condition in stage.conditions
+            if all(sweep.runs[run].status != "FINISHED" for run in condition.runs)
+        ]
         if unfinished and len(unfinished) < len(stage.conditions):
-            notes.append(f"Stage {stage.name}: no run of {_some(unfinished)} has finished.")
-    return notes
+            yield f"Stage {stage.name}: no run of {_listed(unfinished)} has finished."
 
 
-def _missing_records(sweep: Sweep, undelivered: int) -> list[str]:
-    notes = []
+def _missing_records(sweep: Sweep, undelivered: int) -> Iterator[str]:
     if sweep.config is None:
-        notes.append(
+        yield (
             "The configuration is not in MLflow (or its artefacts are not reachable from here), so "
             "it is not known which runs are still to come."
         )
     if undelivered:
-        notes.append(
+        yield (
             f"Not everything of {in_runs(undelivered)} has reached MLflow yet; send it with "
             "`python -m music_rllib.tracking deliver` and the sweep's folder, then report again."
         )
-    return notes
 
 
-def _finished(sweep: Sweep, runs: Iterable[int]) -> bool:
-    return any(sweep.runs[run].status == "FINISHED" for run in runs)
-
-
-def _some(labels: Sequence[str]) -> str:
+def _listed(labels: Sequence[str]) -> str:
     more = len(labels) - SHOWN
     return "; ".join(labels[:SHOWN]) + (f"; and {more} more" if more > 0 else "")

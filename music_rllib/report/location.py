@@ -1,4 +1,4 @@
-"""What a user means by SWEEP: a sweep's folder, an exported folder, or a name."""
+"""Finding the sweep that a user names by its folder, by an exported folder or by its name."""
 
 from __future__ import annotations
 
@@ -17,22 +17,20 @@ from music_rllib.store.object_folder import StorageError
 from music_rllib.store.paths import sweep_folder
 from music_rllib.tracking.store import SweepRecord, TrackingStore, local_folder, resolve_store
 
-__all__ = ["ReportSource", "find_sweep"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class ReportSource:
-    """A sweep and where it was found."""
+    """A sweep and the places where it was found."""
 
     sweep: Sweep
     folder: Path
-    """Where its report goes."""
+    """Folder for its report."""
     store: TrackingStore | None
-    """Where it is logged; None for an exported sweep."""
+    """MLflow store that it is logged to; None for an exported sweep."""
     undelivered: int = 0
-    """Runs of which MLflow does not have everything yet."""
+    """Number of finished runs that are not yet complete in MLflow."""
     damaged: str | None = None
-    """Finished runs that are not any more in the storage what MLflow says of them, in words."""
+    """A sentence about finished runs whose files in the storage are damaged; None without any."""
 
 
 def find_sweep(
@@ -47,23 +45,23 @@ def find_sweep(
 
     Args:
         place: a sweep's folder (`results/smoke`) or URI, an exported folder, or a sweep's name.
-        storage: where a name is looked for.
-        tracking_uri: in place of the store that the sweep was logged to.
-        metrics: which ones to read from MLflow; None for all.
-        processes: of which one may read, too.
+        storage: the storage in which a name is looked up.
+        tracking_uri: an MLflow store to read instead of the sweep's own.
+        metrics: the metrics to read from MLflow; None for all.
+        processes: worker processes that read the values.
 
     Raises:
-        ReportError: where there is no such sweep.
-        TrackingError: where its store is not reachable.
+        ReportError: if there is no such sweep.
+        TrackingError: if its store is not reachable.
     """
     folder = Path(place).expanduser()
     if is_archive(folder):
         return ReportSource(sweep=read_archive(folder), folder=folder, store=None)
-    name, above = folder.absolute().name, str(folder.absolute().parent)
+    name, parent = folder.absolute().name, str(folder.absolute().parent)
     if "://" in place:
         storage = place.rstrip("/").rpartition("/")[0]
-    elif SweepRecord.read(above, name) is not None:
-        storage = above
+    elif SweepRecord.read(parent, name) is not None:
+        storage = parent
     storage = str(local_folder(storage) or storage)
     folder = sweep_folder(storage, name)
     record = SweepRecord.read(storage, name)
@@ -72,13 +70,8 @@ def find_sweep(
         sweep = read_mlflow(store, name, metrics=metrics)
         return ReportSource(sweep=sweep, folder=folder, store=store)
     store = resolve_store(tracking_uri or record.tracking_uri, storage)
-    sweep = read_mlflow(
-        store,
-        record.sweep_name,
-        sweep_id=record.sweep_id,
-        metrics=metrics,
-        processes=processes,
-    )
+    sweep_name, sweep_id = record.sweep_name, record.sweep_id
+    sweep = read_mlflow(store, sweep_name, sweep_id=sweep_id, metrics=metrics, processes=processes)
     return ReportSource(
         sweep=sweep,
         folder=folder,
@@ -89,18 +82,17 @@ def find_sweep(
 
 
 def _undelivered(sweep: Sweep, storage: str, name: str) -> int:
-    """Finished runs of the sweep that MLflow has not wholly, if the storage can be asked."""
-    whole = {
+    """Number of runs that have finished in the storage but are not complete in MLflow."""
+    complete = {
         run.node_key
         for run in sweep.runs
         if run.status == "FINISHED" and names.TAG_INCOMPLETE not in run.tags
     }
     try:
-        planned = sweep_files.read(storage, f"{name}/{sweep_files.PLAN}") or {"nodes": []}
+        plan = sweep_files.read(storage, f"{name}/{sweep_files.PLAN}") or {"nodes": []}
         nodes = NodeStore(storage)
-        keys = {node["key"] for node in planned["nodes"]}
-        return sum(nodes.is_finished(key) for key in keys - whole)
-    except (OSError, StorageError):  # a report needs MLflow only
+        return sum(nodes.is_finished(key) for key in {n["key"] for n in plan["nodes"]} - complete)
+    except (OSError, StorageError):  # a report does not need the storage
         return 0
 
 
@@ -109,6 +101,6 @@ def _damaged(sweep: Sweep, storage: str) -> str | None:
         nodes = NodeStore(storage)
         labels = {run.node_key: run.name for run in sweep.runs if nodes.is_finished(run.node_key)}
         damage = nodes.damage(labels)
-    except (OSError, StorageError):  # a report needs MLflow only
+    except (OSError, StorageError):  # a report does not need the storage
         return None
     return damage_in_words({labels[key]: why for key, why in damage.items()}) if damage else None

@@ -1,4 +1,4 @@
-"""The page: the answer first, then everything behind it in groups."""
+"""The page of a report: the answer first, then figures and tables in groups."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from music_rllib.report.figures.choice import (
 )
 from music_rllib.report.figures.draw import Figures
 from music_rllib.report.figures.importance import FEWEST_RUNS, varied
-from music_rllib.report.pieces import Figure, Panels, TextTable, document
+from music_rllib.report.pieces import DASH, TextTable, document
 from music_rllib.report.study import study_tables
 from music_rllib.report.videos import Films
 from music_rllib.report.web.charts import chart_data
@@ -39,12 +39,8 @@ from music_rllib.results.analysis import StageAnalysis
 from music_rllib.results.claims.answer import answer, planned_in_words
 from music_rllib.results.claims.study import Study
 from music_rllib.results.comparison import verdict
-from music_rllib.results.conditions import SIDE_BY_SIDE, Stage
+from music_rllib.results.conditions import SIDE_BY_SIDE
 from music_rllib.results.data import Sweep
-
-__all__ = ["Report", "render"]
-
-DASH = "–"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,19 +50,20 @@ class Report:
     sweep: Sweep
     analyses: Sequence[StageAnalysis]
     together: StageAnalysis | None
-    """Stages against each other; None where there is nothing to compare."""
+    """Stages against each other; None if there is nothing to compare."""
     study: Study
-    """What is claimed, planned or not."""
+    """The comparisons that were planned and all others."""
     figures: Figures
     missing: Sequence[str]
+    """Sentences about what the report cannot show."""
     difference: float
-    """In success rate, which the reader would want to be able to see."""
+    """The smallest difference in success rate that matters to the reader."""
     command: str
-    """That made this report."""
+    """The command that made this report."""
     films: Films | None = None
-    """None where nobody asked for videos."""
+    """None if no videos were asked for."""
     differences: Sequence[TextTable] = ()
-    """Of two sweeps: what was set otherwise, and what came of it."""
+    """Tables of how settings and results of two sweeps side by side differ."""
 
     @property
     def drawings(self) -> Sequence[Drawing]:
@@ -74,29 +71,32 @@ class Report:
 
 
 def render(report: Report, *, live: bool = False) -> str:
-    """The page as HTML that needs nothing else.
+    """The page as self-contained HTML.
 
     Args:
-        report: what it shows.
-        live: whether it is served, and follows a sweep that runs.
+        report: the content of the page.
+        live: whether the page is served and follows a running sweep.
     """
     sweep = report.sweep
     data = chart_data(sweep, report.drawings)
     numbers = {stage["name"]: number for number, stage in enumerate(data["stages"])}
-    said = _said(report)
-    # What is claimed is to be seen at once; how it was counted stands below in small letters.
-    claims = next((i for i, line in enumerate(said) if line.startswith("Counted:")), len(said))
+    answer_lines = _answer(report)
+    # The claims stand in large letters, and how runs were counted below them in small ones.
+    counted = (i for i, line in enumerate(answer_lines) if line.startswith("Counted:"))
+    claims = next(counted, len(answer_lines))
     return document(
         data,
         live=live,
         name=sweep.name,
         facts=_facts(report),
         missing=report.missing,
-        asked=_asked(report),
-        said=said[:claims],
-        about=said[claims:],
-        large=_large(report, numbers),
-        groups=list(_groups(report, numbers)),
+        question=_question(report),
+        answer=answer_lines[:claims],
+        counting=answer_lines[claims:],
+        numbers=numbers,
+        pictures=report.figures.pictures,
+        large=_large_figure(report, list(numbers)),
+        groups=list(_groups(report)),
         differences=[table for table in report.differences if table.rows],
         searches=[search_section(search) for search in sweep.searches],
         films=report.films,
@@ -110,34 +110,38 @@ def render(report: Report, *, live: bool = False) -> str:
 
 def _facts(report: Report) -> Sequence[tuple[str, object]]:
     sweep = report.sweep
-    states = Counter(run.status for run in sweep.runs)
+    finished = Counter(run.status for run in sweep.runs)["FINISHED"]
     stages = [analysis.stage for analysis in report.analyses]
-    seeds = sorted({len(stage.seeds) for stage in stages})
+    seeds = [len(stage.seeds) for stage in stages]
+    ends = sorted({min(seeds), max(seeds)}) if seeds else []
+    began = DASH
+    if sweep.started is not None:
+        began = f"{datetime.fromtimestamp(sweep.started / 1000, UTC):%Y-%m-%d %H:%M UTC}"
     return (
         ("Sweep", state_in_words(sweep.status)),
-        ("Runs finished", f"{states['FINISHED']} of {len(sweep.runs)} begun"),
-        ("Seeds per condition", _range(seeds)),
+        ("Runs finished", f"{finished} of {len(sweep.runs)} begun"),
+        ("Seeds per condition", " to ".join(map(str, ends)) or DASH),
         ("Tasks", ", ".join(dict.fromkeys(t for s in stages for t in s.tasks)) or DASH),
-        ("Began", _date(sweep.started)),
+        ("Began", began),
     )
 
 
 # The answer -------------------------------------------------------------------------------------
 
 
-def _main(report: Report) -> StageAnalysis | None:
-    """What came of the sweep: its stages against each other, or the last that has the task."""
-    if report.together is not None:
+def _main_analysis(report: Report) -> StageAnalysis | None:
+    """Stages against each other, or the last stage that trains for the task, or the last one."""
+    if report.together is not None or not report.analyses:
         return report.together
-    last = [one for one in report.analyses if one.stage.has_task_reward] or report.analyses
-    return last[-1] if last else None
+    with_task = [one for one in report.analyses if one.stage.has_task_reward]
+    return (with_task or report.analyses)[-1]
 
 
-def _asked(report: Report) -> str:
-    """What the plan asks, or what the sweep's conditions do."""
+def _question(report: Report) -> str:
+    """The question of the plan, or the one that the sweep's conditions ask."""
     if report.study.question is not None:
         return report.study.question
-    main = _main(report)
+    main = _main_analysis(report)
     if main is None:
         return "Nothing has run yet."
     stage = main.stage
@@ -145,142 +149,125 @@ def _asked(report: Report) -> str:
     aim = " or ".join("success rate" if word == "success" else word for word in metrics)
     budgets = [b for run in stage.runs if (b := report.sweep.runs[run].budget)]
     steps = f", {statistics.median(budgets):,.0f} environment steps per run" if budgets else ""
-    seeds = f"{len(stage.seeds)} seed{'s' * (len(stage.seeds) != 1)}"
-    where = f"on {_and(stage.tasks)} ({seeds}{steps})"
-    if len(stage.conditions) == 1:
-        return f"What {aim} does {stage.conditions[0].label} reach {where}?"
-    settings = _and(varied(stage.conditions) or ["the stage"])
-    choices = len(stage.conditions)
-    which = f"{choices} settings of {settings}" if choices > 4 else _and(_labels(stage), "or")
+    seeds = "1 seed" if len(stage.seeds) == 1 else f"{len(stage.seeds)} seeds"
+    where = f"on {_enumerated(stage.tasks)} ({seeds}{steps})"
+    labels = [condition.label for condition in stage.conditions]
+    if len(labels) == 1:
+        return f"What {aim} does {labels[0]} reach {where}?"
+    which = _enumerated(labels, "or")
+    if len(labels) > 4:
+        settings = _enumerated(varied(stage.conditions) or ["the stage"])
+        which = f"{len(labels)} settings of {settings}"
     return f"Which ends at the higher {aim} {where}: {which}?"
 
 
-def _labels(stage: Stage) -> list[str]:
-    return [condition.label for condition in stage.conditions]
-
-
-def _said(report: Report) -> list[str]:
-    """The study's answer; of final values the main comparison, and other stages' first lines."""
-    main = _main(report)
+def _answer(report: Report) -> list[str]:
+    """The study's answer; then for final values the main comparison and that of other stages."""
+    main = _main_analysis(report)
     if main is None or not main.scopes:
         return []
     planned = planned_in_words(report.study)
-    said = [*answer(report.sweep, report.study)[1:], f"{planned[0].upper()}{planned[1:]}."]
+    lines = [*answer(report.sweep, report.study)[1:], f"{planned[0].upper()}{planned[1:]}."]
     others = [one for one in report.analyses if one.stage.has_task_reward and one is not main]
     firsts = [] if report.together else [verdict(s.scopes[0])[0] for s in others if s.scopes]
     finals = [verdict(main.scopes[0], report.difference)[0], *firsts]
-    return [*said, *(f"At the end of training: {line}" for line in finals)]
+    return [*lines, *(f"At the end of training: {line}" for line in finals)]
 
 
 # Figures ----------------------------------------------------------------------------------------
 
 
-def _large(report: Report, numbers: Mapping[str, int]) -> Figure | None:
-    """All tasks of what came of the sweep, by what they are judged by."""
-    stages = [stage for stage in numbers if stage == SIDE_BY_SIDE] or list(numbers)[-1:]
-    drawn = [d for d in report.drawings if d.stage in stages and d.title in PRIMARY]
-    return _figure(report, "Learning curves", drawn, numbers, metric="") if drawn else None
+def _large_figure(report: Report, stages: Sequence[str]) -> Mapping[str, Any] | None:
+    """Learning curves of the primary metrics: of all stages together, or of the last stage."""
+    shown = [stage for stage in stages if stage == SIDE_BY_SIDE] or stages[-1:]
+    drawings = [d for d in report.drawings if d.stage in shown and d.title in PRIMARY]
+    # The reader selects its metric.
+    return {**_figure("Learning curves", drawings), "metric": ""} if drawings else None
 
 
-def _groups(report: Report, numbers: Mapping[str, int]) -> Iterable[Mapping[str, Any]]:
-    own = {drawing.stage for drawing in report.drawings if drawing.stage != SIDE_BY_SIDE}
-    pairs = [*([report.together] if report.together else []), *report.analyses]
-    tables: dict[str, Sequence[TextTable]] = {
-        PERFORMANCE: [*study_tables(report.study), *(performance_tables(pairs) if pairs else [])],
+def _groups(report: Report) -> Iterable[Mapping[str, Any]]:
+    """Figures, tables and remarks under each heading that has any."""
+    stages = {drawing.stage for drawing in report.drawings if drawing.stage != SIDE_BY_SIDE}
+    analyses = [*filter(None, [report.together]), *report.analyses]
+    performance = performance_tables(analyses) if analyses else []
+    tables = {
+        PERFORMANCE: [*study_tables(report.study), *performance],
         COST: [budget(report.sweep, report.analyses), failures(report.sweep)],
     }
+    remarks = {PERFORMANCE: list(_remarks(report)), SETTINGS: list(_not_drawn(report))}
     for group in GROUPS:
         by_title: dict[str, list[Drawing]] = {}
         for drawing in report.drawings:
-            on_top = drawing.stage == SIDE_BY_SIDE and drawing.title in PRIMARY
-            if drawing.group == group and not on_top:
+            # The large figure has the primary metrics of its stages.
+            is_large = drawing.stage == SIDE_BY_SIDE or len(stages) < 2
+            if drawing.group == group and not (is_large and drawing.title in PRIMARY):
                 by_title.setdefault(drawing.title, []).append(drawing)
-        figures = [
-            _figure(report, title, drawn, numbers)
-            for title, drawn in by_title.items()
-            # The large figure has them already.
-            if len(own) > 1 or title not in PRIMARY
-        ]
-        said = {PERFORMANCE: list(_remarks(report)), SETTINGS: _not_drawn(report)}.get(group, [])
-        shown = [table for table in tables.get(group, ()) if table.rows]
-        if figures or shown or said:
-            yield {"title": group, "figures": figures, "tables": shown, "said": said}
+        content = {
+            "figures": [_figure(*item) for item in by_title.items()],
+            "tables": [table for table in tables.get(group, ()) if table.rows],
+            "remarks": remarks.get(group, []),
+        }
+        if any(content.values()):
+            yield {"title": group, **content}
 
 
-def _figure(
-    report: Report,
-    title: str,
-    drawings: Sequence[Drawing],
-    numbers: Mapping[str, int],
-    metric: str | None = None,
-) -> Figure:
-    if metric is None and drawings[0].metric is not None:
-        metric = drawings[0].metric.name
-    pictures = report.figures.pictures
-    return Figure(
-        name=slug(title),
-        title=title,
-        caption=drawings[-1].caption,
-        metric=metric,
-        stages=[
-            Panels(
-                name=drawing.name,
-                stage=drawing.stage if len(drawings) > 1 else "",
-                number=numbers.get(drawing.stage, -1),
-                legend=drawing.legend,
-                panels=[
-                    (f"{drawing.title}, {panel.title}", panel.title, svg)
-                    for panel, svg in zip(drawing.panels, pictures[drawing.name], strict=True)
-                ],
-            )
-            for drawing in drawings
-        ],
-    )
+def _figure(title: str, drawings: Sequence[Drawing]) -> Mapping[str, Any]:
+    """A figure of one or more stages; the page's script draws the curves of its metric."""
+    metric = drawings[0].metric
+    panels = sum(len(drawing.panels) for drawing in drawings)
+    return {
+        "name": slug(title),
+        "title": title,
+        "caption": drawings[-1].caption,
+        "metric": None if metric is None else metric.name,
+        "drawings": drawings,
+        # A CSS class for the number of columns that it spans.
+        "span": ("one", "two", "three")[min(panels, 3) - 1],
+    }
 
 
 def _remarks(report: Report) -> Iterable[Sequence[str]]:
-    """Of each stage what else is to be known, and what may be said on each task."""
-    several = len(report.analyses) > 1
-    for analysis in [*([report.together] if report.together else []), *reversed(report.analyses)]:
-        stage, said = analysis.stage, []
+    """A heading for each stage, its peculiarities, and a verdict on each of its tasks."""
+    for analysis in [*filter(None, [report.together]), *reversed(report.analyses)]:
+        stage = analysis.stage
+        remarks = []
         if stage.compared not in ((), stage.conditions):
-            said.append("Curves and comparisons are of the runs on fresh seeds; tables have all.")
+            remarks.append(
+                "Curves and comparisons are of the runs on fresh seeds; tables have all."
+            )
         if not stage.has_task_reward:
-            said.append("It trains without the task's reward: success is not its aim.")
+            remarks.append("It trains without the task's reward: success is not its aim.")
         if len(stage.conditions) == 1:
-            said.append(f"It has a single condition ({_labels(stage)[0]}): no comparison.")
+            only = stage.conditions[0].label
+            remarks.append(f"It has a single condition ({only}): no comparison.")
         if len(stage.seeds) == 1:
-            said.append(
+            remarks.append(
                 f"It has a single seed ({stage.seeds[0]}): one run shows what can happen and not "
                 "what usually does; there are no intervals."
             )
-        said += [line for scope in analysis.scopes for line in verdict(scope, report.difference)]
-        head = f"Stage {stage.name} ({stage.variant}), seeds {', '.join(stage.seeds)}"
+        for scope in analysis.scopes:
+            remarks += verdict(scope, report.difference)
+        heading = f"Stage {stage.name} ({stage.variant}), seeds {', '.join(stage.seeds)}"
         if analysis is report.together:
-            head = "Stages side by side, each by the runs of the conditions that all have"
-        if said or several:
-            yield [head, *said]
+            heading = "Stages side by side, each by the runs of the conditions that all have"
+        if remarks or len(report.analyses) > 1:
+            yield [heading, *remarks]
 
 
-def _not_drawn(report: Report) -> list[Sequence[str]]:
-    """What would have to vary for the figures that are not there."""
+def _not_drawn(report: Report) -> Iterable[Sequence[str]]:
+    """For each stage the figures of settings that it lacks, and what it would need for them."""
     drawn = {(drawing.stage, drawing.title) for drawing in report.drawings}
-    found: list[Sequence[str]] = []
     for analysis in report.analyses:
         stage = analysis.stage
-        absent = [title for title in INFLUENCE if (stage.name, title) not in drawn]
-        if not absent or len(stage.conditions) == 1:
-            continue
-        settings = ", ".join(varied(stage.conditions)) or "nothing"
-        found.append(
-            (
+        absent = [title.lower() for title in INFLUENCE if (stage.name, title) not in drawn]
+        if absent and len(stage.conditions) > 1:
+            yield (
                 f"Stage {stage.name}",
-                f"Not drawn: {', '.join(title.lower() for title in absent)}. This stage varies "
-                f"{settings}; sensitivity needs α or the MI weight, the other two need a second "
-                f"setting beside q and finished runs (importance: {FEWEST_RUNS} on a task).",
+                f"Not drawn: {', '.join(absent)}. This stage varies "
+                f"{', '.join(varied(stage.conditions)) or 'nothing'}; sensitivity needs α or the "
+                "MI weight, the other two need a second setting beside q and finished runs "
+                f"(importance: {FEWEST_RUNS} on a task).",
             )
-        )
-    return found
 
 
 _OUTCOMES = {True: "goal reached", False: "goal not reached", None: "the task names no success"}
@@ -305,17 +292,6 @@ _METHOD = (
 )
 
 
-def _and(words: Sequence[str], last: str = "and") -> str:
+def _enumerated(words: Sequence[str], last: str = "and") -> str:
+    """`a, b and c`."""
     return f" {last} ".join(filter(None, (", ".join(words[:-1]), words[-1])))
-
-
-def _range(values: Sequence[int]) -> str:
-    if not values:
-        return DASH
-    return str(values[0]) if len(values) == 1 else f"{values[0]} to {values[-1]}"
-
-
-def _date(milliseconds: int | None) -> str:
-    if milliseconds is None:
-        return DASH
-    return datetime.fromtimestamp(milliseconds / 1000, UTC).strftime("%Y-%m-%d %H:%M UTC")

@@ -1,4 +1,4 @@
-"""The page's pieces as plain data; `page.html` makes HTML of them and escapes every text."""
+"""Tables of the page as data, and the page itself, whose template escapes all texts."""
 
 from __future__ import annotations
 
@@ -13,12 +13,14 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from jinja2.utils import htmlsafe_json_dumps
 
-from music_rllib.report.figures.palette import DASHES, Style
+from music_rllib.report.figures.palette import DASHES
+from music_rllib.results.comparison import interval_text, number
+from music_rllib.results.statistics import Estimate
 
-__all__ = ["Cell", "Figure", "Panels", "TextTable", "document", "number"]
-
-# Nothing may be fetched, and nothing run but the page's own script, whatever finds its way into a
-# page. Matplotlib's drawings have style attributes, for which no hash can stand.
+DASH = "–"
+"""Stands in a table where there is no value."""
+# The page may fetch nothing and run only its own script, whatever text a sweep puts into it.
+# Styles cannot be restricted by a hash: matplotlib's SVGs have style attributes.
 _POLICY = (
     "default-src 'none'; script-src 'sha256-{script}'; connect-src {connect}; "
     "style-src 'unsafe-inline'; img-src data:; media-src data:; base-uri 'none'; form-action 'none'"
@@ -28,19 +30,26 @@ _MARKS = {"o": "●", "s": "■", "D": "◆", "^": "▲", "v": "▼", "P": "✚"
 
 @dataclass(frozen=True, kw_only=True)
 class Cell:
-    """A table's cell that is more than short text."""
+    """A table cell with a layout, a code font or a link."""
 
     text: str
     kind: str = ""
-    """`number`, which stands right, or `long`, which has several lines."""
+    """CSS class: `number` (right-aligned), `long` (wraps over several lines) or empty."""
     code: bool = False
     url: str | None = None
-    """Where it leads."""
+    """Target of its link."""
 
 
-def number(shown: str) -> Cell:
-    """A number that is text already."""
-    return Cell(text=shown, kind="number")
+def number_cell(text: str) -> Cell:
+    """A right-aligned cell with a formatted number."""
+    return Cell(text=text, kind="number")
+
+
+def estimate_cells(estimate: Estimate | None) -> tuple[Cell, str]:
+    """An estimate's value and its 95 % interval; dashes where there is no estimate."""
+    if estimate is None:
+        return number_cell(DASH), DASH
+    return number_cell(number(estimate.value)), interval_text(estimate)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,18 +60,18 @@ class TextTable:
     note: str = ""
     header: Sequence[str]
     rows: Sequence[Sequence[object]]
-    """Texts, numbers and cells."""
+    """Each value is a text, a number or a :class:`Cell`."""
     long: bool = False
-    """Whether it is folded."""
+    """Whether the page shows it folded."""
 
     @cached_property
     def cells(self) -> list[list[Cell]]:
-        """The rows, each value as a cell."""
+        """The rows with each value as a cell."""
         return [[_cell(value) for value in row] for row in self.rows]
 
     @property
     def heads(self) -> list[tuple[str, str]]:
-        """Each column's name, and the kind of its first cell."""
+        """Each column's name and the kind of its first cell."""
         kinds = [cell.kind for cell in self.cells[0]] if self.cells else [""] * len(self.header)
         return list(zip(self.header, kinds, strict=True))
 
@@ -71,38 +80,6 @@ def _cell(value: object) -> Cell:
     if isinstance(value, Cell):
         return value
     return Cell(text=str(value), kind="number" if isinstance(value, int | float) else "")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Panels:
-    """What a figure shows without a script: the panels of one stage."""
-
-    name: str
-    stage: str
-    """Empty where the figure has one only."""
-    number: int
-    """Of the stage in the page's data; -1 where it is not there."""
-    legend: Sequence[tuple[str, Style]]
-    panels: Sequence[tuple[str, str, str]]
-    """What each shows in words, its title, and its SVG element."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Figure:
-    """A figure of the page."""
-
-    name: str
-    title: str
-    caption: str
-    metric: str | None
-    """Whose curves the page's script draws; empty: the one that the reader chooses."""
-    stages: Sequence[Panels]
-
-    @property
-    def span(self) -> str:
-        """Over how many of the page's columns it goes."""
-        panels = sum(len(stage.panels) for stage in self.stages)
-        return ("one", "two", "three")[min(panels, 3) - 1]
 
 
 _PAGES = Environment(
@@ -115,20 +92,20 @@ _PAGES = Environment(
 
 
 def document(data: Any, *, live: bool, **content: Any) -> str:
-    """The whole page, with its style and scripts inside.
+    """Render the whole page, with its style and scripts inline.
 
     Args:
-        data: what its script draws.
-        live: whether it follows a sweep on the server that it came from.
-        content: what `page.html` names.
+        data: the curves that its script draws.
+        live: whether its script polls the server that it came from for the state of the sweep.
+        content: the other variables of `page.html`.
     """
-    scripts = ("chart.js", "page.js", *(("live.js",) if live else ()))
-    script = "\n".join(_own(name) for name in scripts)
+    scripts = ("chart.js", "page.js", "live.js") if live else ("chart.js", "page.js")
+    script = "\n".join(_web_file(name) for name in scripts)
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     page = _PAGES.get_template("page.html").render(
-        style=_own("page.css"),
+        style=_web_file("page.css"),
         script=script,
-        # As JSON, in which no text can end the element.
+        # JSON in which no text can close the script element.
         data=htmlsafe_json_dumps(data, separators=(",", ":"), allow_nan=False),
         policy=_POLICY.format(script=digest, connect="'self'" if live else "'none'"),
         dashes=DASHES,
@@ -139,5 +116,5 @@ def document(data: Any, *, live: bool, **content: Any) -> str:
     return page.strip() + "\n"
 
 
-def _own(name: str) -> str:
+def _web_file(name: str) -> str:
     return (Path(__file__).parent / "web" / name).read_text(encoding="utf-8")

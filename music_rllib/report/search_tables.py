@@ -1,35 +1,33 @@
-"""What a sweep's searches found, as tables of text, from what their driver keeps of them."""
+"""The results of a sweep's searches as tables of text, from the entries of `search.json`."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from music_rllib.report.pieces import TextTable
-
-__all__ = ["search_in_words", "search_tables"]
+from music_rllib.report.pieces import DASH, TextTable
 
 Entry = Mapping[str, Any]
-"""One search, one of its arms, trials or ranked settings, as in `search.json`."""
-DASH = "–"
+"""A search in `search.json`, or one of its arms, trials or ranked settings."""
 
 
 def search_in_words(search: Entry) -> str:
-    """How it searched, in a sentence."""
-    trials = [trial for arm in search["arms"] for trial in arm["trials"]]
+    """A sentence with the search's mode, sampler, objectives and numbers of trials."""
+    states = [trial["state"] for arm in search["arms"] for trial in arm["trials"]]
     counts = ", ".join(
-        f"{count} {state}"
+        f"{states.count(state)} {state}"
         for state in ("judged", "pruned", "failed")
-        if (count := sum(trial["state"] == state for trial in trials))
+        if state in states
     )
-    aims = " and ".join(f"{one['direction']} {one['name']}" for one in search["objectives"])
+    aims = " and ".join(f"{aim['direction']} {aim['name']}" for aim in search["objectives"])
     return f"{search['mode'].capitalize()} ({search['sampler']}): {aims}; trials: {counts}."
 
 
 def search_tables(search: Entry) -> Iterator[TextTable]:
-    """The ranking on fresh seeds, what each setting matters, and every trial."""
-    settings = _settings(search)
-    aims = [one["name"] for one in search["objectives"]]
+    """The ranking on fresh seeds, the importance of each setting, and every trial."""
+    trials = [trial for arm in search["arms"] for trial in arm["trials"]]
+    settings = list(dict.fromkeys(name for trial in trials for name in trial["values"]))
+    aims = [aim["name"] for aim in search["objectives"]]
     if search["ranking"]:
         yield _ranking(search["ranking"], settings, aims)
     for arm in search["arms"]:
@@ -42,13 +40,12 @@ def search_tables(search: Entry) -> Iterator[TextTable]:
         rows=[
             (
                 str(trial["number"]),
-                *_chosen(trial["values"], settings),
+                *(_text(trial["values"].get(name)) for name in settings),
                 trial["state"],
                 *_values(trial.get("objective"), trial.get("interval"), len(aims)),
                 trial["reason"] or "",
             )
-            for arm in search["arms"]
-            for trial in arm["trials"]
+            for trial in trials
             if trial["state"] != "waiting"
         ],
     )
@@ -68,9 +65,9 @@ def _ranking(ranking: Sequence[Entry], settings: Sequence[str], aims: Sequence[s
             (
                 str(place),
                 _text(row["trial"]),
-                *_chosen(row["values"], settings),
+                *(_text(row["values"].get(name)) for name in settings),
                 *_values(row.get("fresh"), row.get("interval"), len(aims)),
-                *_of_seeds(row),
+                *_seeds_and_chance(row),
             )
             for place, row in enumerate(ranking, start=1)
         ],
@@ -87,39 +84,25 @@ def _importance(arm: Entry) -> TextTable:
     )
 
 
-def _of_seeds(row: Entry) -> tuple[str, str, str]:
+def _seeds_and_chance(row: Entry) -> tuple[str, str, str]:
+    """A ranked setting's number of seeds, its objectives in the search, and its chance to lose."""
     if "failure" in row:
         return "", "", f"failed: {row['failure']}"
     better = row.get("best_is_better_with")
     chosen = ", ".join(_number(value) for value in row.get("searched") or ())
-    return (
-        str(len(row["scores"][0])),
-        chosen or DASH,
-        DASH if better is None else _percent(better),
-    )
+    chance = DASH if better is None else _percent(better)
+    return str(len(row["scores"][0])), chosen or DASH, chance
 
 
-def _settings(search: Entry) -> list[str]:
-    return list(
-        dict.fromkeys(
-            name for arm in search["arms"] for trial in arm["trials"] for name in trial["values"]
-        )
-    )
-
-
-def _chosen(values: Mapping[str, Any], settings: Iterable[str]) -> Iterator[str]:
-    return (_text(values.get(name)) for name in settings)
-
-
-def _with_intervals(aims: Iterable[str]) -> Iterator[str]:
+def _with_intervals(aims: Sequence[str]) -> Iterator[str]:
     for aim in aims:
-        yield aim
-        yield "95 % interval"
+        yield from (aim, "95 % interval")
 
 
 def _values(
     values: Sequence[float | None] | None, intervals: Sequence[Any] | None, count: int
 ) -> Iterator[str]:
+    """The value and the interval of each of `count` objectives; empty texts where unknown."""
     for aim in range(count):
         yield _number(values[aim]) if values else ""
         low, high = intervals[aim] if intervals else (None, None)

@@ -1,4 +1,4 @@
-"""Two sweeps as one: what differs in their settings and in what came of them."""
+"""Two sweeps as one, and tables of how their settings and results differ."""
 
 from __future__ import annotations
 
@@ -8,28 +8,23 @@ from dataclasses import replace
 import numpy as np
 
 from music_rllib import names
-from music_rllib.report.pieces import TextTable, number
+from music_rllib.report.pieces import DASH, TextTable, number_cell
 from music_rllib.results import statistics as st
 from music_rllib.results.analysis import StageAnalysis
 from music_rllib.results.archive.merge import merged
-from music_rllib.results.comparison import Final, interval_text
-from music_rllib.results.comparison import number as in_short
+from music_rllib.results.comparison import Final, interval_text, number
 from music_rllib.results.conditions import Condition
 from music_rllib.results.data import RunRecord, Sweep
 
-__all__ = ["difference_tables", "side_by_side"]
-
-_LINKS = (names.TAG_NODE_KEY, names.TAG_SOURCE_NODE)
 MOST_VALUES = 6
-"""Of a setting in one sweep, that are shown."""
-DASH = "–"
+"""Largest number of a setting's values that are shown for one sweep."""
 
 
 def side_by_side(first: Sweep, second: Sweep) -> Sweep:
-    """All runs of both; stages are called by their sweep, so that they are compared."""
-    one, other = _titles(first, second)
-    both = merged(_renamed(first, one), _renamed(second, other))
-    return replace(both, name=f"{one} and {other}", config=None, plans=(), searches=())
+    """All runs of both sweeps; stage names begin with the sweep, so that stages are compared."""
+    titles = _titles(first, second)
+    both = merged(_renamed(first, titles[0]), _renamed(second, titles[1]))
+    return replace(both, name=" and ".join(titles), config=None, plans=(), searches=())
 
 
 def _titles(first: Sweep, second: Sweep) -> tuple[str, str]:
@@ -39,12 +34,17 @@ def _titles(first: Sweep, second: Sweep) -> tuple[str, str]:
 
 
 def _renamed(sweep: Sweep, title: str) -> Sweep:
-    """Runs that both have by the same node are two all the same: otherwise one would lack it."""
-    return replace(sweep, runs=[_of(run, title) for run in sweep.runs])
+    return replace(sweep, runs=[_renamed_run(run, title) for run in sweep.runs])
 
 
-def _of(run: RunRecord, title: str) -> RunRecord:
-    links = {tag: f"{title}/{run.tags[tag]}" for tag in _LINKS if run.tags.get(tag)}
+def _renamed_run(run: RunRecord, title: str) -> RunRecord:
+    """The run with the sweep's title in its name, stage and node keys.
+
+    A run that both sweeps took from the same node counts twice: otherwise one of them would lack
+    it.
+    """
+    keys = (names.TAG_NODE_KEY, names.TAG_SOURCE_NODE)
+    links = {tag: f"{title}/{run.tags[tag]}" for tag in keys if run.tags.get(tag)}
     stage = {names.TAG_STAGE: f"{title}: {run.stage}"}
     return replace(run, name=f"{title}: {run.name}", tags={**run.tags, **links, **stage})
 
@@ -52,23 +52,23 @@ def _of(run: RunRecord, title: str) -> RunRecord:
 def difference_tables(
     first: Sweep, second: Sweep, analyses: Sequence[StageAnalysis]
 ) -> list[TextTable]:
-    """What was set otherwise, and what conditions that both have came to.
+    """Settings that differ, and the final values of all conditions in both sweeps.
 
     Args:
-        first: as it was read, as is `second`.
-        second: the other.
-        analyses: of both as one, by :func:`side_by_side`.
+        first: the first sweep as it was read.
+        second: the second sweep as it was read.
+        analyses: of the sweep that :func:`side_by_side` makes of them.
     """
     titles = _titles(first, second)
-    return [_settings(first, second, titles), _results(analyses, titles)]
+    return [_settings_table(first, second, titles), _results_table(analyses, titles)]
 
 
-def _settings(first: Sweep, second: Sweep, titles: tuple[str, str]) -> TextTable:
-    one, other = _values(first), _values(second)
+def _settings_table(first: Sweep, second: Sweep, titles: tuple[str, str]) -> TextTable:
+    one, other = _setting_values(first), _setting_values(second)
     rows = [
-        (stage, setting, *(_shown(found.get((stage, setting))) for found in (one, other)))
-        for stage, setting in sorted({*one, *other})
-        if one.get((stage, setting)) != other.get((stage, setting))
+        (*key, _values_text(one.get(key)), _values_text(other.get(key)))
+        for key in sorted({*one, *other})
+        if one.get(key) != other.get(key)
     ]
     return TextTable(
         title="Settings that differ",
@@ -77,56 +77,43 @@ def _settings(first: Sweep, second: Sweep, titles: tuple[str, str]) -> TextTable
     )
 
 
-def _values(sweep: Sweep) -> Mapping[tuple[str, str], set[str]]:
-    found: dict[tuple[str, str], set[str]] = {}
+def _setting_values(sweep: Sweep) -> Mapping[tuple[str, str], set[str]]:
+    """The values of each (stage, setting)."""
+    about = (names.TAG_ALGORITHM, names.TAG_VARIANT)
+    values: dict[tuple[str, str], set[str]] = {}
     for run in sweep.runs:
-        about = {
-            name: value
-            for name, value in run.tags.items()
-            if name == names.TAG_ALGORITHM or name == names.TAG_VARIANT
-        }
-        for name, value in {**run.params, **about}.items():
-            found.setdefault((run.stage, name), set()).add(value)
-    return found
+        tags = {tag: run.tags[tag] for tag in about if tag in run.tags}
+        for name, value in {**run.params, **tags}.items():
+            values.setdefault((run.stage, name), set()).add(value)
+    return values
 
 
-def _shown(values: set[str] | None) -> str:
+def _values_text(values: set[str] | None) -> str:
     if not values:
         return DASH
     more = len(values) - MOST_VALUES
     return ", ".join(sorted(values)[:MOST_VALUES]) + (f" and {more} more" if more > 0 else "")
 
 
-def _results(analyses: Sequence[StageAnalysis], titles: tuple[str, str]) -> TextTable:
-    ended = [
+def _results_table(analyses: Sequence[StageAnalysis], titles: tuple[str, str]) -> TextTable:
+    one, other = (
         {
-            (
-                analysis.stage.name.removeprefix(f"{title}: "),
-                scope.name,
-                final.condition.label,
-            ): final
+            (analysis.stage.name.removeprefix(start), scope.name, final.condition.label): final
             for analysis in analyses
-            if analysis.stage.name.startswith(f"{title}: ")
+            if analysis.stage.name.startswith(start)
             for scope in analysis.scopes
             for final in scope.finals
         }
-        for title in titles
-    ]
-    one, other = ended
+        for start in (f"{title}: " for title in titles)
+    )
     rows = []
     for key in dict.fromkeys((*one, *other)):
-        pair = one.get(key), other.get(key)
-        gap = None
-        if pair[0] is not None and pair[1] is not None:
-            gap = st.difference(pair[1].estimate, pair[0].estimate)
-        rows.append(
-            (
-                *key,
-                *map(_mean, pair),
-                number(DASH if gap is None else f"{float(gap.value):+.3g}"),
-                DASH if gap is None else interval_text(gap),
-            )
-        )
+        first, second = one.get(key), other.get(key)
+        difference, interval = DASH, DASH
+        if first is not None and second is not None:
+            gap = st.difference(second.estimate, first.estimate)
+            difference, interval = f"{float(gap.value):+.3g}", interval_text(gap)
+        rows.append((*key, _mean(first), _mean(second), number_cell(difference), interval))
     return TextTable(
         title="Results of both",
         header=("Stage", "Task", "Condition", *titles, "Difference", "95 % interval"),
@@ -139,4 +126,4 @@ def _results(analyses: Sequence[StageAnalysis], titles: tuple[str, str]) -> Text
 def _mean(final: Final[Condition] | None) -> str:
     if final is None or np.isnan(final.value):
         return DASH
-    return f"{in_short(final.value)} ({interval_text(final.estimate)})"
+    return f"{number(final.value)} ({interval_text(final.estimate)})"

@@ -1,50 +1,42 @@
-"""A study in a report: its tables, on the page and as CSV, and its figures."""
+"""The claims of a study: tables for the page, CSV files and figures."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
 from music_rllib.report.figures.choice import SETTINGS, Drawing
-from music_rllib.report.figures.palette import style_of
+from music_rllib.report.figures.palette import styles_of
 from music_rllib.report.figures.study import alpha_panels, area_profile_panels
-from music_rllib.report.pieces import TextTable, number
+from music_rllib.report.pieces import DASH, TextTable, estimate_cells
 from music_rllib.report.tables import Table
 from music_rllib.results.claims.contrasts import Verdict
 from music_rllib.results.claims.sensitivity import alpha_sensitivity
 from music_rllib.results.claims.study import Claim, Study, label_of
 from music_rllib.results.claims.tables import claim_rows, mean_rows
-from music_rllib.results.comparison import SHOW_SEEDS_BELOW, interval_text, p_text
-from music_rllib.results.comparison import number as in_short
+from music_rllib.results.comparison import SHOW_SEEDS_BELOW, number, p_text
 
-__all__ = ["AGAINST_ALPHA", "study_csv", "study_drawings", "study_tables"]
-
-DASH = "–"
 AGAINST_ALPHA = "Area under the curve against α"
 
 
 def study_tables(study: Study) -> list[TextTable]:
-    """The comparisons, the planned ones first, and the primary metric of each condition."""
-    return [_claims(study), _means(study)]
+    """The comparisons, planned ones first, and the primary metric of each condition."""
+    return [_claims_table(study), _means_table(study)]
 
 
-def _claims(study: Study) -> TextTable:
+def _claims_table(study: Study) -> TextTable:
     return TextTable(
         title="Comparisons by the area under the curve",
         header=("Task", "Pair", "Difference", "95 % interval", "p", "Verdict", "Planned", "Seeds"),
         rows=[
             (
-                one.task,
-                f"{one.first} against {one.second}",
-                number(in_short(one.contrast.difference.value)),
-                interval_text(one.contrast.difference),
-                _p(one),
-                f"{one.verdict} within {one.margin:g}"
-                if one.verdict is Verdict.EQUIVALENT
-                else str(one.verdict),
-                "yes" if one.planned else "no",
-                " and ".join(map(str, dict.fromkeys(one.contrast.seeds))),
+                claim.task,
+                f"{claim.first} against {claim.second}",
+                *estimate_cells(claim.contrast.difference),
+                *_p_and_verdict(claim),
+                "yes" if claim.planned else "no",
+                " and ".join(map(str, dict.fromkeys(claim.contrast.seeds))),
             )
-            for one in (*study.planned, *study.afterwards)
+            for claim in (*study.planned, *study.afterwards)
         ],
         note="Differences of a seed where seeds are shared (Student's t, Welch's otherwise); "
         "equivalence by two one-sided tests. Holm's correction over what was planned, and over the "
@@ -52,26 +44,26 @@ def _claims(study: Study) -> TextTable:
     )
 
 
-def _p(claim: Claim) -> str:
-    if claim.verdict is Verdict.EQUIVALENT and claim.p_equivalent is not None:
-        return p_text(claim.p_equivalent)
-    return p_text(claim.p_value)
+def _p_and_verdict(claim: Claim) -> tuple[str, str]:
+    if claim.verdict is not Verdict.EQUIVALENT:
+        return p_text(claim.p_value), str(claim.verdict)
+    p_value = claim.p_value if claim.p_equivalent is None else claim.p_equivalent
+    return p_text(p_value), f"{claim.verdict} within {claim.margin:g}"
 
 
-def _means(study: Study) -> TextTable:
+def _means_table(study: Study) -> TextTable:
     rows = [
         (
-            one.task,
-            label_of(one.condition),
-            one.measure.words,
-            number(in_short(one.estimate.value)),
-            interval_text(one.estimate),
-            " ".join(map(in_short, sorted(one.scores.by_seed.values())))
-            if len(one.scores.by_seed) < SHOW_SEEDS_BELOW
+            mean.task,
+            label_of(mean.condition),
+            mean.measure.words,
+            *estimate_cells(mean.estimate),
+            " ".join(map(number, sorted(mean.scores.by_seed.values())))
+            if len(mean.scores.by_seed) < SHOW_SEEDS_BELOW
             else DASH,
-            f"{len(one.scores.by_seed)} of {one.runs}",
+            f"{len(mean.scores.by_seed)} of {mean.runs}",
         )
-        for one in study.means
+        for mean in study.means
     ]
     return TextTable(
         title="Area under the learning curve",
@@ -82,16 +74,15 @@ def _means(study: Study) -> TextTable:
 
 
 def study_csv(study: Study) -> Iterator[Table]:
-    """The same unrounded, and the curve over α."""
-    means = [row | {"by_seed": _seeds(row["by_seed"])} for row in mean_rows(study)]
+    """The same numbers unrounded, and the primary metric as a function of α."""
+    means = [row | {"by_seed": _seed_scores(row["by_seed"])} for row in mean_rows(study)]
     claims = [row | {"seeds": " ".join(map(str, row["seeds"]))} for row in claim_rows(study)]
     for name, rows in (("area_under_curve", means), ("comparisons", claims)):
-        columns = list(rows[0]) if rows else []
+        columns = " ".join(rows[0]) if rows else ""
         yield Table(name=name, columns=columns, rows=[list(row.values()) for row in rows])
-    lines = alpha_sensitivity(study.means)
     yield Table(
         name="alpha_sensitivity",
-        columns=("task", "entropic_index", "others", "alpha", "mean", "lower", "upper", "seeds"),
+        columns="task entropic_index others alpha mean lower upper seeds",
         rows=[
             (
                 line.task,
@@ -103,33 +94,32 @@ def study_csv(study: Study) -> Iterator[Table]:
                 float(line.estimate.upper[point]),
                 len(mean.scores.by_seed),
             )
-            for line in lines
+            for line in alpha_sensitivity(study.means)
             for point, mean in enumerate(line.means)
         ],
     )
 
 
-def _seeds(by_seed: dict[str, float]) -> str:
+def _seed_scores(by_seed: dict[str, float]) -> str:
     return " ".join(f"{seed}:{score:g}" for seed, score in by_seed.items())
 
 
 def study_drawings(study: Study) -> Iterator[Drawing]:
-    """The primary metric's performance profile, and how it depends on α."""
+    """The performance profile of the primary metric, and its dependence on α."""
     if study.stage is None:
         return
+    styles = styles_of(study.stage.compared)
     shown = list(dict.fromkeys(mean.condition for mean in study.means))
-    siblings = study.stage.compared
-    legend = [(label_of(one), style_of(one, siblings)) for one in shown]
-    if profiles := area_profile_panels(study):
+    if profiles := area_profile_panels(study.means, styles):
         yield Drawing(
             stage=study.stage.name,
             title="Performance profile of the area under the curve",
             caption="Share of finished runs above each area, with 95 % bands at each point.",
             panels=tuple(profiles),
-            legend=legend,
+            legend=[(label_of(condition), styles[condition]) for condition in shown],
         )
-    if lines := alpha_panels(study):
-        by_q = {one.entropic_index: style_of(one, siblings) for one in reversed(shown)}
+    if lines := alpha_panels(study.means, styles):
+        by_q = {one.entropic_index: styles[one] for one in reversed(shown)}
         yield Drawing(
             stage=study.stage.name,
             title=AGAINST_ALPHA,

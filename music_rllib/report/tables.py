@@ -9,47 +9,42 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from music_rllib import names
+from music_rllib.report.figures.choice import Drawing
 from music_rllib.results.analysis import StageAnalysis
+from music_rllib.results.conditions import SIDE_BY_SIDE
 from music_rllib.results.data import Sweep
-
-__all__ = [
-    "Table",
-    "finals_table",
-    "improvement_table",
-    "note",
-    "races_table",
-    "runs_table",
-    "waits_table",
-]
+from music_rllib.results.statistics import Estimate
 
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
-    """One CSV file."""
+    """The content of one CSV file."""
 
     name: str
-    columns: Sequence[str]
+    columns: str
+    """Names of the columns, separated by spaces."""
     rows: Sequence[Sequence[object]]
 
     def to_csv(self) -> str:
-        """With a header; NaN is `nan`, infinity `inf`."""
+        """The rows below a header; NaN is `nan`, infinity `inf`."""
         buffer = io.StringIO()
         writer = csv.writer(buffer, lineterminator="\n")
-        writer.writerow(self.columns)
+        writer.writerow(self.columns.split())
         writer.writerows(self.rows)
         return buffer.getvalue()
 
 
+def _numbers(estimate: Estimate) -> tuple[float, float, float]:
+    return float(estimate.value), float(estimate.lower), float(estimate.upper)
+
+
 def finals_table(analyses: Iterable[StageAnalysis]) -> Table:
-    """How each condition ended, and each of its seeds: means over the tasks."""
+    """Final values of each condition and of each of its seeds, means over the tasks."""
     return Table(
         name="final",
-        columns=(
-            *("stage", "tasks", "metric", "condition", "runs", "seeds", "mean", "lower", "upper"),
-            "each_seed",
-            *("shannon_entropy", "shannon_entropy_lower", "shannon_entropy_upper"),
-            *("tsallis_entropy", "tsallis_entropy_lower", "tsallis_entropy_upper"),
-        ),
+        columns="stage tasks metric condition runs seeds mean lower upper each_seed "
+        "shannon_entropy shannon_entropy_lower shannon_entropy_upper tsallis_entropy "
+        "tsallis_entropy_lower tsallis_entropy_upper",
         rows=[
             (
                 analysis.stage.name,
@@ -58,9 +53,7 @@ def finals_table(analyses: Iterable[StageAnalysis]) -> Table:
                 final.condition.label,
                 final.runs,
                 final.seeds,
-                final.value,
-                float(final.estimate.lower),
-                float(final.estimate.upper),
+                *_numbers(final.estimate),
                 " ".join(f"{score:g}" for score in final.scores.mean(axis=1)),
                 *analysis.entropies[scope.name, final.condition].numbers,
             )
@@ -72,27 +65,27 @@ def finals_table(analyses: Iterable[StageAnalysis]) -> Table:
 
 
 def note(analyses: Iterable[StageAnalysis], run_id: str, figure: str | None) -> str:
-    """The last stage's conditions and the report's first figure, in Markdown for MLflow's page.
+    """The last stage's final values and the report's first figure, in Markdown for MLflow's page.
 
     Args:
-        analyses: Of the sweep's stages.
-        run_id: Of the sweep's own run.
-        figure: An artefact of it; None where nothing is drawn.
+        analyses: The analyses of the sweep's stages.
+        run_id: The MLflow id of the sweep's own run.
+        figure: The path of an artefact of that run; None if nothing is drawn.
     """
     columns = ("tasks", "condition", "seeds", "metric", "mean", "lower", "upper")
     final = finals_table(list(analyses)[-1:])
-    cells = [[str(row[final.columns.index(name)]) for name in columns] for row in _rounded(final)]
-    lines = [f"| {' | '.join(map(_escaped, row))} |" for row in (columns, *cells)]
+    chosen = [final.columns.split().index(name) for name in columns]
+    rows = [[_cell_text(row[column]) for column in chosen] for row in final.rows]
+    lines = [f"| {' | '.join(map(_escaped, row))} |" for row in (columns, *rows)]
     lines.insert(1, "|---" * len(columns) + "|")
     if figure is not None:
-        # MLflow's pages and artefacts have one origin.
+        # MLflow serves its pages and its artefacts from the same origin.
         lines += ["", f"![{figure}](get-artifact?path={figure}&run_uuid={run_id})"]
     return "\n".join(lines)
 
 
-def _rounded(table: Table) -> Iterable[list[object]]:
-    for row in table.rows:
-        yield [f"{value:.3g}" if isinstance(value, float) else value for value in row]
+def _cell_text(value: object) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
 def _escaped(text: str) -> str:
@@ -103,20 +96,16 @@ def improvement_table(analyses: Iterable[StageAnalysis]) -> Table:
     """Probability of improvement of each pair of conditions."""
     return Table(
         name="probability_of_improvement",
-        columns=(
-            *("stage", "tasks", "first", "second", "probability_first_higher", "lower", "upper"),
-            *("gap", "gap_lower", "gap_upper", "p_value_holm", "decided"),
-        ),
+        columns="stage tasks first second probability_first_higher lower upper gap gap_lower "
+        "gap_upper p_value_holm decided",
         rows=[
             (
                 analysis.stage.name,
                 scope.name,
                 pair.first.condition.label,
                 pair.second.condition.label,
-                float(pair.estimate.value),
-                float(pair.estimate.lower),
-                float(pair.estimate.upper),
-                *(float(end) for end in (pair.gap.value, pair.gap.lower, pair.gap.upper)),
+                *_numbers(pair.estimate),
+                *_numbers(pair.gap),
                 pair.p_value,
                 pair.decided,
             )
@@ -128,13 +117,10 @@ def improvement_table(analyses: Iterable[StageAnalysis]) -> Table:
 
 
 def waits_table(analyses: Iterable[StageAnalysis]) -> Table:
-    """Environment steps to each success rate."""
+    """Environment steps that each condition needs to each success rate."""
     return Table(
         name="steps_to_threshold",
-        columns=(
-            *("stage", "task", "condition", "threshold", "runs", "reached"),
-            *("median_env_steps", "lower", "upper", "each_run"),
-        ),
+        columns="stage task condition threshold runs reached median_env_steps lower upper each_run",
         rows=[
             (
                 analysis.stage.name,
@@ -147,8 +133,8 @@ def waits_table(analyses: Iterable[StageAnalysis]) -> Table:
                 wait.lower,
                 wait.upper,
                 " ".join(
-                    f"{steps:.0f}" if there else f">{steps:.0f}"
-                    for steps, there in zip(wait.waits.steps, wait.waits.reached, strict=True)
+                    f"{'' if reached else '>'}{steps:.0f}"
+                    for steps, reached in zip(wait.waits.steps, wait.waits.reached, strict=True)
                 ),
             )
             for analysis in analyses
@@ -158,13 +144,11 @@ def waits_table(analyses: Iterable[StageAnalysis]) -> Table:
 
 
 def races_table(analyses: Iterable[StageAnalysis]) -> Table:
-    """Who gets to each success rate sooner, by pairs of conditions."""
+    """Probability that one condition reaches a success rate sooner than another, by pairs."""
     return Table(
         name="probability_sooner",
-        columns=(
-            *("stage", "task", "threshold", "first", "second", "probability_first_sooner"),
-            *("lower", "upper", "p_value_holm", "decided", "reached"),
-        ),
+        columns="stage task threshold first second probability_first_sooner lower upper "
+        "p_value_holm decided reached",
         rows=[
             (
                 analysis.stage.name,
@@ -172,9 +156,7 @@ def races_table(analyses: Iterable[StageAnalysis]) -> Table:
                 race.threshold,
                 race.first,
                 race.second,
-                float(race.estimate.value),
-                float(race.estimate.lower),
-                float(race.estimate.upper),
+                *_numbers(race.estimate),
                 race.p_value,
                 race.decided,
                 race.reached,
@@ -186,14 +168,11 @@ def races_table(analyses: Iterable[StageAnalysis]) -> Table:
 
 
 def runs_table(sweep: Sweep) -> Table:
-    """Every run."""
+    """Every run of the sweep, with its last evaluation and entropies."""
     return Table(
         name="runs",
-        columns=(
-            *("run_id", "name", "stage", "task", "entropic_index", "seed", "status", "env_steps"),
-            *("budget", "seconds", "success_rate", "episode_return", "failure"),
-            *("shannon_entropy", "tsallis_entropy"),
-        ),
+        columns="run_id name stage task entropic_index seed status env_steps budget seconds "
+        "success_rate episode_return failure shannon_entropy tsallis_entropy",
         rows=[
             (
                 run.run_id,
@@ -212,5 +191,28 @@ def runs_table(sweep: Sweep) -> Table:
                 *(sweep.final(position, metric) for metric in names.ENTROPIES),
             )
             for position, run in enumerate(sweep.runs)
+        ],
+    )
+
+
+def curves_table(drawings: Iterable[Drawing]) -> Table:
+    """The points of all learning curves; stages side by side have none but those of each stage."""
+    return Table(
+        name="curves",
+        columns="stage task condition metric env_steps runs mean lower upper",
+        rows=[
+            (drawing.stage, curve.task, curve.condition.label, drawing.metric.name, *point)
+            for drawing in drawings
+            if drawing.metric is not None and drawing.stage != SIDE_BY_SIDE
+            for curves in drawing.curves.values()
+            for curve in curves
+            for point in zip(
+                curve.steps.astype(int).tolist(),
+                curve.runs.tolist(),
+                curve.estimate.value.tolist(),
+                curve.estimate.lower.tolist(),
+                curve.estimate.upper.tolist(),
+                strict=True,
+            )
         ],
     )

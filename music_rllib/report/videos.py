@@ -1,4 +1,4 @@
-"""Videos in a report: for each q an episode of the policy that is logged with its median run."""
+"""Videos in a report: for each q an episode of the policy of its median run."""
 
 from __future__ import annotations
 
@@ -12,27 +12,25 @@ from typing import TYPE_CHECKING
 from music_rllib.envs.tasks import Task
 from music_rllib.report.figures.choice import slug
 from music_rllib.results.analysis import StageAnalysis
-from music_rllib.results.data import ReportError, Sweep
+from music_rllib.results.data import ReportError, RunRecord, Sweep
 from music_rllib.results.from_mlflow import download_policy
 from music_rllib.tracking.store import TrackingStore
 
 if TYPE_CHECKING:
     from music_rllib.policy.policy import Policy
 
-__all__ = ["Film", "Films", "make_films"]
-
 MOST = 6
-"""Where there would be more, only the first task is filmed."""
+"""Largest number of videos; if there would be more, only the first task is filmed."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Film:
-    """One episode."""
+    """One filmed episode."""
 
     entropic_index: str
     task: str
     run: str
-    """The run's name."""
+    """Name of the run."""
     success: bool | None
     ending: str
     """`mp4` or `gif`."""
@@ -40,19 +38,19 @@ class Film:
 
     @property
     def name(self) -> str:
-        """Of its file."""
+        """Name of its file."""
         return f"{slug(f'q-{self.entropic_index}-{self.task}')}.{self.ending}"
 
     @property
     def uri(self) -> str:
-        """For the page, which fetches nothing."""
+        """The video as a data URI, as the page fetches nothing."""
         kind = "video/mp4" if self.ending == "mp4" else "image/gif"
         return f"data:{kind};base64,{base64.b64encode(self.data).decode()}"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Films:
-    """The videos of a report, and why there are not more."""
+    """The videos of a report, and the reason if some are missing."""
 
     films: Sequence[Film] = ()
     why_not: str | None = None
@@ -65,30 +63,32 @@ def make_films(
     seed: int,
     environments: Sequence[Task] = (),
 ) -> Films:
-    """Film the last stage's policies. Never fails: what can't be is said.
+    """Film the last stage's policies on the built-in tasks and in the user's `environments`.
 
-    Played is in environments that are known, and in `environments`: those of the user.
+    It never fails: the result says why a video is missing.
     """
     if store is None:
         return Films(why_not="an exported sweep has no policies; report on the sweep in MLflow")
-    wanted = list(_wanted(sweep, analyses))
-    if not wanted:
+    chosen = list(_median_runs(sweep, analyses))
+    if not chosen:
         return Films(why_not="no run that was evaluated has finished")
     films: list[Film] = []
     reasons: list[str] = []
-    for q, task, run in wanted:
+    for q, run in chosen:
         try:
             with TemporaryDirectory() as folder:
-                policy = _policy(sweep, store, run, Path(folder), environments)
-                films.append(_film(policy, sweep.runs[run].name, q, task, seed, Path(folder)))
+                policy = _policy(store, sweep.experiment_id, run, Path(folder), environments)
+                films.append(_film(policy, run, q, seed, Path(folder)))
         # An environment may raise anything, and no video is worth losing the report.
         except Exception as error:
-            reasons.append(f"{sweep.runs[run].name}: {str(error).splitlines()[0]}")
+            reasons.append(f"{run.name}: {str(error).splitlines()[0]}")
     return Films(films=films, why_not=reasons[0] if reasons else None)
 
 
-def _wanted(sweep: Sweep, analyses: Sequence[StageAnalysis]) -> Iterator[tuple[str, str, int]]:
-    """(q, task, run): of each q's finished runs on a task the one in the middle."""
+def _median_runs(
+    sweep: Sweep, analyses: Sequence[StageAnalysis]
+) -> Iterator[tuple[str, RunRecord]]:
+    """For each task and q of the last stage, q and the median finished run by its final value."""
     if not analyses:
         return
     stage = analyses[-1].stage
@@ -106,42 +106,41 @@ def _wanted(sweep: Sweep, analyses: Sequence[StageAnalysis]) -> Iterator[tuple[s
                 and (rate := sweep.final(run, sweep.primary_metric(task))) is not None
             ]
             if rated:
-                yield q, task, sorted(rated)[len(rated) // 2][1]
-
-
-def _film(policy: Policy, run: str, q: str, task: str, seed: int, folder: Path) -> Film:
-    from music_rllib.policy.video import film
-
-    frames, (result,) = film(policy, 1, seed, f"q = {q}  ·  {task}")
-    ending, data = _encoded(frames, folder)
-    return Film(
-        entropic_index=q,
-        task=task,
-        run=run,
-        success=result.success,
-        ending=ending,
-        data=data,
-    )
+                _, median = sorted(rated)[len(rated) // 2]
+                yield q, sweep.runs[median]
 
 
 def _policy(
-    sweep: Sweep, store: TrackingStore, run: int, folder: Path, environments: Sequence[Task]
+    store: TrackingStore,
+    experiment_id: str,
+    run: RunRecord,
+    folder: Path,
+    environments: Sequence[Task],
 ) -> Policy:
     from music_rllib.policy.policy import load_policy
 
-    file = download_policy(store, sweep.experiment_id, sweep.runs[run].run_id, folder)
+    file = download_policy(store, experiment_id, run.run_id, folder)
     if file is None:
         raise ReportError("no policy is logged with it")
     return load_policy(file, environments)
 
 
-def _encoded(frames: Sequence[object], folder: Path) -> tuple[str, bytes]:
-    """As MP4, which is a tenth of a GIF, where there is an encoder."""
-    from music_rllib.policy.video import VideoError, write_video
+def _film(policy: Policy, run: RunRecord, q: str, seed: int, folder: Path) -> Film:
+    """An episode as an MP4, or as a GIF of ten times its size where there is no encoder."""
+    from music_rllib.policy.video import VideoError, film, write_video
 
+    frames, (episode,) = film(policy, 1, seed, f"q = {q}  ·  {run.task}")
+    video = folder / "film.mp4"
     try:
-        write_video(folder / "film.mp4", frames)  # type: ignore[arg-type]
+        write_video(video, frames)
     except VideoError:
-        write_video(folder / "film.gif", frames)  # type: ignore[arg-type]
-        return "gif", (folder / "film.gif").read_bytes()
-    return "mp4", (folder / "film.mp4").read_bytes()
+        video = folder / "film.gif"
+        write_video(video, frames)
+    return Film(
+        entropic_index=q,
+        task=run.task,
+        run=run.name,
+        success=episode.success,
+        ending=video.suffix.removeprefix("."),
+        data=video.read_bytes(),
+    )

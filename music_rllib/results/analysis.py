@@ -62,6 +62,7 @@ class Curve:
     """Learning curve of a condition on a task."""
 
     condition: Condition
+    task: str
     steps: Array
     """`[points]` environment steps."""
     values: Array
@@ -209,6 +210,7 @@ def curve(sweep: Sweep, condition: Condition, task: str, metric: str) -> Curve |
     )
     return Curve(
         condition=condition,
+        task=task,
         steps=grid,
         values=values,
         estimate=st.estimate(

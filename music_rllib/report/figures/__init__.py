@@ -1,1 +1,1 @@
-"""The figures of a report, the colours of q, and which sweep gets which figure."""
+"""Figures of a report: their selection for a sweep, their panels, colours and files."""

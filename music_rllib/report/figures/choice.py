@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 
 from music_rllib import names
-from music_rllib.report.figures.entropy import entropy_panel
 from music_rllib.report.figures.importance import (
     CHANCE,
     importance_panel,
@@ -16,38 +16,23 @@ from music_rllib.report.figures.importance import (
     parallel_panel,
     sensitivity_panels,
 )
-from music_rllib.report.figures.palette import BARS, Style, style_of, styles_by_stage, styles_of
+from music_rllib.report.figures.palette import BARS, Style, styles_by_stage, styles_of
 from music_rllib.report.figures.plots import (
     METRICS,
+    MOST_BANDS,
     Legend,
     Metric,
     Panel,
     curve_panel,
+    entropy_panel,
     finals_panel,
     profile_panel,
 )
 from music_rllib.results.analysis import Curve, StageAnalysis, curve
 from music_rllib.results.claims.study import MOST_CONDITIONS
-from music_rllib.results.comparison import SHOW_SEEDS_BELOW, Scope
-from music_rllib.results.conditions import Condition, Stage, side_by_side
+from music_rllib.results.comparison import SHOW_SEEDS_BELOW, Final, Scope
+from music_rllib.results.conditions import SIDE_BY_SIDE, Condition, Stage, side_by_side
 from music_rllib.results.data import Sweep
-
-__all__ = [
-    "AGAINST_ENTROPY",
-    "COST",
-    "CURVES",
-    "FINALS",
-    "GROUPS",
-    "INFLUENCE",
-    "PERFORMANCE",
-    "PRIMARY",
-    "PROFILES",
-    "Drawing",
-    "drawings_of_stages",
-    "named_by_stage",
-    "slug",
-    "stage_drawings",
-]
 
 FINALS = {names.EVAL_SUCCESS: "Final success rate", names.EVAL_RETURN: "Final return"}
 PROFILES = "Performance profile"
@@ -55,7 +40,7 @@ AGAINST_ENTROPY = "Performance against entropy"
 PERFORMANCE, EXPLORATION, INFORMATION = "Performance", "Exploration", "Information"
 SETTINGS, COST = "Settings", "Cost"
 GROUPS = (PERFORMANCE, EXPLORATION, INFORMATION, SETTINGS, COST)
-"""Headings of the page."""
+"""Headings of the page, in their order."""
 _GROUP_OF = {
     names.EVAL_DISPLACEMENT: EXPLORATION,
     names.ENTROPY: EXPLORATION,
@@ -64,16 +49,23 @@ _GROUP_OF = {
     names.MI_REWARD: INFORMATION,
 }
 INFLUENCE = ("Sensitivity", "Importance of settings", "Parallel coordinates")
-CURVES = tuple(metric.title for metric in METRICS)
-PRIMARY = CURVES[:2]
-"""Of what tasks are judged by: success, or the return."""
-OF_ALL_STAGES = (*METRICS[:2], *(one for one in METRICS if one.name == names.EVAL_DISPLACEMENT))
-"""What is drawn of all stages together: it shows an effect before the first success, too."""
+PRIMARY = tuple(metric.title for metric in METRICS[:2])
+"""Titles of the curves of primary metrics: success rate and return."""
+OF_ALL_STAGES = tuple(
+    metric
+    for metric in METRICS
+    if metric.title in PRIMARY or metric.name == names.EVAL_DISPLACEMENT
+)
+"""Curves that are drawn of all stages together; displacement shows an effect before success."""
+
+
+MOST_FACETS = 8
+"""Largest number of panels that the curves of one task are spread over."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Drawing:
-    """One figure of one stage: a panel per task, and its values as a table."""
+    """One figure of one stage: its panels, a legend and a caption."""
 
     stage: str
     title: str
@@ -81,35 +73,36 @@ class Drawing:
     panels: tuple[Panel, ...]
     legend: Legend
     group: str = PERFORMANCE
-    """Under which heading of the page it stands."""
+    """The heading of the page under which it stands."""
     metric: Metric | None = None
-    """Of curves: what is drawn against environment steps."""
+    """The metric that learning curves show; None for other figures."""
     curves: Mapping[str, Sequence[Curve]] = field(default_factory=dict)
-    """By task."""
-    values: tuple[tuple[object, ...], ...] = ()
-    """(stage, task, condition, metric, env_steps, runs, mean, lower, upper) rows."""
+    """The learning curves of each panel, by its title."""
+    facets: Facets | None = None
+    """How conditions are spread over the panels of learning curves and of profiles."""
 
     @property
     def name(self) -> str:
-        """Of its files, and of its place in the page."""
+        """The name of its files without their suffix, and its id in the page."""
         return slug(f"{self.stage}-{self.title}")
+
+    @property
+    def legend_is_of_conditions(self) -> bool:
+        """Whether each entry of the legend is one condition of the stage."""
+        return self.facets is not None and len(self.legend) == len(self.facets.styles)
 
 
 def slug(text: str) -> str:
-    """`text` as a file name."""
+    """`text` as a file name: lower-case letters and digits, joined by hyphens."""
     return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")
 
 
 def stage_drawings(sweep: Sweep, analysis: StageAnalysis) -> Iterator[Drawing]:
-    """The figures for which there is something to draw or to compare."""
-    stage = _shown(sweep, analysis.stage)
-    found = _all_curves(sweep, stage)
-    for metric in METRICS:
-        drawing = _curves(stage, metric, found, styles_of(stage.conditions))
-        if drawing is not None:
-            yield drawing
-    of_shown = [replace(s, finals=s.compared) if s.compared else s for s in analysis.scopes]
-    scopes = [scope for scope in of_shown if len(scope.finals) > 1]
+    """The figures of one stage for which there is something to draw or to compare."""
+    stage = _without_trials(sweep, analysis.stage)
+    yield from _curves(sweep, stage, METRICS)
+    scopes = [replace(s, finals=s.compared) if s.compared else s for s in analysis.scopes]
+    scopes = [scope for scope in scopes if len(scope.finals) > 1]
     for metric_name, title in FINALS.items():
         yield from _finals(stage, title, [one for one in scopes if one.metric == metric_name])
     yield from _against_entropy(sweep, stage)
@@ -117,133 +110,169 @@ def stage_drawings(sweep: Sweep, analysis: StageAnalysis) -> Iterator[Drawing]:
         yield from _influence(sweep, analysis)
 
 
-def _shown(sweep: Sweep, stage: Stage) -> Stage:
-    """Of a search only what is ranked, as soon as there is any: its trials are too many to see."""
+def _without_trials(sweep: Sweep, stage: Stage) -> Stage:
+    """The stage, or the ranked conditions of a search if there are any: its trials are too many."""
     if stage.compared in ((), stage.conditions):
         return stage
-    seeds = {sweep.runs[run].seed for one in stage.compared for run in one.runs}
-    return replace(
-        stage,
-        conditions=stage.compared,
-        seeds=tuple(seed for seed in stage.seeds if seed in seeds),
-    )
+    seeds = {sweep.runs[run].seed for condition in stage.compared for run in condition.runs}
+    ranked = tuple(seed for seed in stage.seeds if seed in seeds)
+    return replace(stage, conditions=stage.compared, seeds=ranked)
 
 
 def _finals(stage: Stage, title: str, scopes: Sequence[Scope[Condition]]) -> Iterator[Drawing]:
     if not scopes:
         return
-    legend = _legend(stage)
     yield Drawing(
         stage=stage.name,
         title=title,
         caption="Large marks: mean; bars: 95 % intervals; small ticks: single runs.",
-        panels=tuple(finals_panel(scope, stage.conditions) for scope in scopes),
-        legend=legend,
+        panels=tuple(panel for scope in scopes for panel in _finals_panels(stage, scope)),
+        legend=[],  # each row has its label
     )
+    facets = Facets.of(stage)
     runs = [final.scores.shape[0] for scope in scopes for final in scope.finals]
     readable = len(stage.conditions) <= MOST_CONDITIONS and max(runs) > 1
     if scopes[0].metric not in names.EVAL_RATES or not readable:
-        return  # single runs' bands are as high as the figure, and those of many are one
+        return  # bands of single runs fill the figure, and those of many conditions overlap
     yield Drawing(
         stage=stage.name,
         title=PROFILES,
         caption="Share of finished runs that end above each success rate, with 95 % bands. A line "
         "that is above another everywhere is better at every standard.",
         panels=tuple(profile_panel(scope, stage.conditions) for scope in scopes),
-        legend=legend,
+        legend=[(condition.label, style) for condition, style in facets.styles.items()],
+        facets=facets,
     )
 
 
+def _finals_panels(stage: Stage, scope: Scope[Condition]) -> Iterator[Panel]:
+    facets = Facets.of(stage)
+    labels = {condition: facets.label(condition) for condition in stage.conditions}
+    panels: dict[str, list[Final[Condition]]] = {}
+    for final in scope.finals:
+        panels.setdefault(facets.title(scope.name, final.condition), []).append(final)
+    for title, shown in panels.items():
+        yield finals_panel(title, scope, shown, facets.styles, labels)
+
+
 def _against_entropy(sweep: Sweep, stage: Stage) -> Iterator[Drawing]:
-    """Colour by q alone: what else varies moves the points along."""
-    by_q = {c.entropic_index: style_of(c, stage.conditions) for c in stage.conditions}
+    by_q = _styles_by_q(stage)
+    # Other settings move the points, so that colour stands for q alone.
     styles = {condition: by_q[condition.entropic_index] for condition in stage.conditions}
-    found = (entropy_panel(sweep, task, styles) for task in stage.tasks)
-    panels = tuple(panel for panel in found if panel is not None)
-    if panels and len(stage.conditions) > 1:
+    panels = [entropy_panel(sweep, task, styles) for task in stage.tasks]
+    if any(panels) and len(stage.conditions) > 1:
         yield Drawing(
             stage=stage.name,
             title=AGAINST_ENTROPY,
             caption="One point for each finished run. Where the values of q lie on one curve, the "
             "entropy explains what they end at; where they differ at the same entropy, q does.",
-            panels=panels,
-            legend=[(f"q = {q}", style._replace(line="solid")) for q, style in by_q.items()],
+            panels=tuple(filter(None, panels)),
+            legend=_legend_by_q(stage),
         )
 
 
 def drawings_of_stages(sweep: Sweep, stages: Sequence[Stage]) -> Iterator[Drawing]:
-    """What all stages that train for the task come to, together; none for a single one."""
+    """Curves of all stages that train for the task, together; none for a single stage."""
     together = side_by_side(stages)
-    if together is None:
-        return
-    found = _all_curves(sweep, together, OF_ALL_STAGES)
-    styles = styles_by_stage(together.conditions)
-    for metric in OF_ALL_STAGES:
-        drawing = _curves(together, metric, found, styles)
-        if drawing is not None:
-            legend = [(named_by_stage(condition), style) for condition, style in styles.items()]
-            # Each stage's own drawing has the values.
-            yield replace(drawing, legend=legend, values=())
+    if together is not None:
+        yield from _curves(sweep, together, OF_ALL_STAGES)
 
 
 def named_by_stage(condition: Condition) -> str:
-    """`music-r, q = 1.5`: of all stages together."""
+    """The label of a condition of all stages together: `music-r, q = 1.5`."""
     (_, stage), *others = condition.others
     rest = replace(condition, others=tuple(others))
     return f"{stage}, {rest.label}"
 
 
-def _all_curves(
-    sweep: Sweep, stage: Stage, metrics: Sequence[Metric] = METRICS
-) -> dict[tuple[str, str], list[Curve]]:
-    """By metric and task; the return of those tasks only that are judged by it."""
-    curves: dict[tuple[str, str], list[Curve]] = {}
-    for metric, task, condition in product(metrics, stage.tasks, stage.conditions):
-        if metric.name == names.EVAL_RETURN != sweep.primary_metric(task):
-            continue
-        one = curve(sweep, condition, task, metric.name)
-        if one is not None:
-            curves.setdefault((metric.name, task), []).append(one)
-    return curves
+@dataclass(frozen=True)
+class Facets:
+    """How a stage's conditions are spread over the panels of a figure."""
+
+    setting: str
+    """The setting whose values have panels of their own; empty: the panels are tasks."""
+    styles: Mapping[Condition, Style]
+    """Of all conditions of the stage; the same in each panel."""
+
+    @classmethod
+    def of(cls, stage: Stage) -> Facets:
+        """One panel for a task, unless it would have too many conditions."""
+        setting = facet_of(stage.conditions)
+        rest = {condition: _without(condition, setting) for condition in stage.conditions}
+        styles_of_all = styles_by_stage if stage.name == SIDE_BY_SIDE else styles_of
+        styles = styles_of_all(tuple(dict.fromkeys(rest.values())))
+        return cls(setting, {condition: styles[rest[condition]] for condition in rest})
+
+    def title(self, task: str, condition: Condition) -> str:
+        """The title of a condition's panel."""
+        value = dict(condition.others).get(self.setting)
+        return f"{task}, {self.setting} = {value}" if self.setting else task
+
+    def label(self, condition: Condition) -> str:
+        """What a condition is called in its panel, whose title says the rest."""
+        rest = _without(condition, self.setting)
+        by_stage = any(name == "stage" for name, _ in rest.others)
+        return named_by_stage(rest) if by_stage else rest.label
 
 
-def _curves(
-    stage: Stage,
-    metric: Metric,
-    found: Mapping[tuple[str, str], list[Curve]],
-    styles: Mapping[Condition, Style],
-) -> Drawing | None:
-    panels, values = [], []
-    shown = {task: found[metric.name, task] for task in stage.tasks if (metric.name, task) in found}
-    for task, curves in shown.items():
-        panels.append(curve_panel(metric, task, curves, styles))
-        for one in curves:
-            head = (stage.name, task, one.condition.label, metric.name)
-            values += [(*head, *row) for row in _rows(one)]
-    if not panels:
-        return None
-    return Drawing(
-        stage=stage.name,
-        title=metric.title,
-        caption=_caption(stage, metric),
-        panels=tuple(panels),
-        legend=_legend(stage),
-        group=_GROUP_OF.get(metric.name, PERFORMANCE),
-        metric=metric,
-        curves=shown,
-        values=tuple(values),
-    )
+def _without(condition: Condition, setting: str) -> Condition:
+    others = tuple(pair for pair in condition.others if pair[0] != setting)
+    return replace(condition, others=others, runs=())
 
 
-def _rows(one: Curve) -> Iterator[tuple[object, ...]]:
-    columns = (one.steps, one.runs, one.estimate.value, one.estimate.lower, one.estimate.upper)
-    for step, runs, *numbers in zip(*columns, strict=True):
-        yield int(step), int(runs), *(float(number) for number in numbers)
+def facet_of(conditions: Sequence[Condition]) -> str:
+    """The setting that spreads conditions over panels where one has too many of them; else empty.
+
+    Of the settings that leave few enough panels, the one with the fewest conditions in a panel.
+    """
+    if len(conditions) <= MOST_CONDITIONS:
+        return ""
+    values: dict[str, list[str]] = {}
+    for condition in conditions:
+        for name, value in condition.others:
+            values.setdefault(name, []).append(value)
+    most = {
+        name: max(Counter(found).values())
+        for name, found in values.items()
+        if name != "stage" and len(found) == len(conditions) and 1 < len(set(found)) <= MOST_FACETS
+    }
+    return min(most, key=lambda name: most[name], default="")
 
 
-def _caption(stage: Stage, metric: Metric) -> str:
+def _curves(sweep: Sweep, stage: Stage, metrics: Sequence[Metric]) -> Iterator[Drawing]:
+    """The learning curves of a stage, of each metric that it has."""
+    facets = Facets.of(stage)
+    labels = {facets.label(condition): style for condition, style in facets.styles.items()}
+    for metric in metrics:
+        panels: dict[str, list[Curve]] = {}
+        for task, condition in product(stage.tasks, stage.conditions):
+            if metric.name == names.EVAL_RETURN != sweep.primary_metric(task):
+                continue  # the return is drawn of those tasks only that are judged by it
+            found = curve(sweep, condition, task, metric.name)
+            if found is not None:
+                panels.setdefault(facets.title(task, condition), []).append(found)
+        if panels:
+            yield Drawing(
+                stage=stage.name,
+                title=metric.title,
+                caption=_caption(stage, metric, max(map(len, panels.values()))),
+                panels=tuple(
+                    curve_panel(metric, title, curves, facets.styles)
+                    for title, curves in panels.items()
+                ),
+                legend=list(labels.items()),
+                group=_GROUP_OF.get(metric.name, PERFORMANCE),
+                metric=metric,
+                curves=panels,
+                facets=facets,
+            )
+
+
+def _caption(stage: Stage, metric: Metric, lines: int) -> str:
     seeds = len(stage.seeds)
-    if seeds == 1:
+    if lines > MOST_BANDS:
+        band = f"Mean over up to {seeds} seeds, without bands, which would hide each other."
+    elif seeds == 1:
         band = "A single seed: each line is one run, and there is no band."
     else:
         band = f"Mean over up to {seeds} seeds with its 95 % band."
@@ -255,23 +284,26 @@ def _caption(stage: Stage, metric: Metric) -> str:
     return f"{band} {thin}{target}"
 
 
-def _legend(stage: Stage) -> Legend:
-    return [(c.label, style_of(c, stage.conditions)) for c in stage.conditions]
+def _styles_by_q(stage: Stage) -> dict[str, Style]:
+    return {c.entropic_index: style for c, style in styles_of(stage.conditions).items()}
+
+
+def _legend_by_q(stage: Stage) -> Legend:
+    styles = _styles_by_q(stage)
+    return [(f"q = {q}", style._replace(line="solid")) for q, style in styles.items()]
 
 
 def _influence(sweep: Sweep, analysis: StageAnalysis) -> Iterator[Drawing]:
-    """What the settings do, where more than q varies."""
+    """The effect of settings, where more than q varies."""
     stage = analysis.stage
-    by_q = {c.entropic_index: style_of(c, stage.conditions) for c in stage.conditions}
-    found = importances(sweep, analysis)
-    per_task = [(t, [one for one in found if one.task == t]) for t in stage.tasks]
+    shares = importances(sweep, analysis)
     parallel = [parallel_panel(scope, stage.conditions) for scope in analysis.scopes]
-    lines = [(f"q = {q}", style._replace(line="solid")) for q, style in by_q.items()]
+    by_q = _legend_by_q(stage)
     bars = [(n, Style(BARS[n == CHANCE], "s", "solid")) for n in ("setting", CHANCE)]
     drawings = (
-        (sensitivity_panels(analysis), _SENSITIVITY, lines),
-        ([importance_panel(task, some) for task, some in per_task if some], _IMPORTANCE, bars),
-        ([panel for panel in parallel if panel is not None], _PARALLEL, lines),
+        (sensitivity_panels(analysis), _SENSITIVITY, by_q),
+        ([importance_panel(*item) for item in shares.items()], _IMPORTANCE, bars),
+        ([panel for panel in parallel if panel is not None], _PARALLEL, by_q),
     )
     for title, (panels, caption, legend) in zip(INFLUENCE, drawings, strict=True):
         if panels:

@@ -1,8 +1,8 @@
-"""Every figure drawn: for the page, and as files for one and two columns of a paper.
+"""Drawing of figures: SVG elements for the page, and files for one and two columns of a paper.
 
-Every figure is drawn on its own canvas, never through pyplot, so no display is needed. On the page
-each panel is an SVG of its own, so that a narrow window stacks them, and takes its ink from the
-page, so that it follows light and dark. The files have all panels together, their fonts embedded.
+A figure has its own canvas and does not use pyplot, so that no display is needed. On the page each
+panel is an SVG element, so that a narrow window stacks them, and its colours are those of the page,
+so that it follows light and dark. The files have all panels together and embed their fonts.
 """
 
 from __future__ import annotations
@@ -20,29 +20,26 @@ import joblib
 import matplotlib as mpl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from music_rllib.report.figures.choice import Drawing
 from music_rllib.report.figures.fonts import short_font
-from music_rllib.report.figures.plots import PANEL, Legend, Panel
-
-__all__ = ["Figures", "drawn_figure", "files", "stale_files"]
+from music_rllib.report.figures.plots import PANEL, Legend, Panel, legend_handles
 
 _Drawn = TypeVar("_Drawn")
 
 TEXT_WIDTH, COLUMN_WIDTH = 7.16, 3.5
-"""Inches of a paper's two columns and of one."""
+"""Width in inches of a paper's text and of one of its two columns."""
 COLUMN = "-column"
-"""Behind the name of a figure that is one column wide."""
+"""Suffix to the name of a figure that is one column wide."""
 ENDINGS = (".png", ".svg", ".pdf")
 _PAGE_FONT, _PAPER_FONT = 10.0, 8.0
 _PANELS_IN_A_ROW = 3
 _LEFT, _RIGHT, _BOTTOM = 0.84, 0.2, 0.52
-"""A panel's margins in inches, where its text has 10 points."""
+"""A panel's margins in inches for text of 10 points."""
 _HANDLE, _LETTER, _LINE = 0.6, 0.085, 0.2
-"""Inches in a legend: before a label, of a letter, and from line to line."""
+"""Inches in a legend: in front of a label, per letter, and from line to line."""
 
-# Stand for "the page's own colour" in an SVG, and are replaced by it.
+# Matplotlib draws with the first colours, and the page's own colours then replace them in the SVG.
 _STAND_INS = ("#010203", "#040506", "#070809")
 _OF_THE_PAGE = ("currentColor", "var(--grid)", "var(--paper)")
 _ON_PAPER = ("#1a1a1a", "#d9d9d9", "#ffffff")
@@ -51,9 +48,9 @@ _CONDITION = re.compile(r'<g id="condition-(\d+)-([^"]*)">')
 
 
 class Figures:
-    """Drawings, as SVG elements for the page and as files.
+    """Drawings as SVG elements for the page and as files.
 
-    With processes each is drawn from when it is added, without when it is asked for.
+    With processes a drawing is drawn as soon as it is added, without them when it is read.
     """
 
     def __init__(self, processes: Executor | None = None) -> None:
@@ -63,32 +60,34 @@ class Figures:
         self._files: list[Callable[[], dict[str, bytes]]] = []
 
     def add(self, drawing: Drawing) -> None:
-        """Draw it, now or later."""
+        """Add a drawing to be drawn."""
         self.drawings.append(drawing)
-        self._inline.append(self._begun(_inline, drawing))
-        self._files.append(self._begun(_files, drawing))
+        self._inline.append(self._started(_inline, drawing))
+        self._files.append(self._started(_files, drawing))
 
     @cached_property
     def pictures(self) -> dict[str, tuple[str, ...]]:
-        """An SVG element for each panel, by the drawings' names."""
-        return {one.name: made() for one, made in zip(self.drawings, self._inline, strict=True)}
+        """The SVG elements of each drawing's panels by the drawing's name."""
+        pairs = zip(self.drawings, self._inline, strict=True)
+        return {drawing.name: result() for drawing, result in pairs}
 
     def files(self) -> Iterator[tuple[str, dict[str, bytes]]]:
         """Each drawing's name and its files; see :func:`files`."""
-        for one, made in zip(self.drawings, self._files, strict=True):
-            yield one.name, made()
+        for drawing, result in zip(self.drawings, self._files, strict=True):
+            yield drawing.name, result()
 
-    def _begun(self, draw: Callable[[Drawing], _Drawn], drawing: Drawing) -> Callable[[], _Drawn]:
-        if self._processes is None:
-            return partial(draw, drawing)
-        # Panels are closures, which Python's own pickle does not take.
-        sent = joblib.wrap_non_picklable_objects(drawing, keep_wrapper=False)
+    def _started(self, draw: Callable[[Drawing], _Drawn], drawing: Drawing) -> Callable[[], _Drawn]:
+        """A function that returns `draw(drawing)`, drawn in a process where there are some."""
         here = partial(draw, drawing)
-        try:
-            begun = self._processes.submit(draw, sent)
-        except BrokenExecutor:  # a process was killed, by want of memory, say
+        if self._processes is None:
             return here
-        return lambda: here() if isinstance(begun.exception(), BrokenExecutor) else begun.result()
+        # Panels are closures, which pickle does not support.
+        picklable = joblib.wrap_non_picklable_objects(drawing, keep_wrapper=False)
+        try:
+            future = self._processes.submit(draw, picklable)
+        except BrokenExecutor:  # a process was killed, for example for its memory
+            return here
+        return lambda: here() if isinstance(future.exception(), BrokenExecutor) else future.result()
 
 
 def _inline(drawing: Drawing) -> tuple[str, ...]:
@@ -103,20 +102,20 @@ def _files(drawing: Drawing) -> dict[str, bytes]:
 
 
 def _svg_inline(panel: Panel, name: str) -> str:
-    """A panel as an SVG element for the page; ids begin with `name`, to be the page's only ones.
+    """A panel as an SVG element for the page; ids begin with `name` to be unique in the page.
 
-    What belongs to a condition carries its number, and its value as a title, which browsers show.
-    Matplotlib escapes the texts in it.
+    The marks of a condition carry its number, and its label as a title, which browsers show.
+    Matplotlib escapes all texts.
     """
     with mpl.rc_context(_settings(_PAGE_FONT, _STAND_INS)):
-        drawn = drawn_figure([panel], [], PANEL[0], _PAGE_FONT)
-        drawn.patch.set_alpha(0.0)
-        text = _svg(drawn)
+        figure = drawn_figure([panel], [], PANEL[0], _PAGE_FONT)
+        figure.patch.set_alpha(0.0)
+        text = _svg(figure)
     text = _CONDITION.sub(r'<g data-condition="\1"><title>\2</title>', text[text.index("<svg") :])
     text = re.sub(r'\b(id="|xlink:href="#|url\(#)', rf"\g<1>{name}-", text)
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
-    for stands_for, colour in zip(_STAND_INS, _OF_THE_PAGE, strict=True):
-        text = text.replace(stands_for, colour)
+    for stand_in, colour in zip(_STAND_INS, _OF_THE_PAGE, strict=True):
+        text = text.replace(stand_in, colour)
     size = re.search(r'width="([\d.]+)pt" height="([\d.]+)pt"', text)
     assert size is not None, "matplotlib gives an SVG a size in points"
     text = text.replace(size[0], "")
@@ -124,12 +123,12 @@ def _svg_inline(panel: Panel, name: str) -> str:
 
 
 def files(panels: Sequence[Panel], legend: Legend) -> dict[str, bytes]:
-    """All panels on white paper, with a legend, by what follows the figure's name.
+    """All panels on white paper with a legend, by the suffix to the figure's name.
 
     `.svg`, `.pdf` and `.png` (150 dpi) are as wide as a paper's text, `-column.svg` and
     `-column.pdf` as one of its two columns.
     """
-    made = {}
+    contents = {}
     outlines = {"svg.fonttype": "path", "pdf.fonttype": 42}
     fonts = {"font.family": [short_font(), "sans-serif"]}
     with mpl.rc_context(_settings(_PAPER_FONT, _ON_PAPER) | outlines | fonts):
@@ -137,28 +136,29 @@ def files(panels: Sequence[Panel], legend: Legend) -> dict[str, bytes]:
             (TEXT_WIDTH, "", ("svg", "pdf", "png")),
             (COLUMN_WIDTH, COLUMN, ("svg", "pdf")),
         ):
-            drawn = drawn_figure(panels, legend, width, _PAPER_FONT)
+            figure = drawn_figure(panels, legend, width, _PAPER_FONT)
             for kind in kinds:
-                made[f"{name}.{kind}"] = _saved(drawn, kind)
-    return made
+                contents[f"{name}.{kind}"] = _saved(figure, kind)
+    return contents
 
 
-def _saved(drawn: Figure, kind: str) -> bytes:
+def _saved(figure: Figure, kind: str) -> bytes:
     if kind == "svg":
-        return _CONDITION.sub("<g>", _svg(drawn)).encode()
+        return _CONDITION.sub("<g>", _svg(figure)).encode()
     buffer = io.BytesIO()
     metadata = {"CreationDate": None} if kind == "pdf" else {}
-    drawn.savefig(buffer, format=kind, dpi=150, metadata=metadata)
+    figure.savefig(buffer, format=kind, dpi=150, metadata=metadata)
     return buffer.getvalue()
 
 
-def _svg(drawn: Figure) -> str:
+def _svg(figure: Figure) -> str:
     buffer = io.StringIO()
-    drawn.savefig(buffer, format="svg", metadata={"Date": None})
+    figure.savefig(buffer, format="svg", metadata={"Date": None})
     return buffer.getvalue()
 
 
 def _settings(font: float, colours: tuple[str, str, str]) -> Any:
+    """Matplotlib's settings for text of `font` points and the colours of ink, grid and paper."""
     ink, grid, paper = colours
     inked = ("axes.edgecolor", "axes.labelcolor", "axes.titlecolor", "text.color")
     return {
@@ -177,15 +177,15 @@ def _settings(font: float, colours: tuple[str, str, str]) -> Any:
         "xtick.labelsize": 0.9 * font,
         "ytick.labelsize": 0.9 * font,
         "svg.fonttype": "none",
-        # A task may be called $x_{1$.
+        # The name of a task may be no valid formula, like $x_{1$.
         "text.parse_math": False,
-        # The same figure is the same file.
+        # Ids in an SVG do not depend on the time, so that the same figure is the same file.
         "svg.hashsalt": "music_rllib",
     }
 
 
 def drawn_figure(panels: Sequence[Panel], legend: Legend, width: float, font: float) -> Figure:
-    """Panels in rows, and the legend below.
+    """A figure with the panels in rows and the legend below them.
 
     Margins are fixed: matplotlib's own layout takes longer than everything else together.
     """
@@ -193,76 +193,54 @@ def drawn_figure(panels: Sequence[Panel], legend: Legend, width: float, font: fl
     in_a_row = min(len(panels), _PANELS_IN_A_ROW) if width > 1.5 * COLUMN_WIDTH else 1
     rows = [panels[i : i + in_a_row] for i in range(0, len(panels), in_a_row)]
     heights = [max(panel.height for panel in row) * scale for row in rows]
-    entries, columns = _legend_grid(legend, width, scale)
-    in_rows = [entries[row :: _rows(entries, columns)] for row in range(_rows(entries, columns))]
-    lines = sum(max(label.count("\n") + 1 for label, _ in row) for row in in_rows if row)
+    entries, columns, lines = _legend_grid(legend, width, scale)
     below = (_LINE * lines + 0.1) * scale if entries else 0.0
-    whole = sum(heights) + below
-    figure = Figure(figsize=(width, whole))
+    top = sum(heights) + below
+    figure = Figure(figsize=(width, top))
     FigureCanvasAgg(figure)
-    top = whole
     for row, height in zip(rows, heights, strict=True):
         for number, panel in enumerate(row):
             cell = (number * width / in_a_row, top - height, width / in_a_row, height)
-            _place(figure, panel, cell, (width, whole), scale)
+            _draw_panel(figure, panel, cell, scale)
         top -= height
     if entries:
-        handles = [
-            Line2D(
-                [], [], color=style.colour, marker=style.marker, linestyle=style.stroke, label=label
-            )
-            for label, style in entries
-        ]
+        handles = legend_handles(entries)
         figure.legend(handles=handles, loc="lower center", ncols=columns, frameon=False)
     return figure
 
 
-def _place(
-    figure: Figure,
-    panel: Panel,
-    cell: tuple[float, float, float, float],
-    whole: tuple[float, float],
-    scale: float,
+def _draw_panel(
+    figure: Figure, panel: Panel, cell: tuple[float, float, float, float], scale: float
 ) -> None:
     """Draw a panel into its cell: left, bottom, width and height in inches."""
     left, bottom, width, height = cell
+    whole_width, whole_height = map(float, figure.get_size_inches())
     x, y = left + _LEFT * scale, bottom + _BOTTOM * scale
-    across = width - (_LEFT + _RIGHT) * scale
+    across, up = width - (_LEFT + _RIGHT) * scale, height - (_BOTTOM + panel.top) * scale
     axes = figure.add_axes(
-        (
-            x / whole[0],
-            y / whole[1],
-            across / whole[0],
-            (height - (_BOTTOM + panel.top) * scale) / whole[1],
-        )
+        (x / whole_width, y / whole_height, across / whole_width, up / whole_height)
     )
     axes.patch.set_alpha(0.0)
-    figure.text(
-        (x + across / 2) / whole[0],
-        (bottom + height - 0.07 * scale) / whole[1],
-        panel.title,
-        ha="center",
-        va="top",
-        size="large",
-    )
+    centre = (x + across / 2) / whole_width
+    title_top = (bottom + height - 0.07 * scale) / whole_height
+    figure.text(centre, title_top, panel.title, ha="center", va="top", size="large")
     panel.draw(axes)
 
 
-def _legend_grid(legend: Legend, width: float, scale: float) -> tuple[Legend, int]:
-    """Labels broken to fit into the figure, and how many of them stand side by side."""
+def _legend_grid(legend: Legend, width: float, scale: float) -> tuple[Legend, int, int]:
+    """Labels broken to fit into the figure, and the numbers of columns and of lines of text."""
     letter, handle = _LETTER * scale, _HANDLE * scale
     most = max(12, int((width - handle - 0.2) / letter))
     entries = [(textwrap.fill(label, most), style) for label, style in legend]
     longest = max((len(line) for label, _ in entries for line in label.split("\n")), default=0)
-    return entries, max(1, int(width / (handle + letter * longest)))
-
-
-def _rows(entries: Legend, columns: int) -> int:
-    return max(1, math.ceil(len(entries) / columns))
+    columns = max(1, int(width / (handle + letter * longest)))
+    rows = math.ceil(len(entries) / columns)
+    by_row = (entries[row::rows] for row in range(rows))
+    return entries, columns, sum(max(label.count("\n") + 1 for label, _ in row) for row in by_row)
 
 
 def stale_files(kept: set[str], names: Sequence[str]) -> Iterator[str]:
-    """Of the `names` of files those of figures that are not among the `kept`."""
+    """Those file names that belong to figures whose name is not among the `kept`."""
     for name in names:
         stem, dot, ending = name.rpartition(".")
         if dot + ending in ENDINGS and stem.removesuffix(COLUMN) not in kept:

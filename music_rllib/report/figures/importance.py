@@ -1,12 +1,12 @@
-"""Which settings matter: what a stage varies, against what its runs ended at.
+"""Which settings matter: what a stage varies, against the final values of its runs.
 
-A *setting* is something numeric or categorical that varies between a stage's runs, q among them.
+A *setting* is a number or a choice that varies between a stage's runs; q is one of them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import LogFormatter
 
 from music_rllib import names
-from music_rllib.report.figures.palette import BARS, colour_of, style_of
+from music_rllib.report.figures.palette import BARS, colour_of, styles_of
 from music_rllib.report.figures.plots import (
     RATE_LIMITS,
     Panel,
@@ -28,92 +28,80 @@ from music_rllib.results.conditions import ENTROPIC_INDEX, SEEDS, Condition
 from music_rllib.results.data import Sweep
 from music_rllib.results.statistics import Array
 
-__all__ = [
-    "CHANCE",
-    "FEWEST_RUNS",
-    "Importance",
-    "importance_panel",
-    "importances",
-    "parallel_panel",
-    "sensitivity_panels",
-    "varied",
-]
-
 ALPHA, WEIGHT = "α", "MI weight"
 CHANCE = "seed (chance)"
-"""How much the seed alone explains: what a setting must exceed to be more than luck."""
+"""The seed as a setting: what another one must exceed to be more than luck."""
 FEWEST_RUNS = 8
-"""Below them a forest of trees explains nothing."""
+"""Fewer runs are not enough for a forest of trees."""
 FEWEST_POINTS = 4
-"""Of a contour: fewer have no surface."""
+"""Fewer points have no contours."""
 TREES = 32
 MOST_LEVELS = 4
-"""Of a setting that is no number, to be treated as a choice."""
+"""Largest number of values of a setting without numbers that is treated as a choice."""
 MOST_PANELS = 12
-"""Of sensitivity; where there would be more, only those of all tasks together are drawn."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Importance:
-    """Share of the variance of what runs ended at that a setting explains."""
-
-    task: str
-    setting: str
-    share: float
+"""Largest number of sensitivity panels; if there are more, those of single tasks are left out."""
 
 
 def settings_of(condition: Condition) -> dict[str, str]:
-    """Everything that tells a condition from others, q first."""
+    """All settings that tell a condition from others, q first."""
     return {ENTROPIC_INDEX: condition.entropic_index, **dict(condition.others)}
 
 
 def varied(conditions: Sequence[Condition]) -> list[str]:
-    """Settings that have more than one value, q first; which seeds a search used is none."""
-    found: dict[str, set[str]] = {}
+    """Settings with more than one value, q first; whether seeds are fresh is no setting."""
+    values: dict[str, set[str]] = {}
     for condition in conditions:
         for name, value in settings_of(condition).items():
-            if name != SEEDS:
-                found.setdefault(name, set()).add(value)
-    return [name for name, values in found.items() if len(values) > 1]
+            values.setdefault(name, set()).add(value)
+    return [name for name, found in values.items() if len(found) > 1 and name != SEEDS]
 
 
 # Sensitivity ------------------------------------------------------------------------------------
 
+Positions = Mapping[Final[Condition], tuple[float, ...]]
+"""Finals with their values of the settings on a figure's axes."""
+
 
 def sensitivity_panels(analysis: StageAnalysis) -> list[Panel]:
-    """What runs ended at over α and the MI reward's weight: one panel per task and q.
+    """Final values over α and the MI reward's weight: one panel per task and q.
 
-    Where both vary it is a contour, where one does a line with its intervals.
+    It is a contour where both vary, and a line with its intervals where one does.
     """
-    names_ = [name for name in (ALPHA, WEIGHT) if name in varied(analysis.stage.conditions)]
-    panels = []
-    for scope in analysis.scopes:
-        numeric = [final for final in scope.finals if _position(final.condition, names_)]
-        if len(names_) == 2:
-            panels += list(_contours(scope, numeric, names_))
-        elif names_ and len(numeric) > 1:
-            panels.append(_lines(scope, numeric, names_[0], analysis.stage.conditions))
+    conditions = analysis.stage.conditions
+    settings = [name for name in (ALPHA, WEIGHT) if name in varied(conditions)]
+    panels: list[Panel] = []
+    for scope in analysis.scopes if settings else ():
+        positions = {
+            final: position
+            for final in scope.finals
+            if (position := _position(final.condition, settings)) is not None
+        }
+        if len(settings) == 2:
+            panels += _contours(scope, positions)
+        elif len(positions) > 1:
+            panels.append(_lines(scope, positions, settings[0], conditions))
     return panels if len(panels) <= MOST_PANELS else panels[: len(panels) // len(analysis.scopes)]
 
 
-def _position(condition: Condition, wanted: Sequence[str]) -> tuple[float, ...] | None:
-    values = settings_of(condition)
-    numbers = [_number(values.get(name, "")) for name in wanted]
-    return None if None in numbers else tuple(n for n in numbers if n is not None)
+def _position(condition: Condition, settings: Sequence[str]) -> tuple[float, ...] | None:
+    """The condition's values of the settings; None where one of them is no number."""
+    texts = settings_of(condition)
+    values = [value for name in settings if (value := _number(texts.get(name, ""))) is not None]
+    return tuple(values) if len(values) == len(settings) else None
 
 
-def _contours(
-    scope: Scope[Condition], finals: Sequence[Final[Condition]], wanted: Sequence[str]
-) -> Iterator[Panel]:
-    by_q: dict[str, list[Final[Condition]]] = {}
-    for final in finals:
-        by_q.setdefault(final.condition.entropic_index, []).append(final)
-    for q, members in by_q.items():
+def _by_q(positions: Positions) -> dict[str, list[Final[Condition]]]:
+    groups: dict[str, list[Final[Condition]]] = {}
+    for final in positions:
+        groups.setdefault(final.condition.entropic_index, []).append(final)
+    return groups
+
+
+def _contours(scope: Scope[Condition], positions: Positions) -> Iterator[Panel]:
+    for q, finals in _by_q(positions).items():
         points: dict[tuple[float, ...], list[float]] = {}
-        for final in members:
-            at = _position(final.condition, wanted)
-            assert at is not None, "the caller has left the others out"
-            points.setdefault(at, []).append(float(final.estimate.value))
+        for final in finals:
+            points.setdefault(positions[final], []).append(final.value)
         where = np.array(list(points))
         if len(where) < FEWEST_POINTS or min(len(set(axis)) for axis in where.T) < 2:
             continue
@@ -122,7 +110,7 @@ def _contours(
 
 
 def _range(scope: Scope[Condition]) -> tuple[float, float]:
-    """Of a rate all that it can be, of a return what was seen."""
+    """[0, 1] for a rate, the range of the final values otherwise."""
     if scope.metric in names.EVAL_RATES:
         return 0.0, 1.0
     values = [final.value for final in scope.finals]
@@ -140,8 +128,8 @@ def _contour(
         marks.set(clip_on=False, zorder=5)
         for set_ticks, at in ((axes.set_xticks, x), (axes.set_yticks, y)):
             distinct = np.unique(at)
-            shown = distinct[np.linspace(0, len(distinct) - 1, min(5, len(distinct))).astype(int)]
-            set_ticks(_scaled(at, shown), [f"{value:g}" for value in shown])
+            ticks = distinct[np.linspace(0, len(distinct) - 1, min(5, len(distinct))).astype(int)]
+            set_ticks(_scaled(ticks), [f"{tick:g}" for tick in ticks])
         axes.set_xlabel("α (entropy coefficient)")
         axes.set_ylabel("MI reward weight")
         axes.grid(visible=False)
@@ -151,45 +139,42 @@ def _contour(
     return Panel(title=title, draw=draw)
 
 
-def _scaled(values: Array, shown: Array | None = None) -> Array:
+def _scaled(values: Array) -> Array:
     """Logarithms where the values span more than a factor of five."""
-    wanted = values if shown is None else shown
-    wide = values.min() > 0 and values.max() / values.min() > 5
-    return np.asarray(np.log10(wanted) if wide else wanted)
+    return np.asarray(np.log10(values) if _is_wide(values) else values)
+
+
+def _is_wide(values: Array) -> bool:
+    return bool(values.min() > 0 and values.max() / values.min() > 5)
 
 
 def _lines(
     scope: Scope[Condition],
-    finals: Sequence[Final[Condition]],
-    name: str,
-    siblings: tuple[Condition, ...],
+    positions: Positions,
+    setting: str,
+    conditions: tuple[Condition, ...],
 ) -> Panel:
-    by_q: dict[str, list[Final[Condition]]] = {}
-    for final in finals:
-        by_q.setdefault(final.condition.entropic_index, []).append(final)
-
-    def at(final: Final[Condition]) -> float:
-        return float(settings_of(final.condition)[name])
+    styles = styles_of(conditions)
 
     def draw(axes: Axes) -> None:
-        for members in by_q.values():
-            ordered = sorted(members, key=at)
-            style = style_of(ordered[0].condition, siblings)
-            x, y = [at(f) for f in ordered], [float(f.estimate.value) for f in ordered]
+        for finals in _by_q(positions).values():
+            ordered = sorted(finals, key=lambda final: positions[final])
+            style = styles[ordered[0].condition]
+            x, y = [positions[final][0] for final in ordered], [final.value for final in ordered]
             axes.plot(x, y, color=style.colour, marker=style.marker, linewidth=1.8)
             for place, final in zip(x, ordered, strict=True):
                 if final.estimate.has_interval:
                     ends = [float(final.estimate.lower), float(final.estimate.upper)]
                     axes.plot([place, place], ends, color=style.colour, linewidth=4, alpha=0.35)
-        places = [at(final) for final in finals]
-        if min(places) > 0 and max(places) / min(places) > 5:
+        log = _is_wide(np.array(list(positions.values())))
+        if log:
             axes.set_xscale("log")
-            # The scale's own labels are formulas, which nothing is read as.
+            # The scale's own labels are formulas, but text.parse_math is off.
             axes.xaxis.set_major_formatter(LogFormatter())
             axes.xaxis.set_minor_formatter(LogFormatter())
         if scope.metric in names.EVAL_RATES:
             axes.set_ylim(*RATE_LIMITS)
-        axes.set_xlabel(f"{name} (log scale)" if axes.get_xscale() == "log" else name)
+        axes.set_xlabel(f"{setting} (log scale)" if log else setting)
         axes.set_ylabel(f"final {names.word_of(scope.metric)}")
 
     return Panel(title=scope.name, draw=draw)
@@ -198,34 +183,34 @@ def _lines(
 # Importance -------------------------------------------------------------------------------------
 
 
-def importances(sweep: Sweep, analysis: StageAnalysis) -> list[Importance]:
-    """Functional ANOVA (Hutter et al. 2014; Optuna's) over the finished runs of each task.
+def importances(sweep: Sweep, analysis: StageAnalysis) -> dict[str, dict[str, float]]:
+    """Share of the variance of final values that each setting explains, by task.
 
-    The seed is one of the settings, as a yardstick. Empty where fewer than two settings vary or
-    too few runs have finished.
+    It is a functional ANOVA (Hutter et al. 2014; Optuna's) over the finished runs, with the seed as
+    a setting to compare with. A task with too few finished runs is left out, and there is none
+    where fewer than two settings vary.
     """
-    wanted = varied(analysis.stage.conditions)
-    if len(wanted) < 2:
-        return []
-    found = []
-    for task in analysis.stage.tasks:
-        rows = list(_rows(sweep, analysis, task, wanted))
-        shares = _fanova(rows) if len(rows) >= FEWEST_RUNS else {}
-        found += [Importance(task=task, setting=n, share=share) for n, share in shares.items()]
-    return found
+    settings = varied(analysis.stage.conditions)
+    shares: dict[str, dict[str, float]] = {}
+    for task in analysis.stage.tasks if len(settings) > 1 else ():
+        rows = list(_rows(sweep, analysis, task, settings))
+        if len(rows) >= FEWEST_RUNS and len({value for _, value in rows}) > 1:
+            shares[task] = _fanova(rows)
+    return shares
 
 
 def _rows(
-    sweep: Sweep, analysis: StageAnalysis, task: str, wanted: Sequence[str]
+    sweep: Sweep, analysis: StageAnalysis, task: str, settings: Sequence[str]
 ) -> Iterator[tuple[dict[str, str], float]]:
+    """Settings and final value of each finished run on the task."""
     for condition in analysis.stage.conditions:
         values = settings_of(condition)
         for run in condition.runs:
             record = sweep.runs[run]
-            last = sweep.final(run, sweep.primary_metric(task))
-            if record.task == task and record.status == "FINISHED" and last is not None:
-                chosen = {name: values.get(name, "-") for name in wanted}
-                yield {**chosen, CHANCE: record.seed}, last
+            final = sweep.final(run, sweep.primary_metric(task))
+            if record.task == task and record.status == "FINISHED" and final is not None:
+                chosen = {name: values.get(name, "-") for name in settings}
+                yield {**chosen, CHANCE: record.seed}, final
 
 
 def _fanova(rows: Sequence[tuple[Mapping[str, str], float]]) -> dict[str, float]:
@@ -233,32 +218,30 @@ def _fanova(rows: Sequence[tuple[Mapping[str, str], float]]) -> dict[str, float]
     from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution
     from optuna.importance import FanovaImportanceEvaluator, get_param_importances
 
-    if len({value for _, value in rows}) < 2:
-        return {}
-    columns = {name: [values[name] for values, _ in rows] for name in rows[0][0]}
     space: dict[str, BaseDistribution] = {}
-    parsed: dict[str, list[object]] = {}
-    for name, texts in columns.items():
-        numbers = [number for text in texts if (number := _number(text)) is not None]
-        if len(set(texts)) < 2:
-            continue
+    columns: dict[str, Sequence[object]] = {}
+    for name in rows[0][0]:
+        texts = [settings[name] for settings, _ in rows]
         levels = sorted(set(texts))
+        numbers = [number for text in texts if (number := _number(text)) is not None]
+        if len(levels) < 2:
+            continue
         if len(numbers) == len(texts) and name != CHANCE:
             space[name] = FloatDistribution(min(numbers), max(numbers))
-            parsed[name] = list(numbers)
+            columns[name] = numbers
         elif len(levels) > MOST_LEVELS:
-            # Optuna's share of a choice takes time exponential in its levels: places in a row.
+            # Optuna's time for a choice is exponential in its levels, so these become numbers.
             space[name] = FloatDistribution(0.0, len(levels) - 1.0)
-            parsed[name] = [float(levels.index(text)) for text in texts]
+            columns[name] = [float(levels.index(text)) for text in texts]
         else:
             space[name] = CategoricalDistribution(levels)
-            parsed[name] = list(texts)
+            columns[name] = texts
     before = optuna.logging.get_verbosity()
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     try:
         study = optuna.create_study(direction="maximize")
-        for number, (_, value) in enumerate(rows):
-            params = {name: values[number] for name, values in parsed.items()}
+        for row, (_, value) in enumerate(rows):
+            params = {name: column[row] for name, column in columns.items()}
             study.add_trial(
                 optuna.trial.create_trial(params=params, distributions=space, value=value)
             )
@@ -268,18 +251,17 @@ def _fanova(rows: Sequence[tuple[Mapping[str, str], float]]) -> dict[str, float]
         optuna.logging.set_verbosity(before)
 
 
-def importance_panel(task: str, found: Sequence[Importance]) -> Panel:
-    """A bar for each setting, the largest on top."""
-    ordered = sorted(found, key=lambda one: -one.share)
-    labels, height = labelled_rows([f"{one.setting}: {one.share:.2f}" for one in ordered])
+def importance_panel(task: str, shares: Mapping[str, float]) -> Panel:
+    """A bar for each setting's share, the largest on top."""
+    ordered = sorted(shares.items(), key=lambda item: -item[1])
+    labels, height = labelled_rows([f"{setting}: {share:.2f}" for setting, share in ordered])
 
     def draw(axes: Axes) -> None:
         axes.set_ylim(len(ordered) - 0.5, -0.8)
         axes.set_xlim(0.0, 1.0)
         rules_behind_rows(axes, len(ordered), above=0.24)
-        for row, (one, label) in enumerate(zip(ordered, labels, strict=True)):
-            chance = one.setting == CHANCE
-            axes.barh(row, one.share, color=BARS[chance], height=0.48, alpha=0.8)
+        for row, ((setting, share), label) in enumerate(zip(ordered, labels, strict=True)):
+            axes.barh(row, share, color=BARS[setting == CHANCE], height=0.48, alpha=0.8)
             row_label(axes, row - 0.28, label)
         axes.set_xlabel("share of the variance at the end")
 
@@ -290,47 +272,39 @@ def importance_panel(task: str, found: Sequence[Importance]) -> Panel:
 
 
 def parallel_panel(scope: Scope[Condition], conditions: Sequence[Condition]) -> Panel | None:
-    """A line per condition through its settings and what it ended at; coloured by q."""
-    wanted = varied(conditions)
-    if len(wanted) < 2 or len(scope.finals) < 2:
+    """A line per condition through its settings and its final value, coloured by q."""
+    settings = varied(conditions)
+    if len(settings) < 2 or len(scope.finals) < 2:
         return None
     columns = [
-        _column([settings_of(f.condition).get(n, "-") for f in scope.finals]) for n in wanted
+        _column([settings_of(final.condition).get(name, "-") for final in scope.finals])
+        for name in settings
     ]
-    heights = [column for column, _ in columns]
     low, high = _range(scope)
-    heights.append([(final.value - low) / (high - low) for final in scope.finals])
-    ticks = [labels for _, labels in columns]
-    ticks.append([(tick, f"{low + tick * (high - low):.4g}") for tick in (0.0, 0.5, 1.0)])
+    columns.append(
+        (
+            [(final.value - low) / (high - low) for final in scope.finals],
+            [(height, f"{low + height * (high - low):.4g}") for height in (0.0, 0.5, 1.0)],
+        )
+    )
+    lines = list(zip(*(heights for heights, _ in columns), strict=True))
 
     def draw(axes: Axes) -> None:
-        for number, final in enumerate(scope.finals):
-            axes.plot(
-                range(len(heights)),
-                [column[number] for column in heights],
-                color=colour_of(final.condition.entropic_index),
-                linewidth=1.4,
-                alpha=0.35 + 0.6 * heights[-1][number],
-            )
-        # No line of the figure runs through a label.
+        for final, heights in zip(scope.finals, lines, strict=True):
+            colour, alpha = colour_of(final.condition.entropic_index), 0.35 + 0.6 * heights[-1]
+            axes.plot(range(len(heights)), heights, color=colour, linewidth=1.4, alpha=alpha)
+        # Labels have a background, so that no line runs through their text.
         behind = {"facecolor": mpl.rcParams["axes.facecolor"], "edgecolor": "none", "pad": 0.8}
-        for place, labels in enumerate(ticks):
+        style: dict[str, Any] = {"va": "center", "fontsize": "small", "bbox": behind}
+        for place, (_, ticks) in enumerate(columns):
             axes.axvline(place, color=axes.spines["left"].get_edgecolor(), linewidth=0.8)
-            side = {"ha": "right", "x": place - 0.04} if place else {"ha": "left", "x": 0.04}
-            for height, label in labels:
-                axes.text(
-                    side["x"],  # type: ignore[arg-type]
-                    height,
-                    label,
-                    ha=side["ha"],
-                    va="center",
-                    fontsize="small",
-                    bbox=behind,
-                )
-        axes.set_xticks(
-            range(len(heights)),
-            [*(_short(n) for n in wanted), f"final\n{names.word_of(scope.metric)}"],
-        )
+            x, side = (place - 0.04, "right") if place else (0.04, "left")
+            for height, label in ticks:
+                axes.text(x, height, label, ha=side, **style)
+        labels = [
+            name.rpartition(": ")[2].rpartition(".")[2].replace("_", "\n") for name in settings
+        ]
+        axes.set_xticks(range(len(columns)), [*labels, f"final\n{names.word_of(scope.metric)}"])
         axes.set_yticks([])
         axes.set_ylim(-0.06, 1.06)
         axes.spines["left"].set_visible(False)
@@ -340,24 +314,19 @@ def parallel_panel(scope: Scope[Condition], conditions: Sequence[Condition]) -> 
 
 
 def _column(texts: Sequence[str]) -> tuple[list[float], list[tuple[float, str]]]:
-    """Heights in [0, 1] by rank, and their labels: settings are chosen by hand or by factors."""
+    """Heights of a setting's values in [0, 1] by rank, and (height, label) of at most six ticks."""
     numbers = {text: _number(text) for text in texts}
     distinct = sorted(numbers, key=lambda t: (numbers[t] is None, numbers[t] or 0.0, t))
     height = {text: i / max(1, len(distinct) - 1) for i, text in enumerate(distinct)}
-    shown = distinct
-    if len(distinct) > 6:
-        shown = [distinct[i] for i in np.linspace(0, len(distinct) - 1, 6).astype(int)]
-    return [height[text] for text in texts], [(height[t], _tick(t)) for t in shown]
+    ticks = np.linspace(0, len(distinct) - 1, min(6, len(distinct))).astype(int)
+    labels = [(height[distinct[i]], _tick_label(distinct[i])) for i in ticks]
+    return [height[text] for text in texts], labels
 
 
-def _tick(text: str) -> str:
-    """What a search draws has six digits."""
+def _tick_label(text: str) -> str:
+    """Three digits of a number, as a search samples six; the first letters of a word."""
     number = _number(text)
     return f"{number:.3g}" if number is not None and len(text) > 6 and "." in text else text[:12]
-
-
-def _short(name: str) -> str:
-    return name.rpartition(": ")[2].rpartition(".")[2].replace("_", "\n")
 
 
 def _number(text: str) -> float | None:

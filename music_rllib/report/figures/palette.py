@@ -1,9 +1,9 @@
-"""How an entropic index looks: the same q has the same colour and marker in every figure.
+"""Colours, markers and lines of conditions: a q has the same colour and marker in every figure.
 
 The values that the paper compares have colours of Okabe and Ito's palette, which colour-blind
 readers tell apart, darkened or lightened until each stands out from white and from black paper.
-Between them the colour is mixed, so any q has one, by a function of q alone. Only where stages
-stand side by side is the colour the stage's.
+The colour of any other q is mixed from its neighbours' and depends on q alone. Only in figures of
+stages side by side does the colour stand for the stage.
 """
 
 from __future__ import annotations
@@ -16,21 +16,8 @@ import numpy as np
 
 from music_rllib.results.conditions import Condition
 
-__all__ = [
-    "BARS",
-    "DARK",
-    "DASHES",
-    "LIGHT",
-    "Style",
-    "colour_of",
-    "marker_of",
-    "style_of",
-    "styles_by_stage",
-    "styles_of",
-]
-
 LIGHT, DARK = "#ffffff", "#14171c"
-"""The two papers."""
+"""Background of the page in light and in dark mode."""
 
 _ANCHORS = (
     (0.5, "#b07aa1"),
@@ -42,10 +29,10 @@ _ANCHORS = (
 _BY_STAGE = tuple(colour for _, colour in (*_ANCHORS[1:], _ANCHORS[0]))
 _UNKNOWN = "#808080"
 BARS = ("#1f7fc4", "#808080")
-"""Of settings, and of what is only chance."""
+"""Colours of bars for settings and for chance."""
 _MARKERS = "osD^vPX"
 _ALIKE = 60.0
-"""Distance in RGB below which thin lines look the same: that of q = 1 and 1.1."""
+"""Distance in RGB below which thin lines look the same, as those of q = 1 and 1.1 do."""
 
 Line = Literal["solid", "dashed", "dashdot", "dotted", "long", "dashdotdot"]
 Stroke = Literal["solid", "dashed", "dashdot", "dotted"] | tuple[float, tuple[float, ...]]
@@ -58,7 +45,7 @@ DASHES: Mapping[Line, str] = {
     "long": "13 3",
     "dashdotdot": "6 2 1.5 2 1.5 2",
 }
-"""On the page, in SVG's words."""
+"""Dash patterns in SVG, in pixels."""
 
 
 class Style(NamedTuple):
@@ -70,7 +57,7 @@ class Style(NamedTuple):
 
     @property
     def stroke(self) -> Stroke:
-        """The line in Matplotlib's words, which know four."""
+        """The line style in Matplotlib, which has names for four of them."""
         if self.line == "long" or self.line == "dashdotdot":
             return 0.0, tuple(float(dash) / 1.5 for dash in DASHES[self.line].split())
         return self.line
@@ -78,7 +65,7 @@ class Style(NamedTuple):
 
 @functools.cache
 def colour_of(entropic_index: str) -> str:
-    """Colour of a q in words; a schedule has that of its last value."""
+    """Colour of a q given as text; a schedule has the colour of its last value."""
     q = _number(entropic_index)
     if q is None:
         return _UNKNOWN
@@ -89,19 +76,14 @@ def colour_of(entropic_index: str) -> str:
 
 
 def marker_of(entropic_index: str) -> str:
-    """Marker of a q in words, different for neighbours on a grid of quarters."""
+    """Marker of a q given as text, different for neighbours on a grid of quarters."""
     q = _number(entropic_index)
     return "*" if q is None else _MARKERS[(round(4 * q) - 4) % len(_MARKERS)]
 
 
-def style_of(condition: Condition, siblings: tuple[Condition, ...]) -> Style:
-    """Colour and marker by q; line and marker tell conditions of like colours apart."""
-    return styles_of(siblings)[condition]
-
-
 @functools.cache
 def styles_of(conditions: tuple[Condition, ...]) -> Mapping[Condition, Style]:
-    """Of the conditions of one stage."""
+    """Styles of a stage's conditions: colour and marker by q, other lines for similar colours."""
     styles: dict[Condition, Style] = {}
     for condition in conditions:
         colour, marker = colour_of(condition.entropic_index), marker_of(condition.entropic_index)
@@ -110,7 +92,7 @@ def styles_of(conditions: tuple[Condition, ...]) -> Mapping[Condition, Style]:
         first = _MARKERS.find(marker)
         turned = (_MARKERS[(first + turn) % len(_MARKERS)] for turn in range(1, len(_MARKERS)))
         taken = {style.marker for style in alike}
-        marker = next((one for one in (marker, *turned) if one not in taken), marker)
+        marker = next((free for free in (marker, *turned) if free not in taken), marker)
         styles[condition] = Style(colour=colour, marker=marker, line=line)
     return styles
 
@@ -122,7 +104,7 @@ def _alike(one: str, other: str) -> bool:
 
 
 def styles_by_stage(conditions: tuple[Condition, ...]) -> dict[Condition, Style]:
-    """Of conditions of several stages: colour by stage; marker and line by q."""
+    """Styles of conditions of several stages: colour by stage, marker and line by q."""
     stages = list(dict.fromkeys(condition.others[0] for condition in conditions))
     indices = list(dict.fromkeys(condition.entropic_index for condition in conditions))
     return {
@@ -136,6 +118,7 @@ def styles_by_stage(conditions: tuple[Condition, ...]) -> dict[Condition, Style]
 
 
 def _number(entropic_index: str) -> float | None:
+    """The number of `1.5`, the last one of `1 to 2 by steps (..)`; None for other text."""
     try:
         return float(entropic_index.split(" (")[0].split(" by ")[0].rpartition(" ")[2])
     except ValueError:

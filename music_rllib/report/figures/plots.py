@@ -1,46 +1,32 @@
-"""The report's figures: the paper's Figures 4 to 7 and what explains them.
+"""Panels of learning curves, final values, profiles and entropies (the paper's Figures 4 to 7).
 
-A *panel* is one task's; it draws itself on the axes that it is given.
+A *panel* shows one task; its function `draw` draws it on given axes.
 """
 
 from __future__ import annotations
 
 import itertools
 import textwrap
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
+from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter
 
 from music_rllib import names
-from music_rllib.report.figures.palette import Style, style_of
+from music_rllib.report.figures.palette import Style, styles_of
 from music_rllib.results import statistics as st
 from music_rllib.results.analysis import Curve
 from music_rllib.results.comparison import SHOW_SEEDS_BELOW, Final, Scope, interval_text, number
 from music_rllib.results.conditions import Condition
+from music_rllib.results.data import Sweep
 from music_rllib.results.statistics import Array, Estimate
-
-__all__ = [
-    "EPOCH",
-    "METRICS",
-    "PANEL",
-    "Legend",
-    "Metric",
-    "Panel",
-    "belongs",
-    "curve_panel",
-    "finals_panel",
-    "labelled_rows",
-    "profile_panel",
-    "row_label",
-    "rules_behind_rows",
-]
 
 Legend = Sequence[tuple[str, Style]]
 """(label, style) pairs."""
@@ -51,59 +37,42 @@ PANEL = (4.3, 3.0)
 """Width and height in inches, at which 10 pt are readable on a page of 400 px."""
 _TOP_WITH_EPOCHS = 0.62
 SAME = 0.008
-"""Of an axis: lines that are closer together cover each other."""
+"""Share of the axis within which lines cover each other."""
 _DASH = 2.5
-"""Of lines that cover others, in line widths."""
+"""Length of the dashes of lines that cover others, in line widths."""
+MOST_BANDS = 8
+"""Largest number of lines in a panel that have bands and lines of single seeds."""
 _MOST_RANKS = 9
 _CROWDED = 10
-"""Lines of which nobody can tell any more how many cover each other: they are solid or dashed."""
+"""Largest number of lines whose dashes tell how many others they cover; of more, one kind does."""
 _LABEL = 46
-"""Letters of a label in one line of a panel."""
+"""Largest number of letters in a line of a row's label."""
 TARGET = 0.85
 """Success rate that Figure 4 of the paper waits for."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Metric:
-    """What one kind of figure shows."""
+    """A metric that has learning curves."""
 
     name: str
     title: str
     axis: str
-    """With its unit."""
+    """Label of the axis, with the unit."""
     limits: tuple[float, float] | None = None
     target: float | None = None
 
 
 RATE_LIMITS = (-0.03, 1.03)
 METRICS = (
-    Metric(
-        name=names.EVAL_SUCCESS,
-        title="Success rate",
-        axis="success rate",
-        limits=RATE_LIMITS,
-        target=TARGET,
-    ),
-    Metric(name=names.EVAL_RETURN, title="Return", axis="return of an episode"),
-    Metric(
-        name=names.EVAL_SUCCESS_ANY,
-        title="Success at any step",
-        axis="success at any step",
-        limits=RATE_LIMITS,
-    ),
-    Metric(
-        name=names.EVAL_DISPLACEMENT,
-        title="Object displacement",
-        axis="object displacement (m)",
-    ),
-    Metric(name=names.MI_BOUND, title="Mutual-information bound", axis="MI bound (nats)"),
-    Metric(name=names.MI_REWARD, title="Mutual-information reward", axis="MI reward per step"),
-    Metric(name=names.ENTROPY, title="Tsallis entropy of the policy", axis="Tsallis entropy"),
-    Metric(
-        name=names.SHANNON_ENTROPY,
-        title="Shannon entropy of the policy",
-        axis="Shannon entropy (nats)",
-    ),
+    Metric(names.EVAL_SUCCESS, "Success rate", "success rate", RATE_LIMITS, TARGET),
+    Metric(names.EVAL_RETURN, "Return", "return of an episode"),
+    Metric(names.EVAL_SUCCESS_ANY, "Success at any step", "success at any step", RATE_LIMITS),
+    Metric(names.EVAL_DISPLACEMENT, "Object displacement", "object displacement (m)"),
+    Metric(names.MI_BOUND, "Mutual-information bound", "MI bound (nats)"),
+    Metric(names.MI_REWARD, "Mutual-information reward", "MI reward per step"),
+    Metric(names.ENTROPY, "Tsallis entropy of the policy", "Tsallis entropy"),
+    Metric(names.SHANNON_ENTROPY, "Shannon entropy of the policy", "Shannon entropy (nats)"),
 )
 
 
@@ -114,9 +83,9 @@ class Panel:
     title: str
     draw: Callable[[Axes], None]
     top: float = 0.32
-    """Margin in inches for the title, and for an axis above the panel."""
+    """Margin in inches for the title and for an axis above the panel."""
     height: float = PANEL[1]
-    """In inches, margins included."""
+    """Height in inches, margins included."""
 
 
 def curve_panel(
@@ -124,24 +93,28 @@ def curve_panel(
 ) -> Panel:
     """`metric` against environment steps, one line with its band per condition.
 
-    The original's epochs stand above where the budget is at least one of them.
+    A second axis counts epochs of the original MUSIC if the curves have at least one.
     """
     epochs = max(float(curve.steps[-1]) for curve in curves) >= EPOCH
     ranks = _ranks(curves, metric)
-
     numbers = {condition: number for number, condition in enumerate(styles)}
+    with_bands = len(curves) <= MOST_BANDS
 
     def draw(axes: Axes) -> None:
         drawn = [
-            _draw_curve(axes, curve, styles[curve.condition], rank, at / len(curves))
+            _draw_curve(
+                axes, curve, styles[curve.condition], rank, at / len(curves), seeds=with_bands
+            )
             for at, (curve, rank) in enumerate(zip(curves, ranks, strict=True))
         ]
         axes.autoscale_view()
-        # Of what was seen: a band of two seeds may be many times as wide.
+        # Limits are those of the lines: a band of two seeds may be many times as wide.
         axes.set_ylim(axes.get_ylim())
         for curve, artists in zip(curves, drawn, strict=True):
-            band = _band(axes, curve.steps, curve.estimate, styles[curve.condition].colour)
-            belongs([*artists, band], numbers[curve.condition], curve.condition.label)
+            if with_bands:
+                colour = styles[curve.condition].colour
+                artists.append(_band(axes, curve.steps, curve.estimate, colour))
+            mark_condition(artists, numbers[curve.condition], curve.condition.label)
         axes.set_xlim(left=0.0)
         axes.set_ylabel(metric.axis)
         axes.set_xlabel("environment steps")
@@ -149,7 +122,8 @@ def curve_panel(
         if metric.limits is not None:
             axes.set_ylim(*metric.limits)
         if metric.target is not None:
-            axes.axhline(metric.target, color=_ink(), linewidth=0.8, linestyle=(0, (1, 3)))
+            ink = mpl.rcParams["axes.edgecolor"]
+            axes.axhline(metric.target, color=ink, linewidth=0.8, linestyle=(0, (1, 3)))
         if epochs:
             _add_epochs(axes)
 
@@ -157,19 +131,19 @@ def curve_panel(
 
 
 def profile_panel(scope: Scope[Condition], siblings: tuple[Condition, ...]) -> Panel:
-    """Share of finished runs above each success rate."""
+    """Share of finished runs that end above each success rate."""
+    styles = styles_of(siblings)
     thresholds = np.linspace(0.0, 1.0, 41)
     profiles = [(final, st.performance_profile(final.scores, thresholds)) for final in scope.finals]
 
     def draw(axes: Axes) -> None:
         for final, profile in profiles:
-            style = style_of(final.condition, siblings)
-            colour, line = style.colour, style.stroke
+            colour, line = styles[final.condition].colour, styles[final.condition].stroke
             lines = axes.step(
                 thresholds, profile.value, where="post", color=colour, linestyle=line, linewidth=1.8
             )
             band = _band(axes, thresholds, profile, colour, step="post")
-            belongs([*lines, band], siblings.index(final.condition), final.condition.label)
+            mark_condition([*lines, band], siblings.index(final.condition), final.condition.label)
         axes.set_xlabel("final success rate τ")
         axes.set_ylabel("share of runs above τ")
         axes.set_xlim(-0.02, 1.02)
@@ -178,58 +152,100 @@ def profile_panel(scope: Scope[Condition], siblings: tuple[Condition, ...]) -> P
     return Panel(title=scope.name, draw=draw)
 
 
-def finals_panel(scope: Scope[Condition], siblings: tuple[Condition, ...]) -> Panel:
-    """How conditions ended, with their intervals, and every run as a point."""
+def finals_panel(
+    title: str,
+    scope: Scope[Condition],
+    shown: Sequence[Final[Condition]],
+    styles: Mapping[Condition, Style],
+    labels: Mapping[Condition, str],
+) -> Panel:
+    """The final values of `shown`, some of `scope`, with their intervals and a mark for every run.
+
+    Panels of the same scope have the same axis.
+    """
     is_rate = scope.metric in names.EVAL_RATES
-    labels, height = labelled_rows([final.condition.label for final in scope.finals])
+    numbers = {condition: number for number, condition in enumerate(styles)}
+    rows, height = labelled_rows([labels[final.condition] for final in shown])
 
     def draw(axes: Axes) -> None:
         scores = np.concatenate([final.scores.ravel() for final in scope.finals])
-        # Intervals of two or three returns may be many times as wide as what was seen.
+        # Intervals of two or three returns may be many times as wide as the runs' range.
         room = 0.5 * (np.ptp(scores) or 1.0)
         limits = RATE_LIMITS if is_rate else (scores.min() - room, scores.max() + room)
-        axes.set_ylim(len(scope.finals) - 0.5, -0.75)
+        axes.set_ylim(len(shown) - 0.5, -0.75)
         axes.set_xlim(*limits)
         axes.locator_params(axis="x", nbins=6)
-        rules_behind_rows(axes, len(scope.finals))
-        for row, (final, label) in enumerate(zip(scope.finals, labels, strict=True)):
-            artists = _draw_final(axes, row, final, siblings, label)
-            said = (
-                f"{final.condition.label}: {number(final.value)}, {interval_text(final.estimate)}"
-            )
-            belongs(artists, siblings.index(final.condition), said)
+        rules_behind_rows(axes, len(shown))
+        for row, (final, label) in enumerate(zip(shown, rows, strict=True)):
+            artists = _draw_final(axes, row, final, styles[final.condition], label)
+            result = f"{number(final.value)}, {interval_text(final.estimate)}"
+            text = f"{final.condition.label}: {result}"
+            mark_condition(artists, numbers[final.condition], text)
         axes.set_xlabel("final success rate" if is_rate else f"final {names.word_of(scope.metric)}")
 
-    return Panel(title=scope.name, draw=draw, height=height)
+    return Panel(title=title, draw=draw, height=height)
+
+
+def entropy_panel(sweep: Sweep, task: str, styles: Mapping[Condition, Style]) -> Panel | None:
+    """A point for each finished run on the task: its final value over its final Shannon entropy.
+
+    Returns:
+        None if fewer than two runs have an entropy.
+    """
+    metric = sweep.primary_metric(task)
+    is_rate = metric in names.EVAL_RATES
+    points = {
+        condition: [
+            (entropy, score)
+            for run in condition.runs
+            if sweep.runs[run].task == task
+            and sweep.runs[run].status == "FINISHED"
+            and (entropy := sweep.final(run, names.SHANNON_ENTROPY)) is not None
+            and (score := sweep.final(run, metric)) is not None
+        ]
+        for condition in styles
+    }
+    if sum(map(len, points.values())) < 2:
+        return None
+
+    def draw(axes: Axes) -> None:
+        for place, (condition, pairs) in enumerate(points.items()):
+            style = styles[condition]
+            entropies, scores = zip(*pairs, strict=True) if pairs else ((), ())
+            marks = axes.plot(
+                entropies, scores, style.marker,
+                color=style.colour, markersize=6, alpha=0.75, mew=0,
+            )  # fmt: skip
+            mark_condition(marks, place, condition.label)
+        axes.set_xlabel("Shannon entropy at the end (nats)")
+        axes.set_ylabel("final success rate" if is_rate else f"final {names.word_of(metric)}")
+        if is_rate:
+            axes.set_ylim(*RATE_LIMITS)
+
+    return Panel(title=task, draw=draw)
 
 
 def labelled_rows(labels: Sequence[str]) -> tuple[list[str], float]:
-    """Labels broken into lines that fit, and the height of a panel with a row for each."""
+    """Labels broken into lines that fit, and the height of a panel with a row per label."""
     broken = [textwrap.fill(label, _LABEL, break_long_words=True) for label in labels]
     lines = max((label.count("\n") + 1 for label in broken), default=1)
     return broken, max(PANEL[1], 1.0 + len(labels) * (0.34 + 0.18 * lines))
 
 
 def rules_behind_rows(axes: Axes, rows: int, above: float = 0.14, below: float = 0.34) -> None:
-    """Grid lines where a row has its marks, and not where it has its label."""
+    """Draw grid lines behind each row's marks, and none behind its label."""
     axes.set_yticks([])
     axes.grid(visible=False)
     low, high = axes.get_xlim()
     at = [tick for tick in axes.get_xticks() if low <= tick <= high]
+    colour = mpl.rcParams["grid.color"]
     for row in range(rows):
-        axes.vlines(
-            at,
-            row - above,
-            row + below,
-            color=mpl.rcParams["grid.color"],
-            linewidth=0.8,
-            zorder=0.5,
-        )
+        axes.vlines(at, row - above, row + below, color=colour, linewidth=0.8, zorder=0.5)
     axes.set_xlim(low, high)
 
 
 def _ranks(curves: Sequence[Curve], metric: Metric) -> list[Array]:
-    """For each point of each curve, how many earlier curves run through it too."""
+    """For each point of each curve, the number of earlier curves that run through it."""
     if metric.limits is not None:
         height = metric.limits[1] - metric.limits[0]
     else:
@@ -239,32 +255,34 @@ def _ranks(curves: Sequence[Curve], metric: Metric) -> list[Array]:
     for place, curve in enumerate(curves):
         rank = np.zeros(len(curve.steps))
         for other in curves[:place]:
-            there = np.interp(
+            covered = np.interp(
                 curve.steps, other.steps, other.estimate.value, left=np.nan, right=np.nan
             )
-            rank += np.abs(there - curve.estimate.value) <= SAME * height
+            rank += np.abs(covered - curve.estimate.value) <= SAME * height
         ranks.append(np.minimum(rank, _MOST_RANKS if len(curves) <= _CROWDED else 1))
     return ranks
 
 
 def _draw_curve(
-    axes: Axes, curve: Curve, style: Style, rank: Array, stagger: float
+    axes: Axes, curve: Curve, style: Style, rank: Array, stagger: float, *, seeds: bool
 ) -> list[Artist]:
-    """Thick where every run counts, thin from where the first one ended; few seeds each apart.
+    """Draw a line: thick where every run counts, thin from where the first one ended.
 
-    Where lines coincide the later ones are dashed, so that each earlier one shows in the gaps.
+    With `seeds`, few of them have lines of their own. Where lines coincide the later ones are
+    dashed, so that each earlier one shows in the gaps.
     """
     colour, marker, line = style.colour, style.marker, style.stroke
     value = curve.estimate.value
     artists: list[Artist] = []
-    if 1 < len(curve.values) < SHOW_SEEDS_BELOW:
+    if seeds and 1 < len(curve.values) < SHOW_SEEDS_BELOW:
         artists += axes.plot(curve.steps, curve.values.T, color=colour, linewidth=0.6, alpha=0.55)
     whole = curve.runs == curve.runs.max()
-    for (covers, thick), runs in _alike(np.column_stack([curve.steps, value]), rank, whole):
-        dashed = (0.0, (_DASH, _DASH * covers)) if covers else line
+    stretches = _stretches(np.column_stack([curve.steps, value]), rank, whole)
+    for (covers, thick), parts in stretches.items():
+        dash = (0.0, (_DASH, _DASH * covers)) if covers else line
         width = 1.8 if thick else 0.8
-        made = LineCollection(runs, colors=colour, linestyles=[dashed], linewidths=width, zorder=2)
-        artists.append(axes.add_collection(made))
+        lines = LineCollection(parts, colors=colour, linestyles=[dash], linewidths=width, zorder=2)
+        artists.append(axes.add_collection(lines))
     every = max(1, len(curve.steps) // 8)
     marks = np.where(whole, value, np.nan)
     artists += axes.plot(
@@ -279,10 +297,8 @@ def _draw_curve(
     return artists
 
 
-def _alike(
-    points: Array, rank: Array, whole: Array
-) -> Iterator[tuple[tuple[int, bool], list[Array]]]:
-    """Stretches of a curve by how many others they cover and by whether every run counts there."""
+def _stretches(points: Array, rank: Array, whole: Array) -> dict[tuple[int, bool], list[Array]]:
+    """Parts of a curve by the number of curves they cover and by whether every run counts there."""
     covers = np.minimum(rank[:-1], rank[1:])
     changes = np.flatnonzero((np.diff(covers) != 0) | (whole[1:-1] != whole[2:])) + 1
     ends = [0, *changes, len(covers)]
@@ -291,7 +307,7 @@ def _alike(
         if first < last:
             key = (int(covers[first]), bool(whole[first + 1]))
             stretches.setdefault(key, []).append(points[first : last + 1])
-    yield from stretches.items()
+    return stretches
 
 
 def _band(
@@ -307,9 +323,9 @@ def _band(
 
 
 def _draw_final(
-    axes: Axes, row: int, final: Final[Condition], siblings: tuple[Condition, ...], label: str
+    axes: Axes, row: int, final: Final[Condition], style: Style, label: str
 ) -> list[Artist]:
-    colour, marker, _ = style_of(final.condition, siblings)
+    colour, marker, _ = style
     scores = final.scores.ravel()
     places = np.full(len(scores), row + 0.22)
     artists: list[Artist] = [*axes.plot(scores, places, "|", color=colour, alpha=0.6, markersize=7)]
@@ -322,7 +338,7 @@ def _draw_final(
 
 
 def row_label(axes: Axes, height: float, label: str) -> Artist:
-    """A label above a row's marks, apart from the axis."""
+    """Write a label above a row's marks, at a distance from the axis."""
     return axes.annotate(
         label,
         (0.0, height),
@@ -334,23 +350,22 @@ def row_label(axes: Axes, height: float, label: str) -> Artist:
     )
 
 
-def belongs(artists: Sequence[Artist], condition: int, said: str) -> None:
-    """Mark what belongs to a condition, by its number: a page shows and hides it by that."""
+def mark_condition(artists: Sequence[Artist], condition: int, title: str) -> None:
+    """Mark artists as a condition's, by its number: the page shows and hides them by it."""
     for artist in artists:
-        artist.set_gid(f"condition-{condition}-{said}")
+        artist.set_gid(f"condition-{condition}-{title}")
+
+
+def legend_handles(legend: Legend) -> list[Line2D]:
+    """A line with its marker for each entry of a legend."""
+    return [
+        Line2D([], [], color=style.colour, marker=style.marker, linestyle=style.stroke, label=label)
+        for label, style in legend
+    ]
 
 
 def _add_epochs(axes: Axes) -> None:
-    def epochs(steps: Any) -> Any:
-        return steps / EPOCH
-
-    def steps(epochs: Any) -> Any:
-        return epochs * EPOCH
-
-    above = axes.secondary_xaxis("top", functions=(epochs, steps))
+    scales = (lambda steps: np.divide(steps, EPOCH), lambda epochs: np.multiply(epochs, EPOCH))
+    above = axes.secondary_xaxis("top", functions=scales)
     above.set_xlabel("epochs of 80 000 steps", fontsize="small", labelpad=2)
     above.tick_params(labelsize="small", pad=1)
-
-
-def _ink() -> str:
-    return str(mpl.rcParams["axes.edgecolor"])

@@ -1,4 +1,4 @@
-"""Processes that read a report's values and draw its figures while the rest is computed."""
+"""Worker processes that read a report's values and draw its figures."""
 
 from __future__ import annotations
 
@@ -10,9 +10,7 @@ from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing import forkserver
 
-__all__ = ["drawing_processes"]
-
-_LOADED = (
+_PRELOADED = (
     "joblib.externals.cloudpickle",
     "matplotlib.backends.backend_pdf",
     "matplotlib.backends.backend_svg",
@@ -24,16 +22,16 @@ _LOADED = (
 
 @contextmanager
 def drawing_processes() -> Iterator[Executor | None]:
-    """As many as there are cores; none for a single one, or where none can be started.
+    """A process for each core; None for a single core, or if no process can be started.
 
-    What they need is loaded in the background from now on, once: all are copies of one process.
+    They are forks of one server, which loads their modules once, in the background.
     """
     cores = len(os.sched_getaffinity(0))
     if cores == 1:
         yield None
         return
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([*_LOADED])
+    context.set_forkserver_preload([*_PRELOADED])
     try:
         forkserver.ensure_running()
     except OSError:

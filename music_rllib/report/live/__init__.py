@@ -1,1 +1,1 @@
-"""A report that follows a sweep: its page on loopback, and what the sweep says of itself."""
+"""The live page: a report of a running sweep, served on loopback with the sweep's progress."""

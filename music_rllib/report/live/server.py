@@ -1,8 +1,8 @@
-"""The page of a sweep that runs, on loopback.
+"""The server of a running sweep's page, on loopback.
 
-Whoever knows the token in the page's address may read it, stop the sweep and resume it: other users
-of the machine reach its ports, too. A page of somebody else's site can't: it knows no token, and
-has no answer to a request with a header of its own.
+A request needs the token of the page's address to read the page and to stop or resume the sweep,
+since other users of the machine can reach its ports, too. Pages of other sites cannot act: they do
+not know the token, and browsers let no foreign page send the header that has it.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ from music_rllib.report.live.state import Progress
 from music_rllib.results.data import ReportError
 from music_rllib.store.object_folder import StorageError
 
-__all__ = ["LivePage", "Server", "make_server", "resume", "serve", "stop"]
-
 HOST = "127.0.0.1"
 LEAST_PAUSE = 10.0
-"""Seconds between two pages; a page that takes long to make leaves four fifths of the time."""
+"""Least seconds between two pages."""
 _RELAX = 4.0
+"""Pause between two pages as a multiple of the time that the last one took."""
 HEADER = "X-Token"
+"""Name of the header that has the token."""
 
 
 class LivePage:
-    """The newest page, made anew while the sweep runs."""
+    """The newest page, made again and again while the sweep runs."""
 
     def __init__(self, make: Callable[[], str], progress: Progress) -> None:
         """Make the first page.
 
         Raises:
-            ReportError: there is nothing to report on.
+            ReportError: there is no sweep to report on.
         """
         self._make, self._progress = make, progress
         self.html, self.version = make(), 1
@@ -53,14 +53,14 @@ class LivePage:
         self._thread.start()
 
     def state(self) -> dict[str, Any]:
-        """How far the sweep is, and which page is the newest."""
+        """The sweep's progress and the number of the newest page."""
         try:
             return {**self._progress.read(), "version": self.version}
         except StorageError as error:
             return {"state": "unknown", "error": str(error), "version": self.version}
 
     def close(self) -> None:
-        """Make no further page."""
+        """End the thread that makes pages."""
         self._ended.set()
         self._thread.join(60.0)
 
@@ -73,7 +73,7 @@ class LivePage:
             before, began = now, time.monotonic()
             try:
                 html = self._make()
-            except ReportError:  # MLflow is busy or down: the next one, perhaps
+            except ReportError:  # MLflow is busy or down: try again later
                 continue
             took = time.monotonic() - began
             if html != self.html:
@@ -81,24 +81,24 @@ class LivePage:
 
 
 def stop(found: SweepLocation) -> None:
-    """Ask the sweep to save its runs and end."""
+    """Request that the sweep saves its runs and ends."""
     sweep_files.write(found.storage, f"{found.name}/{sweep_files.STOP}", '{"stop": true}')
 
 
 def resume(found: SweepLocation, folder: Path) -> Path:
-    """Go on with the sweep in a process of its own, which outlives the page.
+    """Resume the sweep in a new process that outlives the page.
 
     Returns:
-        The file that has what it prints.
+        The file with the output of that process.
     """
     log = folder / "resume.log"
     folder.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, "-m", "music_rllib.sweep", "resume", found.name]
-    with log.open("ab") as sink:
+    with log.open("ab") as output:
         subprocess.Popen(  # noqa: S603
             [*command, "--storage", found.storage],
             stdin=subprocess.DEVNULL,
-            stdout=sink,
+            stdout=output,
             stderr=subprocess.STDOUT,
             start_new_session=True,
         )
@@ -106,22 +106,22 @@ def resume(found: SweepLocation, folder: Path) -> Path:
 
 
 class Server(ThreadingHTTPServer):
-    """Answers whoever knows its token."""
+    """Answers requests that have its token."""
 
     daemon_threads = True
     token: str
 
 
 def make_server(page: LivePage, found: SweepLocation, folder: Path, port: int) -> Server:
-    """A server that is ready to serve, with a token of its own.
+    """A server on the port, with a new token.
 
     Raises:
         BadInputError: the port is taken.
     """
     token = secrets.token_urlsafe(24)
-    own = {"page": page, "found": found, "folder": folder, "token": token}
+    attributes = {"page": page, "found": found, "folder": folder, "token": token}
     try:
-        server = Server((HOST, port), type("Handler", (_Handler,), own))
+        server = Server((HOST, port), type("Handler", (_Handler,), attributes))
     except OSError as error:
         raise BadInputError(f"--port must be free, got {port}: {error.strerror}") from error
     server.token = token
@@ -150,19 +150,19 @@ class _Handler(BaseHTTPRequestHandler):
     server_version, sys_version = "music_rllib", ""
 
     def do_GET(self) -> None:
-        asked = urlsplit(self.path)
-        given = self.headers.get(HEADER) or parse_qs(asked.query).get("token", [""])[0]
-        if not self._allowed(given):
+        url = urlsplit(self.path)
+        token = self.headers.get(HEADER) or parse_qs(url.query).get("token", [""])[0]
+        if not self._allowed(token):
             return
-        if asked.path == "/":
+        if url.path == "/":
             self._answer(HTTPStatus.OK, self.page.html, "text/html")
-        elif asked.path == "/state":
+        elif url.path == "/state":
             self._json(HTTPStatus.OK, self.page.state())
         else:
             self._json(HTTPStatus.NOT_FOUND, {"error": "there is no such page"})
 
     def do_POST(self) -> None:
-        # Never from the address: a form of another site could send that.
+        # Not the address' token: a form of another site could send that.
         if not self._allowed(self.headers.get(HEADER, "")):
             return
         state = self.page.state().get("state")
@@ -177,7 +177,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._json(HTTPStatus.CONFLICT, {"said": said})
 
     def _allowed(self, token: str) -> bool:
-        # A name that leads here is somebody else's (DNS rebinding).
+        # Another host name that resolves to this machine is an attack (DNS rebinding).
         host = (self.headers.get("Host") or "").rpartition(":")[0]
         if host in (HOST, "localhost") and hmac.compare_digest(token.encode(), self.token.encode()):
             return True
@@ -205,4 +205,4 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, *args: Any) -> None:
-        """Nothing: the address with the token must not end up in a log."""
+        """Log nothing: the address has the token."""

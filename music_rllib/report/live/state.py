@@ -1,4 +1,4 @@
-"""How far a sweep is: what its driver writes, with its speed and the time left."""
+"""Progress of a running sweep: its driver's `state.json`, its speed and the time left."""
 
 from __future__ import annotations
 
@@ -12,26 +12,24 @@ from music_rllib.experiment.location import SweepLocation
 from music_rllib.labels import ShortLabels
 from music_rllib.store.object_folder import StorageError
 
-__all__ = ["Progress"]
-
 WINDOW = 120.0
 """Seconds over which the speed is measured."""
 SHOWN = 50
-"""Of running and of failed runs."""
+"""Largest number of running runs, and of failed ones, on the page."""
 
 
 class Progress:
-    """What the page shows of a sweep's `state.json`."""
+    """Reads a sweep's `state.json` for the page."""
 
     def __init__(self, found: SweepLocation) -> None:
         self._found = found
         self._seen: deque[tuple[float, int]] = deque()
 
     def read(self) -> dict[str, Any]:
-        """How far the sweep is now.
+        """State, steps, speed, stages, running and failed runs of the sweep.
 
         Raises:
-            StorageError: its record is damaged or not reachable.
+            StorageError: `state.json` is damaged or not reachable.
         """
         state = self._found.read(sweep_files.STATE)
         if state is None:
@@ -62,7 +60,7 @@ class Progress:
                     "value": one["value"],
                 }
                 for one in state["running"][:SHOWN]
-                if running and one["env_steps"]  # others may be queued behind them
+                if running and one["env_steps"]  # without steps a run may be queued
             ],
             "failures": [
                 {"run": self._short(one["run"]), "cause": one["cause"]}
@@ -71,7 +69,7 @@ class Progress:
         }
 
     def is_running(self) -> bool:
-        """Whether its driver is alive, as far as that can be told."""
+        """Whether the sweep's driver is alive; False if its state cannot be read."""
         try:
             return bool(self.read()["state"] == "running")
         except StorageError:
@@ -84,7 +82,7 @@ class Progress:
         return ShortLabels((stage["name"] for stage in config["stages"]), tasks)
 
     def _speed(self, now: float, done: int) -> float | None:
-        """Environment steps per second, of all runs together; None until there are some."""
+        """Environment steps per second of all runs; None before two states that differ."""
         seen = self._seen
         if seen and (now < seen[-1][0] or done < seen[-1][1]):
             seen.clear()  # another driver has taken over

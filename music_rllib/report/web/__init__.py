@@ -1,1 +1,1 @@
-"""What a report's page is made of: its template, style and scripts, and the data they draw."""
+"""The page's template, style and scripts, its tables and the data that its scripts draw."""

@@ -1,8 +1,8 @@
-// One panel: a metric of several conditions on one task, as an SVG that can be read off.
+// A panel: a metric of several conditions on one task, as an SVG whose values can be read.
 // A curve: {label, colour, dash, x, mean, lower, upper, runs, seeds}; null stands for NaN.
 "use strict";
 
-const FONT = 12, LETTER = 6.9, SAME = 0.008, DASH = 7;
+const MOST_BANDS = 8, LETTER = 6.9, SAME = 0.008, DASH = 7;
 
 function element(name, attributes, parent, text) {
   const isSvg = ["svg", "g", "path", "line", "rect", "text", "clipPath", "circle"].includes(name);
@@ -47,7 +47,7 @@ function valueAt(x, xs, ys) {
   return a + (b - a) * (x - xs[right - 1]) / (xs[right] - xs[right - 1]);
 }
 
-/** For each point of each curve, how many earlier curves run through it too. */
+/** For each point of each curve, the number of earlier curves that run through it. */
 function ranksOf(curves, height) {
   return curves.map((curve, number) => curve.x.map((x, point) => {
     if (curve.mean[point] === null) return 0;
@@ -58,7 +58,7 @@ function ranksOf(curves, height) {
   }));
 }
 
-/** A line through points, cut where a value is missing. */
+/** An SVG path through points, with a gap where a value is missing. */
 function lineThrough(points) {
   let path = "", pen = "M";
   for (const point of points) {
@@ -71,9 +71,9 @@ function lineThrough(points) {
 
 function limitsOf(curves, metric) {
   if (metric.limits) return metric.limits;
-  // Of what was seen: a band of two seeds may be many times as wide.
+  // Limits are those of the lines: a band of two seeds may be many times as wide.
   const all = curves.flatMap((curve) => [curve.mean, ...curve.seeds]).flat().filter((v) => v !== null);
-  let low = Math.min(...[Infinity].concat(all.length ? [all.reduce((a, b) => Math.min(a, b))] : [0]));
+  let low = all.length ? all.reduce((a, b) => Math.min(a, b)) : 0;
   let high = all.length ? all.reduce((a, b) => Math.max(a, b)) : 1;
   if (low === high) [low, high] = [low - 0.5, high + 0.5];
   return [low - 0.04 * (high - low), high + 0.04 * (high - low)];
@@ -81,7 +81,7 @@ function limitsOf(curves, metric) {
 
 let panels = 0;
 
-/** Draws into `box`, in place of what was there; {x: {label}, metric: {axis, limits, target}}. */
+/** Draws the panel into `box` and replaces its content; metric: {title, axis, limits, target}. */
 function drawPanel(box, { title, curves, metric, xLabel }) {
   const width = Math.max(260, box.clientWidth || 400);
   const height = Math.round(Math.min(420, Math.max(210, width * 0.62)));
@@ -130,7 +130,8 @@ function drawPanel(box, { title, curves, metric, xLabel }) {
 
 function drawCurves(parent, curves, px, py, height) {
   const at = (curve, values) => values.map((v, i) => (v === null ? null : [px(curve.x[i]), py(v)]));
-  for (const curve of curves) {
+  // Bands of more lines hide each other; intervals are read beside the pointer.
+  for (const curve of curves.length <= MOST_BANDS ? curves : []) {
     const there = curve.x.map((_, i) => curve.lower[i] !== null && curve.upper[i] !== null);
     if (there.filter(Boolean).length > 1) {
       const keep = (values) => at(curve, values).filter((_, i) => there[i]);
@@ -164,7 +165,7 @@ function drawCurves(parent, curves, px, py, height) {
   });
 }
 
-/** Values beside the pointer, or by the arrow keys. */
+/** Shows the values at the pointer, or at the position that arrow keys select. */
 function readable(box, svg, { curves, px, last, margin, plotHeight, xLabel }) {
   const grid = [...new Set(curves.flatMap((curve) => curve.x))].sort((a, b) => a - b);
   const guide = element("line", { class: "guide", y1: margin.top, y2: margin.top + plotHeight, visibility: "hidden" }, svg);

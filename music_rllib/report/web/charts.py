@@ -3,154 +3,150 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from music_rllib import names
-from music_rllib.report.figures.choice import Drawing, named_by_stage
+from music_rllib.report.figures.choice import Drawing, Facets
 from music_rllib.report.figures.palette import DASHES
 from music_rllib.report.figures.plots import EPOCH
 from music_rllib.results.analysis import Curve
 from music_rllib.results.comparison import SHOW_SEEDS_BELOW
-from music_rllib.results.conditions import SIDE_BY_SIDE, Condition
+from music_rllib.results.conditions import SIDE_BY_SIDE
 from music_rllib.results.data import Sweep
 from music_rllib.results.statistics import Array
 
-__all__ = ["chart_data"]
-
 _FIGURES = 4
-"""Significant ones: more cannot be seen."""
+"""Number of significant figures: more cannot be seen."""
+
+KnownAxes = dict[tuple[tuple[int, ...], bytes], Mapping[str, Any]]
+"""x axes by the runs and steps of a curve: all its metrics share them."""
 
 
 def chart_data(sweep: Sweep, drawings: Sequence[Drawing]) -> dict[str, Any]:
-    """What can be drawn: stages with their conditions, metrics, curves with every x axis.
+    """Stages with their conditions, metrics, and curves with every x axis, for JSON.
 
-    Curves are by the stage's number and the metric's name; NaN is None.
+    Curves are by the number of their stage and the name of their metric; NaN is None.
     """
-    drawn = [drawing for drawing in drawings if drawing.metric is not None]
-    stages = list(dict.fromkeys(drawing.stage for drawing in drawn))
-    metrics = {drawing.metric.name: drawing.metric for drawing in drawn if drawing.metric}
-    curves: dict[str, dict[str, list[Any]]] = {}
-    found = [_stage(name, [d for d in drawn if d.stage == name]) for name in stages]
-    x_axes: dict[tuple[Any, ...], Mapping[str, Any]] = {}
-    for drawing in drawn:
-        stage = found[stages.index(drawing.stage)]
-        labels = [one["label"] for one in stage["conditions"]]
-        rows = curves.setdefault(str(stages.index(drawing.stage)), {})
-        assert drawing.metric is not None
-        rows[drawing.metric.name] = [
-            {
-                "task": stage["tasks"].index(task),
-                "condition": labels.index(_label(drawing, curve.condition)),
-                **_x_axes(sweep, task, curve, x_axes),
-                **_values(curve),
-            }
-            for task, of_task in drawing.curves.items()
-            for curve in of_task
-        ]
+    metrics = {}
+    by_stage: dict[str, list[Drawing]] = {}
+    for drawing in drawings:
+        if drawing.metric is not None:
+            metrics[drawing.metric.name] = drawing.metric
+            by_stage.setdefault(drawing.stage, []).append(drawing)
+    stages = list(by_stage)
+    known: KnownAxes = {}
     return {
-        "stages": found,
-        "main": _main(stages),
-        "metrics": [
-            {
-                "name": metric.name,
-                "title": metric.title,
-                "axis": metric.axis,
-                "limits": metric.limits,
-                "target": metric.target,
+        "stages": [_stage(name, drawn) for name, drawn in by_stage.items()],
+        # The stage of the large figure: all together, or the last one.
+        "main": stages.index(SIDE_BY_SIDE) if SIDE_BY_SIDE in stages else max(0, len(stages) - 1),
+        "metrics": [asdict(metric) for metric in metrics.values()],
+        "curves": {
+            str(number): {
+                drawing.metric.name: _curves(sweep, drawing, drawn, known)
+                for drawing in drawn
+                if drawing.metric is not None
             }
-            for metric in metrics.values()
-        ],
-        "curves": curves,
+            for number, drawn in enumerate(by_stage.values())
+        },
         "epoch": EPOCH,
     }
 
 
-def _main(stages: Sequence[str]) -> int:
-    """The stage whose figure stands on top: all together, or what came of the sweep at last."""
-    return stages.index(SIDE_BY_SIDE) if SIDE_BY_SIDE in stages else max(0, len(stages) - 1)
+def _facets(drawing: Drawing) -> Facets:
+    assert drawing.facets is not None, "learning curves have them"
+    return drawing.facets
+
+
+def _panels(drawings: Sequence[Drawing]) -> list[str]:
+    return list(dict.fromkeys(panel for drawing in drawings for panel in drawing.curves))
 
 
 def _stage(name: str, drawings: Sequence[Drawing]) -> dict[str, Any]:
-    tasks = list(dict.fromkeys(task for drawing in drawings for task in drawing.curves))
-    legend = drawings[0].legend
+    panels = _panels(drawings)
     together = name == SIDE_BY_SIDE
+    facets = _facets(drawings[0])
     return {
         "name": name,
         "together": together,
-        "tasks": tasks,
-        "primary": [_primary(task, drawings) for task in tasks],
+        "panels": panels,
+        "faceted": bool(facets.setting),
+        "primary": [_primary(panel, drawings) for panel in panels],
         "conditions": [
             {
-                "label": label,
-                # Of all stages together a label begins with its stage: the same condition.
+                "label": (label := facets.label(condition)),
+                # Labels of all stages together begin with the stage: a condition has one key.
                 "key": label if together else f"{name}, {label}",
                 "colour": style.colour,
                 "dash": DASHES[style.line],
             }
-            for label, style in legend
+            for condition, style in facets.styles.items()
         ],
     }
 
 
-def _primary(task: str, drawings: Sequence[Drawing]) -> str:
-    """Success, or the return, which is drawn of those tasks only that are judged by it."""
-    drawn = [d.metric.name for d in drawings if d.metric is not None and task in d.curves]
-    if names.EVAL_RETURN in drawn:
-        return names.EVAL_RETURN
-    return names.EVAL_SUCCESS if names.EVAL_SUCCESS in drawn else drawn[0]
+def _primary(panel: str, drawings: Sequence[Drawing]) -> str:
+    """The return, which is drawn only for tasks that are judged by it, or success."""
+    drawn = [d.metric.name for d in drawings if d.metric is not None and panel in d.curves]
+    primary = (names.EVAL_RETURN, names.EVAL_SUCCESS)
+    return next((metric for metric in primary if metric in drawn), drawn[0])
 
 
-def _label(drawing: Drawing, condition: Condition) -> str:
-    if drawing.stage != SIDE_BY_SIDE:
-        return condition.label
-    return named_by_stage(condition)
+def _curves(
+    sweep: Sweep, drawing: Drawing, drawings: Sequence[Drawing], known: KnownAxes
+) -> list[Mapping[str, Any]]:
+    """The curves of one of a stage's `drawings`."""
+    panels, conditions = _panels(drawings), list(_facets(drawing).styles)
+    curves: list[Mapping[str, Any]] = []
+    for panel, found in drawing.curves.items():
+        for curve in found:
+            few = 1 < len(curve.values) < SHOW_SEEDS_BELOW
+            curves.append(
+                {
+                    "panel": panels.index(panel),
+                    "condition": conditions.index(curve.condition),
+                    **_x_axes(sweep, curve, known),
+                    "mean": _plain(curve.estimate.value),
+                    "lower": _plain(curve.estimate.lower),
+                    "upper": _plain(curve.estimate.upper),
+                    "runs": curve.runs.tolist(),
+                    "seeds": [_plain(values) for values in curve.values] if few else [],
+                }
+            )
+    return curves
 
 
-def _values(curve: Curve) -> dict[str, Any]:
-    few = 1 < len(curve.values) < SHOW_SEEDS_BELOW
-    return {
-        "mean": _plain(curve.estimate.value),
-        "lower": _plain(curve.estimate.lower),
-        "upper": _plain(curve.estimate.upper),
-        "runs": curve.runs.tolist(),
-        "seeds": [_plain(values) for values in curve.values] if few else [],
-    }
-
-
-def _x_axes(
-    sweep: Sweep, task: str, curve: Curve, known: dict[tuple[Any, ...], Mapping[str, Any]]
-) -> Mapping[str, Any]:
-    """Steps, and the means over the runs of the updates and of the seconds until then."""
-    runs = tuple(run for run in curve.condition.runs if sweep.runs[run].task == task)
+def _x_axes(sweep: Sweep, curve: Curve, known: KnownAxes) -> Mapping[str, Any]:
+    """Steps, and means over the runs of the updates and the seconds until these steps."""
+    runs = tuple(run for run in curve.condition.runs if sweep.runs[run].task == curve.task)
     key = (runs, curve.steps.tobytes())
     if key not in known:
+        updates = (sweep.finite(run, names.GRAD_UPDATES) for run in runs)
         known[key] = {
             "steps": curve.steps.astype(int).tolist(),
-            "updates": _mean_at(
-                curve.steps, (sweep.finite(run, names.GRAD_UPDATES) for run in runs)
-            ),
+            "updates": _mean_at(curve.steps, updates),
             "seconds": _mean_at(curve.steps, (sweep.seconds_at(run) for run in runs)),
         }
     return known[key]
 
 
 def _mean_at(steps: Array, series: Iterable[tuple[Array, Array]]) -> list[float | None] | None:
-    """Mean over runs that have got that far; None where no run has any of it."""
+    """Mean over the runs that have reached each step; None if no run has any value."""
     rows = [
         np.interp(steps, at, values, left=np.nan, right=np.nan) for at, values in series if len(at)
     ]
     if not rows:
         return None
-    there = ~np.isnan(rows)
-    count = there.sum(axis=0)
-    total = np.where(there, rows, 0.0).sum(axis=0)
+    reached = ~np.isnan(rows)
+    count = reached.sum(axis=0)
+    total = np.where(reached, rows, 0.0).sum(axis=0)
     return _plain(np.where(count > 0, total / np.maximum(count, 1), np.nan))
 
 
 def _plain(values: Array) -> list[float | None]:
     return [
-        float(f"{value:.{_FIGURES}g}") if there else None
-        for value, there in zip(values.tolist(), np.isfinite(values).tolist(), strict=True)
+        float(f"{value:.{_FIGURES}g}") if finite else None
+        for value, finite in zip(values.tolist(), np.isfinite(values).tolist(), strict=True)
     ]

@@ -1,4 +1,4 @@
-// The sweep now: its progress every two seconds, a new page where there is one, stop and resume.
+// The running sweep: its progress every two seconds, new pages, and the stop and resume buttons.
 "use strict";
 
 const token = new URLSearchParams(location.search).get("token") ?? "";
@@ -12,7 +12,7 @@ function time(seconds) {
   return hours ? `${hours} h ${minutes} min` : minutes ? `${minutes} min` : `${Math.round(seconds)} s`;
 }
 
-/** What is new of the page takes the place of what was there; the rest does not move. */
+/** Replaces the parts of the page that have changed; the others stay where they are. */
 async function renew() {
   const page = new DOMParser().parseFromString(await (await asked("/")).text(), "text/html");
   data = JSON.parse(page.getElementById("data").textContent);
@@ -24,7 +24,7 @@ async function renew() {
     before.style.minHeight = `${before.offsetHeight}px`;
     const charts = new Map([...before.querySelectorAll("figure")].map((one) => [one.id, one.querySelector(".live")]));
     before.replaceChildren(...now.childNodes);
-    // Charts stay until they are drawn anew, in the same place.
+    // The old charts stay in their place until the new ones are drawn.
     for (const figure of before.querySelectorAll("figure")) {
       const chart = charts.get(figure.id);
       if (chart) figure.querySelector(".live")?.replaceWith(chart);

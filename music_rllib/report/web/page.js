@@ -1,4 +1,4 @@
-// What the reader may choose: conditions, tasks, metric, x axis, smoothing; and the order of tables.
+// The reader's controls: conditions, tasks, metric, x axis and smoothing of curves; sorting of tables.
 "use strict";
 
 const X_AXES = {
@@ -7,10 +7,10 @@ const X_AXES = {
   seconds: "wall time",
   epochs: "epochs of 80,000 steps",
 };
-const choice = { stage: 0, metric: "", x: "steps", smooth: 1, conditions: new Set(), tasks: new Set() };
+const choice = { stage: 0, metric: "", x: "steps", smooth: 1, conditions: new Set(), panels: new Set() };
 let data = JSON.parse(document.getElementById("data").textContent);
 
-/** Mean over the `width` nearest points; what is missing stays so. */
+/** Means over the `width` nearest points; missing values stay missing. */
 function smoothed(values, width) {
   if (width <= 1) return values;
   const half = (width - 1) / 2;
@@ -26,9 +26,9 @@ function timeUnit(curves) {
   return last >= 7200 ? [3600, "h"] : last >= 120 ? [60, "min"] : [1, "s"];
 }
 
-/** The curves of one panel as they are to be drawn; none where nothing is chosen or known. */
-function chosen(stage, metric, task) {
-  const found = (data.curves[stage]?.[metric] ?? []).filter((curve) => curve.task === task);
+/** The selected curves of one panel, with the selected x axis and smoothing. */
+function chosen(stage, metric, panel) {
+  const found = (data.curves[stage]?.[metric] ?? []).filter((curve) => curve.panel === panel);
   const kept = found.filter((curve) => !choice.conditions.has(data.stages[stage].conditions[curve.condition].key));
   const [unit, word] = timeUnit(kept);
   const xOf = {
@@ -60,12 +60,12 @@ const watcher = new IntersectionObserver((entries) => {
 function drawNow(box) {
   const panel = pending.get(box);
   pending.delete(box);
-  if (panel) drawPanel(box, { ...panel, ...chosen(panel.stage, panel.metric.name, panel.task) });
+  if (panel) drawPanel(box, { ...panel, ...chosen(panel.stage, panel.metric.name, panel.panel) });
 }
 
-/** One box per stage and task; they are drawn as soon as they are near the window. */
+/** Makes a box per panel of each stage, which is drawn when it comes near the window. */
 function fill(parent, wanted) {
-  const boxes = wanted.filter(({ stage, task }) => !choice.tasks.has(data.stages[stage].tasks[task]));
+  const boxes = wanted.filter(({ stage, panel }) => !choice.panels.has(data.stages[stage].panels[panel]));
   while (parent.children.length > boxes.length) parent.lastChild.remove();
   boxes.forEach((panel, i) => {
     const box = parent.children[i] ?? element("div", { class: "panel" }, parent);
@@ -76,9 +76,9 @@ function fill(parent, wanted) {
 }
 
 function panelsOf(metric, stages) {
-  return stages.flatMap((stage) => data.stages[stage].tasks.map((task, number) => ({ stage, task: number, name: task })))
-    .map((one) => ({ ...one, metric: metricOf(metric || data.stages[one.stage].primary[one.task]) }))
-    .filter((one) => (data.curves[one.stage]?.[one.metric.name] ?? []).some((curve) => curve.task === one.task));
+  return stages.flatMap((stage) => data.stages[stage].panels.map((name, panel) => ({ stage, panel, name })))
+    .map((one) => ({ ...one, metric: metricOf(metric || data.stages[one.stage].primary[one.panel]) }))
+    .filter((one) => (data.curves[one.stage]?.[one.metric.name] ?? []).some((curve) => curve.panel === one.panel));
 }
 
 function drawAll() {
@@ -92,7 +92,6 @@ function drawAll() {
       ...one,
       title: [!large && several ? data.stages[one.stage].name : "", one.name].filter(Boolean).join(" · "),
     })));
-    parent.classList.toggle("single", wanted.length === 1);
     figure.classList.add("drawn");
   }
   for (const part of document.querySelectorAll("[data-stage] [data-condition]")) {
@@ -100,8 +99,8 @@ function drawAll() {
     const condition = stage?.conditions[+part.dataset.condition];
     part.style.display = condition && choice.conditions.has(condition.key) ? "none" : "";
   }
-  for (const part of document.querySelectorAll(".static [data-task]")) {
-    part.hidden = choice.tasks.has(part.dataset.task);
+  for (const part of document.querySelectorAll(".static [data-panel]")) {
+    part.hidden = choice.panels.has(part.dataset.panel);
   }
 }
 
@@ -117,7 +116,8 @@ function select(parent, label, options, value, change) {
   list.addEventListener("change", () => { change(list.value); drawAll(); });
 }
 
-function chips(parent, title, entries, off) {
+function chips(parent, title, all, off) {
+  const entries = [...new Map(all.map((one) => [one.key, one])).values()];
   if (entries.length < 2) return;
   const group = element("fieldset", { class: "chips" }, parent);
   element("legend", {}, group, title);
@@ -162,8 +162,9 @@ function controls() {
   select(row, "against", Object.entries(X_AXES), choice.x, (value) => { choice.x = value; });
   select(row, "smooth", [1, 3, 5, 9, 15].map((n) => [n, n === 1 ? "no" : `mean of ${n} points`]), choice.smooth,
     (value) => { choice.smooth = +value; });
-  chips(parent, "tasks", stage.tasks.map((task) => ({ key: task, label: task })), choice.tasks);
+  chips(parent, stage.faceted ? "panels" : "tasks", stage.panels.map((name) => ({ key: name, label: name })), choice.panels);
   chips(parent, "conditions", stage.conditions, choice.conditions);
+  parent.classList.toggle("tall", parent.offsetHeight > innerHeight / 5);
 }
 
 // Tables -----------------------------------------------------------------------------------------

@@ -9,44 +9,32 @@ from dataclasses import replace
 from typing import Any
 
 from music_rllib import names
-from music_rllib.report.pieces import Cell, TextTable, number
+from music_rllib.report.pieces import DASH, Cell, TextTable, estimate_cells, number_cell
 from music_rllib.report.search_tables import search_in_words, search_tables
 from music_rllib.results.analysis import StageAnalysis, Wait
-from music_rllib.results.comparison import SHOW_SEEDS_BELOW, each_seed, interval_text, p_text
-from music_rllib.results.comparison import number as in_short
+from music_rllib.results.comparison import SHOW_SEEDS_BELOW, each_seed, number, p_text
 from music_rllib.results.data import Sweep
-from music_rllib.results.statistics import SIGNIFICANCE, Estimate
+from music_rllib.results.statistics import SIGNIFICANCE
 from music_rllib.results.time_to_threshold import FEWEST_FOR_INTERVAL
 
-__all__ = [
-    "all_runs",
-    "budget",
-    "failures",
-    "origin",
-    "performance_tables",
-    "search_section",
-    "state_in_words",
-]
-
-DASH = "–"
-MOST_ROWS = 30
-"""Of a search's table; a longer one is folded."""
-LONG = 40
-"""Characters from which on a cell has several lines."""
+UNFOLDED_ROWS = 30
+"""Largest number of rows of a search's table that is shown unfolded."""
+UNWRAPPED_LETTERS = 40
+"""Largest number of letters of a search's table cell that is shown in one line."""
 
 
 def performance_tables(analyses: Sequence[StageAnalysis]) -> list[TextTable]:
-    """What runs ended at, when they got somewhere, and the comparisons: of every stage."""
-    kinds = (_final_table, _entropy_table, _waits_table, _races_table, _improvement_table)
-    return [_of_stages([(one.stage.name, kind(one)) for one in analyses]) for kind in kinds]
+    """Final values, entropies, steps to a threshold and comparisons of all stages."""
+    tables = (_final_table, _entropy_table, _waits_table, _races_table, _improvement_table)
+    return [_of_stages([(one.stage.name, table(one)) for one in analyses]) for table in tables]
 
 
 def _of_stages(tables: Sequence[tuple[str, TextTable]]) -> TextTable:
-    """The same table of several stages as one that names them."""
-    if len(tables) == 1:
-        return tables[0][1]
-    rows = [(stage, *row) for stage, table in tables for row in table.rows]
+    """One table with the rows of all stages, and a column for the stage if there are several."""
     first = tables[0][1]
+    if len(tables) == 1:
+        return first
+    rows = [(stage, *row) for stage, table in tables for row in table.rows]
     return replace(first, header=("Stage", *first.header), rows=rows)
 
 
@@ -56,9 +44,8 @@ def _final_table(analysis: StageAnalysis) -> TextTable:
             scope.name,
             final.condition.label,
             names.word_of(scope.metric),
-            number(in_short(final.value)),
-            interval_text(final.estimate),
-            " ".join(map(in_short, each_seed(final))) or DASH,
+            *estimate_cells(final.estimate),
+            " ".join(map(number, each_seed(final))) or DASH,
             final.seeds,
             final.runs,
         )
@@ -79,18 +66,9 @@ def _final_table(analysis: StageAnalysis) -> TextTable:
 
 def _entropy_table(analysis: StageAnalysis) -> TextTable:
     rows = [
-        (
-            scope.name,
-            final.condition.label,
-            *(
-                cell
-                for one in analysis.entropies[scope.name, final.condition]
-                for cell in _with_interval(one)
-            ),
-        )
-        for scope in analysis.scopes
-        for final in scope.finals
-        if any(analysis.entropies[scope.name, final.condition])
+        (scope, condition.label, *estimate_cells(found.shannon), *estimate_cells(found.tsallis))
+        for (scope, condition), found in analysis.entropies.items()
+        if any(found)
     ]
     return TextTable(
         title="How random policies are at the end",
@@ -105,22 +83,16 @@ def _entropy_table(analysis: StageAnalysis) -> TextTable:
     )
 
 
-def _with_interval(estimate: Estimate | None) -> tuple[Cell, str]:
-    if estimate is None:
-        return number(DASH), DASH
-    return number(in_short(estimate.value)), interval_text(estimate)
-
-
 def _waits_table(analysis: StageAnalysis) -> TextTable:
     rows = [
         (
             wait.task,
             wait.condition.label,
-            f"{wait.threshold * 100:.0f} %",
+            _percent(wait.threshold),
             f"{wait.reached} of {wait.runs}",
-            number(_steps(wait.median)),
-            _between(wait),
-            _each_wait(wait),
+            number_cell("not reached" if math.isinf(wait.median) else f"{wait.median:,.0f}"),
+            _wait_interval(wait),
+            _wait_of_each_run(wait),
         )
         for wait in sorted(analysis.waits, key=lambda wait: (wait.threshold, wait.task))
     ]
@@ -142,16 +114,11 @@ def _races_table(analysis: StageAnalysis) -> TextTable:
         (
             race.task,
             f"{race.first} before {race.second}",
-            f"{race.threshold * 100:.0f} %",
+            _percent(race.threshold),
             *(
-                (
-                    number(in_short(race.estimate.value)),
-                    interval_text(race.estimate),
-                    p_text(race.p_value),
-                    "yes" if race.decided else "no",
-                )
+                (*estimate_cells(race.estimate), p_text(race.p_value), _yes_or_no(race.decided))
                 if race.reached
-                else (number(DASH), "not reached by either", DASH, "no")
+                else (number_cell(DASH), "not reached by either", DASH, "no")
             ),
         )
         for race in sorted(analysis.races, key=lambda race: (race.threshold, race.task))
@@ -174,12 +141,10 @@ def _improvement_table(analysis: StageAnalysis) -> TextTable:
         (
             scope.name,
             f"{pair.first.condition.label} over {pair.second.condition.label}",
-            number(in_short(pair.gap.value)),
-            interval_text(pair.gap),
-            number(in_short(pair.estimate.value)),
-            interval_text(pair.estimate),
+            *estimate_cells(pair.gap),
+            *estimate_cells(pair.estimate),
             p_text(pair.p_value),
-            "yes" if pair.decided else "no",
+            _yes_or_no(pair.decided),
         )
         for scope in analysis.scopes
         for pair in scope.comparisons
@@ -198,40 +163,41 @@ def _improvement_table(analysis: StageAnalysis) -> TextTable:
 
 
 def search_section(search: Mapping[str, Any]) -> Mapping[str, Any]:
-    """What a search found: in words, and its tables."""
+    """A search's stage, its summary in a sentence, and its tables."""
     tables = [
         replace(
-            found,
-            rows=[[_search_cell(shown) for shown in row] for row in found.rows],
-            long=len(found.rows) > MOST_ROWS,
+            table,
+            rows=[[_search_cell(text) for text in row] for row in table.rows],
+            long=len(table.rows) > UNFOLDED_ROWS,
         )
-        for found in search_tables(search)
+        for table in search_tables(search)
     ]
     return {"stage": search["stage"], "words": search_in_words(search), "tables": tables}
 
 
-def _search_cell(shown: object) -> Cell:
-    text = str(shown)
-    is_number = text.rstrip(" %").replace(".", "").replace("-", "").isdigit()
-    return number(text) if is_number else Cell(text=text, kind="long" * (len(text) > LONG))
+def _search_cell(value: object) -> Cell:
+    text = str(value)
+    if text.rstrip(" %").replace(".", "").replace("-", "").isdigit():
+        return number_cell(text)
+    return Cell(text=text, kind="long" if len(text) > UNWRAPPED_LETTERS else "")
 
 
 def budget(sweep: Sweep, analyses: Sequence[StageAnalysis]) -> TextTable:
-    """Steps and wall time of each stage."""
+    """Environment steps and wall time of each stage."""
     rows = []
     for analysis in analyses:
         runs = analysis.stage.runs
         done = sum(sweep.last_step(run) for run in runs)
-        budget = sum(sweep.runs[run].budget or 0 for run in runs)
+        planned = sum(sweep.runs[run].budget or 0 for run in runs)
         seconds = [s for run in runs if (s := sweep.runs[run].seconds) is not None]
         rows.append(
             (
                 analysis.stage.name,
                 len(runs),
-                number(f"{done:,}"),
-                number(f"{budget:,}" if budget else DASH),
-                number(_clock(sum(seconds)) if seconds else DASH),
-                number(_clock(statistics.median(seconds)) if seconds else DASH),
+                number_cell(f"{done:,}"),
+                number_cell(f"{planned:,}" if planned else DASH),
+                _time_cell(sum(seconds) if seconds else None),
+                _time_cell(statistics.median(seconds) if seconds else None),
             )
         )
     return TextTable(
@@ -244,7 +210,7 @@ def budget(sweep: Sweep, analyses: Sequence[StageAnalysis]) -> TextTable:
 
 
 def failures(sweep: Sweep) -> TextTable:
-    """The runs that failed."""
+    """The failed runs and the causes of their failures."""
     return TextTable(
         title="What failed and why",
         header=("Run", "Env steps", "Cause"),
@@ -261,7 +227,8 @@ def failures(sweep: Sweep) -> TextTable:
 
 
 def all_runs(sweep: Sweep) -> TextTable:
-    """Every run."""
+    """Every run of the sweep."""
+    finals = (sweep.final(i, sweep.primary_metric(run.task)) for i, run in enumerate(sweep.runs))
     return TextTable(
         title=f"All {len(sweep.runs)} runs",
         header=("Run", "State", "Env steps", "Last evaluation", "Wall time", "MLflow run"),
@@ -269,24 +236,23 @@ def all_runs(sweep: Sweep) -> TextTable:
             (
                 _run_cell(sweep, position),
                 state_in_words(run.status),
-                number(f"{sweep.last_step(position):,}"),
-                number(_last(sweep, position)),
-                number(DASH if run.seconds is None else _clock(run.seconds)),
+                number_cell(f"{sweep.last_step(position):,}"),
+                number_cell(DASH if final is None else number(final)),
+                _time_cell(run.seconds),
                 Cell(text=run.run_id, code=True),
             )
-            for position, run in enumerate(sweep.runs)
+            for position, (run, final) in enumerate(zip(sweep.runs, finals, strict=True))
         ],
     )
 
 
 def origin(sweep: Sweep, command: str) -> TextTable:
-    """Code, versions and place behind the numbers."""
+    """MLflow's address, the code and the versions that the numbers come from."""
     versions = sorted(
-        (name.removeprefix(names.TAG_VERSION_PREFIX), value)
+        f"{name.removeprefix(names.TAG_VERSION_PREFIX)} {value}"
         for name, value in sweep.tags.items()
         if name.startswith(names.TAG_VERSION_PREFIX)
     )
-    said = ", ".join(f"{name} {value}" for name, value in versions)
     commit = sweep.tags.get(names.TAG_GIT_COMMIT, "unknown")
     return TextTable(
         title="Where it comes from",
@@ -296,7 +262,7 @@ def origin(sweep: Sweep, command: str) -> TextTable:
             ("Experiment", f"{sweep.name}, id {sweep.experiment_id}"),
             ("Sweep's run", Cell(text=sweep.run_id, url=sweep.url(sweep.run_id))),
             ("Code", Cell(text=commit, code=True)),
-            ("Versions", Cell(text=said or "unknown", kind="long")),
+            ("Versions", Cell(text=", ".join(versions) or "unknown", kind="long")),
             ("This report", Cell(text=command, kind="long", code=True)),
         ],
     )
@@ -307,37 +273,37 @@ def _run_cell(sweep: Sweep, run: int) -> Cell:
     return Cell(text=record.name, url=sweep.url(record.run_id))
 
 
-def _last(sweep: Sweep, run: int) -> str:
-    value = sweep.final(run, sweep.primary_metric(sweep.runs[run].task))
-    return DASH if value is None else in_short(value)
-
-
-def _steps(value: float) -> str:
-    return "not reached" if math.isinf(value) else f"{value:,.0f}"
-
-
-def _each_wait(wait: Wait) -> str:
+def _wait_of_each_run(wait: Wait) -> str:
     if wait.runs >= SHOW_SEEDS_BELOW:
         return DASH
-    found = zip(wait.waits.steps, wait.waits.reached, strict=True)
-    return " ".join(
-        f"{steps:,.0f}" if there else f">{steps:,.0f}" for steps, there in sorted(found)
-    )
+    runs = sorted(zip(wait.waits.steps, wait.waits.reached, strict=True))
+    return " ".join(f"{'' if reached else '>'}{steps:,.0f}" for steps, reached in runs)
 
 
-def _between(wait: Wait) -> str:
+def _wait_interval(wait: Wait) -> str:
     if math.isnan(wait.lower) or not wait.reached:
         return "no interval"
     upper = "beyond the budget" if math.isinf(wait.upper) else f"{wait.upper:,.0f}"
     return upper if math.isinf(wait.lower) else f"{wait.lower:,.0f} to {upper}"
 
 
-def _clock(seconds: float) -> str:
+def _time_cell(seconds: float | None) -> Cell:
+    """A duration as h:min:s."""
+    if seconds is None:
+        return number_cell(DASH)
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}"
+    return number_cell(f"{hours}:{minutes:02d}:{rest:02d}")
+
+
+def _percent(share: float) -> str:
+    return f"{share * 100:.0f} %"
+
+
+def _yes_or_no(answer: bool) -> str:
+    return "yes" if answer else "no"
 
 
 def state_in_words(status: str) -> str:
-    """MLflow's status of a run or a sweep."""
+    """A word for MLflow's status of a run or a sweep."""
     return {"KILLED": "stopped", "SCHEDULED": "waiting"}.get(status, status.lower())

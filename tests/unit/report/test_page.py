@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -14,6 +15,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from matplotlib.collections import PolyCollection
 
 from music_rllib import names
 from music_rllib.report.build import build_report, write_report
@@ -23,7 +25,8 @@ from music_rllib.report.figures.importance import CHANCE, importances, varied
 from music_rllib.report.figures.palette import DARK, LIGHT, colour_of, marker_of
 from music_rllib.report.figures.processes import drawing_processes
 from music_rllib.report.limitations import planned_runs
-from music_rllib.report.page import Report, render
+from music_rllib.report.page import render
+from music_rllib.report.tables import curves_table
 from music_rllib.results.analysis import THRESHOLDS, analyse
 from music_rllib.results.comparison import Scope, verdict
 from music_rllib.results.conditions import SIDE_BY_SIDE, Condition, find_stages, stage_by_stage
@@ -113,10 +116,6 @@ def compared(finals: Mapping[str, Sequence[float]], **changes: str) -> Sweep:
     )
 
 
-def report_on(sweep: Sweep) -> Report:
-    return build_report(sweep)
-
-
 def first_scope(sweep: Sweep) -> Scope[Condition]:
     return analyse(sweep)[0].scopes[0]
 
@@ -192,7 +191,7 @@ def test_the_spread_at_a_bound_promises_nothing(finals: dict[str, list[float]], 
 
 def test_a_threshold_that_nobody_reaches_is_said_to_be_that() -> None:
     sweep = compared({"1": [0.3, 0.4], "1.5": [0.6, 0.7]})
-    page = render(report_on(sweep))
+    page = render(build_report(sweep))
     assert row_of(page, "FetchPush", "q = 1.5 before q = 1", "85 %") == [
         *("–", "not reached by either", "–", "no")
     ]
@@ -244,7 +243,7 @@ def test_of_a_search_the_ranking_is_drawn_as_soon_as_there_is_one() -> None:
     fresh = [(q, seed, "final1", 0.6) for q in ("1", "1.2") for seed in (7, 8)]
 
     def drawn(sweep: Sweep) -> set[str]:
-        (curves, *_) = report_on(sweep).drawings
+        (curves, *_) = build_report(sweep).drawings
         return {label for label, _ in curves.legend}
 
     assert drawn(searched(*TRIALS)) == {f"q = {q}, seeds = search" for q in ("1", "1.2", "1.4")}
@@ -257,7 +256,7 @@ def test_how_random_policies_are_stands_beside_what_they_ended_at() -> None:
     values = [value for q in entropies for value in entropies[q]]
     shannon = columns([Points([names.SHANNON_ENTROPY], [last], [0], [value]) for value in values])
     sweep = replace(sweep, history={**sweep.history, **shannon})
-    report = report_on(sweep)
+    report = build_report(sweep)
     row = row_of(render(report), "FetchPush", "q = 2", "0.30")
     # Student's: .1/sqrt(3) times 4.303.
     assert row == ["0.05 to 0.55", "–", "–"]
@@ -441,7 +440,7 @@ SWEEPS: dict[str, Callable[[], tuple[Sweep, Sequence[str]]]] = {
 @pytest.mark.parametrize("state", SWEEPS)
 def test_any_state_of_a_sweep_has_a_page(state: str) -> None:
     sweep, expected = SWEEPS[state]()
-    shown = Page(render(report_on(sweep)))
+    shown = Page(render(build_report(sweep)))
     for words in expected:
         assert words in shown.text
     assert not shown.fetched
@@ -492,9 +491,9 @@ def hostile() -> Sweep:
 
 
 def test_a_script_in_any_text_of_a_sweep_is_shown_as_text() -> None:
-    made = replace(report_on(hostile()), command=SCRIPT, missing=[SCRIPT])
+    made = replace(build_report(hostile()), command=SCRIPT, missing=[SCRIPT])
     page = render(made)
-    shown, harmless = Page(page), Page(render(report_on(grid_of_settings())))
+    shown, harmless = Page(page), Page(render(build_report(grid_of_settings())))
     assert shown.tags <= harmless.tags | {"nav", "a", "pre"}
     assert not shown.handlers
     assert not shown.fetched
@@ -525,14 +524,14 @@ def returning(finals: Mapping[str, Sequence[float]], task: str = "Reacher") -> S
 
 def test_a_task_without_success_is_judged_by_its_return_everywhere() -> None:
     sweep = returning({"1": [-9, -8, -7, -9.5, -8.5], "1.5": [-5, -4, -6, -4.5, -5.5]})
-    report = report_on(sweep)
+    report = build_report(sweep)
     shown = Page(render(report))
     assert "Nothing was evaluated" not in shown.text
     assert "q = 1.5 is ahead on Reacher: q = 1.5 with -5.00 (-5.98 to -4.02, 5 seeds)" in shown.text
     drawn = {drawing.title: drawing for drawing in report.drawings}
     assert list(drawn) == ["Return", "Final return"]
     assert "return of an episode" in render(report)
-    assert {row[3] for row in drawn["Return"].values} == {names.EVAL_RETURN}
+    assert {row[3] for row in curves_table(report.drawings).rows} == {names.EVAL_RETURN}
     assert not report.analyses[0].waits, "there is no success rate to wait for"
     assert row_of(render(report), "Reacher", "q = 1.5", "return") == [
         *("-5.00", "-5.98 to -4.02", "-6.00 -5.50 -5.00 -4.50 -4.00", "5", "5")
@@ -555,7 +554,7 @@ def test_tasks_with_and_without_success_stand_side_by_side_and_are_not_averaged(
         for position in range(len(sweep.runs)):
             steps, values = sweep.series(position, metric)
             points.append(Points([metric] * len(steps), list(steps), list(steps), list(values)))
-    report = report_on(sweep_of(list(zip(runs, points, strict=True))))
+    report = build_report(sweep_of(list(zip(runs, points, strict=True))))
     (analysis,) = report.analyses
     assert [(scope.name, scope.metric) for scope in analysis.scopes] == [
         ("FetchPush", names.EVAL_SUCCESS),
@@ -581,7 +580,7 @@ def of_stages(*stages: str) -> Sweep:
 
 
 def test_stages_that_train_for_the_task_are_drawn_side_by_side() -> None:
-    report = report_on(of_stages(*STAGES))
+    report = build_report(of_stages(*STAGES))
     (drawing,) = [one for one in report.drawings if one.stage == SIDE_BY_SIDE]
     named = [(label, style.colour, style.line) for label, style in drawing.legend]
     assert [label for label, _, _ in named] == [
@@ -593,7 +592,7 @@ def test_stages_that_train_for_the_task_are_drawn_side_by_side() -> None:
     page = render(report)
     assert f'id="{drawing.name}"' in page
     for one in (of_stages("pretrain", "plain"), of_stages("plain")):
-        assert SIDE_BY_SIDE not in {drawing.stage for drawing in report_on(one).drawings}
+        assert SIDE_BY_SIDE not in {drawing.stage for drawing in build_report(one).drawings}
 
 
 def test_stages_race_over_the_conditions_that_all_of_them_have() -> None:
@@ -606,7 +605,7 @@ def test_stages_race_over_the_conditions_that_all_of_them_have() -> None:
             for seed in range(2)
         ]
     )
-    report = report_on(sweep)
+    report = build_report(sweep)
     # To 50 %: 200,000 / final / 2 steps, the next evaluation; q = 2 has nobody to race with.
     assert report.together is not None
     (race,) = [race for race in report.together.races if race.threshold == 0.5]
@@ -643,7 +642,7 @@ def test_stages_are_compared_over_what_both_have_on_each_task() -> None:
 
 
 def test_a_legend_stays_inside_its_figure() -> None:
-    report = report_on(of_stages(*STAGES))
+    report = build_report(of_stages(*STAGES))
     (drawing,) = [one for one in report.drawings if one.stage == SIDE_BY_SIDE]
     for panels in (drawing.panels, drawing.panels * 2, drawing.panels * 3):
         figure = drawn_figure(panels, drawing.legend, TEXT_WIDTH, 8.0)
@@ -661,7 +660,7 @@ def test_figures_of_an_earlier_report_go_and_the_same_sweep_is_the_same_file(
         stale = tmp_path / name / "figures" / "old-stage-success-rate.png"
         stale.parent.mkdir(parents=True)
         stale.touch()
-        write_report(report_on(compared({"1": [0.5]})), tmp_path / name)
+        write_report(build_report(compared({"1": [0.5]})), tmp_path / name)
         figures = sorted((tmp_path / name / "figures").iterdir())
         assert [path.name for path in figures] == [
             f"{figure}{ending}"
@@ -674,10 +673,10 @@ def test_figures_of_an_earlier_report_go_and_the_same_sweep_is_the_same_file(
 
 def test_runs_link_to_a_server_s_pages() -> None:
     sweep = compared({"1": [0.5]})
-    assert '<a href="http' not in render(report_on(sweep))
+    assert '<a href="http' not in render(build_report(sweep))
     served = Sweep(**{**sweep.__dict__, "source": "http://mlflow:5000"})
     assert f'<a href="http://mlflow:5000/#/experiments/1/runs/{sweep.runs[0].run_id}">' in (
-        render(report_on(served))
+        render(build_report(served))
     )
 
 
@@ -714,15 +713,15 @@ def test_importance_with_many_seeds_is_found_in_seconds() -> None:
             for seed in range(30)
         ]
     )
-    shares = {one.setting: one.share for one in importances(sweep, analyse(sweep)[0])}
+    (shares,) = importances(sweep, analyse(sweep)[0]).values()
     assert max(shares, key=lambda name: shares[name]) == "q"
     assert 0 < shares[CHANCE] < 0.2
 
 
 def test_what_matters_is_found_and_drawn() -> None:
-    report = report_on(grid_of_settings())
+    report = build_report(grid_of_settings())
     (analysis,) = report.analyses
-    shares = {one.setting: one.share for one in importances(report.sweep, analysis)}
+    (shares,) = importances(report.sweep, analysis).values()
     assert set(shares) == {"q", "α", "MI weight", CHANCE}
     assert shares["q"] > 0.8
     assert shares["MI weight"] < 0.05
@@ -745,16 +744,16 @@ def test_one_varied_setting_gives_a_line_and_the_page_says_what_is_not_drawn() -
             for t in tags
         ]
     )
-    drawn = {drawing.title for drawing in report_on(lines).drawings}
+    drawn = {drawing.title for drawing in build_report(lines).drawings}
     assert "Sensitivity" in drawn
     assert not drawn & set(INFLUENCE[1:])
-    only_q = Page(render(report_on(compared({"1": [0.5, 0.6], "2": [0.6, 0.7]})))).text
+    only_q = Page(render(build_report(compared({"1": [0.5, 0.6], "2": [0.6, 0.7]})))).text
     assert "Not drawn: sensitivity, importance of settings, parallel coordinates" in only_q
     assert "This stage varies q;" in only_q
 
 
 def test_figures_are_the_same_drawn_here_and_in_other_processes() -> None:
-    drawings = report_on(compared({"1": [0.5, 0.6], "1.5": [0.6, 0.7]})).drawings[:2]
+    drawings = build_report(compared({"1": [0.5, 0.6], "1.5": [0.6, 0.7]})).drawings[:2]
     with drawing_processes() as processes:
         drawn = []
         for figures in (Figures(), Figures(processes)):
@@ -765,7 +764,7 @@ def test_figures_are_the_same_drawn_here_and_in_other_processes() -> None:
 
 
 def test_figures_are_drawn_here_where_the_processes_were_killed() -> None:
-    drawings = report_on(compared({"1": [0.5, 0.6], "1.5": [0.6, 0.7]})).drawings
+    drawings = build_report(compared({"1": [0.5, 0.6], "1.5": [0.6, 0.7]})).drawings
     with drawing_processes() as processes:
         assert processes is not None
         early = Figures(processes)
@@ -779,7 +778,7 @@ def test_figures_are_drawn_here_where_the_processes_were_killed() -> None:
 
 
 def test_files_show_characters_that_their_short_font_has_not() -> None:
-    drawing = report_on(compared({"1": [0.5, 0.6]}, task="Ж")).drawings[0]
+    drawing = build_report(compared({"1": [0.5, 0.6]}, task="Ж")).drawings[0]
     drawn = files(drawing.panels, drawing.legend)  # matplotlib warns where no font has it
     assert drawn[".pdf"].count(b"/FontFile2") == 2
 
@@ -787,7 +786,7 @@ def test_files_show_characters_that_their_short_font_has_not() -> None:
 def test_labels_of_rows_stand_beside_the_axis_in_a_browser_too() -> None:
     """In an SVG a browser leaves out the spaces that a text begins with."""
     long = {"1": [0.5, 0.6], "1.5 (" + 5 * "a schedule with many words, " + ")": [0.6, 0.7]}
-    pictures = report_on(compared(long)).figures.pictures
+    pictures = build_report(compared(long)).figures.pictures
     texts = re.findall(r"<text ([^>]*)>([^<]*)", pictures["finetune-final-success-rate"][0])
     labels = [(place, text) for place, text in texts if "q = " in text or "words" in text]
     assert len(labels) > 2
@@ -797,7 +796,7 @@ def test_labels_of_rows_stand_beside_the_axis_in_a_browser_too() -> None:
 
 
 def test_conditions_of_almost_the_same_colour_have_other_lines_and_markers() -> None:
-    drawing = report_on(compared({"1": [0.5, 0.6], "1.07177": [0.6, 0.7], "1.5": [0.6, 0.7]}))
+    drawing = build_report(compared({"1": [0.5, 0.6], "1.07177": [0.6, 0.7], "1.5": [0.6, 0.7]}))
     lines = [style.line for _, style in drawing.drawings[0].legend]
     assert lines == ["solid", "dashed", "solid"]
     markers = [style.marker for _, style in drawing.drawings[0].legend]
@@ -806,7 +805,7 @@ def test_conditions_of_almost_the_same_colour_have_other_lines_and_markers() -> 
 
 def test_a_condition_of_a_search_looks_the_same_in_every_figure() -> None:
     fresh = [(q, seed, "final1", 0.6) for q in ("1", "1.2", "1.4") for seed in (7, 8)]
-    drawings = report_on(searched(*TRIALS, ("1.15", 0, "trial3", 0.1), *fresh)).drawings
+    drawings = build_report(searched(*TRIALS, ("1.15", 0, "trial3", 0.1), *fresh)).drawings
     lines = {drawing.title: [style.line for _, style in drawing.legend] for drawing in drawings}
     curves, areas = lines["Success rate"], lines["Performance profile of the area under the curve"]
     assert curves == areas
@@ -870,3 +869,42 @@ def test_a_colour_depends_on_q_alone() -> None:
     assert len({colour_of(str(q)) for q in np.arange(0.5, 3.01, 0.25)}) == 11
     grid = ("1", "1.25", "1.5", "1.75", "2")
     assert len({marker_of(q) for q in grid}) == len(grid)
+
+
+def test_a_grid_of_many_conditions_has_a_panel_for_each_value_of_the_setting_beside_q() -> None:
+    alphas, indices = ("0.01", "0.1", "1"), ("1", "1.5", "2")
+    sweep = sweep_of(
+        [
+            (one_run(q, seed, params={"tac.alpha": alpha}, alpha=alpha), climbing(0.5))
+            for q, alpha, seed in product(indices, alphas, range(2))
+        ]
+    )
+    report = build_report(sweep)
+    (analysis,) = report.analyses
+    assert len(analysis.stage.conditions) == 9
+    titles = [f"FetchPush, α = {alpha}" for alpha in alphas]
+    for title in ("Success rate", "Final success rate"):
+        (drawing,) = [one for one in report.drawings if one.title == title]
+        assert [panel.title for panel in drawing.panels] == titles
+    curves = {row[:3] for row in curves_table(report.drawings).rows}
+    assert curves == {
+        ("finetune", "FetchPush", f"q = {q}, α = {alpha}") for q, alpha in product(indices, alphas)
+    }
+    page = re.search(r'<script[^>]*id="data"[^>]*>(.*?)</script>', render(report))
+    assert page is not None
+    data = json.loads(page.group(1))
+    (drawn,) = data["stages"]
+    assert drawn["panels"] == titles
+    # One switch and one colour for a q, whichever panel it is in.
+    switches = {one["key"]: one["colour"] for one in drawn["conditions"]}
+    assert list(switches) == [f"finetune, q = {q}" for q in indices]
+
+
+def test_lines_of_more_conditions_than_bands_can_be_told_apart_have_none() -> None:
+    many = compared({f"1.{n}": [0.5, 0.6] for n in range(1, 10)})
+    few = compared({f"1.{n}": [0.5, 0.6] for n in range(1, 9)})
+    for sweep, has_bands in ((many, False), (few, True)):
+        (drawing,) = [d for d in build_report(sweep).drawings if d.title == "Success rate"]
+        assert ("95 % band" in drawing.caption) is has_bands
+        axes = drawn_figure(drawing.panels, [], TEXT_WIDTH, 8.0).axes[0]
+        assert any(isinstance(one, PolyCollection) for one in axes.collections) is has_bands
