@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+import scipy  # loads `scipy.stats` when it is used: it takes a second
 
 from music_rllib import names
 from music_rllib.config.search.settings import Objective, Pruning
@@ -60,7 +60,7 @@ def aggregate(objective: Objective, scores: Array) -> float:
     """A trial's number from those of its runs, `[seeds, tasks]`."""
     match objective.aggregate:
         case "iqm":
-            return float(stats.trim_mean(scores, 0.25, axis=None))
+            return float(scipy.stats.trim_mean(scores, 0.25, axis=None))
         case "mean":
             return float(np.mean(scores))
         case "median":
@@ -170,7 +170,7 @@ def _half_width(
     if freedom == 0:
         return math.inf
     spread = math.sqrt(squares / freedom)
-    quantile = float(stats.t.ppf((1 + confidence) / 2, freedom))
+    quantile = float(scipy.stats.t.ppf((1 + confidence) / 2, freedom))
     return quantile * spread / math.sqrt(_runs_behind(objective, scores))
 
 
