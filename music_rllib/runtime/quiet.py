@@ -29,6 +29,8 @@ _EXPECTED_NOTICES: dict[str, tuple[str, ...]] = {
     "ray._common.deprecation": (
         "DeprecationWarning: `RLModule(config=[RLModuleConfig object])` has been deprecated.",
     ),
+    # See `prepare_environment`.
+    "ray.rllib.utils.framework": ("Not importing JAX", "Not importing TensorFlow"),
     # GPUtil is unmaintained; the sweeper measures its processes with psutil.
     # Tune complains of any callback that takes half a second, as all do on a busy machine.
     "ray.tune.utils.util": ("Install gputil for GPU system monitoring.", "The `"),
@@ -78,6 +80,9 @@ def prepare_environment() -> None:
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
     # MLflow reads the commit through GitPython, which complains at length where git is missing.
     os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
+    # RLlib imports both where they are installed, for seconds in each worker, and TAC uses neither.
+    os.environ.setdefault("RLLIB_TEST_NO_JAX_IMPORT", "1")
+    os.environ.setdefault("RLLIB_TEST_NO_TF_IMPORT", "1")
     _keep_local_ray_on_loopback()
     _authenticate_local_ray()
 
