@@ -118,7 +118,9 @@ def quiet_third_parties() -> None:
         if not any(isinstance(present, _DropExpected) for present in logger.filters):
             logger.addFilter(_DropExpected(beginnings))
     for name in _CHATTY_LOGGERS:
-        logging.getLogger(name).setLevel(logging.WARNING)
+        logger = logging.getLogger(name)
+        if logger.level != logging.WARNING:  # setting it forgets what is cached of every logger
+            logger.setLevel(logging.WARNING)
     # RLlib registers its wrapper environment anew for every environment runner that it builds.
     warnings.filterwarnings(
         "ignore", message=r".*Overriding environment rllib-(single|multi)-agent-env-v0"
