@@ -9,9 +9,9 @@ CONFIG ?=
 PYTEST_ARGS ?=
 SECONDS ?= 600
 SEED    ?= 0
-# The tests of a file stay together and share what they set up.
+# The tests of a file stay together and share what they set up; tests/conftest.py orders the files.
 JOBS   ?= 2
-PYTEST := $(BIN)/python -m pytest -n $(JOBS) --dist loadscope
+PYTEST := $(BIN)/python -m pytest -n $(JOBS) --dist loadscope --no-loadscope-reorder
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
