@@ -19,8 +19,9 @@ from functools import lru_cache
 from math import lcm
 
 import numpy as np
-import scipy  # loads `scipy.stats` when it is used: it takes a second
 from numpy.typing import ArrayLike, NDArray
+
+from music_rllib.imports import imported_on_use
 
 __all__ = [
     "SIGNIFICANCE",
@@ -40,6 +41,8 @@ __all__ = [
     "probability_of_improvement",
     "seeds_to_decide",
 ]
+
+optimize, stats = imported_on_use("scipy.optimize"), imported_on_use("scipy.stats")
 
 Array = NDArray[np.float64]
 
@@ -122,13 +125,13 @@ def interval(
     value, variance, freedom = (
         np.asarray(part, dtype=float) for part in np.broadcast_arrays(value, variance, freedom)
     )
-    t = scipy.stats.t.ppf(1 - _TAIL, np.where(freedom > 0, freedom, np.nan))
+    t = stats.t.ppf(1 - _TAIL, np.where(freedom > 0, freedom, np.nan))
     tied = variance < _NO_SPREAD
     if episodes is None:
         half = np.where(tied, np.nan, t * np.sqrt(variance))
         return Estimate(value=value, lower=value - half, upper=value + half)
     alike = _ratio(value * (1 - value), np.where(tied, np.nan, variance))
-    lessened = np.minimum(alike, episodes) * (scipy.stats.norm.ppf(1 - _TAIL) / t) ** 2
+    lessened = np.minimum(alike, episodes) * (stats.norm.ppf(1 - _TAIL) / t) ** 2
     trials = np.where(tied & ~np.isnan(t), episodes, lessened)
     lower, upper = clopper_pearson(value, trials)
     return Estimate(value=value, lower=lower, upper=upper)
@@ -144,8 +147,8 @@ def clopper_pearson(share: ArrayLike, trials: ArrayLike) -> tuple[Array, Array]:
     share, trials = (np.asarray(part, float) for part in np.broadcast_arrays(share, trials))
     trials = np.where(np.isfinite(trials), trials, np.nan)
     won, lost = share * trials, (1 - share) * trials
-    lower = np.where(won > 0, scipy.stats.beta.ppf(_TAIL, won, lost + 1), 0 * trials)
-    upper = np.where(lost > 0, scipy.stats.beta.ppf(1 - _TAIL, won + 1, lost), 1 + 0 * trials)
+    lower = np.where(won > 0, stats.beta.ppf(_TAIL, won, lost + 1), 0 * trials)
+    upper = np.where(lost > 0, stats.beta.ppf(1 - _TAIL, won + 1, lost), 1 + 0 * trials)
     return lower, upper
 
 
@@ -198,7 +201,7 @@ def probability_of_improvement(x: Array, y: Array) -> Estimate:
     sizes = [wins.shape for wins in _wins(x, y)]
     if min(map(min, sizes)) < 2:
         return Estimate(value=np.asarray(value), lower=np.array(np.nan), upper=np.array(np.nan))
-    quantile = scipy.stats.t.ppf(1 - _TAIL, sum(a + b - 2 for a, b in sizes))
+    quantile = stats.t.ppf(1 - _TAIL, sum(a + b - 2 for a, b in sizes))
 
     def too_far(probability: float) -> float:
         """Above 0 where the estimate is too far from `probability` to come by chance."""
@@ -213,7 +216,7 @@ def probability_of_improvement(x: Array, y: Array) -> Estimate:
         end
         if value == end
         # At 0 and 1 it is 0 as well, so the end is looked for beside them.
-        else scipy.optimize.brentq(too_far, end, value + 1e-9 * (end - value))
+        else optimize.brentq(too_far, end, value + 1e-9 * (end - value))
         for end in (0.0, 1.0)
     ]
     return Estimate(value=np.asarray(value), lower=np.array(ends[0]), upper=np.array(ends[1]))
@@ -240,7 +243,7 @@ def improvement_p_value(x: Array, y: Array) -> float:
 
 def _doubled_u(values: Array, size: int) -> Array:
     """Chances of twice Mann and Whitney's U, `[2 m n + 1]`, of `size` values drawn by lot."""
-    ranks = np.sort(2 * scipy.stats.rankdata(values)).astype(int)  # ties have halves
+    ranks = np.sort(2 * stats.rankdata(values)).astype(int)  # ties have halves
     return _chances(tuple(ranks.tolist()), size)
 
 
@@ -298,10 +301,8 @@ def power_of(
     """
     freedom = 2 * tasks * (seeds - 1)
     shift = abs(difference) / spread * np.sqrt(seeds * tasks / 2)
-    critical = scipy.stats.t.ppf(1 - alpha / 2, freedom)
-    missed = scipy.stats.nct.cdf(critical, freedom, shift) - scipy.stats.nct.cdf(
-        -critical, freedom, shift
-    )
+    critical = stats.t.ppf(1 - alpha / 2, freedom)
+    missed = stats.nct.cdf(critical, freedom, shift) - stats.nct.cdf(-critical, freedom, shift)
     # Far from the centre scipy's cdf is NaN where it would be 0.
     return float(1 - np.nan_to_num(missed, nan=0.0))
 
@@ -344,7 +345,7 @@ def least_difference(seeds: int, spread: float, *, tasks: int = 1, power: float 
     """The difference that `seeds` show with chance `power`; see :func:`power_of`, its inverse."""
     low, high = 0.0, 100 * spread  # two seeds show 17 standard deviations
     return float(
-        scipy.optimize.brentq(
+        optimize.brentq(
             lambda gap: power_of(seeds, gap, spread, tasks=tasks) - power, low, high, rtol=1e-6
         )
     )
