@@ -52,7 +52,7 @@ sweep: venv  ## the first picture: FetchReach over q, MUSIC on FetchPush (minute
 test: venv  ## run the whole suite (CI=true: a missing service is a failure, not a skip)
 	@$(PYTEST) $(PYTEST_ARGS)
 
-test-unit: venv  ## run the quick tests (little more than a minute)
+test-unit: venv  ## run the quick tests (about a minute)
 	@$(PYTEST) tests/unit $(PYTEST_ARGS)
 
 test-faults: venv  ## kill, fill, cut and corrupt, and compare with unbroken runs (a quarter of an hour)

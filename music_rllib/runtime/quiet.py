@@ -83,6 +83,8 @@ def prepare_environment() -> None:
     # RLlib imports both where they are installed, for seconds in each worker, and TAC uses neither.
     os.environ.setdefault("RLLIB_TEST_NO_JAX_IMPORT", "1")
     os.environ.setdefault("RLLIB_TEST_NO_TF_IMPORT", "1")
+    # A local Ray would begin with a worker per CPU, which no run can use: theirs have a setup hook.
+    os.environ.setdefault("RAY_prestart_worker_first_driver", "0")
     _keep_local_ray_on_loopback()
     _authenticate_local_ray()
 
