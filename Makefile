@@ -9,9 +9,9 @@ CONFIG ?=
 PYTEST_ARGS ?=
 SECONDS ?= 600
 SEED    ?= 0
-# The tests of a file stay together and share what they set up.
+# The tests of a file stay together and share what they set up; tests/conftest.py orders the files.
 JOBS   ?= 2
-PYTEST := $(BIN)/python -m pytest -n $(JOBS) --dist loadscope
+PYTEST := $(BIN)/python -m pytest -n $(JOBS) --dist loadscope --no-loadscope-reorder
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
@@ -52,7 +52,7 @@ sweep: venv  ## the first picture: FetchReach over q, MUSIC on FetchPush (minute
 test: venv  ## run the whole suite (CI=true: a missing service is a failure, not a skip)
 	@$(PYTEST) $(PYTEST_ARGS)
 
-test-unit: venv  ## run the quick tests (little more than a minute)
+test-unit: venv  ## run the quick tests (about a minute)
 	@$(PYTEST) tests/unit $(PYTEST_ARGS)
 
 test-faults: venv  ## kill, fill, cut and corrupt, and compare with unbroken runs (a quarter of an hour)

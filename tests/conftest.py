@@ -55,6 +55,25 @@ _TIERS = {
 }
 
 
+LONG = (
+    "integration/test_sweep_local.py",
+    "integration/test_sweep_cluster.py",
+    "integration/test_sweep_finished.py",
+    "integration/test_tac_algorithm.py",
+    "integration/test_learning.py",
+    "integration/test_first_hour.py",
+    "integration/test_sweep_trainable.py",
+    "integration/test_report.py",
+    "integration/test_mlflow_tracking.py",
+    "faults/test_damage.py",
+    "integration/test_direct_updates.py",
+    "integration/test_search_played.py",
+    "integration/test_serve.py",
+    "integration/test_dashboards.py",
+    "integration/test_secrets.py",
+)
+"""Files that take longest, the longest first: begun last, one would keep a single worker busy."""
+
 _THOROUGH_SECONDS = 1800
 """For programs that start several times, on a machine that others keep busy."""
 
@@ -62,13 +81,16 @@ _THOROUGH_SECONDS = 1800
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Mark each test with its folder's tier, so that ``-m`` works without markers in every file.
 
-    What is thorough, and takes many minutes, is left out unless ``-m`` asks for it.
+    The long files come first. What is thorough, and takes many minutes, is left out unless
+    ``-m`` asks for it.
     """
     for item in items:
         if item.path.is_relative_to(_TESTS):
             tier = _TIERS.get(item.path.relative_to(_TESTS).parts[0])
             if tier is not None:
                 item.add_marker(tier)
+    places = {_TESTS / name: place for place, name in enumerate(LONG)}
+    items.sort(key=lambda item: places.get(item.path, len(LONG)))
     thorough = [item for item in items if item.get_closest_marker("thorough")]
     if "thorough" in (config.option.markexpr or ""):
         for item in thorough:

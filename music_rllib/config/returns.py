@@ -11,7 +11,6 @@ from music_rllib.config.tac_settings import (
     NormalisedAlpha,
     TACSettings,
 )
-from music_rllib.functional.tsallis import uniform_entropy
 from music_rllib.intrinsic.settings import MusicSettings
 from music_rllib.schedules import extremes
 
@@ -77,6 +76,8 @@ def _entropy_bonus(tac: TACSettings) -> float:
     """Largest entropy bonus of a step: alpha times the entropy of one uniform action dimension."""
     if tac.policy == "deterministic":
         return 0.0
+    from music_rllib.functional.tsallis import uniform_entropy  # loads PyTorch
+
     qs = extremes(tac.entropic_index)
     return max(0.0, *(_largest_alpha(tac.alpha, q) * uniform_entropy(q) for q in qs))
 

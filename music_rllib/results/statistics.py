@@ -20,7 +20,10 @@ from math import lcm
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import optimize, stats
+
+from music_rllib.imports import imported_on_use
+
+optimize, stats = imported_on_use("scipy.optimize"), imported_on_use("scipy.stats")
 
 Array = NDArray[np.float64]
 

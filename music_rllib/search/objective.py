@@ -10,13 +10,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 
 from music_rllib import names
 from music_rllib.config.search.settings import Objective, Pruning
+from music_rllib.imports import imported_on_use
 from music_rllib.results import statistics as st
 from music_rllib.results.statistics import Array, Estimate
 from music_rllib.store.run_record import Report
+
+stats = imported_on_use("scipy.stats")
 
 
 def score(objective: Objective, history: Sequence[Report], budget: int) -> float:

@@ -7,7 +7,7 @@ import math
 import os
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.table import Table
 
@@ -15,11 +15,12 @@ from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.schema import Stage, SweepConfig
 from music_rllib.experiment.plan import Plan
 from music_rllib.runtime import machine
-from music_rllib.runtime.ray_cluster import cluster
 from music_rllib.sweep.views.search_budget import search_budget
 from music_rllib.sweep.views.tables import new_table
 from music_rllib.sweep.views.text import clock
-from music_rllib.training.sample_run import RunSample, sample_run
+
+if TYPE_CHECKING:
+    from music_rllib.training.sample_run import RunSample
 
 BUSY_LOAD = 0.75
 """Load average per CPU above which other programs have disturbed the measurement."""
@@ -139,6 +140,10 @@ def measure(
     Raises:
         ClusterError: Ray can't be reached or can't hold a run.
     """
+    # Not by every program that shows a plan: RLlib takes seconds to load.
+    from music_rllib.runtime.ray_cluster import cluster
+    from music_rllib.training.sample_run import sample_run
+
     with cluster(config.resources) as room:
         if room.remark is not None:
             say(room.remark)

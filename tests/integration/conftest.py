@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,8 @@ from typing import Any
 import psutil
 import pytest
 import yaml
+
+from music_rllib import names
 
 REPOSITORY = Path(__file__).parents[2]
 ENVIRONMENTS = Path(__file__).parents[1] / "environments"
@@ -99,11 +103,43 @@ class Program:
         pytest.fail(f"no {wanted!r} in:\n{''.join(seen)}{process.communicate()[1]}")
 
 
+def call(
+    main: Callable[[Sequence[str]], int], folder: Path, *arguments: str
+) -> tuple[int, str, str]:
+    """Run a program of ours in this process, in `folder`: exit code, standard output and error.
+
+    For commands beside a sweep: a process of their own would load Python's libraries anew.
+    """
+    output, errors = io.StringIO(), io.StringIO()
+    with (
+        contextlib.chdir(folder),
+        contextlib.redirect_stdout(output),
+        contextlib.redirect_stderr(errors),
+    ):
+        code = main(arguments)
+    return code, output.getvalue(), errors.getvalue()
+
+
 def end(process: subprocess.Popen[str]) -> None:
     """End what `Program.start` started, and its children."""
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
     process.wait()
+
+
+def rows(output: str) -> list[list[str]]:
+    """Cells of the table of results at a sweep's end."""
+    table = output[output.index("Results of") :]
+    lines = [line for line in table.splitlines() if re.match(r"\S*seed\d+ ", line)]
+    return [re.split(r"\s{2,}", line.strip()) for line in lines]
+
+
+def metric_steps(folder: Path, run: Any, name: str = names.ENV_STEPS) -> list[int]:
+    """Where the embedded MLflow of a sweep in `folder` has values of a run's metric."""
+    from mlflow import MlflowClient
+
+    client = MlflowClient(f"sqlite:///{folder}/results/mlflow.db")
+    return [metric.step for metric in client.get_metric_history(run.info.run_id, name)]
 
 
 def listening(process: subprocess.Popen[Any]) -> dict[str, set[str]]:

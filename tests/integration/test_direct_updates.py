@@ -178,6 +178,11 @@ def test_updates_at_once_have_the_bits_of_one_by_one(backbone: str) -> None:
         assert torch.equal(values, expected[name]), name
 
 
+@njit  # once for all sizes: compiling it takes seconds
+def product(left: Any, right: Any, transposed: tuple[bool, bool], out: Any) -> None:
+    blas.multiply(left, transposed[0], right, transposed[1], out)
+
+
 # The fourth and fifth are cut where BLAS multiplies small matrices without copies.
 @pytest.mark.parametrize(
     ("rows", "inner", "columns"),
@@ -187,10 +192,6 @@ def test_updates_at_once_have_the_bits_of_one_by_one(backbone: str) -> None:
 def test_products_are_numpys_however_matrices_lie(
     rows: int, inner: int, columns: int, dtype: Any
 ) -> None:
-    @njit
-    def product(left: Any, right: Any, transposed: tuple[bool, bool], out: Any) -> None:
-        blas.multiply(left, transposed[0], right, transposed[1], out)
-
     rng = np.random.default_rng(0)
     left, right = rng.normal(size=(rows, inner)), rng.normal(size=(inner, columns))
     for of_left, of_right in itertools.product((False, True), repeat=2):

@@ -10,6 +10,7 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,9 @@ import pytest
 import yaml
 
 from music_rllib import load_sweep
+from music_rllib.report.cli import main as report
+from music_rllib.sweep.cli import main as sweep
+from tests.integration.conftest import call
 
 pytestmark = pytest.mark.e2e
 
@@ -36,19 +40,11 @@ def snippet(page: str, language: str, position: int = 0) -> str:
     return str(blocks[position])
 
 
-def python(folder: Path, *arguments: str) -> str:
-    """What `python` prints there; it must end well."""
-    done = subprocess.run(
-        [sys.executable, *arguments],
-        cwd=folder,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=280,
-        check=False,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
+def said(main: Callable[[Sequence[str]], int], folder: Path, *arguments: str) -> str:
+    """What a command prints there; it must end well."""
+    code, output, errors = call(main, folder, *arguments)
+    assert code == 0, output + errors
+    return output
 
 
 @pytest.fixture(scope="module")
@@ -58,15 +54,23 @@ def output(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     document: dict[str, Any] = yaml.safe_load(snippet("README.md", "yaml"))
     document |= {"seeds": [0], "defaults": SECONDS}
     (folder / "my_sweep.yaml").write_text(yaml.safe_dump(document, sort_keys=False))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("MUSIC_RLLIB_REPORT", "on")
-        return folder, python(folder, "-m", "music_rllib.sweep", "my_sweep.yaml")
+    done = subprocess.run(
+        [sys.executable, "-m", "music_rllib.sweep", "my_sweep.yaml"],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "MUSIC_RLLIB_REPORT": "on"},
+        capture_output=True,
+        text=True,
+        timeout=280,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return folder, done.stdout
 
 
 def test_the_sweep_ends_with_its_picture(output: tuple[Path, str]) -> None:
     folder, text = output
-    said, _, path = text.splitlines()[-1].partition(": ")
-    assert said == "Picture"
+    label, _, path = text.splitlines()[-1].partition(": ")
+    assert label == "Picture"
     assert Path(path) == folder / "results" / "my_sweep" / "report" / "figures" / "overview.png"
     assert Path(path).read_bytes().startswith(b"\x89PNG")
     assert (folder / "results" / "my_sweep" / "report" / "report.html").is_file()
@@ -82,7 +86,7 @@ def test_results_in_hand(output: tuple[Path, str], monkeypatch: pytest.MonkeyPat
     assert sorted(set(success["q"])) == [1.0, 1.5, 2.0]
     assert success["env_steps"].max() == 300
     export = ["results/my_sweep", "--export", "published/my_sweep", "--format", "csv"]
-    python(folder, "-m", "music_rllib.report", *export)
+    said(report, folder, *export)
     first, second = load_sweep("results/my_sweep"), load_sweep("published/my_sweep")
     pd.testing.assert_frame_equal(
         first.conditions.sort_values("q"), second.conditions.sort_values("q")
@@ -94,11 +98,11 @@ def test_results_in_hand(output: tuple[Path, str], monkeypatch: pytest.MonkeyPat
     ["status results/my_sweep", "compare results/my_sweep", "plan my_sweep.yaml", "plan"],
 )
 def test_commands_beside_it(output: tuple[Path, str], arguments: str) -> None:
-    assert python(output[0], "-m", "music_rllib.sweep", *arguments.split())
+    assert said(sweep, output[0], *arguments.split())
 
 
 def test_the_best_policy_is_played(output: tuple[Path, str]) -> None:
     folder, _ = output
-    python(folder, "-m", "music_rllib.sweep", "best", "results/my_sweep")
+    said(sweep, folder, "best", "results/my_sweep")
     played = ["evaluate", "results/my_sweep/best", "--episodes", "2"]
-    assert "2 episodes" in python(folder, "-m", "music_rllib.sweep", *played)
+    assert "2 episodes" in said(sweep, folder, *played)

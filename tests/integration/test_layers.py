@@ -87,6 +87,18 @@ def test_lower_layers_load_no_ray() -> None:
     assert done.returncode == 0, done.stderr
 
 
+def test_a_driver_begins_without_what_only_workers_or_reports_need() -> None:
+    """Each takes a second or more, of which a user would wait for the plan."""
+    heavy = ["ray", "torch", "mlflow", "scipy.stats", "pandas", "matplotlib"]
+    code = (
+        "import sys, music_rllib.sweep.driver\n"
+        f"loaded = [name for name in {heavy!r} if name in sys.modules]\n"
+        "assert not loaded, loaded\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
 def test_the_rules_name_what_exists() -> None:
     """A rule about a module that was renamed would hold nothing."""
     for part in (*PURE, *LIGHT, *MAY_LOAD_RAY):

@@ -19,6 +19,7 @@ import requests
 
 from benchmarks.serve import half_sent, memory, random_policy, storm
 from music_rllib.policy import Policy, load_policy
+from music_rllib.serve.command import main
 from tests.integration.conftest import listening
 
 TOKEN = "a-planted-token"
@@ -164,19 +165,20 @@ def test_fuzzing_finds_no_server_error(service: Service, tmp_path: Path) -> None
     ],
 )
 def test_bad_input_is_one_line(
-    service: Service, arguments: list[str], message: str, tmp_path: Path
+    service: Service,
+    arguments: list[str],
+    message: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     taken = service.url.rpartition(":")[2]
     places = {"policy": service.file, "folder": tmp_path, "taken": taken}
     if "--port" not in arguments:
         with socket.create_server(("127.0.0.1", 0)) as probe:
-            arguments += ["--port", str(probe.getsockname()[1])]
-    process = start(*(argument.format(**places) for argument in arguments))
-    try:
-        output, errors = process.communicate(timeout=120)
-    finally:
-        process.kill()
-    assert (process.returncode, output) == (2, "")
+            arguments = [*arguments, "--port", str(probe.getsockname()[1])]
+    code = main([argument.format(**places) for argument in arguments])
+    output, errors = capsys.readouterr()
+    assert (code, output) == (2, "")
     assert message in errors
     assert errors.startswith("error: ")
     assert errors.count("\n") == 1

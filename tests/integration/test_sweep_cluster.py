@@ -45,6 +45,11 @@ class Head(NamedTuple):
     environment: dict[str, str]
     process: subprocess.Popen[Any]
 
+    @property
+    def home(self) -> Path:
+        """Of the user whom the cluster belongs to."""
+        return Path(self.environment["HOME"])
+
 
 def free_ports(count: int) -> list[int]:
     sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
@@ -383,31 +388,38 @@ class Site:
         return str(done.stdout)
 
 
-@pytest.fixture
-def site(sweep_document: dict[str, Any], tmp_path: Path) -> Site:
+def site_at(home: Path, sweep_document: dict[str, Any], tmp_path: Path, **tac: Any) -> Site:
+    """With `home` as its home, and changed settings of TAC."""
     document = small(sweep_document)
+    document["defaults"]["tac"] |= tac
     document["defaults"] |= {"env_steps": 10_000, "evaluation": {"interval": 400, "episodes": 1}}
     fast = tmp_path / "fast"
     document["environments"]["Point"] |= {
         "env_id": "point_env:Paced-v0",
         "env_kwargs": {"fast": str(fast)},
     }
-    home = tmp_path / "home"
-    home.mkdir()
     return Site(Jobs(tmp_path / "checkout", document), fast, home)
 
 
 @pytest.mark.timeout(900)
-def test_job_is_stopped_and_a_later_one_goes_on(site: Site) -> None:
-    with head_node(site.home, 1) as head:
-        site.stop_one(head)
-        site.finish(head)
+def test_job_is_stopped_and_a_later_one_goes_on(
+    head: Head, sweep_document: dict[str, Any], tmp_path: Path
+) -> None:
+    # Updates would be compiled anew in the job's copy of the package.
+    site = site_at(head.home, sweep_document, tmp_path, random_steps=10_000)
+    site.stop_one(head)
+    site.finish(head)
 
 
 @pytest.mark.thorough
 @pytest.mark.timeout(900)  # four programs and two clusters start, one after the other
-def test_job_is_stopped_then_outlives_its_cluster(site: Site) -> None:
+def test_job_is_stopped_then_outlives_its_cluster(
+    sweep_document: dict[str, Any], tmp_path: Path
+) -> None:
     """Stopped in good order; resumed, and its head killed; resumed on a new cluster to its end."""
+    home = tmp_path / "home"
+    home.mkdir()
+    site = site_at(home, sweep_document, tmp_path)
     jobs, work = site.jobs, site.storage / "work"
     with head_node(site.home, 1) as head:
         stranger = jobs.submit(head, "stranger", token="another-token-of-some-length-0123456789")

@@ -1,139 +1,26 @@
-"""A whole sweep with a local Ray and an embedded MLflow, as a user starts it."""
+"""Sweeps with a local Ray that fail, are stopped or killed, and one without success rates.
+
+One in which nothing goes wrong is in test_sweep_finished.py.
+"""
 
 import json
 import re
 import signal
-import subprocess
-import sys
 from collections.abc import Callable
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
 import pytest
-from mlflow import MlflowClient
 
-from music_rllib import load_sweep, names
-from music_rllib.results.archive.folder import write_archive
-from music_rllib.results.from_mlflow import read_mlflow
-from music_rllib.tracking.store import resolve_store
-from tests.integration.conftest import listening
+from music_rllib import names
+from music_rllib.sweep.cli import main
+from tests.integration.conftest import call, listening, metric_steps, rows
 
 pytestmark = pytest.mark.integration
 
 Document = dict[str, Any]
 Runs = Callable[[], dict[str, Any]]
-
-
-EXPECTED = re.compile(
-    r"\[ *\d+:\d\d\] (pretrain/|finetune/|starting a local Ray$|best so far: finetune )"
-    r"|(stage|run|pretrain|finetune)[ :/]|  |Sweep |Results |Storage: |3 runs, |"
-    r"Compare in MLflow: |Open MLflow's pages with: "
-)
-"""Lines of a sweep in which nothing goes wrong."""
-
-
-def rows(output: str) -> list[list[str]]:
-    """Cells of the table of results."""
-    table = output[output.index("Results of") :]
-    lines = [line for line in table.splitlines() if re.match(r"\S*seed\d+ ", line)]
-    return [re.split(r"\s{2,}", line.strip()) for line in lines]
-
-
-def metric_steps(folder: Path, run: Any, name: str = names.ENV_STEPS) -> list[int]:
-    client = MlflowClient(f"sqlite:///{folder}/results/mlflow.db")
-    return [metric.step for metric in client.get_metric_history(run.info.run_id, name)]
-
-
-def test_a_sweep_from_the_plan_to_mlflow_and_then_a_finer_one(
-    sweep_program: Any, sweep_document: Document, mlflow_runs: Runs, tmp_path: Path
-) -> None:
-    sweep_program.environment["COLUMNS"] = "160"  # for the table's last columns
-    sweep_program.write(sweep_document)
-    code, output, errors = sweep_program.run()
-    assert (code, errors) == (0, "")
-    assert "3 runs, 3,600 env steps in all." in output
-    assert output.index("Sweep points") < output.index(": started") < output.index("Results of")
-    unexpected = [line for line in output.splitlines() if not EXPECTED.match(line)]
-    assert unexpected == [], "the newcomer's screen"
-    found = rows(output)
-    runs = ["pretrain/seed0", "finetune/q=1/seed0", "finetune/q=2/seed0"]
-    assert [row[0] for row in found] == runs
-    assert {row[-1] for row in found} == {"finished"}
-    assert all("1,200" in row for row in found)
-    assert "mlflow ui --backend-store-uri" in output
-    check_mlflow(mlflow_runs(), tmp_path, found)
-
-    sweep_document["stages"][1]["grid"]["tac.entropic_index"] = [1.0, 1.5, 2.0]
-    sweep_program.write(sweep_document)
-    code, output, errors = sweep_program.run()
-    assert (code, errors) == (0, "")
-    assert "3 finished earlier and reused, 1,200 env steps left" in output
-    again = rows(output)
-    assert [row[-1] for row in again] == ["reused", "reused", "finished", "reused"]
-    assert [row[:-1] for row in again if row[-1] == "reused"] == [row[:-1] for row in found]
-    assert len(mlflow_runs()) == 1 + 4
-    check_frames(tmp_path)
-
-    code, output, errors = sweep_program.run("--name", "other")
-    assert (code, errors) == (0, "")
-    assert [row[-1] for row in rows(output)] == ["reused"] * 4
-    assert {row[-2] for row in rows(output)}.isdisjoint({row[-2] for row in again})
-    assert "-" not in {row[-2] for row in rows(output)}
-
-
-def check_mlflow(runs: dict[str, Any], folder: Path, found: list[list[str]]) -> None:
-    assert set(runs) == {
-        "points",
-        "seed 0 Point pretrain",
-        "q=1 seed 0 Point finetune",
-        "q=2 seed 0 Point finetune",
-    }
-    parent, pretrain = runs["points"], runs["seed 0 Point pretrain"]
-    for run in runs.values():
-        assert run.info.status == "FINISHED"
-    for q in (1, 2):
-        run = runs[f"q={q} seed 0 Point finetune"]
-        tags = run.data.tags
-        assert tags[names.TAG_LABEL] == f"finetune/Point/tac.entropic_index={q}/seed0"
-        assert tags[names.TAG_PARENT_RUN] == parent.info.run_id
-        assert tags[names.TAG_SOURCE_RUN] == pretrain.info.run_id
-        assert (tags[names.TAG_VARIANT], tags[names.TAG_TASK]) == ("music-r", "Point")
-        assert tags[names.TAG_ENTROPIC_INDEX] == str(q)
-        assert run.data.metrics[names.SETTING_ENTROPIC_INDEX] == q
-        assert run.data.params["tac.entropic_index"] == f"{q}.0"
-        assert metric_steps(folder, run) == [0, 400, 800, 1200]
-        assert metric_steps(folder, run, names.EVAL_SUCCESS) == [0, 400, 800, 1200]
-    ids = [run.info.run_id[:8] for name, run in sorted(runs.items()) if name != "points"]
-    assert sorted(ids) == sorted(row[-2] for row in found)
-
-
-def check_frames(folder: Path) -> None:
-    """The same from the storage, from MLflow and from an export."""
-    store = f"sqlite:///{folder}/results/mlflow.db"
-    write_archive(read_mlflow(resolve_store(store, "results"), "points"), folder / "export")
-    read = [
-        load_sweep(folder / "results" / "points"),
-        load_sweep("points", tracking_uri=store),
-        load_sweep(folder / "export"),
-    ]
-    # MLflow has the moment when it was told.
-    told = {"runs": ["started", "ended"], "curves": ["time"], "conditions": []}
-    order = {
-        "runs": ["name"],
-        "curves": ["key", "metric", "env_steps"],
-        "conditions": ["stage", "q"],
-    }
-    for name, columns in told.items():
-        first, *others = (
-            getattr(one, name).drop(columns=columns).sort_values(order[name]) for one in read
-        )
-        assert len(first)
-        for other in others:
-            pd.testing.assert_frame_equal(
-                first.reset_index(drop=name != "runs"), other.reset_index(drop=name != "runs")
-            )
 
 
 def test_a_task_without_success_shows_its_return_from_the_first_line_to_the_report(
@@ -163,15 +50,9 @@ def test_a_task_without_success_shows_its_return_from_the_first_line_to_the_repo
         ("status", "Best so far: train q = "),
         ("compare", f"{names.EVAL_RETURN} of train on Point"),
     ):
-        said = subprocess.run(
-            [sys.executable, "-m", "music_rllib.sweep", command, "points", "--storage", "results"],
-            cwd=tmp_path,
-            env=sweep_program.environment,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-        assert words in said.stdout
+        code, said, errors = call(main, tmp_path, command, "points", "--storage", "results")
+        assert (code, errors) == (0, "")
+        assert words in said
 
 
 def test_a_failure_is_explained_and_the_others_finish(

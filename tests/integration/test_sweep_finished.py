@@ -1,4 +1,7 @@
-"""A real small sweep to its end: its report, its policies, and MLflow's pages in a browser."""
+"""A real small sweep to its end: its screen, its report, its policies, and MLflow's pages.
+
+And a finer one after it. Both are run once, and looked at from all sides.
+"""
 
 from __future__ import annotations
 
@@ -17,13 +20,25 @@ from typing import Any, NamedTuple
 from urllib.parse import quote
 from urllib.request import urlopen
 
+import pandas as pd
 import pytest
 import yaml
 from mlflow import MlflowClient
 
-from music_rllib import names
+from music_rllib import load_sweep, names
 from music_rllib.report.build import PAGE
-from tests.integration.conftest import ENVIRONMENTS, REPOSITORY, SWEEP
+from music_rllib.results.archive.folder import write_archive
+from music_rllib.results.from_mlflow import read_mlflow
+from music_rllib.sweep.cli import main
+from music_rllib.tracking.store import resolve_store
+from tests.integration.conftest import (
+    ENVIRONMENTS,
+    REPOSITORY,
+    SWEEP,
+    call,
+    metric_steps,
+    rows,
+)
 from tests.integration.devtools import PATIENCE, Page
 
 # A server without accounts has nobody to name.
@@ -44,25 +59,80 @@ class Finished(NamedTuple):
         return {run.info.run_name: run for run in found}
 
 
+EXPECTED = re.compile(
+    r"\[ *\d+:\d\d\] (pretrain/|finetune/|starting a local Ray$|best so far: finetune )"
+    r"|(stage|run|pretrain|finetune)[ :/]|  |Sweep |Results |Storage: |3 runs, |"
+    r"Report: |Picture: |Compare in MLflow: |Open MLflow's pages with: "
+)
+"""Lines of a sweep in which nothing goes wrong."""
+
+
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
     """Two values of q after a MUSIC-u stage, with the report at the end."""
     folder = tmp_path_factory.mktemp("sweep")
     (folder / "sweep.yaml").write_text(yaml.safe_dump(SWEEP))
+    output = _run(folder, report="on")
+    client = MlflowClient(f"sqlite:///{folder}/results/mlflow.db")
+    experiment = client.get_experiment_by_name("points")
+    assert experiment is not None
+    return Finished(folder, output, client, str(experiment.experiment_id))
+
+
+def _run(folder: Path, report: str) -> str:
+    """What a user's sweep says that ends well."""
     done = subprocess.run(
         [sys.executable, "-m", "music_rllib.sweep", "sweep.yaml"],
         cwd=folder,
-        env=os.environ | {"PYTHONPATH": _python_path(), names.VARIABLE_REPORT: "on"},
+        env=_environment() | {names.VARIABLE_REPORT: report},
         capture_output=True,
         text=True,
         check=False,
         timeout=280,
     )
     assert (done.returncode, done.stderr) == (0, "")
-    client = MlflowClient(f"sqlite:///{folder}/results/mlflow.db")
-    experiment = client.get_experiment_by_name("points")
-    assert experiment is not None
-    return Finished(folder, done.stdout, client, str(experiment.experiment_id))
+    return done.stdout
+
+
+def test_the_screen_shows_the_plan_the_runs_and_their_results(finished: Finished) -> None:
+    output = finished.output
+    assert "3 runs, 3,600 env steps in all." in output
+    assert output.index("Sweep points") < output.index(": started") < output.index("Results of")
+    unexpected = [line for line in output.splitlines() if not EXPECTED.match(line)]
+    assert unexpected == [], "the newcomer's screen"
+    found = rows(output)
+    runs = ["pretrain/seed0", "finetune/q=1/seed0", "finetune/q=2/seed0"]
+    assert [row[0] for row in found] == runs
+    assert {row[-1] for row in found} == {"finished"}
+    assert all("1,200" in row for row in found)
+    assert "mlflow ui --backend-store-uri" in output
+
+
+def test_mlflow_has_each_run_with_what_it_was_and_came_from(finished: Finished) -> None:
+    runs = {name: run for name, run in finished.runs().items() if not name.startswith("q=1.5 ")}
+    assert set(runs) == {
+        "points",
+        "seed 0 Point pretrain",
+        "q=1 seed 0 Point finetune",
+        "q=2 seed 0 Point finetune",
+    }
+    parent, pretrain = runs["points"], runs["seed 0 Point pretrain"]
+    for run in runs.values():
+        assert run.info.status == "FINISHED"
+    for q in (1, 2):
+        run = runs[f"q={q} seed 0 Point finetune"]
+        tags = run.data.tags
+        assert tags[names.TAG_LABEL] == f"finetune/Point/tac.entropic_index={q}/seed0"
+        assert tags[names.TAG_PARENT_RUN] == parent.info.run_id
+        assert tags[names.TAG_SOURCE_RUN] == pretrain.info.run_id
+        assert (tags[names.TAG_VARIANT], tags[names.TAG_TASK]) == ("music-r", "Point")
+        assert tags[names.TAG_ENTROPIC_INDEX] == str(q)
+        assert run.data.metrics[names.SETTING_ENTROPIC_INDEX] == q
+        assert run.data.params["tac.entropic_index"] == f"{q}.0"
+        assert metric_steps(finished.folder, run) == [0, 400, 800, 1200]
+        assert metric_steps(finished.folder, run, names.EVAL_SUCCESS) == [0, 400, 800, 1200]
+    ids = [run.info.run_id[:8] for name, run in sorted(runs.items()) if name != "points"]
+    assert sorted(ids) == sorted(row[-2] for row in rows(finished.output))
 
 
 def test_the_sweep_s_run_carries_its_report(finished: Finished) -> None:
@@ -77,7 +147,10 @@ def test_the_sweep_s_run_carries_its_report(finished: Finished) -> None:
     assert "it has no rgb_array rendering" in text
 
 
-def test_each_run_has_its_policy_and_evaluate_finds_it_by_label(finished: Finished) -> None:
+def test_each_run_has_its_policy_and_evaluate_finds_it_by_label(
+    finished: Finished, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(ENVIRONMENTS)
     runs = {name: run for name, run in finished.runs().items() if name != "points"}
     models = finished.client.search_logged_models([finished.experiment_id])
     assert {model.source_run_id for model in models} == {run.info.run_id for run in runs.values()}
@@ -85,23 +158,17 @@ def test_each_run_has_its_policy_and_evaluate_finds_it_by_label(finished: Finish
     label = runs[name].data.tags[names.TAG_LABEL]
     # The policy's file names a module, which only the user may have imported.
     options = ["--episodes", "2", "--json", "--env", "point_env:Point-v0"]
-    done = subprocess.run(
-        [sys.executable, "-m", "music_rllib.sweep", "evaluate", label, *options],
-        cwd=finished.folder,
-        env=os.environ | {"PYTHONPATH": _python_path()},
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=200,
-    )
-    assert (done.returncode, done.stderr) == (0, "")
-    document = json.loads(done.stdout)
+    code, output, errors = call(main, finished.folder, "evaluate", label, *options)
+    assert (code, errors) == (0, "")
+    document = json.loads(output)
     assert (document["task"], document["env_steps"]) == ("Point", 1200)
     assert document["node_key"] == runs[name].data.tags[names.TAG_NODE_KEY]
 
 
-def _python_path() -> str:
-    return os.pathsep.join(map(str, (REPOSITORY, ENVIRONMENTS)))
+def _environment() -> dict[str, str]:
+    """With the test environments, and a screen wide enough for the last columns of tables."""
+    paths = os.pathsep.join(map(str, (REPOSITORY, ENVIRONMENTS)))
+    return os.environ | {"PYTHONPATH": paths, "COLUMNS": "160"}
 
 
 @pytest.fixture(scope="module")
@@ -138,8 +205,7 @@ def test_mlflow_s_pages_filter_and_compare(
 ) -> None:
     program = require_service("chromium")
     runs = finished.runs()
-    pair = [run.info.run_id for name, run in runs.items() if name.startswith("q=")]
-    assert len(pair) == 2
+    pair = [runs[f"q={q} seed 0 Point finetune"].info.run_id for q in (1, 2)]
     asyncio.run(_look(finished, server, program, tmp_path, pair))
 
 
@@ -182,11 +248,11 @@ async def _look(
     pages = f"{server}/#/experiments/{finished.experiment_id}"
     async with Page(program, folder) as page:
         await page.go(f"{pages}/runs")
-        await page.wait_for("points", "4 matching runs")
+        await page.wait_for("points", f"{len(finished.runs())} matching runs")
         # The sweep's own run is shown above those that fit.
         for wanted, matching in (
             ("tags.entropic_index = '2'", 2),
-            ("tags.task = 'Point' and tags.variant = 'music-r'", 3),
+            ("tags.task = 'Point' and tags.variant = 'music-r'", len(finished.runs()) - 1),
             ('metrics."setting/entropic_index" > 1.5', 2),
         ):
             await page.go(f"{pages}/runs?searchFilter={quote(wanted)}")
@@ -202,3 +268,56 @@ async def _look(
         await page.wait_for("policy", "Ready", "q=2 seed 0 Point")
         errors = [e for e in page.errors if not any(words in e for words in HARMLESS)]
     assert not errors
+
+
+def test_a_finer_sweep_reuses_what_is_finished(
+    finished: Finished, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    document = yaml.safe_load((finished.folder / "sweep.yaml").read_text())
+    document["stages"][1]["grid"]["tac.entropic_index"] = [1.0, 1.5, 2.0]
+    (finished.folder / "sweep.yaml").write_text(yaml.safe_dump(document))
+    output = _run(finished.folder, report="off")
+    assert "3 finished earlier and reused, 1,200 env steps left" in output
+    again = rows(output)
+    assert [row[-1] for row in again] == ["reused", "reused", "finished", "reused"]
+    before = [row[:-1] for row in rows(finished.output)]
+    assert [row[:-1] for row in again if row[-1] == "reused"] == before
+    runs = finished.client.search_runs([finished.experiment_id])
+    assert len(runs) == len(finished.runs()) == 1 + 4, "each is there once"
+    check_frames(finished.folder, tmp_path / "export")
+
+    # Under another name there is nothing to train, and MLflow gets all of it once more.
+    monkeypatch.syspath_prepend(ENVIRONMENTS)
+    monkeypatch.setenv("COLUMNS", "160")
+    code, output, errors = call(main, finished.folder, "sweep.yaml", "--name", "other")
+    assert (code, errors) == (0, "")
+    assert [row[-1] for row in rows(output)] == ["reused"] * 4
+    assert {row[-2] for row in rows(output)}.isdisjoint({row[-2] for row in again})
+    assert "-" not in {row[-2] for row in rows(output)}
+
+
+def check_frames(folder: Path, export: Path) -> None:
+    """The same from the storage, from MLflow and from an export."""
+    store = f"sqlite:///{folder}/results/mlflow.db"
+    write_archive(read_mlflow(resolve_store(store, "results"), "points"), export)
+    read = [
+        load_sweep(folder / "results" / "points"),
+        load_sweep("points", tracking_uri=store),
+        load_sweep(export),
+    ]
+    # MLflow has the moment when it was told.
+    told = {"runs": ["started", "ended"], "curves": ["time"], "conditions": []}
+    order = {
+        "runs": ["name"],
+        "curves": ["key", "metric", "env_steps"],
+        "conditions": ["stage", "q"],
+    }
+    for name, columns in told.items():
+        first, *others = (
+            getattr(one, name).drop(columns=columns).sort_values(order[name]) for one in read
+        )
+        assert len(first)
+        for other in others:
+            pd.testing.assert_frame_equal(
+                first.reset_index(drop=name != "runs"), other.reset_index(drop=name != "runs")
+            )
