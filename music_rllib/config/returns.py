@@ -11,7 +11,7 @@ from music_rllib.config.tac_settings import (
     NormalisedAlpha,
     TACSettings,
 )
-from music_rllib.functional.tsallis import uniform_entropy
+from music_rllib.functional.entropy_scale import largest_entropy
 from music_rllib.intrinsic.settings import MusicSettings
 from music_rllib.schedules import extremes
 
@@ -91,7 +91,7 @@ def _entropy_bonus(tac: TACSettings) -> float:
     if tac.policy == "deterministic":
         return 0.0
     qs = extremes(tac.entropic_index)
-    return max(0.0, *(_largest_alpha(tac.alpha, q) * uniform_entropy(q) for q in qs))
+    return max(0.0, *(_largest_alpha(tac.alpha, q) * largest_entropy(q) for q in qs))
 
 
 def _largest_alpha(alpha: Alpha, q: float) -> float:

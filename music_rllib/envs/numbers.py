@@ -1,4 +1,4 @@
-"""What an environment returns is looked at where it comes in: a NaN spreads to every weight."""
+"""Checks of the numbers that an environment returns, since a NaN spreads to every weight."""
 
 from __future__ import annotations
 
@@ -8,22 +8,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["LARGEST", "BadNumberError", "are_usable", "bad_number"]
-
 LARGEST = 1e15
-"""Beyond it, squared errors of returns a hundred times as large, summed over a minibatch, leave
-float32's range."""
+"""Largest accepted number: returns are up to a hundred times as large, and their squared errors,
+summed over a minibatch, must stay within float32's range."""
 _RULE = f"every number must be finite and within +-{LARGEST:g}"
 
 
 class BadNumberError(RuntimeError):
-    """NaN, infinity or an absurd number where nothing can be learned from it; says where."""
+    """An environment or a policy returned NaN, infinity or a huge number; says where."""
 
 
 def are_usable(values: NDArray[np.float32]) -> bool:
-    """Whether the numbers, [N], are surely finite and within `LARGEST`, in half a microsecond.
+    """Whether the length of the vector [N] is below `LARGEST`; takes half a microsecond.
 
-    Where they are not, `bad_number` finds out: the vector's length is what is looked at.
+    If so, every number is finite and within `LARGEST`; if not, `bad_number` checks each of them.
     """
     try:
         # NaN is not less than anything.
@@ -33,11 +31,11 @@ def are_usable(values: NDArray[np.float32]) -> bool:
 
 
 def bad_number(named: Iterable[tuple[str, Any]], where: str) -> BadNumberError | None:
-    """The error that names the first bad one among some arrays; None if there is none.
+    """The error that names the first bad number among some arrays; None if all are good.
 
     Args:
         named: name and array [N], or number.
-        where: who returned them and when.
+        where: the environment and the step that returned them, for the message.
     """
     for name, values in named:
         flat = np.atleast_1d(np.asarray(values, np.float64))

@@ -1,4 +1,4 @@
-"""Arrays of an episode while it is played, from numbers that are looked at as they come in."""
+"""Records an episode while it is played, and checks every number of it."""
 
 from __future__ import annotations
 
@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from music_rllib.envs.numbers import LARGEST, are_usable, bad_number
 from music_rllib.replay.trajectories import ReplayLayout, Trajectory
 
-__all__ = ["Episode", "Recording"]
-
 Floats = NDArray[np.float32]
 _PARTS = ("observation", "desired_goal", "achieved_goal")
 
@@ -22,7 +20,7 @@ class Episode(Trajectory):
     """A finished episode, and whether each of its steps was a success."""
 
     successes: NDArray[np.bool_] | None
-    """[n]; None where the environment does not say."""
+    """[n]; None where the environment does not define success."""
 
     def env_steps(self) -> int:
         return len(self)
@@ -36,8 +34,8 @@ class Recording:
 
     Args:
         layout: sizes of its arrays.
-        zero_goal: desired goals are taken for zeros.
-        name: of environment and episode, for messages.
+        zero_goal: whether desired goals are replaced by zeros.
+        name: name of environment and episode, for messages.
     """
 
     def __init__(self, layout: ReplayLayout, *, zero_goal: bool, name: str) -> None:
@@ -50,14 +48,14 @@ class Recording:
 
     @property
     def place(self) -> str:
-        """Where the episode stands, for messages."""
+        """Name of the episode and its current step, for messages."""
         return f"{self._name}, step {self.steps}"
 
     def see(self, observation: Any) -> None:
-        """Takes in the next observation.
+        """Records the next observation.
 
         Raises:
-            BadNumberError: something in it is NaN, infinite or absurd.
+            BadNumberError: a number in it is NaN, infinite or huge.
         """
         frame, layout = self._frames[self.steps], self._layout
         if layout.goal == 0:
@@ -77,14 +75,14 @@ class Recording:
 
     @property
     def network_input(self) -> Floats:
-        """[I] what the policy sees now."""
+        """[I] the policy's input at the current step."""
         return self._frames[self.steps, : self._layout.network_input]
 
     def step(self, action: Floats, reward: float, success: float | None, observation: Any) -> None:
-        """Takes in a step.
+        """Records a step.
 
         Raises:
-            BadNumberError: something that the environment returned is NaN, infinite or absurd.
+            BadNumberError: a number that the environment returned is NaN, infinite or huge.
         """
         self._actions[self.steps] = action
         self._rewards[self.steps] = reward
@@ -98,7 +96,7 @@ class Recording:
         self.see(observation)
 
     def finish(self, *, terminated: bool) -> Episode:
-        """The episode, when it is over."""
+        """The finished episode."""
         n = self.steps
         return Episode(
             self._frames[: n + 1],

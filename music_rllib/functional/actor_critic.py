@@ -7,16 +7,6 @@ from __future__ import annotations
 
 from torch import Tensor
 
-__all__ = [
-    "alpha_loss",
-    "critic_loss",
-    "critic_target",
-    "policy_loss",
-    "policy_value",
-    "value_loss",
-    "value_target",
-]
-
 
 def critic_target(
     reward: Tensor,

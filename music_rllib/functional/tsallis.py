@@ -1,8 +1,7 @@
 """Tsallis logarithm, exponential and entropies (paper II-C, eq. 4-5).
 
-One convention, the paper's: ``ln_q x = (x^(q-1) - 1) / (q-1)``, which is ``ln x`` at q = 1.
-Everything is computed from log-densities: in float32 the power form is wrong by 0.27 at
-q = 1 + 1e-7.
+The paper's convention: ``ln_q x = (x^(q-1) - 1) / (q-1)``, which is ``ln x`` at q = 1. All is
+computed from log-densities: in float32 the power form is wrong by 0.27 at q = 1 + 1e-7.
 
 Shape legend: B batch, A action dimensions, `...` any shape.
 """
@@ -14,20 +13,8 @@ import math
 import torch
 from torch import Tensor
 
-__all__ = [
-    "MAX_EXPONENT",
-    "bound_active",
-    "exp_q",
-    "gaussian_entropy",
-    "joint_entropy",
-    "ln_q",
-    "ln_q_of_log",
-    "ln_q_of_policy",
-    "uniform_entropy",
-]
-
 MAX_EXPONENT = 10.0
-"""Largest (q-1) ln p that ln_q follows exactly in the losses; beyond it, its tangent.
+"""Largest (q-1) ln p at which the losses use ln_q itself; above, they use its tangent.
 
 A peaked policy makes p^(q-1) explode for q > 1 (a density near 0 for q < 1). The tangent keeps
 value and gradient finite without ever making the gradient zero. e^10 = 22,026: at q = 2 it acts
@@ -35,7 +22,7 @@ on densities above that, at q = 1.5 above 4.9e8.
 """
 
 _SHANNON = 1e-9
-"""|q - 1| below which ln is used: the difference is then far below float64 resolution."""
+"""|q - 1| below which ln is used: the difference is far below float64 resolution."""
 
 
 def ln_q_of_log(log_x: Tensor, q: float, *, max_exponent: float = math.inf) -> Tensor:
@@ -124,14 +111,3 @@ def joint_entropy(per_dimension: Tensor, q: float) -> Tensor:
     if abs(order) < _SHANNON:
         return per_dimension.sum(-1)
     return (1.0 - torch.prod(1.0 - order * per_dimension, dim=-1)) / order
-
-
-def uniform_entropy(q: float, width: float = 2.0) -> float:
-    """S_q of the uniform density on an interval: the largest that S_q can be there.
-
-    (1 - width^(1-q)) / (q-1); ln(width) at q = 1.
-    """
-    order = q - 1.0
-    if abs(order) < _SHANNON:
-        return math.log(width)
-    return -math.expm1(-order * math.log(width)) / order

@@ -25,8 +25,6 @@ from music_rllib.schedules import Linear, Measured, check_measurable
 from music_rllib.tac.rl_module import ESTIMATOR_MODULE, EstimatorModule, TACModule
 from music_rllib.tac.scheduled import ScheduledSettings
 
-__all__ = ["TACConfig"]
-
 _Settings = TypeVar("_Settings", TACSettings, MusicSettings, ReplaySettings)
 
 
@@ -102,16 +100,14 @@ class TACConfig(AlgorithmConfig):
         Raises:
             TypeError: an unknown setting.
         """
-        own = {name: settings.pop(name) for name in list(settings) if name in _TAC_FIELDS}
+        tac = {name: settings.pop(name) for name in list(settings) if name in _TAC_FIELDS}
         super().training(**settings)
-        self._set(own, "")
-        if total_env_steps is not NotProvided:
-            self.total_env_steps = total_env_steps
-        if torch_threads is not NotProvided:
-            self.torch_threads = torch_threads
-        if reward_range is not NotProvided:
-            self.reward_range = reward_range
-        return self
+        return self._set(
+            tac,
+            total_env_steps=total_env_steps,
+            torch_threads=torch_threads,
+            reward_range=reward_range,
+        )
 
     def music(
         self,
@@ -132,12 +128,12 @@ class TACConfig(AlgorithmConfig):
             ValueError: the two overlap, or repeat an index.
         """
         _reject_unknown("music", settings, MusicSettings)
-        self._set(settings, "music_")
+        self._set(_prefixed("music_", settings))
         if agent_indices is not NotProvided:
             self.agent_indices = tuple(agent_indices)
         if surrounding_indices is not NotProvided:
             self.surrounding_indices = tuple(surrounding_indices)
-        if self.agent_indices and self.surrounding_indices:  # one may still be to come
+        if self.agent_indices and self.surrounding_indices:  # a later call may set the other one
             check_split(self.agent_indices, self.surrounding_indices)
         return self
 
@@ -154,14 +150,14 @@ class TACConfig(AlgorithmConfig):
             TypeError: an unknown setting.
         """
         _reject_unknown("replay", settings, ReplaySettings)
-        self._set(settings, "replay_")
-        if moved_distance is not NotProvided:
-            self.moved_distance = moved_distance
-        return self
+        return self._set(_prefixed("replay_", settings), moved_distance=moved_distance)
 
-    def _set(self, settings: Mapping[str, Any], prefix: str) -> None:
-        for name, value in settings.items():
-            setattr(self, prefix + name, value)
+    def _set(self, settings: Mapping[str, Any], **more: Any) -> Self:
+        """Sets attributes; those of `more` only where they are provided."""
+        given = {name: value for name, value in more.items() if value is not NotProvided}
+        for name, value in {**settings, **given}.items():
+            setattr(self, name, value)
+        return self
 
     def update_from_dict(self, config_dict: Any) -> Self:
         """As RLlib's, which takes a mistyped key for a new attribute; here it is an error."""
@@ -287,7 +283,6 @@ class TACConfig(AlgorithmConfig):
                     "agent_indices": self.agent_indices,
                     "surrounding_indices": self.surrounding_indices,
                     "hidden_size": music.hidden_size,
-                    "reward_scale": music.reward_scale,
                 },
                 learner_only=True,
             )
@@ -298,9 +293,9 @@ class TACConfig(AlgorithmConfig):
         """The reward that the Learner adds; a subclass may give another one.
 
         Args:
-            networks: the module `ESTIMATOR_MODULE`, None where there is none.
+            networks: the module `ESTIMATOR_MODULE`; None where the settings have no estimator.
         """
-        return Music(self.music_settings(), networks)
+        return Music(self.music_settings(), networks and networks.estimator)
 
     def scheduled(self, actions: int) -> ScheduledSettings:
         """Settings that change over the run, for so many action dimensions."""
@@ -349,6 +344,10 @@ def _checked(place: str, validation: Callable[[], _T]) -> _T:
             value = "" if "got " in rule else f", got {problem['input']!r}"
             problems.append(f"{where}: {rule}{value}" if where else f"{rule}{value}")
         raise ValueError("; ".join(problems)) from None
+
+
+def _prefixed(prefix: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+    return {prefix + name: value for name, value in settings.items()}
 
 
 def _is_search_space(value: Any) -> bool:
