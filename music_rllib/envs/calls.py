@@ -25,11 +25,7 @@ class Calls:
         self._number[0] += 1
 
     def share(self, path: Path) -> None:
-        """Moves the counter to a file; must not be called within a call of an environment.
-
-        Raises:
-            OSError: the file can't be written.
-        """
+        """Moves the counter to a file; must not be called within a call of an environment."""
         path.write_bytes(bytes(BYTES))
         with path.open("r+b") as file:
             self._number = memoryview(mmap.mmap(file.fileno(), BYTES)).cast("q")

@@ -84,8 +84,6 @@ class _FastFetch:
             return index, None
         return index, int(self._model.jnt_qposadr[self._model.actuator_trnid[index, 0]])
 
-    # -- stepping -------------------------------------------------------------------------
-
     def step(self, action: Any) -> tuple[Goals, Any, bool, bool, dict[str, Any]]:
         """Takes one step, as `BaseRobotEnv.step`: [4] -> observation, reward, ..., info."""
         if np.shape(action) != self._low.shape:
@@ -115,8 +113,6 @@ class _FastFetch:
         # At most 5 cm a step.
         self._mocap_position[:] = self._hand_position + action[:3] * 0.05
         self._mocap_quaternion[:] = self._hand_quaternion + _ROTATION
-
-    # -- observing ------------------------------------------------------------------------
 
     def observe(self) -> Goals:
         """The goal dictionary of the current state, in fresh arrays."""

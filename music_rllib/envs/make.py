@@ -12,7 +12,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from music_rllib.envs.farama_notice import drop_farama_notice
-from music_rllib.envs.numbers import are_usable, bad_number
+from music_rllib.envs.numbers import are_usable, check_numbers
 from music_rllib.envs.tasks import BUILT_IN_TASKS, Task
 from music_rllib.replay.buffer import GoalReward
 
@@ -31,10 +31,8 @@ def _register_robotics() -> None:
 def make_env(env_id: str, **kwargs: Any) -> Env:
     """Makes a Gymnasium environment by its id, with the robotics tasks registered.
 
-    The Fetch tasks get a faster step with the same results (`music_rllib.envs.fetch`).
-
-    Raises:
-        gymnasium.error.Error: unknown id or arguments.
+    The Fetch tasks get a faster step with the same results (`music_rllib.envs.fetch`). Raises
+    `gymnasium.error.Error` for unknown ids and arguments.
     """
     _register_robotics()
     # The checker takes a tenth of every step, and helps only an environment's authors.
@@ -55,12 +53,8 @@ class Known(NamedTuple):
 def known_environment(task: Task, vouched: Iterable[Task] = ()) -> Known | None:
     """The environment of a task from a file; None where the file would choose the code that runs.
 
-    Known are the environments of the built-in tasks and of the user's, and those of Gymnasium and
-    Gymnasium-Robotics without arguments (which may name files).
-
-    Args:
-        task: the task from a file.
-        vouched: tasks that the user declares or names.
+    Known are the environments of the built-in tasks and of the user's (`vouched`), and those of
+    Gymnasium and Gymnasium-Robotics without arguments, which may name files.
     """
     for trusted in (*BUILT_IN_TASKS.values(), *vouched):
         if (trusted.env_id, trusted.env_kwargs) == (task.env_id, task.env_kwargs):
@@ -81,11 +75,7 @@ def is_gymnasium_id(env: object) -> bool:
 
 
 def observation_sizes(space: gym.Space[Any]) -> tuple[int, int]:
-    """Features of the observation and of the goal (0 without goals).
-
-    Raises:
-        ValueError: neither a flat Box nor a goal dictionary of flat boxes.
-    """
+    """Features of observation and goal (0 without goals); ValueError for other spaces."""
     if _is_flat(space):
         return int(space.shape[0]), 0  # type: ignore[index]
     if isinstance(space, spaces.Dict):
@@ -108,11 +98,7 @@ def _is_flat(space: gym.Space[Any] | None) -> bool:
 
 
 def check_action_space(space: gym.Space[Any]) -> spaces.Box:
-    """Returns the space.
-
-    Raises:
-        ValueError: TAC can't act in it: it is not a bounded one-dimensional Box.
-    """
+    """Returns the space; raises ValueError unless it is a bounded one-dimensional Box."""
     if not (isinstance(space, spaces.Box) and len(space.shape) == 1 and space.is_bounded("both")):
         raise ValueError(
             f"environment: the action space must be a bounded one-dimensional Box, got {space}"
@@ -121,11 +107,7 @@ def check_action_space(space: gym.Space[Any]) -> spaces.Box:
 
 
 def episode_limit(env: Env, setting: int | None) -> int:
-    """Steps of the longest episode: the smaller of the environment's limit and `setting`.
-
-    Raises:
-        ValueError: neither is given.
-    """
+    """Steps of the longest episode: the smaller of `setting` and the environment's own limit."""
     own = env.spec.max_episode_steps if env.spec is not None else None
     limits = [limit for limit in (setting, own) if limit is not None]
     if not limits:
@@ -139,10 +121,8 @@ def goal_reward_of(env: Env) -> GoalReward:
     """The environment's reward as a vectorised function of achieved and desired goals.
 
     Resets `env` and takes one step in it to check the function: HER would silently learn from wrong
-    rewards (HandManipulatePen of Gymnasium-Robotics 1.4.2 mixes up the rows of a batch).
-
-    Raises:
-        ValueError: there is no such function, or a row's reward depends on more than its goals.
+    rewards (HandManipulatePen of Gymnasium-Robotics 1.4.2 mixes up the rows of a batch). Raises
+    ValueError where a row's reward depends on more than its goals.
     """
     compute = getattr(env.unwrapped, "compute_reward", None)
     if compute is None or not isinstance(env.observation_space, spaces.Dict):
@@ -154,9 +134,7 @@ def goal_reward_of(env: Env) -> GoalReward:
     def reward(achieved: NDArray[np.float32], desired: NDArray[np.float32]) -> NDArray[Any]:
         rewards = np.asarray(compute(achieved, desired, {}), dtype=np.float32)
         if not are_usable(rewards.ravel()):
-            error = bad_number([("compute_reward", rewards.ravel())], name_of(env))
-            if error is not None:
-                raise error
+            check_numbers([("compute_reward", rewards.ravel())], name_of(env))
         return rewards
 
     try:
@@ -176,12 +154,8 @@ tasks, as for the metric `evaluation/object_moved_share`."""
 def moved_distance_of(env: Env, reward: GoalReward) -> float | None:
     """The distance between achieved goals for `hindsight_episodes: moved`; resets `env`.
 
-    Returns:
-        None where the reward decides: a sparse one does not change within the success distance. A
-        dense one changes with any difference, also with the jitter of a resting object.
-
-    Raises:
-        ValueError: the reward is dense, and the environment has no `distance_threshold`.
+    None where the reward decides: a sparse one does not change within the success distance. A dense
+    one changes even with the jitter of a resting object, and needs a `distance_threshold`.
     """
     start = np.asarray(env.reset(seed=0)[0]["achieved_goal"], np.float32)[None]
     jitter = np.float32(1e-6) * np.maximum(1.0, np.abs(start))

@@ -21,7 +21,7 @@ class BadNumberError(RuntimeError):
 def are_usable(values: NDArray[np.float32]) -> bool:
     """Whether the length of the vector [N] is below `LARGEST`; takes half a microsecond.
 
-    If so, every number is finite and within `LARGEST`; if not, `bad_number` checks each of them.
+    If so, every number is finite and within `LARGEST`; if not, `check_numbers` checks each.
     """
     try:
         # NaN is not less than anything.
@@ -30,20 +30,17 @@ def are_usable(values: NDArray[np.float32]) -> bool:
         return False
 
 
-def bad_number(named: Iterable[tuple[str, Any]], where: str) -> BadNumberError | None:
-    """The error that names the first bad number among some arrays; None if all are good.
+def check_numbers(named: Iterable[tuple[str, Any]], where: str) -> None:
+    """Raises BadNumberError for the first bad number among named arrays [N] or numbers.
 
-    Args:
-        named: name and array [N], or number.
-        where: the environment and the step that returned them, for the message.
+    `where` names the environment and the step that returned them.
     """
     for name, values in named:
         flat = np.atleast_1d(np.asarray(values, np.float64))
         bad = np.flatnonzero(~(np.abs(flat) <= LARGEST))
         if len(bad):
             entry = f"{name}[{bad[0]}]" if np.ndim(values) else name
-            return BadNumberError(
+            raise BadNumberError(
                 f"{where}: {entry} is {flat[bad[0]]:g}, {_RULE}\n"
                 "The run stops before anything is learned from it; its last checkpoint is good."
             )
-    return None

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from music_rllib.envs.numbers import LARGEST, are_usable, bad_number
+from music_rllib.envs.numbers import LARGEST, are_usable, check_numbers
 from music_rllib.replay.trajectories import ReplayLayout, Trajectory
 
 Floats = NDArray[np.float32]
@@ -52,11 +52,7 @@ class Recording:
         return f"{self._name}, step {self.steps}"
 
     def see(self, observation: Any) -> None:
-        """Records the next observation.
-
-        Raises:
-            BadNumberError: a number in it is NaN, infinite or huge.
-        """
+        """Records the next observation; raises BadNumberError for a bad number."""
         frame, layout = self._frames[self.steps], self._layout
         if layout.goal == 0:
             frame[:] = observation
@@ -67,11 +63,7 @@ class Recording:
             frame[layout.network_input :] = observation["achieved_goal"]
         if not are_usable(frame):
             given = {"observation": observation} if layout.goal == 0 else observation
-            error = bad_number(
-                [(name, given[name]) for name in _PARTS if name in given], self.place
-            )
-            if error is not None:
-                raise error
+            check_numbers([(name, given[name]) for name in _PARTS if name in given], self.place)
 
     @property
     def network_input(self) -> Floats:
@@ -79,20 +71,14 @@ class Recording:
         return self._frames[self.steps, : self._layout.network_input]
 
     def step(self, action: Floats, reward: float, success: float | None, observation: Any) -> None:
-        """Records a step.
-
-        Raises:
-            BadNumberError: a number that the environment returned is NaN, infinite or huge.
-        """
+        """Records a step; raises BadNumberError for a bad number."""
         self._actions[self.steps] = action
         self._rewards[self.steps] = reward
         if success is not None:
             self._successes.append(bool(success))
         self.steps += 1
         if not abs(reward) <= LARGEST:
-            error = bad_number([("reward", reward)], self.place)
-            assert error is not None
-            raise error
+            check_numbers([("reward", reward)], self.place)
         self.see(observation)
 
     def finish(self, *, terminated: bool) -> Episode:

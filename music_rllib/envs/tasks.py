@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Annotated, Any, Self
 
@@ -55,11 +55,7 @@ Indices = Annotated[
 
 
 def check_split(agent_indices: Sequence[int], surrounding_indices: Sequence[int]) -> None:
-    """Checks a split into agent and surrounding state; both empty is no split.
-
-    Raises:
-        ValueError: one of the two is empty, or an index is used twice.
-    """
+    """Checks agent and surrounding state: both or none, no index twice; raises ValueError."""
     if bool(agent_indices) != bool(surrounding_indices):
         missing = "surrounding_indices" if agent_indices else "agent_indices"
         raise ValueError(f"{missing} must be given too: a split needs both parts")
@@ -180,35 +176,21 @@ class UnknownTaskError(LookupError):
     """A task name that is neither built in nor declared; the message suggests close ones."""
 
 
-class TaskRegistry(Mapping[str, Task]):
-    """The built-in tasks and those of a user.
-
-    Raises:
-        ValueError: a user's task has the name of another task.
-    """
+class TaskRegistry(dict[str, Task]):
+    """The built-in tasks and those of a user, whose names must be new, by name."""
 
     def __init__(self, user_tasks: Iterable[Task] = ()) -> None:
-        self._tasks = dict(BUILT_IN_TASKS)
+        super().__init__(BUILT_IN_TASKS)
         for task in user_tasks:
-            if task.name in self._tasks:
+            if task.name in self:
                 kind = "a built-in task" if task.name in BUILT_IN_TASKS else "declared twice"
                 raise ValueError(f"{task.name} is {kind}; choose another name")
-            self._tasks[task.name] = task
+            self[task.name] = task
 
-    def __getitem__(self, name: str) -> Task:
-        try:
-            return self._tasks[name]
-        except KeyError:
-            known = ", ".join(self._tasks)
-            raise UnknownTaskError(
-                f"must be a known task ({known}), got {name!r}{closest(name, self._tasks)}"
-            ) from None
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._tasks)
-
-    def __len__(self) -> int:
-        return len(self._tasks)
+    def __missing__(self, name: str) -> Task:
+        raise UnknownTaskError(
+            f"must be a known task ({', '.join(self)}), got {name!r}{closest(name, self)}"
+        )
 
 
 def closest(name: str, known: Iterable[str]) -> str:

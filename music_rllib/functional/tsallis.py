@@ -26,15 +26,12 @@ _SHANNON = 1e-9
 
 
 def ln_q_of_log(log_x: Tensor, q: float, *, max_exponent: float = math.inf) -> Tensor:
-    """ln_q of x, given ln x.
+    """(x^(q-1) - 1)/(q-1) (paper eq. 4), given ln x: [...] -> [...].
 
     Args:
         log_x: [...] natural logarithms, in nats.
         q: entropic index, any real number.
         max_exponent: where (q-1) ln x exceeds this, ln_q continues along its tangent.
-
-    Returns:
-        [...] values of (x^(q-1) - 1)/(q-1); paper eq. 4.
     """
     order = q - 1.0
     if abs(order) < _SHANNON:
@@ -72,16 +69,13 @@ def exp_q(y: Tensor, q: float) -> Tensor:
 
 
 def ln_q_of_policy(log_density: Tensor, q: float, form: str) -> Tensor:
-    """ln_q of a factored policy's density, bounded by `MAX_EXPONENT`.
+    """[B] ln_q of a factored policy's density, bounded by `MAX_EXPONENT`.
 
     Args:
         log_density: [B, A] log-density of each action dimension.
         q: entropic index > 0.
         form: "per_dimension" sums ln_q over dimensions (Lee et al. 2019's code);
             "joint" takes ln_q of the product of densities (the paper's equations).
-
-    Returns:
-        [B]
     """
     if form == "per_dimension":
         return ln_q_of_log(log_density, q, max_exponent=MAX_EXPONENT).sum(-1)

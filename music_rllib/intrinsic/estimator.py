@@ -105,15 +105,12 @@ class MutualInformationEstimator(nn.Module):
     def bound(
         self, observations: Tensor, permutations: Tensor, inside: Tensor | None = None
     ) -> Tensor:
-        """Bound on I(surrounding; agent) of each trajectory, in nats.
+        """Bound on I(surrounding; agent) of each trajectory: [N] nats.
 
         Args:
             observations: [N, T, D]
             permutations: [N, T] of time, for the product of the marginals.
             inside: [N, T] False for padding behind shorter trajectories; None: no padding.
-
-        Returns:
-            [N]
         """
         if self.compiled and observations.device.type == "cpu" and not torch.is_grad_enabled():
             data = self.data(observations, permutations, inside)
@@ -126,16 +123,11 @@ class MutualInformationEstimator(nn.Module):
     def transition_bounds(
         self, states: Tensor, followers: Tensor, *, swapped: bool = True
     ) -> Tensor:
-        """The bounds on the two-frame fragments of transitions, in nats.
+        """Bounds on transitions from states [B, D] to `followers` [B, D]: [B] nats.
 
-        Args:
-            states: [B, D]
-            followers: [B, D] the next states.
-            swapped: pair each frame with the other one's surroundings. False is the identity
-                permutation, which the original draws for half of its minibatches: <= 0.
-
-        Returns:
-            [B]
+        Each is of the two-frame trajectory. `swapped` pairs each frame with the surroundings of the
+        other one; False is the identity permutation, which the original draws for half of its
+        minibatches: <= 0.
         """
         frames = torch.stack([states, followers], dim=1)
         return self.bound(frames, two_frames(len(frames), swapped).to(frames.device))
@@ -143,11 +135,11 @@ class MutualInformationEstimator(nn.Module):
     def learn(
         self, pairs: Data, trajectories: Data, optimizer: FusedAdam, updates: int
     ) -> tuple[Tensor, Tensor]:
-        """Trains on a CPU by compiled code; each update ascends the mean bound of its trajectories.
+        """Trains on a CPU by compiled code; each of the K updates ascends the mean bound.
 
         Args:
             pairs: [K*B] pairs of frames, whose bounds are taken before their update.
-            trajectories: [K*N]
+            trajectories: [K*N] the training data.
             optimizer: of this module's parameters.
             updates: K.
 

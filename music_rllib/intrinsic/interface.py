@@ -40,7 +40,9 @@ class IntrinsicReward(Protocol):
         *,
         first: bool,
     ) -> Sequence[Hashable]:
-        """Draws the random numbers of K updates.
+        """Draws the random numbers of K updates, one value each, for `reward`.
+
+        As a CUDA graph, an update is recorded once per different value, so there should be few.
 
         Args:
             updates: K.
@@ -48,10 +50,6 @@ class IntrinsicReward(Protocol):
                 nothing is trained.
             generator: the Learner's.
             first: whether these are the run's first updates.
-
-        Returns:
-            K values, each for `reward` of one update. As a CUDA graph, an update is recorded once
-            for each different value, so there should be few.
         """
 
     def reward(self, states: Tensor, followers: Tensor, drawn: Hashable) -> Tensor:
@@ -69,15 +67,8 @@ class IntrinsicReward(Protocol):
     ) -> tuple[Tensor, dict[str, Tensor]]:  # fmt: skip
         """Updates its networks K times on a CPU, without autograd where it can.
 
-        Args:
-            states: [K, B, D]
-            followers: [K, B, D] the next states.
-            drawn: the K values of `draw`.
-            trajectories: [K*N, T, D]
-            optimizer: of its networks.
-
-        Returns:
-            [K, B] rewards, each minibatch's before its update, and metrics by name, [K] each.
+        Takes states and followers [K, B, D], the K values of `draw`, and trajectories [K*N, T, D].
+        Returns [K, B] rewards, each minibatch's before its update, and metrics by name, [K] each.
         """
 
     def observe(

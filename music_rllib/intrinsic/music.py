@@ -26,12 +26,7 @@ PRIORITY_CLIP = 2e-4
 
 
 class Music:
-    """MUSIC's reward, an `IntrinsicReward`.
-
-    Args:
-        settings: say whether there is an estimator, and how time is shuffled.
-        estimator: None where the settings have none.
-    """
+    """MUSIC's reward, an `IntrinsicReward`; `estimator` is None where the settings have none."""
 
     def __init__(
         self, settings: MusicSettings, estimator: MutualInformationEstimator | None

@@ -78,12 +78,7 @@ class _FlatMoments(NamedTuple):
 
 
 class FusedAdam(torch.optim.Adam):
-    """`torch.optim.Adam(fused=True)` of one parameter group: same state, same bits.
-
-    Args:
-        parameters: of one device.
-        lr: learning rate.
-    """
+    """`torch.optim.Adam(fused=True)` of parameters on one device: same state, same bits."""
 
     def __init__(self, parameters: Iterable[Tensor], lr: float) -> None:
         parameters = list(parameters)
@@ -117,8 +112,7 @@ class FusedAdam(torch.optim.Adam):
     def descent(self, flat: FlatParameters) -> Descent:
         """The arguments of `descend` for a step of all parameters by the gradients of `flat`.
 
-        Args:
-            flat: this optimizer's parameters, in their order, on a CPU.
+        `flat` has this optimizer's parameters, in their order, on a CPU.
         """
         group, moments = self.param_groups[0], self._flat_moments(flat)
         beta1, beta2 = group["betas"]

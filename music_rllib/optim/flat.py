@@ -12,10 +12,9 @@ _ALIGNMENT = 16
 
 
 class FlatParameters:
-    """Moves parameters into one tensor, of which they are views from then on.
+    """Moves parameters of one type and device into one tensor, of which they become views.
 
-    Args:
-        parameters: of one type and device. They keep their values; their `.data` is replaced.
+    The parameters keep their values; their `.data` is replaced.
     """
 
     def __init__(self, parameters: Sequence[Tensor]) -> None:
@@ -50,10 +49,7 @@ class FlatParameters:
         return self._starts[id(parameter)]
 
     def extent(self, parameters: Sequence[Tensor]) -> tuple[int, int]:
-        """The first position of neighbouring parameters, and the number of values up to their end.
-
-        The zeros between them are counted.
-        """
+        """The first position of neighbouring parameters, and the number of values to their end."""
         first, last = self.start(parameters[0]), self.start(parameters[-1])
         return first, last + parameters[-1].numel() - first
 

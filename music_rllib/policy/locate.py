@@ -25,13 +25,12 @@ def find_policy(wanted: str, storage: str) -> str:
     """The place from which `load_policy` loads the policy that a user names.
 
     Args:
-        wanted: a place (folder, file, URI), the key of a run or its beginning, or a run's label
-            or enough parts of it (`q=1.5/seed0`).
+        wanted: a place (folder, file, URI), which is returned as it is; the key of a run or its
+            beginning; or a run's label or enough parts of it (`q=1.5/seed0`).
         storage: the sweeps' storage, a folder or a URI, in which keys and labels are looked up.
 
     Returns:
-        The folder of a finished run, the newest checkpoint of an unfinished one, or `wanted`
-        where it is a place itself.
+        The folder of a finished run, or the newest checkpoint of an unfinished one.
 
     Raises:
         PolicyError: no run fits, or several do; the message lists them.
@@ -69,10 +68,7 @@ def find_policy(wanted: str, storage: str) -> str:
 
 
 def named_environment(env: str | None) -> str | tuple[Task, ...]:
-    """The environment that `--env` names, as `load_policy` takes it.
-
-    Args:
-        env: an environment's id, or a sweep's YAML file that declares environments.
+    """The environment of `--env` for `load_policy`: an id, or the tasks of a sweep's YAML file.
 
     Raises:
         ConfigError: that file can't be read, or is wrong.

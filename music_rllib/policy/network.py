@@ -95,17 +95,14 @@ class PolicyNetwork:
         return len(self.low)
 
     def act(self, observation: Any) -> Floats:
-        """The deterministic action.
+        """The deterministic action: [A], or [B, A] for a batch, within the environment's bounds.
 
         Args:
             observation: a dictionary with `observation` [O] and `desired_goal` [G] (more is
                 ignored), or an array [I] of both side by side; or batches of them, [B, ...].
 
-        Returns:
-            [A], or [B, A] for a batch, within the environment's bounds.
-
         Raises:
-            ValueError: something is missing, of another size, or not finite.
+            ValueError: a part is missing, of another size, or not finite.
         """
         inputs = self._inputs(observation)
         hidden = np.clip((inputs - self.mean) * self.inverse_std, -self.clip, self.clip)
@@ -160,11 +157,7 @@ class PolicyNetwork:
 
     @classmethod
     def from_file(cls, path: Path) -> PolicyNetwork:
-        """Reads a file of `to_bytes`.
-
-        Raises:
-            PolicyFileError: the file isn't there or isn't a policy.
-        """
+        """Reads a file of `to_bytes`; raises PolicyFileError where it is none."""
         try:
             _check_file(path)
             with safetensors.safe_open(path, framework="numpy") as file:
@@ -203,12 +196,7 @@ _UNREADABLE = (
 
 
 def _check_file(path: Path) -> None:
-    """Checks a file before it is parsed.
-
-    Raises:
-        ValueError: the file is not regular, or its header is too large.
-        OSError: the file can't be read.
-    """
+    """Raises ValueError, before anything is parsed, for no regular file or a large header."""
     if not path.is_file():
         raise ValueError("it is no regular file")
     with path.open("rb") as file:

@@ -64,26 +64,26 @@ class Policy:
 
     @property
     def observation_size(self) -> int:
+        """Features of an observation, without goals."""
         return self.network.observation_size
 
     @property
     def goal_size(self) -> int:
+        """Features of a goal; 0 where the task has none."""
         return self.network.goal_size
 
     @property
     def input_size(self) -> int:
+        """Features of a flat input: observation and goal side by side."""
         return self.network.input_size
 
     @property
     def action_size(self) -> int:
+        """Dimensions of an action."""
         return self.network.action_size
 
     def act(self, observation: Any) -> Floats:
-        """The action in the environment's own units, float32 (see `PolicyNetwork.act`).
-
-        Raises:
-            ValueError: the observation isn't one of the task.
-        """
+        """The action in the environment's own units, float32 (see `PolicyNetwork.act`)."""
         return self.network.act(observation)
 
     def to_bytes(self) -> bytes:
@@ -120,11 +120,7 @@ def load_policy(place: str | Path, env: str | Sequence[Task] = ()) -> Policy:
 
 
 def policy_from_folder(folder: Path, env: str | Sequence[Task] = ()) -> Policy:
-    """The policy in a local node, checkpoint or handoff, or in an MLflow model's folder.
-
-    Args:
-        folder: the local folder.
-        env: as for `load_policy`.
+    """The policy in a local node, checkpoint, handoff or MLflow model; `env` as for `load_policy`.
 
     Raises:
         PolicyError: the weights don't fit their task or settings, or sub-folders hold several

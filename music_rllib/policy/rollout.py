@@ -44,8 +44,7 @@ class Moment(NamedTuple):
 def open_task(policy: Policy, **options: Any) -> Env:
     """Makes the policy's environment; `options` override the task's arguments of `gymnasium.make`.
 
-    Raises:
-        PolicyError: only the policy's file names it, it can't be made, or it doesn't fit.
+    Raises PolicyError where only the policy's file names it, it can't be made, or it doesn't fit.
     """
     known = policy.environment
     if known is None:
@@ -64,10 +63,8 @@ def open_task(policy: Policy, **options: Any) -> Env:
 
 def _check_fit(policy: Policy, env: Env) -> None:
     """Raises ValueError for an environment with other observations, goals or actions."""
-    theirs = (
-        *observation_sizes(env.observation_space),
-        *check_action_space(env.action_space).shape,
-    )
+    actions = check_action_space(env.action_space).shape
+    theirs = (*observation_sizes(env.observation_space), *actions)
     ours = (policy.observation_size, policy.goal_size, policy.action_size)
     if theirs != ours:
         raise ValueError(f"it has observations, goals and actions of {theirs}, the policy {ours}")
@@ -81,14 +78,9 @@ def _check_fit(policy: Policy, env: Env) -> None:
 def play(
     policy: Policy, env: Env, episodes: int, seed: int, see: Callable[[Moment], None] | None = None
 ) -> Iterator[EpisodeResult]:
-    """Plays `episodes` deterministic episodes; equal seeds give equal starts and goals.
+    """Plays `episodes` deterministic episodes in an environment of `open_task`.
 
-    Args:
-        policy: the policy.
-        env: from `open_task`.
-        episodes: number of episodes.
-        seed: determines all of their resets.
-        see: called with each moment of each episode.
+    Equal seeds give equal starts and goals. `see` is called with each moment of each episode.
     """
     for number in range(episodes):
         reset_seed = int(np.random.SeedSequence((seed, number)).generate_state(1)[0])

@@ -47,13 +47,7 @@ class VideoError(BadInputError, RuntimeError):
 def film(
     policy: Policy, episodes: int, seed: int, title: str
 ) -> tuple[list[Frame], list[EpisodeResult]]:
-    """Plays episodes and draws their frames: the scene, the step and the success.
-
-    Args:
-        policy: the policy.
-        episodes: number of episodes, one after the other.
-        seed: the seed of `rollout.play`, which plays the same episodes.
-        title: text above the picture.
+    """Plays and draws episodes; `seed` gives those of `rollout.play`, `title` is written above.
 
     Returns:
         Pictures [height, width, 3], and the results of the episodes.
@@ -141,8 +135,7 @@ def _draw(picture: Image.Image, title: str, moment: Moment, limit: int) -> Frame
 def find_renderer(chosen: str | None = None) -> tuple[str | None, str | None]:
     """Tries to render without a screen by `egl`, `osmesa`, or the user's own `MUJOCO_GL`.
 
-    Returns:
-        The name of the first that works and None, or None and the message why none does.
+    Returns the first name that works and None, or None and the message why none does.
     """
     reasons = []
     for name in [chosen] if chosen else ["egl", "osmesa"]:
@@ -182,9 +175,7 @@ context.free()
 def write_video(path: Path, frames: Sequence[Frame]) -> None:
     """Writes `frames` in the format that the path's ending names.
 
-    Raises:
-        VideoError: the ending is none of `FORMATS`, there is no encoder, or it fails.
-        OSError: the file can't be written.
+    Raises VideoError where it is none of `FORMATS`, there is no encoder, or the encoder fails.
     """
     if path.suffix.lower() == ".gif":
         _write_gif(path, frames)

@@ -87,16 +87,12 @@ class TrajectoryReplay(TrajectoryRing):
         """Transitions held."""
         return self._all_places.total
 
-    # -- storing --------------------------------------------------------------------------
-
     def extend(
         self, trajectories: Sequence[Trajectory], priorities: NDArray[np.float64] | None = None
     ) -> None:
         """Stores finished episodes in place of the oldest ones.
 
-        Args:
-            priorities: [N] MUSIC-p: episodes are drawn by the rank of these. Every call gives
-                them, or none does.
+        MUSIC-p gives `priorities` [N] with every call: episodes are drawn by their rank.
         """
         for i, trajectory in enumerate(trajectories):
             start, steps = self._store(trajectory), len(trajectory)
@@ -139,16 +135,10 @@ class TrajectoryReplay(TrajectoryRing):
             np.any(self._goal_reward(at_first, achieved) < self._goal_reward(achieved, achieved))
         )
 
-    # -- transitions, for TAC -------------------------------------------------------------
-
     def sample_transitions(self, count: int, *, importance_exponent: float = 0.0) -> Transitions:
         """Draws `count` transitions with replacement, uniformly or by priority.
 
-        Args:
-            importance_exponent: PER's beta, for the importance weights.
-
-        Raises:
-            ValueError: the replay is empty.
+        `importance_exponent` is PER's beta. Raises ValueError where the replay is empty.
         """
         start, step, length = self._draw(count)
         relabelled = self._hindsight_share > 0
@@ -199,17 +189,12 @@ class TrajectoryReplay(TrajectoryRing):
         if not self.trajectories:
             raise ValueError("cannot sample from an empty replay: collect an episode first")
 
-    # -- whole trajectories, for MUSIC ----------------------------------------------------
-
     def sample_trajectories(self, count: int) -> WholeTrajectories:
         """Draws the observations of `count` whole trajectories with replacement.
 
         Each is drawn in proportion to its steps, so that every state counts the same, as for the
         policy. Trajectories of a single step are drawn only where there are no others. T is the
-        length of the longest one held.
-
-        Raises:
-            ValueError: the replay is empty.
+        length of the longest one held. Raises ValueError where the replay is empty.
         """
         self._check_filled()
         places = self._whole_places
@@ -222,8 +207,6 @@ class TrajectoryReplay(TrajectoryRing):
         rows = start[:, None] + np.minimum(time, length[:, None])
         observations = self._read(rows, 0, self.layout.observation)
         return WholeTrajectories(observations, time <= length[:, None])
-
-    # -- checkpoints ----------------------------------------------------------------------
 
     def index(self) -> dict[str, Any]:
         """The rest of the state beside `packed`: rows of trajectories, priorities, generator.
@@ -289,9 +272,5 @@ class TrajectoryReplay(TrajectoryRing):
         return {"index": self.index(), "first": first, "trajectories": self.packed(first)}
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Continues exactly where `state()` was taken.
-
-        Raises:
-            ValueError: the state comes from a replay of other sizes.
-        """
+        """Continues exactly where `state()` was taken; ValueError for a replay of other sizes."""
         self.load_packed(state["index"], [(state["first"], state["trajectories"])])

@@ -20,7 +20,7 @@ STEPS_FROM_GUIDE = 3
 
 
 def ranges(starts: Indices, lengths: Indices) -> Indices:
-    """[N], [N] -> [sum of lengths]: start, start + 1, ... of each, behind each other."""
+    """[N], [N] -> [sum of lengths]: start, start + 1, ... of each, concatenated."""
     ends = np.cumsum(lengths)
     total = int(ends[-1]) if len(ends) else 0
     return np.repeat(starts - (ends - lengths), lengths) + np.arange(total)

@@ -24,15 +24,7 @@ from music_rllib.replay.trajectories import Floats, ReplayLayout, Rows, Trajecto
 
 
 class TrajectoryRing:
-    """Holds the newest trajectories that fit.
-
-    Args:
-        layout: sizes of a frame and an action, and the longest episode.
-        capacity: transitions of full episodes held at most, rounded down to whole episodes.
-
-    Raises:
-        ValueError: one episode does not fit.
-    """
+    """Holds the newest trajectories that fit into `capacity` transitions of full episodes."""
 
     def __init__(self, layout: ReplayLayout, capacity: int) -> None:
         if capacity < layout.horizon:
@@ -105,20 +97,14 @@ class TrajectoryRing:
         self._starts, self._lengths = self._starts[count:], self._lengths[count:]
 
     def _read(self, rows: Rows, first: int, count: int) -> Floats:
-        """Copies `count` numbers from column `first` of each row, reaching into the next row.
+        """Copies `count` numbers of `rows` [...] from column `first`, reaching into the next row.
 
-        Args:
-            rows: [...] rows of the ring.
-
-        Returns:
-            [..., count]. Each stretch is copied as a whole, not number by number.
+        Returns [..., count]. Each stretch is copied as a whole, not number by number.
         """
         stretch, stride = np.dtype((np.void, 4 * count)), self._steps.strides[0]
         fitting = (self._steps.nbytes - 4 * (first + count)) // stride + 1
         stretches = np.ndarray((fitting,), stretch, self._steps.data, 4 * first, (stride,))
         return stretches[rows].view(np.float32).reshape(*rows.shape, count)
-
-    # -- checkpoints ----------------------------------------------------------------------
 
     @property
     def oldest(self) -> int:
@@ -146,8 +132,7 @@ class TrajectoryRing:
     def _place(self, first: int, arrays: Mapping[str, NDArray[Any]]) -> int:
         """Writes those of the trajectories `first`, ... that are in the index to their rows.
 
-        Returns:
-            The number after the last one written.
+        Returns the number after the last one written.
         """
         lengths = np.asarray(arrays["lengths"], np.int64)
         begin, end = max(first, self.oldest), min(first + len(lengths), self.trajectories_added)

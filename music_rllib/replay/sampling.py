@@ -52,13 +52,9 @@ class Places:
         return self.starts[which], step, self.lengths[which]
 
     def few_of_one(self, rng: np.random.Generator, count: int, share: float) -> Rows:
-        """Chooses which of `count` transitions to draw from these trajectories.
+        """Those of `count` transitions, a `share` of a minibatch, to draw from these trajectories.
 
-        Args:
-            share: the share of a minibatch that the `count` transitions make up.
-
-        Returns:
-            Positions: all, or so few that `MOST_OF_ONE_EPISODE` holds for the longest trajectory.
+        All of them, or so few that `MOST_OF_ONE_EPISODE` holds for the longest trajectory.
         """
         of_longest = share * self.longest / self.total
         if of_longest <= MOST_OF_ONE_EPISODE:

@@ -32,15 +32,10 @@ class Segment:
 def new_segments(
     replay: TrajectoryReplay, stored: Sequence[Segment], write: Callable[[str, Arrays], str]
 ) -> list[Segment]:
-    """Writes the trajectories that no stored segment has.
+    """Writes the trajectories that none of the `stored` segments (oldest first) has.
 
-    Args:
-        replay: the replay to save.
-        stored: segments that are written already, oldest first.
-        write: writes arrays under a label and returns the name of the segment.
-
-    Returns:
-        The segments that hold all of the replay, oldest first.
+    `write` takes a label and arrays and returns the name of the segment. Returns the segments that
+    hold all of the replay, oldest first.
     """
     needed = [segment for segment in stored if segment.end > replay.oldest]
     first = max([replay.oldest, *(segment.end for segment in needed)])

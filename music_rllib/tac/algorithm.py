@@ -20,7 +20,6 @@ from ray.rllib.core import (
 from ray.rllib.core.columns import Columns
 from ray.rllib.env.env_runner_group import EnvRunnerGroup
 from ray.rllib.policy.sample_batch import MultiAgentBatch, SampleBatch
-from ray.rllib.utils.checkpoints import Checkpointable
 from ray.rllib.utils.metrics import (
     ENV_RUNNER_RESULTS,
     ENV_RUNNER_SAMPLING_TIMER,
@@ -54,7 +53,7 @@ class TAC(Algorithm):
     """Tsallis Actor-Critic (paper Fig. 3), with MUSIC's intrinsic reward where configured."""
 
     REPLAY = "replay"
-    """Name of the checkpoint component with the trajectories."""
+    """Name of the trajectories' part of the state."""
 
     @classmethod
     def get_default_config(cls) -> TACConfig:
@@ -285,10 +284,9 @@ class TAC(Algorithm):
         return by_network(state)
 
     def set_network_weights(self, weights: Mapping[str, Mapping[str, NDArray[Any]]]) -> None:
-        """Loads the given networks, as `get_network_weights` returns them; the others are kept.
+        """Loads the given networks, as `get_network_weights` returns them; keeps the others.
 
-        Raises:
-            ValueError: an unknown network, or tensors that are missing, unknown or of other shape.
+        Raises ValueError for an unknown network, and for missing, unknown or misshapen tensors.
         """
         modules = by_module(weights, self.get_network_weights())
         self.learner_group.foreach_learner(
@@ -300,18 +298,12 @@ class TAC(Algorithm):
 
     # -- checkpoints ----------------------------------------------------------------------
 
-    def get_checkpointable_components(self) -> list[tuple[str, Checkpointable]]:
-        return [
-            *super().get_checkpointable_components(),
-            (self.REPLAY, _ReplayComponent(self.replay)),
-        ]
-
     def get_state(
         self, components: Any = None, *, not_components: Any = None, **kw: Any
     ) -> StateDict:
         state = super().get_state(components, not_components=not_components, **kw)
         if self._check_component(self.REPLAY, components, not_components):
-            state[self.REPLAY] = _ReplayComponent(self.replay).get_state()
+            state[self.REPLAY] = self.replay.state()
         state[_COUNTERS] = {"env_steps": self.env_steps, "grad_updates": self.grad_updates}
         state[_RUNNERS] = dict(self._runner_states)
         return state
@@ -340,21 +332,3 @@ _REPLAY_STREAM = 101
 def _random_state(runner: TrajectoryEnvRunner) -> tuple[int, StateDict]:
     """The worker index, and the state of the runner without its weights."""
     return runner.worker_index, runner.get_state(not_components=COMPONENT_RL_MODULE)
-
-
-class _ReplayComponent(Checkpointable):
-    """The replay as a component of RLlib's checkpoints."""
-
-    def __init__(self, replay: TrajectoryReplay) -> None:
-        self._replay = replay
-
-    def get_state(
-        self, components: Any = None, *, not_components: Any = None, **kw: Any
-    ) -> StateDict:
-        return self._replay.state()
-
-    def set_state(self, state: StateDict) -> None:
-        self._replay.load_state(state)
-
-    def get_ctor_args_and_kwargs(self) -> tuple[tuple[Any, ...], dict[str, Any]]:
-        return (), {}

@@ -22,17 +22,9 @@ class NonFiniteLossError(RuntimeError):
 
 
 def check_finite(keys: Sequence[str], table: Tensor, updates: int, q: float, alpha: float) -> None:
-    """Checks the metrics of a call.
+    """Raises NonFiniteLossError where a metric of a call is not finite.
 
-    Args:
-        keys: names of the M metrics.
-        table: [K, M]
-        updates: updates of the run so far, these K included.
-        q: entropic index, for the message.
-        alpha: entropy coefficient, for the message.
-
-    Raises:
-        NonFiniteLossError: a metric is not finite.
+    `table` is [K, M] with the metrics named by `keys`, `updates` the number of the last update.
     """
     bad = ~torch.isfinite(table)
     if not bad.any():
@@ -51,13 +43,10 @@ def check_finite(keys: Sequence[str], table: Tensor, updates: int, q: float, alp
 def of_updates(
     observed: Mapping[str, Tensor], settings: TACSettings, q: float
 ) -> dict[str, Tensor]:
-    """Metrics of K updates, [K] each.
+    """Metrics of K updates, [K] each, from their observed tensors.
 
-    Args:
-        observed: `q_values` [K, C, B] and `targets` [K, B]; of a stochastic policy `log_density`
-            and `log_std` [K, B, A]; of an intrinsic reward `intrinsic` [K, B].
-        settings: TAC's.
-        q: entropic index.
+    `observed` has `q_values` [K, C, B] and `targets` [K, B]; with a stochastic policy `log_density`
+    and `log_std` [K, B, A]; with an intrinsic reward `intrinsic` [K, B].
     """
     target = observed["targets"]
     metrics = {names.Q_MEAN: observed["q_values"].mean((1, 2))}

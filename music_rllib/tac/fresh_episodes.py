@@ -22,18 +22,14 @@ from music_rllib.tac.rl_module import TACModule, choose_action
 
 @dataclass(frozen=True, kw_only=True)
 class FreshEpisodes:
-    """Episodes as tensors, concatenated."""
+    """Concatenated episodes: states and next states [S, I], actions [S, A], task rewards [S]."""
 
     states: Tensor
-    """[S, I]"""
     followers: Tensor
-    """[S, I] the next states."""
     actions: Tensor
-    """[S, A]"""
     rewards: Tensor
-    """[S] the task's rewards."""
     lengths: list[int]
-    """[E]"""
+    """[E] steps of each episode."""
     terminated: NDArray[np.bool_]
     """[E]"""
 
@@ -65,7 +61,7 @@ def critic_bias(
 
     Args:
         fresh: the episodes.
-        rewards: [S] total rewards, with the intrinsic one.
+        rewards: [S] with the intrinsic reward.
         module: TAC's networks.
         objective: gives the entropy's part of the return, and the value after a truncation.
         noise: standard normal noise [S, A] for the policy's actions, by name.

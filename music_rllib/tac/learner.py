@@ -58,8 +58,6 @@ LOSSES = "losses"
 class TACLearner(TorchLearner):
     """Tsallis actor-critic updates (paper III-B), with an intrinsic reward where configured."""
 
-    # -- construction ---------------------------------------------------------------------
-
     def build(self) -> None:
         quiet_third_parties()  # a remote Learner is a process of its own
         keep_freed_memory()
@@ -159,8 +157,7 @@ class TACLearner(TorchLearner):
     ) -> ResultDict:
         """Does one update for each minibatch of the batch, and logs the means of their metrics.
 
-        Raises:
-            diagnostics.NonFiniteLossError: a loss is not finite.
+        Raises `diagnostics.NonFiniteLossError` where a loss is not finite.
         """
         self._check_is_built()
         self.before_gradient_based_update(timesteps=timesteps or {})
@@ -214,8 +211,7 @@ class TACLearner(TorchLearner):
     def _step(self, minibatch: FlatMinibatch, constants: UpdateConstants) -> dict[str, Tensor]:
         """Updates every network but the targets by autograd, without waiting for the device.
 
-        Returns:
-            `LOSSES` [M], in the order of `_names_of_losses`, and tensors for the diagnostics.
+        Returns `LOSSES` [M], in the order of `_names_of_losses`, and tensors for the diagnostics.
         """
         columns: Minibatch = {}
         for (module_id, name), values in minibatch.items():

@@ -47,12 +47,9 @@ def _precision(bf16: bool, inputs: Tensor) -> AbstractContextManager[None]:
 
 
 class Critics(nn.Module):
-    """Q1 and Q2 of equal shape, evaluated together: one batched matrix product a layer.
+    """C critics of equal shape, evaluated together: one batched matrix product a layer.
 
-    The first layer of both reads the same input, so it is a single product.
-
-    Args:
-        count: C, two unless the algorithm has a single critic (DDPG).
+    C is 2, or 1 for DDPG. The first layer of both reads the same input, so it is a single product.
     """
 
     def __init__(
@@ -73,9 +70,8 @@ class Critics(nn.Module):
     def forward(self, inputs: Tensor, *, frozen: bool = False) -> Tensor:
         """[B, I] -> [C, B].
 
-        Args:
-            frozen: gradients reach the inputs only. The policy's step needs just those, and a
-                third of its work is saved.
+        With `frozen`, gradients reach the inputs only: enough for the policy's step, and a third
+        less work.
         """
         *hidden_layers, (weight, bias) = self._layers(frozen)
         with _precision(self.bf16, inputs):

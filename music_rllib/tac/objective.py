@@ -35,10 +35,7 @@ class Losses(NamedTuple):
 class Objective:
     """TAC's losses (paper III-B) with the current networks, q and alpha.
 
-    Args:
-        settings: of TAC.
-        module: its networks, with log alpha where it is learned.
-        now: the current values of scheduled settings.
+    `module` has TAC's networks, with log alpha where it is learned; `now` the scheduled settings.
     """
 
     def __init__(self, settings: TACSettings, module: TACModule, now: ScheduledSettings) -> None:
@@ -111,13 +108,7 @@ class Objective:
     def excess_entropy(self, log_density: Tensor, log_std: Tensor, ln_q_pi: Tensor) -> Tensor:
         """The policy's entropy minus the target of a learned alpha, in the target's own measure.
 
-        Args:
-            log_density: [B, A]
-            log_std: [B, A]
-            ln_q_pi: [B]
-
-        Returns:
-            [] the derivative of alpha's loss by log alpha.
+        [] from log_density and log_std [B, A] and ln_q_pi [B]; the derivative of alpha's loss.
         """
         alpha = self._settings.alpha
         assert isinstance(alpha, LearnedAlpha)

@@ -64,8 +64,6 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
             self.log_alpha = nn.Parameter(torch.tensor(settings.alpha.initial).log())
         self.make_target_networks()
 
-    # -- acting ---------------------------------------------------------------------------
-
     def policy_parameters(self, normalised: Tensor) -> tuple[Tensor, Tensor | None]:
         """[B, I] -> mean [B, A] before tanh, log standard deviation [B, A] within its bounds."""
         return self.distribution(self.policy(normalised))
@@ -93,8 +91,6 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
         inputs = _network_inputs(batch[Columns.OBS])
         noise = torch.randn(inputs.shape[0], self.action_size, device=inputs.device)
         return {Columns.ACTIONS: self.act(inputs, noise)}
-
-    # -- learning -------------------------------------------------------------------------
 
     def _forward_train(self, batch: dict[str, Any], **kwargs: Any) -> dict[str, Any]:
         """All that the losses need; `batch` is documented at `TACLearner`."""

@@ -14,11 +14,8 @@ from music_rllib.schedules import Follower, Linear, Measured, Piecewise, Quantit
 class ScheduledSettings:
     """Settings that change over a run, at the time of the last `advance`.
 
-    Args:
-        tac: TAC's settings, with q and alpha.
-        music: MUSIC's settings, with the weight.
-        total_env_steps: the run's budget; 0 where it is not known.
-        actions: action dimensions.
+    `total_env_steps` is the run's budget, 0 where it is not known; `actions` the number of action
+    dimensions.
     """
 
     entropic_index: float

@@ -35,12 +35,8 @@ def by_module(
 ) -> dict[str, dict[str, NDArray[Any]]]:
     """The states of the Learner's modules, from the arrays of some networks.
 
-    Args:
-        weights: the arrays, of this version or an earlier one.
-        own: the current arrays of all networks.
-
-    Raises:
-        ValueError: an unknown network, or tensors that are missing, unknown or of other shape.
+    `weights` may be of an earlier version; `own` are the current arrays of all networks. Raises
+    ValueError for an unknown network, and for missing, unknown or misshapen tensors.
     """
     if "normaliser" in weights:
         weights = {**weights, "normaliser": in_this_form(weights["normaliser"])}
