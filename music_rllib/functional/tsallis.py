@@ -1,4 +1,4 @@
-"""Tsallis logarithm, exponential and entropies (paper II-C, eq. 4-5).
+"""The Tsallis logarithm of numbers and of policies (paper II-C, eq. 4-5).
 
 The paper's convention: ``ln_q x = (x^(q-1) - 1) / (q-1)``, which is ``ln x`` at q = 1. All is
 computed from log-densities: in float32 the power form is wrong by 0.27 at q = 1 + 1e-7.
@@ -56,18 +56,6 @@ def ln_q(x: Tensor, q: float) -> Tensor:
     return ln_q_of_log(torch.log(x), q)
 
 
-def exp_q(y: Tensor, q: float) -> Tensor:
-    """The q-exponential [1 + (q-1) y]_+ ^ (1/(q-1)) (paper eq. 4).
-
-    Zero (q > 1) or infinite (q < 1) where 1 + (q-1) y <= 0.
-    """
-    order = q - 1.0
-    if abs(order) < _SHANNON:
-        return torch.exp(y)
-    base = (order * y).clamp(min=-1.0)
-    return torch.exp(torch.log1p(base) / order)
-
-
 def ln_q_of_policy(log_density: Tensor, q: float, form: str) -> Tensor:
     """[B] ln_q of a factored policy's density, bounded by `MAX_EXPONENT`.
 
@@ -82,26 +70,3 @@ def ln_q_of_policy(log_density: Tensor, q: float, form: str) -> Tensor:
     if form == "joint":
         return ln_q_of_log(log_density.sum(-1), q, max_exponent=MAX_EXPONENT)
     raise ValueError(f"entropy_form must be per_dimension or joint, got {form!r}")
-
-
-def gaussian_entropy(std: Tensor, q: float) -> Tensor:
-    """S_q of a one-dimensional Gaussian, per standard deviation: [...] -> [...].
-
-    (1 - q^(-1/2) (2 pi std^2)^((1-q)/2)) / (q-1); the Shannon entropy at q = 1.
-    """
-    log_width = 0.5 * torch.log(2.0 * math.pi * std**2)
-    order = q - 1.0
-    if abs(order) < _SHANNON:
-        return log_width + 0.5
-    return -torch.expm1(-order * log_width - 0.5 * math.log(q)) / order
-
-
-def joint_entropy(per_dimension: Tensor, q: float) -> Tensor:
-    """S_q of independent dimensions together: [..., A] -> [...].
-
-    (1 - prod_i (1 - (q-1) S_i)) / (q-1); their sum at q = 1.
-    """
-    order = q - 1.0
-    if abs(order) < _SHANNON:
-        return per_dimension.sum(-1)
-    return (1.0 - torch.prod(1.0 - order * per_dimension, dim=-1)) / order

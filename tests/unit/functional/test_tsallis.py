@@ -14,13 +14,11 @@ from music_rllib.functional.entropy_scale import largest_entropy
 from music_rllib.functional.tsallis import (
     MAX_EXPONENT,
     bound_active,
-    exp_q,
-    gaussian_entropy,
-    joint_entropy,
     ln_q,
     ln_q_of_log,
     ln_q_of_policy,
 )
+from tests.unit.functional.entropies import exp_q, gaussian_entropy, joint_entropy
 
 orders = st.floats(0.5, 3.0)
 positive = st.floats(1e-3, 1e3)
