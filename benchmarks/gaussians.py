@@ -63,19 +63,21 @@ def trained_bound(rho: float, dims: int, seed: int, steps: int = 500) -> float:
     """Bound on held-out samples of an estimator trained on correlated Gaussians."""
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)
-    estimator = MutualInformationEstimator(dims, dims)
+    estimator = MutualInformationEstimator(range(dims), range(dims, 2 * dims))
     optimizer = torch.optim.Adam(estimator.parameters(), lr=1e-2)
     decay = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.05, steps)
     for _ in range(steps):
         x, y = correlated(rho, dims, 1, 1024, generator)
-        loss = -estimator.bound(x, y, time_permutations(1, 1024, generator)).mean()
+        loss = -estimator.bound(torch.cat([x, y], -1), time_permutations(1, 1024, generator)).mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
         decay.step()
     x, y = correlated(rho, dims, *HELD_OUT, generator)
     with torch.no_grad():
-        return float(estimator.bound(x, y, time_permutations(*HELD_OUT, generator)).mean())
+        return float(
+            estimator.bound(torch.cat([x, y], -1), time_permutations(*HELD_OUT, generator)).mean()
+        )
 
 
 def main() -> None:

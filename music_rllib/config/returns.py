@@ -76,10 +76,10 @@ def _entropy_bonus(tac: TACSettings) -> float:
     """Largest entropy bonus of a step: alpha times the entropy of one uniform action dimension."""
     if tac.policy == "deterministic":
         return 0.0
-    from music_rllib.functional.tsallis import uniform_entropy  # loads PyTorch
+    from music_rllib.functional.entropy_scale import largest_entropy  # loads PyTorch
 
     qs = extremes(tac.entropic_index)
-    return max(0.0, *(_largest_alpha(tac.alpha, q) * uniform_entropy(q) for q in qs))
+    return max(0.0, *(_largest_alpha(tac.alpha, q) * largest_entropy(q) for q in qs))
 
 
 def _largest_alpha(alpha: Alpha, q: float) -> float:

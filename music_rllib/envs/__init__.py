@@ -1,1 +1,1 @@
-"""Tasks: which environment, its horizon, and its split into agent and surrounding state."""
+"""Tasks and their environments: definitions, construction, checks, and Fetch's fast step."""

@@ -1,15 +1,10 @@
-"""gymnasium-robotics' notice about an environment that nobody here uses."""
+"""Silences gymnasium-robotics' notice about an environment that this package does not use."""
 
 from __future__ import annotations
 
-__all__ = ["drop_farama_notice"]
-
 
 def drop_farama_notice() -> None:
-    """Drop gymnasium-robotics' import-time notice about the Adroit hand; we use Fetch.
-
-    It is printed, not logged, while ``gymnasium_robotics`` is imported.
-    """
+    """Removes the notice about the Adroit hand, which ``gymnasium_robotics`` prints on import."""
     try:
         import farama_notifications as farama
     except ImportError:

@@ -1,10 +1,9 @@
-"""The Fetch tasks' own step, with every name looked up once instead of at every step.
+"""A faster step for the Fetch tasks, which looks every name up once instead of at every step.
 
-Gymnasium-Robotics finds joints, sites and bodies by name, some fifty times a step, and asks for
+Gymnasium-Robotics looks joints, sites and bodies up by name, some fifty times a step, and computes
 Jacobians one by one: half of a step's time is not physics. Here addresses and views of the
-simulator's arrays are resolved when the environment is made. Observations, rewards and the
-simulation itself are those of the original, bit for bit
-(`test_fast_fetch_steps_equal_the_originals_bit_for_bit`).
+simulator's arrays are found when the environment is made. Observations, rewards and simulation
+equal the original's bit for bit (`test_fast_fetch_steps_equal_the_originals_bit_for_bit`).
 """
 
 from __future__ import annotations
@@ -17,8 +16,6 @@ import mujoco
 import numpy as np
 from gymnasium_robotics.envs.fetch.fetch_env import MujocoFetchEnv
 from numpy.typing import NDArray
-
-__all__ = ["speed_up"]
 
 Floats = NDArray[np.float64]
 Goals = dict[str, Floats]
@@ -35,15 +32,15 @@ _REPLACED = (
     "compute_truncated",
     "_is_success",
 )
-"""Methods whose work `_FastFetch` does; an environment that has its own of one keeps them all."""
+"""Methods that `_FastFetch` replaces; an environment that overrides one of them is left alone."""
 
 _ROTATION = np.array([1.0, 0.0, 1.0, 0.0])
-"""What the original adds to the gripper's orientation (a quaternion, normalised by MuJoCo)."""
+"""Added to the gripper's orientation, as in the original (MuJoCo normalises the quaternion)."""
 _ALMOST_ZERO = np.finfo(np.float64).eps * 4.0
 
 
 def speed_up(env: gym.Env[Any, Any]) -> None:
-    """Gives a Fetch environment the faster step, in place; leaves every other one as it is."""
+    """Gives a Fetch environment the faster step, in place; does nothing to other environments."""
     unwrapped = env.unwrapped
     if not isinstance(unwrapped, MujocoFetchEnv) or unwrapped.render_mode == "human":
         return
@@ -82,15 +79,13 @@ class _FastFetch:
         self._low, self._high = env.action_space.low, env.action_space.high
 
     def _actuator(self, index: int) -> tuple[int, int | None]:
-        """Its control, and the position its target is relative to."""
+        """The index of its control, and the address of the position that its target adds to."""
         if self._model.actuator_biastype[index] == 0:
             return index, None
         return index, int(self._model.jnt_qposadr[self._model.actuator_trnid[index, 0]])
 
-    # -- stepping -------------------------------------------------------------------------
-
     def step(self, action: Any) -> tuple[Goals, Any, bool, bool, dict[str, Any]]:
-        """`BaseRobotEnv.step` of the Fetch tasks, [4] -> observation, reward, ..., info."""
+        """Takes one step, as `BaseRobotEnv.step`: [4] -> observation, reward, ..., info."""
         if np.shape(action) != self._low.shape:
             raise ValueError("Action dimension mismatch")
         env = self._env
@@ -109,7 +104,7 @@ class _FastFetch:
         return observation, reward, False, False, {"is_success": success}
 
     def _control(self, action: NDArray[Any]) -> None:
-        """Moves the target that the hand is welded to, and the fingers."""
+        """Moves the fingers, and the target that the hand is welded to."""
         if self._actuators:
             opening = 0.0 if self._env.block_gripper else float(action[3])
             for index, address in self._actuators:
@@ -118,8 +113,6 @@ class _FastFetch:
         # At most 5 cm a step.
         self._mocap_position[:] = self._hand_position + action[:3] * 0.05
         self._mocap_quaternion[:] = self._hand_quaternion + _ROTATION
-
-    # -- observing ------------------------------------------------------------------------
 
     def observe(self) -> Goals:
         """The goal dictionary of the current state, in fresh arrays."""
@@ -151,14 +144,14 @@ class _FastFetch:
 
 
 def _id(model: Any, kind: Any, name: str) -> int:
-    found = int(mujoco.mj_name2id(model, kind, name))
-    if found < 0:
+    index = int(mujoco.mj_name2id(model, kind, name))
+    if index < 0:
         raise ValueError(f"the Fetch model has no {kind.name} {name!r}")
-    return found
+    return index
 
 
 def _weld(model: Any) -> tuple[int, int]:
-    """The mocap body and the body welded to it, which follows it."""
+    """The mocap body and the body welded to it."""
     (weld,) = [i for i in range(model.neq) if model.eq_type[i] == mujoco.mjtEq.mjEQ_WELD]
     first, second = int(model.eq_obj1id[weld]), int(model.eq_obj2id[weld])
     if model.body_mocapid[first] != -1:
@@ -167,7 +160,7 @@ def _weld(model: Any) -> tuple[int, int]:
 
 
 def _distance(achieved: Floats, desired: Floats) -> np.float64:
-    """Euclidean, summed in `numpy.linalg.norm`'s order."""
+    """Euclidean distance, summed in the order of `numpy.linalg.norm`."""
     x, y, z = (achieved - desired).tolist()
     return np.float64(math.sqrt(x * x + y * y + z * z))
 

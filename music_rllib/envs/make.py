@@ -1,4 +1,4 @@
-"""Making environments, and asking them what the learner needs to know."""
+"""Makes environments, and gets from them what the learner needs to know."""
 
 from __future__ import annotations
 
@@ -12,30 +12,16 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from music_rllib.envs.farama_notice import drop_farama_notice
-from music_rllib.envs.numbers import are_usable, bad_number
+from music_rllib.envs.numbers import are_usable, check_numbers
 from music_rllib.envs.tasks import BUILT_IN_TASKS, Task
 from music_rllib.replay.buffer import GoalReward
-
-__all__ = [
-    "Env",
-    "Known",
-    "check_action_space",
-    "episode_limit",
-    "goal_reward_of",
-    "is_gymnasium_id",
-    "known_environment",
-    "make_env",
-    "moved_distance_of",
-    "name_of",
-    "observation_sizes",
-]
 
 Env = gym.Env[Any, Any]
 
 
 @functools.cache
 def _register_robotics() -> None:
-    """Makes the Fetch tasks known to Gymnasium, without the package's notice on another hand."""
+    """Registers the robotics tasks with Gymnasium, without their package's notice."""
     drop_farama_notice()
     import gymnasium_robotics
 
@@ -43,44 +29,38 @@ def _register_robotics() -> None:
 
 
 def make_env(env_id: str, **kwargs: Any) -> Env:
-    """A Gymnasium environment by its id; the robotics tasks are registered on the way.
+    """Makes a Gymnasium environment by its id, with the robotics tasks registered.
 
-    The Fetch tasks take a faster step with the same results (`music_rllib.envs.fetch`).
-
-    Raises:
-        gymnasium.error.Error: unknown id or arguments.
+    The Fetch tasks get a faster step with the same results (`music_rllib.envs.fetch`). Raises
+    `gymnasium.error.Error` for unknown ids and arguments.
     """
     _register_robotics()
-    # The checker would cost a tenth of every step and only speaks to an environment's authors.
+    # The checker takes a tenth of every step, and helps only an environment's authors.
     env = gym.make(env_id, disable_env_checker=True, **kwargs)
-    from music_rllib.envs.fetch import speed_up  # not before the notice is dropped
+    from music_rllib.envs.fetch import speed_up  # after the notice is dropped
 
     speed_up(env)
     return env
 
 
 class Known(NamedTuple):
-    """An environment that may be made: the code and the arguments are not a file's choice."""
+    """An environment that may be made, because no file chose its code and arguments."""
 
     env_id: str
     kwargs: Mapping[str, Any]
 
 
 def known_environment(task: Task, vouched: Iterable[Task] = ()) -> Known | None:
-    """The environment of a task that came in a file; None where it would choose what runs.
+    """The environment of a task from a file; None where the file would choose the code that runs.
 
-    Known are those of the built-in tasks, what Gymnasium and Gymnasium-Robotics themselves have,
-    as it is without arguments (which may name files), and what the user vouches for.
-
-    Args:
-        task: From a file.
-        vouched: Tasks that the user declares or names.
+    Known are the environments of the built-in tasks and of the user's (`vouched`), and those of
+    Gymnasium and Gymnasium-Robotics without arguments, which may name files.
     """
-    for one in (*BUILT_IN_TASKS.values(), *vouched):
-        if (one.env_id, one.env_kwargs) == (task.env_id, task.env_kwargs):
-            return Known(one.env_id, one.env_kwargs)
+    for trusted in (*BUILT_IN_TASKS.values(), *vouched):
+        if (trusted.env_id, trusted.env_kwargs) == (task.env_id, task.env_kwargs):
+            return Known(trusted.env_id, trusted.env_kwargs)
     _register_robotics()
-    # With a module in front it would be imported before anything else is looked at.
+    # An id with a module in front would import the module before anything is checked.
     spec = None if ":" in task.env_id else gym.registry.get(task.env_id)
     if spec is None or task.env_kwargs or not isinstance(spec.entry_point, str):
         return None
@@ -89,17 +69,13 @@ def known_environment(task: Task, vouched: Iterable[Task] = ()) -> Known | None:
 
 
 def is_gymnasium_id(env: object) -> bool:
-    """Whether `env` is a Gymnasium id (`module:` in front or not), not one of Ray's, or a class."""
+    """Whether `env` is a Gymnasium id, with `module:` in front or not; no Ray id, and no class."""
     _register_robotics()
     return isinstance(env, str) and (":" in env or env in gym.registry)
 
 
 def observation_sizes(space: gym.Space[Any]) -> tuple[int, int]:
-    """Features of the observation and of the goal (0 without goals).
-
-    Raises:
-        ValueError: neither a flat Box nor a goal dictionary of flat boxes.
-    """
+    """Features of observation and goal (0 without goals); ValueError for other spaces."""
     if _is_flat(space):
         return int(space.shape[0]), 0  # type: ignore[index]
     if isinstance(space, spaces.Dict):
@@ -122,11 +98,7 @@ def _is_flat(space: gym.Space[Any] | None) -> bool:
 
 
 def check_action_space(space: gym.Space[Any]) -> spaces.Box:
-    """The space, if TAC can act in it.
-
-    Raises:
-        ValueError: not a bounded one-dimensional Box.
-    """
+    """Returns the space; raises ValueError unless it is a bounded one-dimensional Box."""
     if not (isinstance(space, spaces.Box) and len(space.shape) == 1 and space.is_bounded("both")):
         raise ValueError(
             f"environment: the action space must be a bounded one-dimensional Box, got {space}"
@@ -135,29 +107,22 @@ def check_action_space(space: gym.Space[Any]) -> spaces.Box:
 
 
 def episode_limit(env: Env, setting: int | None) -> int:
-    """Steps of the longest episode: the smaller of the environment's limit and the setting.
-
-    Raises:
-        ValueError: neither is given.
-    """
-    limits = [setting, env.spec.max_episode_steps if env.spec is not None else None]
-    given = [limit for limit in limits if limit is not None]
-    if not given:
+    """Steps of the longest episode: the smaller of `setting` and the environment's own limit."""
+    own = env.spec.max_episode_steps if env.spec is not None else None
+    limits = [limit for limit in (setting, own) if limit is not None]
+    if not limits:
         raise ValueError(
             "tac.max_episode_steps must be set: the environment has no time limit of its own"
         )
-    return min(given)
+    return min(limits)
 
 
 def goal_reward_of(env: Env) -> GoalReward:
-    """The environment's reward as a function of achieved and desired goals, vectorised.
+    """The environment's reward as a vectorised function of achieved and desired goals.
 
-    Whether it is one is tried out, which resets `env` and takes one step in it: HER would learn
-    from wrong rewards without any sign of it (HandManipulatePen of Gymnasium-Robotics 1.4.2 mixes
-    up the rows of a batch).
-
-    Raises:
-        ValueError: no such function, or one that is not a function of each row's goals alone.
+    Resets `env` and takes one step in it to check the function: HER would silently learn from wrong
+    rewards (HandManipulatePen of Gymnasium-Robotics 1.4.2 mixes up the rows of a batch). Raises
+    ValueError where a row's reward depends on more than its goals.
     """
     compute = getattr(env.unwrapped, "compute_reward", None)
     if compute is None or not isinstance(env.observation_space, spaces.Dict):
@@ -169,9 +134,7 @@ def goal_reward_of(env: Env) -> GoalReward:
     def reward(achieved: NDArray[np.float32], desired: NDArray[np.float32]) -> NDArray[Any]:
         rewards = np.asarray(compute(achieved, desired, {}), dtype=np.float32)
         if not are_usable(rewards.ravel()):
-            error = bad_number([("compute_reward", rewards.ravel())], name_of(env))
-            if error is not None:
-                raise error
+            check_numbers([("compute_reward", rewards.ravel())], name_of(env))
         return rewards
 
     try:
@@ -184,19 +147,15 @@ def goal_reward_of(env: Env) -> GoalReward:
 
 
 MOVED_SHARE = 0.2
-"""Share of a task's success distance from which on what is achieved counts as moved: 1 cm in the
-Fetch tasks, as for the metric `evaluation/object_moved_share`."""
+"""Share of a task's success distance from which an achieved goal counts as moved: 1 cm in the Fetch
+tasks, as for the metric `evaluation/object_moved_share`."""
 
 
 def moved_distance_of(env: Env, reward: GoalReward) -> float | None:
-    """How far achieved goals must be apart for `hindsight_episodes: moved`; resets `env`.
+    """The distance between achieved goals for `hindsight_episodes: moved`; resets `env`.
 
-    Returns:
-        None where the reward decides: a sparse one does not change within the success distance.
-        A dense one tells any two goals apart, a resting object's jitter included.
-
-    Raises:
-        ValueError: a dense reward, and the environment does not say its success distance.
+    None where the reward decides: a sparse one does not change within the success distance. A dense
+    one changes even with the jitter of a resting object, and needs a `distance_threshold`.
     """
     start = np.asarray(env.reset(seed=0)[0]["achieved_goal"], np.float32)[None]
     jitter = np.float32(1e-6) * np.maximum(1.0, np.abs(start))
@@ -212,7 +171,7 @@ def moved_distance_of(env: Env, reward: GoalReward) -> float | None:
 
 
 def _is_vectorised(reward: GoalReward, env: Env) -> bool:
-    """Whether goals around the first achieved one are worth the same alone and in a batch."""
+    """Whether goals around the first achieved one have the same rewards alone and in a batch."""
     rng, rows = np.random.default_rng(0), 256
     start = np.asarray(env.reset(seed=0)[0]["achieved_goal"], np.float32)
     achieved = np.tile(start, (rows, 1))

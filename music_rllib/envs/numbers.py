@@ -1,4 +1,4 @@
-"""What an environment returns is looked at where it comes in: a NaN spreads to every weight."""
+"""Checks of the numbers that an environment returns, since a NaN spreads to every weight."""
 
 from __future__ import annotations
 
@@ -8,22 +8,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["LARGEST", "BadNumberError", "are_usable", "bad_number"]
-
 LARGEST = 1e15
-"""Beyond it, squared errors of returns a hundred times as large, summed over a minibatch, leave
-float32's range."""
+"""Largest accepted number: returns are up to a hundred times as large, and their squared errors,
+summed over a minibatch, must stay within float32's range."""
 _RULE = f"every number must be finite and within +-{LARGEST:g}"
 
 
 class BadNumberError(RuntimeError):
-    """NaN, infinity or an absurd number where nothing can be learned from it; says where."""
+    """An environment or a policy returned NaN, infinity or a huge number; says where."""
 
 
 def are_usable(values: NDArray[np.float32]) -> bool:
-    """Whether the numbers, [N], are surely finite and within `LARGEST`, in half a microsecond.
+    """Whether the length of the vector [N] is below `LARGEST`; takes half a microsecond.
 
-    Where they are not, `bad_number` finds out: the vector's length is what is looked at.
+    If so, every number is finite and within `LARGEST`; if not, `check_numbers` checks each.
     """
     try:
         # NaN is not less than anything.
@@ -32,20 +30,17 @@ def are_usable(values: NDArray[np.float32]) -> bool:
         return False
 
 
-def bad_number(named: Iterable[tuple[str, Any]], where: str) -> BadNumberError | None:
-    """The error that names the first bad one among some arrays; None if there is none.
+def check_numbers(named: Iterable[tuple[str, Any]], where: str) -> None:
+    """Raises BadNumberError for the first bad number among named arrays [N] or numbers.
 
-    Args:
-        named: name and array [N], or number.
-        where: who returned them and when.
+    `where` names the environment and the step that returned them.
     """
     for name, values in named:
         flat = np.atleast_1d(np.asarray(values, np.float64))
         bad = np.flatnonzero(~(np.abs(flat) <= LARGEST))
         if len(bad):
             entry = f"{name}[{bad[0]}]" if np.ndim(values) else name
-            return BadNumberError(
+            raise BadNumberError(
                 f"{where}: {entry} is {flat[bad[0]]:g}, {_RULE}\n"
                 "The run stops before anything is learned from it; its last checkpoint is good."
             )
-    return None

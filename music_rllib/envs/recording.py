@@ -1,4 +1,4 @@
-"""Arrays of an episode while it is played, from numbers that are looked at as they come in."""
+"""Records an episode while it is played, and checks every number of it."""
 
 from __future__ import annotations
 
@@ -8,10 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from music_rllib.envs.numbers import LARGEST, are_usable, bad_number
+from music_rllib.envs.numbers import LARGEST, are_usable, check_numbers
 from music_rllib.replay.trajectories import ReplayLayout, Trajectory
-
-__all__ = ["Episode", "Recording"]
 
 Floats = NDArray[np.float32]
 _PARTS = ("observation", "desired_goal", "achieved_goal")
@@ -22,7 +20,7 @@ class Episode(Trajectory):
     """A finished episode, and whether each of its steps was a success."""
 
     successes: NDArray[np.bool_] | None
-    """[n]; None where the environment does not say."""
+    """[n]; None where the environment does not define success."""
 
     def env_steps(self) -> int:
         return len(self)
@@ -36,8 +34,8 @@ class Recording:
 
     Args:
         layout: sizes of its arrays.
-        zero_goal: desired goals are taken for zeros.
-        name: of environment and episode, for messages.
+        zero_goal: whether desired goals are replaced by zeros.
+        name: name of environment and episode, for messages.
     """
 
     def __init__(self, layout: ReplayLayout, *, zero_goal: bool, name: str) -> None:
@@ -50,15 +48,11 @@ class Recording:
 
     @property
     def place(self) -> str:
-        """Where the episode stands, for messages."""
+        """Name of the episode and its current step, for messages."""
         return f"{self._name}, step {self.steps}"
 
     def see(self, observation: Any) -> None:
-        """Takes in the next observation.
-
-        Raises:
-            BadNumberError: something in it is NaN, infinite or absurd.
-        """
+        """Records the next observation; raises BadNumberError for a bad number."""
         frame, layout = self._frames[self.steps], self._layout
         if layout.goal == 0:
             frame[:] = observation
@@ -69,36 +63,26 @@ class Recording:
             frame[layout.network_input :] = observation["achieved_goal"]
         if not are_usable(frame):
             given = {"observation": observation} if layout.goal == 0 else observation
-            error = bad_number(
-                [(name, given[name]) for name in _PARTS if name in given], self.place
-            )
-            if error is not None:
-                raise error
+            check_numbers([(name, given[name]) for name in _PARTS if name in given], self.place)
 
     @property
     def network_input(self) -> Floats:
-        """[I] what the policy sees now."""
+        """[I] the policy's input at the current step."""
         return self._frames[self.steps, : self._layout.network_input]
 
     def step(self, action: Floats, reward: float, success: float | None, observation: Any) -> None:
-        """Takes in a step.
-
-        Raises:
-            BadNumberError: something that the environment returned is NaN, infinite or absurd.
-        """
+        """Records a step; raises BadNumberError for a bad number."""
         self._actions[self.steps] = action
         self._rewards[self.steps] = reward
         if success is not None:
             self._successes.append(bool(success))
         self.steps += 1
         if not abs(reward) <= LARGEST:
-            error = bad_number([("reward", reward)], self.place)
-            assert error is not None
-            raise error
+            check_numbers([("reward", reward)], self.place)
         self.see(observation)
 
     def finish(self, *, terminated: bool) -> Episode:
-        """The episode, when it is over."""
+        """The finished episode."""
         n = self.steps
         return Episode(
             self._frames[: n + 1],

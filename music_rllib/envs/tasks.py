@@ -2,8 +2,8 @@
 
 MUSIC (paper III-A) needs to know which observation entries belong to the agent (x, for Fetch the
 gripper's position) and which to its surroundings (y, the object's position). That split is part
-of a task's definition. Four Fetch tasks are built in; a user declares others in a sweep's YAML
-under ``environments:``::
+of a task's definition. Users declare tasks beside the built-in ones in a sweep's YAML under
+``environments:``::
 
     environments:
       MyPush:
@@ -19,37 +19,20 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Annotated, Any, Self
 
-from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    JsonValue,
-    model_validator,
-)
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, JsonValue, model_validator
 
 from music_rllib import names
 from music_rllib.limits import MOST_INDICES
-
-__all__ = [
-    "BUILT_IN_TASKS",
-    "Indices",
-    "Task",
-    "TaskRegistry",
-    "UnknownTaskError",
-    "check_split",
-    "closest",
-]
 
 _RANGE = re.compile(r"(\d+):(\d+)")
 
 
 def _expand_range(value: Any) -> Any:
-    """`"3:6"` becomes (3, 4, 5); whatever else is left for the validators."""
+    """Turns `"3:6"` into (3, 4, 5) and a list into a tuple; returns any other value unchanged."""
     if isinstance(value, list | tuple):
         if len(value) > MOST_INDICES:
             raise ValueError(f"must have at most {MOST_INDICES} entries, got {len(value)}")
@@ -72,11 +55,7 @@ Indices = Annotated[
 
 
 def check_split(agent_indices: Sequence[int], surrounding_indices: Sequence[int]) -> None:
-    """Whether these can be agent and surrounding state; both empty: there is no split.
-
-    Raises:
-        ValueError: one is missing, or an index is there twice, in one of them or in both.
-    """
+    """Checks agent and surrounding state: both or none, no index twice; raises ValueError."""
     if bool(agent_indices) != bool(surrounding_indices):
         missing = "surrounding_indices" if agent_indices else "agent_indices"
         raise ValueError(f"{missing} must be given too: a split needs both parts")
@@ -133,7 +112,7 @@ class Task(BaseModel):
 
     @property
     def primary_metric(self) -> str:
-        """What its runs are judged by: the success rate, or the return where it has no success."""
+        """The metric that compares its runs: the success rate, or the return without success."""
         return names.primary_metric(self.success_key)
 
     @property
@@ -142,9 +121,9 @@ class Task(BaseModel):
         return bool(self.surrounding_indices)
 
     def identity(self) -> dict[str, Any]:
-        """All that determines what the task is: neither its name nor how it is trained on."""
-        left_out = {"name", "reward_range", "mi_reward_weight", "moved_distance"}
-        return self.model_dump(mode="json", exclude=left_out)
+        """The settings that define the task, without its name and its training settings."""
+        excluded = {"name", "reward_range", "mi_reward_weight", "moved_distance"}
+        return self.model_dump(mode="json", exclude=excluded)
 
 
 _SPARSE = (-1.0, 0.0)
@@ -164,8 +143,8 @@ def _fetch(name: str, *, split: bool = True, mi_reward_weight: float = 1.0) -> T
 
 
 def _hand(name: str) -> Task:
-    # observation: 24 joint angles, their 24 velocities, the object's 6 velocities and its pose. Of
-    # the pose only the position, so that distances between surrounding states are metres.
+    # observation: 24 joint angles, their 24 velocities, the object's 6 velocities and its pose. The
+    # split uses only the pose's position, so that distances of surrounding states are metres.
     return Task(
         name=name,
         env_id=f"{name}-v1",
@@ -190,47 +169,32 @@ BUILT_IN_TASKS: Mapping[str, Task] = MappingProxyType(
         )
     }
 )
-"""Tasks of Gymnasium-Robotics, each of them held against its live environment by tests."""
+"""Tasks of Gymnasium-Robotics; tests compare each of them with its environment."""
 
 
 class UnknownTaskError(LookupError):
     """A task name that is neither built in nor declared; the message suggests close ones."""
 
 
-class TaskRegistry(Mapping[str, Task]):
-    """The built-in tasks and those of a user."""
+class TaskRegistry(dict[str, Task]):
+    """The built-in tasks and those of a user, whose names must be new, by name."""
 
     def __init__(self, user_tasks: Iterable[Task] = ()) -> None:
-        """Add `user_tasks`.
-
-        Raises:
-            ValueError: A name is taken already.
-        """
-        self._tasks = dict(BUILT_IN_TASKS)
+        super().__init__(BUILT_IN_TASKS)
         for task in user_tasks:
-            if task.name in self._tasks:
+            if task.name in self:
                 kind = "a built-in task" if task.name in BUILT_IN_TASKS else "declared twice"
                 raise ValueError(f"{task.name} is {kind}; choose another name")
-            self._tasks[task.name] = task
+            self[task.name] = task
 
-    def __getitem__(self, name: str) -> Task:
-        try:
-            return self._tasks[name]
-        except KeyError:
-            known = ", ".join(self._tasks)
-            raise UnknownTaskError(
-                f"must be a known task ({known}), got {name!r}{closest(name, self._tasks)}"
-            ) from None
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._tasks)
-
-    def __len__(self) -> int:
-        return len(self._tasks)
+    def __missing__(self, name: str) -> Task:
+        raise UnknownTaskError(
+            f"must be a known task ({', '.join(self)}), got {name!r}{closest(name, self)}"
+        )
 
 
 def closest(name: str, known: Iterable[str]) -> str:
-    """`" (did you mean 'FetchPush'?)"`, or nothing where no known name is close."""
+    """`" (did you mean 'FetchPush'?)"`, or an empty text where no known name is close."""
     by_folded = {candidate.casefold(): candidate for candidate in known}
     matches = difflib.get_close_matches(name.casefold(), by_folded, n=1, cutoff=0.6)
     return f" (did you mean {by_folded[matches[0]]!r}?)" if matches else ""

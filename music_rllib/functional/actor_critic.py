@@ -7,16 +7,6 @@ from __future__ import annotations
 
 from torch import Tensor
 
-__all__ = [
-    "alpha_loss",
-    "critic_loss",
-    "critic_target",
-    "policy_loss",
-    "policy_value",
-    "value_loss",
-    "value_target",
-]
-
 
 def critic_target(
     reward: Tensor,
@@ -25,16 +15,15 @@ def critic_target(
     gamma: float,
     bounds: tuple[float, float] | None = None,
 ) -> Tensor:
-    """What both critics learn (paper eq. 9), with the terminal mask that the paper leaves out.
+    """The critics' target (paper eq. 9), with the terminal mask that the paper leaves out.
+
+    [B] without gradient.
 
     Args:
         reward: [B]
         discount: [B] 0 where the episode terminated, else 1 (truncation is not termination).
         next_value: [B] the target network's value of the next state.
         bounds: the range that returns can have; targets are clipped to it.
-
-    Returns:
-        [B], without gradient.
     """
     target = (reward + gamma * discount * next_value).detach()
     return target if bounds is None else target.clamp(*bounds)
@@ -55,15 +44,11 @@ def critic_loss(q_values: Tensor, target: Tensor, weights: Tensor | None = None)
 
 
 def value_target(q_of_policy: Tensor, ln_q_pi: Tensor, alpha: Tensor | float) -> Tensor:
-    """What the value network learns (paper eq. 8).
+    """The value network's target (paper eq. 8): [B] without gradient.
 
     Args:
-        q_of_policy: [C, B] critics at an action drawn from the policy, as the paper's Algorithm
-            has it; the smaller one counts.
+        q_of_policy: [C, B] critics at an action drawn from the policy, as in the paper's algorithm.
         ln_q_pi: [B] ln_q of the policy's density at that action.
-
-    Returns:
-        [B], without gradient.
     """
     return (q_of_policy.amin(0) - alpha * ln_q_pi).detach()
 
@@ -84,9 +69,5 @@ def policy_loss(value_of_policy: Tensor, ln_q_pi: Tensor, alpha: Tensor | float)
 
 
 def alpha_loss(log_alpha: Tensor, excess_entropy: Tensor) -> Tensor:
-    """Drives S_q of the policy to its target (Haarnoja et al. 2018b, eq. 18).
-
-    Args:
-        excess_entropy: [] S_q less its target, without gradient.
-    """
+    """Drives S_q to its target by the excess entropy [] (Haarnoja et al. 2018b, eq. 18)."""
     return log_alpha * excess_entropy

@@ -1,17 +1,15 @@
-"""How much one alpha weighs the Tsallis entropies of different q, and alphas that weigh them alike.
+"""The pressure of one alpha on policies of different q, and alphas that make it equal.
 
 S_q of different q have different scales: under one fixed alpha a policy of standard deviation .1
 feels 2.8 times the pressure at q = 2 that it feels at q = 1, and at .02 it is 14 times. A
 comparison of q at one alpha is then also one of the policies' widths.
 
-Plain numbers only. A: action dimensions; forms are those of `ln_q_of_policy`.
+A: action dimensions; forms are those of `ln_q_of_policy`.
 """
 
 from __future__ import annotations
 
 import math
-
-__all__ = ["entropy_pressure", "largest_entropy", "matched_alpha", "normalised_alpha"]
 
 _SHANNON = 1e-9
 """|q - 1| below which S_q is Shannon's entropy."""
@@ -20,11 +18,11 @@ _SHANNON = 1e-9
 def entropy_pressure(
     q: float, width: float, actions: int = 1, form: str = "per_dimension"
 ) -> float:
-    """dS_q / d ln sigma of one action dimension of a Gaussian policy, all as wide as `width`.
+    """dS_q / d ln sigma of one action dimension of a Gaussian policy of standard deviation `width`.
 
-    Per dimension it is G = q^(-1/2) (sqrt(2 pi) sigma)^(1-q), the integral of p^q. The joint
-    entropy (1 - G^A)/(q-1) has G^A. Shannon's has 1 at every width. Of the Gaussian before tanh,
-    which changes little at widths below .3.
+    Per dimension it is G = q^(-1/2) (sqrt(2 pi) sigma)^(1-q), the integral of p^q; for the joint
+    entropy (1 - G^A)/(q-1) it is G^A; for Shannon's it is 1 at every width. The Gaussian is taken
+    before tanh, which changes little at widths below .3.
     """
     log_integral = -0.5 * math.log(q) + (1.0 - q) * math.log(math.sqrt(2.0 * math.pi) * width)
     return math.exp(log_integral * (actions if form == "joint" else 1))

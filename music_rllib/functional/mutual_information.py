@@ -11,8 +11,6 @@ import math
 import torch
 from torch import Tensor
 
-__all__ = ["donsker_varadhan", "shuffle_time", "time_permutations"]
-
 
 def donsker_varadhan(joint: Tensor, marginals: Tensor, inside: Tensor | None = None) -> Tensor:
     """mean_t T(x, y) - log mean_t exp T(x, y'), a lower bound on I(X; Y) in nats.
@@ -20,7 +18,7 @@ def donsker_varadhan(joint: Tensor, marginals: Tensor, inside: Tensor | None = N
     Args:
         joint: [N, T] statistics of pairs that occurred together.
         marginals: [N, T] statistics of pairs from the product of marginals.
-        inside: [N, T] False for padding behind a trajectory that ends early; None: all are whole.
+        inside: [N, T] False for padding behind a trajectory that ends early; None: no padding.
 
     Returns:
         [N] bounds; unchanged when a constant is added to the statistic. The mean over few
@@ -47,10 +45,10 @@ def time_permutations(
 
     Args:
         generator: source of randomness; its device is the result's.
-        sharing: neighbours that have one permutation, as in the original, which draws it once
-            per minibatch (on two frames it is the identity half the time).
-        inside: [N, T] False for padding, which then stays behind: each trajectory's own frames
-            change places among themselves. None: all are whole.
+        sharing: number of neighbours with the same permutation; the original draws one per
+            minibatch (on two frames it is the identity half the time).
+        inside: [N, T] False for padding, which keeps its place: only a trajectory's own frames are
+            permuted. None: no padding.
     """
     rows = trajectories // sharing
     keys = torch.rand(rows, frames, generator=generator, device=generator.device)

@@ -12,14 +12,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-__all__ = [
-    "PolicySample",
-    "bounded_log_std",
-    "deterministic_action",
-    "sample_squashed",
-    "squashed_action",
-]
-
 _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 _LOG_2 = math.log(2.0)
 
@@ -36,8 +28,8 @@ class PolicySample(NamedTuple):
 def bounded_log_std(raw: Tensor, bounds: tuple[float, float], form: str) -> Tensor:
     """Log standard deviation [B, A] of the network's outputs [B, A], within `bounds`.
 
-    At an output of 0, where a fresh network is, `clamp` has sigma = 1 and `tanh` the middle of the
-    bounds: 1.2e-4 of [-20, 2].
+    A fresh network's output of 0 gives sigma = 1 with `clamp`, and with `tanh` the middle of the
+    bounds: sigma = 1.2e-4 for [-20, 2].
     """
     low, high = bounds
     if form == "clamp":
@@ -58,7 +50,7 @@ def sample_squashed(mean: Tensor, log_std: Tensor, noise: Tensor) -> PolicySampl
 
 
 def squashed_action(mean: Tensor, log_std: Tensor, noise: Tensor) -> Tensor:
-    """The action of `sample_squashed` [B, A] alone: to act takes no density."""
+    """The action of `sample_squashed` [B, A] without its density."""
     return torch.tanh(_before_tanh(mean, log_std, noise))
 
 

@@ -1,8 +1,7 @@
-"""Tsallis logarithm, exponential and entropies (paper II-C, eq. 4-5).
+"""The Tsallis logarithm of numbers and of policies (paper II-C, eq. 4-5).
 
-One convention, the paper's: ``ln_q x = (x^(q-1) - 1) / (q-1)``, which is ``ln x`` at q = 1.
-Everything is computed from log-densities: in float32 the power form is wrong by 0.27 at
-q = 1 + 1e-7.
+The paper's convention: ``ln_q x = (x^(q-1) - 1) / (q-1)``, which is ``ln x`` at q = 1. All is
+computed from log-densities: in float32 the power form is wrong by 0.27 at q = 1 + 1e-7.
 
 Shape legend: B batch, A action dimensions, `...` any shape.
 """
@@ -14,20 +13,8 @@ import math
 import torch
 from torch import Tensor
 
-__all__ = [
-    "MAX_EXPONENT",
-    "bound_active",
-    "exp_q",
-    "gaussian_entropy",
-    "joint_entropy",
-    "ln_q",
-    "ln_q_of_log",
-    "ln_q_of_policy",
-    "uniform_entropy",
-]
-
 MAX_EXPONENT = 10.0
-"""Largest (q-1) ln p that ln_q follows exactly in the losses; beyond it, its tangent.
+"""Largest (q-1) ln p at which the losses use ln_q itself; above, they use its tangent.
 
 A peaked policy makes p^(q-1) explode for q > 1 (a density near 0 for q < 1). The tangent keeps
 value and gradient finite without ever making the gradient zero. e^10 = 22,026: at q = 2 it acts
@@ -35,19 +22,16 @@ on densities above that, at q = 1.5 above 4.9e8.
 """
 
 _SHANNON = 1e-9
-"""|q - 1| below which ln is used: the difference is then far below float64 resolution."""
+"""|q - 1| below which ln is used: the difference is far below float64 resolution."""
 
 
 def ln_q_of_log(log_x: Tensor, q: float, *, max_exponent: float = math.inf) -> Tensor:
-    """ln_q of x, given ln x.
+    """(x^(q-1) - 1)/(q-1) (paper eq. 4), given ln x: [...] -> [...].
 
     Args:
         log_x: [...] natural logarithms, in nats.
         q: entropic index, any real number.
         max_exponent: where (q-1) ln x exceeds this, ln_q continues along its tangent.
-
-    Returns:
-        [...] values of (x^(q-1) - 1)/(q-1); paper eq. 4.
     """
     order = q - 1.0
     if abs(order) < _SHANNON:
@@ -72,66 +56,17 @@ def ln_q(x: Tensor, q: float) -> Tensor:
     return ln_q_of_log(torch.log(x), q)
 
 
-def exp_q(y: Tensor, q: float) -> Tensor:
-    """The q-exponential [1 + (q-1) y]_+ ^ (1/(q-1)) (paper eq. 4).
-
-    Zero (q > 1) or infinite (q < 1) where 1 + (q-1) y <= 0.
-    """
-    order = q - 1.0
-    if abs(order) < _SHANNON:
-        return torch.exp(y)
-    base = (order * y).clamp(min=-1.0)
-    return torch.exp(torch.log1p(base) / order)
-
-
 def ln_q_of_policy(log_density: Tensor, q: float, form: str) -> Tensor:
-    """ln_q of a factored policy's density, bounded by `MAX_EXPONENT`.
+    """[B] ln_q of a factored policy's density, bounded by `MAX_EXPONENT`.
 
     Args:
         log_density: [B, A] log-density of each action dimension.
         q: entropic index > 0.
         form: "per_dimension" sums ln_q over dimensions (Lee et al. 2019's code);
             "joint" takes ln_q of the product of densities (the paper's equations).
-
-    Returns:
-        [B]
     """
     if form == "per_dimension":
         return ln_q_of_log(log_density, q, max_exponent=MAX_EXPONENT).sum(-1)
     if form == "joint":
         return ln_q_of_log(log_density.sum(-1), q, max_exponent=MAX_EXPONENT)
     raise ValueError(f"entropy_form must be per_dimension or joint, got {form!r}")
-
-
-def gaussian_entropy(std: Tensor, q: float) -> Tensor:
-    """S_q of a one-dimensional Gaussian, per standard deviation: [...] -> [...].
-
-    (1 - q^(-1/2) (2 pi std^2)^((1-q)/2)) / (q-1); the Shannon entropy at q = 1.
-    """
-    log_width = 0.5 * torch.log(2.0 * math.pi * std**2)
-    order = q - 1.0
-    if abs(order) < _SHANNON:
-        return log_width + 0.5
-    return -torch.expm1(-order * log_width - 0.5 * math.log(q)) / order
-
-
-def joint_entropy(per_dimension: Tensor, q: float) -> Tensor:
-    """S_q of independent dimensions together: [..., A] -> [...].
-
-    (1 - prod_i (1 - (q-1) S_i)) / (q-1); their sum at q = 1.
-    """
-    order = q - 1.0
-    if abs(order) < _SHANNON:
-        return per_dimension.sum(-1)
-    return (1.0 - torch.prod(1.0 - order * per_dimension, dim=-1)) / order
-
-
-def uniform_entropy(q: float, width: float = 2.0) -> float:
-    """S_q of the uniform density on an interval: the largest that S_q can be there.
-
-    (1 - width^(1-q)) / (q-1); ln(width) at q = 1.
-    """
-    order = q - 1.0
-    if abs(order) < _SHANNON:
-        return math.log(width)
-    return -math.expm1(-order * math.log(width)) / order

@@ -1,4 +1,4 @@
-"""What an intrinsic reward is to the Learner, which knows none of them by name.
+"""The interface between the Learner and an intrinsic reward.
 
 Shape legend: K updates of a call, B transitions and N trajectories of one, T frames, D observation.
 """
@@ -16,27 +16,21 @@ from torch import Tensor
 from music_rllib.optim.adam import FusedAdam
 from music_rllib.replay.trajectories import Trajectory
 
-__all__ = ["IntrinsicReward"]
-
 
 class IntrinsicReward(Protocol):
-    """Relabels minibatches, learns from trajectories, and says what it has measured.
+    """Relabels minibatches, learns from trajectories, and measures fresh episodes.
 
-    Its networks belong to a module of the Learner; here is what is done with them. Every random
-    number comes from the generator that is passed in, so that a resumed run draws the same ones.
+    Its networks belong to a module of the Learner. Every random number comes from the generator
+    that is passed in, so that a resumed run draws the same ones.
     """
 
     @property
     def is_on(self) -> bool:
-        """Whether there is a reward; without one `draw` and `total` may still be called."""
+        """Whether there is a reward; without one, `draw` and `total` may still be called."""
 
     @property
     def learning_rate(self) -> float | None:
-        """Of its networks; None where they stay as they are."""
-
-    @property
-    def trajectories(self) -> int:
-        """N that one update learns from."""
+        """Learning rate of its networks; None where they are not trained."""
 
     def draw(
         self,
@@ -46,44 +40,35 @@ class IntrinsicReward(Protocol):
         *,
         first: bool,
     ) -> Sequence[Hashable]:
-        """Random numbers of K updates, in one go.
+        """Draws the random numbers of K updates, one value each, for `reward`.
+
+        As a CUDA graph, an update is recorded once per different value, so there should be few.
 
         Args:
             updates: K.
-            trajectories: [K*N, T, D] that are learned from, to which columns may be added; None
-                where nothing is learned.
-            generator: of the Learner.
+            trajectories: [K*N, T, D] the training data, to which columns may be added; None where
+                nothing is trained.
+            generator: the Learner's.
             first: whether these are the run's first updates.
-
-        Returns:
-            K values, each for `reward` of one update. Captured as a CUDA graph, an update is
-            recorded once for each value, so there should be few.
         """
 
     def reward(self, states: Tensor, followers: Tensor, drawn: Hashable) -> Tensor:
         """[B, D] states and the next ones -> [B]."""
 
     def total(self, task: Tensor, intrinsic: Tensor, weight: float) -> Tensor:
-        """[B] the task's reward and the intrinsic one -> [B] that is learned from."""
+        """[B] the task's reward and the intrinsic one -> [B] the reward of the critics' targets."""
 
     def loss(self, trajectories: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
-        """[N, T, D] -> [] to be minimised by its networks, and metrics by name."""
+        """[N, T, D] -> [] the loss of its networks, and metrics by name."""
 
     def learn(
         self, states: Tensor, followers: Tensor, drawn: Sequence[Hashable],
         trajectories: Mapping[str, Tensor], optimizer: FusedAdam,
     ) -> tuple[Tensor, dict[str, Tensor]]:  # fmt: skip
-        """K updates of its networks on a CPU, without autograd where it can.
+        """Updates its networks K times on a CPU, without autograd where it can.
 
-        Args:
-            states: [K, B, D]
-            followers: [K, B, D] the next ones.
-            drawn: K, as `draw` gave them.
-            trajectories: [K*N, T, D]
-            optimizer: of its networks.
-
-        Returns:
-            [K, B] rewards, each minibatch's before its update, and metrics by name, [K] each.
+        Takes states and followers [K, B, D], the K values of `draw`, and trajectories [K*N, T, D].
+        Returns [K, B] rewards, each minibatch's before its update, and metrics by name, [K] each.
         """
 
     def observe(
@@ -93,16 +78,16 @@ class IntrinsicReward(Protocol):
         followers: Tensor,
         generator: torch.Generator,
     ) -> Tensor:
-        """[steps] reward of fresh episodes, from which nothing has been learned yet."""
+        """[steps] reward of fresh episodes, none of which has been trained on."""
 
     def priorities(self, episodes: Sequence[Tensor]) -> NDArray[np.float64]:
-        """[T, D] frames of episodes -> one number each, by which the replay draws them."""
+        """[T, D] frames of episodes -> one priority each, for the replay."""
 
     def metrics(self) -> dict[str, float]:
-        """What was measured of fresh episodes since the last call."""
+        """Measures of the fresh episodes since the last call."""
 
     def state(self) -> Any:
-        """What a checkpoint needs beside the networks."""
+        """The state for a checkpoint, without the networks."""
 
     def load_state(self, state: Any) -> None:
-        """Takes over what `state` gave."""
+        """Continues from a result of `state`."""

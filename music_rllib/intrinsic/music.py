@@ -6,7 +6,6 @@ Shape legend: K updates of a call, B transitions and N trajectories of one, T fr
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -15,52 +14,25 @@ from torch import Tensor
 
 from music_rllib import names
 from music_rllib.functional.mutual_information import time_permutations
-from music_rllib.intrinsic.held_out import HeldOutBound
+from music_rllib.intrinsic.estimator import MutualInformationEstimator, intrinsic_reward, two_frames
 from music_rllib.intrinsic.settings import MusicSettings
 from music_rllib.optim.adam import FusedAdam
-from music_rllib.replay.trajectories import Trajectory
-
-__all__ = ["HELD_OUT_STEPS", "Music"]
+from music_rllib.replay.trajectories import Trajectory, WholeTrajectories, long_enough
 
 HELD_OUT_STEPS = "held_out_steps"
-"""Metric: steps behind the bound on fresh trajectories, which it is averaged by."""
+"""Metric: the number of steps that the bound on fresh trajectories is averaged over."""
 PRIORITY_CLIP = 2e-4
 """MUSIC-p: largest bound (nats) of one step that counts for its trajectory's priority."""
 
 
-class Estimator(Protocol):
-    """The estimator on whole observations, of which it takes its two halves."""
-
-    def adapt_to(self, observations: Tensor) -> None:
-        """[..., D] before its first training."""
-
-    def bound(self, observations: Tensor, permutations: Tensor, inside: Tensor | None) -> Tensor:
-        """[N, T, D], [N, T] permutations and padding -> [N] nats."""
-
-    def learn(
-        self, states: Tensor, followers: Tensor, swapped: Sequence[bool],
-        trajectories: Mapping[str, Tensor], optimizer: FusedAdam,
-    ) -> tuple[Tensor, Tensor]:  # fmt: skip
-        """K updates, and the [K, B] rewards before each; [K] mean bounds."""
-
-    def transition_bounds(self, observations: Tensor) -> Tensor:
-        """[T, D] -> [T - 1] nats."""
-
-    def reward(self, states: Tensor, followers: Tensor, *, swapped: bool) -> Tensor:
-        """[B, D], [B, D] -> [B] in [-1, 0]."""
-
-
 class Music:
-    """MUSIC's reward, an `IntrinsicReward`.
+    """MUSIC's reward, an `IntrinsicReward`; `estimator` is None where the settings have none."""
 
-    Args:
-        settings: say whether there is an estimator, and how time is shuffled.
-        estimator: None where there is none.
-    """
-
-    def __init__(self, settings: MusicSettings, estimator: Estimator | None) -> None:
+    def __init__(
+        self, settings: MusicSettings, estimator: MutualInformationEstimator | None
+    ) -> None:
         self._settings, self._estimator = settings, estimator
-        self._held_out = HeldOutBound()
+        self._held_out_sum = self._held_out_steps = 0.0
 
     @property
     def is_on(self) -> bool:
@@ -71,10 +43,7 @@ class Music:
         return self._settings.lr if self._settings.estimator == "trained" else None
 
     @property
-    def trajectories(self) -> int:
-        return self._settings.batch_trajectories
-
-    def _present(self) -> Estimator:
+    def _network(self) -> MutualInformationEstimator:
         assert self._estimator is not None
         return self._estimator
 
@@ -98,7 +67,7 @@ class Music:
         if trajectories is not None:
             observations, inside = trajectories["obs"], trajectories.get("inside")
             if first:
-                self._present().adapt_to(observations)
+                self._network.adapt_to(observations)
             rows, frames = observations.shape[:2]
             sharing = 1 if self._settings.shuffle == "independent" else rows // updates
             trajectories["permutations"] = time_permutations(
@@ -106,26 +75,41 @@ class Music:
             )
         return swapped
 
+    @torch.no_grad()
     def reward(self, states: Tensor, followers: Tensor, drawn: Hashable) -> Tensor:
-        return self._present().reward(states, followers, swapped=bool(drawn))
+        """[B] in [-1, 0]."""
+        bounds = self._network.transition_bounds(states, followers, swapped=bool(drawn))
+        return intrinsic_reward(bounds, self._settings.reward_scale)
 
     def total(self, task: Tensor, intrinsic: Tensor, weight: float) -> Tensor:
         weighted = weight * intrinsic
         return task + weighted if self._settings.task_reward else weighted
 
     def loss(self, trajectories: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
-        """Less the mean bound, in nats."""
+        """The negative mean bound, in nats."""
         permutations, inside = trajectories["permutations"], trajectories.get("inside")
-        bound = self._present().bound(trajectories["obs"], permutations, inside).mean()
+        bound = self._network.bound(trajectories["obs"], permutations, inside).mean()
         return -bound, {names.MI_BOUND: bound.detach()}
 
+    @torch.no_grad()
     def learn(
         self, states: Tensor, followers: Tensor, drawn: Sequence[Hashable],
         trajectories: Mapping[str, Tensor], optimizer: FusedAdam,
     ) -> tuple[Tensor, dict[str, Tensor]]:  # fmt: skip
-        swapped = [bool(one) for one in drawn]
-        rewards, bounds = self._present().learn(states, followers, swapped, trajectories, optimizer)
-        return rewards, {names.MI_BOUND: bounds}
+        """K updates by compiled code."""
+        updates, rows = states.shape[:2]
+        pairs = torch.stack([states, followers], dim=2).flatten(0, 1)
+        swaps = torch.cat([two_frames(rows, bool(swapped)) for swapped in drawn])
+        permutations, inside = trajectories["permutations"], trajectories.get("inside")
+        network = self._network
+        bounds, means = network.learn(
+            network.data(pairs, swaps, None),
+            network.data(trajectories["obs"], permutations, inside),
+            optimizer,
+            updates,
+        )
+        rewards = intrinsic_reward(bounds, self._settings.reward_scale)
+        return rewards.view(updates, rows), {names.MI_BOUND: means}
 
     def observe(
         self,
@@ -134,25 +118,38 @@ class Music:
         followers: Tensor,
         generator: torch.Generator,
     ) -> Tensor:
-        estimator = self._present()
-        reward = estimator.reward(states, followers, swapped=True)
-        self._held_out.add(episodes, estimator.bound, generator)
+        reward = self.reward(states, followers, drawn=True)
+        self._measure_held_out(episodes, generator)
         return reward
+
+    @torch.no_grad()
+    def _measure_held_out(self, episodes: Sequence[Trajectory], generator: torch.Generator) -> None:
+        """Adds the bounds of fresh episodes, weighted by their steps, for `metrics`."""
+        lengths = np.array([len(episode) for episode in episodes])
+        chosen = np.flatnonzero(long_enough(lengths)).tolist()
+        whole = WholeTrajectories.of([episodes[i].frames for i in chosen])
+        device = generator.device
+        observations = torch.as_tensor(whole.observations, device=device)
+        inside = None if whole.inside is None else torch.as_tensor(whole.inside, device=device)
+        count, frames = observations.shape[:2]
+        permutations = time_permutations(count, frames, generator, inside=inside)
+        bounds = self._network.bound(observations, permutations, inside).cpu().numpy()
+        self._held_out_sum += float(bounds @ lengths[chosen])
+        self._held_out_steps += float(lengths[chosen].sum())
 
     def priorities(self, episodes: Sequence[Tensor]) -> NDArray[np.float64]:
         """MUSIC-p: the sum of each episode's per-step bounds, each clipped to [0, 2e-4] nats."""
-        bounds = self._present().transition_bounds
-        sums = [bounds(frames).clamp(0.0, PRIORITY_CLIP).sum() for frames in episodes]
-        return torch.stack(sums).cpu().numpy().astype(np.float64)
+        bounds = [self._network.transition_bounds(each[:-1], each[1:]) for each in episodes]
+        sums = torch.stack([steps.clamp(0.0, PRIORITY_CLIP).sum() for steps in bounds])
+        return sums.cpu().numpy().astype(np.float64)
 
     def metrics(self) -> dict[str, float]:
-        taken = self._held_out.take()
-        return (
-            dict(zip((names.HELD_OUT_BOUND, HELD_OUT_STEPS), taken, strict=True)) if taken else {}
-        )
+        total, steps = self.state()
+        self.load_state((0.0, 0.0))
+        return {names.HELD_OUT_BOUND: total / steps, HELD_OUT_STEPS: steps} if steps else {}
 
     def state(self) -> list[float]:
-        return self._held_out.state()
+        return [self._held_out_sum, self._held_out_steps]
 
     def load_state(self, state: Sequence[float]) -> None:
-        self._held_out.load_state(state)
+        self._held_out_sum, self._held_out_steps = state

@@ -8,8 +8,6 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from music_rllib.schedules import AdaptiveSchedule, bounded
 
-__all__ = ["MusicSettings"]
-
 
 class MusicSettings(BaseModel):
     """The intrinsic reward, its estimator, and what the agent sees of goals and task reward."""

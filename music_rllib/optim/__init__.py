@@ -1,1 +1,1 @@
-"""Adam, and parameters that lie behind each other for it."""
+"""Adam, and a flat layout of parameters for it."""

@@ -7,53 +7,49 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-__all__ = ["FlatParameters"]
-
 _ALIGNMENT = 16
 """Floats of a cache line: no parameter shares one with its neighbour."""
 
 
 class FlatParameters:
-    """Moves parameters into one tensor, of which they are views from then on.
+    """Moves parameters of one type and device into one tensor, of which they become views.
 
-    Args:
-        parameters: of one type and device. Their values stay; their `.data` is replaced.
+    The parameters keep their values; their `.data` is replaced.
     """
 
     def __init__(self, parameters: Sequence[Tensor]) -> None:
-        starts, size = [], 0
+        self.parameters = list(parameters)
+        self._starts: dict[int, int] = {}
+        size = 0
         for parameter in parameters:
-            starts.append(size)
+            self._starts[id(parameter)] = size
             size += -(-parameter.numel() // _ALIGNMENT) * _ALIGNMENT
-        self._places = list(zip(starts, (p.shape for p in parameters), strict=True))
-        self._indices = {id(parameter): i for i, parameter in enumerate(parameters)}
         self.values = parameters[0].new_zeros(size).detach()
         """[S] with zeros between the parameters."""
         self.gradients = torch.zeros_like(self.values)
         """[S]"""
-        self.parameters = list(parameters)
         for parameter, view in zip(parameters, self.views(self.values), strict=True):
             view.copy_(parameter.detach())
             parameter.data = view
 
     def views(self, flat: Tensor) -> list[Tensor]:
-        """What belongs to each parameter in a tensor [S]."""
-        return [flat[start : start + shape.numel()].view(shape) for start, shape in self._places]
+        """The parts of a tensor [S] that belong to the parameters, one each."""
+        return [self._view(flat, parameter) for parameter in self.parameters]
 
     def gradient(self, parameter: Tensor) -> Tensor:
-        """The view of `gradients` that belongs to a parameter."""
-        start, shape = self._places[self._indices[id(parameter)]]
-        return self.gradients[start : start + shape.numel()].view(shape)
+        """The part of `gradients` that belongs to a parameter."""
+        return self._view(self.gradients, parameter)
+
+    def _view(self, flat: Tensor, parameter: Tensor) -> Tensor:
+        start = self.start(parameter)
+        return flat[start : start + parameter.numel()].view(parameter.shape)
 
     def start(self, parameter: Tensor) -> int:
-        """Where the values of a parameter begin."""
-        return self._places[self._indices[id(parameter)]][0]
+        """The position in `values` at which a parameter begins."""
+        return self._starts[id(parameter)]
 
     def extent(self, parameters: Sequence[Tensor]) -> tuple[int, int]:
-        """Where parameters that lie behind each other begin, and how many values they have.
-
-        What is between them is counted.
-        """
+        """The first position of neighbouring parameters, and the number of values to their end."""
         first, last = self.start(parameters[0]), self.start(parameters[-1])
         return first, last + parameters[-1].numel() - first
 

@@ -1,7 +1,7 @@
-"""Policies of finished runs, loaded without Ray: they take observations and give actions.
+"""Trained policies, loaded without Ray: they map observations to actions.
 
-The names below are loaded on first use: :mod:`music_rllib.policy.network` is read by lower layers,
-and copied into MLflow models, so it must not cost more than numpy.
+The names below are imported on first use, because :mod:`music_rllib.policy.network` is imported by
+lower layers and copied into MLflow models and must load nothing but numpy and safetensors.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
-    """Load a public name from its home."""
+    """Imports a public name from its module."""
     home = _HOMES.get(name)
     if home is None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,4 +1,4 @@
-"""What a person names: a run's policy (by key, label or place), and an environment."""
+"""Finds the policy that a user names by key, label or place, and the environment."""
 
 from __future__ import annotations
 
@@ -15,45 +15,45 @@ from music_rllib.labels import is_meant
 from music_rllib.policy.policy import PolicyError
 from music_rllib.store.object_folder import ObjectFolders, open_storage
 
-__all__ = ["find_policy", "named_environment"]
-
 _SHORTEST_KEY = 4
-_NAMED = 8
+"""Characters of a key's beginning that are enough to name it."""
+_LISTED = 8
+"""Runs that a message lists."""
 
 
 def find_policy(wanted: str, storage: str) -> str:
-    """Where `load_policy` finds the policy that is meant.
+    """The place from which `load_policy` loads the policy that a user names.
 
     Args:
-        wanted: a place (folder, file, URI), the key of a run or its beginning, or a run's label
-            or the parts of it that tell which (`q=1.5/seed0`).
+        wanted: a place (folder, file, URI), which is returned as it is; the key of a run or its
+            beginning; or a run's label or enough parts of it (`q=1.5/seed0`).
         storage: the sweeps' storage, a folder or a URI, in which keys and labels are looked up.
 
     Returns:
-        The finished node; for a run that isn't finished its newest checkpoint; or the place.
+        The folder of a finished run, or the newest checkpoint of an unfinished one.
 
     Raises:
-        PolicyError: nothing fits, or several runs do; says what there is.
+        PolicyError: no run fits, or several do; the message lists them.
     """
     if "://" in wanted or wanted.startswith(("models:/", "runs:/")) or Path(wanted).exists():
         return wanted
     filesystem, root = open_storage(storage)
     labels: dict[str, list[str]] = {}
     for key, label in _labels(filesystem, root):
-        labels.setdefault(key, []).append(label)  # sweeps that share a run call it differently
+        labels.setdefault(key, []).append(label)  # sweeps that share a run label it differently
     nodes = ObjectFolders(filesystem, f"{root}/nodes")
     finished = nodes.names()
     unfinished = [key for key in _folders(filesystem, f"{root}/work") if key not in finished]
     keys = _matching(wanted, [*finished, *unfinished], labels)
     if not keys:
-        known = [labels.get(key, [key])[0] for key in finished][:_NAMED]
+        known = [labels.get(key, [key])[0] for key in finished][:_LISTED]
         there = f"finished there: {', '.join(known)}" if known else "no run is finished there"
         raise PolicyError(
             f"{wanted!r} must be a folder, or the key or label of a run in {storage}; {there}"
         )
     if len(keys) > 1:
-        fits = [f"{labels[key][0]} ({key[:8]})" if key in labels else key for key in keys[:_NAMED]]
-        more = f" and {len(keys) - _NAMED} more" if len(keys) > _NAMED else ""
+        fits = [f"{labels[key][0]} ({key[:8]})" if key in labels else key for key in keys[:_LISTED]]
+        more = f" and {len(keys) - _LISTED} more" if len(keys) > _LISTED else ""
         raise PolicyError(
             f"{wanted!r} must mean one run, it fits {', '.join(fits)}{more}; say more of its "
             "label, or its key"
@@ -68,10 +68,7 @@ def find_policy(wanted: str, storage: str) -> str:
 
 
 def named_environment(env: str | None) -> str | tuple[Task, ...]:
-    """What `--env` names, for `load_policy`.
-
-    Args:
-        env: an environment's id, or a sweep's YAML file that declares environments.
+    """The environment of `--env` for `load_policy`: an id, or the tasks of a sweep's YAML file.
 
     Raises:
         ConfigError: that file can't be read, or is wrong.
@@ -87,13 +84,14 @@ def _matching(wanted: str, keys: list[str], labels: dict[str, list[str]]) -> lis
         return by_label
     if wanted in keys:
         return [wanted]
-    if len(wanted) >= _SHORTEST_KEY and (found := [k for k in keys if k.startswith(wanted)]):
-        return found
+    by_prefix = [key for key in keys if key.startswith(wanted)]
+    if len(wanted) >= _SHORTEST_KEY and by_prefix:
+        return by_prefix
     return [key for key in keys if any(is_meant(wanted, label) for label in labels.get(key, ()))]
 
 
 def _labels(filesystem: pafs.FileSystem, root: str) -> Iterator[tuple[str, str]]:
-    """Key and label of every run that a sweep with its folder in this storage has planned."""
+    """Key and label of every run in the plans of the storage's sweeps."""
     for name in _folders(filesystem, root):
         plan = f"{root}/{name}/plan.json"
         if filesystem.get_file_info(plan).type != pafs.FileType.File:
@@ -109,10 +107,9 @@ def _labels(filesystem: pafs.FileSystem, root: str) -> Iterator[tuple[str, str]]
 
 
 def _folders(filesystem: pafs.FileSystem, root: str) -> list[str]:
-    selector = pafs.FileSelector(root, allow_not_found=True)
-    found = filesystem.get_file_info(selector)
+    entries = filesystem.get_file_info(pafs.FileSelector(root, allow_not_found=True))
     return sorted(
         info.base_name
-        for info in found
+        for info in entries
         if info.type == pafs.FileType.Directory and not info.base_name.startswith(".")
     )

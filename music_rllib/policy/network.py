@@ -22,18 +22,16 @@ import numpy.typing as npt
 import safetensors
 from safetensors.numpy import save as save_safetensors
 
-__all__ = ["PolicyFileError", "PolicyNetwork"]
-
 FORMAT = "music_rllib policy 1"
 MOST_HEADER_BYTES = 1 << 20
-"""Of a policy's file, which may come from anywhere; a policy of ours has some thousand."""
+"""Largest header of a policy's file, which may come from anywhere; ours have a few thousand."""
 _HEADER = "music_rllib_policy"
 
 Floats = npt.NDArray[np.float32]
 
 
 class PolicyFileError(ValueError):
-    """A file that isn't a policy; says which and why."""
+    """A file is no policy; the message names the file and the reason."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,11 +43,11 @@ class PolicyNetwork:
     biases: tuple[Floats, ...]
     """[outputs] of each layer; the last has A, or 2 A of which the first half are means."""
     mean: Floats
-    """[I] taken from the inputs."""
+    """[I] subtracted from the inputs."""
     inverse_std: Floats
-    """[I] multiplies what is left."""
+    """[I] factor on the shifted inputs."""
     clip: float
-    """Normalised inputs are cut to plus/minus this."""
+    """Normalised inputs are clipped to plus/minus this."""
     low: Floats
     """[A] the environment's lowest actions."""
     high: Floats
@@ -57,14 +55,10 @@ class PolicyNetwork:
     goal_size: int
     """G, 0 for an environment without goals."""
     about: Mapping[str, Any] = field(default_factory=dict)
-    """Where it comes from: JSON values, of no influence on actions."""
+    """The run it comes from, as JSON values; no influence on actions."""
 
     def __post_init__(self) -> None:
-        """Check that the arrays fit together.
-
-        Raises:
-            ValueError: they don't.
-        """
+        """Checks that the arrays fit together; raises ValueError where they don't."""
         sizes = [self.input_size, *(len(bias) for bias in self.biases)]
         shapes = [(out, into) for into, out in pairwise(sizes)]
         if not self.weights or [weight.shape for weight in self.weights] != shapes:
@@ -87,31 +81,28 @@ class PolicyNetwork:
 
     @property
     def input_size(self) -> int:
-        """I: features of observation and goal."""
+        """I, features of observation and goal."""
         return len(self.mean)
 
     @property
     def observation_size(self) -> int:
-        """O: features of the observation alone."""
+        """O, features of the observation alone."""
         return self.input_size - self.goal_size
 
     @property
     def action_size(self) -> int:
-        """A."""
+        """A, dimensions of an action."""
         return len(self.low)
 
     def act(self, observation: Any) -> Floats:
-        """The deterministic action.
+        """The deterministic action: [A], or [B, A] for a batch, within the environment's bounds.
 
         Args:
             observation: a dictionary with `observation` [O] and `desired_goal` [G] (more is
                 ignored), or an array [I] of both side by side; or batches of them, [B, ...].
 
-        Returns:
-            [A], or [B, A] for a batch, within the environment's bounds.
-
         Raises:
-            ValueError: something is missing, of another size, or not finite.
+            ValueError: a part is missing, of another size, or not finite.
         """
         inputs = self._inputs(observation)
         hidden = np.clip((inputs - self.mean) * self.inverse_std, -self.clip, self.clip)
@@ -136,10 +127,10 @@ class PolicyNetwork:
                     + " and ".join(str(part.shape) for part in parts)
                 )
             return np.concatenate(parts, axis=-1)
-        what = f"observation ({self.observation_size})"
+        name = f"observation ({self.observation_size})"
         if self.goal_size:
-            what += f" and desired_goal ({self.goal_size}) side by side"
-        return _numbers(observation, what, self.input_size)
+            name += f" and desired_goal ({self.goal_size}) side by side"
+        return _numbers(observation, name, self.input_size)
 
     def _part(self, observation: Mapping[str, Any], name: str, size: int) -> Floats:
         if name not in observation:
@@ -166,11 +157,7 @@ class PolicyNetwork:
 
     @classmethod
     def from_file(cls, path: Path) -> PolicyNetwork:
-        """Inverse of `to_bytes`.
-
-        Raises:
-            PolicyFileError: the file isn't there or isn't a policy.
-        """
+        """Reads a file of `to_bytes`; raises PolicyFileError where it is none."""
         try:
             _check_file(path)
             with safetensors.safe_open(path, framework="numpy") as file:
@@ -209,12 +196,7 @@ _UNREADABLE = (
 
 
 def _check_file(path: Path) -> None:
-    """Before anything parses it.
-
-    Raises:
-        ValueError: It is no regular file, or its header is too large.
-        OSError: It can't be read.
-    """
+    """Raises ValueError, before anything is parsed, for no regular file or a large header."""
     if not path.is_file():
         raise ValueError("it is no regular file")
     with path.open("rb") as file:

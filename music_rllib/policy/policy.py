@@ -1,4 +1,4 @@
-"""Loading a run's policy from where the run left it, without Ray and without unpickling."""
+"""Loads a run's policy from any place that holds it, without Ray and without unpickling."""
 
 from __future__ import annotations
 
@@ -33,30 +33,21 @@ from music_rllib.store.handoff import (
 )
 from music_rllib.store.object_folder import MANIFEST, ObjectFolders, StorageError, open_storage
 
-__all__ = [
-    "RUN_FILE",
-    "Policy",
-    "PolicyError",
-    "load_policy",
-    "policy_from_folder",
-    "unknown_environment",
-]
-
 RUN_FILE = "run.json"
-"""A run's settings, in its node and in its checkpoints."""
+"""File with a run's settings, in its node and in its checkpoints."""
 MLFLOW_FILE = "policy.safetensors"
-"""The policy in an MLflow model."""
-NAMED = 8
+"""File with the policy in an MLflow model."""
+_LISTED = 8
 """Sub-folders that a message lists."""
 
 
 class PolicyError(BadInputError, ValueError):
-    """A policy that can't be loaded; says from where and why."""
+    """A policy can't be loaded; the message names the place and the reason."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Policy:
-    """The deterministic policy of a run, and what it was trained for."""
+    """The deterministic policy of a run, and the task and settings it was trained with."""
 
     network: PolicyNetwork
     task: Task
@@ -64,12 +55,12 @@ class Policy:
     seed: int
     node_key: str
     env_steps: int
-    """Environment steps that it was trained for."""
+    """Environment steps of its training."""
     max_episode_steps: int
-    """Steps of its episodes."""
+    """Steps after which its episodes are truncated."""
     environment: Known | None
-    """What its episodes are played in. None where only the policy's file names it, and neither
-    this package nor the user knows it: then it acts, and nothing is imported for it."""
+    """The environment of its episodes. None where only the policy's file names it, and neither
+    this package nor the user does: the policy acts, but no environment is imported."""
 
     @property
     def observation_size(self) -> int:
@@ -92,33 +83,29 @@ class Policy:
         return self.network.action_size
 
     def act(self, observation: Any) -> Floats:
-        """The action in the environment's own units, float32 (see `PolicyNetwork.act`).
-
-        Raises:
-            ValueError: the observation isn't one of the task.
-        """
+        """The action in the environment's own units, float32 (see `PolicyNetwork.act`)."""
         return self.network.act(observation)
 
     def to_bytes(self) -> bytes:
-        """One file with all of it; `load_policy` reads it."""
+        """The content of a policy's file, which `load_policy` reads."""
         return self.network.to_bytes()
 
 
 def load_policy(place: str | Path, env: str | Sequence[Task] = ()) -> Policy:
-    """Load the policy of a finished or unfinished run.
+    """Loads the policy of a finished or unfinished run.
 
-    Nothing that stands in it is imported or executed.
+    Nothing that its files name is imported or executed.
 
     Args:
         place: a folder, or an `s3://` or `gs://` URI, of a finished node (`nodes/KEY`), of a
             checkpoint (`work/KEY/NUMBER`) or of a handoff; a policy's own file; or an MLflow URI
             (`models:/...`, `runs:/...`).
-        env: the environment that its episodes are played in, where it isn't one of the built-in
-            tasks or of Gymnasium: its id (`module:` in front is imported), or tasks that declare
-            it, as `experiment.config.declared_tasks` reads them from a sweep's YAML file.
+        env: the environment of its episodes, where it isn't one of the built-in tasks or of
+            Gymnasium: its id (`module:` in front is imported), or tasks that declare it, as
+            `config.load.declared_tasks` reads them from a sweep's YAML file.
 
     Raises:
-        PolicyError: nothing there is a policy, or it is damaged; names the place.
+        PolicyError: there is no policy, or it is damaged; the message names the place.
     """
     text = str(place)
     try:
@@ -133,27 +120,23 @@ def load_policy(place: str | Path, env: str | Sequence[Task] = ()) -> Policy:
 
 
 def policy_from_folder(folder: Path, env: str | Sequence[Task] = ()) -> Policy:
-    """The policy in a local node, checkpoint or handoff, or in an MLflow model's folder.
-
-    Args:
-        folder: where.
-        env: as for `load_policy`.
+    """The policy in a local node, checkpoint, handoff or MLflow model; `env` as for `load_policy`.
 
     Raises:
-        PolicyError: there are weights, but they don't belong to their task or settings, or there
-            are several policies in sub-folders.
-        HandoffError: there are none.
+        PolicyError: the weights don't fit their task or settings, or sub-folders hold several
+            policies.
+        HandoffError: there are no weights.
     """
     for inside in (MLFLOW_FILE, f"artifacts/{MLFLOW_FILE}"):
         if (folder / inside).is_file():
             return _from_file(folder / inside, env)
     try:
-        above, manifest = open_handoff(folder)
+        handoff_parent, manifest = open_handoff(folder)
     except HandoffError as error:
-        raise _several(folder) or error from None
+        raise _several_policies(folder) or error from None
     info = manifest.info
     wanted = ["policy", "normaliser"] if info.architecture.normalise_observations else ["policy"]
-    parts = read_handoff(above, wanted, info.task)
+    parts = read_handoff(handoff_parent, wanted, info.task)
     run = _run_settings(folder / RUN_FILE)
     tac = run.tac if run else TACSettings()
     try:
@@ -161,27 +144,29 @@ def policy_from_folder(folder: Path, env: str | Sequence[Task] = ()) -> Policy:
     except PolicyError:
         raise
     except (ValueError, LookupError) as error:
-        raise PolicyError(f"{above} must fit the task {info.task.name}: {error!r}") from error
+        raise PolicyError(
+            f"{handoff_parent} must fit the task {info.task.name}: {error!r}"
+        ) from error
     return _policy(network, env)
 
 
-def _several(folder: Path) -> PolicyError | None:
-    """What to say of a folder with policies in its sub-folders only; None for another one.
+def _several_policies(folder: Path) -> PolicyError | None:
+    """The error for a folder that has policies in its sub-folders only; None for any other.
 
-    `best` leaves such a folder where a sweep has several tasks.
+    `best` writes such a folder where a sweep has several tasks.
     """
     if (folder / "handoff").exists() or (folder / HANDOFF_FILE).exists():
-        return None  # there is one, and the error says what is wrong with it
-    found = []
-    for below in sorted(folder.glob("*/")):
+        return None  # the error of this handoff is the one to report
+    policies = []
+    for child in sorted(folder.glob("*/")):
         with contextlib.suppress(HandoffError):
-            found.append(f"{below} ({open_handoff(below)[1].info.task.name})")
-    if not found:
+            policies.append(f"{child} ({open_handoff(child)[1].info.task.name})")
+    if not policies:
         return None
-    more = f" and {len(found) - NAMED} more" if len(found) > NAMED else ""
+    more = f" and {len(policies) - _LISTED} more" if len(policies) > _LISTED else ""
     return PolicyError(
         f"{folder} must hold one policy, its sub-folders hold one each: give "
-        f"{' or '.join(found[:NAMED])}{more}"
+        f"{' or '.join(policies[:_LISTED])}{more}"
     )
 
 
@@ -268,24 +253,24 @@ def _from_mlflow(uri: str, env: str | Sequence[Task]) -> Policy:
 
 @contextlib.contextmanager
 def _local_copy(place: str) -> Iterator[Path]:
-    """A sealed folder's verified copy; another local folder as it is."""
+    """Yields a verified copy of an object folder, or any other local folder itself."""
     filesystem, root = open_storage(place)
-    above, _, name = root.rpartition("/")
-    sealed = ObjectFolders(filesystem, above)
-    if not sealed.exists(name):
+    parent, _, name = root.rpartition("/")
+    folders = ObjectFolders(filesystem, parent)
+    if not folders.exists(name):
         if isinstance(filesystem, pafs.LocalFileSystem):
             yield Path(root)
             return
         raise PolicyError(f"{place} must be a finished node or a checkpoint: no {MANIFEST} there")
     with TemporaryDirectory() as folder:
-        sizes = {file: one.bytes for file, one in sealed.manifest(name).files.items()}
+        sizes = {file: entry.bytes for file, entry in folders.manifest(name).files.items()}
         needed = {file for file in sizes if file in _FILES or file.startswith("handoff/")}
         total = sum(sizes[file] for file in needed)
         if total > MOST_WEIGHTS_BYTES:
             raise PolicyError(
                 f"{place} must have at most {MOST_WEIGHTS_BYTES} bytes of weights, it has {total}"
             )
-        sealed.fetch(name, Path(folder), needed.__contains__)
+        folders.fetch(name, Path(folder), needed.__contains__)
         yield Path(folder)
 
 
@@ -293,7 +278,7 @@ _FILES = {RUN_FILE, HANDOFF_FILE, MLFLOW_FILE, f"artifacts/{MLFLOW_FILE}"}
 
 
 def _run_settings(path: Path) -> RunSettings | None:
-    """A run's settings; None for a handoff that came alone."""
+    """A run's settings; None for a handoff without them."""
     if not path.is_file():
         return None
     try:
@@ -304,26 +289,26 @@ def _run_settings(path: Path) -> RunSettings | None:
 
 
 def _spaces(info: HandoffInfo, env: str | Sequence[Task]) -> Spaces:
-    """Sizes and action bounds, asked of the environment where the handoff doesn't say them."""
+    """Sizes and action bounds, from the environment where the handoff doesn't have them."""
     if info.spaces is not None:
         return info.spaces
     known = _environment(info.task, env)
     if known is None:
         raise PolicyError(unknown_environment(info.task))
     try:
-        made = make_env(known.env_id, **known.kwargs)
+        environment = make_env(known.env_id, **known.kwargs)
     except (gym.error.Error, ImportError, TypeError) as error:
         raise PolicyError(
             f"{info.task.name}: the environment {known.env_id} must be there: {error}"
         ) from error
     try:
-        return Spaces.of(made.observation_space, made.action_space)
+        return Spaces.of(environment.observation_space, environment.action_space)
     finally:
-        made.close()
+        environment.close()
 
 
 def unknown_environment(task: Task) -> str:
-    """Why a task's environment is not made, and what to say to have it made."""
+    """The message that a task's environment is not made, and how to have it made."""
     arguments = f" with {shown(task.env_kwargs)}" if task.env_kwargs else ""
     return (
         f"the environment of {task.name} must be a built-in task's, one of Gymnasium's, or named "

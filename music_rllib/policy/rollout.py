@@ -1,4 +1,4 @@
-"""Episodes of a policy in its task, and what came of them."""
+"""Plays episodes of a policy in its task."""
 
 from __future__ import annotations
 
@@ -13,17 +13,15 @@ from numpy.typing import NDArray
 from music_rllib.envs.make import Env, check_action_space, make_env, observation_sizes
 from music_rllib.policy.policy import Policy, PolicyError, unknown_environment
 
-__all__ = ["EpisodeResult", "Moment", "open_task", "play"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeResult:
-    """One episode; None where the task doesn't say."""
+    """The result of one episode; None where the task doesn't define a value."""
 
     seed: int
-    """Of the environment's reset."""
+    """Seed of the environment's reset."""
     success: bool | None
-    """At the last step: what success rates mean here."""
+    """Success at the last step, which success rates count."""
     success_any_step: bool | None
     episode_return: float
     """Undiscounted sum of the task's rewards."""
@@ -33,22 +31,20 @@ class EpisodeResult:
 
 
 class Moment(NamedTuple):
-    """What an onlooker sees after the reset and after each step."""
+    """The state of an episode after the reset or a step, for a film."""
 
     env: Env
     step: int
     success: bool | None
-    """None before the first step, and where the task doesn't say."""
+    """None before the first step, and where the task doesn't define it."""
     distance: float | None
-    """Between achieved and desired goal."""
+    """Distance between achieved and desired goal."""
 
 
 def open_task(policy: Policy, **options: Any) -> Env:
-    """The policy's environment; `options` go to `gymnasium.make` over those of the task.
+    """Makes the policy's environment; `options` override the task's arguments of `gymnasium.make`.
 
-    Raises:
-        PolicyError: nobody but the policy's file knows it, it can't be made, or the policy is
-            not for it.
+    Raises PolicyError where only the policy's file names it, it can't be made, or it doesn't fit.
     """
     known = policy.environment
     if known is None:
@@ -66,15 +62,13 @@ def open_task(policy: Policy, **options: Any) -> Env:
 
 
 def _check_fit(policy: Policy, env: Env) -> None:
-    """Raise ValueError for an environment with other observations, goals or actions."""
-    theirs = (
-        *observation_sizes(env.observation_space),
-        *check_action_space(env.action_space).shape,
-    )
+    """Raises ValueError for an environment with other observations, goals or actions."""
+    actions = check_action_space(env.action_space).shape
+    theirs = (*observation_sizes(env.observation_space), *actions)
     ours = (policy.observation_size, policy.goal_size, policy.action_size)
     if theirs != ours:
         raise ValueError(f"it has observations, goals and actions of {theirs}, the policy {ours}")
-    beyond = [one for one in policy.task.surrounding_indices if one >= policy.observation_size]
+    beyond = [i for i in policy.task.surrounding_indices if i >= policy.observation_size]
     if beyond:
         raise ValueError(
             f"surrounding_indices must be < {policy.observation_size}, got {beyond[0]}"
@@ -84,18 +78,13 @@ def _check_fit(policy: Policy, env: Env) -> None:
 def play(
     policy: Policy, env: Env, episodes: int, seed: int, see: Callable[[Moment], None] | None = None
 ) -> Iterator[EpisodeResult]:
-    """Play `episodes` deterministic episodes; equal seeds give equal starts and goals.
+    """Plays `episodes` deterministic episodes in an environment of `open_task`.
 
-    Args:
-        policy: acts.
-        env: from `open_task`.
-        episodes: how many.
-        seed: determines all of their resets.
-        see: is shown each moment of each episode.
+    Equal seeds give equal starts and goals. `see` is called with each moment of each episode.
     """
     for number in range(episodes):
-        reset = int(np.random.SeedSequence((seed, number)).generate_state(1)[0])
-        yield _episode(policy, env, reset, see)
+        reset_seed = int(np.random.SeedSequence((seed, number)).generate_state(1)[0])
+        yield _episode(policy, env, reset_seed, see)
 
 
 def _episode(
@@ -110,11 +99,12 @@ def _episode(
         action = policy.act(observation).astype(env.action_space.dtype)
         observation, reward, terminated, truncated, info = env.step(action)
         total += float(reward)
-        said = info.get(policy.task.success_key) if policy.task.success_key else None
-        if said is not None:
-            successes.append(bool(said))
+        success = info.get(policy.task.success_key) if policy.task.success_key else None
+        if success is not None:
+            success = bool(success)
+            successes.append(success)
         if see:
-            see(Moment(env, steps, None if said is None else bool(said), _distance(observation)))
+            see(Moment(env, steps, success, _distance(observation)))
         if terminated or truncated:
             break
     last = _surroundings(policy, observation)

@@ -1,7 +1,7 @@
-"""Pictures of a policy at work: rendered without a screen, as MP4 or GIF.
+"""Films of a policy's episodes, rendered without a screen, as MP4 or GIF.
 
-MuJoCo draws off-screen through EGL or OSMesa. Which of them works depends on the machine's
-drivers, and a wrong choice can end the process: each is tried out in a process of its own.
+MuJoCo renders off-screen through EGL or OSMesa. Which of them works depends on the machine's
+drivers, and a wrong choice can end the process: each is tried in a process of its own.
 """
 
 from __future__ import annotations
@@ -24,40 +24,33 @@ from music_rllib.errors import BadInputError
 from music_rllib.policy.policy import Policy
 from music_rllib.policy.rollout import EpisodeResult, Moment, open_task, play
 
-__all__ = ["FORMATS", "VideoError", "film", "find_renderer", "write_video"]
-
 FORMATS = (".mp4", ".gif")
 FRAMES_PER_SECOND = 20
 SIZE = 320
-"""Width and height of the picture in pixels; a line of text is above and below."""
+"""Width and height of the picture in pixels, without the lines of text above and below."""
 LINE = 26
+"""Height of a line of text in pixels."""
 HOLD = 12
 """Frames for which an episode's last picture stays."""
 
 SUCCESS, NOT_YET, UNKNOWN = "#009E73", "#D55E00", "#666666"
-"""Okabe and Ito's green and vermilion; words say the same."""
+"""Okabe and Ito's green and vermilion, and grey; a text repeats what they mean."""
 DARK, LIGHT = "#1b1b1b", "#ffffff"
 
 Frame = NDArray[np.uint8]
 
 
 class VideoError(BadInputError, RuntimeError):
-    """No video can be made here; says why and what to do."""
+    """No video can be made; the message has the reason and what to do."""
 
 
 def film(
     policy: Policy, episodes: int, seed: int, title: str
 ) -> tuple[list[Frame], list[EpisodeResult]]:
-    """Play and draw episodes: the scene, its goal, the step, and whether it is a success.
-
-    Args:
-        policy: acts.
-        episodes: how many, one after the other.
-        seed: as for `episodes.play`: the same episodes.
-        title: is written above.
+    """Plays and draws episodes; `seed` gives those of `rollout.play`, `title` is written above.
 
     Returns:
-        Pictures [height, width, 3], and what came of the episodes.
+        Pictures [height, width, 3], and the results of the episodes.
 
     Raises:
         VideoError: this machine or this environment can't draw.
@@ -66,16 +59,18 @@ def film(
     frames: list[Frame] = []
     results: list[EpisodeResult] = []
     _check_drawable(policy)
-    why_not = use_renderer()
+    renderer, why_not = find_renderer(os.environ.get("MUJOCO_GL"))
+    if renderer is not None:
+        os.environ["MUJOCO_GL"] = renderer
     env = open_task(policy, render_mode="rgb_array", **_size(policy))
     try:
         if why_not is not None and hasattr(env.unwrapped, "mujoco_renderer"):
             raise VideoError(why_not)
 
         def see(moment: Moment) -> None:
-            about = title if episodes == 1 else f"{title}  ·  episode {len(results) + 1}"
+            heading = title if episodes == 1 else f"{title}  ·  episode {len(results) + 1}"
             limit = policy.max_episode_steps
-            frames.append(_draw(_picture(moment.env), about, moment, limit))
+            frames.append(_draw(_picture(moment.env), heading, moment, limit))
 
         for result in play(policy, env, episodes, seed, see):
             results.append(result)
@@ -94,7 +89,7 @@ def _check_drawable(policy: Policy) -> None:
 
 
 def _size(policy: Policy) -> dict[str, int]:
-    """Options of MuJoCo's environments; others choose their own size."""
+    """Size options of MuJoCo's environments; others choose their own size."""
     name = "" if policy.environment is None else policy.environment.env_id
     mujoco = any(word in name for word in ("Fetch", "Hand", "Cheetah", "Hopper", "Walker", "Ant"))
     return {"width": SIZE, "height": SIZE} if mujoco else {}
@@ -103,7 +98,7 @@ def _size(policy: Policy) -> dict[str, int]:
 def _picture(env: Env) -> Image.Image:
     try:
         picture: Any = env.render()
-    # Whatever a driver raises: without a screen that is what happens.
+    # Without a screen, drivers raise errors of any type.
     except Exception as error:
         raise VideoError(f"the scene can't be drawn: {error}") from error
     if picture is None:
@@ -112,7 +107,7 @@ def _picture(env: Env) -> Image.Image:
 
 
 def _draw(picture: Image.Image, title: str, moment: Moment, limit: int) -> Frame:
-    # Even sizes: MP4 stores colours for two by two pixels.
+    # Even sizes, because MP4 stores colours for two by two pixels.
     width = (max(picture.width, SIZE) + 1) // 2 * 2
     height = (picture.height + 1) // 2 * 2
     sheet = Image.new("RGB", (width, height + 2 * LINE), DARK)
@@ -136,20 +131,11 @@ def _draw(picture: Image.Image, title: str, moment: Moment, limit: int) -> Frame
     return np.asarray(sheet, np.uint8)
 
 
-def use_renderer() -> str | None:
-    """Let MuJoCo draw by the first way that works; why not, where none does."""
-    name, why_not = find_renderer(os.environ.get("MUJOCO_GL"))
-    if name is not None:
-        os.environ["MUJOCO_GL"] = name
-    return why_not
-
-
 @functools.cache
 def find_renderer(chosen: str | None = None) -> tuple[str | None, str | None]:
-    """The way to draw without a screen: `egl` or `osmesa`, or the user's own `MUJOCO_GL`.
+    """Tries to render without a screen by `egl`, `osmesa`, or the user's own `MUJOCO_GL`.
 
-    Returns:
-        Its name, or None and what is the matter with each.
+    Returns the first name that works and None, or None and the message why none does.
     """
     reasons = []
     for name in [chosen] if chosen else ["egl", "osmesa"]:
@@ -187,11 +173,9 @@ context.free()
 
 
 def write_video(path: Path, frames: Sequence[Frame]) -> None:
-    """Write `frames` as the format that the path's ending names.
+    """Writes `frames` in the format that the path's ending names.
 
-    Raises:
-        VideoError: the ending is none of `FORMATS`, there is no encoder, or it fails.
-        OSError: the file can't be written.
+    Raises VideoError where it is none of `FORMATS`, there is no encoder, or the encoder fails.
     """
     if path.suffix.lower() == ".gif":
         _write_gif(path, frames)
@@ -202,8 +186,8 @@ def write_video(path: Path, frames: Sequence[Frame]) -> None:
 
 
 def _write_gif(path: Path, frames: Sequence[Frame]) -> None:
-    # One palette for all, so that nothing flickers and unchanged pixels cost nothing; made of more
-    # than one picture, so that the colours of success and failure are in it.
+    # One palette for all frames: nothing flickers, and unchanged pixels take no space. Several
+    # frames make it, so that it has the colours of success and failure.
     samples = [frames[i] for i in np.linspace(0, len(frames) - 1, 6).astype(int)]
     palette = Image.fromarray(np.concatenate(samples)).quantize(160)
     pictures = [
@@ -236,9 +220,8 @@ def _write_mp4(path: Path, frames: Sequence[Frame]) -> None:
 
 
 def _encoder() -> str:
-    found = shutil.which("ffmpeg")
-    if found:
-        return found
+    if system_ffmpeg := shutil.which("ffmpeg"):
+        return system_ffmpeg
     try:
         import imageio_ffmpeg
 

@@ -10,19 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["SumTree", "TDPriorities", "WeightedDraws", "ranges", "rank_weights"]
-
 Indices = NDArray[np.int64]
 Weights = NDArray[np.float64]
 
 SMALLEST_ERROR = 1e-6
-"""Added to every TD error, so that no transition is lost for ever (Schaul et al. 2016, 3.3)."""
-
+"""Added to every TD error, so that every transition can be drawn (Schaul et al. 2016, 3.3)."""
 STEPS_FROM_GUIDE = 3
+"""Sums that are compared one after the other before bisection."""
 
 
 def ranges(starts: Indices, lengths: Indices) -> Indices:
-    """[N], [N] -> [sum of lengths]: start, start + 1, ... of each, behind each other."""
+    """[N], [N] -> [sum of lengths]: start, start + 1, ... of each, concatenated."""
     ends = np.cumsum(lengths)
     total = int(ends[-1]) if len(ends) else 0
     return np.repeat(starts - (ends - lengths), lengths) + np.arange(total)
@@ -31,7 +29,7 @@ def ranges(starts: Indices, lengths: Indices) -> Indices:
 def rank_weights(priorities: Weights) -> Weights:
     """[N] -> [N]: dense rank - 1, so that the least is never drawn (Zhao et al. 2021's code).
 
-    Where all are equal there is nothing to prefer: every weight is 1.
+    Where all are equal, every weight is 1.
     """
     ranks = np.unique(priorities, return_inverse=True)[1].astype(np.float64)
     return ranks if ranks.any() else np.ones(len(priorities))
@@ -41,29 +39,31 @@ class WeightedDraws:
     """Draws from N fixed weights in a time that hardly depends on N.
 
     A uniform number is looked up among the running sums of the weights. A guide table (Chen & Asau
-    1974) says where to begin: the first sum beyond each of equal parts of the whole. A few steps
-    on is nearly always far enough; where it is not, the rest is found by bisection.
+    1974) says where to begin: the first sum beyond each of equal parts of the total. A few steps
+    from there are nearly always enough; otherwise bisection finds the sum.
+
+    Args:
+        weights: [N] >= 0, not all 0.
     """
 
     def __init__(self, weights: Weights) -> None:
-        """Weights [N] >= 0, not all 0."""
         self._indices = np.flatnonzero(weights)
         self._sums = np.cumsum(weights[self._indices])
         self._parts = 2 * len(self._indices)
-        # A part too early: the product that finds a number's part may round up.
+        # One part too early: the product that finds a number's part may round up.
         edges = np.arange(-1, self._parts - 1) * (self._sums[-1] / self._parts)
         self._guide = np.searchsorted(self._sums, edges, side="right")
 
     def draw(self, uniform: Weights) -> Indices:
         """[B] numbers in [0, 1) -> [B] indices, each with probability weight / total."""
         mass = uniform * self._sums[-1]
-        found = self._guide[(uniform * self._parts).astype(np.int64)]
-        before = np.flatnonzero(self._sums[found] <= mass)
+        position = self._guide[(uniform * self._parts).astype(np.int64)]
+        before = np.flatnonzero(self._sums[position] <= mass)
         for _ in range(STEPS_FROM_GUIDE):
-            found[before] += 1
-            before = before[self._sums[found[before]] <= mass[before]]
-        found[before] = np.searchsorted(self._sums, mass[before], side="right")
-        drawn: Indices = self._indices[found]
+            position[before] += 1
+            before = before[self._sums[position[before]] <= mass[before]]
+        position[before] = np.searchsorted(self._sums, mass[before], side="right")
+        drawn: Indices = self._indices[position]
         return drawn
 
 
@@ -86,7 +86,7 @@ class SumTree:
         return self._tree[indices + self._leaves]
 
     def set(self, indices: Indices, weights: Weights | float) -> None:
-        """Sets weights >= 0; of an index named twice the last one counts."""
+        """Sets weights >= 0; where an index comes twice, its last weight counts."""
         nodes = np.asarray(indices, np.int64) + self._leaves
         self._tree[nodes] = weights
         while len(nodes) and nodes[0] > 1:
@@ -100,31 +100,18 @@ class SumTree:
         while nodes[0] < self._leaves:
             nodes *= 2
             left = self._tree[nodes]
-            # An empty right half is never entered, also where rounding would lead there.
+            # An empty right half is never entered, even where rounding would lead there.
             right = (mass >= left) & (self._tree[nodes + 1] > 0)
             mass = np.where(right, mass - left, mass)
             nodes += right
         return nodes - self._leaves
-
-    def state(self) -> Weights:
-        """The leaves, from which `load_state` rebuilds all sums."""
-        return self._tree[self._leaves :].copy()
-
-    def load_state(self, leaves: Weights) -> None:
-        """Takes over the leaves of an equal tree."""
-        self._tree[self._leaves :] = leaves
-        level = self._leaves
-        while level > 1:
-            level >>= 1
-            pairs = self._tree[2 * level : 4 * level].reshape(level, 2)
-            self._tree[level : 2 * level] = pairs[:, 0] + pairs[:, 1]
 
 
 class TDPriorities:
     """Proportional prioritised replay over the rows of a ring of trajectories.
 
     Schaul et al. 2016, "Prioritized Experience Replay", section 3.3-3.4. New transitions get the
-    largest priority seen so far.
+    largest priority so far.
     """
 
     def __init__(self, rows: int, exponent: float) -> None:
@@ -135,13 +122,13 @@ class TDPriorities:
         self._length = np.zeros(rows, np.int32)
 
     def add(self, start: int, steps: int) -> None:
-        """A trajectory was stored in `steps` rows from `start` on."""
+        """Adds a trajectory that was stored in `steps` rows from `start` on."""
         rows = np.arange(start, start + steps)
         self._tree.set(rows, self._largest)
         self._start[rows], self._length[rows] = start, steps
 
     def remove(self, start: int, steps: int) -> None:
-        """The trajectory in these rows is gone."""
+        """Removes the trajectory in these rows."""
         self._tree.set(np.arange(start, start + steps), 0.0)
 
     def draw(self, uniform: Weights) -> tuple[Indices, Indices, Indices]:
@@ -160,36 +147,20 @@ class TDPriorities:
         return scaled
 
     def update(self, rows: Indices, errors: NDArray[np.float32]) -> None:
-        """[B] absolute TD errors become the priorities of [B] rows."""
+        """Sets the priorities of [B] rows by their absolute TD errors [B]."""
         priorities = (errors.astype(np.float64) + SMALLEST_ERROR) ** self._exponent
         self._tree.set(rows, priorities)
         self._largest = max(self._largest, float(priorities.max()))
 
-    def state(self) -> dict[str, Any]:
-        """Everything draws depend on."""
-        return {
-            "leaves": self._tree.state(),
-            "largest": self._largest,
-            "start": self._start.copy(),
-            "length": self._length.copy(),
-        }
-
-    def load_state(self, state: dict[str, Any]) -> None:
-        """Continues where `state()` was taken."""
-        self._tree.load_state(state["leaves"])
-        self._largest = float(state["largest"])
-        self._start[:] = state["start"]
-        self._length[:] = state["length"]
-
     def packed(self, rows: Indices) -> dict[str, Any]:
-        """Everything draws depend on, where `rows` are those of the trajectories held."""
+        """The state for a checkpoint; `rows` are those of the trajectories held."""
         return {"leaves": self._tree[rows], "largest": self._largest}
 
     def load_packed(self, starts: Indices, lengths: Indices, state: dict[str, Any]) -> None:
-        """Continues where `packed` was taken of these trajectories. For an empty one only."""
+        """Continues where `packed` was taken of these trajectories."""
         rows = ranges(starts, lengths)
-        if len(rows):
-            self._tree.set(rows, np.asarray(state["leaves"], np.float64))
+        self._tree = SumTree(len(self._start))
+        self._tree.set(rows, np.asarray(state["leaves"], np.float64))
         self._start[rows] = np.repeat(starts, lengths)
         self._length[rows] = np.repeat(lengths, lengths)
         self._largest = float(state["largest"])

@@ -1,10 +1,9 @@
-"""Trajectories in one float32 array, which wraps.
+"""A ring buffer of trajectories in one float32 array.
 
-All steps of all trajectories lie behind each other. A row is the frame (observation, desired goal,
-achieved goal), then the action taken there, its reward, and whether it was terminal: a transition
-is two neighbouring rows, one stretch of memory. A trajectory of n steps takes n + 1 rows and is
-never split by the ring's end, so a ring of capacity C holds exactly C transitions of full
-episodes, fewer where episodes end early.
+A row is a frame (observation, desired goal, achieved goal), the action taken there, its reward, and
+whether it was terminal; a transition is two neighbouring rows, one stretch of memory. A trajectory
+of n steps takes n + 1 rows and is never split by the ring's end, so a ring of capacity C holds
+exactly C transitions of full episodes, fewer where episodes end early.
 
 Memory, h being the longest episode: ``4 (D + 2G + A + 2) bytes * C (h + 1)/h`` plus 16 bytes a
 trajectory, claimed from the system as it fills. A million FetchPush transitions: 151 MB.
@@ -23,19 +22,9 @@ from numpy.typing import NDArray
 from music_rllib.replay.priorities import ranges
 from music_rllib.replay.trajectories import Floats, ReplayLayout, Rows, Trajectory
 
-__all__ = ["TrajectoryRing"]
-
 
 class TrajectoryRing:
-    """The newest trajectories that fit.
-
-    Args:
-        layout: sizes of a frame and an action, and the longest episode.
-        capacity: transitions of full episodes held at most, rounded down to whole episodes.
-
-    Raises:
-        ValueError: no room for one episode.
-    """
+    """Holds the newest trajectories that fit into `capacity` transitions of full episodes."""
 
     def __init__(self, layout: ReplayLayout, capacity: int) -> None:
         if capacity < layout.horizon:
@@ -44,7 +33,7 @@ class TrajectoryRing:
             )
         self.layout = layout
         ring = capacity // layout.horizon * (layout.horizon + 1)
-        # Untouched pages of zeros cost nothing: the system hands them out as they are written.
+        # Pages of zeros take no memory until they are written.
         self._steps = np.zeros((ring, layout.frame + layout.action + 2), np.float32)
         self._frames = self._steps[:, : layout.frame]
         self._actions = self._steps[:, layout.frame : -2]
@@ -71,7 +60,7 @@ class TrajectoryRing:
         return self._used * self._steps.shape[1] * self._steps.itemsize
 
     def _store(self, trajectory: Trajectory) -> int:
-        """Writes a trajectory in place of the oldest ones; its first row."""
+        """Writes a trajectory in place of the oldest ones and returns its first row."""
         steps = len(trajectory)
         if not 0 < steps <= self.layout.horizon:
             raise ValueError(f"an episode must have 1 to {self.layout.horizon} steps, got {steps}")
@@ -90,10 +79,10 @@ class TrajectoryRing:
         return start
 
     def _make_room(self, frames: int) -> int:
-        """Start of `frames` free consecutive frames; the oldest trajectories there are dropped."""
+        """Drops the oldest trajectories where `frames` rows are needed; returns the first row."""
         stale, held = 0, len(self._starts)
         if self._write + frames > len(self._frames):
-            # What lies between here and the ring's end is the oldest: it goes, and the ring wraps.
+            # The trajectories between here and the ring's end are the oldest: the ring wraps.
             while stale < held and self._starts[stale] >= self._write:
                 stale += 1
             self._write = 0
@@ -104,36 +93,30 @@ class TrajectoryRing:
         return self._write
 
     def _drop(self, count: int) -> None:
-        """Forgets the oldest trajectories."""
+        """Drops the `count` oldest trajectories."""
         self._starts, self._lengths = self._starts[count:], self._lengths[count:]
 
     def _read(self, rows: Rows, first: int, count: int) -> Floats:
-        """`count` numbers of each row from column `first` on, and on into the row after it.
+        """Copies `count` numbers of `rows` [...] from column `first`, reaching into the next row.
 
-        Args:
-            rows: [...] rows of the ring.
-
-        Returns:
-            [..., count], a copy. Each stretch is copied as a whole, not number by number.
+        Returns [..., count]. Each stretch is copied as a whole, not number by number.
         """
         stretch, stride = np.dtype((np.void, 4 * count)), self._steps.strides[0]
         fitting = (self._steps.nbytes - 4 * (first + count)) // stride + 1
         stretches = np.ndarray((fitting,), stretch, self._steps.data, 4 * first, (stride,))
         return stretches[rows].view(np.float32).reshape(*rows.shape, count)
 
-    # -- checkpoints ----------------------------------------------------------------------
-
     @property
     def oldest(self) -> int:
-        """Number of the oldest trajectory held: they are counted from 0 as they are added."""
+        """Number of the oldest trajectory held; trajectories are numbered from 0 as added."""
         return self.trajectories_added - self.trajectories
 
     def packed(self, first: int, end: int | None = None) -> dict[str, NDArray[Any]]:
-        """The trajectories from number `first` (>= `oldest`) up to `end`, behind each other.
+        """Copies the trajectories number `first` (>= `oldest`) to `end` - 1, concatenated.
 
         Returns:
             lengths [N], terminated [N], frames [sum of n+1, D + 2G], actions [sum of n, A],
-            rewards [sum of n]: copies. Together with `index()` all that there is.
+            rewards [sum of n]; with `index()` the whole state.
         """
         held = slice(first - self.oldest, None if end is None else end - self.oldest)
         starts, lengths = self._starts[held], self._lengths[held]
@@ -147,15 +130,16 @@ class TrajectoryRing:
         }
 
     def _place(self, first: int, arrays: Mapping[str, NDArray[Any]]) -> int:
-        """Puts the held ones of the trajectories `first`, ... in their rows; number after them."""
+        """Writes those of the trajectories `first`, ... that are in the index to their rows.
+
+        Returns the number after the last one written.
+        """
         lengths = np.asarray(arrays["lengths"], np.int64)
         begin, end = max(first, self.oldest), min(first + len(lengths), self.trajectories_added)
         if begin >= end:
             return begin
-        given, held = (
-            slice(begin - first, end - first),
-            slice(begin - self.oldest, end - self.oldest),
-        )
+        given = slice(begin - first, end - first)
+        held = slice(begin - self.oldest, end - self.oldest)
         starts, own = self._starts[held], self._lengths[held]
         frames, actions = arrays["frames"], arrays["actions"]
         if not np.array_equal(own, lengths[given]) or frames.shape[1] != self.layout.frame:
@@ -163,7 +147,7 @@ class TrajectoryRing:
                 f"trajectories {begin} to {end - 1} must be those of the checkpoint's index, with "
                 f"{self.layout.frame} numbers a frame, got {frames.shape[1]}"
             )
-        # Where trajectory i begins among the rows of all: its steps, and one frame more of each.
+        # Steps before trajectory i in the arrays; each trajectory has one frame more than steps.
         before = np.cumsum(lengths) - lengths
         skipped, frames_skipped = before[given], (before + np.arange(len(lengths)))[given]
         rows, source = ranges(starts, own), ranges(skipped, own)

@@ -11,26 +11,24 @@ import numpy as np
 
 from music_rllib.replay.trajectories import Rows
 
-__all__ = ["MOST_OF_ONE_EPISODE", "Places"]
-
 MOST_OF_ONE_EPISODE = 0.4
-"""Share of a minibatch that `hindsight_episodes: moved` may take from one episode, on average. Less
-would last longer: with a tenth, until eight have moved, a run from scratch that was compared
-learned FetchPush later (docs/results.md)."""
+"""Share of a minibatch that `hindsight_episodes: moved` may take from one episode, on average. A
+smaller share stays in effect for longer: a tenth, until eight episodes have moved; a run from
+scratch then learned FetchPush later (docs/results.md)."""
 
 
 @dataclass(frozen=True)
 class Places:
-    """Where the transitions of some trajectories lie, to draw from."""
+    """The rows of some trajectories, from which transitions are drawn."""
 
     starts: Rows
     lengths: Rows
     ends: Rows
-    """[N] transitions up to the end of each trajectory."""
+    """[N] cumulative sum of the lengths."""
     longest: int
-    """Transitions of the longest one; 0 if there is none."""
+    """Length of the longest one; 0 if there is none."""
     equal: bool
-    """Whether all are of one length."""
+    """Whether all have the same length."""
 
     @classmethod
     def of(cls, starts: Rows, lengths: Rows) -> Places:
@@ -40,11 +38,11 @@ class Places:
 
     @property
     def total(self) -> int:
-        """Transitions of all."""
+        """Number of transitions."""
         return int(self.ends[-1]) if len(self.ends) else 0
 
     def draw(self, rng: np.random.Generator, count: int) -> tuple[Rows, Rows, Rows]:
-        """First row, step and length of their trajectory, of `count` transitions; [B] each."""
+        """Draws `count` transitions: first row of their trajectory, step, its length; [B] each."""
         drawn = rng.integers(0, self.total, count)
         if self.equal:
             which, step = np.divmod(drawn, self.lengths[0])
@@ -54,13 +52,9 @@ class Places:
         return self.starts[which], step, self.lengths[which]
 
     def few_of_one(self, rng: np.random.Generator, count: int, share: float) -> Rows:
-        """Which of `count` transitions to draw from here, so that no trajectory gives too many.
+        """Those of `count` transitions, a `share` of a minibatch, to draw from these trajectories.
 
-        Args:
-            share: of a minibatch, that these `count` make up.
-
-        Returns:
-            Positions: all, or as many as leave the longest trajectory `MOST_OF_ONE_EPISODE`.
+        All of them, or so few that `MOST_OF_ONE_EPISODE` holds for the longest trajectory.
         """
         of_longest = share * self.longest / self.total
         if of_longest <= MOST_OF_ONE_EPISODE:

@@ -1,12 +1,12 @@
-"""A replay in files that are written once: segments of trajectories, in the order of their coming.
+"""A replay in files that are written once: segments of consecutive trajectories.
 
-A trajectory never changes once it is stored, so a checkpoint writes those that have come since the
-last one, and names the segments that hold the others.
+A trajectory never changes once it is stored, so a checkpoint writes only those that were added
+since the last checkpoint, and names the segments that hold the others.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,10 +14,8 @@ from numpy.typing import NDArray
 
 from music_rllib.replay.buffer import TrajectoryReplay
 
-__all__ = ["Segment", "load_segments", "new_segments"]
-
 MOST = 2_000
-"""Trajectories of a segment: a file is made in memory, some 15 MB for the Fetch tasks."""
+"""Largest number of trajectories in a segment: a file is built in memory, 15 MB for Fetch."""
 
 Arrays = Mapping[str, NDArray[Any]]
 
@@ -34,15 +32,10 @@ class Segment:
 def new_segments(
     replay: TrajectoryReplay, stored: Sequence[Segment], write: Callable[[str, Arrays], str]
 ) -> list[Segment]:
-    """Write what is new.
+    """Writes the trajectories that none of the `stored` segments (oldest first) has.
 
-    Args:
-        replay: What is to be saved.
-        stored: Segments that are written already, oldest first.
-        write: Takes a label and arrays, and gives the name under which it has written them.
-
-    Returns:
-        The segments that hold all of the replay, oldest first.
+    `write` takes a label and arrays and returns the name of the segment. Returns the segments that
+    hold all of the replay, oldest first.
     """
     needed = [segment for segment in stored if segment.end > replay.oldest]
     first = max([replay.oldest, *(segment.end for segment in needed)])
@@ -51,17 +44,3 @@ def new_segments(
         name = write(f"{begin:09d}-{end:09d}", replay.packed(begin, end))
         needed.append(Segment(name, begin, end))
     return needed
-
-
-def load_segments(
-    replay: TrajectoryReplay,
-    index: Mapping[str, Any],
-    segments: Iterable[Segment],
-    read: Callable[[str], Arrays],
-) -> None:
-    """Continue exactly where `index` (`replay.index()`) was taken; one segment in memory at a time.
-
-    Raises:
-        ValueError: They come from a replay of other sizes, or do not make up all of it.
-    """
-    replay.load_packed(dict(index), ((segment.first, read(segment.name)) for segment in segments))

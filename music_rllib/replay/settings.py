@@ -8,8 +8,6 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from music_rllib.schedules import Schedule, bounded
 
-__all__ = ["ReplaySettings"]
-
 
 class ReplaySettings(BaseModel):
     """Size of the replay, and hindsight relabelling (Andrychowicz et al. 2017)."""

@@ -1,4 +1,4 @@
-"""What a replay takes and gives: trajectories, transitions, whole trajectories side by side.
+"""The data of a replay: trajectories, transitions, and batches of whole trajectories.
 
 Shape legend: B transitions, N trajectories, n steps of one, T frames of the longest one,
 D observation, G goal, A action.
@@ -12,19 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "Floats",
-    "ReplayLayout",
-    "Rows",
-    "Trajectory",
-    "Transitions",
-    "WholeTrajectories",
-    "long_enough",
-]
-
 SHORTEST = 2
-"""Steps of a trajectory that time can be shuffled in: of two frames half of all permutations are
-the identity."""
+"""Fewest steps of a trajectory that the estimator learns from: of two frames, half of all
+permutations of time are the identity."""
 
 Floats = NDArray[np.float32]
 Rows = NDArray[np.int64]
@@ -69,7 +59,7 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class Transitions:
-    """A minibatch, or several behind each other."""
+    """One minibatch, or several concatenated."""
 
     inputs: Floats
     """[B, D + G] observation and desired goal."""
@@ -81,17 +71,14 @@ class Transitions:
     """[B] 0 where the episode terminated, else 1."""
     next_inputs: Floats
     """[B, D + G]"""
-    weights: Floats | None = None
-    """[B] importance weights in (0, 1] where transitions are drawn by TD error."""
-    rows: Rows | None = None
-    """[B] where they lie, for `update_priorities`."""
+    weights: Floats | None
+    """[B] importance weights in (0, 1]; None where transitions are not drawn by TD error."""
+    rows: Rows
+    """[B] rows of the ring, for `update_priorities`."""
 
 
 def long_enough(lengths: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """[N] steps -> [N] whether the estimator learns from it; all, where there are only short ones.
-
-    Not less than the longest one has, so that there is always something to learn from.
-    """
+    """[N] steps -> [N] whether the estimator learns from it; all where all are too short."""
     return lengths >= min(SHORTEST, int(lengths.max(initial=0)))
 
 
@@ -100,16 +87,16 @@ class WholeTrajectories:
     """Trajectories from their first to their last frame."""
 
     observations: Floats
-    """[N, T, D]; behind a shorter one its last frame again."""
+    """[N, T, D]; a shorter one is padded with its last frame."""
     inside: NDArray[np.bool_] | None
-    """[N, T] False for what is behind a shorter one; None where all are of one length."""
+    """[N, T] False for padding; None where all have the same length."""
 
     @classmethod
     def of(cls, frames: Sequence[Floats]) -> WholeTrajectories:
-        """Of N arrays [n+1, D]."""
-        counts = np.array([len(one) for one in frames])
+        """Stacks N arrays [n+1, D]."""
+        counts = np.array([len(each) for each in frames])
         if (counts == counts[0]).all():
             return cls(np.stack(frames), None)
         longest = int(counts.max())
-        padded = [np.pad(one, ((0, longest - len(one)), (0, 0)), mode="edge") for one in frames]
+        padded = [np.pad(each, ((0, longest - len(each)), (0, 0)), mode="edge") for each in frames]
         return cls(np.stack(padded), np.arange(longest) < counts[:, None])

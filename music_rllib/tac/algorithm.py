@@ -1,4 +1,4 @@
-"""`TAC`: collect episodes, store them, learn from the replay, hand the weights back."""
+"""The algorithm `TAC`: collects episodes, stores them, learns from the replay, syncs weights."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ from ray.rllib.core import (
 from ray.rllib.core.columns import Columns
 from ray.rllib.env.env_runner_group import EnvRunnerGroup
 from ray.rllib.policy.sample_batch import MultiAgentBatch, SampleBatch
-from ray.rllib.utils.checkpoints import Checkpointable
 from ray.rllib.utils.metrics import (
     ENV_RUNNER_RESULTS,
     ENV_RUNNER_SAMPLING_TIMER,
@@ -35,27 +34,26 @@ from ray.rllib.utils.typing import StateDict
 
 from music_rllib.envs.make import goal_reward_of, moved_distance_of
 from music_rllib.envs.numbers import BadNumberError
+from music_rllib.envs.recording import Episode
 from music_rllib.replay.buffer import TrajectoryReplay
 from music_rllib.replay.trajectories import Transitions
 from music_rllib.schedules import value_at
 from music_rllib.tac.config import TACConfig
-from music_rllib.tac.env_runner import SUCCESS_LAST, Episode, TrajectoryEnvRunner, seed_or_entropy
+from music_rllib.tac.env_runner import SUCCESS_LAST, TrajectoryEnvRunner, seed_or_entropy
 from music_rllib.tac.rl_module import ESTIMATOR_MODULE
 from music_rllib.tac.weights import NetworkWeights, by_module, by_network
 
-__all__ = ["TAC"]
-
 REVIVE_SECONDS = 300.0
-"""How long a remote environment runner that died may take to come back."""
+"""How long a remote environment runner that died may take to be restarted."""
 UPDATES_PER_CALL = 100
-"""Updates whose minibatches are sampled and sent together: few enough to stay in the cache."""
+"""Updates whose minibatches are sampled and sent together: few enough for the CPU's cache."""
 
 
 class TAC(Algorithm):
     """Tsallis Actor-Critic (paper Fig. 3), with MUSIC's intrinsic reward where configured."""
 
     REPLAY = "replay"
-    """Name of the component with the trajectories, for `get_state` and `save_to_path`."""
+    """Name of the trajectories' part of the state."""
 
     @classmethod
     def get_default_config(cls) -> TACConfig:
@@ -71,14 +69,12 @@ class TAC(Algorithm):
         self.grad_updates = 0
         """Gradient updates done so far."""
         self.replay = self._make_replay()
-        self._runner_states: dict[int, StateDict] = {}
-        """Remote runners' random streams after their last episodes, by worker index."""
-        for index, state in self._ask_runners(_stream_of):
-            self._runner_states[index] = state
+        self._runner_states: dict[int, StateDict] = dict(self._call_runners(_random_state))
+        """Random states of the remote runners after their last episodes, by worker index."""
 
     def _make_replay(self) -> TrajectoryReplay:
         settings = self._replay_settings
-        runner = self._a_runner_with_environments()
+        runner = self._runner_with_environment()
         goal_reward = goal_reward_of(runner.env) if settings.hindsight_k > 0 else None
         moved_distance = self.config.moved_distance
         if goal_reward and settings.hindsight_episodes == "moved" and moved_distance is None:
@@ -91,15 +87,11 @@ class TAC(Algorithm):
             hindsight_k=settings.hindsight_k,
             hindsight_episodes=settings.hindsight_episodes,
             moved_distance=moved_distance,
-            td_exponent=settings.priority_exponent if self._by_td_error else None,
+            td_exponent=settings.priority_exponent if settings.priority == "td_error" else None,
         )
 
-    @property
-    def _by_td_error(self) -> bool:
-        return bool(self._replay_settings.priority == "td_error")
-
-    def _a_runner_with_environments(self) -> TrajectoryEnvRunner:
-        """The local runner; with remote ones it has no environments yet, and needs one now."""
+    def _runner_with_environment(self) -> TrajectoryEnvRunner:
+        """The local runner; one without environments, as beside remote runners, gets one."""
         runner: TrajectoryEnvRunner = self.env_runner
         if not runner.envs:
             runner.config = runner.config.copy(copy_frozen=False).env_runners(
@@ -109,7 +101,7 @@ class TAC(Algorithm):
         return runner
 
     def _setup_logdir(self) -> None:
-        """Outside Tune, a temporary folder instead of a new one in the user's home every time."""
+        """Outside Tune, logs to a temporary folder instead of a new one in the user's home."""
         if self._storage is not None:
             super()._setup_logdir()
         else:
@@ -136,15 +128,17 @@ class TAC(Algorithm):
                 )
             self.grad_updates += updates
             self.metrics.aggregate(results, key=LEARNER_RESULTS)
-            if drawn.rows is not None and self._by_td_error:
-                self.replay.update_priorities(drawn.rows, self._td_errors())
+            if drawn.weights is not None:
+                errors = self._call_learner(lambda learner: learner.take_td_errors())
+                self.replay.update_priorities(drawn.rows, errors)
         with self.metrics.log_time((TIMERS, SYNCH_WORKER_WEIGHTS_TIMER)):
-            self.env_runner_group.sync_weights(
-                from_worker_or_learner_group=self.learner_group, inference_only=True
-            )
+            self._sync_weights(self.env_runner_group)
+
+    def _sync_weights(self, group: EnvRunnerGroup) -> None:
+        group.sync_weights(from_worker_or_learner_group=self.learner_group, inference_only=True)
 
     def evaluate(self, *args: Any, **kwargs: Any) -> Any:
-        """As RLlib's; what follows the success rate takes it from here."""
+        """Evaluates as RLlib does, and gives the success rate to settings that follow it."""
         results = super().evaluate(*args, **kwargs)
         success = results.get(ENV_RUNNER_RESULTS, {}).get(SUCCESS_LAST)
         if success is not None:
@@ -155,13 +149,13 @@ class TAC(Algorithm):
         return results
 
     def _collect(self, *, random_actions: bool) -> list[Episode]:
-        """One episode in every sub-environment."""
+        """Plays one episode in every sub-environment."""
 
         def play(runner: TrajectoryEnvRunner) -> tuple[list[Episode], Any]:
             return runner.sample(random_actions=random_actions), runner.get_metrics()
 
         remote = bool(self._runner_states)
-        samples = self._collect_from_afar(play) if remote else [play(self.env_runner)]
+        samples = self._collect_remotely(play) if remote else [play(self.env_runner)]
         self.metrics.aggregate([metrics for _, metrics in samples], key=ENV_RUNNER_RESULTS)
         episodes = [episode for sampled, _ in samples for episode in sampled]
         self.env_steps += sum(len(episode) for episode in episodes)
@@ -169,31 +163,31 @@ class TAC(Algorithm):
 
     # -- remote environment runners, which may die ----------------------------------------
 
-    def _ask_runners(self, question: Callable[[Any], Any], among: Iterable[int] = ()) -> list[Any]:
-        """Answers of the remote runners that are alive, of all or of those named."""
-        answers: list[Any] = self.env_runner_group.foreach_env_runner(
-            question, local_env_runner=False, remote_worker_ids=sorted(among) or None
+    def _call_runners(self, function: Callable[[Any], Any], ids: Iterable[int] = ()) -> list[Any]:
+        """Results of the living remote runners among `ids`, or of all where none are given."""
+        results: list[Any] = self.env_runner_group.foreach_env_runner(
+            function, local_env_runner=False, remote_worker_ids=sorted(ids) or None
         )
-        return answers
+        return results
 
-    def _collect_from_afar(self, play: Callable[[Any], Any]) -> list[tuple[list[Episode], Any]]:
-        """One round of every remote runner, in their order; a dead one plays it again.
+    def _collect_remotely(self, play: Callable[[Any], Any]) -> list[tuple[list[Episode], Any]]:
+        """Plays one round on every remote runner, again where a runner died; in runners' order.
 
         Raises:
-            RuntimeError: one did not come back.
-            BadNumberError: an environment returned something that nothing can be learned from.
+            RuntimeError: a runner could not be restarted.
+            BadNumberError: an environment returned a number that cannot be learned from.
         """
 
-        def play_and_tell(runner: TrajectoryEnvRunner) -> tuple[Any, tuple[int, StateDict]]:
+        def play_with_state(runner: TrajectoryEnvRunner) -> tuple[Any, tuple[int, StateDict]]:
             try:
-                return play(runner), _stream_of(runner)
-            except BadNumberError as error:  # raised, it would be taken for the runner's death
-                return error, _stream_of(runner)
+                return play(runner), _random_state(runner)
+            except BadNumberError as error:  # raised, it would count as the runner's death
+                return error, _random_state(runner)
 
         samples: dict[int, tuple[list[Episode], Any]] = {}
         give_up = time.monotonic() + REVIVE_SECONDS
         while missing := self._runner_states.keys() - samples.keys():
-            for sample, (index, state) in self._ask_runners(play_and_tell, missing):
+            for sample, (index, state) in self._call_runners(play_with_state, missing):
                 if isinstance(sample, BadNumberError):
                     raise sample
                 samples[index], self._runner_states[index] = sample, state
@@ -208,21 +202,21 @@ class TAC(Algorithm):
         return [samples[index] for index in sorted(samples)]
 
     def restore_env_runners(self, env_runner_group: EnvRunnerGroup) -> list[int]:
-        """Brings dead runners back, with the random streams that they would have gone on with."""
+        """Restarts dead runners in the random states from which they would have continued."""
         restored: list[int] = super().restore_env_runners(env_runner_group)
         if restored and env_runner_group is self.env_runner_group:
-            self._put_back_streams(restored)
-            env_runner_group.sync_weights(
-                from_worker_or_learner_group=self.learner_group, inference_only=True
-            )
+            self._restore_random_states(restored)
+            self._sync_weights(env_runner_group)
         return restored
 
-    def _put_back_streams(self, indices: Iterable[int]) -> None:
+    def _restore_random_states(self, indices: Iterable[int]) -> None:
         states = {index: self._runner_states[index] for index in indices}
-        self._ask_runners(lambda runner: runner.set_state(states[runner.worker_index]), states)
+        self._call_runners(lambda runner: runner.set_state(states[runner.worker_index]), states)
+
+    # -- learning -------------------------------------------------------------------------
 
     def _observe_inputs(self, episodes: list[Episode]) -> None:
-        """Shows the new states to the normaliser, also with the goals that hindsight will use."""
+        """Adds the new states to the normaliser, also with the goals that hindsight will use."""
         width, layout = self.replay.layout.network_input, self.replay.layout
         frames = np.concatenate([episode.frames for episode in episodes])
         inputs = frames[:, :width]
@@ -232,30 +226,26 @@ class TAC(Algorithm):
         self.learner_group.foreach_learner(lambda learner: learner.observe_inputs(inputs))
 
     def _trajectory_priorities(self, episodes: list[Episode]) -> NDArray[np.float64] | None:
-        """MUSIC-p: how the frozen estimator values each of the episodes."""
+        """MUSIC-p: a priority for each episode by the frozen estimator."""
         if not self._music.prioritise_replay:
             return None
-        priorities: NDArray[np.float64] = self._ask_learner(
+        priorities: NDArray[np.float64] = self._call_learner(
             lambda learner: learner.trajectory_priorities(episodes)
         )
         return priorities
 
-    def _td_errors(self) -> NDArray[np.float32]:
-        errors: NDArray[np.float32] = self._ask_learner(lambda learner: learner.take_td_errors())
-        return errors
-
-    def _ask_learner(self, question: Callable[[Any], Any]) -> Any:
-        return next(iter(self.learner_group.foreach_learner(question))).get()
+    def _call_learner(self, function: Callable[[Any], Any]) -> Any:
+        return next(iter(self.learner_group.foreach_learner(function))).get()
 
     def _updates_due(self) -> list[int]:
-        """Updates to catch up with the replay ratio, in calls of at most `UPDATES_PER_CALL`."""
-        learned_from = self.env_steps - self._settings.random_steps
-        due = int(learned_from * self._settings.replay_ratio) - self.grad_updates
+        """The updates that the replay ratio asks for, in calls of at most `UPDATES_PER_CALL`."""
+        counted_steps = self.env_steps - self._settings.random_steps
+        due = int(counted_steps * self._settings.replay_ratio) - self.grad_updates
         full, rest = divmod(max(due, 0), UPDATES_PER_CALL)
         return [UPDATES_PER_CALL] * full + ([rest] if rest else [])
 
     def sample_batch(self, updates: int) -> MultiAgentBatch:
-        """All minibatches of `updates` updates behind each other, as `TACLearner` takes them."""
+        """The minibatches of `updates` updates, concatenated as `TACLearner` takes them."""
         return self._batch_of(self._draw(updates), updates)
 
     def _draw(self, updates: int) -> Transitions:
@@ -280,52 +270,40 @@ class TAC(Algorithm):
         batches = {DEFAULT_MODULE_ID: SampleBatch(columns)}
         if self._music.estimator == "trained":
             whole = self.replay.sample_trajectories(updates * self._music.batch_trajectories)
-            of_estimator: dict[str, NDArray[Any]] = {Columns.OBS: whole.observations}
+            trajectories: dict[str, NDArray[Any]] = {Columns.OBS: whole.observations}
             if whole.inside is not None:
-                of_estimator["inside"] = whole.inside
-            batches[ESTIMATOR_MODULE] = SampleBatch(of_estimator)
+                trajectories["inside"] = whole.inside
+            batches[ESTIMATOR_MODULE] = SampleBatch(trajectories)
         return MultiAgentBatch(batches, env_steps=len(drawn.rewards))
 
     # -- plain weights --------------------------------------------------------------------
 
     def get_network_weights(self) -> NetworkWeights:
-        """Plain arrays of each network: policy, critics, value, value_target, normaliser, ..."""
+        """The arrays of each network: policy, critics, value, value_target, normaliser, ..."""
         state = self.learner_group.get_state(components="learner/rl_module")["learner"]["rl_module"]
         return by_network(state)
 
     def set_network_weights(self, weights: Mapping[str, Mapping[str, NDArray[Any]]]) -> None:
-        """Loads networks by name, as `get_network_weights` gives them; all others stay as they are.
+        """Loads the given networks, as `get_network_weights` returns them; keeps the others.
 
-        Raises:
-            ValueError: an unknown network, or tensors that are missing, unknown or of other shape.
+        Raises ValueError for an unknown network, and for missing, unknown or misshapen tensors.
         """
         modules = by_module(weights, self.get_network_weights())
         self.learner_group.foreach_learner(
             lambda learner: [learner.module[mid].set_state(state) for mid, state in modules.items()]
         )
-        self._push_weights()
-
-    def _push_weights(self) -> None:
         for group in (self.env_runner_group, self.eval_env_runner_group):
             if group is not None:
-                group.sync_weights(
-                    from_worker_or_learner_group=self.learner_group, inference_only=True
-                )
+                self._sync_weights(group)
 
     # -- checkpoints ----------------------------------------------------------------------
-
-    def get_checkpointable_components(self) -> list[tuple[str, Checkpointable]]:
-        return [
-            *super().get_checkpointable_components(),
-            (self.REPLAY, _ReplayComponent(self.replay)),
-        ]
 
     def get_state(
         self, components: Any = None, *, not_components: Any = None, **kw: Any
     ) -> StateDict:
         state = super().get_state(components, not_components=not_components, **kw)
         if self._check_component(self.REPLAY, components, not_components):
-            state[self.REPLAY] = _ReplayComponent(self.replay).get_state()
+            state[self.REPLAY] = self.replay.state()
         state[_COUNTERS] = {"env_steps": self.env_steps, "grad_updates": self.grad_updates}
         state[_RUNNERS] = dict(self._runner_states)
         return state
@@ -340,37 +318,17 @@ class TAC(Algorithm):
         if _COUNTERS in state:
             self.env_steps = state[_COUNTERS]["env_steps"]
             self.grad_updates = state[_COUNTERS]["grad_updates"]
-        if (
-            self._runner_states.keys()
-            and self._runner_states.keys() == state.get(_RUNNERS, {}).keys()
-        ):
-            self._runner_states = dict(state[_RUNNERS])
-            self._put_back_streams(self._runner_states)
+        runner_states = state.get(_RUNNERS, {})
+        if runner_states and runner_states.keys() == self._runner_states.keys():
+            self._runner_states = dict(runner_states)
+            self._restore_random_states(runner_states)
 
 
 _COUNTERS, _RUNNERS = "tac_counters", "tac_runners"
 _REPLAY_STREAM = 101
-"""Keeps the replay's random stream apart from the environment runners'."""
+"""Separates the replay's random stream from those of the environment runners."""
 
 
-def _stream_of(runner: TrajectoryEnvRunner) -> tuple[int, StateDict]:
-    """Worker index, and what its next episodes depend on beside the weights."""
+def _random_state(runner: TrajectoryEnvRunner) -> tuple[int, StateDict]:
+    """The worker index, and the state of the runner without its weights."""
     return runner.worker_index, runner.get_state(not_components=COMPONENT_RL_MODULE)
-
-
-class _ReplayComponent(Checkpointable):
-    """The replay as RLlib checkpoints want their parts."""
-
-    def __init__(self, replay: TrajectoryReplay) -> None:
-        self._replay = replay
-
-    def get_state(
-        self, components: Any = None, *, not_components: Any = None, **kw: Any
-    ) -> StateDict:
-        return self._replay.state()
-
-    def set_state(self, state: StateDict) -> None:
-        self._replay.load_state(state)
-
-    def get_ctor_args_and_kwargs(self) -> tuple[tuple[Any, ...], dict[str, Any]]:
-        return (), {}

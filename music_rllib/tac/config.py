@@ -25,8 +25,6 @@ from music_rllib.schedules import Linear, Measured, check_measurable
 from music_rllib.tac.rl_module import ESTIMATOR_MODULE, EstimatorModule, TACModule
 from music_rllib.tac.scheduled import ScheduledSettings
 
-__all__ = ["TACConfig"]
-
 _Settings = TypeVar("_Settings", TACSettings, MusicSettings, ReplaySettings)
 
 
@@ -50,7 +48,7 @@ class TACConfig(AlgorithmConfig):
         from music_rllib.tac.algorithm import TAC
         from music_rllib.tac.env_runner import TrajectoryEnvRunner
 
-        # RLlib's notices about its own API stack are nothing that a user of TAC can act on.
+        # A user of TAC can do nothing about RLlib's notices on its own API stack.
         quiet_third_parties()
         super().__init__(algo_class=algo_class or TAC)
         for settings, prefix in _OWNED:
@@ -65,16 +63,16 @@ class TACConfig(AlgorithmConfig):
         self.moved_distance: float | None = None
         self.framework_str = "torch"
         self.env_runner_cls = TrajectoryEnvRunner
-        # One iteration is one episode per sub-environment, and what is learned from it.
+        # One iteration is one episode per sub-environment and the updates after it.
         self.min_time_s_per_iteration = None
         self.min_sample_timesteps_per_iteration = 1_000
-        # NaNs are looked for once an update call, with a message; not in every gradient.
+        # The Learner checks for NaNs once per update call, with a message; not in every gradient.
         self.torch_skip_nan_gradients = True
-        # TAC pushes weights itself; there are no connector states to synchronise.
+        # TAC syncs weights itself; there are no connector states to sync.
         self._dont_auto_sync_env_runner_states = True
 
     def __setattr__(self, key: str, value: Any) -> None:
-        # At once, because RLlib later takes every -1 for "not set" and would run the default.
+        # Checked here, because RLlib later takes every -1 for "not set" and would use the default.
         if key in _CHECKS and not _is_search_space(value):
             _checked(key, lambda: _CHECKS[key].validate_python(value))
         super().__setattr__(key, value)
@@ -92,7 +90,7 @@ class TACConfig(AlgorithmConfig):
         """Sets TAC's hyper-parameters.
 
         Args:
-            total_env_steps: budget of the run, which `linear` schedules are fractions of.
+            total_env_steps: budget of the run, of which `linear` schedules are fractions.
             reward_range: smallest and largest reward of the environment, if they are known:
                 `validate()` then warns of `target_bounds` that cut off values within reach.
             torch_threads: threads of the Learner's process. More than one gains nothing on
@@ -102,16 +100,14 @@ class TACConfig(AlgorithmConfig):
         Raises:
             TypeError: an unknown setting.
         """
-        own = {name: settings.pop(name) for name in list(settings) if name in _TAC_FIELDS}
+        tac = {name: settings.pop(name) for name in list(settings) if name in _TAC_FIELDS}
         super().training(**settings)
-        self._set(own, "")
-        if total_env_steps is not NotProvided:
-            self.total_env_steps = total_env_steps
-        if torch_threads is not NotProvided:
-            self.torch_threads = torch_threads
-        if reward_range is not NotProvided:
-            self.reward_range = reward_range
-        return self
+        return self._set(
+            tac,
+            total_env_steps=total_env_steps,
+            torch_threads=torch_threads,
+            reward_range=reward_range,
+        )
 
     def music(
         self,
@@ -129,15 +125,15 @@ class TACConfig(AlgorithmConfig):
 
         Raises:
             TypeError: an unknown setting.
-            ValueError: the two overlap, or repeat an index.
+            ValueError: the indices overlap, or repeat one.
         """
         _reject_unknown("music", settings, MusicSettings)
-        self._set(settings, "music_")
+        self._set(_prefixed("music_", settings))
         if agent_indices is not NotProvided:
             self.agent_indices = tuple(agent_indices)
         if surrounding_indices is not NotProvided:
             self.surrounding_indices = tuple(surrounding_indices)
-        if self.agent_indices and self.surrounding_indices:  # one may still be to come
+        if self.agent_indices and self.surrounding_indices:  # a later call may set the other one
             check_split(self.agent_indices, self.surrounding_indices)
         return self
 
@@ -145,28 +141,28 @@ class TACConfig(AlgorithmConfig):
         """Sets the replay and hindsight up.
 
         Args:
-            moved_distance: how far what is achieved must get from where it was at first, in its
-                own units, for `hindsight_episodes: moved`. None: the task's reward decides, or
-                where it is dense a fifth of the environment's `distance_threshold`.
+            moved_distance: for `hindsight_episodes: moved`, the distance from the first achieved
+                goal that counts as moved. None: the task's reward decides, or where it is dense a
+                fifth of the environment's `distance_threshold`.
             **settings: fields of `ReplaySettings`.
 
         Raises:
             TypeError: an unknown setting.
         """
         _reject_unknown("replay", settings, ReplaySettings)
-        self._set(settings, "replay_")
-        if moved_distance is not NotProvided:
-            self.moved_distance = moved_distance
+        return self._set(_prefixed("replay_", settings), moved_distance=moved_distance)
+
+    def _set(self, settings: Mapping[str, Any], **more: Any) -> Self:
+        """Sets attributes; those of `more` only where they are provided."""
+        given = {name: value for name, value in more.items() if value is not NotProvided}
+        for name, value in {**settings, **given}.items():
+            setattr(self, name, value)
         return self
 
-    def _set(self, settings: Mapping[str, Any], prefix: str) -> None:
-        for name, value in settings.items():
-            setattr(self, prefix + name, value)
-
     def update_from_dict(self, config_dict: Any) -> Self:
-        """As RLlib's, which takes a mistyped key for a new attribute; here it is an error."""
-        # RLlib also reads what it writes under names that are no attributes, and Tune adds its own
-        # in double underscores.
+        """Updates the settings as RLlib does, but raises ValueError for unknown keys."""
+        # RLlib also reads keys of its own dictionaries that are no attributes, and Tune adds keys
+        # with double underscores.
         known = {*self.to_dict(), "multiagent"}
         unknown = [
             key
@@ -180,15 +176,15 @@ class TACConfig(AlgorithmConfig):
     # -- reading --------------------------------------------------------------------------
 
     def tac_settings(self) -> TACSettings:
-        """The validated settings of TAC; raises ValueError naming what is wrong."""
+        """The validated settings of TAC; raises ValueError that names each problem."""
         return self._collect(TACSettings, "")
 
     def music_settings(self) -> MusicSettings:
-        """The validated settings of MUSIC; raises ValueError naming what is wrong."""
+        """The validated settings of MUSIC; raises ValueError that names each problem."""
         return self._collect(MusicSettings, "music_")
 
     def replay_settings(self) -> ReplaySettings:
-        """The validated settings of the replay; raises ValueError naming what is wrong."""
+        """The validated settings of the replay; raises ValueError that names each problem."""
         return self._collect(ReplaySettings, "replay_")
 
     def _collect(self, model: type[_Settings], prefix: str) -> _Settings:
@@ -259,12 +255,12 @@ class TACConfig(AlgorithmConfig):
                 )
 
     def _rewards(self) -> Range | None:
-        """The task's, a step: as it was set, or a built-in environment's; None: not known."""
-        if self.reward_range is not None:
-            return Range(*self.reward_range)
-        known = (task.reward_range for task in BUILT_IN_TASKS.values() if task.env_id == self.env)
-        found = next(known, None) if not self.env_config else None
-        return None if found is None else Range(*found)
+        """The range of a step's reward, as set or a built-in task's; None: unknown."""
+        reward_range = self.reward_range
+        if reward_range is None and not self.env_config:
+            built_in = (t.reward_range for t in BUILT_IN_TASKS.values() if t.env_id == self.env)
+            reward_range = next(built_in, None)
+        return None if reward_range is None else Range(*reward_range)
 
     # -- what RLlib builds from it --------------------------------------------------------
 
@@ -287,7 +283,6 @@ class TACConfig(AlgorithmConfig):
                     "agent_indices": self.agent_indices,
                     "surrounding_indices": self.surrounding_indices,
                     "hidden_size": music.hidden_size,
-                    "reward_scale": music.reward_scale,
                 },
                 learner_only=True,
             )
@@ -295,15 +290,14 @@ class TACConfig(AlgorithmConfig):
         return spec
 
     def intrinsic_reward(self, networks: Any) -> IntrinsicReward:
-        """The reward that the Learner adds; a subclass may give another one.
+        """The reward that the Learner adds; a subclass may return another one.
 
-        Args:
-            networks: the module `ESTIMATOR_MODULE`, None where there is none.
+        `networks` is the module `ESTIMATOR_MODULE`; None where the settings have no estimator.
         """
-        return Music(self.music_settings(), networks)
+        return Music(self.music_settings(), networks and networks.estimator)
 
     def scheduled(self, actions: int) -> ScheduledSettings:
-        """Settings that change over the run, for so many action dimensions."""
+        """The settings that change over the run; `actions` is the number of action dimensions."""
         return ScheduledSettings(
             self.tac_settings(), self.music_settings(), self.total_env_steps or 0, actions
         )
@@ -325,19 +319,19 @@ _CHECKS: dict[str, TypeAdapter[Any]] = {
     for settings, prefix in _OWNED
     for name, field in settings.model_fields.items()
 } | {name: TypeAdapter(Indices) for name in ("agent_indices", "surrounding_indices")}
-"""The rule of each field by itself; rules between fields are checked by `validate()`."""
+"""The rule of each single field; `validate()` checks rules between fields."""
 _KINDS = frozenset(
     {
         *("constant", "linear", "piecewise", "measured", "scheduled", "learned"),
         *("policy", "gaussian_noise"),
     }
 )
-"""Members of unions, which pydantic puts into an error's place."""
+"""Members of unions, which pydantic adds to an error's location."""
 _T = TypeVar("_T")
 
 
 def _checked(place: str, validation: Callable[[], _T]) -> _T:
-    """What `validation` returns, its errors as one ValueError that names field, rule and value."""
+    """The result of `validation`; its errors become one ValueError with field, rule and value."""
     try:
         return validation()
     except ValidationError as error:
@@ -351,8 +345,12 @@ def _checked(place: str, validation: Callable[[], _T]) -> _T:
         raise ValueError("; ".join(problems)) from None
 
 
+def _prefixed(prefix: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+    return {prefix + name: value for name, value in settings.items()}
+
+
 def _is_search_space(value: Any) -> bool:
-    """A value that Tune has yet to choose."""
+    """Whether Tune still has to choose the value."""
     return isinstance(value, Domain) or (isinstance(value, dict) and "grid_search" in value)
 
 

@@ -1,51 +1,30 @@
-"""What is measured of updates or of fresh episodes. Formulas: docs/algorithms.md.
+"""Metrics of gradient updates. Formulas: docs/algorithms.md.
 
 All updates of a call are measured at once, which takes a tenth of the time of one by one.
 
-Shape legend: K updates, B batch, A action dimensions, S steps of several episodes behind each
-other.
+Shape legend: K updates, B batch, A action dimensions, C critics.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from music_rllib import names
 from music_rllib.config.tac_settings import TACSettings
 from music_rllib.functional.tsallis import MAX_EXPONENT, bound_active, ln_q_of_log, ln_q_of_policy
 
-__all__ = [
-    "NonFiniteLossError",
-    "check_finite",
-    "discounted_returns",
-    "of_intrinsic_reward",
-    "of_policy",
-    "of_targets",
-    "of_updates",
-    "td_errors",
-]
-
 
 class NonFiniteLossError(RuntimeError):
-    """A loss became infinite or NaN; the message names it and the update."""
+    """A loss is infinite or NaN; the message names it and the update."""
 
 
 def check_finite(keys: Sequence[str], table: Tensor, updates: int, q: float, alpha: float) -> None:
-    """Raises where a metric of a call is not finite.
+    """Raises NonFiniteLossError where a metric of a call is not finite.
 
-    Args:
-        keys: M names.
-        table: [K, M]
-        updates: of the run, after this call's.
-        q: entropic index, for the message, as `alpha`.
-
-    Raises:
-        NonFiniteLossError: names what, and at which update.
+    `table` is [K, M] with the metrics named by `keys`, `updates` the number of the last update.
     """
     bad = ~torch.isfinite(table)
     if not bad.any():
@@ -60,18 +39,28 @@ def check_finite(keys: Sequence[str], table: Tensor, updates: int, q: float, alp
     )
 
 
+@torch.no_grad()
 def of_updates(
     observed: Mapping[str, Tensor], settings: TACSettings, q: float
 ) -> dict[str, Tensor]:
-    """Metrics of K updates, [K] each, from what was observed of them, [K, ...] each."""
+    """Metrics of K updates, [K] each, from their observed tensors.
+
+    `observed` has `q_values` [K, C, B] and `targets` [K, B]; with a stochastic policy `log_density`
+    and `log_std` [K, B, A]; with an intrinsic reward `intrinsic` [K, B].
+    """
+    target = observed["targets"]
     metrics = {names.Q_MEAN: observed["q_values"].mean((1, 2))}
-    metrics |= of_targets(observed["targets"], settings.target_bounds)
+    if settings.target_bounds is not None:
+        metrics[names.CLIPPED_TARGETS] = _share_at_bounds(target, settings.target_bounds)
     if "log_density" in observed:
-        density, log_std = observed["log_density"], observed["log_std"]
-        form, bounds = settings.entropy_form, settings.log_std_bounds
-        metrics |= of_policy(density, log_std, q, form, bounds)
+        metrics |= _of_policy(observed["log_density"], q, settings.entropy_form)
+        log_std, bounds = observed["log_std"], settings.log_std_bounds
+        metrics[names.LOG_STD_AT_BOUND] = _share_at_bounds(log_std, bounds)
     if "intrinsic" in observed:
-        metrics |= of_intrinsic_reward(observed["intrinsic"])
+        reward = observed["intrinsic"]
+        metrics[names.MI_REWARD] = reward.mean(1)
+        metrics[names.MI_REWARD_LOWEST] = _share(reward <= -1.0)
+        metrics[names.MI_REWARD_HIGHEST] = _share(reward >= 0.0)
     return metrics
 
 
@@ -81,20 +70,8 @@ def td_errors(observed: Mapping[str, Tensor]) -> Tensor:
     return errors.abs().mean(1).flatten()
 
 
-@torch.no_grad()
-def of_policy(
-    log_density: Tensor, log_std: Tensor, q: float, form: str, log_std_bounds: tuple[float, float]
-) -> dict[str, Tensor]:
-    """Entropies of the minibatches' policies, and which of their numerical bounds act.
-
-    Args:
-        log_density: [K, B, A] of the policy's actions.
-        log_std: [K, B, A]
-        q: entropic index.
-        form: of ln_q, as `ln_q_of_policy` has it.
-        log_std_bounds: what `log_std` was clipped to.
-    """
-    low, high = log_std_bounds
+def _of_policy(log_density: Tensor, q: float, form: str) -> dict[str, Tensor]:
+    """Entropies of the policy, and how often the bound of ln_q acts, by log-densities [K, B, A]."""
     # Bounded as in the losses: a metric that overflows would stop a run whose losses are finite.
     tsallis = -ln_q_of_log(log_density, q, max_exponent=MAX_EXPONENT).mean(1)
     shannon = -log_density.mean(1)
@@ -105,37 +82,14 @@ def of_policy(
         names.ENTROPY: -ln_q_of_policy(log_density, q, form).mean(1),
         names.SHANNON_ENTROPY: shannon.sum(1),
         names.CLIPPED_DENSITIES: _share(bound_active(bounded, q)),
-        names.LOG_STD_AT_BOUND: _share((log_std <= low) | (log_std >= high)),
     }
 
 
-@torch.no_grad()
-def of_targets(target: Tensor, bounds: tuple[float, float] | None) -> dict[str, Tensor]:
-    """Share of critic targets [K, B] that lie on their bounds; nothing where there are none."""
-    if bounds is None:
-        return {}
+def _share_at_bounds(values: Tensor, bounds: tuple[float, float]) -> Tensor:
     low, high = bounds
-    return {names.CLIPPED_TARGETS: _share((target <= low) | (target >= high))}
-
-
-@torch.no_grad()
-def of_intrinsic_reward(reward: Tensor) -> dict[str, Tensor]:
-    """Means of the intrinsic rewards [K, B], and the shares at the ends of their range [-1, 0]."""
-    return {
-        names.MI_REWARD: reward.mean(1),
-        names.MI_REWARD_LOWEST: _share(reward <= -1.0),
-        names.MI_REWARD_HIGHEST: _share(reward >= 0.0),
-    }
+    return _share((values <= low) | (values >= high))
 
 
 def _share(holds: Tensor) -> Tensor:
     """[K, ...] booleans -> [K]."""
     return holds.flatten(1).float().mean(1)
-
-
-def discounted_returns(
-    rewards: NDArray[np.float64], lengths: Sequence[int], gamma: float
-) -> NDArray[np.float64]:
-    """Discounted sum of each episode's rewards: [S] and the episodes' lengths -> one each."""
-    episodes = np.split(rewards, np.cumsum(lengths)[:-1])
-    return np.array([episode @ gamma ** np.arange(len(episode)) for episode in episodes])

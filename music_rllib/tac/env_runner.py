@@ -1,9 +1,9 @@
-"""Collects whole episodes into arrays, a few sub-environments in step with each other.
+"""Plays whole episodes in a few sub-environments, stepped together.
 
 RLlib's SingleAgentEnvRunner spends more than half of its time in connectors and episode objects,
 resets to the same goal again and again under a seed, and never seeds random actions. This runner
 plays one episode per sub-environment and call, seeds every reset by (seed, worker, episode), and
-between calls holds no simulator state: a checkpoint of a few integers resumes it exactly.
+holds no simulator state between calls: a checkpoint of a few integers resumes it exactly.
 """
 
 from __future__ import annotations
@@ -49,22 +49,12 @@ from music_rllib.replay.trajectories import ReplayLayout
 from music_rllib.runtime.quiet import quiet_third_parties
 from music_rllib.tac.rl_module import TACModule
 
-__all__ = [
-    "DISPLACEMENT",
-    "MOVED",
-    "SUCCESS_ANY",
-    "SUCCESS_LAST",
-    "Episode",
-    "TrajectoryEnvRunner",
-    "seed_or_entropy",
-]
-
 SUCCESS_LAST, SUCCESS_ANY = "success_last_step", "success_any_step"
 DISPLACEMENT, MOVED = "object_displacement", "object_moved"
-"""Metrics of an episode beside RLlib's own."""
+"""Metrics of an episode in addition to RLlib's own."""
 
 MOVED_THRESHOLD = 0.01
-"""Distance (metres in the Fetch tasks) from its start beyond which the object counts as moved."""
+"""Distance from its start (metres in the Fetch tasks) above which the object counts as moved."""
 
 Floats = NDArray[np.float32]
 
@@ -82,7 +72,7 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
         music = self.config.music_settings()
         self._zero_goals = music.goals == "zero" and not self.config.in_evaluation
         self._success_key: str | None = self.config.success_key
-        # Training and evaluation draw from unrelated streams, and so do the workers.
+        # Training and evaluation have independent random streams, and so do the workers.
         self._entropy = (
             seed_or_entropy(self.config.seed),
             int(self.config.in_evaluation),
@@ -100,7 +90,7 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
 
     def make_env(self) -> None:
         self.close_envs()
-        self.envs = [self._make_one(i) for i in range(self.config.num_envs_per_env_runner)]
+        self.envs = [self._make_sub_env(i) for i in range(self.config.num_envs_per_env_runner)]
         self.env = self.envs[0]
         self._action_space = check_action_space(self.env.action_space)
         observation, goal = observation_sizes(self.env.observation_space)
@@ -111,7 +101,7 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
             horizon=episode_limit(self.env, self._settings.max_episode_steps),
         )
 
-    def _make_one(self, vector_index: int) -> Env:
+    def _make_sub_env(self, vector_index: int) -> Env:
         context = EnvContext(
             self.config.env_config,
             worker_index=self.worker_index,
@@ -149,11 +139,11 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
         """Plays whole episodes.
 
         Args:
-            num_timesteps: play until at least so many steps are done.
-            num_episodes: play exactly so many. Neither: one per sub-environment.
-            explore: act by the training behaviour instead of deterministically.
+            num_timesteps: play at least this many steps.
+            num_episodes: play exactly this many episodes. Neither: one per sub-environment.
+            explore: act by the training behaviour; False: deterministically.
             random_actions: act uniformly.
-            force_reset: accepted for RLlib; every call begins with fresh episodes anyway.
+            force_reset: ignored, since every call begins with fresh episodes.
         """
         if explore is None:
             explore = bool(self.config.explore)
@@ -163,35 +153,31 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
             count = len(self.envs)
             if num_episodes is not None:
                 count = min(count, num_episodes - len(episodes))
-            played = self._play(count, explore=explore, random_actions=random_actions)
-            episodes += played
-            steps += sum(len(episode) for episode in played)
-            if num_episodes is not None and len(episodes) < num_episodes:
-                continue
-            if num_timesteps is not None and steps < num_timesteps:
-                continue
-            break
+            episodes += self._play(count, explore=explore, random_actions=random_actions)
+            steps = sum(len(episode) for episode in episodes)
+            if len(episodes) >= (num_episodes or 0) and steps >= (num_timesteps or 0):
+                break
         self._log(episodes, steps)
         return episodes
 
     def _play(self, count: int, *, explore: bool, random_actions: bool) -> list[Episode]:
-        """One episode in each of the first `count` sub-environments."""
-        recordings = [self._begin(i) for i in range(count)]
+        """Plays one episode in each of the first `count` sub-environments."""
+        recordings = [self._start_episode(i) for i in range(count)]
         finished: dict[int, Episode] = {}
         while len(finished) < count:
             playing = [i for i in range(count) if i not in finished]
             inputs = np.stack([recordings[i].network_input for i in playing])
             actions = self._act(inputs, explore=explore, random_actions=random_actions)
             if not actions.ravel().dot(actions.ravel()) <= actions.size:
-                raise self._bad_action(actions, inputs, [recordings[i] for i in playing])
+                raise _bad_action(actions, inputs, [recordings[i].place for i in playing])
             for i, action, scaled in zip(playing, actions, self._to_env(actions), strict=True):
                 ended = self._step(self.envs[i], recordings[i], action, scaled)
                 if ended is not None:
                     finished[i] = recordings[i].finish(terminated=ended)
         return [finished[i] for i in range(count)]
 
-    def _begin(self, index: int) -> Recording:
-        """Starts the next episode in sub-environment `index`."""
+    def _start_episode(self, index: int) -> Recording:
+        """Resets sub-environment `index`."""
         entropy = np.random.SeedSequence((*self._entropy, self._episodes_started))
         self._episodes_started += 1
         seed = int(entropy.generate_state(1)[0])
@@ -207,20 +193,8 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
         recording.see(observation)
         return recording
 
-    def _bad_action(
-        self, actions: Floats, inputs: Floats, recordings: list[Recording]
-    ) -> BadNumberError:
-        """The observations were finite, so it is the networks that are not, or are exceeded."""
-        row, dimension = np.argwhere(~(np.abs(actions) <= 1.0))[0]
-        return BadNumberError(
-            f"{recordings[row].place}: the policy's action[{dimension}] is "
-            f"{actions[row, dimension]:g}, it must be within +-1\n"
-            "The networks' weights are not finite, or the observation is too large for them (its "
-            f"largest entry is {np.abs(inputs[row]).max():g})."
-        )
-
     def _step(self, env: Env, recording: Recording, action: Floats, scaled: Floats) -> bool | None:
-        """One step; at the episode's end whether it terminated, before that None."""
+        """Takes one step; returns whether the episode terminated at its end, None before it."""
         with in_environment:
             observation, reward, terminated, truncated, info = env.step(scaled)
         success = info.get(self._success_key) if self._success_key else None
@@ -230,7 +204,7 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
         return None
 
     def _to_env(self, actions: Floats) -> Floats:
-        """[B, A] from [-1, 1] to the environment's bounds."""
+        """Scales actions [B, A] from [-1, 1] to the environment's bounds."""
         low, high = self._action_space.low, self._action_space.high
         scaled = low + (actions + 1.0) * 0.5 * (high - low)
         clipped: Floats = np.clip(scaled, low, high).astype(self._action_space.dtype)
@@ -250,10 +224,10 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
             return self.module.act(states, torch.from_numpy(noise)).numpy()
         actions = np.clip(self.module.act(states).numpy() + behaviour.std * noise, -1.0, 1.0)
         uniform = self._rng.uniform(-1.0, 1.0, shape).astype(np.float32)
-        chosen = self._rng.random((len(inputs), 1)) < behaviour.random_share
-        return np.where(chosen, uniform, actions)
+        is_random = self._rng.random((len(inputs), 1)) < behaviour.random_share
+        return np.where(is_random, uniform, actions)
 
-    # -- metrics, state, end --------------------------------------------------------------
+    # -- metrics and state ----------------------------------------------------------------
 
     def _log(self, episodes: list[Episode], steps: int) -> None:
         log = self.metrics.log_value
@@ -262,7 +236,7 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
         log(NUM_EPISODES, len(episodes), reduce="sum")
         log(NUM_ENV_STEPS_SAMPLED_LIFETIME, steps, reduce="lifetime_sum", with_throughput=True)
         log(NUM_EPISODES_LIFETIME, len(episodes), reduce="lifetime_sum")
-        # The mean over an iteration: RLlib does not carry a window over from one to the next.
+        # The mean over an iteration: RLlib does not keep a window from one iteration to the next.
         window = max(len(episodes), self.config.metrics_num_episodes_for_smoothing)
         for episode in episodes:
             for name, value in self._episode_metrics(episode):
@@ -304,8 +278,8 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
             self._episodes_started = int(state["episodes_started"])
             self._rng.bit_generator.state = state["rng"]
         if COMPONENT_RL_MODULE in state:
-            # Always taken: RLlib's runner skips weights with an older sequence number, which
-            # leaves it stale when an earlier checkpoint is restored in the same process.
+            # Not by sequence number: RLlib's runner skips older weights, which leaves it stale when
+            # an earlier checkpoint is restored in the same process.
             module_state = state[COMPONENT_RL_MODULE]
             if isinstance(module_state, ray.ObjectRef):
                 module_state = ray.get(module_state)
@@ -330,8 +304,22 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
         self.close_envs()
 
 
+def _bad_action(actions: Floats, inputs: Floats, places: list[str]) -> BadNumberError:
+    """The error for actions [B, A] outside +-1, in episodes that stand at `places` [B].
+
+    The observations are finite, so the networks' weights are not, or are too large for the inputs.
+    """
+    row, dimension = np.argwhere(~(np.abs(actions) <= 1.0))[0]
+    return BadNumberError(
+        f"{places[row]}: the policy's action[{dimension}] is "
+        f"{actions[row, dimension]:g}, it must be within +-1\n"
+        "The networks' weights are not finite, or the observation is too large for them (its "
+        f"largest entry is {np.abs(inputs[row]).max():g})."
+    )
+
+
 def seed_or_entropy(seed: int | None) -> int:
-    """The seed, or fresh entropy from the system where none is set."""
+    """The seed, or fresh entropy from the system for None."""
     if seed is not None:
         return seed
     entropy = np.random.SeedSequence().entropy

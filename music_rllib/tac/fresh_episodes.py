@@ -1,6 +1,6 @@
-"""What fresh episodes of the policy say of the critics, before anything is learned from them.
+"""The critics' bias on fresh episodes of the policy, before they are trained on.
 
-Shape legend: E episodes, S steps of all of them behind each other, I network inputs, A actions.
+Shape legend: E episodes, S steps of all episodes, I network inputs, A action dimensions.
 """
 
 from __future__ import annotations
@@ -16,27 +16,20 @@ from ray.rllib.core.columns import Columns
 from torch import Tensor
 
 from music_rllib.replay.trajectories import Trajectory
-from music_rllib.tac.diagnostics import discounted_returns
 from music_rllib.tac.objective import Objective
 from music_rllib.tac.rl_module import TACModule, choose_action
-
-__all__ = ["FreshEpisodes", "critic_bias"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class FreshEpisodes:
-    """Episodes as tensors."""
+    """Concatenated episodes: states and next states [S, I], actions [S, A], task rewards [S]."""
 
     states: Tensor
-    """[S, I]"""
     followers: Tensor
-    """[S, I]"""
     actions: Tensor
-    """[S, A]"""
     rewards: Tensor
-    """[S] of the task."""
     lengths: list[int]
-    """[E]"""
+    """[E] steps of each episode."""
     terminated: NDArray[np.bool_]
     """[E]"""
 
@@ -44,14 +37,14 @@ class FreshEpisodes:
     def of(cls, episodes: Sequence[Trajectory], inputs: int, device: torch.device) -> FreshEpisodes:
         """The episodes on a device; the first `inputs` columns of a frame are a network's input."""
 
-        def together(arrays: Sequence[NDArray[Any]]) -> Tensor:
+        def concatenated(arrays: Sequence[NDArray[Any]]) -> Tensor:
             return torch.as_tensor(np.concatenate(arrays), device=device)
 
         return cls(
-            states=together([episode.frames[:-1, :inputs] for episode in episodes]),
-            followers=together([episode.frames[1:, :inputs] for episode in episodes]),
-            actions=together([episode.actions for episode in episodes]),
-            rewards=together([episode.rewards for episode in episodes]),
+            states=concatenated([episode.frames[:-1, :inputs] for episode in episodes]),
+            followers=concatenated([episode.frames[1:, :inputs] for episode in episodes]),
+            actions=concatenated([episode.actions for episode in episodes]),
+            rewards=concatenated([episode.rewards for episode in episodes]),
             lengths=[len(episode) for episode in episodes],
             terminated=np.array([episode.terminated for episode in episodes]),
         )
@@ -64,14 +57,14 @@ def critic_bias(
     objective: Objective,
     noise: Mapping[str, Tensor],
 ) -> float:
-    """Mean over episodes of what the critics expect at the first step, less what came.
+    """Mean over episodes of the critics' value of the first step minus the realised return.
 
     Args:
         fresh: the episodes.
-        rewards: [S] that are learned from.
+        rewards: [S] with the intrinsic reward.
         module: TAC's networks.
-        objective: what is earned for entropy, and the value beyond an episode that was cut off.
-        noise: standard normal numbers [S, A] for the policy's actions, by name.
+        objective: gives the entropy's part of the return, and the value after a truncation.
+        noise: standard normal noise [S, A] for the policy's actions, by name.
     """
     first = np.cumsum([0, *fresh.lengths[:-1]])
     last = np.cumsum(fresh.lengths) - 1
@@ -79,14 +72,15 @@ def critic_bias(
     log_density = choose_action(mean, log_std, noise.get("noise"))[1]
     entropy = -objective.ln_q(log_density).expand(len(rewards))
     earned = (rewards + float(objective.alpha) * entropy).cpu().numpy().astype(float)
-    # The first action is what the critic is asked about: its entropy is not in its value.
+    # A critic's value does not have the entropy of the action that it is given.
     earned[first] = rewards.cpu().numpy()[first]
     ends = {Columns.NEXT_OBS: fresh.followers[last]}
     ends |= {name: values[last] for name, values in noise.items()}
     tail = objective.soft_value(module.forward_target(ends)).cpu().numpy()
     gamma = objective.gamma
-    realised = discounted_returns(earned, fresh.lengths, gamma)
+    episodes = np.split(earned, first[1:])
+    realised = np.array([episode @ gamma ** np.arange(len(episode)) for episode in episodes])
     realised += ~fresh.terminated * gamma ** np.array(fresh.lengths) * tail
-    asked = torch.cat([module.normaliser(fresh.states[first]), fresh.actions[first]], -1)
-    predicted = module.critics(asked).amin(0).cpu().numpy()
+    inputs = torch.cat([module.normaliser(fresh.states[first]), fresh.actions[first]], -1)
+    predicted = module.critics(inputs).amin(0).cpu().numpy()
     return float((predicted - realised).mean())

@@ -1,14 +1,14 @@
 """The Learner: gradient updates of TAC and of an intrinsic reward, many in a call.
 
-A call of `update()` carries K minibatches behind each other, one row each (B transitions,
-N trajectories, T frames, I network inputs, D observation, A actions):
+A call of `update()` gets K concatenated minibatches (B transitions, N trajectories, T frames,
+I network inputs, D observation, A actions):
 
 - module `default_policy`: OBS [K*B, I], ACTIONS [K*B, A], REWARDS [K*B] (the task's),
   "discounts" [K*B], NEXT_OBS [K*B, I], and "weights" [K*B] where the replay is prioritised
 - module `mi_estimator`, where it is trained: OBS [K*N, T, D] whole trajectories
 
-Each of the K updates relabels its transitions with the intrinsic reward as it is then, and takes
-one step of every network.
+Each of the K updates relabels its transitions with the current intrinsic reward and takes one step
+of every network.
 """
 
 from __future__ import annotations
@@ -51,8 +51,6 @@ from music_rllib.tac.objective import Losses, Objective
 from music_rllib.tac.rl_module import ESTIMATOR_MODULE, TACModule
 from music_rllib.tac.scheduled import ScheduledSettings
 
-__all__ = ["GRAD_UPDATES", "TACLearner"]
-
 GRAD_UPDATES = "grad_updates"
 LOSSES = "losses"
 
@@ -60,14 +58,12 @@ LOSSES = "losses"
 class TACLearner(TorchLearner):
     """Tsallis actor-critic updates (paper III-B), with an intrinsic reward where configured."""
 
-    # -- construction ---------------------------------------------------------------------
-
     def build(self) -> None:
         quiet_third_parties()  # a remote Learner is a process of its own
         keep_freed_memory()
         self._settings: TACSettings = self.config.tac_settings()
-        # A driver-side algorithm would otherwise use every core for 256-row products, and with
-        # another trial beside it run twenty times slower; the sums would also change.
+        # An algorithm in the driver would otherwise use every core for 256-row products, and run
+        # twenty times slower beside another trial; sums would also change.
         torch.set_num_threads(self.config.torch_threads)
         use_threads(self.config.torch_threads)
         self._adam: dict[str, FusedAdam] = {}
@@ -85,28 +81,30 @@ class TACLearner(TorchLearner):
         pairs = self._policy_module.get_target_network_pairs()
         self._online: list[Tensor] = [p for online, _ in pairs for p in online.parameters()]
         self._targets: list[Tensor] = [p for _, target in pairs for p in target.parameters()]
-        on_gpu, plain = self._device.type == "cuda", self._keeps_gradients_to_itself
         self._captured: CapturedUpdate[UpdateConstants] | None = None
-        if on_gpu and plain:
+        self._direct: DirectUpdate | None = None
+        if self._rllib_needs_gradients:
+            return
+        if self._device.type == "cuda":
             self._captured = CapturedUpdate(self._step, CudaRecorder(self._device))
-        standard = not on_gpu and plain and self._is_standard
-        self._direct = DirectUpdate(self._policy_module) if standard else None
+        elif self._is_standard:
+            self._direct = DirectUpdate(self._policy_module)
 
     @cached_property
     def _intrinsic(self) -> IntrinsicReward:
-        has_one = ESTIMATOR_MODULE in self.module
-        networks = self.module[ESTIMATOR_MODULE].unwrapped() if has_one else None
+        has_estimator = ESTIMATOR_MODULE in self.module
+        networks = self.module[ESTIMATOR_MODULE].unwrapped() if has_estimator else None
         return self.config.intrinsic_reward(networks)  # type: ignore[no-any-return]
 
     @property
-    def _keeps_gradients_to_itself(self) -> bool:
-        """Whether RLlib neither looks at gradients nor exchanges them."""
+    def _rllib_needs_gradients(self) -> bool:
+        """Whether RLlib clips, logs or exchanges gradients."""
         config = self.config
-        return config.grad_clip is None and not config.log_gradients and config.num_learners <= 1
+        return config.grad_clip is not None or config.log_gradients or config.num_learners > 1
 
     @property
     def _is_standard(self) -> bool:
-        """Whether networks and losses are those that `DirectUpdate` has the derivatives of."""
+        """Whether `DirectUpdate` has the derivatives of these networks and losses."""
         own_loss = type(self).compute_loss_for_module is TACLearner.compute_loss_for_module
         own_networks = type(self._policy_module) is TACModule
         return own_loss and own_networks and self._settings.precision == "float32"
@@ -146,7 +144,7 @@ class TACLearner(TorchLearner):
         self._objective.refresh()
 
     def observe_measured(self, quantity: Quantity, measured: float, env_steps: int) -> None:
-        """Takes what was measured after `env_steps`; settings follow it from the next update on."""
+        """Records a measurement after `env_steps`; settings follow it from the next update on."""
         self._now.observe(quantity, measured, env_steps)
 
     def update(
@@ -157,10 +155,9 @@ class TACLearner(TorchLearner):
         timesteps: dict[str, Any] | None = None,
         **kwargs: Any,
     ) -> ResultDict:
-        """Runs all minibatches of the batch; metrics are their means, logged once.
+        """Does one update for each minibatch of the batch, and logs the means of their metrics.
 
-        Raises:
-            diagnostics.NonFiniteLossError: a loss is not finite any more.
+        Raises `diagnostics.NonFiniteLossError` where a loss is not finite.
         """
         self._check_is_built()
         self.before_gradient_based_update(timesteps=timesteps or {})
@@ -173,8 +170,7 @@ class TACLearner(TorchLearner):
             self._direct = DirectUpdate(self._policy_module)
         minibatches = self._minibatches(self._convert_batch_type(batch))
         if minibatches.updates:
-            direct = self._direct is not None
-            learn = self._learn_directly if direct else self._learn_by_autograd
+            learn = self._learn_by_autograd if self._direct is None else self._learn_directly
             self._log_updates(learn(minibatches))
         self.after_gradient_based_update(timesteps=timesteps or {})
         return self.metrics.reduce()
@@ -182,41 +178,40 @@ class TACLearner(TorchLearner):
     def _learn_by_autograd(self, minibatches: Minibatches) -> dict[str, Tensor]:
         history = []
         step = self._captured or self._step
-        for one in minibatches.one_by_one():
-            history.append(step(one.flat, self._constants(one)))
+        for minibatch in minibatches.one_by_one():
+            history.append(step(minibatch.flat, self._constants(minibatch)))
             self._grad_updates += 1
             if self._grad_updates % self._settings.target_update_interval == 0:
-                self._average()
-        return {name: torch.stack([one[name] for one in history]) for name in history[0]}
+                self._update_targets()
+        return {name: torch.stack([each[name] for each in history]) for name in history[0]}
 
     def _learn_directly(self, minibatches: Minibatches) -> dict[str, Tensor]:
-        """Without autograd; all at once, unless alpha changes from one to the next."""
+        """Updates without autograd: all in one call, or one by one where alpha is learned."""
         history = []
-        for some in minibatches.one_by_one() if "alpha" in self._adam else (minibatches,):
+        for part in minibatches.one_by_one() if "alpha" in self._adam else (minibatches,):
             self._losses, self._observed = {}, {}
-            rewards = functools.partial(self._learn_intrinsic, some)
-            self._update_directly(self._relabelled(some.columns, rewards))
-            self._grad_updates += some.updates
-            losses = torch.stack([loss.view(some.updates) for loss in self._losses.values()], 1)
+            rewards = functools.partial(self._learn_intrinsic, part)
+            self._update_directly(self._relabelled(part.columns, rewards))
+            self._grad_updates += part.updates
+            losses = torch.stack([loss.view(part.updates) for loss in self._losses.values()], 1)
             history.append({LOSSES: losses, **self._observed})
         self._names_of_losses = list(self._losses)
-        return {name: torch.cat([some[name] for some in history]) for name in history[0]}
+        return {name: torch.cat([each[name] for each in history]) for name in history[0]}
 
-    @torch.no_grad()  # else the targets keep a graph of all their averages
-    def _average(self) -> None:
+    @torch.no_grad()  # otherwise the targets would keep a graph of all their averages
+    def _update_targets(self) -> None:
         torch._foreach_lerp_(self._targets, self._online, self._settings.tau)
 
     def postprocess_gradients(self, gradients_dict: ParamDict) -> ParamDict:
-        """RLlib sorts them by module and optimizer first; for nothing where nothing is clipped."""
+        """Skips RLlib's sorting of gradients where nothing is clipped or logged."""
         if self.config.grad_clip is None and not self.config.log_gradients:
             return gradients_dict
         return super().postprocess_gradients(gradients_dict)
 
     def _step(self, minibatch: FlatMinibatch, constants: UpdateConstants) -> dict[str, Tensor]:
-        """One update by autograd of every network but the targets; nothing waits for the device.
+        """Updates every network but the targets by autograd, without waiting for the device.
 
-        Returns:
-            `LOSSES` [M], in the order of `_names_of_losses`, and what is diagnosed of it.
+        Returns `LOSSES` [M], in the order of `_names_of_losses`, and tensors for the diagnostics.
         """
         columns: Minibatch = {}
         for (module_id, name), values in minibatch.items():
@@ -230,7 +225,7 @@ class TACLearner(TorchLearner):
         return {LOSSES: torch.stack(list(self._losses.values())), **self._observed}
 
     def _minibatches(self, batch: MultiAgentBatch) -> Minibatches:
-        """With the random numbers of all updates, drawn in one go."""
+        """The minibatches of a batch, with the random numbers of all updates."""
         columns: Minibatch = {mid: dict(b) for mid, b in batch.policy_batches.items()}
         policy = columns[DEFAULT_MODULE_ID]
         policy |= self._policy_noise(policy[Columns.ACTIONS])
@@ -242,25 +237,25 @@ class TACLearner(TorchLearner):
     def _constants(self, minibatch: Minibatches) -> UpdateConstants:
         alpha = None if isinstance(self._settings.alpha, LearnedAlpha) else self._now.alpha
         shape = None
-        if (learned_from := minibatch.columns.get(ESTIMATOR_MODULE)) is not None:
-            shape = (learned_from[Columns.OBS].shape[1], "inside" in learned_from)
+        if (trajectories := minibatch.columns.get(ESTIMATOR_MODULE)) is not None:
+            shape = (trajectories[Columns.OBS].shape[1], "inside" in trajectories)
         now, (drawn,) = self._now, minibatch.drawn
         return UpdateConstants(now.entropic_index, now.mi_reward_weight, alpha, drawn, shape)
 
     def _policy_noise(self, actions: Tensor) -> dict[str, Tensor]:
-        """Standard normal numbers for the policy's actions, and the next ones where needed."""
+        """Standard normal noise for the policy's actions, and for the next ones where needed."""
         if self._settings.policy == "deterministic":
             return {}
-        wanted = ["noise"] if self._settings.bootstrap == "value" else ["noise", "next_noise"]
+        columns = ["noise"] if self._settings.bootstrap == "value" else ["noise", "next_noise"]
         options = {"generator": self._generator, "device": self._device}
-        return {name: torch.randn(actions.shape, **options) for name in wanted}
+        return {name: torch.randn(actions.shape, **options) for name in columns}
 
-    def _relabelled(self, minibatch: Minibatch, reward_of: Callable[[], Tensor]) -> Minibatch:
-        """With the reward that is learned from: the task's and the intrinsic one, weighted."""
+    def _relabelled(self, minibatch: Minibatch, intrinsic_of: Callable[[], Tensor]) -> Minibatch:
+        """The minibatch with the total reward: the task's and the weighted intrinsic one."""
         if not self._intrinsic.is_on:
             return minibatch
         policy = minibatch[DEFAULT_MODULE_ID]
-        self._observed["intrinsic"] = intrinsic = reward_of()
+        self._observed["intrinsic"] = intrinsic = intrinsic_of()
         weight = self._now.mi_reward_weight
         reward = self._intrinsic.total(policy[Columns.REWARDS], intrinsic.flatten(), weight)
         return {**minibatch, DEFAULT_MODULE_ID: {**policy, Columns.REWARDS: reward}}
@@ -271,25 +266,23 @@ class TACLearner(TorchLearner):
         return self._losses_of(fwd_out["tac"], batch).total
 
     def _losses_of(self, forward: TACForward, batch: Mapping[str, Tensor]) -> Losses:
-        """The losses; what is measured of them is kept, as reading it out here would wait."""
+        """The losses; keeps the tensors of the metrics, since reading them here would wait."""
         losses = self._objective.losses(forward, batch)
         self._losses |= losses.named
         self._observed |= {"q_values": forward.q_values.detach(), "targets": losses.target}
-        if forward.log_density is not None and forward.log_std is not None:
-            self._observed |= {
-                "log_density": forward.log_density.detach(),
-                "log_std": forward.log_std.detach(),
-            }
+        for name in ("log_density", "log_std"):
+            if (values := getattr(forward, name)) is not None:
+                self._observed[name] = values.detach()
         return losses
 
     def loss_of_trajectories(self, batch: Mapping[str, Tensor]) -> Tensor:
-        """What the intrinsic reward's networks minimise; called by their module."""
+        """The loss of the intrinsic reward's networks; called by their module."""
         loss, metrics = self._intrinsic.loss(batch)
         self._losses |= metrics
         return loss
 
     def _update_directly(self, minibatches: Minibatch) -> None:
-        """RLlib's `_update` without its detours; several updates, where nothing else learns."""
+        """Updates TAC's networks without autograd, and a learned alpha by one step."""
         assert self._direct is not None
         q, alpha = self._now.entropic_index, float(self._objective.alpha)
         policy = minibatches[DEFAULT_MODULE_ID]
@@ -297,14 +290,16 @@ class TACLearner(TorchLearner):
         self._losses |= learned.losses
         self._observed |= learned.observed
         if "alpha" in self._adam:
-            seen = learned.observed
+            log_density, log_std = (
+                learned.observed[name][0] for name in ("log_density", "log_std")
+            )
             self._policy_module.log_alpha.grad = self._objective.excess_entropy(
-                seen["log_density"][0], seen["log_std"][0], learned.ln_q_pi[0]
+                log_density, log_std, learned.ln_q_pi[0]
             )
             self._adam["alpha"].step()
 
     def _learn_intrinsic(self, minibatches: Minibatches) -> Tensor:
-        """[K, B] rewards, each minibatch's as its networks are then; they depend on no other."""
+        """[K, B] intrinsic rewards, each minibatch's before the update of their networks."""
         if "estimator" not in self._adam:
             return minibatches.intrinsic_rewards(self._intrinsic)
         states, followers = minibatches.transitions
@@ -316,7 +311,7 @@ class TACLearner(TorchLearner):
         return rewards
 
     def _log_updates(self, outputs: Mapping[str, Tensor]) -> None:
-        """Means of the updates' metrics; `outputs` has what `_step` returns, of K updates."""
+        """Logs the means of the updates' metrics; `outputs` are those of `_step`, stacked to K."""
         losses_of_updates = dict(zip(self._names_of_losses, outputs[LOSSES].T, strict=True))
         q, alpha = self._now.entropic_index, float(self._objective.alpha)
         metrics = losses_of_updates | diagnostics.of_updates(outputs, self._settings, q)
@@ -334,13 +329,13 @@ class TACLearner(TorchLearner):
         if names.SHANNON_ENTROPY in means:
             self._now.observe("shannon_entropy", means[names.SHANNON_ENTROPY])
 
-    # -- fresh episodes, td errors --------------------------------------------------------
+    # -- fresh episodes, TD errors --------------------------------------------------------
 
     @torch.no_grad()
     def diagnose(self, episodes: Sequence[Trajectory]) -> None:
-        """Measures fresh episodes of the policy, before anything is learned from them.
+        """Measures fresh episodes of the policy before they are trained on.
 
-        Logs the critics' bias at their first steps; the intrinsic reward takes its own measures.
+        Logs the critics' bias at their first steps; the intrinsic reward keeps its own measures.
         """
         fresh = FreshEpisodes.of(episodes, self._policy_module.input_size, self._device)
         rewards = fresh.rewards
@@ -354,7 +349,7 @@ class TACLearner(TorchLearner):
 
     @torch.no_grad()
     def trajectory_priorities(self, episodes: Sequence[Trajectory]) -> NDArray[np.float64]:
-        """One number an episode, by which the replay draws them."""
+        """[N] priorities of the episodes in the replay."""
         frames = [torch.as_tensor(e.frames, device=self._device) for e in episodes]
         return self._intrinsic.priorities(frames)
 
@@ -368,7 +363,7 @@ class TACLearner(TorchLearner):
     # -- normaliser, state ----------------------------------------------------------------
 
     def observe_inputs(self, inputs: Any) -> None:
-        """Takes [B, I] new network inputs (numpy) into the running normaliser."""
+        """Updates the running normaliser by [B, I] new network inputs (numpy)."""
         normaliser = self._policy_module.normaliser
         if isinstance(normaliser, RunningNormaliser):
             normaliser.update(torch.as_tensor(inputs, device=self._device))
@@ -384,11 +379,11 @@ class TACLearner(TorchLearner):
         return state
 
     def set_state(self, state: StateDict) -> None:
-        # RLlib keeps newer weights over older ones; restoring means what the state says.
+        # RLlib ignores weights with an older sequence number; a restored state replaces newer ones.
         self._weights_seq_no = 0
         super().set_state(state)
         for optimizer in self._optimizer_parameters:
-            for group in optimizer.param_groups:  # a state may come from another device
+            for group in optimizer.param_groups:  # the state may come from another device
                 group["capturable"] = self._device.type == "cuda"
         if self._captured is not None:
             self._captured.forget()

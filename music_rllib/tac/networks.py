@@ -2,21 +2,20 @@
 
 Shape legend: B batch, I input features, O outputs, C critics.
 
-With `bf16` the products of all layers but the last are in bfloat16, which has eight significant
-bits: enough for activations, too few for values, densities and weights.
+With `bf16` the products of all layers but the last are in bfloat16. Its eight significant bits are
+enough for activations, and too few for values, densities and weights.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from itertools import pairwise
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
-
-__all__ = ["Critics", "Perceptron"]
 
 
 class Perceptron(nn.Sequential):
@@ -35,32 +34,22 @@ class Perceptron(nn.Sequential):
 
     def forward(self, inputs: Tensor) -> Tensor:
         *hidden_layers, last = self._linear
-        if self.bf16:
-            with _in_bf16(inputs):
-                hidden = _hidden(inputs, hidden_layers).float()
-        else:
-            hidden = _hidden(inputs, hidden_layers)
-        return F.linear(hidden, last.weight, last.bias)
+        hidden = inputs
+        with _precision(self.bf16, inputs):
+            # Not as modules: for acting's few rows, calls take half of the products' time.
+            for layer in hidden_layers:
+                hidden = torch.relu_(F.linear(hidden, layer.weight, layer.bias))
+        return F.linear(hidden.float() if self.bf16 else hidden, last.weight, last.bias)
 
 
-def _hidden(inputs: Tensor, layers: Sequence[nn.Linear]) -> Tensor:
-    # Not as modules: for the few rows of acting their calls take half as long as the products.
-    for layer in layers:
-        inputs = torch.relu_(F.linear(inputs, layer.weight, layer.bias))
-    return inputs
-
-
-def _in_bf16(inputs: Tensor) -> torch.autocast:
-    return torch.autocast(inputs.device.type, torch.bfloat16)
+def _precision(bf16: bool, inputs: Tensor) -> AbstractContextManager[None]:
+    return torch.autocast(inputs.device.type, torch.bfloat16) if bf16 else nullcontext()
 
 
 class Critics(nn.Module):
-    """Q1 and Q2 of equal shape, evaluated together: one batched matrix product a layer.
+    """C critics of equal shape, evaluated together: one batched matrix product a layer.
 
-    The first layer of both reads the same input, so it is a single product.
-
-    Args:
-        count: C, two unless the algorithm has a single critic (DDPG).
+    C is 2, or 1 for DDPG. The first layer of both reads the same input, so it is a single product.
     """
 
     def __init__(
@@ -81,18 +70,13 @@ class Critics(nn.Module):
     def forward(self, inputs: Tensor, *, frozen: bool = False) -> Tensor:
         """[B, I] -> [C, B].
 
-        Args:
-            frozen: gradients reach the inputs only. The policy's step needs just those, and a
-                third of its work is saved.
+        With `frozen`, gradients reach the inputs only: enough for the policy's step, and a third
+        less work.
         """
         *hidden_layers, (weight, bias) = self._layers(frozen)
-        if self.bf16:
-            with _in_bf16(inputs):
-                hidden = self._hidden(inputs, hidden_layers)
-            hidden = hidden.float()
-        else:
+        with _precision(self.bf16, inputs):
             hidden = self._hidden(inputs, hidden_layers)
-        return torch.baddbmm(bias, hidden, weight).squeeze(-1)
+        return torch.baddbmm(bias, hidden.float() if self.bf16 else hidden, weight).squeeze(-1)
 
     def _hidden(self, inputs: Tensor, layers: list[tuple[Tensor, Tensor]]) -> Tensor:
         """[B, I] -> [C, B, H]."""
@@ -100,7 +84,7 @@ class Critics(nn.Module):
         _, fan_in, width = first_weight.shape
         stacked = first_weight.transpose(0, 1).reshape(fan_in, self.count * width)
         hidden = (inputs @ stacked).view(-1, self.count, width).transpose(0, 1) + first_bias
-        # ReLU in place: a second matrix of this size costs more than what is done with it.
+        # ReLU in place: another matrix of this size costs more than the operation.
         hidden = torch.relu_(hidden)
         for weight, bias in others:
             hidden = torch.relu_(torch.baddbmm(bias, hidden, weight))

@@ -1,4 +1,4 @@
-"""The observation normaliser: running moments per feature, merged so that offsets do no harm.
+"""The observation normaliser: running moments per feature, exact also for large offsets.
 
 Shape legend: B batch, I input features.
 """
@@ -13,31 +13,29 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-__all__ = ["RunningNormaliser", "for_another_run", "in_this_form"]
-
 _ROUNDING = float(np.finfo(np.float32).eps) / 2
-"""Standard deviation, as a share of the mean, up to which a feature only flickers between two
-neighbouring numbers of float32."""
+"""Standard deviation, as a share of the mean, up to which a feature counts as constant: it only
+alternates between two neighbouring numbers of float32."""
 _OLD_ROUNDING = 1e-12
-"""Variance, as a share of the squared mean, up to which sums of squares were only rounding."""
+"""Variance, as a share of the squared mean, that sums of squares have by rounding alone."""
 
 Moments = Mapping[str, NDArray[Any]]
 
 
 class RunningNormaliser(nn.Module):
-    """Running mean and standard deviation per feature; clips what it normalises.
+    """Running mean and standard deviation per feature; its outputs are clipped.
 
-    The moments live in float64 buffers, so they are part of the module's state: environment
-    runners, checkpoints and handoffs get them with the weights. Each feature has a count of its
-    own, since a run that starts from another one begins anew with some (`for_another_run`).
+    The moments are float64 buffers and so part of the module's state: environment runners,
+    checkpoints and handoffs get them with the weights. Each feature has its own count, since a run
+    that starts from another one resets the counts of some (`for_another_run`).
     """
 
     count: Tensor
-    """[I] observations so far."""
+    """[I] number of observations."""
     centre: Tensor
     """[I] their mean."""
     squares: Tensor
-    """[I] the sum of their squared distances from it: no difference of large sums."""
+    """[I] the sum of their squared distances from the mean."""
     mean: Tensor
     inverse_std: Tensor
 
@@ -52,19 +50,19 @@ class RunningNormaliser(nn.Module):
     def forward(self, values: Tensor) -> Tensor:
         """[..., I] -> [..., I]: (x - mean) / max(std, epsilon), clipped to plus/minus `clip`.
 
-        0 for a feature that has been the same in all observations.
+        0 for a feature that was the same in all observations.
         """
         return ((values - self.mean) * self.inverse_std).clamp(-self.clip, self.clip)
 
     @torch.no_grad()
     def update(self, values: Tensor) -> None:
-        """Takes [B, I] more observations, B > 0, into the moments.
+        """Adds [B, I] observations, B > 0, to the moments.
 
-        The batch's moments are merged with those so far (Chan et al. 1983, "Algorithms for
-        computing the sample variance", (2.1)), each taken from numbers near 0.
+        The batch's moments are merged with the previous ones (Chan et al. 1983, "Algorithms for
+        computing the sample variance", (2.1)), each computed from numbers near 0.
         """
         values = values.to(self.centre)
-        # From the first row on: of equal numbers the mean is then exactly that number.
+        # Relative to the first row: the mean of equal numbers is then exactly that number.
         shifted = values - values[0]
         shifted_mean = shifted.mean(0)
         added = values.shape[0]
@@ -75,20 +73,20 @@ class RunningNormaliser(nn.Module):
         self.centre += distance * (added / total)
         self.count.copy_(total)
         std = (self.squares / self.count).sqrt()
-        # What was constant so far taught the networks nothing: it becomes 0 whatever it is later.
-        # MUSIC-u is trained on goals of 0 and evaluated with real ones, which would otherwise enter
-        # as -5 or 5, through weights that were never learned.
+        # The networks have learned nothing about a constant feature, so it stays 0 even when its
+        # value changes. MUSIC-u is trained on goals of 0 and evaluated with real ones, which would
+        # otherwise enter as -5 or 5, through untrained weights.
         constant = std <= _ROUNDING * self.centre.abs()
         self.mean.copy_(self.centre)
         self.inverse_std.copy_(torch.where(constant, 0.0, 1.0 / std.clamp(min=self.epsilon)))
 
 
 def for_another_run(moments: Moments) -> dict[str, NDArray[Any]]:
-    """The normaliser's arrays that a run starts with which goes on with these networks.
+    """The initial moments of a run that starts from the networks of another run.
 
-    Features that were constant begin anew: counted in, they would keep the standard deviation of
-    what comes small for as long as the source run was. MUSIC-u's goals are zeros, in MUSIC-f they
-    vary. Until they do they stay 0, as the networks know them.
+    Features that were constant are reset: their count would keep the standard deviation small for
+    as long as the source run was. MUSIC-u's goals are zeros; in MUSIC-f they vary. Until they do,
+    they stay 0.
     """
     moments = in_this_form(moments)
     varied = moments["inverse_std"] > 0
@@ -97,7 +95,7 @@ def for_another_run(moments: Moments) -> dict[str, NDArray[Any]]:
 
 
 def in_this_form(moments: Moments) -> dict[str, NDArray[Any]]:
-    """The same moments, also of a handoff of before version 3: one count, sums, sums of squares."""
+    """The moments, converted where a handoff before version 3 has one count, sums and squares."""
     if "total_square" not in moments:
         return dict(moments)
     rest = {name: np.asarray(a) for name, a in moments.items() if not name.startswith("total")}

@@ -1,4 +1,4 @@
-"""What TAC minimises on one minibatch, by the settings of the moment.
+"""TAC's losses on one minibatch, by the current settings.
 
 Shape legend: B batch, A action dimensions, C critics.
 """
@@ -21,8 +21,6 @@ from music_rllib.tac.kernels.forward import Bootstrap, TACForward
 from music_rllib.tac.rl_module import TACModule
 from music_rllib.tac.scheduled import ScheduledSettings
 
-__all__ = ["Losses", "Objective"]
-
 
 class Losses(NamedTuple):
     """The losses of a minibatch."""
@@ -35,12 +33,9 @@ class Losses(NamedTuple):
 
 
 class Objective:
-    """TAC's losses (paper III-B) with the networks, q and alpha that hold now.
+    """TAC's losses (paper III-B) with the current networks, q and alpha.
 
-    Args:
-        settings: of TAC.
-        module: its networks; a learned alpha is among them.
-        now: what schedules make of q and alpha.
+    `module` has TAC's networks, with log alpha where it is learned; `now` the scheduled settings.
     """
 
     def __init__(self, settings: TACSettings, module: TACModule, now: ScheduledSettings) -> None:
@@ -49,11 +44,11 @@ class Objective:
         self.refresh()
 
     def refresh(self) -> None:
-        """Takes over q, which a learned alpha's target follows; once for many updates."""
+        """Adapts a learned alpha's target to the current q; called once for many updates."""
         alpha = self._settings.alpha
         self._target_entropy = 0.0
         if isinstance(alpha, LearnedAlpha):
-            self._target_entropy = self._entropy_for(alpha)
+            self._target_entropy = self._target_of(alpha)
 
     @property
     def gamma(self) -> float:
@@ -74,13 +69,13 @@ class Objective:
         return ln_q_of_policy(log_density, self._now.entropic_index, self._settings.entropy_form)
 
     def soft_value(self, bootstrap: Bootstrap) -> Tensor:
-        """[B] value of the states, the policy's entropy there included."""
+        """[B] value of the states, with the entropy of the policy's action."""
         if bootstrap.log_density is None:
             return bootstrap.value
         return bootstrap.value - self.alpha * self.ln_q(bootstrap.log_density)
 
     def losses(self, forward: TACForward, batch: Mapping[str, Tensor]) -> Losses:
-        """Of a minibatch with rewards, discounts and, where prioritised, weights, [B] each."""
+        """The losses of a minibatch; `batch` has the columns documented at `TACLearner`."""
         settings, alpha = self._settings, self.alpha
         target = actor_critic.critic_target(
             batch[Columns.REWARDS],
@@ -111,15 +106,9 @@ class Objective:
         return Losses(total, named, target)
 
     def excess_entropy(self, log_density: Tensor, log_std: Tensor, ln_q_pi: Tensor) -> Tensor:
-        """How much too random the policy is for a learned alpha, in its target's own measure.
+        """The policy's entropy minus the target of a learned alpha, in the target's own measure.
 
-        Args:
-            log_density: [B, A]
-            log_std: [B, A]
-            ln_q_pi: [B]
-
-        Returns:
-            [] the derivative by log alpha.
+        [] from log_density and log_std [B, A] and ln_q_pi [B]; the derivative of alpha's loss.
         """
         alpha = self._settings.alpha
         assert isinstance(alpha, LearnedAlpha)
@@ -129,10 +118,10 @@ class Objective:
             return log_std.mean() - math.log(alpha.target_width)
         return -ln_q_pi.mean() - self._target_entropy
 
-    def _entropy_for(self, alpha: LearnedAlpha) -> float:
-        """The target in units of S_q; `auto` follows q."""
+    def _target_of(self, alpha: LearnedAlpha) -> float:
+        """The target S_q; `auto` follows q."""
         if alpha.target_entropy != "auto":
             return float(alpha.target_entropy)
-        # S_q of a density of e per dimension: -1 nat each at q = 1, as SAC has it.
+        # S_q of a density of e per dimension: -1 nat each at q = 1, as in SAC.
         ones = torch.ones(1, self._module.action_size)
         return -float(ln_q_of_policy(ones, self._now.entropic_index, self._settings.entropy_form))

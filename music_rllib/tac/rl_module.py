@@ -1,9 +1,8 @@
-"""RLModules: TAC's five networks, and MUSIC's estimator beside them on the Learner."""
+"""RLModules: TAC's networks, and MUSIC's estimator, which is on the Learner only."""
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -21,18 +20,10 @@ from music_rllib.functional.squashed_gaussian import (
     sample_squashed,
     squashed_action,
 )
-from music_rllib.intrinsic.estimator import MutualInformationEstimator, intrinsic_reward, two_frames
-from music_rllib.optim.adam import FusedAdam
+from music_rllib.intrinsic.estimator import MutualInformationEstimator
 from music_rllib.tac.kernels.forward import Bootstrap, TACForward
 from music_rllib.tac.networks import Critics, Perceptron
 from music_rllib.tac.normaliser import RunningNormaliser
-
-__all__ = [
-    "ESTIMATOR_MODULE",
-    "EstimatorModule",
-    "TACModule",
-    "choose_action",
-]
 
 ESTIMATOR_MODULE = "mi_estimator"
 """Module id of MUSIC's estimator in the Learner."""
@@ -41,12 +32,12 @@ ESTIMATOR_MODULE = "mi_estimator"
 class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
     """The networks of TAC behind one observation normaliser.
 
-    In the paper's form: policy, value, averaged value and twin critics. `bootstrap: critics` has
-    averaged critics in the value networks' place; a deterministic policy has one critic, and an
-    average of itself (DDPG).
+    The paper has a policy, a value network, its average, and twin critics. `bootstrap: critics`
+    replaces the value networks by averaged critics; a deterministic policy has one critic and an
+    averaged policy (DDPG).
 
-    Observations are a one-dimensional Box, or a goal dictionary, of which the networks see
-    observation and desired goal. `model_config["tac"]` is a dumped `TACSettings`.
+    Observations are a one-dimensional Box, or a goal dictionary, whose observation and desired goal
+    are the networks' inputs. `model_config["tac"]` is a dumped `TACSettings`.
     """
 
     def setup(self) -> None:
@@ -56,7 +47,7 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
         sizes = settings.hidden_sizes
         self.input_size, self.action_size = inputs, actions
         self.deterministic = settings.policy == "deterministic"
-        # Acting is a few rows at a time, on machines of any kind.
+        # Acting stays float32: it has few rows, and runs on machines without bfloat16.
         bf16 = settings.precision == "bf16" and not self.inference_only
         outputs = actions if self.deterministic else 2 * actions
         self.policy = Perceptron(inputs, sizes, outputs, bf16=bf16)
@@ -73,14 +64,12 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
             self.log_alpha = nn.Parameter(torch.tensor(settings.alpha.initial).log())
         self.make_target_networks()
 
-    # -- acting ---------------------------------------------------------------------------
-
     def policy_parameters(self, normalised: Tensor) -> tuple[Tensor, Tensor | None]:
         """[B, I] -> mean [B, A] before tanh, log standard deviation [B, A] within its bounds."""
         return self.distribution(self.policy(normalised))
 
     def distribution(self, outputs: Tensor) -> tuple[Tensor, Tensor | None]:
-        """What the outputs of the policy's network stand for: mean and log standard deviation."""
+        """Mean and log standard deviation from the outputs of the policy's network."""
         if self.deterministic:
             return outputs, None
         mean, raw = outputs.chunk(2, dim=-1)
@@ -103,10 +92,8 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
         noise = torch.randn(inputs.shape[0], self.action_size, device=inputs.device)
         return {Columns.ACTIONS: self.act(inputs, noise)}
 
-    # -- learning -------------------------------------------------------------------------
-
     def _forward_train(self, batch: dict[str, Any], **kwargs: Any) -> dict[str, Any]:
-        """Everything the losses need; `batch` is documented at `TACLearner`."""
+        """All that the losses need; `batch` is documented at `TACLearner`."""
         inputs = self.normaliser(batch[Columns.OBS])
         mean, log_std = self.policy_parameters(inputs)
         action, log_density = choose_action(mean, log_std, batch.get("noise"))
@@ -123,7 +110,7 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
         }
 
     def train(self, mode: bool = True) -> TACModule:
-        """As ever, but fast: RLlib asks for each update, of which all layers took 3 %."""
+        """Skips a mode that is already set: RLlib sets it for each update, which took 3 % of it."""
         return self if self.training == mode else super().train(mode)
 
     @property
@@ -132,7 +119,7 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
 
     @torch.no_grad()
     def forward_target(self, batch: dict[str, Any]) -> Bootstrap:
-        """The target networks at the next states."""
+        """The target networks' values of the next states."""
         inputs = self.normaliser(batch[Columns.NEXT_OBS])
         if self._has_value:
             return Bootstrap(self.value_target(inputs).squeeze(-1))
@@ -163,16 +150,16 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
     def get_state(
         self, components: Any = None, *, inference_only: bool = False, **kwargs: Any
     ) -> StateDict:
-        """Copies of all tensors as arrays; for acting only, without what that does not need."""
-        left_out = set(self.get_non_inference_attributes()) if inference_only else set()
+        """Copies of all tensors as arrays; with `inference_only`, of those that acting needs."""
+        excluded = self.get_non_inference_attributes() if inference_only else []
         return {
             name: tensor.detach().cpu().numpy().copy()
             for name, tensor in self.state_dict().items()
-            if name.partition(".")[0] not in left_out
+            if name.partition(".")[0] not in excluded
         }
 
     def set_state(self, state: StateDict) -> None:
-        """Takes over the tensors of `state` that this module has."""
+        """Loads the tensors of `state` that this module has."""
         own = self.state_dict()
         known = {name: torch.tensor(state[name]) for name in own if name in state}
         if self.inference_only and (missing := own.keys() - known.keys()):
@@ -187,88 +174,14 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
 class EstimatorModule(TorchRLModule, SelfSupervisedLossAPI):
     """MUSIC's estimator; lives on the Learner only and is trained on whole trajectories.
 
-    `model_config`: `agent_indices` and `surrounding_indices` into the observation,
-    `hidden_size`, `reward_scale`.
+    `model_config` has the arguments of `MutualInformationEstimator`.
     """
 
-    agent: Tensor
-    surrounding: Tensor
-
     def setup(self) -> None:
-        config = self.model_config
-        for half in ("agent", "surrounding"):
-            # A buffer moves to the module's device; it is no weight to be handed over.
-            indices = torch.tensor(config[f"{half}_indices"])
-            self.register_buffer(half, indices, persistent=False)
-        self.reward_scale: float = config["reward_scale"]
-        self.estimator = MutualInformationEstimator(
-            len(self.agent), len(self.surrounding), config["hidden_size"]
-        )
-
-    def split(self, observations: Tensor) -> tuple[Tensor, Tensor]:
-        """[..., D] observations -> [..., X] agent state and [..., Y] surrounding state."""
-        return (
-            observations.index_select(-1, self.agent),
-            observations.index_select(-1, self.surrounding),
-        )
-
-    def adapt_to(self, observations: Tensor) -> None:
-        """Before its first training: [..., D] observations such as those it is to learn from."""
-        self.estimator.adapt_to(*self.split(observations))
-
-    def bound(
-        self, observations: Tensor, permutations: Tensor, inside: Tensor | None = None
-    ) -> Tensor:
-        """[N, T, D] trajectories, [N, T] permutations and padding -> [N] bounds in nats."""
-        return self.estimator.bound(*self.split(observations), permutations, inside)
-
-    @torch.no_grad()
-    def learn(
-        self, states: Tensor, followers: Tensor, swapped: Sequence[bool],
-        trajectories: Mapping[str, Tensor], optimizer: FusedAdam,
-    ) -> tuple[Tensor, Tensor]:  # fmt: skip
-        """K updates on a CPU, by compiled code.
-
-        Args:
-            states: [K, B, D], of whose transitions each update takes the reward first.
-            followers: [K, B, D] the next states.
-            swapped: K, as `reward` takes it.
-            trajectories: [K*N, T, D] "obs", [K*N, T] "permutations" and padding "inside".
-            optimizer: of this module's parameters.
-
-        Returns:
-            [K, B] rewards in [-1, 0], and [K] mean bounds of the trajectories in nats.
-        """
-        updates, rows = states.shape[:2]
-        frames = torch.stack([states, followers], dim=2).flatten(0, 1)
-        others = torch.cat([two_frames(rows, one) for one in swapped])
-        of = self.estimator.data
-        found, means = self.estimator.learn(
-            of(*self.split(frames), others, None),
-            of(
-                *self.split(trajectories["obs"]),
-                trajectories["permutations"],
-                trajectories.get("inside"),
-            ),
-            optimizer,
-            updates,
-        )
-        return intrinsic_reward(found, self.reward_scale).view(updates, rows), means
-
-    def transition_bounds(self, observations: Tensor, *, swapped: bool = True) -> Tensor:
-        """[T, D] states of one trajectory -> [T-1] bounds of its transitions, in nats."""
-        frames = torch.stack([observations[:-1], observations[1:]], dim=1)
-        return self.estimator.transition_bound(*self.split(frames), swapped=swapped)
-
-    @torch.no_grad()
-    def reward(self, inputs: Tensor, next_inputs: Tensor, *, swapped: bool = True) -> Tensor:
-        """Intrinsic reward of transitions, [B, D] each -> [B] in [-1, 0]."""
-        frames = torch.stack([inputs, next_inputs], dim=1)
-        bound = self.estimator.transition_bound(*self.split(frames), swapped=swapped)
-        return intrinsic_reward(bound, self.reward_scale)
+        self.estimator = MutualInformationEstimator(**self.model_config)
 
     def _forward_train(self, batch: dict[str, Any], **kwargs: Any) -> dict[str, Any]:
-        return {}  # the Learner's intrinsic reward asks for the bound
+        return {}  # the intrinsic reward computes the bound in its loss
 
     def compute_self_supervised_loss(
         self, *, learner: Any, module_id: str, config: Any, batch: Any, fwd_out: dict[str, Tensor]
@@ -280,7 +193,7 @@ class EstimatorModule(TorchRLModule, SelfSupervisedLossAPI):
 def choose_action(
     mean: Tensor, log_std: Tensor | None, noise: Tensor | None
 ) -> tuple[Tensor, Tensor | None]:
-    """Action [B, A] and its log-density [B, A], which a deterministic policy has not."""
+    """Action [B, A] and its log-density [B, A]; None for a deterministic policy."""
     if log_std is None or noise is None:
         return deterministic_action(mean), None
     sample = sample_squashed(mean, log_std, noise)
@@ -288,7 +201,7 @@ def choose_action(
 
 
 def _network_inputs(observation: Any) -> Tensor:
-    """Observation and desired goal side by side, for callers that have a goal dictionary."""
+    """The observation, or the observation and desired goal of a goal dictionary, as a tensor."""
     if isinstance(observation, dict):
         return torch.cat([observation["observation"], observation["desired_goal"]], dim=-1).float()
     return torch.as_tensor(observation).float()

@@ -1,4 +1,4 @@
-"""What q, alpha and the weight of the intrinsic reward are now."""
+"""The current values of q, alpha and the intrinsic reward's weight."""
 
 from __future__ import annotations
 
@@ -10,23 +10,18 @@ from music_rllib.config.tac_settings import TACSettings, alpha_at
 from music_rllib.intrinsic.settings import MusicSettings
 from music_rllib.schedules import Follower, Linear, Measured, Piecewise, Quantity, value_at
 
-__all__ = ["ScheduledSettings"]
-
 
 class ScheduledSettings:
-    """Settings that change over a run, as of the last `advance`.
+    """Settings that change over a run, at the time of the last `advance`.
 
-    Args:
-        tac: has q and alpha.
-        music: has the weight.
-        total_env_steps: the run's budget, 0 where it is not known.
-        actions: action dimensions.
+    `total_env_steps` is the run's budget, 0 where it is not known; `actions` the number of action
+    dimensions.
     """
 
     entropic_index: float
     mi_reward_weight: float
     alpha: float
-    """At this q; without effect where it is learned."""
+    """Alpha at the current q; without effect where it is learned."""
 
     def __init__(
         self, tac: TACSettings, music: MusicSettings, total_env_steps: int, actions: int
@@ -44,8 +39,8 @@ class ScheduledSettings:
         self._set(0, {})
 
     def advance(self, env_steps: int) -> None:
-        """To the values after `env_steps`, of what has been measured so far."""
-        self._set(env_steps, {name: one.measured for name, one in self._followers.items()})
+        """Sets the values for `env_steps`, by the measurements so far."""
+        self._set(env_steps, {name: each.measured for name, each in self._followers.items()})
 
     def _set(self, env_steps: int, followed: dict[str, float | None]) -> None:
         self._env_steps, self._followed = env_steps, followed
@@ -56,13 +51,13 @@ class ScheduledSettings:
         self.alpha = alpha_at(self._tac, self.entropic_index, env_steps, self._total, self._actions)
 
     def observe(self, quantity: Quantity, measured: float, env_steps: int | None = None) -> None:
-        """Takes what was measured after `env_steps`, or at the last `advance`."""
+        """Records a measurement after `env_steps`, or at the last `advance`."""
         at = self._env_steps if env_steps is None else env_steps
         for follower in self._followers.values():
             follower.observe(quantity, measured, at)
 
     def metrics(self) -> dict[str, float]:
-        """The values, and what they follow, by their public names; alpha is the Learner's."""
+        """The values without alpha, and the measurements that they follow, by metric name."""
         values = (self.entropic_index, self.mi_reward_weight)
         followed = {
             names.FOLLOWED[name]: measured
@@ -72,16 +67,15 @@ class ScheduledSettings:
         return dict(zip(self._adaptive, values, strict=True)) | followed
 
     def state(self) -> dict[str, Any]:
-        """For a checkpoint: fresh episodes are diagnosed by the values of the last update."""
-        followers = {name: follower.state() for name, follower in self._followers.items()}
+        """The state for a checkpoint; the values of the last update diagnose fresh episodes."""
         return {
             "env_steps": self._env_steps,
             "followed": dict(self._followed),
-            "followers": followers,
+            "followers": {name: follower.state() for name, follower in self._followers.items()},
         }
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Goes on from `state`."""
+        """Continues from a result of `state`."""
         self._set(state["env_steps"], dict(state["followed"]))
         for name, follower in self._followers.items():
             follower.load_state(state["followers"][name])

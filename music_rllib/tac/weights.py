@@ -1,4 +1,4 @@
-"""The Learner's modules as plain arrays by network, and back."""
+"""Converts the states of the Learner's modules to arrays by network, and back."""
 
 from __future__ import annotations
 
@@ -12,42 +12,36 @@ from ray.rllib.core import DEFAULT_MODULE_ID
 from music_rllib.tac.normaliser import in_this_form
 from music_rllib.tac.rl_module import ESTIMATOR_MODULE
 
-__all__ = ["NetworkWeights", "by_module", "by_network"]
-
 NetworkWeights = dict[str, dict[str, NDArray[Any]]]
-"""Network name to array name to array."""
+"""Arrays by network name and array name."""
 
 
 def by_network(state: Mapping[str, Mapping[str, Any]]) -> NetworkWeights:
-    """The states of the Learner's modules as arrays of each network."""
-    found: NetworkWeights = {}
+    """The arrays of each network, from the states of the Learner's modules."""
+    weights: NetworkWeights = {}
     for name, array in state[DEFAULT_MODULE_ID].items():
         network, _, rest = name.partition(".")
-        found.setdefault(network, {})[rest or network] = np.asarray(array)
+        weights.setdefault(network, {})[rest or network] = np.asarray(array)
     if ESTIMATOR_MODULE in state:
-        found[ESTIMATOR_MODULE] = {
+        weights[ESTIMATOR_MODULE] = {
             name.removeprefix("estimator."): np.asarray(array)
             for name, array in state[ESTIMATOR_MODULE].items()
         }
-    return found
+    return weights
 
 
 def by_module(
     weights: Mapping[str, Mapping[str, NDArray[Any]]], own: NetworkWeights
 ) -> dict[str, dict[str, NDArray[Any]]]:
-    """States for the Learner's modules.
+    """The states of the Learner's modules, from the arrays of some networks.
 
-    Args:
-        weights: of some networks, of this version or an earlier one.
-        own: of all networks that there are.
-
-    Raises:
-        ValueError: an unknown network, or tensors that are missing, unknown or of other shape.
+    `weights` may be of an earlier version; `own` are the current arrays of all networks. Raises
+    ValueError for an unknown network, and for missing, unknown or misshapen tensors.
     """
     if "normaliser" in weights:
         weights = {**weights, "normaliser": in_this_form(weights["normaliser"])}
     if ESTIMATOR_MODULE in weights and ESTIMATOR_MODULE in own:
-        # Those of before version 3 use all inputs raw.
+        # Estimators before version 3 use all inputs raw.
         raw = {"offset": np.zeros_like, "scale": np.ones_like}
         defaults = {name: like(own[ESTIMATOR_MODULE][name]) for name, like in raw.items()}
         weights = {**weights, ESTIMATOR_MODULE: {**defaults, **weights[ESTIMATOR_MODULE]}}

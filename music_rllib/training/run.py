@@ -18,7 +18,7 @@ from music_rllib.compiling import is_kept
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.experiment.continuation import REPORT_INTERVAL
 from music_rllib.intrinsic.music import HELD_OUT_STEPS
-from music_rllib.replay.segments import Segment, load_segments, new_segments
+from music_rllib.replay.segments import Segment, new_segments
 from music_rllib.store.handoff import Spaces
 from music_rllib.store.node_store import Draft, Saved
 from music_rllib.store.state_io import read_arrays, read_state, write_arrays, write_state
@@ -224,12 +224,9 @@ class TrainingRun:
         state = read_state(saved.folder)
         self.algorithm.set_state(state["algorithm"])
         segments = [Segment(*segment) for segment in state["segments"]]
-        load_segments(
-            self.algorithm.replay,
-            state["replay"],
-            segments,
-            lambda name: read_arrays(saved.parts[name] / _TRAJECTORIES),
-        )
+        files = ((segment.first, saved.parts[segment.name] / _TRAJECTORIES) for segment in segments)
+        parts = ((first, read_arrays(path)) for first, path in files)  # one in memory at a time
+        self.algorithm.replay.load_packed(state["replay"], parts)
         self._segments = [] if foreign else segments
         self._rounds = defaultdict(list, state["rounds"])
         self._begun = state.get("begun", True)  # older checkpoints are all of begun runs

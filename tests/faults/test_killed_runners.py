@@ -19,7 +19,7 @@ def remote_runner() -> TAC:
 
 
 def kill_runner(algo: TAC) -> None:
-    (pid,) = algo._ask_runners(lambda runner: os.getpid())
+    (pid,) = algo._call_runners(lambda runner: os.getpid())
     assert pid != os.getpid()
     os.kill(pid, signal.SIGKILL)
 

@@ -12,7 +12,7 @@ from music_rllib.config.reading.presets import SHIPPED, shipped_presets
 from music_rllib.config.reading.yaml_file import read_yaml
 from music_rllib.config.remarks import remarks
 from music_rllib.functional.actor_critic import critic_target
-from music_rllib.functional.tsallis import gaussian_entropy, joint_entropy
+from tests.unit.functional.entropies import gaussian_entropy, joint_entropy
 
 SWEEP = """
 name: one

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from music_rllib.envs.numbers import LARGEST, BadNumberError, are_usable, bad_number
+from music_rllib.envs.numbers import LARGEST, BadNumberError, are_usable, check_numbers
 from music_rllib.envs.recording import Recording
 from music_rllib.replay.trajectories import ReplayLayout
 
@@ -19,7 +19,7 @@ LAYOUT = ReplayLayout(observation=5, action=2, goal=2, horizon=4)
 @given(values=SOUND)
 def test_what_can_be_learned_from_passes(values: list[float]) -> None:
     assert are_usable(np.array(values, np.float32))
-    assert bad_number([("observation", values)], "here") is None
+    check_numbers([("observation", values)], "here")
 
 
 @given(values=SOUND, bad=BAD, data=st.data())
@@ -29,8 +29,10 @@ def test_one_bad_number_among_any_others_is_found_and_named(
     place = data.draw(st.integers(0, len(values) - 1))
     values[place] = bad
     assert not are_usable(np.array(values, np.float32))
-    error = bad_number([("reward", 1.0), ("observation", values)], "Env-v0, step 3")
-    assert str(error).startswith(f"Env-v0, step 3: observation[{place}] is {bad:g}, every number")
+    with pytest.raises(BadNumberError) as caught:
+        check_numbers([("reward", 1.0), ("observation", values)], "Env-v0, step 3")
+    message = f"Env-v0, step 3: observation[{place}] is {bad:g}, every number"
+    assert str(caught.value).startswith(message)
 
 
 def observation(**changes: tuple[int, float]) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from music_rllib.functional.entropy_scale import (
     matched_alpha,
     normalised_alpha,
 )
-from music_rllib.functional.tsallis import gaussian_entropy, joint_entropy
+from tests.unit.functional.entropies import gaussian_entropy, joint_entropy
 
 FORMS = ["per_dimension", "joint"]
 

@@ -10,17 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import integrate, optimize, stats
 
+from music_rllib.functional.entropy_scale import largest_entropy
 from music_rllib.functional.tsallis import (
     MAX_EXPONENT,
     bound_active,
-    exp_q,
-    gaussian_entropy,
-    joint_entropy,
     ln_q,
     ln_q_of_log,
     ln_q_of_policy,
-    uniform_entropy,
 )
+from tests.unit.functional.entropies import exp_q, gaussian_entropy, joint_entropy
 
 orders = st.floats(0.5, 3.0)
 positive = st.floats(1e-3, 1e3)
@@ -115,8 +113,8 @@ def test_no_density_on_the_action_interval_exceeds_the_uniform_one(q: float) -> 
         density = stats.beta(max(shape, 1.0), 2.0, loc=-1, scale=2).pdf(grid)
         density = np.maximum(density, 1e-12)
         integrand = -density * ln_q_of_log(torch.as_tensor(np.log(density)), q).numpy()
-        assert integrate.trapezoid(integrand, grid) <= uniform_entropy(q) + 1e-6
-    assert uniform_entropy(1.0) == pytest.approx(math.log(2))
+        assert integrate.trapezoid(integrand, grid) <= largest_entropy(q) + 1e-6
+    assert largest_entropy(1.0) == pytest.approx(math.log(2))
 
 
 @pytest.mark.parametrize("q", [1.0, 1.3, 1.5, 2.0, 3.0])

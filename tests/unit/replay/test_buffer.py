@@ -97,7 +97,7 @@ def test_hindsight_takes_goals_achieved_later_and_recomputes_rewards() -> None:
     first = later[step[relabelled] == 0]
     assert np.bincount(first.astype(int), minlength=6)[1:].min() > 0.17 * len(first)
     # Sampling never writes into the store.
-    assert (buffer.state()["frames"][:, 3] == -1.0).all()
+    assert (buffer.packed(buffer.oldest)["frames"][:, 3] == -1.0).all()
 
 
 def resting(number: int, steps: int) -> Trajectory:
@@ -254,6 +254,7 @@ def test_restored_replay_is_the_same_and_goes_on_the_same(lengths: list[int], ch
     original.extend(made)
     original.sample_transitions(7)
     state = original.state()
+    restored.extend([dataclasses.replace(episode(n, 4), terminated=True) for n in range(3)])
     restored.load_state(state)
     for name, value in restored.state().items():
         np.testing.assert_equal(value, state[name])
@@ -313,7 +314,7 @@ def test_tree_holds_the_weights_and_draws_in_proportion(
         assert (abs(drawn - 2000 * weights / weights.sum()) < 2).all()
         assert not drawn[weights == 0].any()
     copy = SumTree(size)
-    copy.load_state(tree.state())
+    copy.set(np.arange(size), tree[np.arange(size)])
     assert copy.total == tree.total
 
 
@@ -391,6 +392,7 @@ def test_per_forgets_what_was_overwritten_and_keeps_hindsight_inside_its_episode
     restored = TrajectoryReplay(
         LAYOUT, 10, np.random.default_rng(1), goal_reward=matches, hindsight_k=4, td_exponent=0.6
     )
+    restored.extend([episode(number, 4) for number in range(2)])
     restored.load_state(replay.state())
     np.testing.assert_array_equal(
         replay.sample_transitions(50).inputs, restored.sample_transitions(50).inputs

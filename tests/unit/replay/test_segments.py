@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from music_rllib.replay import segments as module
 from music_rllib.replay.buffer import TrajectoryReplay
-from music_rllib.replay.segments import MOST, Segment, load_segments, new_segments
+from music_rllib.replay.segments import MOST, Segment, new_segments
 from music_rllib.replay.trajectories import ReplayLayout, Trajectory
 from music_rllib.store.state_io import read_arrays, read_state, write_arrays, write_state
 
@@ -58,8 +58,8 @@ class Disk:
         self.written += path.stat().st_size
         return path.name
 
-    def read(self, name: str) -> dict[str, NDArray[Any]]:
-        return read_arrays(self.folder / name)
+    def parts(self, segments: list[Segment]) -> Iterator[tuple[int, dict[str, NDArray[Any]]]]:
+        return ((each.first, read_arrays(self.folder / each.name)) for each in segments)
 
 
 @pytest.fixture
@@ -100,7 +100,7 @@ def test_saved_loaded_and_saved_again_it_is_the_same_bytes(
             patch.setattr(module, "MOST", most)
             segments = new_segments(original, segments, disk.write)
     loaded = make(12, seed=seed + 1, td=td)
-    load_segments(loaded, original.index(), segments, disk.read)
+    loaded.load_packed(original.index(), disk.parts(segments))
 
     first, second = (folder / name for name in ("first", "second"))
     for replay, place in ((original, first), (loaded, second)):
@@ -157,11 +157,11 @@ def test_what_does_not_fit_is_refused(disk: Disk) -> None:
     replay.extend([episode(rng, 5)])
     both = new_segments(replay, first, disk.write)
     with pytest.raises(ValueError, match="trajectory 1 must be in the checkpoint's files"):
-        load_segments(make(20), replay.index(), both[:1], disk.read)
+        make(20).load_packed(replay.index(), disk.parts(both[:1]))
     with pytest.raises(ValueError, match="trajectory 0 must be in the checkpoint's files"):
-        load_segments(make(20), replay.index(), both[1:], disk.read)
+        make(20).load_packed(replay.index(), disk.parts(both[1:]))
     with pytest.raises(ValueError, match="the replay holds 6 frames, the checkpoint has 12"):
-        load_segments(make(5), replay.index(), both, disk.read)
+        make(5).load_packed(replay.index(), disk.parts(both))
 
 
 def test_plain_states_keep_values_and_types(tmp_path: Path) -> None:
