@@ -59,8 +59,8 @@ def cluster(resources: Resources) -> Iterator[Room]:
     """Connect to Ray for this `with`, and yield its capacity.
 
     Raises:
-        ClusterError: There is no cluster at the address, or no node can hold a run, neither a
-            present one nor one that an autoscaler would add.
+        ClusterError: There is no cluster at the address, a local one does not start, or no node can
+            hold a run, neither a present one nor one that an autoscaler would add.
     """
     address = cluster_address()
     options: dict[str, Any] = {
@@ -77,12 +77,14 @@ def cluster(resources: Resources) -> Iterator[Room]:
         }
     try:
         ray.init(**options)
-    except (ConnectionError, RuntimeError, ValueError) as error:
+    except Exception as error:  # plain ones, too: for a node that is not up within 30 s
+        cause = next(iter(str(error).strip().splitlines()), type(error).__name__)
         if address is None:
-            raise
+            raise ClusterError(
+                f"Ray did not start on this machine, which may be too busy for it: {cause}"
+            ) from error
         raise ClusterError(
-            f"RAY_ADDRESS must be a Ray cluster that can be reached, got {address!r}: "
-            f"{str(error).strip().splitlines()[0]}"
+            f"RAY_ADDRESS must be a Ray cluster that can be reached, got {address!r}: {cause}"
         ) from error
     try:
         yield _room(resources)

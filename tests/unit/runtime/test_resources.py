@@ -11,7 +11,7 @@ import pytest
 from pydantic import ValidationError
 
 from music_rllib.config.schema import Resources
-from music_rllib.runtime import autoscaler
+from music_rllib.runtime import autoscaler, ray_cluster
 from music_rllib.runtime.machine import ClusterError
 from music_rllib.runtime.ray_cluster import WAITING, Room, _room, slots
 
@@ -200,3 +200,20 @@ def test_a_trial_asks_ray_for_all_of_it() -> None:
     assert RunTrainable.default_resource_request(job.to_tune()).bundles == [wanted.bundle]
     plain = NodeJob.of(node, "results", 1)
     assert RunTrainable.default_resource_request(plain.to_tune()).bundles == [{"CPU": 1}]
+
+
+@pytest.mark.parametrize("address", [None, "127.0.0.1:1"])
+def test_a_ray_that_does_not_start_is_said_in_a_line(
+    address: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def not_in_time(**options: Any) -> None:
+        raise Exception("The current node timed out during startup.\nMore of it.")  # as Ray does
+
+    monkeypatch.setattr(ray_cluster.ray, "init", not_in_time)
+    monkeypatch.setattr(ray_cluster, "cluster_address", lambda: address)
+    with pytest.raises(ClusterError) as caught, ray_cluster.cluster(Resources()):
+        pass
+    said = str(caught.value)
+    assert "timed out during startup" in said
+    assert "\n" not in said
+    assert (address or "did not start on this machine") in said
