@@ -30,8 +30,6 @@ _EXPECTED_NOTICES: dict[str, tuple[str, ...]] = {
     "ray._common.deprecation": (
         "DeprecationWarning: `RLModule(config=[RLModuleConfig object])` has been deprecated.",
     ),
-    # See `prepare_environment`.
-    "ray.rllib.utils.framework": ("Not importing JAX", "Not importing TensorFlow"),
     # GPUtil is unmaintained, and psutil measures our processes. Tune also warns of any callback
     # that takes half a second, as all do on a busy machine ("The `...").
     "ray.tune.utils.util": ("Install gputil for GPU system monitoring.", "The `"),
@@ -76,9 +74,6 @@ def prepare_environment() -> None:
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
     # MLflow reads the commit through GitPython, which prints a long warning if git is missing.
     os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
-    # RLlib imports both where they are installed, for seconds in each worker; TAC uses neither.
-    os.environ.setdefault("RLLIB_TEST_NO_JAX_IMPORT", "1")
-    os.environ.setdefault("RLLIB_TEST_NO_TF_IMPORT", "1")
     # A local Ray would begin with a worker per CPU, which no run can use: theirs have a setup hook.
     os.environ.setdefault("RAY_prestart_worker_first_driver", "0")
     if "RAY_ADDRESS" in os.environ:

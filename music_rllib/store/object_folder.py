@@ -53,11 +53,15 @@ def must_be_writable(path: str, codes: Container[int | None] | None = None) -> I
         ) from error
 
 
+_MOST_NAME = 255
+"""Bytes of a file's name that any file system takes."""
+
+
 def _inside(name: str) -> str:
     path = PurePosixPath(name)
-    strange = "\\" in name or not name.isprintable()
+    strange = "\\" in name or not name.isprintable() or len(name.encode()) > _MOST_NAME
     if path.is_absolute() or ".." in path.parts or not path.parts or strange:
-        raise ValueError(f"must be a path inside the folder, got {name!r}")
+        raise ValueError(f"must be a path inside the folder, got {name[:_MOST_NAME]!r}")
     return name
 
 
