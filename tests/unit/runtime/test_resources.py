@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import pytest
+import ray
 from pydantic import ValidationError
 
 from music_rllib.config.schema import Resources
@@ -209,7 +210,7 @@ def test_a_ray_that_does_not_start_is_said_in_a_line(
     def not_in_time(**options: Any) -> None:
         raise Exception("The current node timed out during startup.\nMore of it.")  # as Ray does
 
-    monkeypatch.setattr(ray_cluster.ray, "init", not_in_time)
+    monkeypatch.setattr(ray, "init", not_in_time)
     monkeypatch.setattr(ray_cluster, "cluster_address", lambda: address)
     with pytest.raises(ClusterError) as caught, ray_cluster.cluster(Resources()):
         pass
