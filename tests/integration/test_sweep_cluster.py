@@ -45,6 +45,11 @@ class Head(NamedTuple):
     environment: dict[str, str]
     process: subprocess.Popen[Any]
 
+    @property
+    def home(self) -> Path:
+        """Of the user whom the cluster belongs to."""
+        return Path(self.environment["HOME"])
+
 
 def free_ports(count: int) -> list[int]:
     sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
@@ -383,8 +388,8 @@ class Site:
         return str(done.stdout)
 
 
-def site_at(tmp_path: Path, sweep_document: dict[str, Any], **tac: Any) -> Site:
-    """A home and a checkout below `tmp_path`; `tac` has changed settings."""
+def site_at(home: Path, sweep_document: dict[str, Any], tmp_path: Path, **tac: Any) -> Site:
+    """With `home` as its home, and changed settings of TAC."""
     document = small(sweep_document)
     document["defaults"]["tac"] |= tac
     document["defaults"] |= {"env_steps": 10_000, "evaluation": {"interval": 400, "episodes": 1}}
@@ -393,20 +398,17 @@ def site_at(tmp_path: Path, sweep_document: dict[str, Any], **tac: Any) -> Site:
         "env_id": "point_env:Paced-v0",
         "env_kwargs": {"fast": str(fast)},
     }
-    home = tmp_path / "home"
-    home.mkdir()
     return Site(Jobs(tmp_path / "checkout", document), fast, home)
 
 
 @pytest.mark.timeout(900)
 def test_job_is_stopped_and_a_later_one_goes_on(
-    sweep_document: dict[str, Any], tmp_path: Path
+    head: Head, sweep_document: dict[str, Any], tmp_path: Path
 ) -> None:
-    # A cluster of its own: on two nodes Ray deletes a stopped job's folder before its driver ends.
-    site = site_at(tmp_path, sweep_document, random_steps=9_999)  # nothing has to be compiled
-    with head_node(site.home, 1) as head:
-        site.stop_one(head)
-        site.finish(head)
+    # Updates would be compiled anew in the job's copy of the package.
+    site = site_at(head.home, sweep_document, tmp_path, random_steps=9_999)
+    site.stop_one(head)
+    site.finish(head)
 
 
 @pytest.mark.thorough
@@ -415,7 +417,9 @@ def test_job_is_stopped_then_outlives_its_cluster(
     sweep_document: dict[str, Any], tmp_path: Path
 ) -> None:
     """Stopped in good order; resumed, and its head killed; resumed on a new cluster to its end."""
-    site = site_at(tmp_path, sweep_document)
+    home = tmp_path / "home"
+    home.mkdir()
+    site = site_at(home, sweep_document, tmp_path)
     jobs, work = site.jobs, site.storage / "work"
     with head_node(site.home, 1) as head:
         stranger = jobs.submit(head, "stranger", token="another-token-of-some-length-0123456789")

@@ -8,6 +8,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ray import tune
@@ -101,9 +102,23 @@ def compute(
                 checkpoint_config=tune.CheckpointConfig(checkpoint_at_end=False),
             ),
         )
-        tuner.fit()
+        try:
+            tuner.fit()
+        except FileNotFoundError:
+            # Ray deletes a stopped job's working folder while its driver still ends, and Tune needs
+            # one for a summary that nobody reads.
+            if stopping.received is None or _has_working_folder():
+                raise
     done = sweep.scheduler.complete and (controller is None or controller.over)
     return None if done else stopping.received
+
+
+def _has_working_folder() -> bool:
+    try:
+        Path.cwd()
+    except FileNotFoundError:
+        return False
+    return True
 
 
 def _trial_name(trial: Trial) -> str:
