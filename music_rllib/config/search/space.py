@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping
 from typing import Annotated, Any, Self, TypeGuard
 
@@ -62,13 +63,13 @@ class _Range(_Dimension):
         return self
 
     @property
+    @abstractmethod
     def size(self) -> int | None:
         """Number of values; None if they can't be counted."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _at(self, position: int) -> Any:
         """The value at a position in the order of values."""
-        raise NotImplementedError
 
     def ends(self) -> tuple[Any, ...]:
         """Values that must be valid for the whole range to be."""
