@@ -285,6 +285,7 @@ def _attach(source: ReportSource, folder: Path, report: Report) -> None:
     """Keep the report, in `folder`, with the sweep's run in MLflow."""
     from music_rllib.redaction import for_people
     from music_rllib.report.tables import note
+    from music_rllib.results.claims.answer import answer
     from music_rllib.results.data import ReportError
     from music_rllib.results.from_mlflow import attach
 
@@ -294,7 +295,8 @@ def _attach(source: ReportSource, folder: Path, report: Report) -> None:
     last = analyses[-1].stage.name if analyses else ""
     drawn = sorted((d.name for d in report.drawings), key=lambda name: not name.startswith(last))
     figure = f"report/figures/{drawn[0]}.png" if drawn else None
-    text = note(analyses, sweep.run_id, figure)
+    said = answer(sweep, report.study)[1]
+    text = note(said, analyses, sweep.run_id, figure)
     attach(source.store, sweep.run_id, folder, "report", text)
     where = sweep.url(sweep.run_id) or f"run {sweep.run_id}"
     typer.echo(for_people(f"Attached to the sweep's run in MLflow: {where}"))

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from music_rllib import names
 from music_rllib.report.figures.choice import Drawing
 from music_rllib.results.analysis import StageAnalysis
+from music_rllib.results.comparison import interval_text, number
 from music_rllib.results.conditions import SIDE_BY_SIDE
 from music_rllib.results.data import Sweep
 from music_rllib.results.statistics import Estimate
@@ -64,28 +65,31 @@ def finals_table(analyses: Iterable[StageAnalysis]) -> Table:
     )
 
 
-def note(analyses: Iterable[StageAnalysis], run_id: str, figure: str | None) -> str:
-    """The last stage's final values and the report's first figure, in Markdown for MLflow's page.
+def note(answer: str, analyses: Iterable[StageAnalysis], run_id: str, figure: str | None) -> str:
+    """The answer, the last stage's final values and a figure, in Markdown for MLflow's page.
 
     Args:
+        answer: The first sentence of the report's answer.
         analyses: The analyses of the sweep's stages.
         run_id: The MLflow id of the sweep's own run.
         figure: The path of an artefact of that run; None if nothing is drawn.
     """
-    columns = ("tasks", "condition", "seeds", "metric", "mean", "lower", "upper")
-    final = finals_table(list(analyses)[-1:])
-    chosen = [final.columns.split().index(name) for name in columns]
-    rows = [[_cell_text(row[column]) for column in chosen] for row in final.rows]
-    lines = [f"| {' | '.join(map(_escaped, row))} |" for row in (columns, *rows)]
-    lines.insert(1, "|---" * len(columns) + "|")
+    rows: list[tuple[str, ...]] = [("task", "condition", "seeds", "final value", "95 %")]
+    for analysis in list(analyses)[-1:]:
+        for scope in analysis.scopes:
+            for final in scope.finals:
+                value = f"{names.word_of(scope.metric)} {number(final.value)}"
+                interval = interval_text(final.estimate)
+                label = final.condition.label
+                rows.append((scope.name, label, str(final.seeds), value, interval))
+    # MLflow's tables have no space between their columns.
+    lines = ["".join(f"| {_escaped(text)}&emsp;" for text in row) + "|" for row in rows]
+    lines.insert(1, "|---" * len(rows[0]) + "|")
+    lines = [f"**{_escaped(answer)}**", "", *lines]
     if figure is not None:
         # MLflow serves its pages and its artefacts from the same origin.
         lines += ["", f"![{figure}](get-artifact?path={figure}&run_uuid={run_id})"]
     return "\n".join(lines)
-
-
-def _cell_text(value: object) -> str:
-    return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
 def _escaped(text: str) -> str:

@@ -1,10 +1,15 @@
-"""A page in headless Chromium, driven by its DevTools protocol."""
+"""A page in headless Chromium, driven by its DevTools protocol.
+
+Its pictures are kept in the folder that the variable MUSIC_RLLIB_PICTURES names, such as docs/img.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import base64
+import io
 import json
+import os
 import subprocess
 import time
 from pathlib import Path
@@ -13,6 +18,7 @@ from typing import Any, Self
 from urllib.request import urlopen
 
 import aiohttp
+from PIL import Image
 
 PATIENCE = 180.0
 
@@ -119,6 +125,19 @@ class Page:
         """Move the pointer."""
         await self._send("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
 
+    async def click(self, label: str, kind: str = "button") -> None:
+        """Click on the first element of this kind with `label` in its text."""
+        found = (
+            f"[...document.querySelectorAll({kind!r})].find(e => e.innerText.includes({label!r}))"
+        )
+        x, y = await self.evaluate(
+            f"(({{x, y, width, height}}) => [x + width / 2, y + height / 2])"
+            f"({found}.getBoundingClientRect())"
+        )
+        where = {"x": x, "y": y, "button": "left", "clickCount": 1}
+        for moment in ("mousePressed", "mouseReleased"):
+            await self._send("Input.dispatchMouseEvent", type=moment, **where)
+
     async def evaluate(self, script: str) -> Any:
         """The value of a JavaScript expression, or of what it promises."""
         options = {"returnByValue": True, "awaitPromise": True}
@@ -150,7 +169,10 @@ class Page:
         missing = [word for word in words if word not in text]
         raise AssertionError(f"no {missing} in:\n{text[:3000]}\nerrors: {self.errors}")
 
-    async def picture(self, path: Path) -> None:
-        """What the window shows, as PNG."""
+    async def picture(self, name: str) -> None:
+        """Keep what the window shows as the PNG `name`."""
+        await asyncio.sleep(0.5)
         reply = await self._send("Page.captureScreenshot", format="png")
-        path.write_bytes(base64.b64decode(reply["data"]))
+        path = Path(os.environ.get("MUSIC_RLLIB_PICTURES") or self._folder) / name
+        shown = Image.open(io.BytesIO(base64.b64decode(reply["data"])))
+        shown.quantize(96, dither=Image.Dither.NONE).save(path, optimize=True)

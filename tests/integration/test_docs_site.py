@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -14,7 +13,6 @@ import pytest
 from tests.integration.devtools import Page
 
 ROOT = Path(__file__).parents[2]
-PICTURES = os.environ.get("MUSIC_RLLIB_PICTURES")
 """Folder in which the picture is kept, such as docs/img."""
 
 
@@ -56,7 +54,7 @@ def test_the_site_is_built_read_and_searched(
                 await tab.wait_for(*words)
             await tab.go((site / "index.html").as_uri())
             await tab.wait_for("Two commands")
-            await tab.picture(Path(PICTURES or tmp_path) / "docs-site.png")
+            await tab.picture("docs-site.png")
             await tab.go((site / "search.html").as_uri() + "?q=hindsight")
             await tab.wait_for("Search finished", "Algorithms")
             assert not tab.errors

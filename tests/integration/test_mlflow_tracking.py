@@ -5,10 +5,8 @@ from __future__ import annotations
 import dataclasses
 import gc
 import json
-import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -16,7 +14,6 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
-from urllib.request import urlopen
 
 import mlflow
 import numpy as np
@@ -41,6 +38,7 @@ from music_rllib.tracking.cli import app
 from music_rllib.tracking.policy_model import write_model
 from music_rllib.tracking.projection import StoredRun
 from music_rllib.tracking.tracker import Tracker
+from tests.integration.mlflow_server import MlflowServer
 from tests.kept_sweep import kept_sweep
 
 MakeTracker = Callable[..., Tracker]
@@ -578,61 +576,14 @@ def test_a_killed_driver_leaves_neither_gaps_nor_duplicates(
 # A server that is killed ------------------------------------------------------------------------
 
 
-class Server:
-    """``mlflow server`` on a fixed port, which can be killed and started again."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            self.port = probe.getsockname()[1]
-        self.uri = f"http://127.0.0.1:{self.port}"
-        self._process: subprocess.Popen[bytes] | None = None
-
-    def start(self) -> None:
-        command = [sys.executable, "-m", "mlflow", "server", "--workers", "1"]
-        command += ["--host", "127.0.0.1", "--port", str(self.port)]
-        command += ["--backend-store-uri", f"sqlite:///{self.folder}/mlflow.db"]
-        command += ["--artifacts-destination", str(self.folder / "artefacts")]
-        with (self.folder / "server.log").open("ab") as log:
-            self._process = subprocess.Popen(
-                command,
-                env={**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"},
-                stdout=log,
-                stderr=log,
-                start_new_session=True,
-            )
-
-    def signal(self, number: signal.Signals) -> None:
-        """To the server and its worker: the group of the process that was started here."""
-        if self._process is None:
-            return
-        os.killpg(self._process.pid, number)
-        if number == signal.SIGKILL:
-            self._process.wait()
-            self._process = None
-
-    def wait(self) -> None:
-        """Until it answers."""
-        deadline = time.monotonic() + 60
-        while time.monotonic() < deadline:
-            assert self._process is not None
-            if self._process.poll() is not None:
-                break
-            try:
-                with urlopen(f"{self.uri}/health", timeout=2):
-                    return
-            except OSError:
-                time.sleep(0.1)
-        pytest.fail("the server did not start: " + (self.folder / "server.log").read_text())
-
-
 @pytest.fixture(scope="module", autouse=True)
-def server(tmp_path_factory: pytest.TempPathFactory, fresh_store: FreshStore) -> Iterator[Server]:
+def server(
+    tmp_path_factory: pytest.TempPathFactory, fresh_store: FreshStore
+) -> Iterator[MlflowServer]:
     """Started before the first test, since it takes long to come up; the last test waits."""
     folder = tmp_path_factory.mktemp("server")
     shutil.copy(fresh_store.database, folder)
-    server = Server(folder)
+    server = MlflowServer(folder)
     server.start()
     yield server
     server.signal(signal.SIGKILL)
@@ -649,7 +600,7 @@ def test_a_view_is_kept_for_the_mlflow_that_knows_it(tracker_on: MakeTracker) ->
 
 
 def test_a_server_killed_while_logging_loses_and_doubles_nothing(
-    server: Server, tracker_on: MakeTracker, policy: Path, caplog: pytest.LogCaptureFixture
+    server: MlflowServer, tracker_on: MakeTracker, policy: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Killed and started again mid-way; later it hangs, and the next driver sends the rest."""
     server.wait()

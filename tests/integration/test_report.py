@@ -5,20 +5,15 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
-import os
 import re
 import shutil
-import signal
-import socket
 import sqlite3
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import get_args
-from urllib.request import urlopen
 
 import numpy as np
 import pytest
@@ -40,6 +35,7 @@ from music_rllib.store.run_record import Report
 from music_rllib.tracking.projection import StoredRun
 from music_rllib.tracking.store import resolve_store
 from music_rllib.tracking.tracker import Tracker
+from tests.integration.mlflow_server import MlflowServer
 
 STEPS = range(20_000, 100_001, 20_000)
 CONFIG = """
@@ -305,31 +301,8 @@ def test_there_is_no_such_sweep(sweep_folder: Path, tmp_path: Path) -> None:
 
 @pytest.fixture
 def server(sweep_folder: Path) -> Iterator[str]:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    command = [sys.executable, "-m", "mlflow", "server", "--port", str(port), "--workers", "1"]
-    store = f"sqlite:///{sweep_folder.parent}/mlflow.db"
-    process = subprocess.Popen(
-        [*command, "--backend-store-uri", store],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        env={**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"},
-        start_new_session=True,
-    )
-    url = f"http://127.0.0.1:{port}"
-    try:
-        for _ in range(600):
-            try:
-                urlopen(f"{url}/health", timeout=1).close()
-                break
-            except OSError:
-                assert process.poll() is None
-                time.sleep(0.1)
-        yield url
-    finally:
-        os.killpg(process.pid, signal.SIGTERM)
-        process.wait(20)
+    with MlflowServer(sweep_folder.parent) as server:
+        yield server.uri
 
 
 def test_a_server_gives_the_same_as_its_database(server: str, nodes: list[Node]) -> None:

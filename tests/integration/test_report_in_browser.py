@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import os
 import threading
 import time
 from collections.abc import Callable
@@ -13,7 +12,6 @@ from typing import Any
 
 import axe_core_python
 import pytest
-from PIL import Image
 
 from music_rllib.experiment.location import SweepLocation
 from music_rllib.report.build import build_report
@@ -27,9 +25,6 @@ from tests.integration.devtools import Page
 from tests.unit.report.test_live import write_state
 
 DATA = Path(__file__).parents[2] / "docs" / "results" / "data"
-PICTURES = os.environ.get("MUSIC_RLLIB_PICTURES")
-"""Folder in which the pictures are kept, such as docs/img."""
-
 LOOK = Path(__file__).with_name("look.js").read_text()
 """Finds text of figures that is cut or too faint, and controls without a name."""
 AXE = Path(axe_core_python.__file__).with_name("axe.min.js").read_text()
@@ -84,13 +79,6 @@ def open_page(require_service: Callable[[str], Path], tmp_path: Path) -> Callabl
     return lambda: Page(require_service("chromium"), tmp_path)
 
 
-async def picture(page: Page, folder: Path, name: str) -> None:
-    await asyncio.sleep(0.5)
-    path = Path(PICTURES or folder) / name
-    await page.picture(path)
-    Image.open(path).quantize(96, dither=Image.Dither.NONE).save(path, optimize=True)
-
-
 def test_the_page_can_be_read_in_every_size_light_and_dark(
     open_page: Callable[[], Page], page: Path, tmp_path: Path
 ) -> None:
@@ -105,7 +93,7 @@ def test_the_page_can_be_read_in_every_size_light_and_dark(
                 await tab.evaluate(AXE)
                 assert await tab.evaluate(VIOLATIONS) == []
                 name = "-dark" if dark else "" if width == 1400 else f"-{width}"
-                await picture(tab, tmp_path, f"report{name}.png")
+                await tab.picture(f"report{name}.png")
             assert not tab.errors
             assert not tab.requests
         return seen
@@ -249,7 +237,6 @@ def test_the_live_page_takes_up_what_is_new_and_leaves_the_reader_where_he_is(
             await tab.go(f"{address}?token={http.token}")
             text = await tab.wait_for("The sweep is running", "train/B failed: <b>no</b>")
             assert "1 started, 2 waiting" in text
-            await picture(tab, tmp_path, "report-live.png")
             assert not (seen := await tab.evaluate(LOOK))["nameless"]
             assert not seen["faint"]
             await tab.evaluate(CHOOSE % ["against", "epochs"])

@@ -257,7 +257,9 @@ def _curves(sweep: Sweep, stage: Stage, metrics: Sequence[Metric]) -> Iterator[D
                 title=metric.title,
                 caption=_caption(stage, metric, max(map(len, panels.values()))),
                 panels=tuple(
-                    curve_panel(metric, title, curves, facets.styles)
+                    curve_panel(
+                        metric, title, curves, facets.styles, with_epochs=not facets.setting
+                    )
                     for title, curves in panels.items()
                 ),
                 legend=list(labels.items()),

@@ -89,13 +89,19 @@ class Panel:
 
 
 def curve_panel(
-    metric: Metric, task: str, curves: Sequence[Curve], styles: Mapping[Condition, Style]
+    metric: Metric,
+    title: str,
+    curves: Sequence[Curve],
+    styles: Mapping[Condition, Style],
+    *,
+    with_epochs: bool = True,
 ) -> Panel:
     """`metric` against environment steps, one line with its band per condition.
 
-    A second axis counts epochs of the original MUSIC if the curves have at least one.
+    A second axis counts epochs of the original MUSIC if it is wanted and the curves have at least
+    one.
     """
-    epochs = max(float(curve.steps[-1]) for curve in curves) >= EPOCH
+    epochs = with_epochs and max(float(curve.steps[-1]) for curve in curves) >= EPOCH
     ranks = _ranks(curves, metric)
     numbers = {condition: number for number, condition in enumerate(styles)}
     with_bands = len(curves) <= MOST_BANDS
@@ -127,7 +133,7 @@ def curve_panel(
         if epochs:
             _add_epochs(axes)
 
-    return Panel(title=task, draw=draw, **({"top": _TOP_WITH_EPOCHS} if epochs else {}))
+    return Panel(title=title, draw=draw, **({"top": _TOP_WITH_EPOCHS} if epochs else {}))
 
 
 def profile_panel(scope: Scope[Condition], siblings: tuple[Condition, ...]) -> Panel:

@@ -76,7 +76,8 @@ function showState(state) {
     bar(bars, stage.name, over, all, counts.map(([name, n]) => `${n} ${name}`).join(", "));
   }
   for (const run of state.running ?? []) {
-    bar(bars, run.run, run.done, run.budget, `${run.metric} ${shown(run.value)}`);
+    const steps = `${run.done.toLocaleString("en")} of ${run.budget.toLocaleString("en")}`;
+    bar(bars, run.run, run.done, run.budget, `${steps}, ${run.metric} ${shown(run.value)}`);
   }
   for (const failure of state.failures ?? []) {
     const line = element("p", { class: "note" }, box);

@@ -48,7 +48,8 @@ def answer(sweep: Sweep, study: Study) -> list[str]:
     if rest := [claim for claim in study.claims if claim not in shown[:MOST_CLAIMS]]:
         counts = Counter(claim.verdict for claim in rest)
         verdicts = ", ".join(f"{n} {verdict}" for verdict, n in counts.items())
-        sentences.append(f"Of {len(rest)} more comparisons: {verdicts}.")
+        more = f"{len(rest)} more comparisons: {verdicts}"
+        sentences.append(f"{more}." if len(rest) > 1 else f"1 more comparison: {rest[0].verdict}.")
     sentences += [_counted(study, shown), _seeds(study, shown)]
     sentences.append(f"Control: {_control(sweep, study, study.stage)}.")
     if any(claim.verdict is Verdict.UNDECIDED for claim in study.claims):
