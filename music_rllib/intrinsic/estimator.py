@@ -62,6 +62,7 @@ class MutualInformationEstimator(nn.Module):
         inputs = len(agent_indices) + len(surrounding_indices)
         self.register_buffer("offset", torch.zeros(inputs))
         self.register_buffer("scale", torch.ones(inputs))
+        self._width = 1 + max(*agent_indices, *surrounding_indices)
         self._raw = True
         self._flat: FlatParameters | None = None
         hook = MutualInformationEstimator._update_raw
@@ -129,8 +130,12 @@ class MutualInformationEstimator(nn.Module):
         other one; False is the identity permutation, which the original draws for half of its
         minibatches: <= 0.
         """
-        frames = torch.stack([states, followers], dim=1)
+        frames = self.pairs(states, followers)
         return self.bound(frames, two_frames(len(frames), swapped).to(frames.device))
+
+    def pairs(self, states: Tensor, followers: Tensor) -> Tensor:
+        """[..., B, D] states and followers -> [..., B, 2, d] what is read of them, side by side."""
+        return torch.stack([each[..., : self._width] for each in (states, followers)], dim=-2)
 
     def learn(
         self, pairs: Data, trajectories: Data, optimizer: FusedAdam, updates: int

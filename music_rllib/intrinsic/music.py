@@ -98,10 +98,10 @@ class Music:
     ) -> tuple[Tensor, dict[str, Tensor]]:  # fmt: skip
         """K updates by compiled code."""
         updates, rows = states.shape[:2]
-        pairs = torch.stack([states, followers], dim=2).flatten(0, 1)
+        network = self._network
+        pairs = network.pairs(states, followers).flatten(0, 1)
         swaps = torch.cat([two_frames(rows, bool(swapped)) for swapped in drawn])
         permutations, inside = trajectories["permutations"], trajectories.get("inside")
-        network = self._network
         bounds, means = network.learn(
             network.data(pairs, swaps, None),
             network.data(trajectories["obs"], permutations, inside),

@@ -189,8 +189,9 @@ class TrajectoryReplay(TrajectoryRing):
         if not self.trajectories:
             raise ValueError("cannot sample from an empty replay: collect an episode first")
 
-    def sample_trajectories(self, count: int) -> WholeTrajectories:
-        """Draws the observations of `count` whole trajectories with replacement.
+    def sample_trajectories(self, count: int, width: int | None = None) -> WholeTrajectories:
+        """Draws `count` whole trajectories with replacement, the first `width` numbers of each
+        observation (None: all of them).
 
         Each is drawn in proportion to its steps, so that every state counts the same, as for the
         policy. Trajectories of a single step are drawn only where there are no others. T is the
@@ -199,14 +200,11 @@ class TrajectoryReplay(TrajectoryRing):
         self._check_filled()
         places = self._whole_places
         start, _, length = places.draw(self.rng, count)
-        time = np.arange(places.longest + 1)
+        time, width = np.arange(places.longest + 1), width or self.layout.observation
         if places.equal:
-            return WholeTrajectories(
-                self._read(start[:, None] + time, 0, self.layout.observation), None
-            )
+            return WholeTrajectories(self._read(start[:, None] + time, 0, width), None)
         rows = start[:, None] + np.minimum(time, length[:, None])
-        observations = self._read(rows, 0, self.layout.observation)
-        return WholeTrajectories(observations, time <= length[:, None])
+        return WholeTrajectories(self._read(rows, 0, width), time <= length[:, None])
 
     def index(self) -> dict[str, Any]:
         """The rest of the state beside `packed`: rows of trajectories, priorities, generator.

@@ -269,7 +269,9 @@ class TAC(Algorithm):
             columns["weights"] = drawn.weights
         batches = {DEFAULT_MODULE_ID: SampleBatch(columns)}
         if self._music.estimator == "trained":
-            whole = self.replay.sample_trajectories(updates * self._music.batch_trajectories)
+            last = max(*self.config.agent_indices, *self.config.surrounding_indices)
+            count = updates * self._music.batch_trajectories
+            whole = self.replay.sample_trajectories(count, width=last + 1)
             trajectories: dict[str, NDArray[Any]] = {Columns.OBS: whole.observations}
             if whole.inside is not None:
                 trajectories["inside"] = whole.inside

@@ -202,6 +202,7 @@ def test_trajectories_of_one_length_come_whole_and_in_order() -> None:
     assert (whole.observations[:, :, 1] == np.arange(6)).all()
     counts = np.bincount(whole.observations[:, 0, 0].astype(int))
     np.testing.assert_allclose(counts, 2_000, atol=5 * 37)
+    assert buffer.sample_trajectories(9, width=2).observations.shape == (9, 6, 2)
 
 
 def test_trajectories_of_any_length_come_whole_each_by_its_steps() -> None:
