@@ -190,12 +190,12 @@ class TrajectoryReplay(TrajectoryRing):
             raise ValueError("cannot sample from an empty replay: collect an episode first")
 
     def sample_trajectories(self, count: int, width: int | None = None) -> WholeTrajectories:
-        """Draws `count` whole trajectories with replacement, the first `width` numbers of each
-        observation (None: all of them).
+        """Draws `count` whole trajectories with replacement.
 
-        Each is drawn in proportion to its steps, so that every state counts the same, as for the
-        policy. Trajectories of a single step are drawn only where there are no others. T is the
-        length of the longest one held. Raises ValueError where the replay is empty.
+        Of each observation the first `width` numbers, by default all of them. Each trajectory is
+        drawn in proportion to its steps, so that every state counts the same, as for the policy.
+        Trajectories of a single step are drawn only where there are no others. T is the length of
+        the longest one held. Raises ValueError where the replay is empty.
         """
         self._check_filled()
         places = self._whole_places

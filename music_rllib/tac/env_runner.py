@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import ray
-import torch
 from numpy.typing import NDArray
 from ray.rllib.core import COMPONENT_RL_MODULE, DEFAULT_AGENT_ID, DEFAULT_MODULE_ID
 from ray.rllib.env import INPUT_ENV_SPACES
@@ -47,7 +46,7 @@ from music_rllib.envs.numbers import BadNumberError
 from music_rllib.envs.recording import Episode, Recording
 from music_rllib.replay.trajectories import ReplayLayout
 from music_rllib.runtime.quiet import quiet_third_parties
-from music_rllib.tac.rl_module import TACModule
+from music_rllib.tac.rl_module import Actor, TACModule
 
 SUCCESS_LAST, SUCCESS_ANY = "success_last_step", "success_any_step"
 DISPLACEMENT, MOVED = "object_displacement", "object_moved"
@@ -164,10 +163,11 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
         """Plays one episode in each of the first `count` sub-environments."""
         recordings = [self._start_episode(i) for i in range(count)]
         finished: dict[int, Episode] = {}
+        actor = self.module.actor()
         while len(finished) < count:
             playing = [i for i in range(count) if i not in finished]
             inputs = np.stack([recordings[i].network_input for i in playing])
-            actions = self._act(inputs, explore=explore, random_actions=random_actions)
+            actions = self._act(actor, inputs, explore=explore, random_actions=random_actions)
             if not actions.ravel().dot(actions.ravel()) <= actions.size:
                 raise _bad_action(actions, inputs, [recordings[i].place for i in playing])
             for i, action, scaled in zip(playing, actions, self._to_env(actions), strict=True):
@@ -210,19 +210,18 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
         clipped: Floats = np.clip(scaled, low, high).astype(self._action_space.dtype)
         return clipped
 
-    def _act(self, inputs: Floats, *, explore: bool, random_actions: bool) -> Floats:
+    def _act(self, actor: Actor, inputs: Floats, *, explore: bool, random_actions: bool) -> Floats:
         """[B, I] -> [B, A] in [-1, 1]."""
         shape = (len(inputs), self.layout.action)
         if random_actions:
             return self._rng.uniform(-1.0, 1.0, shape).astype(np.float32)
-        states = torch.from_numpy(inputs)
         behaviour = self._settings.behaviour
         if not explore:
-            return self.module.act(states).numpy()
+            return actor(inputs, None)
         noise = self._rng.standard_normal(shape, dtype=np.float32)
         if not isinstance(behaviour, GaussianNoise):
-            return self.module.act(states, torch.from_numpy(noise)).numpy()
-        actions = np.clip(self.module.act(states).numpy() + behaviour.std * noise, -1.0, 1.0)
+            return actor(inputs, noise)
+        actions = np.clip(actor(inputs, None) + behaviour.std * noise, -1.0, 1.0)
         uniform = self._rng.uniform(-1.0, 1.0, shape).astype(np.float32)
         is_random = self._rng.random((len(inputs), 1)) < behaviour.random_share
         return np.where(is_random, uniform, actions)

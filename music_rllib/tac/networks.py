@@ -9,13 +9,17 @@ enough for activations, and too few for values, densities and weights.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from itertools import pairwise
 
+import numpy as np
 import torch
 import torch.nn.functional as F
+from numpy.typing import NDArray
 from torch import Tensor, nn
+
+Floats = NDArray[np.float32]
 
 
 class Perceptron(nn.Sequential):
@@ -40,6 +44,25 @@ class Perceptron(nn.Sequential):
             for layer in hidden_layers:
                 hidden = torch.relu_(F.linear(hidden, layer.weight, layer.bias))
         return F.linear(hidden.float() if self.bf16 else hidden, last.weight, last.bias)
+
+    def in_numpy(self) -> Callable[[Floats], Floats]:
+        """`forward` of the weights as they are now, in float32 on a CPU.
+
+        With an acting policy's few rows PyTorch's calls take longer than the products.
+        """
+        *hidden_layers, (last, last_bias) = [
+            (layer.weight.detach().numpy().T, layer.bias.detach().numpy()) for layer in self._linear
+        ]
+
+        def forward(hidden: Floats) -> Floats:
+            for weight, bias in hidden_layers:
+                hidden = hidden @ weight
+                hidden += bias
+                np.maximum(hidden, 0.0, out=hidden)
+            outputs: Floats = hidden @ last + last_bias
+            return outputs
+
+        return forward
 
 
 def _precision(bf16: bool, inputs: Tensor) -> AbstractContextManager[None]:

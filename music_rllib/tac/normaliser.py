@@ -5,7 +5,7 @@ Shape legend: B batch, I input features.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -53,6 +53,17 @@ class RunningNormaliser(nn.Module):
         0 for a feature that was the same in all observations.
         """
         return ((values - self.mean) * self.inverse_std).clamp(-self.clip, self.clip)
+
+    def in_numpy(self) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
+        """`forward` by the moments as they are now."""
+        mean, inverse_std = self.mean.numpy(), self.inverse_std.numpy()
+
+        def forward(values: NDArray[np.float32]) -> NDArray[np.float32]:
+            normalised = (values - mean) * inverse_std
+            clipped: NDArray[np.float32] = np.clip(normalised, -self.clip, self.clip)
+            return clipped
+
+        return forward
 
     @torch.no_grad()
     def update(self, values: Tensor) -> None:

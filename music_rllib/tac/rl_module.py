@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -22,9 +23,11 @@ from music_rllib.functional.squashed_gaussian import (
 )
 from music_rllib.intrinsic.estimator import MutualInformationEstimator
 from music_rllib.tac.kernels.forward import Bootstrap, TACForward
-from music_rllib.tac.networks import Critics, Perceptron
+from music_rllib.tac.networks import Critics, Floats, Perceptron
 from music_rllib.tac.normaliser import RunningNormaliser
 
+Actor = Callable[[Floats, Floats | None], Floats]
+"""Inputs [B, I] and noise [B, A], or None -> actions [B, A]."""
 ESTIMATOR_MODULE = "mi_estimator"
 """Module id of MUSIC's estimator in the Learner."""
 
@@ -79,7 +82,23 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
     @torch.no_grad()
     def act(self, inputs: Tensor, noise: Tensor | None = None) -> Tensor:
         """[B, I] -> [B, A] in [-1, 1]: a sample for standard normal noise [B, A], or tanh(mean)."""
-        mean, log_std = self.policy_parameters(self.normaliser(inputs))
+        return self._action(self.policy(self.normaliser(inputs)), noise)
+
+    def actor(self) -> Actor:
+        """`act` of arrays by the weights as they are now, on a CPU."""
+        policy, normaliser = self.policy.in_numpy(), self.normaliser
+        normalise = normaliser.in_numpy() if isinstance(normaliser, RunningNormaliser) else None
+
+        @torch.no_grad()
+        def act(inputs: Floats, noise: Floats | None) -> Floats:
+            outputs = policy(inputs if normalise is None else normalise(inputs))
+            drawn = None if noise is None else torch.from_numpy(noise)
+            return self._action(torch.from_numpy(outputs), drawn).numpy()
+
+        return act
+
+    def _action(self, outputs: Tensor, noise: Tensor | None) -> Tensor:
+        mean, log_std = self.distribution(outputs)
         if noise is None or log_std is None:
             return deterministic_action(mean)
         return squashed_action(mean, log_std, noise)

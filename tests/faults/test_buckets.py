@@ -15,7 +15,7 @@ from music_rllib import names
 from tests.faults import comparison, sweeps
 from tests.faults.test_dead_servers import server
 from tests.integration.conftest import Program
-from tests.integration.test_mlflow_tracking import Server
+from tests.integration.mlflow_server import MlflowServer
 
 __all__ = ["server"]
 
@@ -46,7 +46,7 @@ def bucket(program: Program) -> Iterator[str]:
 
 
 def test_a_driver_in_a_new_pod_goes_on(
-    program: Program, unbroken: Path, bucket: str, server: Server, tmp_path: Path
+    program: Program, unbroken: Path, bucket: str, server: MlflowServer, tmp_path: Path
 ) -> None:
     program.write(sweeps.document(storage=bucket, mlflow={"tracking_uri": server.uri}))
     program.environment["HOME"] = str(tmp_path / "one")

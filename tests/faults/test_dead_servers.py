@@ -13,7 +13,7 @@ import requests
 from tests.faults import comparison, sweeps
 from tests.faults.sweeps import deliver
 from tests.integration.conftest import Program
-from tests.integration.test_mlflow_tracking import Server
+from tests.integration.mlflow_server import MlflowServer
 from tests.integration.test_refusing_mlflow import TODO, refusing
 from tests.integration.test_secrets import PASSWORD, USER, mlflow_server
 
@@ -23,10 +23,10 @@ pytestmark = pytest.mark.thorough
 
 
 @pytest.fixture
-def server(tmp_path: Path) -> Iterator[Server]:
+def server(tmp_path: Path) -> Iterator[MlflowServer]:
     folder = tmp_path / "server"
     folder.mkdir()
-    own = Server(folder)
+    own = MlflowServer(folder)
     own.start()
     own.wait()
     yield own
@@ -41,7 +41,7 @@ def same(unbroken: Path, program: Program, uri: str) -> None:
 
 
 def test_a_server_that_is_away_for_a_minute(
-    program: Program, unbroken: Path, server: Server
+    program: Program, unbroken: Path, server: MlflowServer
 ) -> None:
     document = sweeps.document(mlflow={"tracking_uri": server.uri})
     program.write(document)
@@ -57,7 +57,7 @@ def test_a_server_that_is_away_for_a_minute(
     same(unbroken, program, server.uri)
 
 
-def test_a_server_that_stays_away(program: Program, unbroken: Path, server: Server) -> None:
+def test_a_server_that_stays_away(program: Program, unbroken: Path, server: MlflowServer) -> None:
     program.write(sweeps.document(mlflow={"tracking_uri": server.uri}))
     process = sweeps.start_until(program, "pretrain/seed0: started")
     server.signal(signal.SIGKILL)
@@ -72,7 +72,7 @@ def test_a_server_that_stays_away(program: Program, unbroken: Path, server: Serv
     same(unbroken, program, server.uri)
 
 
-def test_a_server_that_answers_500(program: Program, unbroken: Path, server: Server) -> None:
+def test_a_server_that_answers_500(program: Program, unbroken: Path, server: MlflowServer) -> None:
     """To everything, from the first run on; what it is to get follows when it is well again."""
     program.write(sweeps.document(mlflow={"tracking_uri": server.uri}))
     process = sweeps.start_until(program, "pretrain/seed0: started")

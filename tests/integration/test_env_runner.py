@@ -6,10 +6,12 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 
 from music_rllib.envs.numbers import BadNumberError
 from music_rllib.tac.config import TACConfig
 from music_rllib.tac.env_runner import TrajectoryEnvRunner
+from music_rllib.tac.normaliser import RunningNormaliser
 
 
 class Countdown(gym.Env[Any, Any]):
@@ -32,6 +34,9 @@ class Countdown(gym.Env[Any, Any]):
         self.seen.append(action)
         self.left -= 1
         return np.array([self.left, 1.0], np.float32), 1.0, self.left == 0, False, {}
+
+
+NOISE = {"kind": "gaussian_noise", "std": 0.05, "random_share": 0.3}
 
 
 def runner(
@@ -118,12 +123,35 @@ def test_number_of_timesteps_and_episodes_are_honoured() -> None:
     assert len(made.sample()) == 2
 
 
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        {"policy": "deterministic", "alpha": 0.0, "bootstrap": "critics", "behaviour": NOISE},
+        {"normalise_observations": False, "log_std_form": "tanh"},
+    ],
+)
+def test_it_acts_by_the_numbers_of_its_module(settings: dict[str, Any]) -> None:
+    made = runner(Countdown, num_envs=2, max_episode_steps=10, **settings)
+    rng = np.random.default_rng(0)
+    module = made.module
+    if settings.get("normalise_observations", True):
+        assert isinstance(module.normaliser, RunningNormaliser)
+        module.normaliser.update(torch.from_numpy(rng.normal(3.0, 9.0, (50, 2))))
+    inputs = rng.normal(3.0, 99.0, (30, 2)).astype(np.float32)
+    noise = rng.standard_normal((30, *Countdown.action_space.shape), dtype=np.float32)
+    rows, drawn = torch.from_numpy(inputs), torch.from_numpy(noise)
+    actor = module.actor()
+    np.testing.assert_allclose(actor(inputs, noise), module.act(rows, drawn), atol=1e-5)
+    np.testing.assert_allclose(actor(inputs, None), module.act(rows), atol=1e-5)
+
+
 def test_noise_of_the_original_music() -> None:
-    noise = {"kind": "gaussian_noise", "std": 0.05, "random_share": 0.3}
-    made = runner(Countdown, num_envs=8, max_episode_steps=10, behaviour=noise)
+    made = runner(Countdown, num_envs=8, max_episode_steps=10, behaviour=NOISE)
     inputs = np.zeros((6000, 2), np.float32)
-    actions = made._act(inputs, explore=True, random_actions=False)
-    mean = made._act(inputs[:1], explore=False, random_actions=False)
+    actor = made.module.actor()
+    actions = made._act(actor, inputs, explore=True, random_actions=False)
+    mean = made._act(actor, inputs[:1], explore=False, random_actions=False)
     far = np.abs(actions - mean).max(1) > 5 * 0.05
     # A uniform action is that near with probability (0.25)^2 at most.
     assert 0.25 < far.mean() < 0.32
