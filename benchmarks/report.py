@@ -10,12 +10,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import closing, suppress
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+import psutil
 
 from benchmarks.measure import Row, Taken, middle, taken_by
 from music_rllib import names
@@ -88,10 +89,11 @@ def _opened(chromium: str, address: str) -> Taken:
 def _run(command: Sequence[str]) -> None:
     """Run a command until what it has started has ended too, whose CPU time is then known."""
     ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+    own = psutil.Process()
+    before = own.children()  # Ray, in `python -m benchmarks`
     subprocess.run(command, check=True, capture_output=True)
-    with suppress(ChildProcessError):
-        while True:
-            os.wait()
+    for child in set(own.children()) - set(before):
+        os.waitpid(child.pid, 0)
 
 
 def config(storage: Path) -> SweepConfig:

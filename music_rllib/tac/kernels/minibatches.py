@@ -6,7 +6,7 @@ Shape legend: K updates, B transitions of a minibatch, N trajectories.
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from ray.rllib.core import DEFAULT_MODULE_ID
@@ -69,9 +69,12 @@ class Minibatches(NamedTuple):
         """[K, B] of networks that stay as they are: those for which the same was drawn together."""
         states, followers = self.transitions
         rewards: Tensor = states.new_empty(states.shape[:2])
-        for drawn in dict.fromkeys(self.drawn):
-            alike = torch.tensor([k for k, other in enumerate(self.drawn) if other == drawn])
+        kinds = dict.fromkeys(self.drawn)
+        for drawn in kinds:
+            alike: Any = slice(None)  # which copies nothing
+            if len(kinds) > 1:
+                alike = torch.tensor([k for k, other in enumerate(self.drawn) if other == drawn])
             before, after = (values[alike].flatten(0, 1) for values in (states, followers))
             found = reward.reward(before, after, drawn)
-            rewards[alike] = found.unflatten(0, (len(alike), -1))
+            rewards[alike] = found.unflatten(0, (-1, states.shape[1]))
         return rewards
