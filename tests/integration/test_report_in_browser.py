@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import threading
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import axe_core_python
+import numpy as np
 import pytest
 
+from music_rllib import names
 from music_rllib.experiment.location import SweepLocation
 from music_rllib.report.build import build_report
 from music_rllib.report.live import server
@@ -214,27 +219,42 @@ def test_printed_and_without_a_script_everything_is_there(
     assert not seen["faint"]
 
 
-def test_the_live_page_takes_up_what_is_new_and_leaves_the_reader_where_he_is(
-    open_page: Callable[[], Page],
-    report: Report,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+@pytest.fixture
+def serve(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Callable[[Callable[[], str]], str]]:
+    """Serves the page of the sweep `tiny`, and gives its address with the token."""
     monkeypatch.setattr(server, "LEAST_PAUSE", 0.2)
     monkeypatch.setattr(server, "_RELAX", 1.0)
+    place, opened = SweepLocation(storage=str(tmp_path), name="tiny"), ExitStack()
+
+    def start(make_page: Callable[[], str]) -> str:
+        live = server.LivePage(make_page, Progress(place))
+        opened.callback(live.close)
+        http = server.make_server(live, place, tmp_path, 0)
+        opened.callback(http.server_close)
+        threading.Thread(target=http.serve_forever, daemon=True).start()
+        opened.callback(http.shutdown)
+        return f"http://127.0.0.1:{http.server_port}/?token={http.token}"
+
+    with opened:
+        yield start
+
+
+def test_the_live_page_takes_up_what_is_new_and_leaves_the_reader_where_he_is(
+    open_page: Callable[[], Page],
+    serve: Callable[[Callable[[], str]], str],
+    report: Report,
+    tmp_path: Path,
+) -> None:
     write_state(tmp_path, 100, time.time())
     pages = {"html": render(report, live=True)}
-    live = server.LivePage(
-        lambda: pages["html"], Progress(SweepLocation(storage=str(tmp_path), name="tiny"))
-    )
-    http = server.make_server(live, SweepLocation(storage=str(tmp_path), name="tiny"), tmp_path, 0)
-    threading.Thread(target=http.serve_forever, daemon=True).start()
-    address = f"http://127.0.0.1:{http.server_port}/"
+    address = serve(lambda: pages["html"])
 
     async def use() -> None:
         async with open_page() as tab:
             await tab.view(1400, 1000)
-            await tab.go(f"{address}?token={http.token}")
+            await tab.go(address)
             text = await tab.wait_for("The sweep is running", "train/B failed: <b>no</b>")
             assert "1 started, 2 waiting" in text
             assert not (seen := await tab.evaluate(LOOK))["nameless"]
@@ -252,11 +272,73 @@ def test_the_live_page_takes_up_what_is_new_and_leaves_the_reader_where_he_is(
             await tab.wait_for("told to save its runs and stop")
             assert (tmp_path / "tiny" / "stop.json").exists()
             assert not tab.errors
-            assert all(url.startswith(address) for url in tab.requests)
+            assert all(url.startswith(address.partition("?")[0]) for url in tab.requests)
 
-    try:
-        asyncio.run(use())
-    finally:
-        http.shutdown()
-        http.server_close()
-        live.close()
+    asyncio.run(use())
+
+
+def test_a_study_half_way(
+    open_page: Callable[[], Page], serve: Callable[[Callable[[], str]], str], tmp_path: Path
+) -> None:
+    """FetchPush on fresh seeds as it was when half of its runs had ended."""
+    whole = read_archive(DATA / "claims-push")
+    sweep = as_of(whole, sorted(run.ended or 0 for run in whole.runs)[len(whole.runs) // 2])
+    running = [i for i, run in enumerate(sweep.runs) if run.status == "RUNNING"]
+    write_state(tmp_path, 0, time.time())
+    file = tmp_path / "tiny" / "state.json"
+    done = sum(map(sweep.last_step, range(len(sweep.runs))))
+    state = {
+        "env_steps": {"done": done, "left": 7_000_000 - done},
+        "stages": [
+            {"name": stage, "runs": _counts(sweep, stage, planned)}
+            for stage, planned in (("pretrain", 20), ("music-r", 60))
+        ],
+        "running": [
+            {
+                "run": f"{sweep.runs[i].stage}/q={sweep.runs[i].entropic_index}"
+                f"/seed{sweep.runs[i].seed}",
+                "env_steps": sweep.last_step(i),
+                "budget": sweep.runs[i].budget,
+                "metric": names.EVAL_SUCCESS,
+                "value": sweep.final(i, names.EVAL_SUCCESS),
+            }
+            for i in running
+        ],
+        "failures": [],
+    }
+    file.write_text(json.dumps(json.loads(file.read_text()) | state))
+    page = render(build_report(sweep, live=True), live=True)
+    address = serve(lambda: page)
+
+    async def look() -> None:
+        async with open_page() as tab:
+            await tab.view(1400, 1000)
+            await tab.go(address)
+            text = await tab.wait_for("The sweep is running", "With the α that suits it")
+            assert running
+            assert all(
+                f"{sweep.last_step(i):,} of {sweep.runs[i].budget:,}" in text for i in running
+            )
+            await tab.picture("report-live.png")
+            assert not tab.errors
+
+    asyncio.run(look())
+
+
+def as_of(sweep: Sweep, time: int) -> Sweep:
+    """What there was of it at a time, in ms since the epoch."""
+    begun = [i for i, run in enumerate(sweep.runs) if (run.started or 0) < time]
+    history = {}
+    for metric, column in sweep.history.items():
+        then = column.select((column.time < time) & np.isin(column.run, begun))
+        history[metric] = replace(then, run=np.searchsorted(begun, then.run))
+    runs = [sweep.runs[i] for i in begun]
+    states = [run.status if (run.ended or time) < time else "RUNNING" for run in runs]
+    runs = [replace(run, status=state) for run, state in zip(runs, states, strict=True)]
+    return replace(sweep, runs=runs, history=history, status="RUNNING")
+
+
+def _counts(sweep: Sweep, stage: str, planned: int) -> dict[str, int]:
+    found = Counter(run.status for run in sweep.runs if run.stage == stage)
+    finished, started = found["FINISHED"], found["RUNNING"]
+    return {"finished": finished, "started": started, "waiting": planned - finished - started}
