@@ -314,7 +314,7 @@ async def _photograph(wanted: dict[str, str], program: Path, folder: Path) -> No
         ):
             await page.go(wanted.get(name, wanted["comparison"]))
             await page.wait_for(*words)
-            await asyncio.sleep(2.0)
+            await asyncio.sleep(1.0)
             if pressed is not None:
                 await page.click(pressed, "button" if pressed else ".ag-row button")
             await page.wait_for(*then)
