@@ -127,7 +127,7 @@ def searched(config: SweepConfig, stage: Stage) -> Iterator[Kind]:
 def measure(
     config: SweepConfig, kinds: Collection[Kind], say: Callable[[str], None]
 ) -> tuple[list[Cost], int]:
-    """Train a run of each kind for some seconds, one after the other.
+    """Train runs of each kind for some seconds, as many side by side as fit.
 
     Args:
         config: Has the resources of a run.
@@ -151,7 +151,8 @@ def measure(
         for number, kind in enumerate(kinds, 1):
             say(f"measuring {number} of {len(kinds)}: {kind.label}")
             run = kind.settings.model_copy(update={"env_steps": kind.env_steps})
-            costs.append(Cost(kind=kind, sample=sample_run(run, config.resources)))
+            sample = sample_run(run, config.resources, min(room.at_once, max(kind.runs, 1)))
+            costs.append(Cost(kind=kind, sample=sample))
         return costs, room.at_once
 
 
@@ -171,10 +172,10 @@ def cost_table(costs: list[Cost], slots: int) -> Table:
             clock(row["seconds_a_run"]),
             clock(row["seconds"]),
         )
-    at_once = "one run at a time" if slots == 1 else f"{slots} runs at a time"
+    at_once = "one run at a time" if slots == 1 else f"{slots} runs at a time, measured so"
     largest = max((cost.sample.memory for cost in costs), default=0)
     lines = [
-        f"About {clock(document['seconds'])} with {at_once}, each measured by itself.",
+        f"About {clock(document['seconds'])} with {at_once}.",
         _memory_in_words(largest, slots),
     ]
     load = os.getloadavg()[0]

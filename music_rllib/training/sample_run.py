@@ -1,9 +1,10 @@
-"""The time and memory that a run takes, measured on one that trains for some seconds."""
+"""The time and memory that a run takes, measured on some that train side by side for seconds."""
 
 from __future__ import annotations
 
 import time
-from typing import NamedTuple
+from statistics import fmean
+from typing import Any, NamedTuple
 
 import psutil
 import ray
@@ -15,23 +16,28 @@ from music_rllib.training.run import TrainingRun
 
 SECONDS = 4.0
 """Shortest duration of the measured training, after one iteration that warms up."""
+PATIENCE = 60.0
+"""Longest wait for further processes after the first one, on a cluster that others use, too."""
 
 
 class RunSample(NamedTuple):
-    """Measurements of one run."""
+    """Means of runs of a kind that trained at the same time."""
 
     start_seconds: float
-    """Time from the request for a process to its first environment steps."""
+    """Time from the request for processes to the first environment steps of all."""
     steps_per_second: float
     """Environment steps per second of training."""
     evaluation_seconds: float
     """Duration of one evaluation."""
     memory: int
-    """Bytes of the process at the run's end, without the libraries that all runs share."""
+    """Bytes of the largest process at its run's end, without the libraries that all runs share."""
 
 
-def sample_run(run: RunSettings, resources: Resources) -> RunSample:
-    """Train a run for some seconds in a worker of the connected Ray.
+def sample_run(run: RunSettings, resources: Resources, at_once: int) -> RunSample:
+    """Train so many copies of a run at once for some seconds, in workers of the connected Ray.
+
+    They share caches, memory and clock speed of their machine, as the runs of a sweep do. Copies
+    for which there is no place are left out.
 
     Raises:
         ValueError: The settings do not fit the environment.
@@ -39,15 +45,24 @@ def sample_run(run: RunSettings, resources: Resources) -> RunSample:
     bundle = resources.bundle
     options = {"num_cpus": bundle["CPU"], "num_gpus": bundle.get("GPU", 0.0)}
     began = time.perf_counter()
-    worker = ray.remote(_Worker).options(**options, memory=bundle.get("memory")).remote()
+    workers: list[Any] = [
+        ray.remote(_Worker).options(**options, memory=bundle.get("memory")).remote()
+        for _ in range(at_once)
+    ]
     try:
-        ray.get(worker.start.remote(run, resources.gpus_per_run))
+        starts = {worker.start.remote(run, resources.gpus_per_run): worker for worker in workers}
+        ray.wait(list(starts))
+        ready, _ = ray.wait(list(starts), num_returns=at_once, timeout=PATIENCE)
+        ray.get(ready)
         started = time.perf_counter() - began
-        return RunSample(started, *ray.get(worker.train.remote()))
+        found = ray.get([starts[one].train.remote() for one in ready])
+        speeds, evaluations, memory = zip(*found, strict=True)
+        return RunSample(started, fmean(speeds), fmean(evaluations), max(memory))
     except RayTaskError as error:
         raise error.cause from None
     finally:
-        ray.kill(worker)
+        for worker in workers:
+            ray.kill(worker)
 
 
 class _Worker:

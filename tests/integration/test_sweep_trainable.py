@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
+import time
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -16,7 +17,8 @@ from ray.tune.trainable import trainable
 
 from music_rllib import names
 from music_rllib.config.run_settings import RunSettings, Variant, handed_over, preset
-from music_rllib.envs.tasks import Task
+from music_rllib.config.schema import Resources
+from music_rllib.envs.tasks import BUILT_IN_TASKS, Task
 from music_rllib.experiment.plan import node_key
 from music_rllib.intrinsic.music import HELD_OUT_STEPS
 from music_rllib.policy import find_policy, load_policy
@@ -24,6 +26,7 @@ from music_rllib.store.handoff import read_handoff
 from music_rllib.store.node_store import NodeStore
 from music_rllib.store.run_record import from_json_lines
 from music_rllib.training import run as run_module
+from music_rllib.training import sample_run
 from music_rllib.training.job import NodeJob
 from music_rllib.training.run import TrainingRun, _means
 from music_rllib.training.worker import CAUSE, NOTES, REPORTS, RunTrainable
@@ -312,3 +315,16 @@ def test_a_checkpoint_has_the_policy_that_it_would_go_on_with(tmp_path: Path) ->
     policy = load_policy(find_policy(node.key, str(tmp_path)))
     assert (policy.env_steps, policy.max_episode_steps) == (200, 20)
     np.testing.assert_allclose(policy.act(inputs), expected, atol=1e-6)
+
+
+@pytest.mark.usefixtures("local_ray")
+def test_what_runs_take_side_by_side_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sample_run, "SECONDS", 0.5)
+    run = settings("tac", task=BUILT_IN_TASKS["FetchReach"])
+    began = time.perf_counter()
+    sample = sample_run.sample_run(run, Resources(cpus_per_run=1), at_once=2)
+    took = time.perf_counter() - began
+    assert 0 < sample.start_seconds < took
+    assert 0 < sample.evaluation_seconds < took
+    assert sample.steps_per_second > 20
+    assert 5 * 2**20 < sample.memory < 2 * 2**30
