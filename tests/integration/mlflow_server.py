@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import socket
@@ -9,8 +10,8 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from types import TracebackType
 from typing import Self
+from urllib.parse import quote
 from urllib.request import urlopen
 
 import pytest
@@ -34,12 +35,7 @@ class MlflowServer:
         self.wait()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.signal(signal.SIGKILL)
 
     def start(self) -> None:
@@ -79,3 +75,9 @@ class MlflowServer:
             else:
                 return
         pytest.fail("the server did not start: " + (self.folder / "server.log").read_text())
+
+
+def comparing(server: str, experiment: str, runs: list[str]) -> str:
+    """Where MLflow compares selected runs."""
+    chosen, experiments = (quote(json.dumps(ids)) for ids in (runs, [str(experiment)]))
+    return f"{server}/#/compare-runs?runs={chosen}&experiments={experiments}"

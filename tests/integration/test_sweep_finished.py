@@ -13,7 +13,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import quote
@@ -22,23 +21,13 @@ import pandas as pd
 import pytest
 import yaml
 from mlflow import MlflowClient
-from typer.testing import CliRunner
 
 from music_rllib import load_sweep, names
-from music_rllib.config.load import load_sweep as load_config
-from music_rllib.experiment.plan import make_plan
-from music_rllib.experiment.run_info import run_info
 from music_rllib.report.build import PAGE
-from music_rllib.report.cli import app as report_app
-from music_rllib.results.archive.folder import read_archive, write_archive
-from music_rllib.results.data import Sweep
+from music_rllib.results.archive.folder import write_archive
 from music_rllib.results.from_mlflow import read_mlflow
-from music_rllib.store.run_record import Report
 from music_rllib.sweep.cli import main
-from music_rllib.sweep.listeners.mlflow_view import VERSIONS, comparison_view
-from music_rllib.tracking.projection import StoredRun
 from music_rllib.tracking.store import resolve_store
-from music_rllib.tracking.tracker import Tracker
 from tests.integration.conftest import (
     ENVIRONMENTS,
     REPOSITORY,
@@ -48,7 +37,7 @@ from tests.integration.conftest import (
     rows,
 )
 from tests.integration.devtools import PATIENCE, Page
-from tests.integration.mlflow_server import MlflowServer
+from tests.integration.mlflow_server import MlflowServer, comparing
 
 # A server without accounts has nobody to name.
 HARMLESS = ("mlflow/users/current",)
@@ -228,105 +217,6 @@ async def _compare(finished: Finished, link: str, server: str, program: Path, fo
     assert not errors
 
 
-@pytest.fixture(scope="module")
-def published(finished: Finished, tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Where MLflow compares a sweep of which the data are published, logged beside the other."""
-    sweep = read_archive(REPOSITORY / "docs" / "results" / "data" / "proof-fetch-push-her")
-    file = tmp_path_factory.mktemp("published") / "sweep.yaml"
-    file.write_text(str(sweep.config))
-    config = load_config(file)
-    plan = make_plan(config)
-    of_seed = {(run.entropic_index, run.seed): number for number, run in enumerate(sweep.runs)}
-    storage = str(finished.folder / "results")
-    with Tracker(sweep_name=config.name, storage=storage, config=config.document) as tracker:
-        for node in plan.nodes:
-            key = (f"{node.values['tac.entropic_index']:g}", str(node.run.seed))
-            stored = StoredRun(_reports(sweep, of_seed[key]))
-            tracker.mirror(run_info(node), partial(StoredRun, *stored))
-        tracker.keep_view(comparison_view(plan, tracker.sweep_id, time.time()), VERSIONS)
-        link = tracker.comparison_url().partition("/#/")[2]
-        assert tracker.flush(60.0)
-    arguments = [f"{storage}/{config.name}", "--attach", "--no-videos"]
-    assert CliRunner().invoke(report_app, arguments).exit_code == 0
-    return f"#/{link}"
-
-
-def _reports(sweep: Sweep, run: int) -> list[Report]:
-    """Those in which the run was evaluated."""
-    steps, _ = sweep.series(run, names.EVAL_SUCCESS)
-    begun = sweep.runs[run].started or 0
-    return [
-        Report(
-            env_steps=int(step),
-            seconds=float(step) / 400,
-            timestamp_ms=begun + round(2.5 * step),
-            metrics={
-                metric: float(values[at == step][0])
-                # MLflow compares by what was logged first.
-                for metric in sorted(sweep.history, key=lambda one: one != names.EVAL_SUCCESS)
-                for at, values in [sweep.series(run, metric)]
-                if step in at
-            },
-        )
-        for step in steps
-    ]
-
-
-def test_pictures_of_a_comparison(
-    finished: Finished,
-    published: str,
-    server: str,
-    require_service: Callable[[str], Path],
-    tmp_path: Path,
-) -> None:
-    """As the documentation shows them."""
-    found = finished.client.get_experiment_by_name("proof-fetch-push-her")
-    assert found is not None
-    runs = {
-        run.info.run_name: run.info.run_id
-        for run in finished.client.search_runs([found.experiment_id])
-    }
-    pages = f"{server}/#/experiments/{found.experiment_id}"
-    three = [runs[f"q={q} seed 0 FetchPush train"] for q in ("1", "1.5", "2")]
-    wanted = {
-        "comparison": f"{server}/{published}",
-        "sweep": f"{pages}/runs/{runs['proof-fetch-push-her']}",
-        "runs": f"{pages}/runs?searchFilter=" + quote('metrics."setting/entropic_index" > 1.2'),
-        "compare": _comparing(server, found.experiment_id, three),
-    }
-    asyncio.run(_photograph(wanted, require_service("chromium"), tmp_path))
-
-
-async def _photograph(wanted: dict[str, str], program: Path, folder: Path) -> None:
-    async with Page(program, folder) as page:
-        await page.view(1500, 800)
-        await page.go(wanted["comparison"])
-        await page.wait_for("Group: 1.5")
-        # MLflow's assistant takes up a third of the window until it is closed.
-        await page.evaluate("localStorage.setItem('mlflow.assistant.panelOpen_v1', 'false')")
-        lines = [f"{q} ({names.EVAL_SUCCESS})" for q in ("1", "1.5")]
-        for name, words, pressed, then in (
-            ("comparison", ["Comparison", *lines], None, lines),
-            ("grouping", lines, "Group by: entropic_index", ["Tags\n"]),
-            ("sweep", ["q = 1.5 against q = 1 on FetchPush"], "Show more", ["Show less"]),
-            ("runs", ["7 matching runs"], "", ["q=1.5 seed 0 FetchPush", "q=2 seed 2 FetchPush"]),
-            ("compare", ["Comparing 3 Runs", "tac.entropic_index"], None, ["Metrics:"]),
-        ):
-            await page.go(wanted.get(name, wanted["comparison"]))
-            await page.wait_for(*words)
-            await asyncio.sleep(1.0)
-            if pressed is not None:
-                await page.click(pressed, "button" if pressed else ".ag-row button")
-            await page.wait_for(*then)
-            await page.picture(f"mlflow-{name}.png")
-
-
-def _comparing(server: str, experiment: str, runs: list[str]) -> str:
-    """Where MLflow compares selected runs."""
-    chosen, experiments = (quote(json.dumps(ids)) for ids in (runs, [str(experiment)]))
-    return f"{server}/#/compare-runs?runs={chosen}&experiments={experiments}"
-
-
 async def _look(
     finished: Finished, server: str, program: Path, folder: Path, pair: list[str]
 ) -> None:
@@ -342,7 +232,7 @@ async def _look(
         ):
             await page.go(f"{pages}/runs?searchFilter={quote(wanted)}")
             await page.wait_for(f"{matching} matching runs")
-        await page.go(_comparing(server, finished.experiment_id, pair))
+        await page.go(comparing(server, finished.experiment_id, pair))
         text = await page.wait_for("Comparing 2 Runs", "q=2 seed 0 Point", "tac.entropic_index")
         axes = re.search(r"Parameters:\s+(.*?)\s+Metrics:\s+(.*?)\s+Clear All", text, re.DOTALL)
         assert axes
