@@ -85,6 +85,9 @@ def build_report(
         study_drawings(study),
     ):
         figures.add(drawing)
+    gaps = missing(sweep, analyses, undelivered, live=live or beside is not None)
+    for one in beside or ():  # each has a configuration of its own
+        gaps += [f"{one.name}: {line}" for line in missing(one, (), 0)]
     return Report(
         sweep=sweep,
         analyses=analyses,
@@ -92,7 +95,7 @@ def build_report(
         study=study,
         figures=figures,
         differences=() if beside is None else difference_tables(*beside, analyses),
-        missing=missing(sweep, analyses, undelivered, live=live) + ([damaged] if damaged else []),
+        missing=[*gaps, *filter(None, [damaged])],
         difference=difference,
         command=command,
         films=None

@@ -21,6 +21,7 @@ def test_the_page_of_two_sweeps_says_what_differs() -> None:
     both = side_by_side(first, second)
     assert len(both.runs) == 2 * len(first.runs), "runs of the same node are two"
     made = build_report(both, beside=(first, second))
+    assert made.missing == []
     settings, results = made.differences
     ((_, setting, before, after),) = settings.rows
     assert (setting, after) == ("tac.alpha", "0.125")
@@ -39,3 +40,10 @@ def test_the_page_of_two_sweeps_says_what_differs() -> None:
         "proof-fetch-reach (first)",
         "proof-fetch-reach (second)",
     }
+
+
+def test_what_is_missing_is_said_of_the_sweep_that_lacks_it() -> None:
+    first = read_archive(DATA / "proof-fetch-reach")
+    second = replace(first, name="other", runs=first.runs[:-1])
+    (missing,) = build_report(side_by_side(first, second), beside=(first, second)).missing
+    assert missing.startswith("other: 1 run not begun")
