@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[1]
 
 project = "music_rllib"
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
-exclude_patterns = ["results/page.md", "search.md"]
+exclude_patterns = ["results/page.md", "results/appendix.md", "search.md"]
 root_doc = "index"
 html_theme = "furo"
 html_title = "music_rllib"
@@ -55,6 +55,7 @@ performance
 :hidden:
 :caption: What came out
 results
+results_appendix
 results/plan
 changelog
 ```

@@ -1,14 +1,17 @@
-"""Writes docs/results.md and its figures from the runs in docs/results/data, and nothing else.
+"""Writes docs/results.md, its appendix and their figures from the runs in docs/results/data alone.
 
 python docs/generate_results.py            # writes them
-python docs/generate_results.py --check    # exit code 1 where the page is out of date
+python docs/generate_results.py --check    # exit code 1 where a page is out of date
 
-The page's words are in docs/results/page.md. Where that says `{{ KIND NAME }}`, a table is put of
-the sweep NAME: of all of its runs that any export in docs/results/data has, whichever sweep
-computed them, if tune_configs has a sweep of that name, and else of the export
-docs/results/data/NAME. KIND is `runs`, `success`, `stages`, `curves`, `races` or `effects`, with
-stages behind NAME if not all are meant, `metric`, with metrics, `search`, or `factorial`: what a
-study of q and α says so far.
+The pages' words are in docs/results/page.md and appendix.md. Where they say `{{ KIND NAME }}`, a
+table is put of the sweep NAME: of all of its runs that any export in docs/results/data has,
+whichever sweep computed them, if tune_configs has a sweep of that name, and else of the export
+docs/results/data/NAME. KIND is
+
+- of a planned study: `verdict`, with the hypothesis, `answer`, `outcomes`, with stages, `seeds`,
+  `cells`, or `figure`, with the name of one;
+- of any sweep: `runs`, `provenance`, `success`, `stages`, `curves`, `races` or `effects`, with
+  stages behind NAME if not all are meant, `metric`, with metrics, or `search`.
 
     python -m music_rllib.report results/NAME --export docs/results/data/NAME --add
 """
@@ -25,9 +28,9 @@ import numpy as np
 
 from music_rllib import names
 from music_rllib.config.load import load_sweep
+from music_rllib.config.schema import SweepConfig
 from music_rllib.experiment.plan import make_plan
 from music_rllib.report.figures.choice import (
-    AGAINST_ENTROPY,
     PRIMARY,
     Drawing,
     drawings_of_stages,
@@ -36,14 +39,16 @@ from music_rllib.report.figures.choice import (
 )
 from music_rllib.report.figures.draw import files
 from music_rllib.report.search_tables import search_in_words, search_tables
-from music_rllib.report.study import AGAINST_ALPHA, study_drawings
+from music_rllib.report.study import study_drawings
 from music_rllib.results import statistics as st
-from music_rllib.results.analysis import StageAnalysis, analyse
+from music_rllib.results.analysis import THRESHOLDS, StageAnalysis, analyse
 from music_rllib.results.archive.folder import is_archive, read_archive
 from music_rllib.results.archive.merge import of_plan
 from music_rllib.results.claims.answer import answer
-from music_rllib.results.claims.study import Mean, Study, study_of
-from music_rllib.results.comparison import Final, each_seed, verdict
+from music_rllib.results.claims.contrasts import Verdict
+from music_rllib.results.claims.plan import analysis_plan
+from music_rllib.results.claims.study import Mean, label_of, study_of
+from music_rllib.results.comparison import Final, each_seed, p_text, verdict
 from music_rllib.results.comparison import number as in_short
 from music_rllib.results.conditions import Condition, Stage, find_stages
 from music_rllib.results.data import Sweep
@@ -56,40 +61,50 @@ from music_rllib.results.time_to_threshold import (
 )
 
 FOLDER = Path(__file__).parent
-PAGE, TEMPLATE = FOLDER / "results.md", FOLDER / "results" / "page.md"
+PAGES = {"results.md": "page.md", "results_appendix.md": "appendix.md"}
 DATA, FIGURES = FOLDER / "results" / "data", FOLDER / "results" / "figures"
 CONFIGS = FOLDER.parent / "tune_configs"
 THRESHOLD = 0.9
-NOTICE = (
-    "<!-- Written by docs/generate_results.py from docs/results/page.md and docs/results/data. -->"
-)
+NOTICE = "<!-- Written by docs/generate_results.py from docs/results/{} and docs/results/data. -->"
 EARLIER = ("2",)
 """Versions of the algorithm whose runs are shown where there are none of a later one."""
 NOT_RUN = "*Not run yet.*"
 
 
 def main() -> int:
-    """Writes the page, or checks it."""
+    """Writes the pages, or checks them."""
     figures: dict[str, bytes] = {}
-    text = page(figures)
+    texts = {FOLDER / name: page(template, figures) for name, template in PAGES.items()}
     if "--check" in sys.argv[1:]:
-        current = PAGE.read_text("utf-8") if PAGE.exists() else ""
-        if current != text:
-            print(f"{PAGE} is out of date: python docs/generate_results.py", file=sys.stderr)
-        return int(current != text)
-    PAGE.write_text(text, encoding="utf-8")
+        stale = [
+            str(path)
+            for path, text in texts.items()
+            if not path.exists() or path.read_text("utf-8") != text
+        ]
+        if stale:
+            names_of = ", ".join(stale)
+            print(f"Out of date: {names_of}. python docs/generate_results.py", file=sys.stderr)
+        return int(bool(stale))
+    for path, text in texts.items():
+        path.write_text(text, encoding="utf-8")
     FIGURES.mkdir(parents=True, exist_ok=True)
-    for stale in FIGURES.glob("*.svg"):
-        stale.unlink()
+    for old in FIGURES.glob("*.svg"):
+        old.unlink()
     for name, content in figures.items():
         (FIGURES / name).write_bytes(content)
     return 0
 
 
-def page(figures: dict[str, bytes]) -> str:
-    """The template with its tables filled in; the figures that it shows go into `figures`."""
+def page(template: str, figures: dict[str, bytes]) -> str:
+    """A template with its tables filled in; the figures that it shows go into `figures`."""
     tables: dict[str, Callable[..., Iterable[str]]] = {
+        "answer": answer_text,
+        "outcomes": outcomes_table,
+        "seeds": seeds_table,
+        "cells": cells,
+        "figure": lambda sweep, name: named_figure(sweep, name, figures),
         "runs": runs_table,
+        "provenance": lambda sweep: [provenance(sweep)],
         "success": lambda sweep, *stages: success(sweep, figures, stages),
         "stages": stages_table,
         "curves": lambda sweep, *stages: stage_curves(sweep, figures, stages),
@@ -97,28 +112,36 @@ def page(figures: dict[str, bytes]) -> str:
         "effects": effects_table,
         "metric": metric_table,
         "search": lambda sweep: search_text(sweep, figures),
-        "factorial": lambda sweep: factorial(sweep, figures),
     }
 
     def fill(match: re.Match[str]) -> str:
         kind, name, *rest = match[1].split()
+        if kind == "verdict":
+            return verdict_text(name, " ".join(rest))
         sweep = sweep_called(name)
         return NOT_RUN if sweep is None else "\n".join(tables[kind](sweep, *rest))
 
-    template = TEMPLATE.read_text("utf-8")
-    return f"{NOTICE}\n\n{re.sub(r'{{ (.*?) }}', fill, template)}"
+    text = (FOLDER / "results" / template).read_text("utf-8")
+    return f"{NOTICE.format(template)}\n\n{re.sub(r'{{ (.*?) }}', fill, text)}"
 
 
 @cache
 def sweep_called(name: str) -> Sweep | None:
     """What has been exported of a sweep's runs; None where nothing has."""
-    for file in sorted(CONFIGS.glob("**/*.yaml")):
-        if f"name: {name}\n" in file.read_text("utf-8"):
-            plan = make_plan(load_sweep(file))
-            if not plan.searched:
-                earlier = [make_plan(load_sweep(file), algorithm=version) for version in EARLIER]
-                return of_plan(plan, exports(), *earlier)
+    config = config_of(name)
+    if config is not None and not (plan := make_plan(config)).searched:
+        earlier = [make_plan(config, algorithm=version) for version in EARLIER]
+        return of_plan(plan, exports(), *earlier)
     return read_archive(DATA / name) if is_archive(DATA / name) else None
+
+
+@cache
+def config_of(name: str) -> SweepConfig | None:
+    """The sweep of that name in tune_configs; None where there is none."""
+    files = sorted(CONFIGS.glob("**/*.yaml"))
+    found = (file for file in files if f"name: {name}\n" in file.read_text("utf-8"))
+    file = next(found, None)
+    return load_sweep(file) if file else None
 
 
 @cache
@@ -264,9 +287,7 @@ def waits(sweep: Sweep, task: str, runs: Sequence[int]) -> tuple[str, str]:
     )
     if not told.reached.any():
         return "not reached", each
-    low, high = median_wait_interval(told)
-    spread = "" if np.isnan(low) else f" [{_steps_text(low)}, {_steps_text(high)}]"
-    return f"{_steps_text(median_wait(told))}{spread}", each
+    return _wait_text(median_wait(told), *median_wait_interval(told)), each
 
 
 def curves(sweep: Sweep, analysis: StageAnalysis, figures: dict[str, bytes]) -> Iterator[str]:
@@ -401,30 +422,96 @@ def last_value(sweep: Sweep, run: int | None, metric: str) -> float:
     return float("nan") if value is None else value
 
 
-# -- every q at every alpha ----------------------------------------------------------------------
+# -- planned studies -----------------------------------------------------------------------------
 
 
-def factorial(sweep: Sweep, figures: dict[str, bytes]) -> Iterator[str]:
-    """How far it is, its answer, performance against realised entropy and α, and each cell."""
-    study = study_of(sweep)
-    finished = sum(run.status == "FINISHED" for run in sweep.runs)
-    yield f"**{finished} of {planned_runs(sweep.name)} planned runs have finished.**"
-    yield ""
-    yield from (f"- {sentence}" for sentence in answer(sweep, study))
-    drawings = [d for found in analyse(sweep) for d in stage_drawings(sweep, found)]
-    for drawing in (*drawings, *study_drawings(study)):
-        if drawing.title in (AGAINST_ENTROPY, AGAINST_ALPHA):
-            yield ""
-            yield from figure(sweep, drawing, figures)
-    yield ""
-    yield from cells(sweep, study)
-    yield ""
-    yield provenance(sweep)
+def verdict_text(name: str, hypothesis: str) -> str:
+    """What a study says of a hypothesis of its plan; nothing before all of its runs have finished.
+
+    Raises:
+        ValueError: if its plan has no such hypothesis.
+    """
+    config = config_of(name)
+    plan = analysis_plan(config) if config else None
+    if plan is None or hypothesis not in plan.hypotheses:
+        raise ValueError(f"{name} has no hypothesis {hypothesis!r}")
+    sweep = sweep_called(name)
+    if sweep is None:
+        return "not begun"
+    finished, planned = progress(sweep)
+    if finished < planned:
+        return f"under way: {finished} of {planned} runs"
+    claims = {claim.hypothesis.text: claim for claim in study_of(sweep).planned if claim.hypothesis}
+    claim = claims[hypothesis]
+    tested = claim.p_value
+    if claim.verdict is Verdict.EQUIVALENT and claim.p_equivalent is not None:
+        tested = claim.p_equivalent
+    difference = _signed(claim.contrast.difference)
+    return f"**{claim.verdict}**: {difference}; {p_text(tested)}; {claim.contrast.seeds[0]} seeds"
 
 
-def cells(sweep: Sweep, study: Study) -> Iterator[str]:
+def answer_text(sweep: Sweep) -> Iterator[str]:
+    """A study's answer; before all of its runs have finished only how far it is."""
+    finished, planned = progress(sweep)
+    yield f"**{finished} of {planned} planned runs have finished.**"
+    if finished == planned:
+        yield ""
+        yield from (f"- {sentence}" for sentence in answer(sweep, study_of(sweep)))
+
+
+def progress(sweep: Sweep) -> tuple[int, int]:
+    """Runs that have finished, and those that the sweep's file plans."""
+    config = config_of(sweep.name)
+    planned = len(make_plan(config).nodes) if config else len(sweep.runs)
+    return sum(run.status == "FINISHED" for run in sweep.runs), planned
+
+
+def outcomes_table(sweep: Sweep, *stages: str) -> Iterator[str]:
+    """One row per condition: what was planned to be counted, and what stands beside it."""
+    rates = (f"steps to {_percent(rate)}: median [95 %]" for rate in THRESHOLDS)
+    area, success = "area: mean [95 %]", "success at the end: mean [95 %]"
+    yield _row("condition", area, success, *rates, "Shannon entropy, nats", "S_q", "seeds")
+    yield _rule(6 + len(THRESHOLDS))
+    for analysis in analyse(sweep):
+        if analysis.stage.name in stages:
+            prefix = f"{analysis.stage.name}, " if len(stages) > 1 else ""
+            for mean in study_of(sweep, analysis.stage.name).means:
+                yield _row(*_outcomes(analysis, mean, prefix))
+
+
+def _outcomes(analysis: StageAnalysis, mean: Mean, prefix: str) -> Iterator[str]:
+    key = (mean.condition, mean.task)
+    (final,) = (
+        final
+        for scope in analysis.scopes
+        for final in scope.finals
+        if (final.condition, scope.name) == key
+    )
+    yield f"{prefix}{label_of(mean.condition)}"
+    yield _spread(mean.estimate)
+    yield _interval(final)[0]
+    for wait in analysis.waits:
+        if (wait.condition, wait.task) == key:
+            yield _wait_text(wait.median, wait.lower, wait.upper)
+    for entropy in analysis.entropies[mean.task, mean.condition]:
+        yield _spread(entropy) if entropy else ""
+    yield f"{len(mean.scores.by_seed)} of {mean.runs}"
+
+
+def seeds_table(sweep: Sweep) -> Iterator[str]:
+    """The area under the curve of every seed."""
+    means = study_of(sweep).means
+    yield _row("seed", *(label_of(mean.condition) for mean in means))
+    yield _rule(1 + len(means))
+    for seed in sorted({seed for mean in means for seed in mean.scores.by_seed}, key=int):
+        scores = (mean.scores.by_seed.get(seed) for mean in means)
+        yield _row(seed, *("" if score is None else f"{score:.3f}" for score in scores))
+
+
+def cells(sweep: Sweep) -> Iterator[str]:
     """A row for each α and a column for each q: area under the curve, entropy at the end, seeds."""
-    by_cell = {(mean.condition.entropic_index, alpha_of(sweep, mean)): mean for mean in study.means}
+    means = study_of(sweep).means
+    by_cell = {(mean.condition.entropic_index, alpha_of(sweep, mean)): mean for mean in means}
     qs, alphas = (sorted({cell[i] for cell in by_cell}, key=float) for i in (0, 1))
     yield _row("α", *(f"q = {q}" for q in qs))
     yield _rule(1 + len(qs))
@@ -448,10 +535,21 @@ def cell_text(sweep: Sweep, mean: Mean | None) -> str:
     return f"{np.mean(scores):.2f}{spread}, {entropy:.1f} nats ({len(scores)})"
 
 
-def planned_runs(name: str) -> int:
-    """Of the sweep's file."""
-    (file,) = (f for f in CONFIGS.glob("**/*.yaml") if f"name: {name}\n" in f.read_text("utf-8"))
-    return len(make_plan(load_sweep(file)).nodes)
+def named_figure(sweep: Sweep, name: str, figures: dict[str, bytes]) -> Iterator[str]:
+    """The figure of that name, of the stage that is compared.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    study = study_of(sweep)
+    stages = [
+        found for found in analyse(sweep) if study.stage and found.stage.name == study.stage.name
+    ]
+    drawings = [d for found in stages for d in stage_drawings(sweep, found)]
+    named = {slug(d.title): d for d in (*drawings, *study_drawings(study))}
+    if name not in named:
+        raise ValueError(f"{sweep.name} has no figure {name}, but {', '.join(named)}")
+    yield from figure(sweep, named[name], figures)
 
 
 # -- searches ------------------------------------------------------------------------------------
@@ -507,6 +605,17 @@ def _spread(found: st.Estimate) -> str:
 
 def _percent(share: float) -> str:
     return f"{100 * share:.0f} %"
+
+
+def _signed(found: st.Estimate) -> str:
+    """`-0.07 (95 % -0.10 to -0.04)`."""
+    value, lower, upper = (float(x) for x in (found.value, found.lower, found.upper))
+    return f"{value:+.2f} (95 % {lower:.2f} to {upper:.2f})"
+
+
+def _wait_text(median: float, low: float, high: float) -> str:
+    spread = "" if np.isnan(low) else f" [{_steps_text(low)}, {_steps_text(high)}]"
+    return f"{_steps_text(median)}{spread}"
 
 
 def _steps_text(steps: float) -> str:
