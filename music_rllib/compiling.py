@@ -12,6 +12,7 @@ from typing import Any
 
 from numba import njit
 from numba.core.caching import FunctionCache
+from numba.extending import register_jitable
 
 logger = logging.getLogger(__name__)
 
@@ -19,14 +20,16 @@ Function = Callable[..., Any]
 
 
 def compiled(function: Function, *, any_order: bool = False) -> Any:
-    """Compile a function that other compiled functions call.
+    """Let compiled functions call a function; Python calls it as it stands, uncompiled.
 
     Args:
         any_order: allows the compiler to reorder sums, which vectorises them. The order is the
             same in every run, and NaN stays NaN.
     """
     fastmath = {"reassoc", "contract", "nsz"} if any_order else False
-    return njit(function, error_model="numpy", fastmath=fastmath)
+    # `register_jitable` leaves out the wrappers for calls from elsewhere: a third of the time.
+    options = {"error_model": "numpy", "fastmath": fastmath, "no_cfunc_wrapper": True}
+    return register_jitable(**options)(function)
 
 
 def kept_on_disk(function: Function) -> Any:

@@ -223,7 +223,8 @@ def _asked(networks: Networks, pairs: Array, of_values: Array, action: Array) ->
     rows, of_value = np.arange(2 * count), np.empty((2 * count, 1), action.dtype)
     for c in range(len(networks.critics)):
         critic = networks.critics[c]
-        of_value[:count, 0] = of_values[c, :count]
+        for r in range(count):
+            of_value[r, 0] = of_values[c, r]
         end = count  # of the minibatch, and then of what the policy improves on
         for r in range(count, 2 * count):
             if of_values[c, r] != 0.0:
@@ -346,11 +347,14 @@ def _differentiate(
     _learn_policy(networks, rule, entered, sample, of_action, slopes, alpha)
     if rule.has_value:
         losses[2] = _learn_value(networks, states[:rows], smallest, ln_q_pi, alpha)
-    learned.q_values[k] = values[:, :rows]
-    learned.target[k] = target
-    learned.log_density[k] = sample.log_density
-    learned.log_std[k] = sample.log_std
-    learned.ln_q_pi[k] = ln_q_pi
+    for r in range(rows):  # assigning whole slices takes seconds to compile
+        for c in range(len(values)):
+            learned.q_values[k, c, r] = values[c, r]
+        for a in range(sample.log_density.shape[1]):
+            learned.log_density[k, r, a] = sample.log_density[r, a]
+            learned.log_std[k, r, a] = sample.log_std[r, a]
+        learned.target[k, r] = target[r]
+        learned.ln_q_pi[k, r] = ln_q_pi[r]
 
 
 @compiled

@@ -163,7 +163,7 @@ class DirectUpdate:
 
     def _rule_of(self, module: TACModule) -> Rule:
         settings, normaliser = module.settings, module.normaliser
-        mean, clip = torch.zeros(module.input_size), math.inf
+        mean, clip = self.flat.values.new_zeros(module.input_size), math.inf
         inverse_std = torch.ones_like(mean)
         if isinstance(normaliser, RunningNormaliser):  # it writes these in place
             mean, inverse_std, clip = normaliser.mean, normaliser.inverse_std, normaliser.clip
