@@ -467,16 +467,28 @@ def progress(sweep: Sweep) -> tuple[int, int]:
 
 
 def outcomes_table(sweep: Sweep, *stages: str) -> Iterator[str]:
-    """One row per condition: what was planned to be counted, and what stands beside it."""
+    """One column per condition: what was planned to be counted, and below it what was not."""
     rates = (f"steps to {_percent(rate)}: median [95 %]" for rate in THRESHOLDS)
-    area, success = "area: mean [95 %]", "success at the end: mean [95 %]"
-    yield _row("condition", area, success, *rates, "Shannon entropy, nats", "S_q", "seeds")
-    yield _rule(6 + len(THRESHOLDS))
+    columns = [
+        [
+            "",
+            "**area under the curve: mean [95 %]**",
+            "success at the end: mean [95 %]",
+            *rates,
+            "Shannon entropy at the end, nats",
+            "S_q at the end",
+            "seeds",
+        ]
+    ]
     for analysis in analyse(sweep):
         if analysis.stage.name in stages:
             prefix = f"{analysis.stage.name}, " if len(stages) > 1 else ""
-            for mean in study_of(sweep, analysis.stage.name).means:
-                yield _row(*_outcomes(analysis, mean, prefix))
+            means = study_of(sweep, analysis.stage.name).means
+            columns += [list(_outcomes(analysis, mean, prefix)) for mean in means]
+    header, *rows = zip(*columns, strict=True)
+    yield _row(*header)
+    yield _rule(len(header))
+    yield from (_row(*row) for row in rows)
 
 
 def _outcomes(analysis: StageAnalysis, mean: Mean, prefix: str) -> Iterator[str]:

@@ -165,7 +165,7 @@ def _against_entropy(sweep: Sweep, stage: Stage) -> Iterator[Drawing]:
             stage=stage.name,
             title=AGAINST_ENTROPY,
             caption="One point for each finished run. Where the values of q lie on one curve, the "
-            "entropy explains what they end at; where they differ at the same entropy, q does.",
+            "entropy explains how they do; where they differ at the same entropy, q does.",
             panels=tuple(filter(None, panels)),
             legend=_legend_by_q(stage),
         )

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -23,6 +23,7 @@ from music_rllib import names
 from music_rllib.report.figures.palette import Style, styles_of
 from music_rllib.results import statistics as st
 from music_rllib.results.analysis import Curve
+from music_rllib.results.claims.scores import Measure, measure_on, scores_of
 from music_rllib.results.comparison import SHOW_SEEDS_BELOW, Final, Scope, interval_text, number
 from music_rllib.results.conditions import Condition
 from music_rllib.results.data import Sweep
@@ -193,24 +194,14 @@ def finals_panel(
 
 
 def entropy_panel(sweep: Sweep, task: str, styles: Mapping[Condition, Style]) -> Panel | None:
-    """A point for each finished run on the task: its final value over its final Shannon entropy.
+    """A point for each finished run on the task: its area under the curve over its entropy.
 
     Returns:
         None if fewer than two runs have an entropy.
     """
-    metric = sweep.primary_metric(task)
-    is_rate = metric in names.EVAL_RATES
-    points = {
-        condition: [
-            (entropy, score)
-            for run in condition.runs
-            if sweep.runs[run].task == task
-            and sweep.runs[run].status == "FINISHED"
-            and (entropy := sweep.final(run, names.SHANNON_ENTROPY)) is not None
-            and (score := sweep.final(run, metric)) is not None
-        ]
-        for condition in styles
-    }
+    runs = [run for condition in styles for run in condition.runs]
+    measure = measure_on(sweep, task, runs, "auc")
+    points = {condition: list(_by_entropy(sweep, condition, task, measure)) for condition in styles}
     if sum(map(len, points.values())) < 2:
         return None
 
@@ -224,11 +215,20 @@ def entropy_panel(sweep: Sweep, task: str, styles: Mapping[Condition, Style]) ->
             )  # fmt: skip
             mark_condition(marks, place, condition.label)
         axes.set_xlabel("Shannon entropy at the end (nats)")
-        axes.set_ylabel("final success rate" if is_rate else f"final {names.word_of(metric)}")
-        if is_rate:
-            axes.set_ylim(*RATE_LIMITS)
+        axes.set_ylabel(measure.words)
 
     return Panel(title=task, draw=draw)
+
+
+def _by_entropy(
+    sweep: Sweep, condition: Condition, task: str, measure: Measure
+) -> Iterator[tuple[float, float]]:
+    scores = scores_of(sweep, condition, task, measure).by_seed
+    for run in condition.runs:
+        record = sweep.runs[run]
+        entropy = sweep.final(run, names.SHANNON_ENTROPY)
+        if record.task == task and record.seed in scores and entropy is not None:
+            yield entropy, scores[record.seed]
 
 
 def labelled_rows(labels: Sequence[str]) -> tuple[list[str], float]:

@@ -262,10 +262,13 @@ def test_how_random_policies_are_stands_beside_what_they_ended_at() -> None:
     assert row == ["0.05 to 0.55", "–", "–"]
     (drawing,) = [one for one in report.drawings if one.title == AGAINST_ENTROPY]
     axes = drawn_figure(drawing.panels, drawing.legend, TEXT_WIDTH, 8.0).axes[0]
-    points = {
-        tuple(point) for line in axes.lines for point in np.asarray(line.get_xydata()).tolist()
-    }
-    assert points == set(zip(values, [0.5, 0.6, 0.7, 0.4, 0.5, 0.6], strict=True))
+    points = sorted(
+        point for line in axes.lines for point in np.asarray(line.get_xydata()).tolist()
+    )
+    # Of a straight line to `final` that begins at its tenth, which it has until then.
+    areas = [0.505 * final for final in (0.5, 0.6, 0.7, 0.4, 0.5, 0.6)]
+    expected = sorted(zip(values, areas, strict=True))
+    np.testing.assert_allclose(points, expected, rtol=1e-6)
 
 
 def test_a_run_that_failed_has_no_final_rate_but_counts_as_waiting() -> None:
