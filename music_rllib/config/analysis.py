@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self
 
 from pydantic import AfterValidator, Field
@@ -14,6 +14,7 @@ from music_rllib.names import EVAL_RETURN
 from music_rllib.schedules import StrictModel
 
 if TYPE_CHECKING:
+    from music_rllib.config.run_settings import RunSettings
     from music_rllib.config.schema import Stage
 
 SETTINGS_IN_SHORT = {
@@ -122,21 +123,15 @@ def check_analysis(
 
 def _broken_rule(stage: Stage, condition: Mapping[str, str]) -> str | None:
     """The rule that a condition breaks; None if the stage has such runs."""
-    points: list[Mapping[str, Any]] = [point.values for point in stage.points]
     space = stage.search.space if stage.search else {}
-    if stage.search:
-        points = list(stage.search.arms())
-    runs = list(stage.points[0].runs.values())
+    points = stage.search.arms() if stage.search else [dict(p.values) for p in stage.points]
+    runs = [run for point in stage.points for run in list(point.runs.values())[:1]]
     if not runs:  # the stage's settings are invalid, which is a problem of its own
         return None
-    fixed = runs[0].model_dump(mode="json")
     for name, text in condition.items():
         if name == "stage" or name in space:
             continue
-        values = [point[name] for point in points if name in point]
-        if not values:
-            with contextlib.suppress(LookupError):
-                values = [value for value in [lookup(fixed, name.split("."))] if value is not None]
+        values = [point[name] for point in points if name in point] or _values(runs, name)
         if not values:
             varied = dict.fromkeys([*(name for point in points for name in point), *space])
             settings = ", ".join(varied) or "nothing"
@@ -144,6 +139,17 @@ def _broken_rule(stage: Stage, condition: Mapping[str, str]) -> str | None:
         if not any(_equals(text, value) for value in values):
             return f"must name values that {stage.name} has, {name} is {shown(values)}, got {text}"
     return None
+
+
+def _values(runs: Sequence[RunSettings], name: str) -> list[Any]:
+    """The values of a setting that runs have, also where a grid varies the group that it is in."""
+    values: list[Any] = []
+    for run in runs:
+        with contextlib.suppress(LookupError):
+            value = lookup(run.model_dump(mode="json"), name.split("."))
+            if value is not None and value not in values:
+                values.append(value)
+    return values
 
 
 def _equals(text: str, value: Any) -> bool:

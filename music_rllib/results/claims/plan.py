@@ -196,7 +196,12 @@ def _control(stage: Stage) -> str:
         tuned = ", ".join(search.space)
         each = f" for each value of {', '.join(search.compare)}" if search.compare else ""
         return f"{tuned} tuned{each}, with {search.count} trials"
-    words = sorted({in_words(run.tac.alpha) for p in stage.points for run in p.runs.values()})
+    runs = [run for point in stage.points for run in point.runs.values()]
+    pairs = {(in_words(run.tac.entropic_index), in_words(run.tac.alpha)) for run in runs}
+    words = sorted({alpha for _, alpha in pairs})
+    if len(words) > 1 and len(dict(pairs)) == len(pairs):
+        own = ", ".join(f"{alpha} at q = {q}" for q, alpha in sorted(pairs))
+        return f"α of its own for each q: {own}"
     if len(words) > 1:
         return f"α varied: {', '.join(words)}; differences are means over it"
     return f"α {words[0]}" if is_controlled(words[0]) else f"none: one α of {words[0]} for all"

@@ -15,6 +15,7 @@ from music_rllib.config.problems import ConfigError
 from music_rllib.config.run_settings import VARIANTS, RunSettings, handed_over, preset
 from music_rllib.config.schema import SweepConfig
 from music_rllib.envs.tasks import BUILT_IN_TASKS
+from music_rllib.results.claims.plan import analysis_plan
 from music_rllib.schedules import Linear
 from music_rllib.store.handoff import write_handoff
 
@@ -212,6 +213,20 @@ def without_success(document: Document) -> Document:
     grid = {"tac.entropic_index": [1.0, 1.5]}
     stages = [{"name": "a", "variant": "tac", "grid": grid}]
     return document | {"environments": {"Swing": task}, "tasks": ["Swing"], "stages": stages}
+
+
+def test_an_alpha_of_its_own_for_each_q_is_a_group_of_the_grid(
+    load: Callable[..., SweepConfig],
+) -> None:
+    tuned = [{"entropic_index": 1.0, "alpha": 0.05}, {"entropic_index": 1.5, "alpha": 0.15}]
+    document = asking("q = 1.5 better than q = 1", stage="finetune")
+    document["stages"][1]["grid"] = {"tac": tuned}
+    plan = analysis_plan(load(document))
+    assert plan is not None
+    assert plan.control == "α of its own for each q: 0.05 at q = 1, 0.15 at q = 1.5"
+    document["analysis"]["hypotheses"] = ["q = 1.5, alpha = 0.2 against q = 1"]
+    with pytest.raises(ConfigError, match=r"tac.alpha is \[0.05, 0.15\], got 0.2"):
+        load(document)
 
 
 BAD: list[tuple[Document, str]] = [
