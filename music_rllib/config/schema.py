@@ -133,8 +133,8 @@ class StageHeader(StrictModel):
     per_task: dict[str, dict[str, Any]] = Field(default_factory=dict)
     """Task to settings that replace the stage's for it: `{FetchSlide: {env_steps: 300000}}`."""
     grid: dict[str, Annotated[list[Any], Field(min_length=1)]] = Field(default_factory=dict)
-    """Dotted setting to its values; the product of all lists gives the stage's trials. Settings that
-    vary together are mappings of their group: `tac: [{entropic_index: 1, alpha: 0.05}, ...]`."""
+    """Dotted setting to its values; the product of all lists gives the stage's trials. Settings
+    that vary together are a group: `tac: [{entropic_index: 1, alpha: 0.05}, ...]`."""
     search: SearchSettings | None = None
     """A search for the trials in place of `grid` (docs/search.md)."""
 
