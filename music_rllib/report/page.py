@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from itertools import chain, groupby
 from typing import Any
 
 from music_rllib import names
@@ -247,11 +248,22 @@ def _remarks(report: Report) -> Iterable[Sequence[str]]:
             )
         for scope in analysis.scopes:
             remarks += verdict(scope, report.difference)
-        heading = f"Stage {stage.name} ({stage.variant}), seeds {', '.join(stage.seeds)}"
+        heading = f"Stage {stage.name} ({stage.variant}), seeds {_in_ranges(stage.seeds)}"
         if analysis is report.together:
             heading = "Stages side by side, each by the runs of the conditions that all have"
         if remarks or len(report.analyses) > 1:
             yield [heading, *remarks]
+
+
+def _in_ranges(seeds: Sequence[str]) -> str:
+    """`0, 1, 1000 to 1019`."""
+    ordered = sorted(map(int, seeds))
+    runs = [
+        [seed for _, seed in run]
+        for _, run in groupby(enumerate(ordered), key=lambda pair: pair[1] - pair[0])
+    ]
+    ranges = [[f"{run[0]} to {run[-1]}"] if len(run) > 2 else map(str, run) for run in runs]
+    return ", ".join(chain.from_iterable(ranges))
 
 
 def _not_drawn(report: Report) -> Iterable[Sequence[str]]:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import base64
-import io
 import json
 import os
 import subprocess
@@ -18,7 +17,6 @@ from typing import Any, Self
 from urllib.request import urlopen
 
 import aiohttp
-from PIL import Image
 
 PATIENCE = 180.0
 
@@ -174,5 +172,4 @@ class Page:
         await asyncio.sleep(0.5)
         reply = await self._send("Page.captureScreenshot", format="png")
         path = Path(os.environ.get("MUSIC_RLLIB_PICTURES") or self._folder) / name
-        shown = Image.open(io.BytesIO(base64.b64decode(reply["data"])))
-        shown.quantize(96, dither=Image.Dither.NONE).save(path, optimize=True)
+        path.write_bytes(base64.b64decode(reply["data"]))
