@@ -9,7 +9,7 @@ whichever sweep computed them, if tune_configs has a sweep of that name, and els
 docs/results/data/NAME. KIND is
 
 - of a planned study: `verdict`, with the hypothesis, `answer`, `outcomes`, with stages, `seeds`,
-  `cells`, `figure`, with the name of one, or `hours` of its runs;
+  `cells`, `figure`, with the name of one, `hours` or `progress` of its runs;
 - of any sweep: `runs`, `provenance`, `success`, `stages`, `curves`, `races` or `effects`, with
   stages behind NAME if not all are meant, `metric`, with metrics, or `search`.
 
@@ -121,6 +121,8 @@ def page(template: str, figures: dict[str, bytes]) -> str:
         sweep = sweep_called(name)
         if kind == "hours":
             return f"{sum(run.seconds or 0.0 for run in sweep.runs) / 3600:.1f}" if sweep else "0"
+        if kind == "progress":
+            return "{} of {} runs".format(*progress(sweep)) if sweep else "not begun"
         return NOT_RUN if sweep is None else "\n".join(tables[kind](sweep, *rest))
 
     text = (FOLDER / "results" / template).read_text("utf-8")
