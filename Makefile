@@ -77,7 +77,7 @@ profile: venv  ## write a flame graph of a training run to results/profile.svg
 	@$(BIN)/python -m benchmarks.profile
 
 results: venv  ## rebuild docs/results.md, its appendix and figures from docs/results/data
-	@$(BIN)/python docs/generate_results.py
+	@$(BIN)/python -m docs.generate_results
 
 docs: venv  ## build the documentation site in build/docs, with search; open its index.html
 	@rm -rf build/docs

@@ -45,10 +45,8 @@ def _claims_table(study: Study) -> TextTable:
 
 
 def _p_and_verdict(claim: Claim) -> tuple[str, str]:
-    if claim.verdict is not Verdict.EQUIVALENT:
-        return p_text(claim.p_value), str(claim.verdict)
-    p_value = claim.p_value if claim.p_equivalent is None else claim.p_equivalent
-    return p_text(p_value), f"{claim.verdict} within {claim.margin:g}"
+    within = f" within {claim.margin:g}" if claim.verdict is Verdict.EQUIVALENT else ""
+    return p_text(claim.p_of_verdict), f"{claim.verdict}{within}"
 
 
 def _means_table(study: Study) -> TextTable:

@@ -82,24 +82,28 @@ def _changed(before: AnalysisPlan, after: AnalysisPlan) -> list[str]:
 
 
 def in_words(claim: Claim) -> str:
-    """`q = 1.5 against q = 1 on FetchPush: superior by 0.12 (95 % 0.05 to 0.19; p = 0.002)`."""
+    """`q = 1.5 against q = 1 on FetchPush: superior, +0.12 (95 % 0.05 to 0.19; p = 0.002)`."""
+    verdict = str(claim.verdict)
+    if claim.verdict is Verdict.EQUIVALENT:
+        verdict = f"equivalent within {claim.margin:g}"
+    where = "over all tasks" if claim.task == ALL_TASKS else f"on {claim.task}"
+    mean = f", averaged over {claim.cells} settings" if claim.cells > 1 else ""
+    held = {True: ", as expected", False: ", not as expected", None: ""}[claim.confirmed]
+    return (
+        f"{claim.first} against {claim.second} {where}{mean}: {verdict}, {numbers_in_words(claim)}"
+        f"{held}"
+    )
+
+
+def numbers_in_words(claim: Claim) -> str:
+    """`+0.12 (95 % 0.05 to 0.19; p = 0.002)`."""
     difference = claim.contrast.difference
     is_small = abs(difference.value) < 100
     gap = f"{float(difference.value):+.2f}" if is_small else number(difference.value)
     ends = interval_text(difference)
     if difference.has_interval:
         ends = f"95 % {ends}"
-    tested, verdict = p_text(claim.p_value), str(claim.verdict)
-    if claim.verdict is Verdict.EQUIVALENT:
-        verdict = f"equivalent within {claim.margin:g}"
-        tested = p_text(claim.p_equivalent if claim.p_equivalent is not None else 1.0)
-    where = "over all tasks" if claim.task == ALL_TASKS else f"on {claim.task}"
-    mean = f", averaged over {claim.cells} settings" if claim.cells > 1 else ""
-    held = {True: ", as expected", False: ", not as expected", None: ""}[claim.confirmed]
-    return (
-        f"{claim.first} against {claim.second} {where}{mean}: {verdict}, {gap} ({ends}; {tested})"
-        f"{held}"
-    )
+    return f"{gap} ({ends}; {p_text(claim.p_of_verdict)})"
 
 
 def _counted(study: Study, shown: Sequence[Claim]) -> str:

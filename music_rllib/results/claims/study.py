@@ -58,6 +58,13 @@ class Claim:
     """Number of pairs of conditions, alike in the rest, over which it is the mean."""
 
     @property
+    def p_of_verdict(self) -> float:
+        """The adjusted p-value of the test that the verdict comes from."""
+        if self.verdict is Verdict.EQUIVALENT and self.p_equivalent is not None:
+            return self.p_equivalent
+        return self.p_value
+
+    @property
     def confirmed(self) -> bool | None:
         """Whether its hypothesis holds; None where that is undecided or nothing was expected."""
         expected = {

@@ -1,0 +1,1 @@
+"""The tables and figures of docs/results.md and its appendix (generate_results.py)."""

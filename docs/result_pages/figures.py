@@ -1,0 +1,16 @@
+"""Figures as files of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from music_rllib.report.figures.choice import Drawing, slug
+from music_rllib.report.figures.draw import files
+from music_rllib.results.data import Sweep
+
+
+def figure(sweep: Sweep, drawing: Drawing, figures: dict[str, bytes]) -> Iterator[str]:
+    """Puts the drawing into `figures` and shows it."""
+    name = f"{slug(sweep.name)}-{drawing.name}.svg"
+    figures[name] = files(drawing.panels, drawing.legend)[".svg"]
+    yield f"![{drawing.title} of {sweep.name}, {drawing.stage}](results/figures/{name})"

@@ -1,0 +1,144 @@
+"""Studies that were planned: their answers, and what stands beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from docs.result_pages.exports import config_of, is_complete, progress_text, sweep_called
+from docs.result_pages.figures import figure
+from docs.result_pages.runs import last_value
+from docs.result_pages.words import interval, percent, row, rule, spread, wait_text
+from music_rllib import names
+from music_rllib.report.figures.choice import slug, stage_drawings
+from music_rllib.report.study import study_drawings
+from music_rllib.results.analysis import THRESHOLDS, StageAnalysis, analyse
+from music_rllib.results.claims.answer import answer, numbers_in_words
+from music_rllib.results.claims.plan import analysis_plan
+from music_rllib.results.claims.study import Mean, label_of, study_of
+from music_rllib.results.data import Sweep
+
+
+def verdict_text(name: str, *words: str) -> str:
+    """What a study says of a hypothesis of its plan; until all of its runs have finished, how far.
+
+    Raises:
+        ValueError: if its plan has no such hypothesis.
+    """
+    config, hypothesis = config_of(name), " ".join(words)
+    plan = analysis_plan(config) if config else None
+    if plan is None or hypothesis not in plan.hypotheses:
+        raise ValueError(f"{name} has no hypothesis {hypothesis!r}")
+    sweep = sweep_called(name)
+    if sweep is None or not is_complete(sweep):
+        return progress_text(name)
+    claims = {claim.hypothesis.text: claim for claim in study_of(sweep).planned if claim.hypothesis}
+    claim = claims[hypothesis]
+    return f"**{claim.verdict}**, {numbers_in_words(claim)}; {claim.contrast.seeds[0]} seeds"
+
+
+def answer_text(sweep: Sweep) -> Iterator[str]:
+    """A study's answer; before all of its runs have finished only how far it is."""
+    yield f"**{progress_text(sweep.name).capitalize()}.**"
+    if is_complete(sweep):
+        yield ""
+        yield from (f"- {sentence}" for sentence in answer(sweep, study_of(sweep)))
+
+
+def outcomes_table(sweep: Sweep, *stages: str) -> Iterator[str]:
+    """One column per condition: what was planned to be counted, and below it what was not."""
+    rates = (f"steps to {percent(rate)}: median [95 %]" for rate in THRESHOLDS)
+    columns = [
+        [
+            "",
+            "**area under the curve: mean [95 %]**",
+            "success at the end: mean [95 %]",
+            *rates,
+            "Shannon entropy at the end, nats",
+            "S_q at the end",
+            "seeds",
+        ]
+    ]
+    for analysis in analyse(sweep):
+        if analysis.stage.name in stages:
+            prefix = f"{analysis.stage.name}, " if len(stages) > 1 else ""
+            means = study_of(sweep, analysis.stage.name).means
+            columns += [list(_outcomes(analysis, mean, prefix)) for mean in means]
+    header, *lines = zip(*columns, strict=True)
+    yield row(*header)
+    yield rule(len(header))
+    yield from (row(*line) for line in lines)
+
+
+def _outcomes(analysis: StageAnalysis, mean: Mean, prefix: str) -> Iterator[str]:
+    key = (mean.condition, mean.task)
+    (final,) = (
+        final
+        for scope in analysis.scopes
+        for final in scope.finals
+        if (final.condition, scope.name) == key
+    )
+    yield f"{prefix}{label_of(mean.condition)}"
+    yield spread(mean.estimate)
+    yield interval(final)[0]
+    for wait in analysis.waits:
+        if (wait.condition, wait.task) == key:
+            yield wait_text(wait.median, wait.lower, wait.upper)
+    for entropy in analysis.entropies[mean.task, mean.condition]:
+        yield spread(entropy) if entropy else ""
+    yield f"{len(mean.scores.by_seed)} of {mean.runs}"
+
+
+def seeds_table(sweep: Sweep) -> Iterator[str]:
+    """The area under the curve of every seed."""
+    means = study_of(sweep).means
+    yield row("seed", *(label_of(mean.condition) for mean in means))
+    yield rule(1 + len(means))
+    for seed in sorted({seed for mean in means for seed in mean.scores.by_seed}, key=int):
+        scores = (mean.scores.by_seed.get(seed) for mean in means)
+        yield row(seed, *("" if score is None else f"{score:.3f}" for score in scores))
+
+
+def cells(sweep: Sweep) -> Iterator[str]:
+    """A row for each α and a column for each q: area under the curve, entropy at the end, seeds."""
+    means = study_of(sweep).means
+    by_cell = {(mean.condition.entropic_index, alpha_of(sweep, mean)): mean for mean in means}
+    qs, alphas = (sorted({cell[i] for cell in by_cell}, key=float) for i in (0, 1))
+    yield row("α", *(f"q = {q}" for q in qs))
+    yield rule(1 + len(qs))
+    for alpha in alphas:
+        yield row(alpha, *(cell_text(sweep, by_cell.get((q, alpha))) for q in qs))
+
+
+def alpha_of(sweep: Sweep, mean: Mean) -> str:
+    """Of a condition's runs."""
+    return sweep.runs[mean.condition.runs[0]].tags[names.TAG_ALPHA]
+
+
+def cell_text(sweep: Sweep, mean: Mean | None) -> str:
+    """`0.21 ± 0.03, 1.4 nats (5)`; the spread is the standard deviation over seeds."""
+    if mean is None or not mean.scores.by_seed:
+        return ""
+    scores = list(mean.scores.by_seed.values())
+    runs = [run for run in mean.condition.runs if sweep.runs[run].status == "FINISHED"]
+    entropy = np.mean([last_value(sweep, run, names.SHANNON_ENTROPY) for run in runs])
+    apart = f" ± {np.std(scores, ddof=1):.2f}" if len(scores) > 1 else ""
+    return f"{np.mean(scores):.2f}{apart}, {entropy:.1f} nats ({len(scores)})"
+
+
+def named_figure(sweep: Sweep, name: str, figures: dict[str, bytes]) -> Iterator[str]:
+    """The figure of that name, of the stage that is compared.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    study = study_of(sweep)
+    stages = [
+        found for found in analyse(sweep) if study.stage and found.stage.name == study.stage.name
+    ]
+    drawings = [d for found in stages for d in stage_drawings(sweep, found)]
+    named = {slug(d.title): d for d in (*drawings, *study_drawings(study))}
+    if name not in named:
+        raise ValueError(f"{sweep.name} has no figure {name}, but {', '.join(named)}")
+    yield from figure(sweep, named[name], figures)

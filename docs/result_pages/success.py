@@ -1,0 +1,107 @@
+"""Success rates of stages and conditions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from docs.result_pages.figures import figure
+from docs.result_pages.words import THRESHOLD, interval, row, rule, wait_text
+from music_rllib.report.figures.choice import PRIMARY, drawings_of_stages, stage_drawings
+from music_rllib.results.analysis import StageAnalysis, analyse
+from music_rllib.results.comparison import verdict
+from music_rllib.results.conditions import Condition, find_stages
+from music_rllib.results.data import Sweep
+from music_rllib.results.time_to_threshold import median_wait, median_wait_interval, waits_of
+
+
+def success(sweep: Sweep, figures: dict[str, bytes], stages: Sequence[str] = ()) -> Iterator[str]:
+    """Per stage: final success and steps to the threshold, what may be said, and the curves."""
+    for analysis in analyse(sweep):
+        if stages and analysis.stage.name not in stages:
+            continue
+        yield from success_table(sweep, analysis)
+        yield ""
+        for scope in analysis.scopes:
+            yield " ".join(verdict(scope))
+            yield ""
+        yield from curves(sweep, analysis, figures)
+
+
+def success_table(sweep: Sweep, analysis: StageAnalysis) -> Iterator[str]:
+    """One row per task and condition."""
+    yield row("task", f"{analysis.stage.variant}", *_OUTCOME)
+    yield rule(2 + len(_OUTCOME))
+    for task in analysis.stage.tasks:
+        for condition, cells in outcomes(sweep, analysis, task):
+            yield row(task, condition.label, *cells)
+
+
+def stages_table(sweep: Sweep, *stages: str) -> Iterator[str]:
+    """One row per task, stage and condition: stages side by side."""
+    yield row("task", "stage", "condition", *_OUTCOME)
+    yield rule(3 + len(_OUTCOME))
+    for analysis in analyse(sweep):
+        if not stages or analysis.stage.name in stages:
+            for task in analysis.stage.tasks:
+                for condition, cells in outcomes(sweep, analysis, task):
+                    yield row(task, analysis.stage.name, condition.label, *cells)
+
+
+_OUTCOME = (
+    "finished",
+    "success, last evaluation: mean [95 %]",
+    "each seed, %",
+    f"steps to {100 * THRESHOLD:.0f} %: median [95 %]",
+    "each run",
+)
+
+
+def outcomes(
+    sweep: Sweep, analysis: StageAnalysis, task: str
+) -> Iterator[tuple[Condition, tuple[str, ...]]]:
+    """Each condition with a run of the task, and what `_OUTCOME` names."""
+    (scope,) = [scope for scope in analysis.scopes if scope.name == task]
+    finals = {final.condition: final for final in scope.finals}
+    for condition in analysis.stage.conditions:
+        runs = [i for i in condition.runs if sweep.runs[i].task == task]
+        if runs:
+            done = sum(sweep.runs[i].status == "FINISHED" for i in runs)
+            yield (
+                condition,
+                (
+                    f"{done} of {len(runs)}",
+                    *interval(finals.get(condition)),
+                    *waits(sweep, task, runs),
+                ),
+            )
+
+
+def waits(sweep: Sweep, task: str, runs: Sequence[int]) -> tuple[str, str]:
+    """Median of the steps to the threshold, censored where it was not reached, and each run's."""
+    told = waits_of(sweep, task, runs, THRESHOLD)
+    if told is None:
+        return "", ""
+    each = ", ".join(
+        f"{'' if there else '> '}{steps:,.0f}"
+        for steps, there in sorted(zip(told.steps, told.reached, strict=True))
+    )
+    if not told.reached.any():
+        return "not reached", each
+    return wait_text(median_wait(told), *median_wait_interval(told)), each
+
+
+def curves(sweep: Sweep, analysis: StageAnalysis, figures: dict[str, bytes]) -> Iterator[str]:
+    """The figure of success rates."""
+    for drawing in stage_drawings(sweep, analysis):
+        if drawing.title == "Success rate":
+            yield from figure(sweep, drawing, figures)
+            yield ""
+
+
+def stage_curves(sweep: Sweep, figures: dict[str, bytes], stages: Sequence[str]) -> Iterator[str]:
+    """The figure of success rates of several stages, side by side."""
+    for drawing in drawings_of_stages(
+        sweep, [stage for stage in find_stages(sweep) if stage.name in stages]
+    ):
+        if drawing.title in PRIMARY:
+            yield from figure(sweep, drawing, figures)

@@ -1,0 +1,79 @@
+"""Rows and numbers as the pages write them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+
+import numpy as np
+
+from music_rllib.results import statistics as st
+from music_rllib.results.comparison import Final, each_seed, number
+from music_rllib.results.conditions import Condition
+
+THRESHOLD = 0.9
+"""Success rate that the proofs of the appendix wait for."""
+
+
+def row(*cells: object) -> str:
+    """A row of a table."""
+    return "| " + " | ".join(map(str, cells)) + " |"
+
+
+def rule(columns: int) -> str:
+    """The line below a table's header."""
+    return "|" + "---|" * columns
+
+
+def interval(final: Final[Condition] | None) -> tuple[str, str]:
+    """A final rate with its interval, and each seed's; empty where none has finished."""
+    if final is None:
+        return "", ""
+    found = final.estimate
+    value, each = percent(final.value), ", ".join(f"{100 * x:.0f}" for x in each_seed(final))
+    if not found.has_interval:
+        return f"{value} (one seed)", each
+    return f"{value} [{percent(float(found.lower))}, {percent(float(found.upper))}]", each
+
+
+def spread(found: st.Estimate) -> str:
+    """`0.57 [0.53, 0.61]`."""
+    if not np.isfinite(found.value):
+        return ""
+    value, lower, upper = (number(float(x)) for x in (found.value, found.lower, found.upper))
+    return f"{value} [{lower}, {upper}]" if found.has_interval else value
+
+
+def percent(share: float) -> str:
+    """`57 %`."""
+    return f"{100 * share:.0f} %"
+
+
+def wait_text(median: float, low: float, high: float) -> str:
+    """A median number of steps with its interval, if it has one."""
+    ends = "" if np.isnan(low) else f" [{steps_text(low)}, {steps_text(high)}]"
+    return f"{steps_text(median)}{ends}"
+
+
+def steps_text(steps: float) -> str:
+    """`42,600`, or that they were not reached."""
+    return f"{steps:,.0f}" if np.isfinite(steps) else "not reached"
+
+
+def clock(seconds: float | None) -> str:
+    """`7:05`."""
+    if seconds is None:
+        return ""
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes}:{rest:02}"
+
+
+def all_of(values: Iterable[str]) -> str:
+    """All different ones, as code."""
+    return ", ".join(f"`{value}`" for value in sorted(set(values) - {""}))
+
+
+def natural(name: str) -> list[tuple[int, int | str]]:
+    """Sorts seed10 after seed9."""
+    parts = re.split(r"(\d+)", name)
+    return [(0, int(part)) if part.isdigit() else (1, part) for part in parts]
