@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import socket
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from tests.faults import comparison, sweeps
 from tests.faults.test_dead_servers import server
 from tests.integration.conftest import Program
 from tests.integration.mlflow_server import MlflowServer
+from tests.ports import free_port
 
 __all__ = ["server"]
 
@@ -25,9 +25,7 @@ pytestmark = pytest.mark.thorough
 @pytest.fixture
 def bucket(program: Program) -> Iterator[str]:
     """A URI below a bucket of an S3 server, which `program` may write to."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     logging.getLogger("werkzeug").setLevel(logging.ERROR)  # a line for each request
     own = ThreadedMotoServer("127.0.0.1", port, verbose=False)
     own.start()

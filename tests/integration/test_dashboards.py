@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import socket
 import subprocess
 import time
 from collections.abc import Callable, Iterator
@@ -18,6 +17,7 @@ import pytest
 import yaml
 
 from music_rllib.sweep.listeners.prometheus import GAUGES, TARGETS
+from tests.ports import free_port
 
 DASHBOARDS = Path(__file__).parents[2] / "dashboards"
 PATIENCE = 240.0
@@ -73,10 +73,7 @@ class Prometheus:
     """A server on the sweep's targets, with the repository's own configuration."""
 
     def __init__(self, program: Path, folder: Path) -> None:
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            port = probe.getsockname()[1]
-        self.address = f"127.0.0.1:{port}"
+        self.address = f"127.0.0.1:{free_port()}"
         text = (DASHBOARDS / "prometheus.yml").read_text()
         config = yaml.safe_load(text)
         (job,) = config["scrape_configs"]

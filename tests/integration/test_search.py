@@ -7,7 +7,6 @@ import json
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import textwrap
@@ -20,6 +19,7 @@ import pytest
 from music_rllib import names
 from music_rllib.search.storage import known_studies
 from tests.faults import comparison
+from tests.ports import free_port
 
 pytestmark = pytest.mark.integration
 
@@ -186,9 +186,7 @@ def postgresql(require_service: Callable[[str], Path], tmp_path: Path) -> Iterat
     data = folder / "data"
     initdb = [*user, str(programs / "initdb"), "-D", str(data), "-U", "driver", "--no-sync"]
     subprocess.run(initdb, **run)  # type: ignore[call-overload]
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     options = f"-p {port} -k {folder} -c listen_addresses=127.0.0.1 -c fsync=off"
     control = [*user, str(programs / "pg_ctl"), "-D", str(data), "-w", "-l", str(folder / "log")]
     subprocess.run([*control, "-o", options, "start"], **run)  # type: ignore[call-overload]

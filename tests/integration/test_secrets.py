@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
 import stat
 import subprocess
 import sys
@@ -17,6 +16,7 @@ import pytest
 import requests
 
 from music_rllib.redaction import redact
+from tests.ports import free_port
 
 ROOT = Path(__file__).parents[2]
 USER, PASSWORD = "music", "planted-mlflow-password"
@@ -34,8 +34,7 @@ SECRETS = [value for name, value in PLANTED.items() if "planted" in value]
 @pytest.fixture
 def mlflow_server(tmp_path: Path) -> Iterator[str]:
     """`cluster/mlflow-server.sh` on loopback, with sqlite; its URI."""
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        port = probe.getsockname()[1]
+    port = free_port()
     folder = tmp_path / "server"
     folder.mkdir()
     environment = os.environ | {

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -21,6 +20,7 @@ from benchmarks.serve import half_sent, memory, random_policy, storm
 from music_rllib.policy import Policy, load_policy
 from music_rllib.serve.command import main
 from tests.integration.conftest import listening
+from tests.ports import free_port
 
 TOKEN = "a-planted-token"
 
@@ -50,8 +50,7 @@ def start(*arguments: str, token: str | None = None) -> subprocess.Popen[str]:
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     file = tmp_path_factory.mktemp("serve") / "policy.safetensors"
     file.write_bytes(random_policy(hidden=32))
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        port = probe.getsockname()[1]
+    port = free_port()
     limits = ("--max-requests", "32", "--send-seconds", "5")
     process = start(str(file), "--port", str(port), *limits, token=TOKEN)
     assert process.stdout is not None
@@ -174,8 +173,7 @@ def test_bad_input_is_one_line(
     taken = service.url.rpartition(":")[2]
     places = {"policy": service.file, "folder": tmp_path, "taken": taken}
     if "--port" not in arguments:
-        with socket.create_server(("127.0.0.1", 0)) as probe:
-            arguments = [*arguments, "--port", str(probe.getsockname()[1])]
+        arguments = [*arguments, "--port", str(free_port())]
     code = main([argument.format(**places) for argument in arguments])
     output, errors = capsys.readouterr()
     assert (code, output) == (2, "")

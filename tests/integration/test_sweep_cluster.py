@@ -6,7 +6,6 @@ import contextlib
 import json
 import os
 import shutil
-import socket
 import subprocess
 import sys
 import tempfile
@@ -23,6 +22,7 @@ import requests
 import yaml
 
 from music_rllib.runtime.quiet import LOCAL_RAY_BEYOND_LOOPBACK
+from tests.ports import free_port
 
 pytestmark = pytest.mark.integration
 
@@ -51,25 +51,16 @@ class Head(NamedTuple):
         return Path(self.environment["HOME"])
 
 
-def free_ports(count: int) -> list[int]:
-    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
-    ports = [sock.getsockname()[1] for sock in sockets]
-    for sock in sockets:
-        sock.close()
-    return ports
-
-
 def ray_start(
     folder: Path, environment: dict[str, str], cpus: int, *options: str
 ) -> subprocess.Popen[Any]:
     """A node; ends with its process, which is `--block`."""
-    (agent,) = free_ports(1)
     command = [str(BIN / "ray"), "start", "--block", f"--num-cpus={cpus}"]
     common = [
         "--disable-usage-stats",
         "--node-ip-address=127.0.0.1",
         # Takes the jobs; its default port may belong to another Ray on this machine.
-        f"--dashboard-agent-listen-port={agent}",
+        f"--dashboard-agent-listen-port={free_port()}",
     ]
     with (folder / "log").open("a") as log:
         return subprocess.Popen(
@@ -89,7 +80,7 @@ def without_loopback_only() -> dict[str, str]:
 @contextlib.contextmanager
 def head_node(home: Path, cpus: int, workers: Sequence[int] = ()) -> Iterator[Head]:
     """A head that asks for a token, and further nodes, all with this home folder."""
-    port, dashboard = free_ports(2)
+    port, dashboard = free_port(), free_port()
     # Not pytest's folder: Ray's sockets need a short path.
     folder = Path(tempfile.mkdtemp(prefix="ray"))
     environment = without_loopback_only() | {
@@ -234,7 +225,7 @@ def growing_head(folder: Path, home: Path) -> Iterator[Head]:
     `ray.cluster_utils.AutoscalingCluster` isn't used: it stops every Ray of the machine, and needs
     a file that Ray's wheel doesn't have.
     """
-    (port,) = free_ports(1)
+    port = free_port()
     # The nodes that are added are at this address, and so must be the head.
     here = ray.util.get_node_ip_address()
     address = f"{here}:{port}"

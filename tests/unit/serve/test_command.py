@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 from pathlib import Path
 
 import pytest
@@ -11,6 +10,7 @@ import yaml
 from music_rllib.serve.application import ServeSettings, policy_of
 from music_rllib.serve.command import main
 from tests.hostile_files import INPUTS, PENDULUM, write_policy
+from tests.ports import free_port
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
@@ -32,13 +32,8 @@ def test_numbers_are_refused_by_the_option_they_are_of(
     assert f"Invalid value for '--{option}'" in errors.splitlines()[-1]
 
 
-def free_port() -> str:
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        return str(probe.getsockname()[1])
-
-
 def test_a_storage_without_meaning_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    errors = refused(capsys, "xx", "--storage", "ftp://x", "--port", free_port())
+    errors = refused(capsys, "xx", "--storage", "ftp://x", "--port", str(free_port()))
     assert errors.startswith("error: storage must be a folder or an s3:// or gs:// URI")
     assert errors.count("\n") == 1
 
@@ -67,9 +62,9 @@ def test_an_environment_of_ones_own_is_named_as_for_evaluate(
     """An older policy says nothing of its sizes, so its environment is asked."""
     own = PENDULUM.model_copy(update={"name": "Mine", "env_kwargs": {"g": 9.0}})
     place = str(write_policy(tmp_path, own, spaces=None))
-    assert "as --env" in refused(capsys, place, "--port", free_port())
+    assert "as --env" in refused(capsys, place, "--port", str(free_port()))
     declared = tmp_path / "mine.yaml"
-    refusal = refused(capsys, place, "--env", str(declared), "--port", free_port())
+    refusal = refused(capsys, place, "--env", str(declared), "--port", str(free_port()))
     assert refusal.startswith(f"error: {declared}: ")
     task = own.model_dump(include={"env_id", "env_kwargs", "horizon", "success_key"})
     declared.write_text(yaml.safe_dump({"environments": {"Mine": task}}))

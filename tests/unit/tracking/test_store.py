@@ -14,13 +14,7 @@ import pytest
 from music_rllib.errors import TrackingError
 from music_rllib.tracking import store as store_module
 from music_rllib.tracking.store import check_reachable, resolve_store
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
+from tests.ports import free_port
 
 
 @contextmanager
