@@ -339,7 +339,7 @@ def _show_results(
     """Print the results of runs and searches, and where MLflow shows them."""
     results = results_table(
         opened.plan,
-        opened.scheduler.__getitem__,
+        state_file.status,
         state_file.unfinished | opened.results(),
         tracker.run_id,
         console.width,

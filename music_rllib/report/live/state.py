@@ -60,7 +60,7 @@ class Progress:
                     "value": one["value"],
                 }
                 for one in state["running"][:SHOWN]
-                if running and one["env_steps"]  # without steps a run may be queued
+                if running
             ],
             "failures": [
                 {"run": self._short(one["run"]), "cause": one["cause"]}

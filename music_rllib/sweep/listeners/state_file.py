@@ -46,6 +46,8 @@ class StateFile(Listener):
         """Node key to what a run that is not finished has spent and measured."""
         self._checkpointed = _checkpointed_steps(sweep)
         self._results: dict[str, RunResult] = {}
+        self._at_work: set[str] = set()
+        """Keys of handed-out nodes that a worker has begun; the others queue for a core in Tune."""
         self._failures: list[dict[str, str]] = []
         self._driver: dict[str, Any] = {
             "pid": os.getpid(),
@@ -87,7 +89,21 @@ class StateFile(Listener):
         with contextlib.suppress(StorageError):  # the results are safe without it
             self._write()
 
+    def status(self, key: str) -> Status:
+        """The node's status; one that was handed out waits until a worker has begun it."""
+        scheduler = self._sweep.scheduler
+        if not scheduler.knows(key):
+            return Status.WAITING
+        queued = scheduler[key] is Status.STARTED and key not in self._at_work
+        return Status.WAITING if queued else scheduler[key]
+
     # -- events of the driver's loop ---------------------------------------------------------
+
+    def started(self, node: Node) -> None:
+        self._at_work.add(node.key)
+
+    def paused(self, node: Node) -> None:
+        self._at_work.discard(node.key)
 
     def reported(self, node: Node, reports: list[Report]) -> None:
         before = self.unfinished.get(node.key)
@@ -144,8 +160,7 @@ class StateFile(Listener):
         steps_done = steps_left = 0
         running = []
         for node in sweep.plan.nodes:
-            known = sweep.scheduler.knows(node.key)
-            status = sweep.scheduler[node.key] if known else Status.WAITING
+            status = self.status(node.key)
             counts.setdefault(node.stage, Counter())[str(status)] += 1
             if status in (Status.FINISHED, Status.REUSED):
                 steps_done += node.run.env_steps

@@ -20,6 +20,7 @@ from music_rllib.config.load import load_sweep
 from music_rllib.experiment import location, sweep_files
 from music_rllib.experiment.plan import Node, make_plan
 from music_rllib.experiment.run_info import run_info
+from music_rllib.experiment.scheduler import Status
 from music_rllib.experiment.session import Sweep, keep_record, open_sweep
 from music_rllib.experiment.sweep_files import as_json
 from music_rllib.labels import ShortLabels
@@ -489,8 +490,9 @@ def test_a_driver_that_was_killed_is_interrupted(
 def test_nothing_runs_after_a_crash(storage: str, tmp_path: Path, program: Program) -> None:
     sweep = opened(storage, tmp_path)
     node = sweep.plan.nodes[0]
-    with contextlib.suppress(RuntimeError), StateFile(sweep):
+    with contextlib.suppress(RuntimeError), StateFile(sweep) as state_file:
         sweep.scheduler.start(node.key)
+        state_file.started(node)
         raise RuntimeError("out of luck")
     state = program("status", f"{storage}/mine", "--json").document
     assert (state["state"], state["running"]) == ("failed", [])
@@ -498,6 +500,26 @@ def test_nothing_runs_after_a_crash(storage: str, tmp_path: Path, program: Progr
     shown = program("status", f"{storage}/mine").output
     assert node.label not in shown
     assert "interrupted" in shown
+
+
+def test_a_run_that_queues_for_a_core_does_not_run_yet(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    """Tune is handed more runs than there are cores, so that none stays idle."""
+    sweep = opened(storage, tmp_path)
+    at_work, queued = sweep.plan.nodes[:2]
+    with StateFile(sweep) as state_file:
+        for node in (at_work, queued):
+            sweep.scheduler.start(node.key)
+        state_file.started(at_work)
+        assert [state_file.status(node.key) for node in (at_work, queued)] == [
+            Status.STARTED,
+            Status.WAITING,
+        ]
+        state_file.end("stopped")
+    state = sweep_files.read(storage, "mine/state.json")
+    assert [one["run"] for one in state["running"]] == [at_work.label]
+    assert state["stages"][0]["runs"] == {"started": 1, "waiting": 8}
 
 
 def test_the_recorded_configuration_is_the_sweeps(storage: str, tmp_path: Path) -> None:
