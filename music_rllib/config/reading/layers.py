@@ -120,10 +120,11 @@ def merge(
                 layers.put(path, value, (*place, *path))
             elif settings is not defaults:  # in `defaults` it may have an effect in other stages
                 problems.append(idle._replace(path=(*place, *path)))
-    for dotted, (below, value) in point.items():
+    for dotted, value, below in _point_settings(point):
         place = (*stage_path, *below)
         if dotted in rules.without_effect:
-            problems.append(idle._replace(path=place[: place.index(dotted) + 1]))
+            once = place[: place.index(dotted) + 1] if dotted in place else place
+            problems.append(idle._replace(path=once))
         elif problem := layers.put_dotted(dotted, value, place):
             problems.append(problem)
     # Contradictions of the variant are reported also if other settings are invalid.
@@ -133,6 +134,16 @@ def merge(
             origin = layers.origin(("music", field), stage_path)
             problems.append(Problem(origin, contradiction(variant, fixed, music[field])))
     return layers, problems
+
+
+def _point_settings(point: PlacedPoint) -> Iterator[tuple[str, Any, KeyPath]]:
+    """Dotted settings, values and places of a point, the fields of groups one by one."""
+    for dotted, (place, value) in point.items():
+        if dotted in SECTIONS and isinstance(value, Mapping):
+            for field, inner in value.items():
+                yield f"{dotted}.{field}", inner, (*place, field)
+        else:
+            yield dotted, value, place
 
 
 def _settings(layer: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], Any]]:

@@ -107,6 +107,18 @@ def test_later_layers_win(load: Callable[..., SweepConfig]) -> None:
     assert (tac.gamma, tac.tau, tac.lr) == (0.9, 0.2, 0.3)
 
 
+def test_a_group_in_a_grid_is_laid_field_by_field(load: Callable[..., SweepConfig]) -> None:
+    """What it does not name stays, as in every other layer: the preset's networks, for one."""
+    tuned = [{"entropic_index": 1.0, "alpha": 0.05}, {"entropic_index": 1.5, "alpha": 0.15}]
+    document = changed(preset="small")
+    plain = run_of(load(document), stage=1).tac
+    document["stages"][1] |= {"tac": {"tau": 0.2}, "grid": {"tac": tuned}}
+    config = load(document)
+    for point, group in enumerate(tuned):
+        tac = run_of(config, 1, point).tac
+        assert tac == plain.model_copy(update={"tau": 0.2, **group})
+
+
 def test_a_schedule_replaces_the_one_below_it_whole(load: Callable[..., SweepConfig]) -> None:
     ramp = {"schedule": "linear", "start": 1.0, "end": 2.0, "begin": 0.2}
     document = changed(
@@ -357,6 +369,9 @@ BAD: list[tuple[Document, str]] = [
     (with_stage(1, grid={"tac.lr.x": [1]}), "needs tac.lr to be a mapping, got 0.002"),
     (with_stage(1, grid={"entropic_index": [1]}), "(did you mean 'tac.entropic_index'?)"),
     (with_stage(1, grid={"music.lr": [1.0]}), "has no effect with variant music-r"),
+    (with_stage(1, grid={"music": [{"lr": 1.0}]}), "grid.music[0].lr has no effect with variant"),
+    (with_stage(1, grid={"tac": [{"alfa": 1.0}]}), "alfa is not a known setting (did you mean"),
+    (with_stage(1, grid={"tac": [{"lr": -1.0}]}), "grid.tac[0].lr must be > 0, got -1"),
     (with_stage(1, grid={"music.estimator": ["none"]}), 'must be "frozen" for music-r, got "none"'),
     (asking("q = 1.5 or q = 1"), "analysis.hypotheses[0] must be two different conditions with"),
     (asking("q = 1 against q = 1"), "must be two different conditions with"),
