@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
+import sys
 import tempfile
 import time
 import weakref
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.core import (
@@ -60,7 +63,8 @@ class TAC(Algorithm):
         return TACConfig()
 
     def setup(self, config: TACConfig) -> None:
-        super().setup(config)
+        with _determinism_without_compiler():
+            super().setup(config)
         self._settings = self.config.tac_settings()
         self._music = self.config.music_settings()
         self._replay_settings = self.config.replay_settings()
@@ -334,3 +338,26 @@ _REPLAY_STREAM = 101
 def _random_state(runner: TrajectoryEnvRunner) -> tuple[int, StateDict]:
     """The worker index, and the state of the runner without its weights."""
     return runner.worker_index, runner.get_state(not_components=COMPONENT_RL_MODULE)
+
+
+@contextlib.contextmanager
+def _determinism_without_compiler() -> Iterator[None]:
+    """Spare each run's process a second: RLlib seeds torch by a call that loads its compiler.
+
+    That sets the compiler's own flag too, which matters only where it is loaded.
+    """
+    if "torch._inductor" in sys.modules:
+        yield
+        return
+
+    def use(mode: bool, *, warn_only: bool = False) -> None:
+        torch.set_deterministic_debug_mode(
+            ("warn" if warn_only else "error") if mode else "default"
+        )
+
+    original = torch.use_deterministic_algorithms
+    torch.use_deterministic_algorithms = use
+    try:
+        yield
+    finally:
+        torch.use_deterministic_algorithms = original

@@ -99,6 +99,25 @@ def test_a_driver_begins_without_what_only_workers_or_reports_need() -> None:
     assert done.returncode == 0, done.stderr
 
 
+def test_a_run_begins_without_torchs_compiler() -> None:
+    """It would take a second and 70 MB in each process; seeds and optimizers of torch load it."""
+    code = (
+        "import sys, torch\n"
+        "from ray.rllib.utils.torch_utils import set_torch_seed\n"
+        "from music_rllib.optim.adam import FusedAdam\n"
+        "from music_rllib.tac.algorithm import _determinism_without_compiler\n"
+        "with _determinism_without_compiler():\n"
+        "    set_torch_seed(0)\n"
+        "assert torch.are_deterministic_algorithms_enabled()\n"
+        "optimizer = FusedAdam([torch.zeros(1, requires_grad=True)], 0.1)\n"
+        "optimizer.load_state_dict(optimizer.state_dict())\n"
+        "optimizer.zero_grad()\n"
+        "assert 'torch._dynamo' not in sys.modules\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
 def test_the_rules_name_what_exists() -> None:
     """A rule about a module that was renamed would hold nothing."""
     for part in (*PURE, *LIGHT, *MAY_LOAD_RAY):
