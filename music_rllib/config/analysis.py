@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self
 
 from pydantic import AfterValidator, Field
@@ -150,6 +151,45 @@ def _values(runs: Sequence[RunSettings], name: str) -> list[Any]:
             if value is not None and value not in values:
                 values.append(value)
     return values
+
+
+def unnamed_differences(
+    analysis: Analysis, stages: Mapping[str, Stage]
+) -> Iterator[tuple[str, list[str]]]:
+    """Hypotheses whose two sides differ in settings that they do not name, and these settings.
+
+    Without α, as the plan says by what it is controlled, and without MUSIC's, by which stages of
+    different variants differ.
+    """
+    default = analysis.stage or list(stages)[-1]
+    for text in analysis.hypotheses:
+        hypothesis = Hypothesis.of(text)
+        sides = (hypothesis.first, hypothesis.second)
+        first, second = (_all_values(stages[side.get("stage", default)], side) for side in sides)
+        named = {".".join(key.split(".")[:2]) for side in sides for key in side} | {"tac.alpha"}
+        if unnamed := [key for key in first if key not in named and first[key] != second[key]]:
+            yield text, unnamed
+
+
+def _all_values(stage: Stage, condition: Mapping[str, str]) -> dict[str, set[str]]:
+    """Dotted setting to the values, in words, that it has in the runs of a condition."""
+    settings = {name: text for name, text in condition.items() if name != "stage"}
+    runs = [run for point in stage.points for run in point.runs.values()]
+    values: defaultdict[str, set[str]] = defaultdict(set)
+    # What is searched is in no run of the stage yet: then they are all alike.
+    for run in [run for run in runs if _has(run, settings)] or runs:
+        dumped = run.model_dump(mode="json", include={"env_steps", "num_envs", "tac", "replay"})
+        for key, value in dumped.items():
+            for name, inner in value.items() if isinstance(value, dict) else [("", value)]:
+                values[f"{key}.{name}".rstrip(".")].add(shown(inner))
+    return values
+
+
+def _has(run: RunSettings, settings: Mapping[str, str]) -> bool:
+    return all(
+        any(_equals(text, value) for value in _values([run], name))
+        for name, text in settings.items()
+    )
 
 
 def _equals(text: str, value: Any) -> bool:

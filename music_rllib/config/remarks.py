@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Iterator, Mapping
 
+from music_rllib.config.analysis import unnamed_differences
 from music_rllib.config.problems import ConfigError
 from music_rllib.config.returns import Range, cut_off
 from music_rllib.config.run_settings import RunSettings
@@ -30,7 +31,14 @@ def remarks(config: SweepConfig) -> list[str]:
             runs = [runs[task.name] for runs in _points(stage) if task.name in runs]
             if (text := _cut_off_returns(task, runs)) is not None:
                 places.setdefault(text, []).append(f"{stage.name}/{task.name}")
-    return [f"{', '.join(where)}: {text}" for text, where in places.items()]
+    lines = [f"{', '.join(where)}: {text}" for text, where in places.items()]
+    if config.analysis is not None:
+        stages = {stage.name: stage for stage in config.stages}
+        lines += [
+            f"analysis: {hypothesis!r} compares runs that differ in {', '.join(settings)} too"
+            for hypothesis, settings in unnamed_differences(config.analysis, stages)
+        ]
+    return lines
 
 
 def _cut_off_returns(task: Task, runs: Iterable[RunSettings]) -> str | None:

@@ -12,6 +12,7 @@ import yaml
 
 from music_rllib.config.load import load_sweep
 from music_rllib.config.problems import ConfigError
+from music_rllib.config.remarks import remarks
 from music_rllib.config.run_settings import VARIANTS, RunSettings, handed_over, preset
 from music_rllib.config.schema import SweepConfig
 from music_rllib.envs.tasks import BUILT_IN_TASKS
@@ -239,6 +240,19 @@ def test_an_alpha_of_its_own_for_each_q_is_a_group_of_the_grid(
     document["analysis"]["hypotheses"] = ["q = 1.5, alpha = 0.2 against q = 1"]
     with pytest.raises(ConfigError, match=r"tac.alpha is \[0.05, 0.15\], got 0.2"):
         load(document)
+
+
+def test_a_hypothesis_about_runs_that_differ_in_more_than_it_says_is_remarked(
+    load: Callable[..., SweepConfig],
+) -> None:
+    document = asking("stage = finetune, q = 1 better than stage = alone", stage="finetune")
+    tac = {"entropic_index": 1.0, "alpha": 0.7}
+    document["stages"].append({"name": "alone", "variant": "tac", "tac": tac})
+    assert remarks(load(document)) == []
+    tac["gamma"] = 0.9
+    document["stages"][-1]["env_steps"] = 9000
+    (remark,) = remarks(load(document))
+    assert "better than stage = alone' compares runs that differ in env_steps, tac.gamma" in remark
 
 
 BAD: list[tuple[Document, str]] = [
