@@ -143,7 +143,7 @@ def _broken_rule(stage: Stage, condition: Mapping[str, str]) -> str | None:
 
 
 def _values(runs: Sequence[RunSettings], name: str) -> list[Any]:
-    """The values of a setting that runs have, also where a grid varies the group that it is in."""
+    """The values of a setting that runs have."""
     values: list[Any] = []
     for run in runs:
         with contextlib.suppress(LookupError):

@@ -25,6 +25,7 @@ from music_rllib.config.reading.layers import (
     LAYER_KEYS,
     PlacedPoint,
     all_settings,
+    field_by_field,
     for_a_grid,
     known_settings,
     merge,
@@ -126,7 +127,7 @@ class _StageSettings:
 
     def at(self, point: PlacedPoint, findings: Findings) -> Point:
         """Settings at a point of the grid or the search."""
-        runs = {}
+        runs, point = {}, field_by_field(point)
         # Settings are checked even where no task is valid.
         for task in self.tasks or (BUILT_IN_TASKS["FetchPush"],):
             layers, problems = merge(self.variant, task, self.defaults, self.own, self.path, point)

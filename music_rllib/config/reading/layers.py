@@ -90,6 +90,17 @@ def all_settings() -> list[str]:
     return [*LAYER_KEYS, *fields]
 
 
+def field_by_field(point: PlacedPoint) -> PlacedPoint:
+    """A point whose groups, `tac: {entropic_index: 1, alpha: 0.05}`, are settings of their own."""
+    settings: dict[str, tuple[KeyPath, Any]] = {}
+    for dotted, (place, value) in point.items():
+        if dotted in SECTIONS and isinstance(value, Mapping):
+            settings |= {f"{dotted}.{name}": ((*place, name), value[name]) for name in value}
+        else:
+            settings[dotted] = (place, value)
+    return settings
+
+
 def merge(
     variant: Variant,
     task: Task,
@@ -120,7 +131,7 @@ def merge(
                 layers.put(path, value, (*place, *path))
             elif settings is not defaults:  # in `defaults` it may have an effect in other stages
                 problems.append(idle._replace(path=(*place, *path)))
-    for dotted, value, below in _point_settings(point):
+    for dotted, (below, value) in point.items():
         place = (*stage_path, *below)
         if dotted in rules.without_effect:
             once = place[: place.index(dotted) + 1] if dotted in place else place
@@ -134,16 +145,6 @@ def merge(
             origin = layers.origin(("music", field), stage_path)
             problems.append(Problem(origin, contradiction(variant, fixed, music[field])))
     return layers, problems
-
-
-def _point_settings(point: PlacedPoint) -> Iterator[tuple[str, Any, KeyPath]]:
-    """Dotted settings, values and places of a point, the fields of groups one by one."""
-    for dotted, (place, value) in point.items():
-        if dotted in SECTIONS and isinstance(value, Mapping):
-            for field, inner in value.items():
-                yield f"{dotted}.{field}", inner, (*place, field)
-        else:
-            yield dotted, value, place
 
 
 def _settings(layer: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], Any]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence, Set
 from typing import Any
 
@@ -123,6 +124,9 @@ def _grid_axes(stage: Stage) -> list[str]:
     for point in stage.points:
         for name, value in point.values.items():
             values.setdefault(name, {})[short(value)] = None
+    if math.prod(map(len, values.values())) > len(stage.points):  # settings that vary together
+        points = [", ".join(map(short, point.values.values())) for point in stage.points]
+        return [f"{', '.join(values)}: {'; '.join(points)}"]
     return [f"{name}: {', '.join(choices)}" for name, choices in values.items()]
 
 

@@ -87,6 +87,18 @@ def test_the_plan_counts_runs_budgets_and_what_is_finished(config: SweepConfig, 
     assert summary in text
 
 
+def test_settings_that_vary_together_are_shown_together(tmp_path: Path) -> None:
+    tuned = [{"entropic_index": 1.0, "alpha": 0.15}, {"entropic_index": 1.5, "alpha": 0.05}]
+    stage = {"name": "her", "variant": "tac", "grid": {"tac": tuned}}
+    config = loaded(tmp_path, stages=[stage])
+    plan = make_plan(config)
+    text = shown(plan_view(config, plan, set()))
+    assert "\n  tac.entropic_index, tac.alpha: 1, 0.15; 1.5, 0.05\n" in text
+    labels = {node.label for node in plan.nodes if node.run.seed == 0}
+    point = "tac.entropic_index={},tac.alpha={}".format
+    assert {label.split("/")[-2] for label in labels} == {point(1, 0.15), point(1.5, 0.05)}
+
+
 def test_the_plan_shows_what_a_control_makes_of_alpha_at_each_q(tmp_path: Path) -> None:
     alpha = {"value": 0.05, "matched_width": 0.1}
     ramp = {"schedule": "linear", "start": 1.0, "end": 2.0}
