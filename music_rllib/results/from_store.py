@@ -11,6 +11,7 @@ import numpy as np
 
 from music_rllib import names
 from music_rllib.experiment.plan import Plan, Run, short
+from music_rllib.labels import symbol
 from music_rllib.results import statistics as st
 from music_rllib.results.comparison import Scope, scopes_of
 from music_rllib.results.statistics import Array, Estimate
@@ -45,8 +46,8 @@ class Condition:
 
     @property
     def label(self) -> str:
-        """`tac.entropic_index = 1.5`, or the stage where nothing varies."""
-        pairs = [f"{name} = {short(value)}" for name, value in self.values.items()]
+        """`q = 1.5, alpha = 0.1`, or the stage where nothing varies."""
+        pairs = [f"{symbol(name)} = {short(value)}" for name, value in self.values.items()]
         return ", ".join(pairs) or self.stage
 
     def estimate(self) -> Estimate:

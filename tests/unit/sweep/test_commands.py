@@ -258,7 +258,7 @@ def test_compare_and_the_report_say_the_same_of_the_same_sweep(
 def test_compare_names_a_winner_on_evidence(storage: str, tmp_path: Path, program: Program) -> None:
     played(storage, tmp_path, runs=15, seeds=5)
     (group,) = program("compare", f"{storage}/mine", "--json").document["groups"]
-    assert group["verdict"].startswith("tac.entropic_index = 1.5 is ahead")
+    assert group["verdict"].startswith("q = 1.5 is ahead")
     first, *others = group["conditions"]
     assert first["p_value"] is None
     # All of 5 runs above all of 5: 2 of 252 relabellings, three times for three comparisons.
