@@ -162,34 +162,43 @@ def unnamed_differences(
     different variants differ.
     """
     default = analysis.stage or list(stages)[-1]
+    runs = {name: list(_documents(stage)) for name, stage in stages.items()}
     for text in analysis.hypotheses:
         hypothesis = Hypothesis.of(text)
         sides = (hypothesis.first, hypothesis.second)
-        first, second = (_all_values(stages[side.get("stage", default)], side) for side in sides)
+        first, second = (_all_values(runs[side.get("stage", default)], side) for side in sides)
         named = {".".join(key.split(".")[:2]) for side in sides for key in side} | {"tac.alpha"}
         if unnamed := [key for key in first if key not in named and first[key] != second[key]]:
             yield text, unnamed
 
 
-def _all_values(stage: Stage, condition: Mapping[str, str]) -> dict[str, set[str]]:
+def _documents(stage: Stage) -> Iterator[dict[str, Any]]:
+    for point in stage.points:
+        for run in point.runs.values():
+            yield run.model_dump(mode="json")
+
+
+def _all_values(
+    runs: Sequence[Mapping[str, Any]], condition: Mapping[str, str]
+) -> dict[str, set[str]]:
     """Dotted setting to the values, in words, that it has in the runs of a condition."""
     settings = {name: text for name, text in condition.items() if name != "stage"}
-    runs = [run for point in stage.points for run in point.runs.values()]
     values: defaultdict[str, set[str]] = defaultdict(set)
     # What is searched is in no run of the stage yet: then they are all alike.
     for run in [run for run in runs if _has(run, settings)] or runs:
-        dumped = run.model_dump(mode="json", include={"env_steps", "num_envs", "tac", "replay"})
-        for key, value in dumped.items():
-            for name, inner in value.items() if isinstance(value, dict) else [("", value)]:
-                values[f"{key}.{name}".rstrip(".")].add(shown(inner))
+        for key in ("env_steps", "num_envs"):
+            values[key].add(shown(run[key]))
+        for section in ("tac", "replay"):
+            for name, value in run[section].items():
+                values[f"{section}.{name}"].add(shown(value))
     return values
 
 
-def _has(run: RunSettings, settings: Mapping[str, str]) -> bool:
-    return all(
-        any(_equals(text, value) for value in _values([run], name))
-        for name, text in settings.items()
-    )
+def _has(run: Mapping[str, Any], settings: Mapping[str, str]) -> bool:
+    try:
+        return all(_equals(text, lookup(run, name.split("."))) for name, text in settings.items())
+    except LookupError:
+        return False
 
 
 def _equals(text: str, value: Any) -> bool:
