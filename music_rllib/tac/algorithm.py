@@ -110,7 +110,14 @@ class TAC(Algorithm):
             super()._setup_logdir()
         else:
             self._logdir = tempfile.mkdtemp(prefix="tac-")
-            weakref.finalize(self, shutil.rmtree, self._logdir, ignore_errors=True)
+            self._remove_logdir = weakref.finalize(
+                self, shutil.rmtree, self._logdir, ignore_errors=True
+            )
+
+    def cleanup(self) -> None:
+        super().cleanup()
+        if self._storage is None:  # not left to the interpreter's end, which workers of Ray skip
+            self._remove_logdir()
 
     # -- one step of the algorithm --------------------------------------------------------
 

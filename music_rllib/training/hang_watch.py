@@ -11,13 +11,14 @@ from __future__ import annotations
 import contextlib
 import os
 import select
+import shutil
 import signal
 import struct
 import subprocess
 import sys
 import time
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import mkdtemp
 
 RECORD = "hung.txt"
 """File in a run's work folder: the attempt that hung, the seconds it hung, and the stack."""
@@ -50,8 +51,8 @@ class HangWatch:
         from music_rllib.envs.calls import in_environment
 
         self._calls = in_environment
-        self._folder = TemporaryDirectory(prefix="music-hang-", ignore_cleanup_errors=True)
-        calls, stack = Path(self._folder.name, "calls"), Path(self._folder.name, "stack")
+        folder = Path(mkdtemp(prefix="music-hang-"))  # the watching process removes it
+        calls, stack = folder / "calls", folder / "stack"
         self._calls.share(calls)
         self._stack = stack.open("w")
         faulthandler.register(signal.SIGUSR2, self._stack, all_threads=True)
@@ -76,7 +77,6 @@ class HangWatch:
         self._calls.unshare()
         faulthandler.unregister(signal.SIGUSR2)
         self._stack.close()
-        self._folder.cleanup()
 
 
 def check_hung(record: str | None, attempt: str, what: str) -> None:
@@ -122,9 +122,12 @@ def _call_in(stack: str) -> str:
 def main() -> None:
     """Watch the process that the arguments name until it ends, or hangs."""
     pid, seconds, calls, stack, storage, record, attempt = sys.argv[1:]
-    if not _hangs(int(pid), float(seconds), Path(calls)):
-        return
-    text = _dump(int(pid), Path(stack))
+    try:
+        if not _hangs(int(pid), float(seconds), Path(calls)):
+            return
+        text = _dump(int(pid), Path(stack))
+    finally:
+        shutil.rmtree(Path(calls).parent, ignore_errors=True)
     # Only now, as they take tens of megabytes.
     from music_rllib.experiment.sweep_files import write
     from music_rllib.store.object_folder import StorageError

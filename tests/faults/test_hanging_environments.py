@@ -39,11 +39,25 @@ watch.end()
 """
 
 
+def temporary_folder(storage: Path) -> Path:
+    folder = storage.with_name(f"{storage.name}-temporary")
+    folder.mkdir(exist_ok=True)
+    return folder
+
+
+def leaves_nothing_behind(storage: Path) -> bool:
+    """The watching process ends a moment after the one it watches."""
+    deadline = time.monotonic() + 10
+    while any(temporary_folder(storage).iterdir()) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return not any(temporary_folder(storage).iterdir())
+
+
 def worker(storage: Path, what: str) -> subprocess.Popen[str]:
     paths = os.pathsep.join(map(str, (REPOSITORY, ENVIRONMENTS)))
     return subprocess.Popen(
         [sys.executable, "-c", WORKER, str(storage), what],
-        env=os.environ | {"PYTHONPATH": paths},
+        env=os.environ | {"PYTHONPATH": paths, "TMPDIR": str(temporary_folder(storage))},
         stdout=subprocess.PIPE,
         text=True,
     )
@@ -63,6 +77,7 @@ def test_a_call_that_does_not_return_ends_the_worker_and_leaves_its_stack(
         check_hung(record, "attempt", "Hanging-v0")
     check_hung(record, "another attempt", "Hanging-v0")
     check_hung(None, "attempt", "Hanging-v0")
+    assert leaves_nothing_behind(tmp_path)
 
 
 @pytest.mark.parametrize("what", ["works", "stopped"])
@@ -77,6 +92,15 @@ def test_what_takes_its_time_is_no_hang(what: str, tmp_path: Path) -> None:
             process.send_signal(signal.SIGCONT)
         assert process.wait(timeout=60) == 0
     assert not list(tmp_path.iterdir())
+    assert leaves_nothing_behind(tmp_path)
+
+
+def test_a_worker_that_is_killed_leaves_nothing_behind(tmp_path: Path) -> None:
+    with worker(tmp_path, "works") as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "watched\n"
+        process.kill()
+    assert leaves_nothing_behind(tmp_path)
 
 
 @pytest.mark.parametrize(

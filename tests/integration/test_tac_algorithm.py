@@ -362,6 +362,7 @@ def test_a_bad_reward_stops_training_and_never_reaches_the_replay(runners: int) 
     assert np.isfinite(algo.replay.packed(0)["rewards"]).all()
     assert weight_sums(algo) == weights
     algo.stop()
+    assert not Path(algo.logdir).exists()
 
 
 @pytest.mark.parametrize(
