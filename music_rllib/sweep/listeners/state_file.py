@@ -191,8 +191,15 @@ class StateFile(Listener):
             for stage in sweep.config.stages
         ]
         searches = self.searches()
-        # A stage without the task's reward is left out: its success is chance.
-        judged = [s for s in sweep.config.stages if VARIANTS[s.variant].fixed["task_reward"]]
+        # A stage without the task's reward is left out, as its success is chance; and one that
+        # tries a single setting, which is the best of nothing.
+        tried = {stage["name"]: stage["trials"] for stage in stages}
+        judged = [
+            stage
+            for stage in sweep.config.stages
+            if VARIANTS[stage.variant].fixed["task_reward"]
+            and (stage.search is not None or tried[stage.name] > 1)
+        ]
         self._state = {
             "sweep": sweep.config.name,
             "stages": stages,

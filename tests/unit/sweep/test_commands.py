@@ -327,6 +327,18 @@ def test_a_condition_with_all_its_runs_is_better_than_a_lucky_one(
     assert (state["best"]["values"], state["best"]["runs"]) == (whole["values"], 3)
 
 
+def test_a_single_setting_is_the_best_of_nothing(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    sweep = opened(storage, tmp_path, stages=[{"name": "train", "variant": "tac"}])
+    with StateFile(sweep) as state_file:
+        finish(sweep, state_file, sweep.plan.nodes[0], 0.5, tmp_path / "made")
+        assert state_file.headline()[1] is None
+        state_file.end("finished")
+    assert "Best" not in program("status", f"{storage}/mine").output
+    assert program("best", f"{storage}/mine", "--output", "out", "--json").document["value"] == 0.5
+
+
 def test_tasks_without_success_are_judged_by_their_return(
     storage: str, tmp_path: Path, program: Program
 ) -> None:
