@@ -34,6 +34,8 @@ RENEWALS = 4
 SETTLE_SECONDS = 2.0
 """Wait between writing a lease into an object store and reading it again."""
 LOCK_SECONDS = 30.0
+LOOK_SECONDS = 1.0
+"""Longest time in which a renewing thread does not see that the time of day was set."""
 
 
 class LeaseLostError(RuntimeError):
@@ -313,7 +315,7 @@ class HeldLease:
         """
         pause = self._duration / RENEWALS
         day, steady = time.time(), time.monotonic()
-        while not self._ended.wait(min(1.0, pause)):
+        while not self._ended.wait(min(LOOK_SECONDS, pause)):
             if time.monotonic() - steady >= pause or abs(time.time() - day) >= pause:
                 return True
         return False

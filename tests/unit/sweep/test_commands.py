@@ -468,7 +468,8 @@ def test_stop_reaches_the_driver(
     storage: str, tmp_path: Path, program: Program, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     received = threading.Event()
-    monkeypatch.setattr("music_rllib.sweep.listeners.state_file.REMOTE_SECONDS", 1.0)
+    for name in ("LOCAL_SECONDS", "REMOTE_SECONDS"):
+        monkeypatch.setattr(f"music_rllib.sweep.listeners.state_file.{name}", 0.2)
     before = signal.signal(signal.SIGINT, lambda *_: received.set())
     try:
         sweep = opened(storage, tmp_path)
