@@ -1,8 +1,11 @@
-"""Discounted returns that a configuration can reach, and whether `target_bounds` cut them off."""
+"""Discounted returns that a configuration can reach, and what cuts them off or is beyond them."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from music_rllib.config.tac_settings import (
     Alpha,
@@ -16,6 +19,9 @@ from music_rllib.schedules import extremes
 
 _ROUNDING = 1e-6
 """-1 / (1 - 0.98) is -49.99999999999996, which [-50, 0] does not cut off."""
+_DIVERGED = 2.0
+"""So many times what can be reached is too much: in 402 runs on Fetch critics came to 0.97 times
+that at most, in one that had diverged to 13.9 times."""
 
 
 class Range(NamedTuple):
@@ -28,7 +34,7 @@ class Range(NamedTuple):
         return f"{self.low:.4g} to {self.high:.4g}"
 
 
-def _reward_of_step(task: Range, music: MusicSettings) -> Range:
+def reward_of_step(task: Range, music: MusicSettings) -> Range:
     """Range of a step's reward: the task's, plus an intrinsic one in weight times [-1, 0]."""
     low, high = task if music.task_reward else Range(0.0, 0.0)
     weight = extremes(music.mi_reward_weight)[1] if music.estimator != "none" else 0.0
@@ -55,7 +61,7 @@ def cut_off(tac: TACSettings, music: MusicSettings, task: Range) -> CutOff | Non
     """
     if tac.target_bounds is None:
         return None
-    bounds, reward = Range(*tac.target_bounds), _reward_of_step(task, music)
+    bounds, reward = Range(*tac.target_bounds), reward_of_step(task, music)
     steps = 1.0 / (1.0 - tac.gamma)
     bonus = _entropy_bonus(tac) * tac.gamma * steps
     reached = Range(
@@ -88,3 +94,23 @@ def _largest_alpha(alpha: Alpha, q: float) -> float:
     if isinstance(alpha, MatchedAlpha | NormalisedAlpha):
         return alpha.scaled(extremes(alpha.value)[1], q, 1, "per_dimension")
     return extremes(alpha)[1]
+
+
+def have_diverged(
+    means: NDArray[np.float64], bonuses: NDArray[np.float64], reward: Range, gamma: float
+) -> NDArray[np.bool_]:
+    """Where critics are so far from all returns that they can't have learned them from rewards.
+
+    Args:
+        means: [N] means of the critics, in the order of time.
+        bonuses: [N] α S_q of the policy at the same times. Its largest size so far counts, as
+            it has no bound and critics follow it late.
+        reward: That of a step.
+        gamma: The discount.
+
+    Returns:
+        [N]; False where a number is NaN.
+    """
+    step = max(abs(reward.low), abs(reward.high))
+    reached = (step + np.maximum.accumulate(np.abs(bonuses))) / (1.0 - gamma)
+    return np.asarray(np.abs(means) > _DIVERGED * reached)

@@ -41,6 +41,9 @@ WANTED = (
     names.EVAL_EPISODES,
     names.ENV_STEPS,
     names.GRAD_UPDATES,
+    names.Q_MEAN,
+    names.ALPHA,
+    names.MI_REWARD_WEIGHT,
 )
 """Metrics that a report reads."""
 

@@ -1,4 +1,4 @@
-"""What a report cannot show, and why, in sentences."""
+"""What a report cannot show, and what is to be taken with care, in sentences."""
 
 from __future__ import annotations
 
@@ -7,10 +7,13 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from music_rllib import names
 from music_rllib.labels import ShortLabels, in_runs
 from music_rllib.results.analysis import StageAnalysis
 from music_rllib.results.data import Sweep
+from music_rllib.results.statistics import Array
 
 SHOWN = 5
 """Largest number of labels in a sentence."""
@@ -27,16 +30,17 @@ def missing(
 ) -> list[str]:
     """A sentence for everything that is missing, without the runs to come of a `live` sweep."""
     if live:
-        return list(_missing_evidence(sweep, analyses))
+        return [*_missing_evidence(sweep, analyses), *_diverged(sweep)]
     return [
         *_missing_runs(sweep),
         *_missing_evidence(sweep, analyses),
+        *_diverged(sweep),
         *_missing_records(sweep, undelivered),
     ]
 
 
-def planned_runs(config: str) -> tuple[str, ...] | None:
-    """Names of the runs that a sweep's configuration plans.
+def planned_runs(config: str) -> dict[str, str] | None:
+    """Keys and names of the runs that a sweep's configuration plans.
 
     Returns:
         None if they are unknown: the configuration is from another version, or it starts from
@@ -54,17 +58,18 @@ def planned_runs(config: str) -> tuple[str, ...] | None:
             plan = make_plan(load_sweep(path))
         except (ConfigError, HandoffError):
             return None
-    return tuple(node.label for node in plan.nodes)
+    return {node.key: node.label for node in plan.nodes}
 
 
 def _missing_runs(sweep: Sweep) -> Iterator[str]:
     if not sweep.runs:
         yield "No run has begun, so there is nothing to draw or compare."
-    planned = None if sweep.config is None else planned_runs(sweep.config)
-    known = {run.name for run in sweep.runs}
-    waiting = [name for name in planned or () if name not in known]
+    planned = (None if sweep.config is None else planned_runs(sweep.config)) or {}
+    # Another version of this package may have named them, or counted their keys, otherwise.
+    known = {text for run in sweep.runs for text in (run.node_key, run.name)}
+    waiting = [name for key, name in planned.items() if known.isdisjoint((key, name))]
     if waiting:
-        short = ShortLabels.of(planned or ())
+        short = ShortLabels.of(planned.values())
         yield f"{in_runs(len(waiting))} not begun: {_listed([*map(short, waiting)])}."
     states = Counter(run.status for run in sweep.runs)
     for state, text in _STATES.items():
@@ -90,6 +95,41 @@ def _missing_evidence(sweep: Sweep, analyses: Sequence[StageAnalysis]) -> Iterat
         ]
         if unfinished and len(unfinished) < len(stage.conditions):
             yield f"Stage {stage.name}: no run of {_listed(unfinished)} has finished."
+
+
+def _diverged(sweep: Sweep) -> Iterator[str]:
+    short = ShortLabels.of(run.name for run in sweep.runs)
+    labels = [short(run.name) for i, run in enumerate(sweep.runs) if _has_diverged(sweep, i)]
+    if labels:
+        yield (
+            f"The critics of {in_runs(len(labels))} diverged, to values that no reward explains "
+            f"({names.Q_MEAN}): {_listed(labels)}. It counts as any other."
+        )
+
+
+def _has_diverged(sweep: Sweep, run: int) -> bool:
+    from music_rllib.config.returns import Range, have_diverged
+
+    params = sweep.runs[run].params
+    steps, means = sweep.series(run, names.Q_MEAN)
+    try:
+        low, high = map(float, params["task.reward_range"].strip("[]").split(","))
+        gamma = float(params["tac.gamma"])
+    except (KeyError, ValueError):
+        return False  # nobody knows what can be reached
+    if not len(steps) or not gamma < 1:
+        return False
+
+    def at_steps(metric: str) -> Array:
+        values = dict(zip(*sweep.series(run, metric), strict=True))
+        return np.array([values.get(step, 0.0) for step in steps])
+
+    if params.get("music.task_reward") == "False":
+        low = high = 0.0
+    if params.get("music.estimator") != "none":
+        low -= at_steps(names.MI_REWARD_WEIGHT).max()
+    bonuses = at_steps(names.ALPHA) * at_steps(names.ENTROPY)
+    return bool(have_diverged(means, bonuses, Range(low, high), gamma).any())
 
 
 def _missing_records(sweep: Sweep, undelivered: int) -> Iterator[str]:

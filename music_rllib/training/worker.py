@@ -30,6 +30,7 @@ from music_rllib.store.run_record import (
     last_values,
     to_json_lines,
 )
+from music_rllib.training.divergence import divergence
 from music_rllib.training.failure_reason import cause_of
 from music_rllib.training.hang_watch import RECORD, HangWatch, check_hung
 from music_rllib.training.job import NodeJob
@@ -306,6 +307,7 @@ class RunTrainable(Trainable):
                 metrics=metrics,
             )
         )
+        self._notes += divergence(self._job.run, self._history)
         if not training.env_steps and training.will_compile:
             self._notes.append("compiles its updates first, once on a machine: some 20 seconds")
         late = time.monotonic() - self._saved_at >= 60.0 * self._job.checkpoints.minutes

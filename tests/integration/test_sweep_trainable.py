@@ -107,6 +107,20 @@ def numbers(storage: Path, node: NodeJob) -> list[dict[str, float]]:
     ]
 
 
+@pytest.mark.parametrize(("lowest", "times"), [(-1e-6, 1), (-100.0, 0)])
+def test_critics_beyond_what_can_be_earned_are_told_of_once(
+    lowest: float, times: int, tmp_path: Path
+) -> None:
+    """The first task says that its rewards are far smaller than they are."""
+    task = POINT.model_copy(update={"reward_range": (lowest, 0.0)})
+    tac = settings("tac").tac.model_dump() | {"alpha": 0.0}
+    results = compute(job(tmp_path, settings("tac", task=task, tac=tac)))
+    notes = [note for result in results for note in result[NOTES] if "critics" in note]
+    assert len(notes) == times
+    for note in notes:
+        assert re.match(r"its critics diverge: \S+ on average, with rewards of -1e-06 to 0 ", note)
+
+
 @pytest.mark.usefixtures("local_ray")
 def test_every_variant_trains_from_its_source(tmp_path: Path) -> None:
     store = NodeStore(str(tmp_path))

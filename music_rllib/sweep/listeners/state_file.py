@@ -181,11 +181,12 @@ class StateFile(Listener):
                         "value": reached.metrics.get(metric) if reached else None,
                     }
                 )
+        trials = Counter(stage for stage, _ in {(run.stage, run.trial) for run in sweep.plan.runs})
         stages = [
             {
                 "name": stage.name,
                 "variant": stage.variant,
-                "trials": len({run.trial for run in sweep.plan.runs if run.stage == stage.name}),
+                "trials": trials[stage.name],
                 "runs": dict(counts.get(stage.name, {})),
             }
             for stage in sweep.config.stages
@@ -193,12 +194,11 @@ class StateFile(Listener):
         searches = self.searches()
         # A stage without the task's reward is left out, as its success is chance; and one that
         # tries a single setting, which is the best of nothing.
-        tried = {stage["name"]: stage["trials"] for stage in stages}
         judged = [
             stage
             for stage in sweep.config.stages
             if VARIANTS[stage.variant].fixed["task_reward"]
-            and (stage.search is not None or tried[stage.name] > 1)
+            and (stage.search is not None or trials[stage.name] > 1)
         ]
         self._state = {
             "sweep": sweep.config.name,

@@ -6,11 +6,12 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from music_rllib.config.load import load_sweep
 from music_rllib.config.remarks import remarks
-from music_rllib.config.returns import Range, cut_off
+from music_rllib.config.returns import Range, cut_off, have_diverged
 from music_rllib.config.tac_settings import TACSettings
 from music_rllib.intrinsic.settings import MusicSettings
 
@@ -132,3 +133,20 @@ def test_a_sweep_says_where_and_with_both_numbers(
     path = tmp_path / "sweep.yaml"
     path.write_text(SWEEP + "\n".join(stages))
     assert remarks(load_sweep(path)) == expected
+
+
+@pytest.mark.parametrize(
+    ("means", "bonuses", "expected"),
+    [
+        ([0, -25, -39, 39], [0, 0, 0, 0], [False] * 4),
+        ([0, -41, 41], [0, 0, 0], [False, True, True]),
+        # A policy so narrow that its entropies weigh as much as ten rewards, and later not.
+        ([-41, -300, -300, -500], [0, -10, 0, 0], [True, False, False, True]),
+        ([math.nan, -math.inf, -41], [0, 0, math.nan], [False, True, False]),
+    ],
+)
+def test_critics_that_no_return_explains_have_diverged(
+    means: list[float], bonuses: list[float], expected: list[bool]
+) -> None:
+    found = have_diverged(np.array(means), np.array(bonuses, float), SPARSE, 0.95)
+    assert found.tolist() == expected

@@ -127,6 +127,33 @@ def said_about(sweep: Sweep) -> str:
 # What is said -----------------------------------------------------------------------------------
 
 
+def test_runs_whose_critics_diverged_are_named() -> None:
+    """With the MI reward a step is worth -1.5 at least, so that -60 at gamma 0.95 is too low."""
+    known = {"task.reward_range": "[-1.0, 0.0]", "tac.gamma": "0.95"}
+
+    def run(seed: int, critics: float, params: Mapping[str, str]) -> tuple[RunRecord, Points]:
+        logged = [(names.Q_MEAN, critics), (names.MI_REWARD_WEIGHT, 0.5)]
+        metrics = [name for name, _ in logged for _ in range(2)]
+        values = [part * value for _, value in logged for part in (1.0, 0.5)]
+        points = Points(metrics, [1000, 2000] * 2, [1, 2] * 2, values)
+        return one_run("2", seed, params=params), points
+
+    report = build_report(
+        sweep_of(
+            [
+                run(0, -59.0, known),
+                run(1, -61.0, known),
+                run(2, -61.0, known | {"task.reward_range": "None"}),
+                run(3, -41.0, known | {"music.estimator": "none"}),
+                run(4, -41.0, known | {"music.task_reward": "False"}),
+            ]
+        )
+    )
+    (said,) = [line for line in report.missing if "critics" in line]
+    assert said.startswith("The critics of 3 runs diverged, to values that no reward explains")
+    assert [f"seed{seed}" in said for seed in range(5)] == [False, True, False, True, True]
+
+
 def test_a_clear_winner_is_named() -> None:
     said = said_about(
         compared({"1": [0.3, 0.32, 0.35, 0.31, 0.3], "1.5": [0.9, 0.92, 0.88, 0.95, 0.9]})
@@ -694,6 +721,23 @@ def test_planned_runs_of_a_configuration() -> None:
     assert planned is not None
     assert len(planned) == 2
     assert planned_runs("name: [") is None
+
+
+@pytest.mark.parametrize(("key", "named"), [(True, False), (False, True), (False, False)])
+def test_a_run_that_another_version_named_otherwise_has_begun(key: bool, named: bool) -> None:
+    planned = planned_runs(CONFIG) or {}
+    runs = [
+        (
+            replace(
+                one_run(q, 0, node_key=node if key else "another"),
+                name=name if named else f"as it was called then: {q}",
+            ),
+            climbing(0.5),
+        )
+        for q, (node, name) in zip(("1", "1.5"), planned.items(), strict=True)
+    ]
+    said = " ".join(build_report(sweep_of(runs, config=CONFIG)).missing)
+    assert ("not begun" in said) == (not key and not named)
 
 
 # Influence of settings --------------------------------------------------------------------------
