@@ -13,7 +13,7 @@ from music_rllib.report.figures.choice import drawings_of_stages, stage_drawings
 from music_rllib.report.figures.draw import Figures, files, stale_files
 from music_rllib.report.figures.overview import overview
 from music_rllib.report.figures.plots import METRICS
-from music_rllib.report.limitations import missing
+from music_rllib.report.limitations import diverged, missing
 from music_rllib.report.page import Report, render
 from music_rllib.report.side_by_side import difference_tables
 from music_rllib.report.study import study_csv, study_drawings
@@ -98,7 +98,7 @@ def build_report(
         study=study,
         figures=figures,
         differences=() if beside is None else difference_tables(*beside, analyses),
-        missing=[*gaps, *filter(None, [damaged])],
+        limitations=[*gaps, *diverged(sweep), *filter(None, [damaged])],
         difference=difference,
         command=command,
         films=None

@@ -199,7 +199,7 @@ def _report(
             processes=processes,
         )
         page = write_report(report, output or source.folder / "report")
-    for note in report.missing:
+    for note in report.limitations:
         typer.echo(f"missing: {for_people(note)}")
     for analysis in report.analyses:
         for line in verdict(analysis.scopes[0], difference):

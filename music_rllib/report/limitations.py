@@ -1,4 +1,4 @@
-"""What a report cannot show, and what is to be taken with care, in sentences."""
+"""What a report cannot show, and which runs are to be taken with care, in sentences."""
 
 from __future__ import annotations
 
@@ -30,11 +30,10 @@ def missing(
 ) -> list[str]:
     """A sentence for everything that is missing, without the runs to come of a `live` sweep."""
     if live:
-        return [*_missing_evidence(sweep, analyses), *_diverged(sweep)]
+        return list(_missing_evidence(sweep, analyses))
     return [
         *_missing_runs(sweep),
         *_missing_evidence(sweep, analyses),
-        *_diverged(sweep),
         *_missing_records(sweep, undelivered),
     ]
 
@@ -97,41 +96,6 @@ def _missing_evidence(sweep: Sweep, analyses: Sequence[StageAnalysis]) -> Iterat
             yield f"Stage {stage.name}: no run of {_listed(unfinished)} has finished."
 
 
-def _diverged(sweep: Sweep) -> Iterator[str]:
-    short = ShortLabels.of(run.name for run in sweep.runs)
-    labels = [short(run.name) for i, run in enumerate(sweep.runs) if _has_diverged(sweep, i)]
-    if labels:
-        yield (
-            f"The critics of {in_runs(len(labels))} diverged, to values that no reward explains "
-            f"({names.Q_MEAN}): {_listed(labels)}. It counts as any other."
-        )
-
-
-def _has_diverged(sweep: Sweep, run: int) -> bool:
-    from music_rllib.config.returns import Range, have_diverged
-
-    params = sweep.runs[run].params
-    steps, means = sweep.series(run, names.Q_MEAN)
-    try:
-        low, high = map(float, params["task.reward_range"].strip("[]").split(","))
-        gamma = float(params["tac.gamma"])
-    except (KeyError, ValueError):
-        return False  # nobody knows what can be reached
-    if not len(steps) or not gamma < 1:
-        return False
-
-    def at_steps(metric: str) -> Array:
-        values = dict(zip(*sweep.series(run, metric), strict=True))
-        return np.array([values.get(step, 0.0) for step in steps])
-
-    if params.get("music.task_reward") == "False":
-        low = high = 0.0
-    if params.get("music.estimator") != "none":
-        low -= at_steps(names.MI_REWARD_WEIGHT).max()
-    bonuses = at_steps(names.ALPHA) * at_steps(names.ENTROPY)
-    return bool(have_diverged(means, bonuses, Range(low, high), gamma).any())
-
-
 def _missing_records(sweep: Sweep, undelivered: int) -> Iterator[str]:
     if sweep.config is None:
         yield (
@@ -143,6 +107,46 @@ def _missing_records(sweep: Sweep, undelivered: int) -> Iterator[str]:
             f"Not everything of {in_runs(undelivered)} has reached MLflow yet; send it with "
             "`python -m music_rllib.tracking deliver` and the sweep's folder, then report again."
         )
+
+
+def diverged(sweep: Sweep) -> list[str]:
+    """A sentence that names the runs whose critics have diverged, if there are any."""
+    short = ShortLabels.of(run.name for run in sweep.runs)
+    labels = [short(run.name) for i, run in enumerate(sweep.runs) if _has_diverged(sweep, i)]
+    if not labels:
+        return []
+    return [
+        f"The critics of {in_runs(len(labels))} diverged, to values that no reward explains "
+        f"({names.Q_MEAN}): {_listed(labels)}. Such a run counts as any other."
+    ]
+
+
+def _has_diverged(sweep: Sweep, run: int) -> bool:
+    from music_rllib.config.returns import Range, have_diverged, reward_of_step
+    from music_rllib.intrinsic.settings import MusicSettings
+
+    def at_steps(metric: str) -> Array:
+        values = dict(zip(*sweep.series(run, metric), strict=True))
+        return np.array([values.get(step, 0.0) for step in steps])
+
+    params = sweep.runs[run].params
+    steps, means = sweep.series(run, names.Q_MEAN)
+    weight = at_steps(names.MI_REWARD_WEIGHT).max(initial=0.0)
+    try:
+        low, high = map(float, params["task.reward_range"].strip("[]").split(","))
+        gamma = float(params["tac.gamma"])
+        music = MusicSettings(
+            estimator="frozen" if weight else "none",
+            mi_reward_weight=weight,
+            task_reward=params.get("music.task_reward") != "False",
+        )
+    except (KeyError, ValueError):
+        return False  # nobody knows what can be reached
+    if not gamma < 1:
+        return False
+    bonuses = at_steps(names.ALPHA) * at_steps(names.ENTROPY)
+    reward = reward_of_step(Range(low, high), music)
+    return bool(have_diverged(means, bonuses, reward, gamma).any())
 
 
 def _listed(labels: Sequence[str]) -> str:

@@ -55,8 +55,8 @@ class Report:
     study: Study
     """The comparisons that were planned and all others."""
     figures: Figures
-    missing: Sequence[str]
-    """Sentences about what the report cannot show."""
+    limitations: Sequence[str]
+    """Sentences about what the report cannot show, and what is to be taken with care."""
     difference: float
     """The smallest difference in success rate that matters to the reader."""
     command: str
@@ -90,7 +90,7 @@ def render(report: Report, *, live: bool = False) -> str:
         live=live,
         name=sweep.name,
         facts=_facts(report),
-        missing=report.missing,
+        limitations=report.limitations,
         question=_question(report),
         answer=answer_lines[:claims],
         counting=answer_lines[claims:],

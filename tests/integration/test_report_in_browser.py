@@ -261,7 +261,7 @@ def test_the_live_page_takes_up_what_is_new_and_leaves_the_reader_where_he_is(
             assert not seen["faint"]
             await tab.evaluate(CHOOSE % ["against", "epochs"])
             await tab.evaluate("scrollTo(0, 700)")
-            missing = replace(report, missing=["A run that has just failed."])
+            missing = replace(report, limitations=["A run that has just failed."])
             write_state(tmp_path, 200, time.time())
             pages["html"] = render(missing, live=True)
             await tab.wait_for("A run that has just failed.")

@@ -21,7 +21,7 @@ def test_the_page_of_two_sweeps_says_what_differs() -> None:
     both = side_by_side(first, second)
     assert len(both.runs) == 2 * len(first.runs), "runs of the same node are two"
     made = build_report(both, beside=(first, second))
-    assert made.missing == []
+    assert made.limitations == []
     settings, results = made.differences
     ((_, setting, before, after),) = settings.rows
     assert (setting, after) == ("tac.alpha", "0.125")
@@ -45,5 +45,5 @@ def test_the_page_of_two_sweeps_says_what_differs() -> None:
 def test_what_is_missing_is_said_of_the_sweep_that_lacks_it() -> None:
     first = read_archive(DATA / "proof-fetch-reach")
     second = replace(first, name="other", runs=first.runs[:-1])
-    (missing,) = build_report(side_by_side(first, second), beside=(first, second)).missing
+    (missing,) = build_report(side_by_side(first, second), beside=(first, second)).limitations
     assert missing.startswith("other: 1 run not begun")
