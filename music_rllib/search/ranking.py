@@ -128,11 +128,12 @@ def _best_condition(
     stage: Stage, plan: Plan, results: Mapping[str, RunResult]
 ) -> dict[str, Any] | None:
     measure = measure_of(stage, plan, results)
-    candidates = conditions(plan, results, measure.metric)
-    best = best_of((c for c in candidates if c.stage == stage.name), measure)
+    candidates = [c for c in conditions(plan, results, measure.metric) if c.stage == stage.name]
+    best = best_of(candidates, measure)
     if best is None:
         return None
     estimate = best.estimate()
+    rivals = (c for c in candidates if c is not best and c.complete == best.complete)
     return {
         "stage": stage.name,
         "values": dict(best.values),
@@ -140,6 +141,7 @@ def _best_condition(
         "metric": measure.metric,
         "direction": "maximize",
         "value": float(estimate.value),
+        "level": sum(float(c.estimate().value) == float(estimate.value) for c in rivals),
         "interval": [float(estimate.lower), float(estimate.upper)],
         "runs": best.planned if best.complete else len(best.runs),
         "planned": best.planned,
@@ -176,7 +178,8 @@ def best_in_words(best: Mapping[str, Any]) -> str:
     values = ", ".join(f"{symbol(name)} = {short(value)}" for name, value in best["values"].items())
     number = with_interval(best["value"], best["interval"])
     runs, planned = best["runs"], best.get("planned", best["runs"])
-    text = f"{best['stage']} {values}".rstrip() + f": {best.get('by', 'success')} {number}, "
+    level = f" and {best['level']} more" if best.get("level") else ""  # the first of equals
+    text = f"{best['stage']} {values}".rstrip() + f"{level}: {best.get('by', 'success')} {number}, "
     if runs < planned:
         text += f"{runs} of {planned} runs (no condition has all of its runs yet)"
     else:

@@ -339,6 +339,19 @@ def test_a_single_setting_is_the_best_of_nothing(
     assert program("best", f"{storage}/mine", "--output", "out", "--json").document["value"] == 0.5
 
 
+def test_the_first_of_equals_is_not_named_alone(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    sweep = opened(storage, tmp_path, seeds=[0])
+    with StateFile(sweep) as state_file:
+        for node in sweep.plan.nodes:
+            value = 0.25 if node.run.tac.entropic_index == 1.0 else 1.0
+            finish(sweep, state_file, node, value, tmp_path / "made")
+        state_file.end("finished")
+    said = program("status", f"{storage}/mine").output
+    assert "Best so far: train q = 1.5 and 1 more: success 1" in said
+
+
 def test_tasks_without_success_are_judged_by_their_return(
     storage: str, tmp_path: Path, program: Program
 ) -> None:
