@@ -107,6 +107,7 @@ def numbers(storage: Path, node: NodeJob) -> list[dict[str, float]]:
     ]
 
 
+@pytest.mark.usefixtures("local_ray")
 @pytest.mark.parametrize(("lowest", "times"), [(-1e-6, 1), (-100.0, 0)])
 def test_critics_beyond_what_can_be_earned_are_told_of_once(
     lowest: float, times: int, tmp_path: Path
