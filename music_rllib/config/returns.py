@@ -109,8 +109,8 @@ def have_diverged(
         gamma: The discount.
 
     Returns:
-        [N]; False where a number is NaN.
+        [N]; False where a mean is NaN, and before the first bonus that is not.
     """
     step = max(abs(reward.low), abs(reward.high))
-    reached = (step + np.maximum.accumulate(np.abs(bonuses))) / (1.0 - gamma)
+    reached = (step + np.fmax.accumulate(np.abs(bonuses))) / (1.0 - gamma)
     return np.asarray(np.abs(means) > _DIVERGED * reached)

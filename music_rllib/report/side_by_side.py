@@ -98,7 +98,12 @@ def _values_text(values: set[str] | None) -> str:
 def _results_table(analyses: Sequence[StageAnalysis], titles: tuple[str, str]) -> TextTable:
     one, other = (
         {
-            (analysis.stage.name.removeprefix(start), scope.name, final.condition.label): final
+            # A setting of what a condition starts from has the sweep's title, too.
+            (
+                analysis.stage.name.removeprefix(start),
+                scope.name,
+                final.condition.label.replace(start, ""),
+            ): final
             for analysis in analyses
             if analysis.stage.name.startswith(start)
             for scope in analysis.scopes

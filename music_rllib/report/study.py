@@ -15,22 +15,26 @@ from music_rllib.results.claims.study import Claim, Study, label_of
 from music_rllib.results.claims.tables import claim_rows, mean_rows
 from music_rllib.results.comparison import SHOW_SEEDS_BELOW, number, p_text
 
-AGAINST_ALPHA = "Area under the curve against α"
-
 
 def study_tables(study: Study) -> list[TextTable]:
     """The comparisons, planned ones first, and the primary metric of each condition."""
     return [_claims_table(study), _means_table(study)]
 
 
+def _kind(study: Study) -> str:
+    """What conditions are compared by: `area under the curve`."""
+    return study.means[0].measure.kind_in_words if study.means else "area under the curve"
+
+
 def _claims_table(study: Study) -> TextTable:
     return TextTable(
-        title="Comparisons by the area under the curve",
-        header=("Task", "Pair", "Difference", "95 % interval", "p", "Verdict", "Planned", "Seeds"),
+        title=f"Comparisons by the {_kind(study)}",
+        header="Task,Pair,Measure,Difference,95 % interval,p,Verdict,Planned,Seeds".split(","),
         rows=[
             (
                 claim.task,
                 f"{claim.first} against {claim.second}",
+                claim.measure.words,
                 *estimate_cells(claim.contrast.difference),
                 *_p_and_verdict(claim),
                 "yes" if claim.planned else "no",
@@ -64,10 +68,10 @@ def _means_table(study: Study) -> TextTable:
         for mean in study.means
     ]
     return TextTable(
-        title="Area under the learning curve",
+        title=f"{_kind(study).capitalize()} of each condition",
         header=("Task", "Condition", "Measure", "Mean", "95 % interval", "Each seed", "Finished"),
         rows=rows,
-        note="Mean over the budget by the trapezoid rule, of finished runs.",
+        note="Of finished runs; the area is the mean over the budget, by the trapezoid rule.",
     )
 
 
@@ -106,13 +110,13 @@ def study_drawings(study: Study) -> Iterator[Drawing]:
     """The performance profile of the primary metric, and its dependence on α."""
     if study.stage is None:
         return
-    styles = styles_of(study.stage.compared)
+    styles, kind = styles_of(study.stage.compared), _kind(study)
     shown = list(dict.fromkeys(mean.condition for mean in study.means))
     if profiles := area_profile_panels(study.means, styles):
         yield Drawing(
             stage=study.stage.name,
-            title="Performance profile of the area under the curve",
-            caption="Share of finished runs above each area, with 95 % bands at each point.",
+            title=f"Performance profile of the {kind}",
+            caption="Share of finished runs above each value, with 95 % bands at each point.",
             panels=tuple(profiles),
             legend=[(label_of(condition), styles[condition]) for condition in shown],
         )
@@ -120,7 +124,7 @@ def study_drawings(study: Study) -> Iterator[Drawing]:
         by_q = {one.entropic_index: styles[one] for one in reversed(shown)}
         yield Drawing(
             stage=study.stage.name,
-            title=AGAINST_ALPHA,
+            title=f"{kind.capitalize()} against α",
             group=SETTINGS,
             caption="Mean over the seeds with its 95 % interval, a line for each q: what a "
             "comparison at one α would have found stands at that α.",

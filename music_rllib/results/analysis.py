@@ -101,6 +101,9 @@ class StageAnalysis:
     """Comparisons of each pair of conditions, for each threshold."""
     entropies: Mapping[tuple[str, Condition], Entropies]
     """Entropies by scope and condition."""
+    cut_at: Mapping[str, float]
+    """Environment steps at which final scores were read on a task; without tasks on which they are
+    those of the runs' ends."""
 
 
 def analyse(sweep: Sweep) -> list[StageAnalysis]:
@@ -108,12 +111,19 @@ def analyse(sweep: Sweep) -> list[StageAnalysis]:
     return [_analyse(sweep, stage) for stage in find_stages(sweep)]
 
 
-def _analyse(sweep: Sweep, stage: Stage) -> StageAnalysis:
+def _analyse(
+    sweep: Sweep, stage: Stage, cut_at: Mapping[str, float] | None = None
+) -> StageAnalysis:
+    cut_at = cut_at or {}
     metrics = {task: sweep.primary_metric(task) for task in stage.tasks}
     scopes = scopes_of(
         metrics,
         [
-            (condition, _final_scores(sweep, condition, metrics), sweep.episodes(condition.runs))
+            (
+                condition,
+                _final_scores(sweep, condition, metrics, cut_at),
+                sweep.episodes(condition.runs),
+            )
             for condition in stage.conditions
         ],
         stage.compared,
@@ -135,31 +145,51 @@ def _analyse(sweep: Sweep, stage: Stage) -> StageAnalysis:
             race for task, threshold in cells for race in races(sweep, task, groups, threshold)
         ),
         entropies={
-            (scope.name, final.condition): _entropies(sweep, final.condition, stage, scope.name)
+            (scope.name, final.condition): _entropies(
+                sweep,
+                final.condition,
+                stage.tasks if scope.name == ALL_TASKS else [scope.name],
+                cut_at,
+            )
             for scope in scopes
             for final in scope.finals
         },
+        cut_at=cut_at,
     )
 
 
-def _entropies(sweep: Sweep, condition: Condition, stage: Stage, scope: str) -> Entropies:
-    tasks = stage.tasks if scope == ALL_TASKS else (scope,)
+def _entropies(
+    sweep: Sweep, condition: Condition, tasks: Sequence[str], cut_at: Mapping[str, float]
+) -> Entropies:
     runs = tuple(run for run in condition.runs if sweep.runs[run].task in tasks)
     estimates = []
     for metric in (names.SHANNON_ENTROPY, names.ENTROPY):
-        scores = _final_scores(sweep, replace(condition, runs=runs), dict.fromkeys(tasks, metric))
+        metrics = dict.fromkeys(tasks, metric)
+        scores = _final_scores(sweep, replace(condition, runs=runs), metrics, cut_at)
         complete = scores[~np.isnan(scores).any(axis=1)]
         estimates.append(st.estimate(complete) if len(complete) else None)
     return Entropies(*estimates)
 
 
 def analyse_stages(sweep: Sweep, stages: Sequence[Stage]) -> StageAnalysis | None:
-    """Stages compared with each other (:func:`stage_by_stage`); None where there is nothing to."""
+    """Stages compared with each other (:func:`stage_by_stage`); None where there is nothing to.
+
+    Where one has a smaller budget on a task, the others are read at its end.
+    """
     together = stage_by_stage(sweep, stages)
-    return None if together is None else _analyse(sweep, together)
+    if together is None:
+        return None
+    cut_at = {}
+    for task in together.tasks:
+        budgets = [sweep.least_budget(task, one.runs) for one in together.compared]
+        if len({budget for budget in budgets if np.isfinite(budget)}) > 1:
+            cut_at[task] = min(budgets)
+    return _analyse(sweep, together, cut_at)
 
 
-def _final_scores(sweep: Sweep, condition: Condition, metrics: Mapping[str, str]) -> Array:
+def _final_scores(
+    sweep: Sweep, condition: Condition, metrics: Mapping[str, str], cut_at: Mapping[str, float]
+) -> Array:
     """Last values of finished runs, `[seeds, T]`, NaN where there is none."""
     tasks = list(metrics)
     rows: dict[tuple[str, int], Array] = {}
@@ -170,7 +200,7 @@ def _final_scores(sweep: Sweep, condition: Condition, metrics: Mapping[str, str]
         key = (record.seed, seen[record.seed, record.task])
         seen[record.seed, record.task] += 1
         row = rows.setdefault(key, np.full(len(tasks), np.nan))
-        score = sweep.final(run, metrics[record.task])
+        score = sweep.final(run, metrics[record.task], cut_at.get(record.task, np.inf))
         if record.is_finished and score is not None:
             row[tasks.index(record.task)] = score
     return np.array(list(rows.values())).reshape(len(rows), len(tasks))

@@ -204,10 +204,11 @@ class Sweep:
         column = self.column(run, self.primary_metric(record.task))
         return column.step.astype(float), (column.time - record.started) / 1000
 
-    def final(self, run: int, metric: str) -> float | None:
-        """The last value of a metric of `runs[run]`; None where it has none, or NaN."""
-        values = self.column(run, metric).value
-        return float(values[-1]) if len(values) and not np.isnan(values[-1]) else None
+    def final(self, run: int, metric: str, until: float = np.inf) -> float | None:
+        """The last value of a metric of `runs[run]` up to a step; None unless it is finite."""
+        column = self.column(run, metric)
+        values = column.value[: np.searchsorted(column.step, until, side="right")]
+        return float(values[-1]) if len(values) and np.isfinite(values[-1]) else None
 
     def on(self, task: str) -> list[int]:
         """Positions of the runs on a task."""
@@ -228,6 +229,14 @@ class Sweep:
         """Environment steps that `runs[run]` is known to have done."""
         steps = (self.column(run, metric).step for metric in self.history)
         return max((int(of_metric[-1]) for of_metric in steps if len(of_metric)), default=0)
+
+    def least_budget(self, task: str, runs: Iterable[int]) -> float:
+        """The smallest budget of these runs on a task in environment steps; infinite without one.
+
+        A run whose budget is not known counts with the steps that it has done.
+        """
+        own = [run for run in runs if self.runs[run].task == task]
+        return min((float(self.runs[r].budget or self.last_step(r)) for r in own), default=np.inf)
 
     def url(self, run_id: str) -> str | None:
         """The page of a run, where a server shows it."""

@@ -55,7 +55,7 @@ def first_passage(steps: Array, values: Array, threshold: float) -> tuple[float,
 
 def waits_of(sweep: Sweep, task: str, runs: Sequence[int], threshold: float) -> Waits | None:
     """Steps of a task's runs to a success rate; None where none was evaluated."""
-    passages = [passage for _, *passage in _passages(sweep, task, runs, threshold)]
+    passages = list(_passages(sweep, task, runs, threshold))
     if not passages:
         return None
     steps, reached = zip(*passages, strict=True)
@@ -64,13 +64,13 @@ def waits_of(sweep: Sweep, task: str, runs: Sequence[int], threshold: float) -> 
 
 def _passages(
     sweep: Sweep, task: str, runs: Sequence[int], threshold: float
-) -> Iterator[tuple[int, float, bool]]:
-    """Position and :func:`first_passage` of each run on a task that was evaluated."""
+) -> Iterator[tuple[float, bool]]:
+    """:func:`first_passage` of each run on a task that was evaluated."""
     for run in runs:
         if sweep.runs[run].task == task:
             passage = first_passage(*sweep.finite(run, names.EVAL_SUCCESS), threshold)
             if passage is not None:
-                yield run, *passage
+                yield passage
 
 
 def median_wait(waits: Waits) -> float:
@@ -142,7 +142,9 @@ def races(
     """Comparison of each pair of groups, a later group against an earlier one.
 
     A run that ended below the threshold is later than every run that reached it, and ties with the
-    others that did not.
+    others that did not. Runs of another length count as if all had the smaller budget of the two
+    groups. A run that is not finished is left out, also where it has arrived: of runs that were
+    stopped early only the quick ones have.
 
     Args:
         sweep: the runs.
@@ -150,16 +152,19 @@ def races(
         groups: name to positions in `sweep.runs`.
         threshold: success rate at the last step of evaluation episodes.
     """
-    earliness = {name: _earliness(sweep, task, runs, threshold) for name, runs in groups.items()}
-    known = [name for name in groups if len(earliness[name])]
-    pairs = [(second, first) for first, second in combinations(known, 2)]
-    reached = [bool(np.isfinite([*earliness[a], *earliness[b]]).any()) for a, b in pairs]
+    finished = {
+        name: [run for run in runs if sweep.runs[run].task == task and sweep.runs[run].is_finished]
+        for name, runs in groups.items()
+    }
+    pairs = []
+    for first, second in combinations(groups, 2):
+        sides = (finished[second], finished[first])
+        budget = sweep.least_budget(task, [*sides[0], *sides[1]])
+        x, y = (_earliness(sweep, task, runs, threshold, budget) for runs in sides)
+        if len(x) and len(y):
+            pairs.append((second, first, x, y, bool(np.isfinite([*x, *y]).any())))
     # A pair without a run that reached the threshold could not have come out otherwise: no test.
-    p_values = [
-        st.improvement_p_value(earliness[a], earliness[b])
-        for (a, b), any_ in zip(pairs, reached, strict=True)
-        if any_
-    ]
+    p_values = [st.improvement_p_value(x, y) for _, _, x, y, reached in pairs if reached]
     adjusted = iter(st.holm(p_values))
     return tuple(
         Race(
@@ -167,23 +172,21 @@ def races(
             threshold=threshold,
             first=a,
             second=b,
-            runs=(len(earliness[a]), len(earliness[b])),
-            reached=any_,
-            estimate=st.probability_of_improvement(earliness[a], earliness[b]),
-            p_value=next(adjusted) if any_ else 1.0,
+            runs=(len(x), len(y)),
+            reached=reached,
+            estimate=st.probability_of_improvement(x, y),
+            p_value=next(adjusted) if reached else 1.0,
         )
-        for (a, b), any_ in zip(pairs, reached, strict=True)
+        for a, b, x, y, reached in pairs
     )
 
 
-def _earliness(sweep: Sweep, task: str, runs: Sequence[int], threshold: float) -> Array:
-    """Minus the steps to the threshold, `[R, 1]`; minus infinity for runs that ended below it.
-
-    A run that is not finished and below the threshold could still be the sooner: it is left out.
-    """
+def _earliness(
+    sweep: Sweep, task: str, runs: Sequence[int], threshold: float, budget: float
+) -> Array:
+    """Minus the steps to the threshold, `[R, 1]`; minus infinity for runs below it at `budget`."""
     earliness = [
-        -steps if reached else -np.inf
-        for run, steps, reached in _passages(sweep, task, runs, threshold)
-        if reached or sweep.runs[run].is_finished
+        -steps if reached and steps <= budget else -np.inf
+        for steps, reached in _passages(sweep, task, runs, threshold)
     ]
     return np.array(earliness, dtype=float).reshape(-1, 1)

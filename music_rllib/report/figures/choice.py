@@ -80,11 +80,14 @@ class Drawing:
     """The learning curves of each panel, by its title."""
     facets: Facets | None = None
     """How conditions are spread over the panels of learning curves and of profiles."""
+    number: int = 1
+    """Tells drawings apart whose stages and titles are alike as file names."""
 
     @property
     def name(self) -> str:
         """The name of its files without their suffix, and its id in the page."""
-        return slug(f"{self.stage}-{self.title}")
+        number = f" {self.number}" if self.number > 1 else ""
+        return slug(f"{self.stage}-{self.title}{number}")
 
     @property
     def legend_is_of_conditions(self) -> bool:

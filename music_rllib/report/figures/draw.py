@@ -13,6 +13,7 @@ import re
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor
+from dataclasses import replace
 from functools import cached_property, partial
 from typing import Any, TypeVar
 
@@ -60,7 +61,9 @@ class Figures:
         self._files: list[Callable[[], dict[str, bytes]]] = []
 
     def add(self, drawing: Drawing) -> None:
-        """Add a drawing to be drawn."""
+        """Add a drawing to be drawn, under a name of its own."""
+        while any(drawing.name == other.name for other in self.drawings):
+            drawing = replace(drawing, number=drawing.number + 1)
         self.drawings.append(drawing)
         self._inline.append(self._started(_inline, drawing))
         self._files.append(self._started(_files, drawing))

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from music_rllib import names
-from music_rllib.experiment.plan import Plan
+from music_rllib.experiment.plan import Node, Plan
 from music_rllib.results.claims.plan import PlanVersion
 from music_rllib.results.data import Column, History, RunRecord, Sweep, joined
 
@@ -44,28 +44,33 @@ def of_plan(plan: Plan, exports: Iterable[Sweep], *earlier: Plan) -> Sweep | Non
         plan: The plan.
         exports: The exports that are searched.
         earlier: The same plan under earlier versions of the algorithm, for runs that have not been
-            made since.
+            made since. A run's source is of the version that the run started from.
 
     Returns:
         None where no export has any of its runs.
     """
     exports = list(exports)
     best = _best(exports)
+    versions = (plan, *earlier)
+    found: list[tuple[Plan, Node]] = []
+    sources: set[str | None] = set()
+    # A run has the same position in each plan, and its source comes before it.
+    for nodes in reversed(list(zip(*(version.nodes for version in versions), strict=True))):
+        known = [pair for pair in zip(versions, nodes, strict=True) if pair[1].key in best]
+        if known:
+            found.append(min(known, key=lambda pair: pair[1].key not in sources))
+            sources.add(found[-1][1].source_key)
     runs, places = [], []
-    # A run has the same position in each plan.
-    for nodes in zip(*(version.nodes for version in (plan, *earlier)), strict=True):
-        for version, node in zip((plan, *earlier), nodes, strict=True):
-            if node.key in best:
-                places.append(best[node.key])
-                run = _run(best[node.key])
-                own = {
-                    names.TAG_SWEEP: plan.name,
-                    names.TAG_STAGE: node.stage,
-                    names.TAG_ALGORITHM: version.algorithm,
-                    names.TAG_TRIAL: str(node.trial),
-                }
-                runs.append(replace(run, name=node.label, tags={**run.tags, **own}))
-                break
+    for version, node in reversed(found):
+        places.append(best[node.key])
+        run = _run(best[node.key])
+        own = {
+            names.TAG_SWEEP: plan.name,
+            names.TAG_STAGE: node.stage,
+            names.TAG_ALGORITHM: version.algorithm,
+            names.TAG_TRIAL: str(node.trial),
+        }
+        runs.append(replace(run, name=node.label, tags={**run.tags, **own}))
     if not runs:
         return None
     return replace(

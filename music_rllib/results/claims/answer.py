@@ -50,10 +50,10 @@ def answer(sweep: Sweep, study: Study) -> list[str]:
         verdicts = ", ".join(f"{n} {verdict}" for verdict, n in counts.items())
         more = f"{len(rest)} more comparisons: {verdicts}"
         sentences.append(f"{more}." if len(rest) > 1 else f"1 more comparison: {rest[0].verdict}.")
-    sentences += [_counted(study, shown), _seeds(study, shown)]
+    sentences += [_counted(study, shown), _seeds(sweep, study, shown)]
     sentences.append(f"Control: {_control(sweep, study, study.stage)}.")
     if any(claim.verdict is Verdict.UNDECIDED for claim in study.claims):
-        sentences += filter(None, [seeds_needed(shown, study.means, len(study.claims))])
+        sentences += filter(None, [seeds_needed(shown, study.means, study.family)])
     return [*sentences, *(f"Not tested: {text}." for text in study.untested[:1])]
 
 
@@ -87,7 +87,7 @@ def in_words(claim: Claim) -> str:
     if claim.verdict is Verdict.EQUIVALENT:
         verdict = f"equivalent within {claim.margin:g}"
     where = "over all tasks" if claim.task == ALL_TASKS else f"on {claim.task}"
-    mean = f", averaged over {claim.cells} settings" if claim.cells > 1 else ""
+    mean = f", averaged over {len(claim.pairs)} settings" if len(claim.pairs) > 1 else ""
     held = {True: ", as expected", False: ", not as expected", None: ""}[claim.confirmed]
     return (
         f"{claim.first} against {claim.second} {where}{mean}: {verdict}, {numbers_in_words(claim)}"
@@ -113,13 +113,13 @@ def _counted(study: Study, shown: Sequence[Claim]) -> str:
     margins = {one.margin for one in shown if one.margin is not None}
     if margins:
         text += f"; a difference below {max(margins):g} does not matter"
-    many = len(study.claims)
-    return f"{text}; Holm's correction over {many} comparisons." if many > 1 else f"{text}."
+    if study.family > 1:
+        text += f"; Holm's correction over {study.family} comparisons"
+    return f"{text}."
 
 
-def _seeds(study: Study, shown: Sequence[Claim]) -> str:
-    runs = sum(one.runs for one in study.means)
-    finished = sum(len(one.scores.by_seed) for one in study.means)
+def _seeds(sweep: Sweep, study: Study, shown: Sequence[Claim]) -> str:
+    finished = sum(sweep.runs[run].is_finished for run in study.runs)
     counts = sorted({n for one in shown for n in one.contrast.seeds})
     if not counts:
         counts = sorted({len(one.scores.by_seed) for one in study.means})
@@ -131,7 +131,7 @@ def _seeds(study: Study, shown: Sequence[Claim]) -> str:
         text += ", compared in pairs" if all(paired) else ", not all of them shared"
     if study.stage is not None and study.stage.is_search:
         text += ", fresh ones that no setting was chosen by"
-    return f"{text}; {finished} of {runs} runs are finished."
+    return f"{text}; {finished} of {len(study.runs)} runs are finished."
 
 
 def _control(sweep: Sweep, study: Study, stage: Stage) -> str:
@@ -171,14 +171,17 @@ def seeds_needed(claims: Sequence[Claim], means: Sequence[Mean], family: int) ->
             f"All are within {margin:g} of the ceiling or the floor, where seeds differ less than "
             "elsewhere: their spread does not tell how many would be needed."
         )
-    bounded = {(mean.condition.label, mean.task) for mean in means if _at_a_bound(mean, margin)}
+    bounded = {(mean.condition, mean.task) for mean in means if _at_a_bound(mean, margin)}
     clear = [
         claim.contrast
         for claim in claims
         if claim.margin is not None
         and np.isfinite(claim.contrast.spread)
         and min(claim.contrast.seeds) >= FEWEST_SEEDS
-        and not {(claim.first, claim.task), (claim.second, claim.task)} & bounded
+        and not any(
+            all((condition, claim.task) in bounded for condition in side)
+            for side in zip(*claim.pairs, strict=True)
+        )
     ]
     if not clear:
         return None

@@ -38,6 +38,11 @@ class Measure:
         return self.metric in names.EVAL_RATES
 
     @property
+    def kind_in_words(self) -> str:
+        """`area under the curve`, or `final value`."""
+        return "final value" if self.kind == "final" else "area under the curve"
+
+    @property
     def words(self) -> str:
         """`mean success over 100,000 steps`."""
         word = names.word_of(self.metric)
@@ -61,13 +66,8 @@ def measure_on(
     sweep: Sweep, task: str, runs: Sequence[int], kind: str, metric: str | None = None
 ) -> Measure:
     """The measure of the runs on a task, over a budget that each of them has."""
-    budgets = [
-        float(sweep.runs[run].budget or sweep.last_step(run))
-        for run in runs
-        if sweep.runs[run].task == task
-    ]
     metric = metric or sweep.primary_metric(task)
-    return Measure(kind=kind, metric=metric, horizon=min(budgets, default=0.0))
+    return Measure(kind=kind, metric=metric, horizon=sweep.least_budget(task, runs))
 
 
 def scores_of(sweep: Sweep, condition: Condition, task: str, measure: Measure) -> Scores:

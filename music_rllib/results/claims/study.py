@@ -46,6 +46,8 @@ class Claim:
     margin: float | None
     """Difference below which it does not matter; None where none was stated."""
     contrast: Contrast
+    pairs: Cells = field(repr=False)
+    """Pairs of conditions, alike in the rest, over which it is the mean."""
     p_value: float = 1.0
     """Adjusted p-value of no difference; it and the fields below are set by :func:`_decided`."""
     p_equivalent: float | None = None
@@ -54,8 +56,12 @@ class Claim:
     planned: bool = False
     """Whether it was stated before the first of its runs had finished."""
     hypothesis: Hypothesis | None = None
-    cells: int = 1
-    """Number of pairs of conditions, alike in the rest, over which it is the mean."""
+
+    @property
+    def subject(self) -> tuple[object, ...]:
+        """What it is about: two claims on the same subject differ in nothing but the plan."""
+        pairs = frozenset(frozenset(pair) for pair in self.pairs)
+        return pairs, self.task, self.measure.kind, self.measure.metric
 
     @property
     def p_of_verdict(self) -> float:
@@ -107,6 +113,10 @@ class Study:
     """Other claims: hypotheses that are only in `latest`, and other pairs of the stage."""
     untested: tuple[str, ...]
     """Hypotheses that can't be tested, with the reason."""
+    runs: tuple[int, ...]
+    """Positions in `Sweep.runs` of what may be compared, of the stage and those of `plan`."""
+    family: int
+    """Number of comparisons that `claims` are corrected for, those that can't be tested included."""
 
     @property
     def question(self) -> str | None:
@@ -134,7 +144,7 @@ def study_of(
         sweep: its runs, with the metrics that are read.
         stage: of the comparisons that nobody planned; None: the plan's, or the last that trains
             for the task.
-        metric: of those; None: each task's primary one.
+        metric: of those; None: each task's primary one, measured as the plan says.
         maximised: whether more of `metric` is better.
     """
     stages = {found.name: found for found in find_stages(sweep)}
@@ -145,35 +155,44 @@ def study_of(
         chosen = next((s for s in reversed(stages.values()) if s.has_task_reward), None)
     untested: list[str] = []
     planned = list(_of_plan(sweep, stages, plan, (), untested)) if plan else []
+    without_test = len(untested)
     afterwards: list[Claim] = []
     if latest is not None and latest != plan:
         known = plan.plan.hypotheses if plan and _same_test(plan, latest) else ()
         afterwards += _of_plan(sweep, stages, latest, known, untested)
     means: list[Mean] = []
     if chosen is not None:
-        runs = [run for condition in chosen.compared for run in condition.runs]
+        kind, margin = "auc", None
+        if latest is not None and metric is None:
+            kind, margin = latest.plan.metric, latest.plan.margin
         measures = {
-            task: replace(measure_on(sweep, task, runs, "auc", metric), maximised=maximised)
+            task: replace(measure_on(sweep, task, _runs(chosen), kind, metric), maximised=maximised)
             for task in chosen.tasks
         }
         means += _means(sweep, chosen, measures)
-        margin = latest.plan.margin if latest else None
-        seen = {(frozenset((one.first, one.second)), one.task) for one in (*planned, *afterwards)}
+        seen = {claim.subject for claim in (*planned, *afterwards)}
         pairs = [(label_of(x), label_of(y), [(x, y)]) for x, y in _pairs(chosen.compared)]
         afterwards += [
-            claim
-            for claim in _claims(sweep, pairs, measures, margin)
-            if (frozenset((claim.first, claim.second)), claim.task) not in seen
+            claim for claim in _claims(sweep, pairs, measures, margin) if claim.subject not in seen
         ]
+    about = [stages[name] for name in (plan.plan.stages if plan else ()) if name in stages]
+    family = len(planned) + without_test if plan else len(afterwards)
     return Study(
         stage=chosen,
         plan=plan,
         latest=latest,
         means=tuple(means),
-        planned=_decided(planned, planned=True),
+        planned=_decided(planned, planned=True, without_test=without_test),
         afterwards=_decided(afterwards, planned=False),
         untested=tuple(dict.fromkeys(untested)),
+        family=family,
+        runs=tuple({run: None for stage in filter(None, [chosen, *about]) for run in _runs(stage)}),
     )
+
+
+def _runs(stage: Stage) -> list[int]:
+    """The runs of a stage's conditions that may be compared."""
+    return [run for condition in stage.compared for run in condition.runs]
 
 
 def _planned(sweep: Sweep, stages: Mapping[str, Stage]) -> PlanVersion | None:
@@ -209,7 +228,7 @@ def _of_plan(
             continue
         runs = [run for pair in cells for condition in pair for run in condition.runs]
         measures = {
-            task: measure_on(sweep, task, runs, version.plan.metric)
+            task: _as_planned(measure_on(sweep, task, runs, version.plan.metric), task, version)
             for task in dict.fromkeys(sweep.runs[run].task for run in runs)
         }
         labelled = (in_words(hypothesis.first), in_words(hypothesis.second), cells)
@@ -217,6 +236,11 @@ def _of_plan(
         if not claims:
             untested.append(f"{text}: no seed has finished in both conditions")
         yield from (replace(claim, hypothesis=hypothesis) for claim in claims)
+
+
+def _as_planned(measure: Measure, task: str, version: PlanVersion) -> Measure:
+    """The measure over no more than the budget that was planned."""
+    return replace(measure, horizon=min(measure.horizon, version.plan.budget.get(task, np.inf)))
 
 
 def _claims(
@@ -246,7 +270,7 @@ def _claims(
                     measure=measure,
                     margin=own_margin,
                     contrast=tested,
-                    cells=len(cells),
+                    pairs=cells,
                 )
 
 
@@ -267,18 +291,19 @@ def label_of(condition: Condition) -> str:
 def _pairs(conditions: Sequence[Condition]) -> list[tuple[Condition, Condition]]:
     """Pairs of a later condition and an earlier one; of many conditions, each and its reference.
 
-    The reference is the condition alike in the rest with q = 1, or with the smallest q.
+    The reference is the condition alike in the rest with q = 1, or with the smallest q; where no
+    two conditions are alike in the rest, the first of those with this q.
     """
     if len(conditions) <= MOST_CONDITIONS:
         return [(second, first) for first, second in combinations(conditions, 2)]
     indices = [one.entropic_index for one in conditions]
     reference = "1" if "1" in indices else indices[0]
     references = {one.others: one for one in conditions if one.entropic_index == reference}
-    return [
-        (one, references[one.others])
-        for one in conditions
-        if one.others in references and one is not references[one.others]
-    ]
+    pairs = [(one, references[one.others]) for one in conditions if one.others in references]
+    if all(one is other for one, other in pairs):
+        first = conditions[indices.index(reference)]
+        pairs = [(one, first) for one in conditions]
+    return [(one, other) for one, other in pairs if one is not other]
 
 
 def _contrast(
@@ -314,8 +339,8 @@ def _complete(columns: Sequence[Scores]) -> dict[str, Array]:
     return {seed: np.array([c.by_seed[seed] for c in columns]) for seed in seeds}
 
 
-def _decided(claims: Sequence[Claim], *, planned: bool) -> tuple[Claim, ...]:
-    """The claims with adjusted p-values and verdicts, as one family."""
+def _decided(claims: Sequence[Claim], *, planned: bool, without_test: int = 0) -> tuple[Claim, ...]:
+    """The claims with adjusted p-values and verdicts, as one family with those without a test."""
     opposite = {Verdict.SUPERIOR: Verdict.WORSE, Verdict.WORSE: Verdict.SUPERIOR}
     return tuple(
         replace(
@@ -326,7 +351,7 @@ def _decided(claims: Sequence[Claim], *, planned: bool) -> tuple[Claim, ...]:
             planned=planned,
         )
         for claim, (p_value, p_equivalent, verdict) in zip(
-            claims, decide([claim.contrast for claim in claims]), strict=True
+            claims, decide([claim.contrast for claim in claims], without_test), strict=True
         )
     )
 

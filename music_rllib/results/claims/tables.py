@@ -47,7 +47,7 @@ def claim_rows(study: Study) -> list[dict[str, Any]]:
             "as_expected": claim.confirmed,
             "paired": claim.contrast.paired,
             "seeds": list(claim.contrast.seeds),
-            "pairs_of_conditions": claim.cells,
+            "pairs_of_conditions": len(claim.pairs),
         }
         for claim in (*study.planned, *study.afterwards)
     ]

@@ -142,7 +142,9 @@ def test_a_sweep_says_where_and_with_both_numbers(
         ([0, -41, 41], [0, 0, 0], [False, True, True]),
         # A policy so narrow that its entropies weigh as much as ten rewards, and later not.
         ([-41, -300, -300, -500], [0, -10, 0, 0], [True, False, False, True]),
-        ([math.nan, -math.inf, -41], [0, 0, math.nan], [False, True, False]),
+        ([math.nan, -math.inf, -41], [0, 0, math.nan], [False, True, True]),
+        # An entropy that is not known hides nothing that comes later.
+        ([0, -41, -41], [math.nan, 0, 0], [False, True, True]),
     ],
 )
 def test_critics_that_no_return_explains_have_diverged(

@@ -127,6 +127,44 @@ def said_about(sweep: Sweep) -> str:
 # What is said -----------------------------------------------------------------------------------
 
 
+def test_stages_of_other_budgets_are_read_where_the_shortest_ends() -> None:
+    """Both climb alike: at its own end the longer one is far ahead."""
+    runs = []
+    for seed in range(5):
+        final = 0.8 + 0.01 * seed
+        short = one_run("1", seed, stage="her", params={"env_steps": "100000"})
+        runs.append((short, climbing(final, 100_000)))
+        runs.append((one_run("1", seed), climbing(final)))
+    made = build_report(sweep_of(runs))
+    assert made.together is not None
+    (comparison,) = made.together.scopes[0].comparisons
+    assert float(comparison.gap.value) == pytest.approx(0)
+    assert not any(race.decided for race in made.together.races)
+    page = unescape(render(made))
+    assert "After 100,000 steps, when the first stage ends: " in page
+    assert "At the end of training" not in page
+
+
+def test_stages_that_are_alike_as_file_names_keep_their_figures() -> None:
+    runs = [
+        (one_run(q, seed, stage=stage), climbing(0.1 * seed))
+        for stage in ("run_1", "run-1")
+        for q in ("1", "1.5")
+        for seed in range(3)
+    ]
+    figures = build_report(sweep_of(runs)).figures
+    assert len(figures.pictures) == len(figures.drawings)
+
+
+def test_runs_without_a_seed_and_with_an_infinite_return_are_reported() -> None:
+    record, points = one_run("1", 0), climbing(0.5)
+    record = replace(record, params={**record.params, "task.success_key": "None"})
+    endless = Points([names.EVAL_RETURN] * 2, [1, 2], [1, 2], [1.0, np.inf])
+    nameless = {tag: text for tag, text in record.tags.items() if tag != names.TAG_SEED}
+    runs = [(record, endless), (replace(record, tags=nameless), points)]
+    assert render(build_report(sweep_of(runs)))
+
+
 def test_runs_whose_critics_diverged_are_named() -> None:
     """With the MI reward a step is worth -1.5 at least, so that -60 at gamma 0.95 is too low."""
     known = {"task.reward_range": "[-1.0, 0.0]", "tac.gamma": "0.95"}

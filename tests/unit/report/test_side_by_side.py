@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from music_rllib import names
 from music_rllib.report.build import build_report
 from music_rllib.report.page import render
-from music_rllib.report.pieces import Cell
+from music_rllib.report.pieces import DASH, Cell
 from music_rllib.report.side_by_side import side_by_side
 from music_rllib.results.archive.folder import read_archive
 
@@ -40,6 +41,26 @@ def test_the_page_of_two_sweeps_says_what_differs() -> None:
         "proof-fetch-reach (first)",
         "proof-fetch-reach (second)",
     }
+
+
+def test_conditions_that_their_pretraining_tells_apart_find_each_other() -> None:
+    first = read_archive(DATA / "proof-fetch-reach")
+    source, other, *rest = first.runs
+    runs = [
+        replace(
+            run, tags={**run.tags, names.TAG_STAGE: "pre"}, params={**run.params, "music.lr": lr}
+        )
+        for run, lr in ((source, "0.1"), (other, "0.2"))
+    ]
+    runs += [
+        replace(run, tags={**run.tags, names.TAG_SOURCE_NODE: runs[position % 2].node_key})
+        for position, run in enumerate(rest)
+    ]
+    first = replace(first, runs=runs)
+    second = replace(first, name="other")
+    _, results = build_report(side_by_side(first, second), beside=(first, second)).differences
+    assert any("pre: music.lr" in str(label) for _, _, label, *_ in results.rows)
+    assert all(DASH not in (mean, other) for *_, mean, other, _, _ in results.rows)
 
 
 def test_what_is_missing_is_said_of_the_sweep_that_lacks_it() -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from music_rllib import names
 from music_rllib.report.figures.draw import files
-from music_rllib.report.study import study_csv, study_drawings
+from music_rllib.report.study import study_csv, study_drawings, study_tables
 from music_rllib.results.claims.answer import answer, seeds_needed
 from music_rllib.results.claims.contrasts import Verdict
 from music_rllib.results.claims.plan import AnalysisPlan, PlanVersion, checked_plans, with_plan
@@ -212,11 +212,11 @@ def test_settings_that_a_hypothesis_leaves_open_are_averaged(rng: np.random.Gene
         for seed in range(5)
     ]
     (claim,) = study_of(sweep_of(runs, BEFORE)).planned
-    assert (claim.cells, claim.contrast.seeds) == (2, (5, 5))
+    assert (len(claim.pairs), claim.contrast.seeds) == (2, (5, 5))
     assert float(claim.contrast.difference.value) == pytest.approx(0.1, abs=0.03)
     one = with_plan((), plan("q = 1.5, alpha = 0.1 against q = 1, alpha = 0.01"), 5)
     (claim,) = study_of(sweep_of(runs, one)).planned
-    assert (claim.cells, claim.first) == (1, "q = 1.5, α = 0.1")
+    assert (len(claim.pairs), claim.first) == (1, "q = 1.5, α = 0.1")
     assert float(claim.contrast.difference.value) == pytest.approx(0.3, abs=0.03)
     vague = with_plan((), plan("q = 1.5, alpha = 0.1 against q = 1"), 5)
     assert "it must name more" in study_of(sweep_of(runs, vague)).untested[0]
@@ -259,6 +259,99 @@ def test_many_conditions_are_held_against_q_1_alike_in_the_rest(rng: np.random.G
     pairs = [(one.first, one.second) for one in study_of(sweep_of(runs)).afterwards]
     assert ("q = 2, α = 0.1", "q = 1, α = 0.1") in pairs
     assert len(pairs) == 6
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        [("1", "0.05"), *((str(q), f"0.{q}") for q in range(2, 8))],
+        [("1", f"0.{alpha}") for alpha in range(1, 8)],
+    ],
+    ids=["each q has an alpha of its own", "one q"],
+)
+def test_many_conditions_none_of_which_are_alike_in_the_rest_are_held_against_the_first(
+    settings: Sequence[tuple[str, str]], rng: np.random.Generator
+) -> None:
+    runs = [
+        run({"tac.entropic_index": q, "tac.alpha": alpha}, seed, 0.2, rng)
+        for q, alpha in settings
+        for seed in range(2)
+    ]
+    found = study_of(sweep_of(runs)).afterwards
+    assert len(found) == 6
+    (reference,) = {claim.second for claim in found}
+    assert reference == ", ".join((f"q = {settings[0][0]}", f"α = {settings[0][1]}"))
+
+
+def own_alphas(rng: np.random.Generator) -> list[tuple[RunRecord, Points]]:
+    return [
+        run({"tac.entropic_index": q, "tac.alpha": alpha}, seed, height, rng)
+        for q, alpha, height in (("1", "0.15", 0.3), ("1.5", "0.05", 0.33), ("2", "0.05", 0.3))
+        for seed in range(6)
+    ]
+
+
+def test_what_was_planned_is_not_compared_a_second_time_under_another_name(
+    rng: np.random.Generator,
+) -> None:
+    sweep = sweep_of(own_alphas(rng), BEFORE)
+    found = study_of(sweep)
+    assert [claim.first for claim in found.planned] == ["q = 1.5"]
+    assert [(claim.first, claim.second) for claim in found.afterwards] == [
+        ("q = 2, α = 0.05", "q = 1, α = 0.15"),
+        ("q = 2, α = 0.05", "q = 1.5, α = 0.05"),
+    ]
+    # Another metric is another comparison, for which the plan has no margin.
+    other = study_of(sweep, metric=names.EVAL_EPISODES)
+    assert len(other.afterwards) == 3
+    assert {claim.margin for claim in other.afterwards} == {None}
+
+
+def test_a_plan_for_final_values_compares_everything_by_them(rng: np.random.Generator) -> None:
+    final = with_plan((), plan("q = 1.5 against q = 1", metric="final"), DONE - 1)
+    found = study_of(sweep_of(own_alphas(rng), final))
+    claims = (*found.planned, *found.afterwards)
+    assert {claim.measure.words for claim in claims} == {"final success"}
+    assert {mean.measure.kind for mean in found.means} == {"final"}
+    comparisons, means = study_tables(found)
+    assert comparisons.title == "Comparisons by the final value"
+    assert means.title == "Final value of each condition"
+
+
+def test_a_condition_of_which_all_runs_failed_counts_as_unfinished(
+    rng: np.random.Generator,
+) -> None:
+    hypotheses = ("q = 1.5 against q = 1", "q = 2 against q = 1")
+    two = with_plan((), plan(*hypotheses), DONE - 1)
+    runs = own_alphas(rng)
+    whole = study_of(sweep_of(runs, two))
+    runs[12:] = [(replace(record, status="FAILED"), points) for record, points in runs[12:]]
+    sweep = sweep_of(runs, two)
+    found = study_of(sweep)
+    assert "12 of 18 runs are finished" in " ".join(answer(sweep, found))
+    assert "q = 2 against q = 1: no seed has finished in both" in found.untested[0]
+    # Its test was planned and still counts for Holm's correction.
+    assert found.planned[0].p_value == pytest.approx(2 * float(found.planned[0].contrast.p_value))
+    assert whole.planned[0].contrast.p_value == found.planned[0].contrast.p_value
+
+
+def test_runs_are_compared_over_the_budget_that_was_planned(rng: np.random.Generator) -> None:
+    short = with_plan((), plan("q = 1.5 against q = 1", budget={"FetchPush": 4000}), DONE - 1)
+    (claim,) = study_of(sweep_of(study({"1": 0.3, "1.5": 0.3}, 3, rng), short)).planned
+    assert claim.measure.horizon == 4000
+
+
+def test_conditions_at_a_ceiling_are_left_out_also_where_each_has_an_alpha(
+    rng: np.random.Generator,
+) -> None:
+    runs = [
+        run({"tac.entropic_index": q, "tac.alpha": alpha}, seed, height, rng)
+        for q, alpha, height in (("1", "0.15", 0.3), ("1.5", "0.05", 0.0))
+        for seed in range(4)
+    ]
+    found = study_of(sweep_of(runs, BEFORE))
+    assert len(found.planned) == 1
+    assert seeds_needed(found.planned, found.means, 1) is None
 
 
 def test_of_a_search_only_fresh_seeds_count_and_each_q_has_its_own_alpha(

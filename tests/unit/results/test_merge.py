@@ -103,7 +103,10 @@ def test_runs_of_an_earlier_version_are_found_where_there_are_none_of_a_later_on
     ]
     found = of_plan(plan, exports, earlier)
     assert found is not None
-    expected = [before[0], now[1], *before[2:]]
-    assert [run.node_key for run in found.runs] == expected
+    # The run that starts from it is of the earlier version, and did not start from this one.
+    assert [run.node_key for run in found.runs] == before
+    found = of_plan(plan, [*exports, sweep((now[3], "FINISHED", [4]))], earlier)
+    assert found is not None
+    assert [run.node_key for run in found.runs] == [before[0], now[1], before[2], now[3]]
     algorithms = [run.tags[names.TAG_ALGORITHM] for run in found.runs]
-    assert algorithms == ["2", ALGORITHM_VERSION, "2", "2"]
+    assert algorithms == ["2", ALGORITHM_VERSION] * 2

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -73,9 +75,24 @@ def test_where_nobody_gets_there_nothing_is_compared() -> None:
 def test_a_run_that_may_still_get_there_says_nothing() -> None:
     (found,) = race([*finished(3), ("RUNNING", None), ("FAILED", None)], finished(5))
     assert found.runs == (1, 1)
-    (found,) = race([*finished(3), ("RUNNING", 2)], finished(5))
-    assert found.runs == (2, 1), "one that is there already has a time"
+    (found,) = race([*finished(3), ("RUNNING", 2), ("FAILED", 1)], finished(5))
+    assert found.runs == (1, 1), "of runs that were stopped early only the quick ones are there"
     assert race([("RUNNING", None)], finished(5)) == ()
+
+
+def test_runs_of_another_length_race_over_the_smaller_budget() -> None:
+    """A longer run is there at the end; at the other's end neither was."""
+    long = finished(*[BUDGET] * 6)
+    sweep = sweep_of([*long, *finished(*[None] * 6)])
+    half = BUDGET // 2
+    sweep = replace(
+        sweep,
+        runs=[replace(run, params={"env_steps": str(BUDGET)}) for run in sweep.runs[:6]]
+        + [replace(run, params={"env_steps": str(half)}) for run in sweep.runs[6:]],
+    )
+    (found,) = races(sweep, "Push", {"long": range(6), "short": range(6, 12)}, 0.9)
+    assert not found.reached
+    assert float(found.estimate.value) == 0.5
 
 
 def test_only_the_task_s_own_runs_race() -> None:
