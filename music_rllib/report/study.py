@@ -15,6 +15,8 @@ from music_rllib.results.claims.study import Claim, Study, label_of
 from music_rllib.results.claims.tables import claim_rows, mean_rows
 from music_rllib.results.comparison import SHOW_SEEDS_BELOW, number, p_text
 
+_VERDICT = ("Verdict", "Planned", "Seeds")
+
 
 def study_tables(study: Study) -> list[TextTable]:
     """The comparisons, planned ones first, and the primary metric of each condition."""
@@ -29,7 +31,7 @@ def _kind(study: Study) -> str:
 def _claims_table(study: Study) -> TextTable:
     return TextTable(
         title=f"Comparisons by the {_kind(study)}",
-        header="Task,Pair,Measure,Difference,95 % interval,p,Verdict,Planned,Seeds".split(","),
+        header=("Task", "Pair", "Measure", "Difference", "95 % interval", "p", *_VERDICT),
         rows=[
             (
                 claim.task,

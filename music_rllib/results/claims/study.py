@@ -116,7 +116,7 @@ class Study:
     runs: tuple[int, ...]
     """Positions in `Sweep.runs` of what may be compared, of the stage and those of `plan`."""
     family: int
-    """Number of comparisons that `claims` are corrected for, those that can't be tested included."""
+    """Number of comparisons that `claims` are corrected for, with those that can't be tested."""
 
     @property
     def question(self) -> str | None:

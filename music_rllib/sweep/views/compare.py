@@ -55,7 +55,7 @@ def _areas_table(rows: Sequence[Mapping[str, Any]]) -> Table:
     measure = " or ".join(dict.fromkeys(row["measure"] for row in rows))
     task = _task_column(rows)
     heads = ("condition", *task, "mean, 95 %", "each seed", "runs")
-    table = new_table(f"Area under the learning curve: {measure}", heads, left=["condition"])
+    table = new_table(f"Compared by: {measure}", heads, left=["condition"])
     for row in rows:
         table.add_row(
             row["condition"],
