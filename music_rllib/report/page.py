@@ -173,10 +173,11 @@ def _answer(report: Report) -> list[str]:
         return []
     planned = planned_in_words(report.study)
     lines = [*answer(report.sweep, report.study)[1:], f"{planned[0].upper()}{planned[1:]}."]
+    lines.append(f"{_read_at(main)}: {verdict(main.scopes[0], report.difference)[0]}")
     others = [one for one in report.analyses if one.stage.has_task_reward and one is not main]
-    firsts = [] if report.together else [verdict(s.scopes[0])[0] for s in others if s.scopes]
-    finals = [f"{_read_at(main)}: {verdict(main.scopes[0], report.difference)[0]}"]
-    return [*lines, *finals, *(f"At the end of training: {line}" for line in firsts)]
+    if report.together is None:
+        lines += [f"Stage {s.stage.name}: {verdict(s.scopes[0])[0]}" for s in others if s.scopes]
+    return lines
 
 
 def _read_at(main: StageAnalysis) -> str:

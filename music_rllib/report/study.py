@@ -15,8 +15,6 @@ from music_rllib.results.claims.study import Claim, Study, label_of
 from music_rllib.results.claims.tables import claim_rows, mean_rows
 from music_rllib.results.comparison import SHOW_SEEDS_BELOW, number, p_text
 
-_VERDICT = ("Verdict", "Planned", "Seeds")
-
 
 def study_tables(study: Study) -> list[TextTable]:
     """The comparisons, planned ones first, and the primary metric of each condition."""
@@ -29,24 +27,25 @@ def _kind(study: Study) -> str:
 
 
 def _claims_table(study: Study) -> TextTable:
+    claims = (*study.planned, *study.afterwards)
+    measures = " or ".join(dict.fromkeys(claim.measure.words for claim in claims))
     return TextTable(
         title=f"Comparisons by the {_kind(study)}",
-        header=("Task", "Pair", "Measure", "Difference", "95 % interval", "p", *_VERDICT),
+        header=("Task", "Pair", "Difference", "95 % interval", "p", "Verdict", "Planned", "Seeds"),
         rows=[
             (
                 claim.task,
                 f"{claim.first} against {claim.second}",
-                claim.measure.words,
                 *estimate_cells(claim.contrast.difference),
                 *_p_and_verdict(claim),
                 "yes" if claim.planned else "no",
                 " and ".join(map(str, dict.fromkeys(claim.contrast.seeds))),
             )
-            for claim in (*study.planned, *study.afterwards)
+            for claim in claims
         ],
-        note="Differences of a seed where seeds are shared (Student's t, Welch's otherwise); "
-        "equivalence by two one-sided tests. Holm's correction over what was planned, and over the "
-        "rest.",
+        note=f"Differences in {measures}, of a seed where seeds are shared (Student's t, Welch's "
+        "otherwise); equivalence by two one-sided tests. Holm's correction over what was planned, "
+        "and over the rest.",
     )
 
 

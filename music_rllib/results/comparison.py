@@ -181,9 +181,8 @@ def verdict(scope: Scope[C], gap: float = GAP, *, maximised: bool = True) -> lis
             "those that they are chosen by, trials are not compared: the best is so by luck, too."
         ]
     if len(scope.compared) == 1:
-        only = scope.compared[0]
         return [
-            f"Only one condition has finished {where}, so nothing is compared: {_in_words(only)}."
+            f"Nothing is compared {where}: only {_in_words(scope.compared[0])} has finished runs."
         ]
     single = [final for final in scope.compared if final.seeds < 2]
     if single:

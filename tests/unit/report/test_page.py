@@ -268,7 +268,7 @@ def test_a_threshold_that_nobody_reaches_is_said_to_be_that() -> None:
 @pytest.mark.parametrize(
     "finals, expected",
     [
-        ({"1.5": [0.5, 0.6]}, "Only one condition has finished"),
+        ({"1.5": [0.5, 0.6]}, "Nothing is compared on FetchPush: only q = 1.5 with 0.55 ("),
         ({"1": [0.1], "1.5": [0.9]}, "every condition has a single seed, so there is no interval"),
         ({"1": [0.1], "1.5": [0.9], "2": [0.5, 0.6]}, "q = 1 and q = 1.5 have a single seed"),
         ({"1": [0.3, 0.3], "1.5": [0.4, 0.4]}, "Seeds ended alike: their spread does not tell"),
