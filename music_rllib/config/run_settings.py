@@ -155,6 +155,8 @@ class RunSettings(StrictModel):
             seed=self.seed,
             node_key=node_key,
             spaces=spaces,
+            observation_clip=self.tac.observation_clip,
+            max_episode_steps=self.tac.max_episode_steps,
         )
 
     def identity(self) -> dict[str, Any]:

@@ -98,10 +98,16 @@ def _is_flat(space: gym.Space[Any] | None) -> bool:
 
 
 def check_action_space(space: gym.Space[Any]) -> spaces.Box:
-    """Returns the space; raises ValueError unless it is a bounded one-dimensional Box."""
-    if not (isinstance(space, spaces.Box) and len(space.shape) == 1 and space.is_bounded("both")):
+    """Returns the space; raises ValueError unless it is a bounded one-dimensional Box of floats."""
+    if not (
+        isinstance(space, spaces.Box)
+        and len(space.shape) == 1
+        and space.is_bounded("both")
+        and np.issubdtype(space.dtype, np.floating)
+    ):
         raise ValueError(
-            f"environment: the action space must be a bounded one-dimensional Box, got {space}"
+            "environment: the action space must be a bounded one-dimensional Box of floats, got "
+            f"{space}"
         )
     return space
 

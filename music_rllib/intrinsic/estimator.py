@@ -131,7 +131,9 @@ class MutualInformationEstimator(nn.Module):
         minibatches: <= 0.
         """
         frames = self.pairs(states, followers)
-        return self.bound(frames, two_frames(len(frames), swapped).to(frames.device))
+        # Not copied from the CPU, which a captured update may not do.
+        times = torch.arange(2, device=frames.device)
+        return self.bound(frames, (times.flip(0) if swapped else times).expand(len(frames), 2))
 
     def pairs(self, states: Tensor, followers: Tensor) -> Tensor:
         """[..., B, D] states and followers -> [..., B, 2, d] what is read of them, side by side."""

@@ -128,7 +128,8 @@ def policy_from_folder(folder: Path, env: str | Sequence[Task] = ()) -> Policy:
         HandoffError: there are no weights.
     """
     for inside in (MLFLOW_FILE, f"artifacts/{MLFLOW_FILE}"):
-        if (folder / inside).is_file():
+        # A handoff's own file of weights has the same name.
+        if (folder / inside).is_file() and not (folder / HANDOFF_FILE).is_file():
             return _from_file(folder / inside, env)
     try:
         handoff_parent, manifest = open_handoff(folder)
@@ -137,10 +138,10 @@ def policy_from_folder(folder: Path, env: str | Sequence[Task] = ()) -> Policy:
     info = manifest.info
     wanted = ["policy", "normaliser"] if info.architecture.normalise_observations else ["policy"]
     parts = read_handoff(handoff_parent, wanted, info.task)
-    run = _run_settings(folder / RUN_FILE)
-    tac = run.tac if run else TACSettings()
+    if info.observation_clip is None:
+        info = _completed(info, handoff_parent)
     try:
-        network = _network(parts, info, tac, _spaces(info, env))
+        network = _network(parts, info, _spaces(info, env))
     except PolicyError:
         raise
     except (ValueError, LookupError) as error:
@@ -173,7 +174,6 @@ def _several_policies(folder: Path) -> PolicyError | None:
 def _network(
     parts: Mapping[str, Mapping[str, NDArray[Any]]],
     info: HandoffInfo,
-    tac: TACSettings,
     spaces: Spaces,
 ) -> PolicyNetwork:
     policy = parts["policy"]
@@ -186,17 +186,19 @@ def _network(
             f"{spaces.observation_size} and {spaces.goal_size}"
         )
     normaliser = parts.get("normaliser")
-    limit = min(tac.max_episode_steps or info.task.horizon, info.task.horizon)
+    limit = min(info.max_episode_steps or info.task.horizon, info.task.horizon)
+    clip = info.observation_clip if normaliser else None
+    about = info.model_dump(mode="json", exclude={"spaces", "observation_clip"})
     return PolicyNetwork(
         weights=tuple(_floats(policy[f"{i}.weight"]) for i in layers),
         biases=tuple(_floats(policy[f"{i}.bias"]) for i in layers),
         mean=_floats(normaliser["mean"] if normaliser else np.zeros(features)),
         inverse_std=_floats(normaliser["inverse_std"] if normaliser else np.ones(features)),
-        clip=tac.observation_clip if normaliser else float(np.finfo(np.float32).max),
+        clip=float(np.finfo(np.float32).max) if clip is None else clip,
         low=np.asarray(spaces.action_low, np.float32),
         high=np.asarray(spaces.action_high, np.float32),
         goal_size=spaces.goal_size,
-        about={**info.model_dump(mode="json", exclude={"spaces"}), "max_episode_steps": limit},
+        about={**about, "max_episode_steps": limit},
     )
 
 
@@ -275,6 +277,18 @@ def _local_copy(place: str) -> Iterator[Path]:
 
 
 _FILES = {RUN_FILE, HANDOFF_FILE, MLFLOW_FILE, f"artifacts/{MLFLOW_FILE}"}
+
+
+def _completed(info: HandoffInfo, handoff: Path) -> HandoffInfo:
+    """A handoff of an earlier version with what its run's settings say, or else the defaults."""
+    run = _run_settings(handoff / RUN_FILE) or _run_settings(handoff.parent / RUN_FILE)
+    tac = run.tac if run else TACSettings()
+    return info.model_copy(
+        update={
+            "observation_clip": tac.observation_clip,
+            "max_episode_steps": tac.max_episode_steps,
+        }
+    )
 
 
 def _run_settings(path: Path) -> RunSettings | None:

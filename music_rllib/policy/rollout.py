@@ -96,7 +96,9 @@ def _episode(
         see(Moment(env, 0, None, _distance(observation)))
     steps = 0
     for steps in range(1, policy.max_episode_steps + 1):
-        action = policy.act(observation).astype(env.action_space.dtype)
+        # A bound may lie between two numbers of the policy's precision.
+        bounds = check_action_space(env.action_space)
+        action = np.clip(policy.act(observation).astype(bounds.dtype), bounds.low, bounds.high)
         observation, reward, terminated, truncated, info = env.step(action)
         total += float(reward)
         success = info.get(policy.task.success_key) if policy.task.success_key else None

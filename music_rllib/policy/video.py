@@ -58,11 +58,11 @@ def film(
     """
     frames: list[Frame] = []
     results: list[EpisodeResult] = []
-    _check_drawable(policy)
+    sizes = _sizes(policy)
     renderer, why_not = find_renderer(os.environ.get("MUJOCO_GL"))
     if renderer is not None:
         os.environ["MUJOCO_GL"] = renderer
-    env = open_task(policy, render_mode="rgb_array", **_size(policy))
+    env = open_task(policy, render_mode="rgb_array", **sizes)
     try:
         if why_not is not None and hasattr(env.unwrapped, "mujoco_renderer"):
             raise VideoError(why_not)
@@ -80,19 +80,19 @@ def film(
     return frames, results
 
 
-def _check_drawable(policy: Policy) -> None:
+def _sizes(policy: Policy) -> dict[str, int]:
+    """Size options of environments that MuJoCo draws; others choose their own size.
+
+    Raises:
+        VideoError: the environment can't be drawn.
+    """
     env = open_task(policy)
     modes = env.metadata.get("render_modes") or []
+    by_mujoco = hasattr(env.unwrapped, "mujoco_renderer")
     env.close()
     if "rgb_array" not in modes:
         raise VideoError(f"{policy.task.name} can't be drawn: it has no rgb_array rendering")
-
-
-def _size(policy: Policy) -> dict[str, int]:
-    """Size options of MuJoCo's environments; others choose their own size."""
-    name = "" if policy.environment is None else policy.environment.env_id
-    mujoco = any(word in name for word in ("Fetch", "Hand", "Cheetah", "Hopper", "Walker", "Ant"))
-    return {"width": SIZE, "height": SIZE} if mujoco else {}
+    return {"width": SIZE, "height": SIZE} if by_mujoco else {}
 
 
 def _picture(env: Env) -> Image.Image:

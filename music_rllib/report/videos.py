@@ -92,13 +92,15 @@ def _median_runs(
     if not analyses:
         return
     stage = analyses[-1].stage
-    qs = list(dict.fromkeys(condition.entropic_index for condition in stage.conditions))
+    # Of a search the chosen ones; its trials may be anything.
+    conditions = stage.compared or stage.conditions
+    qs = list(dict.fromkeys(condition.entropic_index for condition in conditions))
     tasks = stage.tasks if len(qs) * len(stage.tasks) <= MOST else stage.tasks[:1]
     for task in tasks:
         for q in qs[:MOST]:
             rated = [
                 (rate, run)
-                for condition in stage.conditions
+                for condition in conditions
                 if condition.entropic_index == q
                 for run in condition.runs
                 if sweep.runs[run].task == task

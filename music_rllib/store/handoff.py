@@ -118,6 +118,10 @@ class HandoffInfo(_Strict):
     algorithm_version: str = ALGORITHM_VERSION
     spaces: Spaces | None = None
     """Spaces of the environment; None in handoffs of earlier versions."""
+    observation_clip: float | None = None
+    """`tac.observation_clip`; None in handoffs of earlier versions."""
+    max_episode_steps: int | None = None
+    """`tac.max_episode_steps`."""
 
 
 class _Array(_Strict):

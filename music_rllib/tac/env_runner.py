@@ -99,6 +99,12 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
             goal=goal,
             horizon=episode_limit(self.env, self._settings.max_episode_steps),
         )
+        for name in ("agent_indices", "surrounding_indices"):
+            beyond = [index for index in getattr(self.config, name) if index >= observation]
+            if beyond:  # goals and actions come after it
+                raise ValueError(
+                    f"{name} must be < {observation}, the size of the observation, got {beyond[0]}"
+                )
 
     def _make_sub_env(self, vector_index: int) -> Env:
         context = EnvContext(

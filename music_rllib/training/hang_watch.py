@@ -113,7 +113,7 @@ def _innermost(stack: str) -> str:
 def _call_in(stack: str) -> str:
     if "env_runner.py" not in stack:
         return "step() or reset()"
-    return "reset()" if " in _begin" in stack else "step()"
+    return "reset()" if " in _start_episode" in stack else "step()"
 
 
 # -- the watching process ---------------------------------------------------------------------

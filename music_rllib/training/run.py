@@ -255,12 +255,16 @@ def _next_multiple(steps: int, interval: int) -> int:
 
 
 def _training_metrics(result: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
-    """The metrics that a report takes from an RLlib result, by their public names."""
+    """The metrics that a report takes from an RLlib result, by their public names.
+
+    RLlib's mean of nothing is NaN: of an iteration without an update there is no metric.
+    """
     episodes = result.get(ENV_RUNNER_RESULTS, {})
     for key, name in _TRAINING.items():
         if key in episodes:
             yield name, float(episodes[key])
     learner = result.get(LEARNER_RESULTS, {}).get(DEFAULT_MODULE_ID, {})
     for key, value in learner.items():
-        if key == HELD_OUT_STEPS or key.startswith(names.LEARNER_GROUPS):
+        wanted = key == HELD_OUT_STEPS or key.startswith(names.LEARNER_GROUPS)
+        if wanted and not np.isnan(value):
             yield key, float(value)

@@ -131,7 +131,25 @@ class Paced(Point):
         return super().step(action)
 
 
+class HandOver(Point):
+    """Is drawn in a size of its own, and takes no action beyond bounds that float32 can't hold."""
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        super().__init__()
+        self.action_space = spaces.Box(-0.1, 0.1, (2,), np.float64)
+        self.metadata = {"render_modes": ["rgb_array"]}
+        self.render_mode = render_mode
+
+    def step(self, action: Array) -> tuple[dict[str, Array], float, bool, bool, dict[str, Any]]:
+        assert self.action_space.contains(action), f"{action} is out of bounds"
+        return super().step(action)
+
+    def render(self) -> Any:
+        return np.zeros((16, 24, 3), np.uint8)
+
+
 gym.register("Point-v0", "point_env:Point", max_episode_steps=20)
 gym.register("Hanging-v0", entry_point="point_env:Hanging", max_episode_steps=20)
 gym.register("Meeting-v0", entry_point="point_env:Meeting", max_episode_steps=20)
+gym.register("HandOver-v0", entry_point="point_env:HandOver", max_episode_steps=20)
 gym.register("Paced-v0", entry_point="point_env:Paced", max_episode_steps=20)

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from music_rllib.tac.env_runner import TrajectoryEnvRunner
 from music_rllib.training.hang_watch import RECORD, HangError, check_hung
 from tests.faults import sweeps
 from tests.integration.conftest import ENVIRONMENTS, REPOSITORY, Program
@@ -103,6 +104,9 @@ def test_a_worker_that_is_killed_leaves_nothing_behind(tmp_path: Path) -> None:
     assert leaves_nothing_behind(tmp_path)
 
 
+BEGINS = TrajectoryEnvRunner._start_episode.__name__
+
+
 @pytest.mark.parametrize(
     ("record", "call", "place"),
     [
@@ -117,9 +121,9 @@ def test_a_worker_that_is_killed_leaves_nothing_behind(tmp_path: Path) -> None:
         (
             'a\n300.0\nThread 0x2 (most recent call first):\n  File "/x/lease.py", line 1 in w\n\n'
             "Current thread 0x1 (most recent call first):\n"
-            '  File "/x/tac/env_runner.py", line 9 in _begin\n',
+            f'  File "/x/tac/env_runner.py", line 9 in {BEGINS}\n',
             "reset",
-            'File "/x/tac/env_runner.py", line 9 in _begin',
+            f'File "/x/tac/env_runner.py", line 9 in {BEGINS}',
         ),
         ("a\n300.0\n", "step() or reset", "a place that is not known"),
     ],

@@ -68,6 +68,14 @@ def test_fetch_episodes_are_whole_and_aligned() -> None:
     assert not np.allclose(first.frames[0, 25:28], second.frames[0, 25:28])
 
 
+def test_a_split_beyond_the_observation_is_refused() -> None:
+    """Behind it lie goals and the action, which are no surroundings."""
+    config = TACConfig().environment("FetchPush-v4")
+    config.agent_indices, config.surrounding_indices = (0, 1, 2), (3, 25)
+    with pytest.raises(ValueError, match="surrounding_indices must be < 25, the size of the obs"):
+        TrajectoryEnvRunner(config=config, worker_index=0, num_workers=0)
+
+
 def test_every_episode_has_fresh_goals_and_one_seed_fixes_them_all() -> None:
     def goals(seed: int, evaluation: bool) -> np.ndarray:
         made = runner(seed=seed, evaluation=evaluation)
@@ -162,8 +170,10 @@ def test_noise_of_the_original_music() -> None:
 @pytest.mark.parametrize(
     ("space", "message"),
     [
-        (gym.spaces.Discrete(3), "must be a bounded one-dimensional Box, got Discrete"),
+        (gym.spaces.Discrete(3), "bounded one-dimensional Box of floats, got Discrete"),
         (gym.spaces.Box(-np.inf, np.inf, (2,)), "must be a bounded one-dimensional Box"),
+        # What a policy gives between whole numbers would all be cut to 0.
+        (gym.spaces.Box(-1, 1, (2,), np.int32), "of floats, got Box"),
     ],
 )
 def test_unusable_action_spaces_are_named(space: Any, message: str) -> None:

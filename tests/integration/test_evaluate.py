@@ -11,15 +11,18 @@ import pytest
 from PIL import Image
 
 from music_rllib.envs.tasks import BUILT_IN_TASKS, Task
-from music_rllib.policy import Policy, PolicyNetwork
+from music_rllib.policy import Policy, PolicyNetwork, load_policy
 from music_rllib.policy.rollout import open_task, play
 from music_rllib.policy.video import FORMATS, VideoError, film, find_renderer, write_video
 from music_rllib.sweep.cli import main
+from tests.integration.conftest import ENVIRONMENTS
 
 REACH = BUILT_IN_TASKS["FetchReach"]
 
 
-def policy_file(path: Path, task: Task, weight: np.ndarray[Any, Any], goal_size: int) -> Path:
+def policy_file(
+    path: Path, task: Task, weight: np.ndarray[Any, Any], goal_size: int, high: float = 1.0
+) -> Path:
     """A policy of one layer; `about` is what a run's own has."""
     actions, inputs = weight.shape
     network = PolicyNetwork(
@@ -28,8 +31,8 @@ def policy_file(path: Path, task: Task, weight: np.ndarray[Any, Any], goal_size:
         mean=np.zeros(inputs, np.float32),
         inverse_std=np.ones(inputs, np.float32),
         clip=5.0,
-        low=-np.ones(actions, np.float32),
-        high=np.ones(actions, np.float32),
+        low=-np.full(actions, high, np.float32),
+        high=np.full(actions, high, np.float32),
         goal_size=goal_size,
         about={
             "task": task.model_dump(mode="json"),
@@ -150,6 +153,19 @@ def test_a_film_shows_the_counted_episodes(good: Path) -> None:
     env.close()
     assert [one.seed for one in filmed] == [one.seed for one in counted]
     assert [one.success for one in filmed] == [one.success for one in counted]
+
+
+def test_an_environment_with_a_size_and_bounds_of_its_own_is_filmed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its name is like those of MuJoCo's; a saturated action is .1 in float32, which is more."""
+    monkeypatch.syspath_prepend(ENVIRONMENTS)
+    task = Task(name="Mine", env_id="point_env:HandOver-v0", horizon=20)
+    weight = np.full((2, 6), 100.0)
+    policy = load_policy(policy_file(tmp_path / "p.safetensors", task, weight, 2, high=0.1), [task])
+    frames, results = film(policy, 1, 0, "mine")
+    assert len(frames) > 20
+    assert results[0].env_steps == 20
 
 
 @pytest.mark.parametrize("ending", FORMATS)

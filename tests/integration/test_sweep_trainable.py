@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import sys
 import time
@@ -13,6 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from ray.rllib.core import DEFAULT_MODULE_ID
+from ray.rllib.utils.metrics import LEARNER_RESULTS
 from ray.tune.trainable import trainable
 
 from music_rllib import names
@@ -28,7 +31,7 @@ from music_rllib.store.run_record import from_json_lines
 from music_rllib.training import run as run_module
 from music_rllib.training import sample_run
 from music_rllib.training.job import NodeJob
-from music_rllib.training.run import TrainingRun, _means
+from music_rllib.training.run import TrainingRun, _means, _training_metrics
 from music_rllib.training.worker import CAUSE, NOTES, REPORTS, RunTrainable
 
 pytestmark = pytest.mark.integration
@@ -252,6 +255,25 @@ def test_the_bound_on_fresh_episodes_is_averaged_by_their_steps_over_a_report() 
     rounds = {"a": [1.0, 3.0], names.HELD_OUT_BOUND: [0.1, 0.4], HELD_OUT_STEPS: [30.0, 10.0]}
     assert _means(rounds) == pytest.approx({"a": 2.0, names.HELD_OUT_BOUND: 0.175})
     assert _means({"a": [1.0]}) == {"a": 1.0}
+
+
+def test_an_iteration_without_an_update_takes_no_metric_from_the_others() -> None:
+    learned = {"loss/critic": math.nan, "critics/mean": np.float32(2.0), "fps": 3.0}
+    assert dict(_training_metrics({LEARNER_RESULTS: {DEFAULT_MODULE_ID: learned}})) == {
+        "critics/mean": 2.0
+    }
+
+
+@pytest.mark.usefixtures("local_ray")
+def test_few_updates_leave_no_gap_in_the_curves(tmp_path: Path) -> None:
+    """Every second iteration has no update: it plays an episode of 20 steps, an update takes 40."""
+    base = settings("tac").tac.model_dump()
+    run = settings("tac", num_envs=1, tac=base | {"replay_ratio": 0.025})
+    node = job(tmp_path, run)
+    compute(node)
+    rows = [row for row in numbers(tmp_path, node) if row.get(names.GRAD_UPDATES)]
+    assert rows
+    assert not [row for row in rows for value in row.values() if math.isnan(value)]
 
 
 @pytest.mark.usefixtures("local_ray")

@@ -106,6 +106,23 @@ def test_says_what_it_is_for(tmp_path: Path) -> None:
     assert policy.action_size == ACTIONS
 
 
+@pytest.mark.parametrize("earlier", [False, True], ids=["its own", "of an earlier version"])
+@pytest.mark.parametrize("inside", ["handoff", ""], ids=["handoff", "node"])
+def test_a_handoff_acts_as_its_run(
+    inside: str, earlier: bool, tmp_path: Path, observations: np.ndarray[Any, Any]
+) -> None:
+    """Of an earlier version the settings are in the run's file only."""
+    trained = Trained(_run(max_episode_steps=20))
+    node = trained.write(tmp_path, settings=earlier)
+    if earlier:
+        manifest = json.loads((node / "handoff" / "handoff.json").read_text())
+        del manifest["info"]["observation_clip"], manifest["info"]["max_episode_steps"]
+        (node / "handoff" / "handoff.json").write_text(json.dumps(manifest))
+    policy = load_policy(node / inside)
+    assert policy.max_episode_steps == 20
+    np.testing.assert_allclose(policy.act(observations), trained.act(observations), atol=2e-6)
+
+
 def test_one_file_holds_all_of_it(tmp_path: Path, observations: np.ndarray[Any, Any]) -> None:
     policy = load_policy(Trained(_run()).write(tmp_path / "node"))
     (tmp_path / "packed.safetensors").write_bytes(policy.to_bytes())
