@@ -128,7 +128,7 @@ def goal_reward_of(env: Env) -> GoalReward:
 
     Resets `env` and takes one step in it to check the function: HER would silently learn from wrong
     rewards (HandManipulatePen of Gymnasium-Robotics 1.4.2 mixes up the rows of a batch). Raises
-    ValueError where a row's reward depends on more than its goals.
+    ValueError where a row's reward depends on more than its goals, or is not what a step gives.
     """
     compute = getattr(env.unwrapped, "compute_reward", None)
     if compute is None or not isinstance(env.observation_space, spaces.Dict):
@@ -144,11 +144,11 @@ def goal_reward_of(env: Env) -> GoalReward:
         return rewards
 
     try:
-        sound = _is_vectorised(reward, env)
+        problem = _problem_of(reward, env)
     except Exception as error:
-        raise ValueError(_not_vectorised(env, f"it raises {error!r}")) from error
-    if not sound:
-        raise ValueError(_not_vectorised(env, "rewards change with the batch or the simulator"))
+        raise ValueError(_no_hindsight(env, f"it raises {error!r}")) from error
+    if problem:
+        raise ValueError(_no_hindsight(env, problem))
     return reward
 
 
@@ -176,8 +176,8 @@ def moved_distance_of(env: Env, reward: GoalReward) -> float | None:
     )
 
 
-def _is_vectorised(reward: GoalReward, env: Env) -> bool:
-    """Whether goals around the first achieved one have the same rewards alone and in a batch."""
+def _problem_of(reward: GoalReward, env: Env) -> str | None:
+    """Why hindsight can't use the rewards of goals around the first achieved one; None: it can."""
     rng, rows = np.random.default_rng(0), 256
     start = np.asarray(env.reset(seed=0)[0]["achieved_goal"], np.float32)
     achieved = np.tile(start, (rows, 1))
@@ -185,15 +185,21 @@ def _is_vectorised(reward: GoalReward, env: Env) -> bool:
     offsets = np.geomspace(1e-3, 1.0, rows)[:, None] * rng.standard_normal(achieved.shape)
     desired = (achieved + offsets * rng.integers(0, 2, achieved.shape)).astype(np.float32)
     together = reward(achieved, desired)
-    env.step(check_action_space(env.action_space).low)
+    after, given, *_ = env.step(check_action_space(env.action_space).low)
     alone = [reward(achieved[i : i + 1], desired[i : i + 1]) for i in range(rows)]
-    return together.shape == (rows,) and np.allclose(together, np.concatenate(alone))
+    if together.shape != (rows,) or not np.allclose(together, np.concatenate(alone)):
+        return "rewards change with the batch or the simulator"
+    goals = [np.asarray(after[key], np.float32)[None] for key in ("achieved_goal", "desired_goal")]
+    priced = float(reward(*goals)[0])
+    if not np.isclose(float(given), priced, rtol=1e-4, atol=1e-6):
+        return f"a step gave a reward of {float(given):g}, its goals have one of {priced:g}"
+    return None
 
 
-def _not_vectorised(env: Env, reason: str) -> str:
+def _no_hindsight(env: Env, reason: str) -> str:
     return (
         "replay.hindsight_k must be 0 where compute_reward does not price every row of a batch by "
-        f"itself: with {name_of(env)}, {reason}"
+        f"itself, as a step does: with {name_of(env)}, {reason}"
     )
 
 
