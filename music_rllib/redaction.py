@@ -32,6 +32,9 @@ _UNPRINTABLE = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u2069\ufeff\ud800-\udfff]"
 )
 _SECRET_KEY = re.compile(r"password|passwd|secret|token|api_?key|credential", re.I)
+_COUNTED_KEY = re.compile(r"tokens?", re.I)
+"""A number under such a name is how many there are, or one's id."""
+_KEYED_BY_TASK = ("environments", "per_task")
 _NOT_IN_A_NAME = re.compile(r"[^\w./\- ]")
 
 
@@ -66,24 +69,34 @@ def for_people(text: object) -> str:
     return printable(redact(str(text)))
 
 
-def without_secrets(settings: Mapping[str, object]) -> dict[str, object]:
+def without_secrets(settings: Mapping[str, object], *, of_tasks: bool = False) -> dict[str, object]:
     """A copy of nested ``settings`` with redacted text and without keys that name a secret.
 
     A key names a secret if it contains ``password``, ``token``, ``secret``, ``api_key`` or
-    ``credential``.
+    ``credential``; ``n_tokens: 4`` does not, nor do the names of tasks.
+
+    Args:
+        settings: the settings.
+        of_tasks: whether their keys are names of tasks.
     """
     return {
-        str(key): _clean(value)
+        str(key): _clean(str(key), value)
         for key, value in settings.items()
-        if not _SECRET_KEY.search(str(key))
+        if of_tasks or not _is_secret(str(key), value)
     }
 
 
-def _clean(value: object) -> object:
+def _is_secret(key: str, value: object) -> bool:
+    if isinstance(value, int | float):
+        key = _COUNTED_KEY.sub("", key)
+    return _SECRET_KEY.search(key) is not None
+
+
+def _clean(key: str, value: object) -> object:
     if isinstance(value, Mapping):
-        return without_secrets(value)
+        return without_secrets(value, of_tasks=key in _KEYED_BY_TASK)
     if isinstance(value, (list, tuple)):
-        return [_clean(item) for item in value]
+        return [_clean("", item) for item in value]
     return redact(value) if isinstance(value, str) else value
 
 

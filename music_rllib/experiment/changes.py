@@ -12,11 +12,12 @@ from music_rllib.config.schema import SweepConfig
 from music_rllib.experiment.continuation import budget_settings, continued_from
 from music_rllib.experiment.plan import Node
 from music_rllib.experiment.session import Sweep
-from music_rllib.experiment.sweep_files import write_locally
+from music_rllib.experiment.sweep_files import CONFIG, keep, read
 from music_rllib.labels import ShortLabels, in_runs
+from music_rllib.redaction import redact
 from music_rllib.store.node_store import NodeStore, steps_of
 from music_rllib.store.object_folder import StorageError
-from music_rllib.store.paths import resolve_storage, sweep_folder
+from music_rllib.store.paths import resolve_storage
 from music_rllib.version import ALGORITHM_VERSION
 
 FILE = "settings.json"
@@ -69,7 +70,7 @@ def keep_settings(sweep: Sweep) -> None:
         for node in sweep.plan.nodes
     }
     document = {"algorithm": ALGORITHM_VERSION, "runs": runs}
-    write_locally(sweep.folder / FILE, json.dumps(document, indent=1))
+    keep(sweep, FILE, json.dumps(document, indent=1))
 
 
 def check_begun(config: SweepConfig) -> None:
@@ -78,10 +79,11 @@ def check_begun(config: SweepConfig) -> None:
     Raises:
         StorageError: There is no sweep of this name in the storage.
     """
-    folder = sweep_folder(resolve_storage(config.storage)[0], config.name)
-    if not (folder / FILE).is_file():
+    storage = resolve_storage(config.storage)[0]
+    if read(storage, f"{config.name}/{CONFIG}") is None:
         raise StorageError(
-            f"--resume must find an earlier run of sweep {config.name!r}, there is none in {folder}"
+            f"--resume must find an earlier run of sweep {config.name!r}, there is none in "
+            f"{redact(storage)}"
         )
 
 
@@ -91,10 +93,10 @@ def changes_since(sweep: Sweep) -> Changes | None:
     Runs that are new, or that are not in the plan any more, do not count.
     """
     try:
-        before = json.loads((sweep.folder / FILE).read_bytes())
+        before = read(sweep.storage, f"{sweep.config.name}/{FILE}")
         runs: Mapping[str, Any] = before["runs"]
         algorithm = before["algorithm"]
-    except (OSError, ValueError, KeyError, TypeError):
+    except (StorageError, KeyError, TypeError):
         return None  # the first run of the sweep, or an unreadable file
     keys = {node.key for node in sweep.plan.nodes}
     short = ShortLabels.of(node.label for node in sweep.plan.nodes)

@@ -116,8 +116,10 @@ def keep_record(sweep: Sweep) -> None:
     Raises:
         StorageError: The folder can't be written.
     """
-    arguments = [f"# {argument}  (command line)\n" for argument in sweep.config.arguments]
-    keep(sweep, "sweep.yaml", redact("".join(arguments) + sweep.config.text))
+    # A sweep that is continued from its storage has no file: the one that it began with stays.
+    if sweep.config.path.is_file() or not (sweep.folder / "sweep.yaml").is_file():
+        arguments = [f"# {argument}  (command line)\n" for argument in sweep.config.arguments]
+        keep(sweep, "sweep.yaml", redact("".join(arguments) + sweep.config.text))
     keep(sweep, CONFIG, as_json(_configuration(sweep.config)))
     keep(sweep, PLAN, as_json(plan_document(sweep)))
 

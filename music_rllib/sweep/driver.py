@@ -54,6 +54,7 @@ from music_rllib.sweep.report_at_end import report_at_end
 from music_rllib.sweep.views.alpha import adaptive_rows, adaptive_text, alpha_rows, alpha_table
 from music_rllib.sweep.views.plan_json import plan_answer
 from music_rllib.sweep.views.tables import plan_view, results_table, search_views
+from music_rllib.tracking.store import resolve_store
 
 if TYPE_CHECKING:
     from music_rllib.search.controller import SearchController
@@ -169,6 +170,7 @@ def _open(console: Console, config: SweepConfig, *, retrain_damaged: bool) -> Sw
     warn = partial(_say, console, style="yellow")
     folder = sweep_folder(storage, config.name)
     opened = open_sweep(config, plan, storage, folder, warn if retrain_damaged else None)
+    resolve_store(config.mlflow.tracking_uri, storage)
     console.print(plan_view(config, plan, opened.finished))
     if rows := alpha_rows(plan):
         console.print(alpha_table(rows))

@@ -63,6 +63,22 @@ def test_secrets_are_left_out_at_every_depth() -> None:
     assert "password" in settings["mlflow"]
 
 
+def test_names_and_numbers_that_sound_like_secrets_are_kept() -> None:
+    """Without them a sweep that is continued from its storage would be another one."""
+    settings = {
+        "tasks": ["TokenRing"],
+        "environments": {"TokenRing": {"env_kwargs": {"n_tokens": 4, "token": "hunter2"}}},
+        "stages": [{"per_task": {"TokenRing": {"env_steps": 300, "passwords": {"a": "hunter2"}}}}],
+        "pin": {"password": 12345},
+    }
+    assert without_secrets(settings) == {
+        "tasks": ["TokenRing"],
+        "environments": {"TokenRing": {"env_kwargs": {"n_tokens": 4}}},
+        "stages": [{"per_task": {"TokenRing": {"env_steps": 300}}}],
+        "pin": {},
+    }
+
+
 def test_params_are_flat_text() -> None:
     params = flat_params(
         {
