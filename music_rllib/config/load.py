@@ -122,7 +122,7 @@ def declared_tasks(path: str | Path) -> tuple[Task, ...]:
     return tuple(task for name, task in registry.items() if name not in BUILT_IN_TASKS)
 
 
-def _parsed_seeds(text: str, given: Any) -> list[int]:
+def _parsed_seeds(text: str, given: Any) -> list[float]:
     """The seeds of `10` or `0,1,7`; a number keeps those `given` in the file."""
     digits = re.fullmatch(r"\d{1,9}(,\d{1,9})*,?", text)
     if digits and "," not in text and int(text) > MOST_SEEDS:
@@ -133,7 +133,8 @@ def _parsed_seeds(text: str, given: Any) -> list[int]:
         )
     if "," in text:
         return [int(seed) for seed in text.split(",") if seed]
-    known = [seed for seed in given if isinstance(seed, int)] if isinstance(given, list) else [0]
+    given = given if isinstance(given, list) else [0]
+    known = [seed for seed in given if isinstance(seed, int | float)]  # 1e3 is a whole number
     others = (seed for seed in itertools.count() if seed not in known)
     return [*known, *itertools.islice(others, max(int(text) - len(known), 0))][: int(text)]
 

@@ -90,14 +90,27 @@ def all_settings() -> list[str]:
     return [*LAYER_KEYS, *fields]
 
 
+def varied_by(name: str, values: Iterable[Any]) -> list[str]:
+    """Dotted settings that `values` of a grid or search have: `name`, or the fields of a group."""
+    values = list(values)
+    group = name.rpartition(":")[2] in SECTIONS
+    if not group or not all(isinstance(value, Mapping) for value in values):
+        return [name]
+    return [f"{name}.{field}" for value in values for field in value]
+
+
 def field_by_field(point: PlacedPoint) -> PlacedPoint:
-    """A point whose groups, `tac: {entropic_index: 1, alpha: 0.05}`, are settings of their own."""
+    """A point whose groups, `tac: {entropic_index: 1, alpha: 0.05}`, are settings of their own.
+
+    A group stays if one of its fields is also in the point by itself: `merge` refuses it.
+    """
     settings: dict[str, tuple[KeyPath, Any]] = {}
     for dotted, (place, value) in point.items():
-        if dotted in SECTIONS and isinstance(value, Mapping):
-            settings |= {f"{dotted}.{name}": ((*place, name), value[name]) for name in value}
-        else:
+        fields = varied_by(dotted, [value])
+        if any(field in point for field in fields):  # also if it is no group
             settings[dotted] = (place, value)
+        else:
+            settings |= {f"{dotted}.{name}": ((*place, name), value[name]) for name in value}
     return settings
 
 
@@ -133,9 +146,13 @@ def merge(
                 problems.append(idle._replace(path=(*place, *path)))
     for dotted, (below, value) in point.items():
         place = (*stage_path, *below)
+        once = place[: place.index(dotted) + 1] if dotted in place else place
         if dotted in rules.without_effect:
-            once = place[: place.index(dotted) + 1] if dotted in place else place
             problems.append(idle._replace(path=once))
+        elif dotted in SECTIONS and isinstance(value, Mapping):
+            twice = ", ".join(name for name in value if f"{dotted}.{name}" in point)
+            rule = f"must not hold a field that varies by itself too, got {twice}"
+            problems.append(Problem(once, rule))
         elif problem := layers.put_dotted(dotted, value, place):
             problems.append(problem)
     # Contradictions of the variant are reported also if other settings are invalid.

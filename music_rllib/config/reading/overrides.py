@@ -7,13 +7,13 @@ level (`seeds=5`, `resources.cpus_per_run=2`) replaces the value there.
 
 from __future__ import annotations
 
-import copy
+import itertools
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from music_rllib.config.problems import ConfigError, KeyPath, shown, unknown
-from music_rllib.config.reading.layers import LAYER_KEYS, SECTIONS, all_settings
+from music_rllib.config.reading.layers import LAYER_KEYS, SECTIONS, all_settings, varied_by
 from music_rllib.config.reading.yaml_file import read_value
 from music_rllib.config.schema import Header, StageHeader
 
@@ -41,8 +41,6 @@ def parse_overrides(arguments: Iterable[str]) -> dict[str, Override]:
         parts = tuple(key.split("."))
         if not equals or not all(parts):
             raise _refusal(f"must be KEY=VALUE like tac.alpha=0.1, got {shown(argument)}")
-        if key in overrides:
-            raise _refusal(f"{key} must not repeat")
         if parts[0] not in (*LAYER_KEYS, *TOP):
             raise _refusal(f"{key} {unknown(key, (*all_settings(), *TOP))}")
         try:
@@ -50,9 +48,24 @@ def parse_overrides(arguments: Iterable[str]) -> dict[str, Override]:
         except ValueError as error:
             raise _refusal(f"{key} {error}, got {shown(text)}") from None
         if key == "preset" and isinstance(value, str) and value.endswith((".yaml", ".yml")):
-            value = str(Path(value).expanduser().absolute())
-        overrides[key] = Override(key, parts, value)
+            try:
+                value = str(Path(value).expanduser().absolute())
+            except RuntimeError:  # `~name/...`, and nobody has this name
+                rule = "preset must be a file in an existing home folder"
+                raise _refusal(f"{rule}, got {shown(value)}") from None
+        for one in _field_by_field(Override(key, parts, value)):
+            if one.key in overrides:
+                raise _refusal(f"{one.key} must not repeat")
+            overrides[one.key] = one
     return overrides
+
+
+def _field_by_field(override: Override) -> list[Override]:
+    """The override; for a group, `tac={alpha: 0.1}`, one of each field, as layers merge."""
+    key, _, value = override
+    if key not in SECTIONS or not isinstance(value, dict):
+        return [override]
+    return [Override(f"{key}.{name}", (key, name), value[name]) for name in value]
 
 
 def lay_overrides(
@@ -64,7 +77,7 @@ def lay_overrides(
         ConfigError: One names a stage that does not exist, or a setting that a grid or search
             varies.
     """
-    changed = copy.deepcopy(dict(document))
+    changed = _unshared(dict(document))
     origins: dict[KeyPath, str] = {}
     for override in overrides:
         if override.parts[0] in LAYER_KEYS:
@@ -74,9 +87,16 @@ def lay_overrides(
         else:
             places = [override.parts]
         for place in places:
-            _put(changed, place, copy.deepcopy(override.value), override.key)
+            _put(changed, place, _unshared(override.value), override.key)
             origins[place] = override.key
     return changed, origins
+
+
+def _unshared(value: Any) -> Any:
+    """A copy with a value of its own at each use of a YAML alias, so that one place can change."""
+    if isinstance(value, dict):
+        return {key: _unshared(inner) for key, inner in value.items()}
+    return [_unshared(inner) for inner in value] if isinstance(value, list) else value
 
 
 def _places_of_setting(document: dict[str, Any], override: Override) -> list[KeyPath]:
@@ -85,7 +105,9 @@ def _places_of_setting(document: dict[str, Any], override: Override) -> list[Key
     for index, stage in enumerate(_stages(document)):
         _check_not_varied(stage, override)
         layers.append(("stages", index))
-        layers += [("stages", index, "per_task", task) for task in stage.get("per_task") or {}]
+        tasks = stage.get("per_task")
+        tasks = tasks if isinstance(tasks, dict) else {}
+        layers += [("stages", index, "per_task", task) for task in tasks]
     *above, field = override.parts
     if len(above) <= 1:
         for layer in layers:
@@ -108,16 +130,22 @@ def _check_not_varied(stage: Mapping[str, Any], override: Override) -> None:
     if isinstance(search, dict):
         groups |= {f"search.{name}": search.get(name) for name in ("space", "compare")}
     for group, values in groups.items():
-        for name in values if isinstance(values, dict) else ():
-            setting = str(name).rpartition(":")[2]
-            key, varied = f"{override.key}.", f"{setting}."
-            if varied.startswith(key) or key.startswith(varied):
+        for name, choices in values.items() if isinstance(values, dict) else ():
+            choices = choices.get("choice") if isinstance(choices, dict) else choices
+            choices = choices if isinstance(choices, list) else []
+            varied = varied_by(str(name).rpartition(":")[2], choices)
+            if any(_overlap(override.key, setting) for setting in varied):
                 place = f"stages.{stage.get('name')}.{group}.{name}"
                 example = f"; {place}='[{shown(override.value)}]' replaces its values"
                 raise _refusal(
                     f"{override.key} must not be given where {place} varies it"
-                    + (example if group == "grid" else "")
+                    + (example if group == "grid" and name == override.key else "")
                 )
+
+
+def _overlap(one: str, other: str) -> bool:
+    """Whether two dotted settings are the same or one is inside of the other."""
+    return f"{one}.".startswith(f"{other}.") or f"{other}.".startswith(f"{one}.")
 
 
 def _place_in_stage(document: dict[str, Any], override: Override) -> KeyPath:
@@ -157,11 +185,11 @@ def _find(document: Any, path: KeyPath) -> Any:
 
 def _put(document: dict[str, Any], path: KeyPath, value: Any, key: str) -> None:
     here: Any = document
-    for part in path[:-1]:
+    for part, following in itertools.pairwise(path):
         if isinstance(here, dict) and here.get(part) is None:
             here[part] = {}
         here = _find(here, (part,))
-        if not isinstance(here, dict | list):
+        if not isinstance(here, list if isinstance(following, int) else dict):
             raise _refusal(f"{key} must be inside of a mapping, got {shown(here)} at {part}")
     if path[-1] in SECTIONS and isinstance(here.get(path[-1]), dict) and isinstance(value, dict):
         value = here[path[-1]] | value  # as layers merge, field by field

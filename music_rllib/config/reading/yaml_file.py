@@ -7,7 +7,7 @@ the number 186 and ``010`` is eight. Keys must be text and may not repeat; PyYAM
 from __future__ import annotations
 
 import re
-from collections.abc import Hashable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -86,7 +86,7 @@ def _parse(text: str) -> tuple[Any, dict[KeyPath, int]]:
     root = loader.get_single_node()
     if root is None:
         return None, {}
-    _count_values(root, {})
+    _check_values(root, {})
     lines = dict(_lines(root, ()))  # construction changes the nodes of mappings with `<<`
     return loader.construct_document(root), lines
 
@@ -125,18 +125,6 @@ class _StrictLoader(yaml.SafeLoader):
             tag = node.tag.rpartition(":")[2]
             raise _refusal(f"must be of its type, {tag}: {error}", node) from None
 
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
-        seen = set()
-        for key_node, _ in node.value:
-            if key_node.tag == "tag:yaml.org,2002:merge":
-                continue
-            if not (isinstance(key_node, yaml.ScalarNode) and key_node.tag.endswith(":str")):
-                raise _refusal("keys must be text", key_node)
-            if key_node.value in seen:
-                raise _refusal(f"key {key_node.value!r} must not repeat", key_node)
-            seen.add(key_node.value)
-        return super().construct_mapping(node, deep=deep)
-
     def reject(self, node: yaml.Node) -> Any:
         """Refuse a value that is neither text, number, truth value, null, list nor mapping."""
         raise _refusal(f"the tag {node.tag!r} is not allowed here", node)
@@ -161,8 +149,22 @@ for _tag in ("binary", "omap", "pairs", "set", "timestamp"):
     _StrictLoader.add_constructor(f"tag:yaml.org,2002:{_tag}", _StrictLoader.reject)
 
 
-def _count_values(node: yaml.Node, counts: dict[int, int | None]) -> int:
+def _check_keys(node: yaml.MappingNode) -> None:
+    seen = set()
+    for key_node, _ in node.value:
+        if key_node.tag == "tag:yaml.org,2002:merge":
+            continue
+        if not (isinstance(key_node, yaml.ScalarNode) and key_node.tag.endswith(":str")):
+            raise _refusal("keys must be text", key_node)
+        if key_node.value in seen:
+            raise _refusal(f"key {key_node.value!r} must not repeat", key_node)
+        seen.add(key_node.value)
+
+
+def _check_values(node: yaml.Node, counts: dict[int, int | None]) -> int:
     """Number of values in `node`, with those of an alias at each of its uses.
+
+    Before construction, which writes the keys of a `<<` into the mapping that has it.
 
     Args:
         node: The node; too many values in it are an error.
@@ -177,9 +179,10 @@ def _count_values(node: yaml.Node, counts: dict[int, int | None]) -> int:
     counts[id(node)] = None
     total = 1
     if isinstance(node, yaml.MappingNode):
-        total += sum(_count_values(inner, counts) for pair in node.value for inner in pair)
+        _check_keys(node)
+        total += sum(_check_values(inner, counts) for pair in node.value for inner in pair)
     elif isinstance(node, yaml.SequenceNode):
-        total += sum(_count_values(value, counts) for value in node.value)
+        total += sum(_check_values(value, counts) for value in node.value)
     elif node.tag.endswith(":int") and len(node.value) > MOST_DIGITS + 1:
         shown = f"{node.value[:8]}..."
         raise _refusal(f"a number must have at most {MOST_DIGITS} digits, got {shown}", node)

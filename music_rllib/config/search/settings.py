@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Discriminator, Field, JsonValue, Tag, model_validator
 
+from music_rllib.config.reading.layers import varied_by
 from music_rllib.config.search.space import Choice, Dimension, listed
 from music_rllib.schedules import StrictModel
 
@@ -247,9 +248,7 @@ class SearchSettings(StrictModel):
                 values = listed(wanted)
                 if not values or not all(map(self.space[other].contains, values)):
                     yield f"space.{name}.when must hold values of {other}, got {json.dumps(wanted)}"
-        for name in self.compare:
-            if name in self.space:
-                yield f"compare.{name} must not be in the space too, got it in both"
+        yield from self._settings_varied_twice()
         if (self.mode == "compare") != bool(self.compare):
             yield f"compare must be given with mode: compare, and only there, got mode: {self.mode}"
         yield from self._broken_sampler()
@@ -265,6 +264,20 @@ class SearchSettings(StrictModel):
                     yield f"points_to_evaluate must hold settings of the space, got {name!r}"
             if self.sampler == "grid":
                 yield f"points_to_evaluate must be empty with sampler: grid, got {len(point)}"
+
+    def _settings_varied_twice(self) -> Iterator[str]:
+        varied = {
+            f"compare.{name}": {name, *varied_by(name, self.compare[name])} for name in self.compare
+        }
+        varied |= {
+            f"space.{name}": {name, *varied_by(name, at.ends())} for name, at in self.space.items()
+        }
+        for one, other in itertools.combinations(varied, 2):
+            # With `when`, one may exist only where the other has no such field: the ends show it.
+            below = self.space.get(other.removeprefix("space."))
+            apart = below is not None and one.removeprefix("space.") in below.when
+            if (both := varied[one] & varied[other]) and not apart:
+                yield f"{one} must not vary what {other} varies, got {min(both)} in both"
 
     def _broken_sampler(self) -> Iterator[str]:
         if self.sampler == "grid":

@@ -92,6 +92,10 @@ def test_a_sound_file_is_resolved_completely(load: Callable[..., SweepConfig]) -
     assert RunSettings.model_validate_json(run.model_dump_json(), strict=True) == run
 
 
+def test_a_number_of_seeds_keeps_those_of_the_file(load: Callable[..., SweepConfig]) -> None:
+    assert load(changed(seeds=[1e3, 7]), seeds="3").seeds == (1000, 7, 0)
+
+
 def test_later_layers_win(load: Callable[..., SweepConfig]) -> None:
     document = changed(
         defaults={"env_steps": 6000, "tac": {"gamma": 0.9, "tau": 0.1, "lr": 0.1}},

@@ -28,9 +28,9 @@ stages:
 """
 
 
-def load(folder: Path, *arguments: str) -> SweepConfig:
+def load(folder: Path, *arguments: str, text: str = SWEEP) -> SweepConfig:
     path = folder / "sweep.yaml"
-    path.write_text(SWEEP)
+    path.write_text(text)
     return load_sweep(path, overrides=arguments)
 
 
@@ -77,6 +77,107 @@ def test_a_preset_of_the_command_line_lies_below_the_file(tmp_path: Path) -> Non
     assert (first.tac.tau, first.tac.gamma) == (0.05, 0.9)
 
 
+SHARED = """
+name: mine
+tasks: [FetchReach]
+stages:
+  - {name: a, variant: tac, tac: &t {lr: 0.001}, grid: &g {tac.gamma: [0.9, 0.8]}}
+  - {name: b, variant: tac, tac: *t, grid: *g}
+  - {name: c, variant: tac, replay: &r {hindsight_k: 4}, per_task: {FetchReach: {replay: *r}}}
+"""
+
+
+def test_what_an_anchor_shares_changes_in_the_named_stage_only(tmp_path: Path) -> None:
+    changes = ("stages.a.tac.lr=0.01", "stages.a.grid.tac.gamma=[0.7, 0.6]")
+    first, second, third, fourth, _ = runs(load(tmp_path, *changes, text=SHARED))
+    assert [(run.tac.lr, run.tac.gamma) for run in (first, second)] == [(0.01, 0.7), (0.01, 0.6)]
+    assert [(run.tac.lr, run.tac.gamma) for run in (third, fourth)] == [(0.001, 0.9), (0.001, 0.8)]
+
+
+@pytest.mark.parametrize("prefix", ["", "stages.first.", "stages.first.per_task.FetchReach."])
+def test_a_whole_group_replaces_its_fields_and_no_others(tmp_path: Path, prefix: str) -> None:
+    before = runs(load(tmp_path))[0]
+    after = runs(load(tmp_path, f"{prefix}tac={{tau: 0.2, gamma: 0.8}}"))[0]
+    assert (after.tac.tau, after.tac.gamma, after.tac.lr) == (0.2, 0.8, before.tac.lr)
+    interval = "stages.first.evaluation.interval=250"
+    evaluation = runs(load(tmp_path, interval, "evaluation={episodes: 7}"))[0].evaluation
+    assert (evaluation.interval, evaluation.episodes) == (250, 7)
+
+
+GROUPED = """
+name: mine
+tasks: [FetchReach]
+stages:
+  - name: train
+    variant: tac
+    grid: {tac: [{entropic_index: 1, alpha: 0.1}, {entropic_index: 2, alpha: 0.2}]}
+"""
+
+
+def test_what_a_group_of_a_grid_does_not_vary_can_be_given(tmp_path: Path) -> None:
+    after = runs(load(tmp_path, "tac={gamma: 0.9}", text=GROUPED))
+    assert [(run.tac.gamma, run.tac.alpha) for run in after] == [(0.9, 0.1), (0.9, 0.2)]
+    searched = GROUPED.replace("grid: {tac: ", "search: {trials: 2, space: {tac: {choice: ")
+    searched = searched.replace("]}\n", "]}}}\n")
+    assert runs(load(tmp_path, "tac.gamma=0.9", text=searched))[0].tac.gamma == 0.9
+    for text, place in ((GROUPED, "grid"), (searched, "search.space")):
+        with pytest.raises(ConfigError) as refusal:
+            load(tmp_path, "tac.alpha=0.3", text=text)
+        rule = f"tac.alpha must not be given where stages.train.{place}.tac varies it"
+        assert refusal.value.lines == (f"command line: {rule}",)
+
+
+TUNED = "tac: [{entropic_index: 1, alpha: 0.1}, {entropic_index: 2, alpha: 0.2}]"
+TWICE: list[tuple[str, str]] = [
+    (
+        f"grid: {{{TUNED}, tac.alpha: [0.3, 0.4]}}",
+        "tac must not hold a field that varies by itself",
+    ),
+    (f"grid: {{tac.alpha: [0.3, 0.4], {TUNED}}}", "itself too, got alpha"),
+    (
+        f"search: {{trials: 2, mode: compare, compare: {{{TUNED}}}, "
+        "space: {tac.alpha: {float: [0.1, 1]}}}",
+        "compare.tac must not vary what space.tac.alpha varies, got tac.alpha in both",
+    ),
+    (
+        f"search: {{trials: 2, mode: compare, compare: {{{TUNED}, tac.alpha: [1, 2]}}, "
+        "space: {tac.tau: {float: [0.1, 1]}}}",
+        "compare.tac must not vary what compare.tac.alpha varies, got tac.alpha in both",
+    ),
+    (
+        "search: {trials: 2, space: {tac: {choice: [{alpha: 0.1}, {alpha: 0.2}]}, "
+        "tac.alpha: {float: [0.1, 1]}}}",
+        "space.tac must not vary what space.tac.alpha varies, got tac.alpha in both",
+    ),
+    (
+        "search: {trials: 2, space: {tac: {choice: [{tau: 0.1}, {alpha: 0.2}]}, "
+        "tac.alpha: {float: [0.1, 1], when: {tac: {alpha: 0.2}}}}}",
+        "search.space.tac must not hold a field that varies by itself too, got alpha",
+    ),
+    (
+        "search: {trials: 2, mode: compare, compare: {tac: [{tau: 0.1}, {tau: 0.2}]}, "
+        "space: {tac: {choice: [{alpha: 0.1}, {alpha: 0.2}]}}}",
+        "compare.tac must not vary what space.tac varies, got tac in both",
+    ),
+]
+
+
+@pytest.mark.parametrize(("varied", "message"), TWICE)
+def test_a_field_of_a_group_varies_once(tmp_path: Path, varied: str, message: str) -> None:
+    stage = f"{{name: a, variant: tac, {varied}}}"
+    with pytest.raises(ConfigError) as refusal:
+        load(tmp_path, text=f"name: mine\ntasks: [FetchReach]\nstages: [{stage}]\n")
+    (line,) = refusal.value.lines
+    assert message in line
+
+
+def test_a_field_may_vary_where_the_group_lacks_it(tmp_path: Path) -> None:
+    alpha = "tac.alpha: {float: [0.1, 1], when: {tac: {tau: 0.1}}}"
+    space = f"{{tac: {{choice: [{{tau: 0.1}}, {{alpha: 0.2}}]}}, {alpha}}}"
+    stage = f"{{name: a, variant: tac, search: {{trials: 2, space: {space}}}}}"
+    assert load(tmp_path, text=f"name: mine\ntasks: [FetchReach]\nstages: [{stage}]\n").stages
+
+
 REFUSED: list[tuple[str, str]] = [
     ("q=2", "command line: q is not a known setting (did you mean 'tac.entropic_index'?)"),
     ("tac.lr=-1", "command line: tac.lr must be > 0, got -1"),
@@ -90,6 +191,9 @@ REFUSED: list[tuple[str, str]] = [
     ("tac.lr", "command line: must be KEY=VALUE like tac.alpha=0.1"),
     ("tac.lr=[", "command line: tac.lr must be valid YAML"),
     ("storage=", "command line: storage must be text, got null"),
+    ("tasks.0=1", 'command line: tasks.0 must be inside of a mapping, got ["FetchReach"] at tasks'),
+    ("preset=~nobody-at-all/x.yaml", "preset must be a file in an existing home folder, got"),
+    ("tac={tau: 2}", "command line: tac.tau must be <= 1, got 2"),
 ]
 
 
@@ -99,6 +203,18 @@ def test_each_mistake_is_named_once(tmp_path: Path, argument: str, message: str)
         load(tmp_path, argument)
     (line,) = refusal.value.lines
     assert message in line
+
+
+def test_mistakes_that_show_with_another_argument(tmp_path: Path) -> None:
+    for arguments, message in (
+        (("preset=small", "tac.hidden_sizes.0=32"), "tac.hidden_sizes.0 must be inside of a mapp"),
+        (("stages.first.per_task=5", "tac.lr=0.1"), "per_task must be a mapping of keys to values"),
+        (("tac.lr=0.1", "tac={lr: 0.2}"), "command line: tac.lr must not repeat"),
+    ):
+        with pytest.raises(ConfigError) as refusal:
+            load(tmp_path, *arguments)
+        (line,) = refusal.value.lines
+        assert message in line
 
 
 FILES: list[tuple[str, Any]] = [

@@ -60,6 +60,10 @@ def test_every_number_python_prints_is_read_back(
     [
         ("a: 1\nb: 2\na: 3\n", "sweep.yaml:3: must be valid YAML: key 'a' must not repeat"),
         ("a:\n  b: 1\n  b: 2\n", "sweep.yaml:3: must be valid YAML: key 'b' must not repeat"),
+        (
+            "a: &x {b: 1}\nc:\n  <<: *x\n  d: 1\n  d: 2\n",
+            "sweep.yaml:5: must be valid YAML: key 'd'",
+        ),
         ("a: 1\n2: 3\n", "sweep.yaml:2: must be valid YAML: keys must be text"),
         ("a: [1, 2\n", "sweep.yaml:2: must be valid YAML"),
         ("a: &x [*x]\n", "sweep.yaml:1: must be valid YAML: an alias must not contain itself"),
@@ -97,3 +101,9 @@ def test_places_name_the_line_of_a_value_or_of_what_holds_it(tmp_path: Path) -> 
 def test_merge_keys_share_settings(tmp_path: Path) -> None:
     file = read(tmp_path, "a: &base {x: 1, y: 2}\nb:\n  <<: *base\n  y: 3\n")
     assert file.data["b"] == {"x": 1, "y": 3}
+
+
+def test_merge_keys_may_form_a_chain_that_is_used_above_it(tmp_path: Path) -> None:
+    chain = "a:\n  in:\n    deep: &slow\n      <<: &base {x: 1, y: 2}\n      x: 3\n"
+    file = read(tmp_path, f"{chain}b:\n  <<: *slow\n  z: 4\n")
+    assert file.data == {"a": {"in": {"deep": {"x": 3, "y": 2}}}, "b": {"x": 3, "y": 2, "z": 4}}
