@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import re
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, TypeAdapter
 
-from music_rllib.config.problems import Findings, lookup, same, shown
+from music_rllib.config.problems import ConfigError, Findings, lookup, same, shown
+from music_rllib.config.tac_settings import Alpha, in_words
 from music_rllib.names import EVAL_RETURN
-from music_rllib.schedules import StrictModel
+from music_rllib.schedules import AdaptiveSchedule, StrictModel
 
 if TYPE_CHECKING:
-    from music_rllib.config.run_settings import RunSettings
     from music_rllib.config.schema import Stage
 
 SETTINGS_IN_SHORT = {
@@ -29,6 +30,8 @@ _HYPOTHESIS = re.compile(
     r"(?P<first>.+?) (?P<relation>better than|worse than|equivalent to|against) (?P<second>.+)"
 )
 _NEXT_SETTING = re.compile(r",(?=[^,=]+=)")
+_JSON_FOR_PYTHON = {"True": "true", "False": "false", "None": "null"}
+_SCHEDULE: TypeAdapter[Any] = TypeAdapter(Alpha | AdaptiveSchedule)
 
 
 class Hypothesis(NamedTuple):
@@ -52,7 +55,7 @@ class Hypothesis(NamedTuple):
         match = _HYPOTHESIS.fullmatch(words)
         first = _condition(match["first"]) if match else {}
         second = _condition(match["second"]) if match else {}
-        if match is None or not first or not second or first == second:
+        if match is None or not first or not second or same(_parsed(first), _parsed(second)):
             raise ValueError(
                 "must be two different conditions with 'better than', 'worse than', 'equivalent "
                 f"to' or 'against' between them, like 'q = 1.5 against q = 1', got {text!r}"
@@ -70,6 +73,20 @@ def _condition(text: str) -> dict[str, str]:
             return {}
         settings[name] = value
     return settings
+
+
+def _parsed(condition: Mapping[str, str]) -> dict[str, Any]:
+    """A condition's values; a stage may be called `1.0` beside one called `1`."""
+    return {name: text if name == "stage" else parsed(text) for name, text in condition.items()}
+
+
+def parsed(text: str) -> Any:
+    """The value that a hypothesis, or a param in MLflow, has as text: `1.0`, `true`, `True`."""
+    with contextlib.suppress(ValueError):
+        return float(text)
+    with contextlib.suppress(ValueError, RecursionError):
+        return json.loads(_JSON_FOR_PYTHON.get(text, text))
+    return text
 
 
 class Analysis(StrictModel):
@@ -107,6 +124,7 @@ def check_analysis(
         return
     default = analysis.stage or next(reversed(list(stages)), None)
     metrics = set()
+    runs = {name: _compared_runs(stage) for name, stage in stages.items() if stage is not None}
     for position, text in enumerate(analysis.hypotheses):
         hypothesis = Hypothesis.of(text)
         path = ("analysis", "hypotheses", position)
@@ -116,25 +134,47 @@ def check_analysis(
                 findings.add(path, f"must name one of the stages {', '.join(stages)}, got {name!r}")
             elif (stage := stages[name]) is not None:
                 metrics |= {task.primary_metric for task in stage.tasks}
-                if broken := _broken_rule(stage, condition):
+                broken = _broken_rule(stage, runs[name], condition)
+                if broken := broken or _broken_final(stage, condition):
                     findings.add(path, broken)
     if analysis.margin is None and EVAL_RETURN in metrics:
         findings.add(("analysis", "margin"), "must be given for tasks without success, got null")
 
 
-def _broken_rule(stage: Stage, condition: Mapping[str, str]) -> str | None:
+def _compared_runs(stage: Stage) -> list[dict[str, Any]]:
+    """A run of each point of a grid, or compared value of a search; none if one is invalid."""
+    points = list(stage.points)
+    if stage.search is not None and stage.search.compare:
+        own = [{k: v for k, v in arm.items() if ":" not in k} for arm in stage.search.arms()]
+        try:
+            points = [stage.resolve(arm) for arm in own]
+        except ConfigError:
+            return []
+    if not all(point.runs for point in points):
+        return []
+    return [next(iter(point.runs.values())).model_dump(mode="json") for point in points]
+
+
+def _broken_rule(
+    stage: Stage, runs: Sequence[Mapping[str, Any]], condition: Mapping[str, str]
+) -> str | None:
     """The rule that a condition breaks; None if the stage has such runs."""
-    space = stage.search.space if stage.search else {}
-    points = stage.search.arms() if stage.search else [dict(p.values) for p in stage.points]
-    runs = [run for point in stage.points for run in list(point.runs.values())[:1]]
+    space = [name for name in (stage.search.space if stage.search else ()) if ":" not in name]
     if not runs:  # the stage's settings are invalid, which is a problem of its own
         return None
     for name, text in condition.items():
-        if name == "stage" or name in space:
+        if isinstance(parsed(text), Mapping):
+            return (
+                "must name a schedule in words, like '1 to 2' or 'learned', and of another setting "
+                f"a part, like '{name}.{next(iter(parsed(text)), 'kind')} = ...', got {text}"
+            )
+        if name == "stage" or _is_in(name, space):
             continue
-        values = [point[name] for point in points if name in point] or _values(runs, name)
+        values = _values(runs, name)
         if not values:
-            varied = dict.fromkeys([*(name for point in points for name in point), *space])
+            compared = stage.search.compare if stage.search else ()
+            points = [*(name for point in stage.points for name in point.values), *compared]
+            varied = dict.fromkeys([*(name for name in points if ":" not in name), *space])
             settings = ", ".join(varied) or "nothing"
             return f"must name settings, of which {stage.name} varies {settings}, got {name!r}"
         if not any(_equals(text, value) for value in values):
@@ -142,15 +182,56 @@ def _broken_rule(stage: Stage, condition: Mapping[str, str]) -> str | None:
     return None
 
 
-def _values(runs: Sequence[RunSettings], name: str) -> list[Any]:
-    """The values of a setting that runs have."""
-    values: list[Any] = []
+def _broken_final(stage: Stage, condition: Mapping[str, str]) -> str | None:
+    """The rule that a search's final ranking breaks; None if it leaves runs to compare.
+
+    Two conditions are compared that are alike in the rest, which tuned settings are by chance only.
+    """
+    search = stage.search
+    if search is None:
+        return None
+    if search.final is None:
+        return (
+            f"must be about runs on fresh seeds: write final: {{trials: 1}} in the search of "
+            f"{stage.name}, got final: null"
+        )
+    tuned = [name for name, dimension in search.space.items() if not dimension.when]
+    named = all(any(_is_in(name, [one]) for name in condition) for one in tuned)
+    whole_grid = search.sampler == "grid" and search.final.trials >= search.count
+    if search.final.trials == 1 or named or whole_grid:
+        return None
+    return (
+        f"must name every setting in the space of {stage.name}, or be about the best trial alone: "
+        "write final: {trials: 1}, and mode: compare with the values that are compared, "
+        f"got final.trials: {search.final.trials}"
+    )
+
+
+def _is_in(name: str, settings: Sequence[str]) -> bool:
+    """Whether a setting is one of these, a part of one or in a group of these."""
+    return any(f"{name}.".startswith(f"{one}.") for one in settings)
+
+
+def _values(runs: Sequence[Mapping[str, Any]], name: str) -> list[Any]:
+    """The different values of a setting that runs have."""
+    values: dict[str, Any] = {}
     for run in runs:
         with contextlib.suppress(LookupError):
-            value = lookup(run.model_dump(mode="json"), name.split("."))
-            if value is not None and value not in values:
-                values.append(value)
-    return values
+            value = _value(run, name)
+            values[json.dumps(value)] = value
+    return list(values.values())
+
+
+def _value(run: Mapping[str, Any], name: str) -> Any:
+    """A setting of a run as MLflow has it: a schedule, whose params are its parts, in words.
+
+    Raises:
+        LookupError: The run has no such setting.
+    """
+    value = lookup(run, name.split("."))
+    if isinstance(value, Mapping) and name in SETTINGS_IN_SHORT.values():
+        return in_words(_SCHEDULE.validate_python(value))
+    return value
 
 
 def unnamed_differences(
@@ -196,13 +277,10 @@ def _all_values(
 
 def _has(run: Mapping[str, Any], settings: Mapping[str, str]) -> bool:
     try:
-        return all(_equals(text, lookup(run, name.split("."))) for name, text in settings.items())
+        return all(_equals(text, _value(run, name)) for name, text in settings.items())
     except LookupError:
         return False
 
 
 def _equals(text: str, value: Any) -> bool:
-    try:
-        return same(float(text), value)
-    except ValueError:
-        return text in (value, shown(value))
+    return text == value or same(parsed(text), value)

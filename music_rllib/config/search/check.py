@@ -25,6 +25,10 @@ _METRICS = frozenset(
     and not value.isupper()  # a variable of the environment
     and not key.startswith(("TAG_", "KIND_", "ARTEFACT_", "SETTING_"))
 )
+_OF_SUCCESS = frozenset(
+    {names.EVAL_SUCCESS, names.EVAL_SUCCESS_ANY, names.TRAIN_SUCCESS, names.TRAIN_SUCCESS_ANY}
+)
+"""Metrics of tasks that declare success."""
 
 
 def of_stage(values: Mapping[str, Any], stage: str) -> dict[str, Any]:
@@ -61,13 +65,9 @@ def check_search(
     problems_before = len(findings.problems)
     in_search = findings.below("search")
     for position, objective in enumerate(search.objectives):
-        if objective.metric not in _METRICS:
+        if rule := _broken_metric(objective.metric, stage):
             several = (position,) if len(search.objectives) > 1 else ()
-            in_search.add(
-                ("objective", *several, "metric"),
-                f"must be a metric that runs report, got {shown(objective.metric)}"
-                f"{closest(objective.metric, _METRICS)}",
-            )
+            in_search.add(("objective", *several, "metric"), rule)
     above = earlier.get(stage.source.stage) if stage.source and stage.source.stage else None
     if above is not None and above.search is None and len(above.points) > 1:
         findings.add(
@@ -80,13 +80,28 @@ def check_search(
         _check_rungs(search, seeds, most_env_steps(search, stage.points), in_search)
 
 
+def _broken_metric(metric: str, stage: Stage) -> str | None:
+    """The rule that an objective's metric breaks; None if each run reports it."""
+    if metric not in _METRICS:
+        hint = closest(metric, _METRICS)
+        return f"must be a metric that runs report, got {shown(metric)}{hint}"
+    without = [task.name for task in stage.tasks if task.success_key is None]
+    if metric in _OF_SUCCESS and without:
+        return (
+            f"must be a metric that {', '.join(without)} has too, which declares no success: write "
+            f"objective: {{metric: {names.EVAL_RETURN}}}, got {shown(metric)}"
+        )
+    return None
+
+
 def most_env_steps(search: SearchSettings, points: Sequence[Point]) -> int:
     """Environment steps of the longest run of a searched stage with these points; 0 if unknown."""
-    if "env_steps" in search.space:
-        return int(max(search.space["env_steps"].ends()))
+    own = max((run.env_steps for point in points for run in point.runs.values()), default=0)
+    if (dimension := search.space.get("env_steps")) is not None:
+        return max(*map(int, dimension.ends()), own if dimension.when else 0)
     if "env_steps" in search.compare:
         return max(int(float(str(value))) for value in search.compare["env_steps"])
-    return max((run.env_steps for point in points for run in point.runs.values()), default=0)
+    return own
 
 
 def _check_rungs(search: SearchSettings, seeds: int, env_steps: int, findings: Findings) -> None:
@@ -127,7 +142,11 @@ def _check_values(
             rule = f"must be able to hold, got {shown(search.space[name].when)}"
             in_search.add((section, name, "when"), rule)
             continue
-        own = resolve_at({key: at for key, at in point.items() if ":" not in key}, findings)
+        placed = {key: at for key, at in point.items() if ":" not in key}
+        own = resolve_at(placed, findings)
+        if search.final is not None and search.final.env_steps is not None:
+            budget = (("search", "final", "env_steps"), search.final.env_steps)
+            resolve_at({**placed, "env_steps": budget}, findings)
         theirs = None if above is None else _runs_above(above, point, findings)
         tried.append(((section, name), point[name][1], (own.runs, theirs)))
     if len(findings.problems) == problems_before:

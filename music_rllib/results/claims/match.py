@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from music_rllib.config.analysis import Hypothesis
+from music_rllib.config.analysis import Hypothesis, parsed
+from music_rllib.config.problems import same
 from music_rllib.results.conditions import (
     ENTROPIC_INDEX,
     IN_WORDS,
@@ -46,10 +47,7 @@ def _has(run: RunRecord, name: str, value: str) -> bool:
 
 
 def _same(one: str, other: str) -> bool:
-    try:
-        return float(one) == float(other)
-    except ValueError:
-        return one == other
+    return one == other or same(parsed(one), parsed(other))
 
 
 def alike_in_the_rest(

@@ -387,6 +387,27 @@ def test_stages_are_compared_where_a_hypothesis_names_them(rng: np.random.Genera
     assert claim.confirmed is True
 
 
+@pytest.mark.parametrize(
+    ("hypothesis", "setting", "values"),
+    [
+        ("{} = true against {} = false", "tac.normalise_observations", ("True", "False")),
+        ("{} = [-50, 0] against {} = null", "tac.target_bounds", ("[-50.0, 0.0]", "None")),
+        ("{} = 1e-3 against {} = .002", "tac.lr", ("0.001", "0.002")),
+    ],
+)
+def test_values_are_found_however_mlflow_spells_them(
+    hypothesis: str, setting: str, values: Sequence[str], rng: np.random.Generator
+) -> None:
+    runs = [
+        run({"tac.entropic_index": "1.0", setting: value}, seed, 0.3, rng)
+        for value in values
+        for seed in range(3)
+    ]
+    one = with_plan((), plan(hypothesis.format(setting, setting)), 5)
+    found = study_of(sweep_of(runs, one))
+    assert (found.untested, len(found.planned)) == ((), 1)
+
+
 def test_seeds_that_are_not_shared_are_compared_without_pairs(rng: np.random.Generator) -> None:
     runs = [
         run({"tac.entropic_index": q}, seed + 100 * (q == "1"), 0.3, rng)

@@ -324,6 +324,25 @@ MISTAKES: list[tuple[Document, str]] = [
         "pruning.rungs[0].env_steps must be <= 3000, the longest run's env steps, got 4000",
     ),
     (
+        {
+            "space": BRANCHES
+            | {"env_steps": {"int": [2000, 2500], "when": {"tac.bootstrap": "value"}}},
+            "pruning": {"rungs": [{"env_steps": 4000}, {"env_steps": 4001}]},
+        },
+        "pruning.rungs[1].env_steps must be <= 4000, the longest run's env steps, got 4001",
+    ),
+    (
+        {"final": {"env_steps": 500}},
+        "search.final.env_steps must be > tac.random_steps (1000), or nothing is learned, got 500",
+    ),
+    (
+        {
+            "space": {"tac.random_steps": {"int": [100, 2000]}},
+            "final": {"env_steps": 2000},
+        },
+        "search.final.env_steps must be > tac.random_steps (2000), or nothing is learned, got 2000",
+    ),
+    (
         {"space": {"warmup:tac.lr": {"float": [0.1, 1]}}},
         "must name settings of this stage or of the one it starts from, which is 'pretrain'",
     ),
@@ -333,7 +352,7 @@ MISTAKES: list[tuple[Document, str]] = [
 @pytest.mark.parametrize(("search", "message"), MISTAKES, ids=[text[:45] for _, text in MISTAKES])
 def test_mistakes_in_a_search_are_named(search: Document, message: str, tmp_path: Path) -> None:
     path = tmp_path / "sweep.yaml"
-    path.write_text(yaml.safe_dump(document(search)))
+    path.write_text(yaml.safe_dump(document(search), sort_keys=False))
     with pytest.raises(ConfigError) as error:
         load_sweep(path)
     assert message in str(error.value)
@@ -359,6 +378,26 @@ def test_a_mistake_in_the_objective_is_one_error(
     assert message in line
 
 
+@pytest.mark.parametrize("objective", [{}, [{"metric": names.EVAL_RETURN}, {}]])
+def test_success_is_no_objective_where_a_task_declares_none(objective: Any, tmp_path: Path) -> None:
+    swing = {"env_id": "Pendulum-v1", "horizon": 50, "success_key": None}
+    content = document({}, tasks=["FetchPush", "Swing"], environments={"Swing": swing})
+    content["stages"] = [
+        {"name": "a", "variant": "tac", "search": content["stages"][1]["search"]},
+    ]
+    content["stages"][0]["search"]["objective"] = objective
+    path = tmp_path / "sweep.yaml"
+    path.write_text(yaml.safe_dump(content))
+    with pytest.raises(ConfigError) as error:
+        load_sweep(path)
+    (line,) = error.value.lines
+    assert "metric must be a metric that Swing has too, which declares no success" in line
+    assert "write objective: {metric: evaluation/episode_return}, got" in line
+    content["stages"][0]["search"]["objective"] = {"metric": names.EVAL_RETURN}
+    path.write_text(yaml.safe_dump(content))
+    load_sweep(path)
+
+
 def test_a_rung_may_be_beyond_the_shorter_tasks(tmp_path: Path) -> None:
     content = document({"pruning": {"rungs": [{"env_steps": 5000}]}})
     content["tasks"] = ["FetchPush", "FetchSlide"]
@@ -376,6 +415,8 @@ def test_a_rung_may_be_beyond_the_shorter_tasks(tmp_path: Path) -> None:
     ("other", "same"),
     [
         ("studies.db", True),
+        ("~/studies.db", True),
+        ("~nobody-at-all/studies.db", False),
         ("sqlite:///studies.db", True),
         ("./here/../studies.db", True),
         ("{here}/studies.db", True),
@@ -388,4 +429,5 @@ def test_a_database_is_known_by_any_of_its_names(
     other: str, same: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path))
     assert same_database("studies.db", other.format(here=tmp_path)) is same

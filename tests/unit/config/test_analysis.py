@@ -1,0 +1,192 @@
+"""Hypotheses of a sweep's file: those that it can test are accepted, all others refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from music_rllib.config.analysis import Hypothesis
+from music_rllib.config.load import load_sweep
+from music_rllib.config.problems import ConfigError
+
+Document = dict[str, Any]
+Problems = Callable[[str, Document], list[str]]
+
+RAMP: Document = {"schedule": "linear", "start": 2.0, "end": 1.0}
+COMPARED: Document = {
+    "mode": "compare",
+    "compare": {"tac.entropic_index": [1.0, 2.0]},
+    "space": {"tac.alpha": {"float": [0.01, 0.1]}},
+    "trials": 2,
+}
+BEST: Document = {"final": {"trials": 1}}
+
+
+@pytest.fixture
+def problems(tmp_path: Path) -> Problems:
+    """The problems of a sweep with one hypothesis and one stage, `s`, that starts from another."""
+
+    def problems_of(hypothesis: str, stage: Document) -> list[str]:
+        path = tmp_path / "sweep.yaml"
+        stages = [
+            {"name": "u", "variant": "music-u"},
+            {"name": "s", "variant": "music-r", "init_from": "u", **stage},
+        ]
+        document = {"name": "n", "tasks": ["FetchPush"], "stages": stages}
+        path.write_text(yaml.safe_dump(document | {"analysis": {"hypotheses": [hypothesis]}}))
+        try:
+            load_sweep(path)
+        except ConfigError as error:
+            return list(error.lines)
+        return []
+
+    return problems_of
+
+
+def grid(name: str, *values: Any) -> Document:
+    return {"grid": {name: list(values)}}
+
+
+def search(*changes: Document) -> Document:
+    settings = dict(COMPARED)
+    for change in changes:
+        settings |= change
+    return {"search": settings}
+
+
+NORMALISE = "tac.normalise_observations"
+GROUPS = grid("tac", {}, {"entropic_index": 2.0})
+SOUND: list[tuple[str, Document]] = [
+    (
+        f"{NORMALISE} = true better than {NORMALISE} = False",
+        {"variant": "tac", "init_from": None, **grid(NORMALISE, True, False)},
+    ),
+    ("tac.lr = 1e-3 against tac.lr = .002", grid("tac.lr", 0.001, 0.002)),
+    (
+        "tac.target_bounds = [-50,0] against tac.target_bounds = null",
+        grid("tac.target_bounds", None, [-50, 0]),
+    ),
+    (
+        "tac.target_bounds = [-50.0, 0] against tac.target_bounds = None",
+        grid("tac.target_bounds", None, [-50, 0]),
+    ),
+    ("q = 2 to 1 better than q = 1", grid("tac.entropic_index", 1, RAMP)),
+    (
+        "tac.entropic_index.begin = 0.2 better than q = 1",
+        grid("tac.entropic_index", 1, RAMP | {"begin": 0.2}),
+    ),
+    ("alpha = learned against alpha = .1", grid("tac.alpha", 0.1, {"learned": True})),
+    (
+        "weight = 1 to 0 by success rate against weight = 1",
+        grid(
+            "music.mi_reward_weight",
+            1,
+            {"follows": "success_rate", "points": [[0.0, 1.0], [1.0, 0.0]]},
+        ),
+    ),
+    ("q = 2 better than q = 1", GROUPS),
+    (
+        "q = 2 better than q = 1",
+        grid("tac", {"entropic_index": 2.0, "alpha": 0.1}, {"alpha": 0.3}),
+    ),
+    ("q = 2 better than q = 1", search(BEST)),
+    ("q = 2, alpha = 0.1 better than q = 1, alpha = 0.1", search()),
+    (
+        "q = 2 better than q = 1",
+        search(
+            BEST,
+            {
+                "compare": {"tac": [{}, {"entropic_index": 2.0}]},
+                "space": {"env_steps": {"int": [9000, 9999]}},
+            },
+        ),
+    ),
+    (
+        "q = 2 better than q = 1",  # all alphas are in the final ranking of each q
+        search(
+            {
+                "sampler": "grid",
+                "trials": None,
+                "space": {"tac.alpha": {"choice": [0.1, 0.2]}},
+            }
+        ),
+    ),
+]
+
+
+@pytest.mark.parametrize(("hypothesis", "stage"), SOUND)
+def test_what_the_runs_can_tell_is_accepted(
+    hypothesis: str, stage: Document, problems: Problems
+) -> None:
+    assert problems(hypothesis, stage) == []
+
+
+UNTESTABLE: list[tuple[str, Document, str]] = [
+    ("q = 2 better than q = 1", search(), "write final: {trials: 1}, and mode: compare"),
+    ("q = 2, alpha = .1 better than q = 1", search(), "got final.trials: 3"),
+    ("q = 2 better than q = 1", search({"final": None}), "write final: {trials: 1} in the search"),
+    (
+        "u:tac.lr = 0.1 better than u:tac.lr = 0.2",
+        search(BEST, {"space": {"u:tac.lr": {"choice": [0.1, 0.2]}}}),
+        "of which s varies tac.entropic_index, got 'u:tac.lr'",
+    ),
+    ("q = 3 better than q = 1", GROUPS, "tac.entropic_index is [1.0, 2.0], got 3"),
+    (
+        'q = {"schedule": "linear"} better than q = 1',
+        grid("tac.entropic_index", 1, RAMP),
+        "must name a schedule in words, like '1 to 2' or 'learned', and of another setting a part",
+    ),
+    (
+        'alpha = {"learned": true} better than alpha = 0.1',
+        search({"space": {"tac.alpha": {"choice": [0.1, {"learned": True}]}}}),
+        "must name a schedule in words, like '1 to 2' or 'learned', and of another setting a part",
+    ),
+    (
+        "q = 1 to 2 better than q = 1",
+        grid("tac.entropic_index", 1, RAMP),
+        'tac.entropic_index is [1.0, "2 to 1"], got 1 to 2',
+    ),
+    (
+        "q = true better than q = 2",
+        grid("tac.entropic_index", 1, 2),
+        "tac.entropic_index is [1.0, 2.0], got true",
+    ),
+]
+
+
+@pytest.mark.parametrize(("hypothesis", "stage", "message"), UNTESTABLE)
+def test_what_no_run_can_tell_is_refused(
+    hypothesis: str, stage: Document, message: str, problems: Problems
+) -> None:
+    lines = problems(hypothesis, stage)
+    assert [message in line for line in lines][:1] == [True], lines
+
+
+@pytest.mark.parametrize(
+    "stage",
+    [
+        grid("tac.entropic_index", 1, 0),
+        search(BEST, {"compare": {"tac.entropic_index": [1.0, 0.0]}}),
+    ],
+)
+def test_a_value_that_is_invalid_is_no_second_mistake_of_the_hypothesis(
+    stage: Document, problems: Problems
+) -> None:
+    (line,) = problems("q = 0 better than q = 1", stage)
+    assert "must be > 0, got 0" in line
+
+
+@pytest.mark.parametrize(
+    "sides", [("q = 1", "q = 1.0"), ("a = true", "a = True"), ("a = [1, 2]", "a = [1.0,2]")]
+)
+def test_one_value_in_two_spellings_is_one_condition(sides: tuple[str, str]) -> None:
+    with pytest.raises(ValueError, match="must be two different conditions"):
+        Hypothesis.of(" against ".join(sides))
+
+
+def test_stages_are_told_apart_by_their_spelling() -> None:
+    assert Hypothesis.of("stage = 1 against stage = 1.0").relation == "against"
