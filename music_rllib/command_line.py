@@ -10,6 +10,7 @@ import json
 import math
 import os
 import shlex
+import shutil
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -157,7 +158,10 @@ def console_for(*, as_json: bool = False) -> Console:
         emoji=False,
         highlight=False,
         stderr=as_json,
-        width=None if terminal else int(os.environ.get("COLUMNS") or WIDTH),
+        # Rich follows a terminal, but would take a COLUMNS of 0 at its word.
+        width=None
+        if terminal and "COLUMNS" not in os.environ
+        else shutil.get_terminal_size((WIDTH, 24)).columns,
     )
 
 

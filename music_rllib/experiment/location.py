@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,7 @@ from music_rllib.experiment import sweep_files
 from music_rllib.experiment.plan import make_plan
 from music_rllib.experiment.session import Sweep, open_sweep
 from music_rllib.redaction import redact
-from music_rllib.store.paths import check_answers, resolve_storage, sweep_folder
+from music_rllib.store.paths import check_answers, folder_at, resolve_storage, sweep_folder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,6 +82,9 @@ def _locate(place: str, storage: str | None) -> SweepLocation:
     """Where the sweep would be, whether it is there or not."""
     if not place or storage == "":
         raise BadInputError(f"{'--storage' if place else 'SWEEP'} must not be empty, got ''")
+    folder = folder_at(place) if storage is None else None
+    if folder is not None:
+        return SweepLocation(storage=str(folder.parent), name=folder.name)
     if place.endswith((".yaml", ".yml")):
         config = load_sweep(place, storage=storage)
         return SweepLocation(storage=resolve_storage(config.storage)[0], name=config.name)
@@ -88,22 +92,20 @@ def _locate(place: str, storage: str | None) -> SweepLocation:
     if storage is None and "://" in place:
         above, _, name = place.rpartition("/")
         return SweepLocation(storage=above, name=name)
-    if storage is None:
-        folder = Path(place).expanduser().absolute()
-        if folder.is_dir():
-            return SweepLocation(storage=str(folder.parent), name=folder.name)
-        if "/" in place:
-            raise BadInputError(
-                f"SWEEP must be the folder of a sweep, a sweep's name or its YAML file, got "
-                f"{place}: there is no folder {folder} (sweeps beside it: "
-                f"{_names(str(folder.parent))})"
-            )
+    if storage is None and "/" in place:
+        folder = Path(resolve_storage(place)[0])
+        raise BadInputError(
+            f"SWEEP must be the folder of a sweep, a sweep's name or its YAML file, got {place}: "
+            f"there is no folder {folder} (sweeps beside it: {_names(str(folder.parent))})"
+        )
     return SweepLocation(storage=resolve_storage(storage or "results")[0], name=place)
 
 
 def _names(storage: str) -> str:
     """Names of the sweeps in a storage, in words."""
-    return ", ".join(sorted(sweep.name for sweep in sweeps_in(storage))) or "none"
+    with contextlib.suppress(OSError):  # of a path that can't be, with too long a name in it
+        return ", ".join(sorted(sweep.name for sweep in sweeps_in(storage))) or "none"
+    return "none"
 
 
 def sweeps_in(storage: str) -> list[SweepLocation]:

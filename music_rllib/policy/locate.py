@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import warnings
 from collections.abc import Iterator
-from pathlib import Path
 
 import pyarrow.fs as pafs
 
@@ -14,6 +14,7 @@ from music_rllib.envs.tasks import Task
 from music_rllib.labels import is_meant
 from music_rllib.policy.policy import PolicyError
 from music_rllib.store.object_folder import ObjectFolders, open_storage
+from music_rllib.store.paths import resolve_storage
 
 _SHORTEST_KEY = 4
 """Characters of a key's beginning that are enough to name it."""
@@ -35,8 +36,9 @@ def find_policy(wanted: str, storage: str) -> str:
     Raises:
         PolicyError: no run fits, or several do; the message lists them.
     """
-    if "://" in wanted or wanted.startswith(("models:/", "runs:/")) or Path(wanted).exists():
+    if "://" in wanted or wanted.startswith(("models:/", "runs:/")) or os.path.lexists(wanted):
         return wanted
+    storage = resolve_storage(storage)[0]
     filesystem, root = open_storage(storage)
     labels: dict[str, list[str]] = {}
     for key, label in _labels(filesystem, root):
@@ -58,13 +60,12 @@ def find_policy(wanted: str, storage: str) -> str:
             f"{wanted!r} must mean one run, it fits {', '.join(fits)}{more}; say more of its "
             "label, or its key"
         )
-    prefix = storage.rstrip("/")
     if keys[0] in finished:
-        return f"{prefix}/nodes/{keys[0]}"
+        return _below(storage, f"nodes/{keys[0]}")
     checkpoints = ObjectFolders(filesystem, f"{root}/work/{keys[0]}").names()
     if not checkpoints:
         raise PolicyError(f"{wanted!r} must have a checkpoint, it has none in {storage} yet")
-    return f"{prefix}/work/{keys[0]}/{checkpoints[-1]}"
+    return _below(storage, f"work/{keys[0]}/{checkpoints[-1]}")
 
 
 def named_environment(env: str | None) -> str | tuple[Task, ...]:
@@ -76,6 +77,12 @@ def named_environment(env: str | None) -> str | tuple[Task, ...]:
     if env is None:
         return ()
     return declared_tasks(env) if env.endswith((".yaml", ".yml")) else env
+
+
+def _below(storage: str, path: str) -> str:
+    """The place of a path in a storage, whose URI may end with options: `s3://bucket?region=x`."""
+    above, mark, options = storage.partition("?") if "://" in storage else (storage, "", "")
+    return f"{above.rstrip('/')}/{path}{mark}{options}"
 
 
 def _matching(wanted: str, keys: list[str], labels: dict[str, list[str]]) -> list[str]:

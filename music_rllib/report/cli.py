@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import shlex
 import sys
 from collections.abc import Callable, Sequence
@@ -154,13 +155,17 @@ def _export(sweep: Sweep, folder: Path, table_format: TableFormat, *, add: bool)
     from music_rllib.results.archive.merge import merged
     from music_rllib.results.data import ReportError
 
-    if add and is_archive(folder):
-        earlier = read_archive(folder)
-        if earlier.name != sweep.name:
-            raise ReportError(
-                f"--add needs an export of the same sweep, got {earlier.name!r} in {folder} and "
-                f"{sweep.name!r}"
-            )
+    earlier = None
+    if is_archive(folder):
+        # What an interrupted export has left may be replaced.
+        with contextlib.nullcontext() if add else contextlib.suppress(ReportError):
+            earlier = read_archive(folder)
+    if earlier is not None and earlier.name != sweep.name:
+        raise ReportError(
+            f"--export must be the folder of an export of the same sweep, or another folder, got "
+            f"{folder}: it has {earlier.name!r}, not {sweep.name!r}"
+        )
+    if add and earlier is not None:
         sweep = merged(earlier, sweep)
     write_archive(sweep, folder, table_format.value)
     values = sum(len(column.run) for column in sweep.history.values())
@@ -260,9 +265,9 @@ def _serve(
     from music_rllib.report.live.server import LivePage, make_server, serve
     from music_rllib.report.live.state import Progress
     from music_rllib.report.page import render
-    from music_rllib.store.paths import sweep_folder
+    from music_rllib.store.paths import folder_at, sweep_folder
 
-    sweep = find_sweep(place, None if Path(place).exists() else storage)
+    sweep = find_sweep(place, None if "/" in place or folder_at(place) else storage)
     progress = Progress(sweep)
 
     def make_page() -> str:

@@ -10,11 +10,11 @@ from pathlib import Path
 from music_rllib import names
 from music_rllib.experiment import sweep_files
 from music_rllib.results.archive.folder import is_archive, read_archive
-from music_rllib.results.data import Sweep
+from music_rllib.results.data import ReportError, Sweep
 from music_rllib.results.from_mlflow import read_mlflow
 from music_rllib.store.node_store import NodeStore, damage_in_words
 from music_rllib.store.object_folder import StorageError
-from music_rllib.store.paths import sweep_folder
+from music_rllib.store.paths import folder_at, resolve_storage, sweep_folder
 from music_rllib.tracking.store import SweepRecord, TrackingStore, local_folder, resolve_store
 
 
@@ -54,14 +54,19 @@ def find_sweep(
         ReportError: if there is no such sweep.
         TrackingError: if its store is not reachable.
     """
-    folder = Path(place).expanduser()
+    folder = folder_at(place) or Path(resolve_storage(place)[0])
     if is_archive(folder):
         return ReportSource(sweep=read_archive(folder), folder=folder, store=None)
-    name, parent = folder.absolute().name, str(folder.absolute().parent)
+    name, parent = folder.name, str(folder.parent)
     if "://" in place:
         storage = place.rstrip("/").rpartition("/")[0]
     elif SweepRecord.read(parent, name) is not None:
         storage = parent
+    elif "/" in place or place in {".", ".."}:
+        raise ReportError(
+            f"SWEEP must be the folder of a sweep, an exported folder or a sweep's name, got "
+            f"{place}: no sweep has logged to {folder}"
+        )
     storage = str(local_folder(storage) or storage)
     folder = sweep_folder(storage, name)
     record = SweepRecord.read(storage, name)

@@ -97,13 +97,13 @@ def same_database(one: str, other: str) -> bool:
 def _place(url: str) -> str:
     try:
         file = _file_of(_parsed(url, ""))
-    except (ArgumentError, StorageError):
+    except (ArgumentError, StorageError, RuntimeError):
         return url
     return url if file is None else str(file.resolve())
 
 
 def _parsed(url: str, setting: str) -> URL:
-    parsed = make_url(url if "://" in url else f"sqlite:///{url}")
+    parsed = make_url(url if "://" in url else f"sqlite:///{Path(url).expanduser()}")
     if parsed.password:
         raise StorageError(
             f"{setting} must not hold a password, got one in {redact(url)}: put it into the "

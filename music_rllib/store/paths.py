@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import stat
 import subprocess
 import sys
 import tempfile
 import unicodedata
 from pathlib import Path
+from urllib.parse import unquote
 
 from music_rllib.redaction import redact
 from music_rllib.store.object_folder import StorageError
@@ -46,9 +48,13 @@ def resolve_storage(storage: str) -> tuple[str, str | None]:
         The storage, and a notice for the user if it is not relative to the working directory.
 
     Raises:
-        StorageError: The storage begins with the home folder of an unknown user.
+        StorageError: The storage begins with the home folder of an unknown user, or is a URI
+            without a bucket.
     """
     if "://" in storage:
+        host = re.split("[/?]", storage.partition("://")[2])[0]
+        if storage.startswith(BUCKETS) and not host.rpartition("@")[2]:
+            raise StorageError(f"storage must name a bucket, got {redact(storage)!r}")
         return storage, None
     try:
         path = Path(storage).expanduser()
@@ -66,11 +72,27 @@ def resolve_storage(storage: str) -> tuple[str, str | None]:
 
 def sweep_folder(storage: str, name: str) -> Path:
     """Local folder of a sweep's own files: in the storage, or in the home folder for a bucket."""
-    folder = storage.removeprefix("file://")
-    if "://" not in folder:
-        return Path(folder) / name
+    if storage.startswith("file://"):
+        return Path(unquote(storage.removeprefix("file://"))) / name
+    if "://" not in storage:
+        return Path(storage) / name
     bucket = hashlib.sha256(storage.encode()).hexdigest()[:12]
     return Path.home() / ".music_rllib" / bucket / name
+
+
+def folder_at(place: str) -> Path | None:
+    """The folder that `place` names; None where there is none, or none can be reached.
+
+    A sweep is known by its folder's name, which a link to it and `..` don't tell. A link further up
+    stays: other machines may know the folder by that path alone.
+    """
+    try:
+        folder = Path(place).expanduser().absolute()
+        if folder.is_symlink() or ".." in folder.parts:
+            folder = folder.resolve()
+        return folder if folder.is_dir() else None
+    except (OSError, RuntimeError):  # too long a name, a loop of links, nobody's home
+        return None
 
 
 def check_storage(storage: str, name: str) -> None:

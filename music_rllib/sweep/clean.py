@@ -93,9 +93,12 @@ def what_can_go(location: SweepLocation, *, unfinished: bool, everything: bool) 
                 cleaning.add(filesystem, checkpoints, f"checkpoints of {label}: {why}")
         if finished and "continuation" in node:
             last = f"{root}/{CONTINUATIONS}/{node['continuation']}"
-            if exists(last):
-                what = f"last checkpoint of {label}: kept for a run with more env_steps"
-                cleaning.add(filesystem, last, what)
+            what = f"last checkpoint of {label}"
+            if exists(last) and node["continuation"] in users:
+                others = ", ".join(users[node["continuation"]])
+                cleaning.keep(last, f"{what}: {others} has it too")
+            elif exists(last):
+                cleaning.add(filesystem, last, f"{what}: kept for a run with more env_steps")
         if everything and finished:
             cleaning.add(filesystem, result, f"result of {label}")
     if everything:
@@ -114,6 +117,8 @@ def what_can_go(location: SweepLocation, *, unfinished: bool, everything: bool) 
 def _users(location: SweepLocation, nodes: Iterable[Mapping[str, Any]]) -> dict[str, list[str]]:
     """Key to the names of other sweeps that have the node, or whose searches count on it.
 
+    Likewise for the key of a last checkpoint, which runs share that differ in their budget alone.
+
     Raises:
         BadInputError: One of them is running.
     """
@@ -123,7 +128,8 @@ def _users(location: SweepLocation, nodes: Iterable[Mapping[str, Any]]) -> dict[
     for other in sweeps_in(location.storage):
         if other.name == location.name:
             continue
-        theirs = {node["key"] for node in plan_nodes(other)}
+        other_nodes = plan_nodes(other)
+        theirs = {node["key"] for node in other_nodes}
         # A trial that only this sweep has computed is part of their study's results all the same.
         for study in studies.keys() & _studies(other).keys():
             theirs |= _keys_of_stage(studies[study], mine)
@@ -133,7 +139,7 @@ def _users(location: SweepLocation, nodes: Iterable[Mapping[str, Any]]) -> dict[
                 f"SWEEP must share no runs with a running sweep to be cleaned, {location.name} "
                 f"shares {len(shared)} with {other.name}: stop that first"
             )
-        for key in shared:
+        for key in shared | {n["continuation"] for n in other_nodes if "continuation" in n}:
             users.setdefault(key, []).append(other.name)
     return users
 

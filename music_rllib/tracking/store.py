@@ -9,7 +9,7 @@ import sys
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
-from urllib.parse import urlsplit
+from urllib.parse import unquote, urlsplit
 
 from music_rllib.errors import TrackingError
 from music_rllib.experiment import sweep_files
@@ -142,7 +142,7 @@ def resolve_store(tracking_uri: str | None, storage: str) -> TrackingStore:
 def local_folder(storage: str) -> Path | None:
     """`storage` as an absolute path; None if it is a bucket."""
     if storage.startswith("file://"):
-        return Path(urlsplit(storage).path)
+        return Path(unquote(urlsplit(storage).path))
     if "://" in storage:
         return None
     return Path(storage).expanduser().absolute()

@@ -27,7 +27,7 @@ from music_rllib.report.build import PAGE
 from music_rllib.report.cli import app
 from music_rllib.report.location import find_sweep
 from music_rllib.results import from_mlflow
-from music_rllib.results.archive.folder import Format, read_archive
+from music_rllib.results.archive.folder import Format, read_archive, write_archive
 from music_rllib.results.data import ReportError, Sweep
 from music_rllib.results.from_mlflow import read_mlflow
 from music_rllib.results.mlflow_tables import read_tables
@@ -206,11 +206,15 @@ def check_content(sweep: Sweep, nodes: list[Node]) -> None:
 # Reading ----------------------------------------------------------------------------------------
 
 
-def test_what_was_logged_is_what_is_read(sweep_folder: Path, nodes: list[Node]) -> None:
+def test_what_was_logged_is_what_is_read(
+    sweep_folder: Path, nodes: list[Node], tmp_path: Path
+) -> None:
     check_content(find_sweep(str(sweep_folder)).sweep, nodes)
     by_name = find_sweep("tiny", storage=str(sweep_folder.parent), metrics=[names.MI_BOUND])
     assert set(by_name.sweep.history) == {names.MI_BOUND}
     assert by_name.undelivered == 0
+    (tmp_path / "latest").symlink_to(sweep_folder)
+    assert find_sweep(str(tmp_path / "latest")).folder == sweep_folder
 
 
 @pytest.mark.parametrize("table_format", get_args(Format))
@@ -232,6 +236,19 @@ def test_an_exported_sweep_is_the_same_sweep(
     broken = run(exported)
     assert broken.exit_code == 2
     assert f"{exported} must hold an exported sweep" in broken.stderr
+
+
+def test_an_export_of_another_sweep_is_not_replaced(sweep_folder: Path, tmp_path: Path) -> None:
+    exported = tmp_path / "published"
+    assert run(sweep_folder, "--export", exported).exit_code == 0
+    write_archive(dataclasses.replace(read_archive(exported), name="other"), exported)
+    for options in ((), ("--add",)):
+        refused = run(sweep_folder, "--export", exported, *options)
+        assert (refused.exit_code, "it has 'other', not 'tiny'" in refused.stderr) == (2, True)
+    (exported / "runs.parquet").unlink()  # as an interrupted export leaves it
+    assert run(sweep_folder, "--export", exported, "--add").exit_code == 2
+    assert run(sweep_folder, "--export", exported).exit_code == 0
+    assert read_archive(exported).name == "tiny"
 
 
 def test_the_page_shows_what_a_search_found(page: Path) -> None:
@@ -296,6 +313,13 @@ def test_there_is_no_such_sweep(sweep_folder: Path, tmp_path: Path) -> None:
     nothing = run("tiny", "--storage", tmp_path)
     assert nothing.exit_code == 2
     assert f"{tmp_path}/mlflow.db must be the sqlite file" in nothing.stderr
+    # A folder is not taken for the name of a sweep in the storage.
+    for place in (f"{tmp_path}/tiny", "..", "~nobody-at-all/tiny"):
+        nowhere = run(place, "--storage", sweep_folder.parent)
+        assert nowhere.exit_code == 2
+        assert nowhere.stderr.startswith("error: ")
+        assert "sqlite" not in nowhere.stderr
+    assert run("x" * 300, "--serve").exit_code == 2
     assert not list(tmp_path.iterdir())
 
 

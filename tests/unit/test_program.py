@@ -129,6 +129,31 @@ def test_init_writes_a_sweep_that_runs_and_replaces_none(
     assert main(["init", "nowhere/x.yaml"]) == 2
 
 
+@pytest.mark.parametrize(
+    ("file", "name"),
+    [
+        ("123.yaml", "123"),
+        ("true.yaml", "true"),
+        ("nodes.yaml", "nodes_sweep"),
+        ("mlflow.db.yaml", "mlflow.db_sweep"),
+        ("FILE NAME.yaml", "FILE_NAME"),
+    ],
+)
+def test_init_writes_a_valid_name_and_a_command_that_runs(
+    file: str,
+    name: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["init", file]) == 0
+    command = shlex.split(capsys.readouterr().out.partition("Check it with: ")[2])
+    assert command == ["music-rllib", "plan", file]
+    assert load_sweep(file).name == name
+    assert f"#   music-rllib run {shlex.quote(file)} " in Path(file).read_text()
+
+
 def test_presets_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["presets", "--json"]) == 0
     found = {one["name"] for one in json.loads(capsys.readouterr().out)}

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from rich.table import Table
 from rich.text import Text
 
-from music_rllib.command_line import console_for
+from music_rllib.command_line import WIDTH, console_for
 from music_rllib.redaction import (
     MAX_PARAM_LENGTH,
     flat_params,
@@ -133,6 +133,16 @@ def test_a_console_shows_markup_and_escapes_as_text(capsys: pytest.CaptureFixtur
     for word in ("[red]\\u001b[31m", "[link=x]", "[blink]", "[bold]x :smile:"):
         assert word in shown
     assert not any(unicodedata.category(one) == "Cc" for one in shown if one != "\n")
+
+
+@pytest.mark.parametrize(
+    ("columns", "width"), [("50", 50), ("abc", WIDTH), ("0", WIDTH), ("-3", WIDTH), ("", WIDTH)]
+)
+def test_a_console_is_as_wide_as_columns_says_if_that_is_a_width(
+    columns: str, width: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", columns)
+    assert console_for().width == width
 
 
 def test_an_error_shows_control_characters_as_text(

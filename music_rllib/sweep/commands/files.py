@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -46,7 +47,8 @@ def init(
         raise BadInputError(f"FILE must not exist yet, got {file}") from None
     except OSError as error:
         raise BadInputError(f"FILE must be writable, got {file}: {error.strerror}") from error
-    typer.echo(f"{file} is written. Check it with: music-rllib plan {file}")
+    command = shlex.join(["music-rllib", "plan", str(file)])
+    typer.echo(f"{file} is written. Check it with: {command}")
     return 0
 
 

@@ -12,7 +12,7 @@ import torch
 
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.envs.tasks import BUILT_IN_TASKS
-from music_rllib.policy import PolicyError, PolicyNetwork, find_policy, load_policy
+from music_rllib.policy import PolicyError, PolicyNetwork, find_policy, load_policy, locate
 from music_rllib.policy.network import PolicyFileError
 from music_rllib.store.handoff import write_handoff
 from music_rllib.store.object_folder import ObjectFolders, open_storage
@@ -228,6 +228,22 @@ def test_is_found_by_key_label_and_place(tmp_path: Path) -> None:
     shutil.rmtree(tmp_path / "nodes")
     with pytest.raises(PolicyError, match="no run is finished there"):
         find_policy("nothing", storage)
+
+
+def test_is_found_by_a_label_that_is_too_long_for_a_file(tmp_path: Path) -> None:
+    Trained(_run()).publish(tmp_path)
+    (tmp_path / "first").mkdir()
+    label = f"run/{'x' * 300}/seed=0"
+    plan = {"nodes": [{"key": KEY, "label": label}]}
+    (tmp_path / "first" / "plan.json").write_text(json.dumps(plan))
+    assert find_policy(label, str(tmp_path)) == f"{tmp_path}/nodes/{KEY}"
+
+
+def test_a_storage_keeps_its_options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    Trained(_run()).publish(tmp_path)
+    monkeypatch.setattr(locate, "open_storage", lambda _: open_storage(str(tmp_path)))
+    found = find_policy(KEY, "s3://bucket/x/?endpoint_override=127.0.0.1:9")
+    assert found == f"s3://bucket/x/nodes/{KEY}?endpoint_override=127.0.0.1:9"
 
 
 def test_a_run_that_sweeps_share_is_found_by_the_label_of_each(tmp_path: Path) -> None:

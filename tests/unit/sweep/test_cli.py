@@ -398,6 +398,32 @@ def test_an_empty_option_is_not_left_out(
     )
 
 
+LONG = "x" * 300
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("plan", "sweep.yaml", "--storage", "s3://"), "storage must name a bucket, got 's3://'"),
+        (("evaluate", "x", "--storage", "s3://?region=x"), "storage must name a bucket, got "),
+        (("evaluate", "x", "--storage", "~nobody-at-all/x"), "storage must be in a home that is"),
+        (("status", "~nobody-at-all/x"), "storage must be in a home that is known"),
+        (("evaluate", f"{LONG}/seed0"), f"'{LONG}/seed0' must be a folder, or the key or label"),
+        (("status", LONG), f"SWEEP must be a sweep that was started, got {LONG}"),
+        (("status", f"{LONG}/s"), "SWEEP must be the folder of a sweep"),
+        (("status", f"{LONG}/s/s"), "SWEEP must be the folder of a sweep"),
+    ],
+)
+def test_a_place_that_cannot_be_is_bad_input(
+    program: Program, tmp_path: Path, arguments: tuple[str, ...], message: str
+) -> None:
+    (tmp_path / "sweep.yaml").write_text(yaml.safe_dump(document()))
+    result = program(None, *arguments)
+    assert (result.exit_code, result.stderr.startswith(f"error: {message}")) == (2, True), (
+        result.stderr
+    )
+
+
 def test_a_folder_that_is_not_there(program: Program, tmp_path: Path) -> None:
     result = program(None, "status", str(tmp_path / "empty"))
     assert result.exit_code == 2

@@ -18,6 +18,7 @@ from fsspec.implementations.memory import MemoryFileSystem  # type: ignore[impor
 from music_rllib import names
 from music_rllib.config.load import load_sweep
 from music_rllib.experiment import location, sweep_files
+from music_rllib.experiment.continuation import continuation_key
 from music_rllib.experiment.plan import Node, make_plan
 from music_rllib.experiment.run_info import run_info
 from music_rllib.experiment.scheduler import Status
@@ -395,6 +396,26 @@ def test_clean_lists_and_deletes_what_no_other_sweep_has(
     assert (gone.code, ": other)" in gone.errors) == (2, True)
 
 
+def test_clean_keeps_a_last_checkpoint_that_another_sweep_shares(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    """Runs that differ in their budget alone have one folder for it."""
+    longer = opened(storage, tmp_path, name="long", defaults={"env_steps": 8000})
+    sweep = played(storage, tmp_path)
+    node = sweep.plan.nodes[0]
+    last = sweep.store.continuation(continuation_key(node.run, node.source_key))
+    with last.new_checkpoint(8000) as new:
+        (new.folder / "x").touch()
+    going = program("clean", f"{storage}/mine", "--yes", "--json").document
+    assert not going["items"]
+    (kept,) = going["kept"]
+    assert kept["what"] == f"last checkpoint of {node.label}: long has it too"
+    assert len(last.names()) == 1
+    sweep_files.remove(storage, f"{longer.config.name}/plan.json")
+    assert program("clean", f"{storage}/mine", "--yes").code == 0
+    assert not last.names()
+
+
 SEARCH: dict[str, Any] = {
     "space": {"tac.alpha": {"choice": [0.1, 0.2, 0.3]}},
     "sampler": "grid",
@@ -557,6 +578,30 @@ def test_the_recorded_configuration_is_the_sweeps(storage: str, tmp_path: Path) 
     assert found.storage == storage
 
 
+def test_a_sweep_is_found_by_its_folder_whatever_leads_there(
+    tmp_path: Path, program: Program, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    storage = str(tmp_path / "results")
+    for name in ("mine", "push.yaml"):
+        opened(storage, tmp_path, name=name)
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere/latest").symlink_to(f"{storage}/mine")
+    (tmp_path / "results/mine/report").mkdir()
+    monkeypatch.chdir(tmp_path / "results/mine/report")
+    for place in ("..", "../", "../../../elsewhere/latest"):
+        assert location.find_sweep(place, None).place == f"{storage}/mine"
+    assert program("status", f"{storage}/push.yaml", "--json").document["sweep"] == "push.yaml"
+    monkeypatch.setenv("HOME", f"{storage}/mine")
+    assert location.find_sweep("~", None).place == f"{storage}/mine"
+
+
+def test_a_file_uri_names_one_folder(tmp_path: Path, program: Program) -> None:
+    played(f"file://{tmp_path}/a%20b", tmp_path)
+    assert [path.name for path in tmp_path.glob("a*")] == ["a b"]
+    for place in (f"file://{tmp_path}/a%20b/mine", f"{tmp_path}/a b/mine"):
+        assert program("compare", place, "--json").document["groups"]
+
+
 def test_an_analysis_plan_is_recorded_and_changes_no_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: Program
 ) -> None:
@@ -646,7 +691,8 @@ def test_a_damaged_run_is_named_by_every_command_and_trained_again_when_asked(
     assert [line.split(":")[0] for line in removed] == [label(bad.label)]
     assert again.scheduler.next_ready() == bad
     assert len(again.finished) == 8
-    assert program("plan", file, "--storage", storage).code == 0
+    tracked = "mlflow.tracking_uri=http://127.0.0.1:9"  # a plan does not ask it
+    assert program("plan", file, "--storage", storage, tracked).code == 0
     assert program("status", place).code == 0
 
 

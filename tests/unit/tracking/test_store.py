@@ -53,6 +53,12 @@ def test_a_relative_storage_is_made_absolute(
     assert resolve_store(None, "results").database == tmp_path / "results" / "mlflow.db"
 
 
+def test_a_file_uri_is_the_folder_that_it_names() -> None:
+    store = resolve_store(None, "file:///data/a%20b")
+    assert store.database == Path("/data/a b/mlflow.db")
+    assert store.artefact_root == "file:///data/a%20b/mlartifacts"
+
+
 def test_a_server_keeps_its_artefacts_itself() -> None:
     store = resolve_store("http://u:secret@mlflow:5000", "s3://bucket/sweeps")
     assert store.artefact_root is None
