@@ -134,10 +134,11 @@ class Paced(Point):
 class HandOver(Point):
     """Is drawn in a size of its own, and takes no action beyond bounds that float32 can't hold."""
 
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
+
     def __init__(self, render_mode: str | None = None) -> None:
         super().__init__()
         self.action_space = spaces.Box(-0.1, 0.1, (2,), np.float64)
-        self.metadata = {"render_modes": ["rgb_array"]}
         self.render_mode = render_mode
 
     def step(self, action: Array) -> tuple[dict[str, Array], float, bool, bool, dict[str, Any]]:
