@@ -16,7 +16,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from music_rllib.config.analysis import check_analysis
+from music_rllib.config.hypotheses import check_analysis
 from music_rllib.config.problems import (
     ConfigError,
     Findings,

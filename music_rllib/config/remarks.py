@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Iterator, Mapping
 
-from music_rllib.config.analysis import unnamed_differences
+from music_rllib.config.hypotheses import unnamed_differences
 from music_rllib.config.problems import ConfigError
 from music_rllib.config.returns import Range, cut_off
 from music_rllib.config.run_settings import RunSettings

@@ -54,6 +54,18 @@ Indices = Annotated[
 """Positions in the observation vector: a list, or a half-open range `a:b` as in Python."""
 
 
+def beyond_observation(
+    agent_indices: Sequence[int], surrounding_indices: Sequence[int], size: int
+) -> list[str]:
+    """Why a split does not fit an observation of this size: behind it lie goals and the action."""
+    parts = (("agent_indices", agent_indices), ("surrounding_indices", surrounding_indices))
+    return [
+        f"{name} must be < {size}, the size of the observation, got {max(indices)}"
+        for name, indices in parts
+        if indices and max(indices) >= size
+    ]
+
+
 def check_split(agent_indices: Sequence[int], surrounding_indices: Sequence[int]) -> None:
     """Checks agent and surrounding state: both or none, no index twice; raises ValueError."""
     if bool(agent_indices) != bool(surrounding_indices):

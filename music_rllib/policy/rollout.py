@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from music_rllib.envs.make import Env, check_action_space, make_env, observation_sizes
+from music_rllib.envs.tasks import beyond_observation
 from music_rllib.policy.policy import Policy, PolicyError, unknown_environment
 
 
@@ -68,11 +69,9 @@ def _check_fit(policy: Policy, env: Env) -> None:
     ours = (policy.observation_size, policy.goal_size, policy.action_size)
     if theirs != ours:
         raise ValueError(f"it has observations, goals and actions of {theirs}, the policy {ours}")
-    beyond = [i for i in policy.task.surrounding_indices if i >= policy.observation_size]
-    if beyond:
-        raise ValueError(
-            f"surrounding_indices must be < {policy.observation_size}, got {beyond[0]}"
-        )
+    # The agent's are not read.
+    if beyond := beyond_observation((), policy.task.surrounding_indices, policy.observation_size):
+        raise ValueError(beyond[0])
 
 
 def play(

@@ -9,9 +9,10 @@ from music_rllib.report.figures.palette import styles_of
 from music_rllib.report.figures.study import alpha_panels, area_profile_panels
 from music_rllib.report.pieces import DASH, TextTable, estimate_cells
 from music_rllib.report.tables import Table
+from music_rllib.results.claims.claim import Claim
 from music_rllib.results.claims.contrasts import Verdict
 from music_rllib.results.claims.sensitivity import alpha_sensitivity
-from music_rllib.results.claims.study import Claim, Study, label_of
+from music_rllib.results.claims.study import Study, label_of
 from music_rllib.results.claims.tables import claim_rows, mean_rows
 from music_rllib.results.comparison import SHOW_SEEDS_BELOW, number, p_text
 

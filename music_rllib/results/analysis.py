@@ -115,15 +115,12 @@ def _analyse(
     sweep: Sweep, stage: Stage, cut_at: Mapping[str, float] | None = None
 ) -> StageAnalysis:
     cut_at = cut_at or {}
+    ended = sweep.until(cut_at) if cut_at else sweep
     metrics = {task: sweep.primary_metric(task) for task in stage.tasks}
     scopes = scopes_of(
         metrics,
         [
-            (
-                condition,
-                _final_scores(sweep, condition, metrics, cut_at),
-                sweep.episodes(condition.runs),
-            )
+            (condition, _final_scores(ended, condition, metrics), ended.episodes(condition.runs))
             for condition in stage.conditions
         ],
         stage.compared,
@@ -145,12 +142,7 @@ def _analyse(
             race for task, threshold in cells for race in races(sweep, task, groups, threshold)
         ),
         entropies={
-            (scope.name, final.condition): _entropies(
-                sweep,
-                final.condition,
-                stage.tasks if scope.name == ALL_TASKS else [scope.name],
-                cut_at,
-            )
+            (scope.name, final.condition): _entropies(ended, final.condition, stage, scope.name)
             for scope in scopes
             for final in scope.finals
         },
@@ -158,14 +150,12 @@ def _analyse(
     )
 
 
-def _entropies(
-    sweep: Sweep, condition: Condition, tasks: Sequence[str], cut_at: Mapping[str, float]
-) -> Entropies:
+def _entropies(sweep: Sweep, condition: Condition, stage: Stage, scope: str) -> Entropies:
+    tasks = stage.tasks if scope == ALL_TASKS else (scope,)
     runs = tuple(run for run in condition.runs if sweep.runs[run].task in tasks)
     estimates = []
     for metric in (names.SHANNON_ENTROPY, names.ENTROPY):
-        metrics = dict.fromkeys(tasks, metric)
-        scores = _final_scores(sweep, replace(condition, runs=runs), metrics, cut_at)
+        scores = _final_scores(sweep, replace(condition, runs=runs), dict.fromkeys(tasks, metric))
         complete = scores[~np.isnan(scores).any(axis=1)]
         estimates.append(st.estimate(complete) if len(complete) else None)
     return Entropies(*estimates)
@@ -187,9 +177,7 @@ def analyse_stages(sweep: Sweep, stages: Sequence[Stage]) -> StageAnalysis | Non
     return _analyse(sweep, together, cut_at)
 
 
-def _final_scores(
-    sweep: Sweep, condition: Condition, metrics: Mapping[str, str], cut_at: Mapping[str, float]
-) -> Array:
+def _final_scores(sweep: Sweep, condition: Condition, metrics: Mapping[str, str]) -> Array:
     """Last values of finished runs, `[seeds, T]`, NaN where there is none."""
     tasks = list(metrics)
     rows: dict[tuple[str, int], Array] = {}
@@ -200,7 +188,7 @@ def _final_scores(
         key = (record.seed, seen[record.seed, record.task])
         seen[record.seed, record.task] += 1
         row = rows.setdefault(key, np.full(len(tasks), np.nan))
-        score = sweep.final(run, metrics[record.task], cut_at.get(record.task, np.inf))
+        score = sweep.final(run, metrics[record.task])
         if record.is_finished and score is not None:
             row[tasks.index(record.task)] = score
     return np.array(list(rows.values())).reshape(len(rows), len(tasks))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -204,10 +204,18 @@ class Sweep:
         column = self.column(run, self.primary_metric(record.task))
         return column.step.astype(float), (column.time - record.started) / 1000
 
-    def final(self, run: int, metric: str, until: float = np.inf) -> float | None:
-        """The last value of a metric of `runs[run]` up to a step; None unless it is finite."""
-        column = self.column(run, metric)
-        values = column.value[: np.searchsorted(column.step, until, side="right")]
+    def until(self, steps: Mapping[str, float]) -> Sweep:
+        """The sweep with what its runs on a task had measured by a number of environment steps."""
+        last = np.array([steps.get(run.task, np.inf) for run in self.runs])
+        cut = {
+            metric: column.select(column.step <= last[column.run])
+            for metric, column in self.history.items()
+        }
+        return replace(self, history=cut)
+
+    def final(self, run: int, metric: str) -> float | None:
+        """The last value of a metric of `runs[run]`; None unless it is finite."""
+        values = self.column(run, metric).value
         return float(values[-1]) if len(values) and np.isfinite(values[-1]) else None
 
     def on(self, task: str) -> list[int]:

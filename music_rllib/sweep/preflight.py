@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from music_rllib.config.run_settings import RunSettings
-from music_rllib.envs.tasks import BUILT_IN_TASKS, Task, closest
+from music_rllib.envs.tasks import BUILT_IN_TASKS, Task, beyond_observation, closest
 from music_rllib.errors import BadInputError
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.plan import Plan
@@ -90,11 +90,7 @@ def _problems_of(task: Task, env: Env, hindsight: Set[str]) -> list[str]:
         size, goal_size = observation_sizes(env.observation_space)
     except ValueError as error:
         return [str(error).removeprefix("environment: ")]
-    problems = [
-        f"{name} must be < {size}, the size of the observation, got {max(indices)}"
-        for name in ("agent_indices", "surrounding_indices")
-        if (indices := getattr(task, name)) and max(indices) >= size
-    ]
+    problems = beyond_observation(task.agent_indices, task.surrounding_indices, size)
     limit = env.spec.max_episode_steps if env.spec is not None else None
     if limit is not None and task.horizon > limit:
         problems.append(

@@ -44,6 +44,7 @@ from music_rllib.envs.make import (
 )
 from music_rllib.envs.numbers import BadNumberError
 from music_rllib.envs.recording import Episode, Recording
+from music_rllib.envs.tasks import beyond_observation
 from music_rllib.replay.trajectories import ReplayLayout
 from music_rllib.runtime.quiet import quiet_third_parties
 from music_rllib.tac.rl_module import Actor, TACModule
@@ -99,12 +100,9 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
             goal=goal,
             horizon=episode_limit(self.env, self._settings.max_episode_steps),
         )
-        for name in ("agent_indices", "surrounding_indices"):
-            beyond = [index for index in getattr(self.config, name) if index >= observation]
-            if beyond:  # goals and actions come after it
-                raise ValueError(
-                    f"{name} must be < {observation}, the size of the observation, got {beyond[0]}"
-                )
+        split = (self.config.agent_indices, self.config.surrounding_indices)
+        if beyond := beyond_observation(*split, observation):
+            raise ValueError("\n".join(beyond))
 
     def _make_sub_env(self, vector_index: int) -> Env:
         context = EnvContext(

@@ -8,13 +8,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from music_rllib import names
+from music_rllib.results.claims.claim import Claim
 from music_rllib.results.claims.contrasts import (
     Verdict,
     seeds_for_difference,
     seeds_for_equivalence,
 )
 from music_rllib.results.claims.plan import AnalysisPlan, is_controlled
-from music_rllib.results.claims.study import Claim, Mean, Study, label_of
+from music_rllib.results.claims.study import Mean, Study, label_of
 from music_rllib.results.comparison import ALL_TASKS, interval_text, number, p_text
 from music_rllib.results.conditions import Stage
 from music_rllib.results.data import Sweep

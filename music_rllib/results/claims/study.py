@@ -13,74 +13,18 @@ from itertools import combinations
 
 import numpy as np
 
-from music_rllib import names
 from music_rllib.config.analysis import Hypothesis
 from music_rllib.results import statistics as st
-from music_rllib.results.claims.contrasts import Contrast, Verdict, contrast, decide
+from music_rllib.results.claims.claim import Claim, claims_of, decided
 from music_rllib.results.claims.match import alike_in_the_rest, in_words, matching
-from music_rllib.results.claims.plan import MARGIN_OF_A_RATE, PlanVersion
+from music_rllib.results.claims.plan import PlanVersion
 from music_rllib.results.claims.scores import Measure, Scores, ended_first, measure_on, scores_of
-from music_rllib.results.comparison import ALL_TASKS
 from music_rllib.results.conditions import SEEDS, Condition, Stage, find_stages
 from music_rllib.results.data import Sweep
-from music_rllib.results.statistics import Array, Estimate
-
-Cells = Sequence[tuple[Condition, Condition]]
-"""Pairs of conditions that are alike in the rest."""
+from music_rllib.results.statistics import Estimate
 
 MOST_CONDITIONS = 6
 """Number of conditions up to which each is compared with each; more, with a reference."""
-FEWEST_SHARED = 2
-"""Least number of shared seeds for a comparison in pairs."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Claim:
-    """One condition against another on a task, tested."""
-
-    first: str
-    second: str
-    task: str
-    """The task, or `ALL_TASKS` for their mean."""
-    measure: Measure
-    margin: float | None
-    """Difference below which it does not matter; None where none was stated."""
-    contrast: Contrast
-    pairs: Cells = field(repr=False)
-    """Pairs of conditions, alike in the rest, over which it is the mean."""
-    p_value: float = 1.0
-    """Adjusted p-value of no difference; it and the fields below are set by :func:`_decided`."""
-    p_equivalent: float | None = None
-    """Adjusted p-value of no equivalence; None without a margin."""
-    verdict: Verdict = Verdict.UNDECIDED
-    planned: bool = False
-    """Whether it was stated before the first of its runs had finished."""
-    hypothesis: Hypothesis | None = None
-
-    @property
-    def subject(self) -> tuple[object, ...]:
-        """What it is about: two claims on the same subject differ in nothing but the plan."""
-        pairs = frozenset(frozenset(pair) for pair in self.pairs)
-        return pairs, self.task, self.measure.kind, self.measure.metric
-
-    @property
-    def p_of_verdict(self) -> float:
-        """The adjusted p-value of the test that the verdict comes from."""
-        if self.verdict is Verdict.EQUIVALENT and self.p_equivalent is not None:
-            return self.p_equivalent
-        return self.p_value
-
-    @property
-    def confirmed(self) -> bool | None:
-        """Whether its hypothesis holds; None where that is undecided or nothing was expected."""
-        expected = {
-            "better than": Verdict.SUPERIOR,
-            "worse than": Verdict.WORSE,
-            "equivalent to": Verdict.EQUIVALENT,
-        }.get(self.hypothesis.relation if self.hypothesis else "against")
-        if expected is None or self.verdict is Verdict.UNDECIDED:
-            return None
-        return self.verdict is expected
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,11 +114,7 @@ def study_of(
             for task in chosen.tasks
         }
         means += _means(sweep, chosen, measures)
-        seen = {claim.subject for claim in (*planned, *afterwards)}
-        pairs = [(label_of(x), label_of(y), [(x, y)]) for x, y in _pairs(chosen.compared)]
-        afterwards += [
-            claim for claim in _claims(sweep, pairs, measures, margin) if claim.subject not in seen
-        ]
+        afterwards += _of_stage(sweep, chosen, measures, margin, (*planned, *afterwards))
     about = [stages[name] for name in (plan.plan.stages if plan else ()) if name in stages]
     family = len(planned) + without_test if plan else len(afterwards)
     return Study(
@@ -182,8 +122,8 @@ def study_of(
         plan=plan,
         latest=latest,
         means=tuple(means),
-        planned=_decided(planned, planned=True, without_test=without_test),
-        afterwards=_decided(afterwards, planned=False),
+        planned=decided(planned, planned=True, without_test=without_test),
+        afterwards=decided(afterwards, planned=False),
         untested=tuple(dict.fromkeys(untested)),
         family=family,
         runs=tuple({run: None for stage in filter(None, [chosen, *about]) for run in _runs(stage)}),
@@ -232,54 +172,30 @@ def _of_plan(
             for task in dict.fromkeys(sweep.runs[run].task for run in runs)
         }
         labelled = (in_words(hypothesis.first), in_words(hypothesis.second), cells)
-        claims = list(_claims(sweep, [labelled], measures, version.plan.margin))
+        claims = list(claims_of(sweep, [labelled], measures, version.plan.margin))
         if not claims:
             untested.append(f"{text}: no seed has finished in both conditions")
         yield from (replace(claim, hypothesis=hypothesis) for claim in claims)
 
 
+def _of_stage(
+    sweep: Sweep,
+    stage: Stage,
+    measures: Mapping[str, Measure],
+    margin: float | None,
+    others: Sequence[Claim],
+) -> Iterator[Claim]:
+    """The undecided claims of a stage's pairs of conditions, on what no other claim is about."""
+    known = {claim.subject for claim in others}
+    pairs = [(label_of(x), label_of(y), [(x, y)]) for x, y in _pairs(stage.compared)]
+    for claim in claims_of(sweep, pairs, measures, margin):
+        if claim.subject not in known:
+            yield claim
+
+
 def _as_planned(measure: Measure, task: str, version: PlanVersion) -> Measure:
     """The measure over no more than the budget that was planned."""
     return replace(measure, horizon=min(measure.horizon, version.plan.budget.get(task, np.inf)))
-
-
-def _claims(
-    sweep: Sweep,
-    comparisons: Sequence[tuple[str, str, Cells]],
-    measures: Mapping[str, Measure],
-    margin: float | None,
-) -> Iterator[Claim]:
-    """Undecided claims over all tasks, and on each, of two labels and the cells that they name."""
-    for scope, own in _scopes(measures):
-        measure, *others = own.values()
-        if any(other.horizon != measure.horizon for other in others):
-            measure = replace(measure, horizon=np.nan)
-        is_success = measure.metric == names.EVAL_SUCCESS
-        own_margin = MARGIN_OF_A_RATE if margin is None and is_success else margin
-        for first, second, cells in comparisons:
-            columns = [
-                [scores_of(sweep, pair[side], task, m) for pair in cells for task, m in own.items()]
-                for side in (0, 1)
-            ]
-            tested = _contrast(*columns, is_rate=measure.is_rate, margin=own_margin)
-            if tested is not None:
-                yield Claim(
-                    first=first,
-                    second=second,
-                    task=scope,
-                    measure=measure,
-                    margin=own_margin,
-                    contrast=tested,
-                    pairs=cells,
-                )
-
-
-def _scopes(measures: Mapping[str, Measure]) -> Iterator[tuple[str, Mapping[str, Measure]]]:
-    """All tasks together, where they have a unit in common, and each by itself."""
-    if len(measures) > 1 and all(one.is_rate for one in measures.values()):
-        yield ALL_TASKS, measures
-    for task, one in measures.items():
-        yield task, {task: one}
 
 
 def label_of(condition: Condition) -> str:
@@ -304,56 +220,6 @@ def _pairs(conditions: Sequence[Condition]) -> list[tuple[Condition, Condition]]
         first = conditions[indices.index(reference)]
         pairs = [(one, first) for one in conditions]
     return [(one, other) for one, other in pairs if one is not other]
-
-
-def _contrast(
-    first: Sequence[Scores], second: Sequence[Scores], *, is_rate: bool, margin: float | None
-) -> Contrast | None:
-    """The contrast of two sides; None where one has no seed that has finished everywhere.
-
-    Args:
-        first: scores on each task of each of several pairs that are alike in the rest.
-        second: scores of the other side.
-        is_rate: whether they are rates, whose episodes tell how sure seeds that tie are.
-        margin: difference below which it does not matter.
-    """
-    sides = [_complete(first), _complete(second)]
-    if not (sides[0] and sides[1]):
-        return None
-    shared = [seed for seed in sides[0] if seed in sides[1]]
-    paired = len(shared) >= FEWEST_SHARED and 2 * len(shared) >= max(map(len, sides))
-    if paired:
-        sides = [{seed: side[seed] for seed in shared} for side in sides]
-    matrices = [np.array(list(side.values())) for side in sides]
-    apart = None
-    if is_rate:
-        episodes = [float(np.mean([one.episodes for one in side])) for side in (first, second)]
-        apart = st.difference(*map(st.estimate, matrices, episodes))
-    x, y = (matrix.mean(axis=1) for matrix in matrices)
-    return contrast(x, y, paired=paired, margin=margin, apart=apart)
-
-
-def _complete(columns: Sequence[Scores]) -> dict[str, Array]:
-    """The scores of each seed that has finished in every column."""
-    seeds = [seed for seed in columns[0].by_seed if all(seed in c.by_seed for c in columns)]
-    return {seed: np.array([c.by_seed[seed] for c in columns]) for seed in seeds}
-
-
-def _decided(claims: Sequence[Claim], *, planned: bool, without_test: int = 0) -> tuple[Claim, ...]:
-    """The claims with adjusted p-values and verdicts, as one family with those without a test."""
-    opposite = {Verdict.SUPERIOR: Verdict.WORSE, Verdict.WORSE: Verdict.SUPERIOR}
-    return tuple(
-        replace(
-            claim,
-            p_value=p_value,
-            p_equivalent=p_equivalent,
-            verdict=verdict if claim.measure.maximised else opposite.get(verdict, verdict),
-            planned=planned,
-        )
-        for claim, (p_value, p_equivalent, verdict) in zip(
-            claims, decide([claim.contrast for claim in claims], without_test), strict=True
-        )
-    )
 
 
 def _means(sweep: Sweep, stage: Stage, measures: Mapping[str, Measure]) -> Iterator[Mean]:

@@ -376,9 +376,13 @@ def test_a_file_may_be_called_nearly_as_a_command(program: Program, tmp_path: Pa
     assert program(None, "plans", "--dry-run").exit_code == 0
 
 
+LONG = "x" * 300
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        # An empty option is not left out.
         (("run", "sweep.yaml", "--name", ""), "--name must "),
         (("plan", "sweep.yaml", "--storage", ""), "--storage must not be empty"),
         (("plan", "sweep.yaml", "--seeds", ""), "--seeds must be a number of seeds"),
@@ -386,24 +390,6 @@ def test_a_file_may_be_called_nearly_as_a_command(program: Program, tmp_path: Pa
         (("status", "sweep.yaml", "--storage", ""), "--storage must not be empty, got ''"),
         (("evaluate", "a/seed0", "--storage", ""), "--storage must not be empty, got ''"),
         (("status", ""), "SWEEP must not be empty, got ''"),
-    ],
-)
-def test_an_empty_option_is_not_left_out(
-    program: Program, tmp_path: Path, arguments: tuple[str, ...], message: str
-) -> None:
-    (tmp_path / "sweep.yaml").write_text(yaml.safe_dump(document()))
-    result = program(None, *arguments)
-    assert (result.exit_code, result.stderr.startswith(f"error: {message}")) == (2, True), (
-        result.stderr
-    )
-
-
-LONG = "x" * 300
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
         (("plan", "sweep.yaml", "--storage", "s3://"), "storage must name a bucket, got 's3://'"),
         (("evaluate", "x", "--storage", "s3://?region=x"), "storage must name a bucket, got "),
         (("evaluate", "x", "--storage", "~nobody-at-all/x"), "storage must be in a home that is"),
@@ -414,7 +400,7 @@ LONG = "x" * 300
         (("status", f"{LONG}/s/s"), "SWEEP must be the folder of a sweep"),
     ],
 )
-def test_a_place_that_cannot_be_is_bad_input(
+def test_an_option_or_place_that_cannot_be_is_bad_input(
     program: Program, tmp_path: Path, arguments: tuple[str, ...], message: str
 ) -> None:
     (tmp_path / "sweep.yaml").write_text(yaml.safe_dump(document()))
