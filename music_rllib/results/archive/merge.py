@@ -84,12 +84,13 @@ def of_plan(plan: Plan, exports: Iterable[Sweep], *earlier: Plan) -> Sweep | Non
 
 
 def _plans(sweeps: Iterable[Sweep]) -> tuple[PlanVersion, ...]:
-    """Every version of a plan once, as it was recorded first."""
-    first: dict[str, PlanVersion] = {}
+    """Every version of a plan once, as recorded first, without later ones for fewer seeds."""
+    kept: list[PlanVersion] = []
     versions = (version for sweep in sweeps for version in sweep.plans)
     for version in sorted(versions, key=lambda version: version.recorded_ms):
-        first.setdefault(version.hash, version)
-    return tuple(first.values())
+        if not any(version.plan.is_part_of(earlier.plan) for earlier in kept):
+            kept.append(version)
+    return tuple(kept)
 
 
 def _run(place: _Place) -> RunRecord:

@@ -77,6 +77,11 @@ class AnalysisPlan(_Strict):
         """Hash of the content."""
         return content_key(self.model_dump(mode="json"))
 
+    def is_part_of(self, other: AnalysisPlan) -> bool:
+        """Whether this is `other`, or the same for some of its seeds, as of one sitting."""
+        own, others = (set(plan.seeds.split(", ")) for plan in (self, other))
+        return own <= others and self == other.model_copy(update={"seeds": self.seeds})
+
 
 def _stages_of(hypotheses: Sequence[str], default: str) -> frozenset[str]:
     sides = [side for text in hypotheses for side in Hypothesis.of(text)[1:3]]

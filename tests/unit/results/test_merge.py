@@ -1,5 +1,6 @@
 """Merged exports: no run twice, none lost, and each with its own numbers."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ from music_rllib import names
 from music_rllib.config.load import load_sweep
 from music_rllib.experiment.plan import make_plan
 from music_rllib.results.archive.merge import merged, of_plan
+from music_rllib.results.claims.plan import AnalysisPlan, with_plan
 from music_rllib.results.data import Points, RunRecord, Sweep, columns
 from music_rllib.version import ALGORITHM_VERSION
 
@@ -61,6 +63,32 @@ def test_an_unfinished_run_is_the_later_one_and_merging_again_changes_nothing() 
     empty = sweep()
     assert values_of(merged(empty, whole)) == values_of(merged(whole, empty)) == values_of(whole)
     assert np.all(np.diff(merged(whole, whole).history["m"].run) >= 0)
+
+
+def test_a_later_sitting_with_some_of_the_seeds_is_no_other_plan() -> None:
+    """Its runs would be told to have been made when the plan had changed."""
+
+    def recorded(at: int, seeds: str) -> Sweep:
+        plan = AnalysisPlan(
+            question=None,
+            hypotheses=("q = 2 worse than q = 1",),
+            stage="s",
+            metric="auc",
+            primary_metric="p",
+            margin=0.05,
+            seeds=seeds,
+            control="c",
+            budget={},
+            test="t",
+        )
+        return replace(sweep(), plans=with_plan((), plan, at))
+
+    whole, part, more = recorded(1, "0, 1, 12"), recorded(2, "12, 1"), recorded(3, "0, 1, 2")
+    assert merged(whole, part).plans == merged(part, whole).plans == whole.plans
+    assert merged(whole, more).plans == (*whole.plans, *more.plans)
+    # Seeds that came later are a change, though their plan has the earlier ones, too.
+    early, late = recorded(1, "0, 1"), recorded(2, "0, 1, 2")
+    assert merged(early, late).plans == (*early.plans, *late.plans)
 
 
 def test_a_plans_runs_are_found_in_other_sweeps_exports(tmp_path: Path) -> None:
