@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import os
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
@@ -21,9 +22,23 @@ Env = gym.Env[Any, Any]
 
 @functools.cache
 def _register_robotics() -> None:
-    """Registers the robotics tasks with Gymnasium, without their package's notice."""
+    """Registers the robotics tasks with Gymnasium, without their package's notice.
+
+    Raises:
+        gymnasium.error.DependencyNotInstalled: MuJoCo can't be imported.
+    """
     drop_farama_notice()
-    import gymnasium_robotics
+    try:
+        import gymnasium_robotics
+    # With a way of drawing that the machine has not, errors of any type.
+    except Exception as error:
+        way = os.environ.get("MUJOCO_GL")
+        if way is None:
+            raise
+        raise gym.error.DependencyNotInstalled(
+            f"MuJoCo can't be loaded with MUJOCO_GL={way} ({error}): unset it, or install what it "
+            "needs (Debian: libosmesa6 for osmesa, libegl1 for egl)"
+        ) from error
 
     gym.register_envs(gymnasium_robotics)
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from music_rllib.envs.make import make_env
 from music_rllib.envs.tasks import BUILT_IN_TASKS, Task
 from music_rllib.policy import Policy, PolicyNetwork, load_policy
 from music_rllib.policy.rollout import open_task, play
@@ -184,6 +188,7 @@ def test_no_driver_is_said_with_what_to_install(
     good: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """With a way of drawing that this machine has not."""
+    make_env(REACH.env_id).close()  # MuJoCo is loaded; by the test below it is not
     monkeypatch.setenv("MUJOCO_GL", "osmesa" if find_renderer()[0] != "osmesa" else "glfw")
     if find_renderer("osmesa")[0] is not None:
         pytest.skip("every way of drawing works here")
@@ -193,3 +198,20 @@ def test_no_driver_is_said_with_what_to_install(
     assert "no way to draw without a screen works here (osmesa: " in said
     assert "libegl1" in said
     assert not video.exists()
+
+
+def test_a_fresh_process_says_that_mujoco_does_not_load_with_a_way_of_drawing(good: Path) -> None:
+    """Only loading it looks at the variable, and PyOpenGL's error does not name it."""
+    if find_renderer("osmesa")[0] is not None:
+        pytest.skip("osmesa works here")
+    done = subprocess.run(
+        [sys.executable, "-m", "music_rllib", "evaluate", str(good), "--episodes", "1"],
+        env=os.environ | {"MUJOCO_GL": "osmesa"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert "MuJoCo can't be loaded with MUJOCO_GL=osmesa" in done.stderr
+    assert "unset it, or install" in done.stderr
+    assert "Traceback" not in done.stderr
