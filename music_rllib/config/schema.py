@@ -108,7 +108,8 @@ class InitFrom(StrictModel):
     stage: str | None = None
     """An earlier stage; a run starts from that stage's run with the same seed."""
     checkpoint: str | None = None
-    """Folder of a handoff from outside the sweep, in place of a stage."""
+    """Folder of a handoff from outside the sweep, in place of a stage. It is copied into the
+    storage, from which the sweep goes on and is compared, wherever the folder is by then."""
     task: str | None = None
     """Task of the run, or of the checkpoint, to start from; null: each run's own task."""
 
@@ -139,6 +140,10 @@ class StageHeader(StrictModel):
     """A search for the trials in place of `grid` (docs/search.md)."""
 
 
+IMPORTED = "handoff-"
+"""Beginning of the keys of nodes that are handoffs from outside."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Checkpoint:
     """A handoff from outside the sweep."""
@@ -146,6 +151,11 @@ class Checkpoint:
     folder: Path
     """Folder with `handoff.json`."""
     manifest: HandoffManifest
+
+    @property
+    def key(self) -> str:
+        """The node as which a storage has it."""
+        return f"{IMPORTED}{self.manifest.content_hash}"
 
 
 @dataclass(frozen=True, kw_only=True)

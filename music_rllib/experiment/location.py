@@ -14,7 +14,9 @@ from music_rllib.errors import BadInputError
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.plan import make_plan
 from music_rllib.experiment.session import Sweep, open_sweep
+from music_rllib.experiment.sweep_files import IN_STORAGE
 from music_rllib.redaction import redact
+from music_rllib.store.node_store import NodeStore
 from music_rllib.store.paths import check_answers, folder_at, resolve_storage, sweep_folder
 
 
@@ -39,8 +41,14 @@ class SweepLocation:
 
         Raises:
             ConfigError: This version can't make sense of it.
+            StorageError: A handoff that it starts from is damaged, or not there.
         """
         document = self.read(sweep_files.CONFIG)
+        store = NodeStore(self.storage)
+        for stage in document["stages"]:
+            match stage.get("init_from"):
+                case {"checkpoint": str(place)} as source if place.startswith(IN_STORAGE):
+                    source["checkpoint"] = str(store.folder(place.removeprefix(IN_STORAGE)))
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder, f"{self.name}.json")
             path.write_text(sweep_files.as_json(document), encoding="utf-8")

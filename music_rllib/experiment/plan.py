@@ -246,8 +246,8 @@ class Plan:
             return None, {}
         task = source.task or task
         if source.checkpoint is not None:
-            key = f"handoff-{source.checkpoint.manifest.content_hash}"
-            return Input(key=key, task=task, checkpoint=source.checkpoint), {}
+            checkpoint = source.checkpoint
+            return Input(key=checkpoint.key, task=task, checkpoint=checkpoint), {}
         run = self._by_cell[str(source.stage), source_trial, task.name, seed]
         values = {
             name if ":" in name else f"{run.stage}:{name}": value

@@ -13,7 +13,7 @@ from music_rllib.config.schema import SweepConfig
 from music_rllib.experiment.continuation import continuation_key
 from music_rllib.experiment.plan import Plan
 from music_rllib.experiment.scheduler import DONE, Scheduler
-from music_rllib.experiment.sweep_files import CONFIG, PLAN, as_json, keep, read
+from music_rllib.experiment.sweep_files import CONFIG, IN_STORAGE, PLAN, as_json, keep, read
 from music_rllib.labels import ShortLabels
 from music_rllib.redaction import redact, without_secrets
 from music_rllib.store.node_store import NodeStore, damage_in_words
@@ -125,10 +125,9 @@ def keep_record(sweep: Sweep) -> None:
 
 
 def _configuration(config: SweepConfig) -> dict[str, Any]:
-    """The whole configuration, without secrets and with absolute paths."""
+    """The whole configuration, without secrets, and with handoffs as the storage has them."""
     document: dict[str, Any] = json.loads(as_json(without_secrets(config.document)))
-    for stage in document["stages"]:
-        source = stage.get("init_from")
-        if isinstance(source, dict) and source.get("checkpoint"):
-            source["checkpoint"] = str(Path(source["checkpoint"]).expanduser().absolute())
+    for stage, resolved in zip(document["stages"], config.stages, strict=True):
+        if resolved.source and resolved.source.checkpoint:
+            stage["init_from"]["checkpoint"] = f"{IN_STORAGE}{resolved.source.checkpoint.key}"
     return document

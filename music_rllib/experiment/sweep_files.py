@@ -23,6 +23,9 @@ if TYPE_CHECKING:
     from music_rllib.experiment.session import Sweep
 
 CONFIG, PLAN, SEARCH, STATE = "config.json", "plan.json", "search.json", "state.json"
+IN_STORAGE = "storage:"
+"""In `config.json`, in front of the key of a handoff: its first folder may be on another machine,
+or hold another one by now."""
 STOP = "stop.json"
 """Its presence asks the driver to stop."""
 SILENCE_SECONDS = 90.0

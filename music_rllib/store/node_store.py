@@ -14,13 +14,14 @@ The store, not Tune's snapshot, decides which runs are finished.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import shutil
 import uuid
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, mkdtemp
 from typing import Any, NamedTuple
 
 import pyarrow.fs as pafs
@@ -93,6 +94,15 @@ class NodeStore:
     def fetch(self, key: str, folder: Path) -> None:
         """Copy a finished node's files into `folder`, verified."""
         self._nodes.fetch(key, folder)
+
+    def folder(self, key: str) -> Path:
+        """A finished node's folder on this machine; of a bucket, a copy until the program ends."""
+        if self._local:
+            return Path(self.path(key))
+        copy = Path(mkdtemp(prefix="music-rllib-node-"))
+        atexit.register(shutil.rmtree, copy, ignore_errors=True)
+        self.fetch(key, copy)
+        return copy
 
     def verify(self, key: str) -> None:
         """Check that a finished node matches its manifest."""

@@ -9,6 +9,7 @@ from typing import Any
 
 import pyarrow.fs as pafs
 
+from music_rllib.config.schema import IMPORTED
 from music_rllib.errors import BadInputError
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.location import SweepLocation, sweeps_in
@@ -70,7 +71,7 @@ def what_can_go(location: SweepLocation, *, unfinished: bool, everything: bool) 
         raise BadInputError(
             f"SWEEP must not be running to be cleaned, {location.name} is: stop it first"
         )
-    nodes = plan_nodes(location)
+    nodes = _nodes(location)
     users = _users(location, nodes)
     pruned = set((state or {}).get("pruned", ()))
     cleaning = Cleaning()
@@ -114,6 +115,16 @@ def what_can_go(location: SweepLocation, *, unfinished: bool, everything: bool) 
     return cleaning
 
 
+def _nodes(location: SweepLocation) -> list[dict[str, Any]]:
+    """The nodes of a sweep's plan, and the handoffs from outside that they start from."""
+    nodes = plan_nodes(location)
+    imported = {node["input"]: None for node in nodes if str(node["input"]).startswith(IMPORTED)}
+    return [
+        *nodes,
+        *({"key": key, "label": f"{key} (imported)", "input": None} for key in imported),
+    ]
+
+
 def _users(location: SweepLocation, nodes: Iterable[Mapping[str, Any]]) -> dict[str, list[str]]:
     """Key to the names of other sweeps that have the node, or whose searches count on it.
 
@@ -128,7 +139,7 @@ def _users(location: SweepLocation, nodes: Iterable[Mapping[str, Any]]) -> dict[
     for other in sweeps_in(location.storage):
         if other.name == location.name:
             continue
-        other_nodes = plan_nodes(other)
+        other_nodes = _nodes(other)
         theirs = {node["key"] for node in other_nodes}
         # A trial that only this sweep has computed is part of their study's results all the same.
         for study in studies.keys() & _studies(other).keys():

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow.fs as pafs
 import pytest
 import yaml
@@ -17,6 +18,7 @@ from fsspec.implementations.memory import MemoryFileSystem  # type: ignore[impor
 
 from music_rllib import names
 from music_rllib.config.load import load_sweep
+from music_rllib.config.run_settings import RunSettings
 from music_rllib.experiment import location, sweep_files
 from music_rllib.experiment.continuation import continuation_key
 from music_rllib.experiment.plan import Node, make_plan
@@ -34,11 +36,13 @@ from music_rllib.results.comparison import each_seed, verdict
 from music_rllib.results.data import Points, RunRecord, columns
 from music_rllib.results.data import Sweep as Logged
 from music_rllib.store import node_store, object_folder, paths
+from music_rllib.store.handoff import write_handoff
 from music_rllib.store.object_folder import DamagedError
 from music_rllib.store.paths import sweep_folder
 from music_rllib.store.run_record import HISTORY, Report, RunResult, to_json_lines
 from music_rllib.sweep import clean, cli
 from music_rllib.sweep.listeners.state_file import StateFile
+from music_rllib.sweep.preflight import import_checkpoints
 
 SWEEP: dict[str, Any] = {
     "name": "mine",
@@ -414,6 +418,53 @@ def test_clean_keeps_a_last_checkpoint_that_another_sweep_shares(
     sweep_files.remove(storage, f"{longer.config.name}/plan.json")
     assert program("clean", f"{storage}/mine", "--yes").code == 0
     assert not last.names()
+
+
+def from_handoff(storage: str, tmp_path: Path, name: str = "mine") -> Sweep:
+    """A sweep of one run from a handoff in `tmp_path`, which has been taken into the storage."""
+    folder = tmp_path / "given"
+    pretrained = resolved(SWEEP | {"stages": [{"name": "p", "variant": "music-u"}]}, tmp_path)
+    arrays = {"mi_estimator": {"w": np.zeros((3, 2), np.float32)}}
+    write_handoff(folder, arrays, pretrained.handoff_info("0" * 20, 50))
+    stage = {"name": "r", "variant": "music-r", "init_from": {"checkpoint": str(folder)}}
+    sweep = opened(storage, tmp_path, name=name, seeds=[0], stages=[stage])
+    import_checkpoints(sweep.plan, sweep.store)
+    return sweep
+
+
+def resolved(document: dict[str, Any], tmp_path: Path) -> RunSettings:
+    """Settings of the first run."""
+    path = tmp_path / "resolved.yaml"
+    path.write_text(yaml.safe_dump(document))
+    return next(iter(load_sweep(path).stages[0].points[0].runs.values()))
+
+
+def test_a_sweep_goes_on_from_the_handoff_in_its_storage(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    """The folder that it was given is on another machine, or was trained anew."""
+    sweep = from_handoff(storage, tmp_path)
+    (node,) = sweep.plan.nodes
+    (tmp_path / "given").rename(tmp_path / "moved")
+    for _ in ("begun with the folder", "gone on without it"):
+        again = location.find_sweep(f"{storage}/mine", None).open()
+        assert [one.key for one in again.plan.nodes] == [node.key]
+        keep_record(again)
+    assert program("status", f"{storage}/mine").code == 0
+
+
+def test_clean_deletes_a_handoff_unless_another_sweep_starts_from_it(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    sweep = from_handoff(storage, tmp_path)
+    (node,) = sweep.plan.nodes
+    assert node.input is not None
+    from_handoff(storage, tmp_path, "other")
+    (kept,) = program("clean", f"{storage}/mine", "--all", "--json").document["kept"]
+    assert kept["what"] == f"result of {node.input.key} (imported): other has it too"
+    for name, left in (("mine", True), ("other", False)):
+        assert program("clean", f"{storage}/{name}", "--all", "--yes").code == 0
+        assert sweep.store.is_finished(node.input.key) is left
 
 
 SEARCH: dict[str, Any] = {
