@@ -242,6 +242,10 @@ def _source(header: StageHeader, find_tasks: FindTasks, findings: Findings) -> S
     except HandoffError as error:
         findings.add(("checkpoint",), str(error))
         return None
+    except RuntimeError:  # `~name/...`, and nobody has this name
+        rule = f"must be in a home that is known, got {shown(given.checkpoint)}"
+        findings.add(("checkpoint",), rule)
+        return None
     return Source(checkpoint=Checkpoint(folder=folder, manifest=manifest), task=task)
 
 

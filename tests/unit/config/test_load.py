@@ -375,6 +375,7 @@ BAD: list[tuple[Document, str]] = [
     (with_stage(1, init_from={"task": "FetchPush"}), "must have exactly one of stage and check"),
     (with_stage(1, init_from={"stage": "pretrain", "task": "Fetch"}), "got 'Fetch'"),
     (with_stage(1, init_from={"checkpoint": "gone"}), "gone must hold a handoff (handoff.json"),
+    (with_stage(1, init_from={"checkpoint": "~nobody-at-all/x"}), "in a home that is known"),
     (with_stage(1, tasks=["FetchSlide"]), "needs a run of FetchSlide in stage pretrain"),
     (with_stage(1, music={"lr": 0.1}), "music.lr has no effect with variant music-r"),
     (with_stage(1, music={"hidden_size": 64}), "needs the same music.hidden_size in stage finetu"),
