@@ -87,6 +87,10 @@ def _broken_rule(
             return f"must name settings, of which {stage.name} varies {settings}, got {name!r}"
         if not any(_equals(text, value) for value in values):
             return f"must name values that {stage.name} has, {name} is {shown(values)}, got {text}"
+    fixed = {k: v for k, v in condition.items() if k != "stage" and not _is_in(k, space)}
+    if not any(_has(run, fixed) for run in runs):
+        pairs = ", ".join(f"{name} = {text}" for name, text in fixed.items())
+        return f"must name values that a run of {stage.name} has together, got {pairs}"
     return None
 
 
@@ -103,10 +107,18 @@ def _broken_final(stage: Stage, condition: Mapping[str, str]) -> str | None:
             f"must be about runs on fresh seeds: write final: {{trials: 1}} in the search of "
             f"{stage.name}, got final: null"
         )
+    if search.sampler == "grid" and search.final.trials >= search.count:
+        return None
+    if search.final.trials == 1:
+        named = [name for name in condition if _is_in(name, list(search.space))]
+        if not named:
+            return None
+        return (
+            "must not name what is tuned, as only the best trial has runs on fresh seeds: compare "
+            f"its values by mode: compare in the search of {stage.name}, got {named[0]!r}"
+        )
     tuned = [name for name, dimension in search.space.items() if not dimension.when]
-    named = all(any(_is_in(name, [one]) for name in condition) for one in tuned)
-    whole_grid = search.sampler == "grid" and search.final.trials >= search.count
-    if search.final.trials == 1 or named or whole_grid:
+    if all(any(_is_in(name, [one]) for name in condition) for one in tuned):
         return None
     return (
         f"must name every setting in the space of {stage.name}, or be about the best trial alone: "

@@ -125,7 +125,19 @@ def test_what_the_runs_can_tell_is_accepted(
     assert problems(hypothesis, stage) == []
 
 
+TUNED_Q: Document = {
+    "mode": "search",
+    "compare": {},
+    "space": {"tac.entropic_index": {"choice": [1.0, 2.0]}},
+}
 UNTESTABLE: list[tuple[str, Document, str]] = [
+    ("q = 2 better than q = 1", search(BEST, TUNED_Q), "must not name what is tuned"),
+    ("q = 2, alpha = .1 better than q = 1", search(BEST), "got 'tac.alpha'"),
+    (
+        "q = 2, alpha = .3 better than q = 1",
+        grid("tac", {"entropic_index": 2.0, "alpha": 0.1}, {"entropic_index": 1.0, "alpha": 0.3}),
+        "must name values that a run of s has together, got tac.entropic_index = 2, tac.alpha = .3",
+    ),
     ("q = 2 better than q = 1", search(), "write final: {trials: 1}, and mode: compare"),
     ("q = 2, alpha = .1 better than q = 1", search(), "got final.trials: 3"),
     ("q = 2 better than q = 1", search({"final": None}), "write final: {trials: 1} in the search"),
