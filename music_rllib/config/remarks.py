@@ -27,8 +27,9 @@ def remarks(config: SweepConfig) -> list[str]:
     """One line for each warning, with the stages and tasks that it is about."""
     places: dict[str, list[str]] = {}
     for stage in config.stages:
+        points = list(_points(stage))
         for task in stage.tasks:
-            runs = [runs[task.name] for runs in _points(stage) if task.name in runs]
+            runs = [runs[task.name] for runs in points if task.name in runs]
             if (text := _cut_off_returns(task, runs)) is not None:
                 places.setdefault(text, []).append(f"{stage.name}/{task.name}")
     lines = [f"{', '.join(where)}: {text}" for text, where in places.items()]
