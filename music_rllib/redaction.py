@@ -6,23 +6,33 @@ file, the terminal or MLflow, and also `printable` on its way to the terminal.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 from collections.abc import Iterator, Mapping
+from typing import Any
 
 MAX_PARAM_LENGTH = 6000
 """Longest value of a param that MLflow takes, in characters."""
 
-_USER_INFO = re.compile(r"(?P<scheme>[A-Za-z][A-Za-z0-9+.\-]{0,40}://)[^/?#\s'\"]*@")
+_NAMES = (
+    r"password|passwd|passphrase|pwd|secret|token|credential|authorization"
+    r"|(?:api|access|private)[_-]?key"
+)
+_USER_INFO = re.compile(
+    # A database's password may hold what ends the host elsewhere, but then no port looks like it.
+    r"""(?P<scheme>[A-Za-z][A-Za-z0-9+.\-]{0,40}://)
+    (?:[^/?\#\s'"]*@|[^/?\#@\s:'"\[]{0,999}:(?!\d{1,5}(?:[/?\#]|$))[^@\s]{0,999}@)""",
+    re.VERBOSE,
+)
 _QUERY_SECRET = re.compile(
     r"(?P<name>[?&](?:password|passwd|pwd|sslpassword|token|secret|access_key)=)[^&\s'\"]*", re.I
 )
 _ASSIGNED_SECRET = re.compile(
     # Bounded repetitions: a long text must not take time quadratic in its length.
-    r"""(?P<name>(?:password|passwd|pwd|secret|token|api_?key|access_?key|credential)[\w-]{0,40}
-        \\?["']?\s{0,9})
-    (?:(?P<equals>=\s{0,9})|(?P<colon>:\s{0,9}))
-    (?:\\?(?P<quote>["']).{0,9999}?(?P=quote)|(?:Bearer\s+)?[^\s,;&)}\]'"]+)""",
+    rf"""(?P<name>(?:{_NAMES})[\w-]{{0,40}}\\?["']?\s{{0,9}})
+    (?:(?P<equals>=[ \t]{{0,9}})|(?P<colon>:[ \t]{{0,9}}))
+    (?:\\?(?P<quote>["'])(?:\\.|[^\\\n]){{0,9999}}?(?P=quote)|(?:(?:Bearer|Basic)\s+)?[^\s,;&)}}\]'"]+)""",
     re.IGNORECASE | re.VERBOSE,
 )
 _BEARER = re.compile(r"(?P<name>\bBearer\s+)[\w.~+/=-]+")
@@ -31,7 +41,7 @@ _BEARER = re.compile(r"(?P<name>\bBearer\s+)[\w.~+/=-]+")
 _UNPRINTABLE = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u2069\ufeff\ud800-\udfff]"
 )
-_SECRET_KEY = re.compile(r"password|passwd|secret|token|api_?key|credential", re.I)
+_SECRET_KEY = re.compile(_NAMES, re.I)
 _COUNTED_KEY = re.compile(r"tokens?", re.I)
 """A number under such a name is how many there are, or one's id."""
 _KEYED_BY_TASK = ("environments", "per_task")
@@ -43,7 +53,7 @@ def redact(text: str) -> str:
 
     Removed are ``user:password@`` in URIs, and values that are assigned (by ``=``, ``:`` or in a
     URI's query) to a name that contains ``password``, ``token``, ``secret``, ``api_key``,
-    ``access_key`` or ``credential``.
+    ``access_key``, ``credential`` and the like.
     """
     text = _USER_INFO.sub(lambda match: match["scheme"], text)
     text = _QUERY_SECRET.sub(lambda match: match["name"] + "***", text)
@@ -59,6 +69,35 @@ def _hidden(match: re.Match[str]) -> str:
     return f"{match['name']}{match['colon']}{quote}***{quote}"
 
 
+def redact_yaml(text: str) -> str:
+    """YAML without passwords and without the values of keys that name a secret; else as it was."""
+    import yaml
+
+    with contextlib.suppress(yaml.YAMLError, RecursionError):
+        spans = _secret_spans(yaml.compose(text, yaml.SafeLoader), set())
+        for start, end in sorted(set(spans), reverse=True):
+            length = len(text[start:end].rstrip())
+            text = text[:start] + ('"***"' if length else "") + text[start + length :]
+    return redact(text)
+
+
+def _secret_spans(
+    node: Any, seen: set[int], *, of_tasks: bool = False
+) -> Iterator[tuple[int, int]]:
+    """Where in its text a YAML node has the values of keys that name a secret."""
+    if id(node) in seen or not isinstance(node.value if node else None, list):
+        return
+    seen.add(id(node))
+    for item in node.value:
+        key, value = item if isinstance(item, tuple) else (None, item)
+        name = str(key.value) if key is not None else ""
+        number = 0 if value.tag.endswith((":int", ":float")) else None
+        if not of_tasks and _is_secret(name, number):
+            yield value.start_mark.index, value.end_mark.index
+        else:
+            yield from _secret_spans(value, seen, of_tasks=name in _KEYED_BY_TASK)
+
+
 def printable(text: str) -> str:
     """``text`` with control characters as JSON escapes, so that it cannot control a terminal."""
     return _UNPRINTABLE.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
@@ -72,8 +111,8 @@ def for_people(text: object) -> str:
 def without_secrets(settings: Mapping[str, object], *, of_tasks: bool = False) -> dict[str, object]:
     """A copy of nested ``settings`` with redacted text and without keys that name a secret.
 
-    A key names a secret if it contains ``password``, ``token``, ``secret``, ``api_key`` or
-    ``credential``; ``n_tokens: 4`` does not, nor do the names of tasks.
+    A key names a secret if it contains a word of `redact`'s; ``n_tokens: 4`` does not, nor do the
+    names of tasks.
 
     Args:
         settings: the settings.

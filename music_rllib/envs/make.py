@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 from collections.abc import Iterable, Mapping
@@ -74,9 +75,13 @@ def known_environment(task: Task, vouched: Iterable[Task] = ()) -> Known | None:
     for trusted in (*BUILT_IN_TASKS.values(), *vouched):
         if (trusted.env_id, trusted.env_kwargs) == (task.env_id, task.env_kwargs):
             return Known(trusted.env_id, trusted.env_kwargs)
-    _register_robotics()
     # An id with a module in front would import the module before anything is checked.
-    spec = None if ":" in task.env_id else gym.registry.get(task.env_id)
+    if ":" in task.env_id:
+        return None
+    if task.env_id not in gym.registry:
+        with contextlib.suppress(gym.error.DependencyNotInstalled):  # the policy acts all the same
+            _register_robotics()
+    spec = gym.registry.get(task.env_id)
     if spec is None or task.env_kwargs or not isinstance(spec.entry_point, str):
         return None
     package = spec.entry_point.partition(":")[0].partition(".")[0]

@@ -44,6 +44,8 @@ def _expand_range(value: Any) -> Any:
         raise ValueError(f"must be a list of indices or a range such as 0:3, got {value!r}")
     if max(map(len, bounds.groups())) > 9 or int(bounds[2]) - int(bounds[1]) > MOST_INDICES:
         raise ValueError(f"must have at most {MOST_INDICES} entries, got {value[:40]!r}")
+    if int(bounds[1]) > int(bounds[2]):
+        raise ValueError(f"must be a range a:b with a <= b, got {value!r}")
     return tuple(range(int(bounds[1]), int(bounds[2])))
 
 

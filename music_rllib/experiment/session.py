@@ -15,7 +15,7 @@ from music_rllib.experiment.plan import Plan
 from music_rllib.experiment.scheduler import DONE, Scheduler
 from music_rllib.experiment.sweep_files import CONFIG, IN_STORAGE, PLAN, as_json, keep, read
 from music_rllib.labels import ShortLabels
-from music_rllib.redaction import redact, without_secrets
+from music_rllib.redaction import redact, redact_yaml, without_secrets
 from music_rllib.store.node_store import NodeStore, damage_in_words
 from music_rllib.store.object_folder import DamagedError, StorageError
 from music_rllib.store.run_record import RunResult
@@ -118,8 +118,10 @@ def keep_record(sweep: Sweep) -> None:
     """
     # A sweep that is continued from its storage has no file: the one that it began with stays.
     if sweep.config.path.is_file() or not (sweep.folder / "sweep.yaml").is_file():
-        arguments = [f"# {argument}  (command line)\n" for argument in sweep.config.arguments]
-        keep(sweep, "sweep.yaml", redact("".join(arguments) + sweep.config.text))
+        # As YAML of their own, whose values end where their lines do.
+        given = [redact_yaml(one.replace("=", ": ", 1)) for one in sweep.config.arguments]
+        arguments = [f"# {one.replace(': ', '=', 1)}  (command line)\n" for one in given]
+        keep(sweep, "sweep.yaml", "".join(arguments) + redact_yaml(sweep.config.text))
     keep(sweep, CONFIG, as_json(_configuration(sweep.config)))
     keep(sweep, PLAN, as_json(plan_document(sweep)))
 

@@ -13,6 +13,7 @@ from music_rllib.config.load import declared_tasks
 from music_rllib.envs.tasks import Task
 from music_rllib.labels import is_meant
 from music_rllib.policy.policy import PolicyError
+from music_rllib.redaction import redact
 from music_rllib.store.object_folder import ObjectFolders, open_storage
 from music_rllib.store.paths import resolve_storage
 
@@ -39,6 +40,15 @@ def find_policy(wanted: str, storage: str) -> str:
     if "://" in wanted or wanted.startswith(("models:/", "runs:/")) or os.path.lexists(wanted):
         return wanted
     storage = resolve_storage(storage)[0]
+    try:
+        return _find(wanted, storage)
+    except OSError as error:
+        raise PolicyError(
+            f"--storage must be a place that can be read, got {redact(storage)}: {error}"
+        ) from error
+
+
+def _find(wanted: str, storage: str) -> str:
     filesystem, root = open_storage(storage)
     labels: dict[str, list[str]] = {}
     for key, label in _labels(filesystem, root):

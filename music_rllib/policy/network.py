@@ -71,9 +71,14 @@ class PolicyNetwork:
                 f"a policy's last layer must have {self.action_size} or {2 * self.action_size} "
                 f"outputs for {self.action_size} actions, got {sizes[-1]}"
             )
+        vectors = (*self.biases, self.mean, self.inverse_std, self.low, self.high)
+        if {array.ndim for array in vectors} != {1} or self.inverse_std.shape != self.mean.shape:
+            raise ValueError("a policy's biases, normaliser and bounds must be vectors that fit")
         if not 0 <= self.goal_size < self.input_size or self.low.shape != self.high.shape:
             raise ValueError("a policy's goal must be a part of its inputs, its bounds of one size")
-        arrays = (*self.weights, *self.biases, self.mean, self.inverse_std, self.low, self.high)
+        if not (self.low <= self.high).all():
+            raise ValueError("a policy's lowest actions must be below its highest ones")
+        arrays = (*self.weights, *vectors)
         if not all(np.isfinite(array).all() for array in arrays):
             raise ValueError("a policy's arrays must be finite")
         if not 0 < self.clip < np.inf:
@@ -162,13 +167,14 @@ class PolicyNetwork:
             _check_file(path)
             with safetensors.safe_open(path, framework="numpy") as file:
                 header = json.loads((file.metadata() or {}).get(_HEADER, "null"))
-                arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+                names = list(file.keys())
+                if {file.get_slice(name).get_dtype() for name in names} != {"F32"}:
+                    raise ValueError("its arrays must be float32")
+                arrays = {name: file.get_tensor(name) for name in names}
             if not isinstance(header, dict) or header.get("format") != FORMAT:
                 raise ValueError(f"its header must say {FORMAT!r}")
             if not isinstance(header["about"], dict):
                 raise ValueError("its header must say what it is about")
-            if {array.dtype for array in arrays.values()} != {np.dtype(np.float32)}:
-                raise ValueError("its arrays must be float32")
             count = sum(name.endswith(".bias") for name in arrays)
             return cls(
                 weights=tuple(arrays[f"layer.{i}.weight"] for i in range(count)),

@@ -111,10 +111,8 @@ def load_policy(place: str | Path, env: str | Sequence[Task] = ()) -> Policy:
     try:
         if text.startswith(("models:/", "runs:/")):
             return _from_mlflow(text, env)
-        if "://" not in text and Path(text).is_file():
-            return _from_file(Path(text), env)
-        with _local_copy(text) as folder:
-            return policy_from_folder(folder, env)
+        with _local_copy(text) as found:
+            return (_from_file if found.is_file() else policy_from_folder)(found, env)
     except (HandoffError, StorageError, PolicyFileError, OSError) as error:
         raise PolicyError(f"{text} must hold a policy: {error}") from error
 
@@ -255,7 +253,7 @@ def _from_mlflow(uri: str, env: str | Sequence[Task]) -> Policy:
 
 @contextlib.contextmanager
 def _local_copy(place: str) -> Iterator[Path]:
-    """Yields a verified copy of an object folder, or any other local folder itself."""
+    """Yields a verified copy of an object folder, or any other local folder or file itself."""
     filesystem, root = open_storage(place)
     parent, _, name = root.rpartition("/")
     folders = ObjectFolders(filesystem, parent)

@@ -26,7 +26,8 @@ class ClusterError(BadInputError, RuntimeError):
 
 def cluster_address() -> str | None:
     """RAY_ADDRESS, which Ray sets in submitted jobs too; None for a local Ray."""
-    return os.environ.get("RAY_ADDRESS") or None
+    address = os.environ.get("RAY_ADDRESS")
+    return None if address in {None, "", "local"} else address
 
 
 def check_reachable(address: str) -> None:
@@ -35,7 +36,7 @@ def check_reachable(address: str) -> None:
     Raises:
         ClusterError: Nothing answers, or it is no address of a cluster.
     """
-    if address in {"auto", "local"}:
+    if address == "auto":
         return
     if address.startswith(("http://", "https://")):
         raise ClusterError(

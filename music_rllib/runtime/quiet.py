@@ -20,6 +20,7 @@ import warnings
 from functools import partial
 
 from music_rllib.envs.farama_notice import drop_farama_notice
+from music_rllib.runtime.machine import cluster_address
 
 # Logger -> beginnings of messages at WARNING level. All are about our own use of the library and
 # expected, and a user can do nothing about them.
@@ -76,7 +77,7 @@ def prepare_environment() -> None:
     os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
     # A local Ray would begin with a worker per CPU, which no run can use: theirs have a setup hook.
     os.environ.setdefault("RAY_prestart_worker_first_driver", "0")
-    if "RAY_ADDRESS" in os.environ:
+    if cluster_address() is not None:
         return
     # By default every process of a local Ray listens on all addresses, its `/metrics` without a
     # token. Ray's setting for this is named after the systems on which it is the default.

@@ -54,29 +54,24 @@ class Room:
         )
 
 
-@contextlib.contextmanager
-def cluster(resources: Resources) -> Iterator[Room]:
-    """Connect to Ray for this `with`, and yield its capacity.
+def start_ray(**local_options: Any) -> None:
+    """Connect to the cluster of RAY_ADDRESS, or start a local Ray with these options.
 
     Raises:
-        ClusterError: There is no cluster at the address, a local one does not start, or no node can
-            hold a run, neither a present one nor one that an autoscaler would add.
+        ClusterError: There is no cluster at the address, or a local Ray does not start.
     """
     address = cluster_address()
-    options: dict[str, Any] = {
-        "runtime_env": {"worker_process_setup_hook": quiet_third_parties},
-        "log_to_driver": False,
-        "logging_level": logging.WARNING,
-    }
+    options: dict[str, Any] = {}
     if address is None:
-        options |= {
-            "address": "local",  # never a Ray that happens to run on this machine
-            "num_cpus": check_cpus(resources),
-            "include_dashboard": False,
-            "object_store_memory": OBJECT_STORE_BYTES,
-        }
+        # Never a Ray that happens to run on this machine.
+        options = {"address": "local", "include_dashboard": False, **local_options}
     try:
-        ray.init(**options)
+        ray.init(
+            runtime_env={"worker_process_setup_hook": quiet_third_parties},
+            log_to_driver=False,
+            logging_level=logging.WARNING,
+            **options,
+        )
     except Exception as error:  # plain ones, too: for a node that is not up within 30 s
         cause = next(iter(str(error).strip().splitlines()), type(error).__name__)
         if address is None:
@@ -86,6 +81,17 @@ def cluster(resources: Resources) -> Iterator[Room]:
         raise ClusterError(
             f"RAY_ADDRESS must be a Ray cluster that can be reached, got {address!r}: {cause}"
         ) from error
+
+
+@contextlib.contextmanager
+def cluster(resources: Resources) -> Iterator[Room]:
+    """Connect to Ray for this `with`, and yield its capacity.
+
+    Raises:
+        ClusterError: There is no cluster at the address, a local one does not start, or no node can
+            hold a run, neither a present one nor one that an autoscaler would add.
+    """
+    start_ray(num_cpus=check_cpus(resources), object_store_memory=OBJECT_STORE_BYTES)
     try:
         yield _room(resources)
     finally:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import socket
 import time
@@ -31,9 +32,11 @@ class RayWatch:
     def __init__(self) -> None:
         """Watch the Ray that this process is connected to."""
         self._address = cluster_address()
-        children = [] if self._address else psutil.Process().children()
-        named = {child: child.name() for child in children}
-        self._daemons = {child: name for child, name in named.items() if name in DAEMONS}
+        self._daemons: dict[psutil.Process, str] = {}
+        for child in [] if self._address else psutil.Process().children():
+            with contextlib.suppress(psutil.NoSuchProcess):
+                if (name := child.name()) in DAEMONS:
+                    self._daemons[child] = name
         addresses = _addresses(self._address) if self._address else []
         self._checked = time.monotonic()
         self._answered = dict.fromkeys(addresses, self._checked)

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
+import re
 import signal
 import socket
+import sys
 import threading
 from collections.abc import Sequence
 from ipaddress import ip_address
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from music_rllib.command_line import add_command, new_app, run_app
 from music_rllib.errors import BadInputError
+from music_rllib.redaction import redact
 from music_rllib.runtime.machine import check_reachable, cluster_address
+from music_rllib.runtime.signals import SIGNALS
 from music_rllib.serve import TOKEN_VARIABLE
 
 if TYPE_CHECKING:
@@ -108,12 +113,17 @@ def serve(
         max_body_bytes=request_model(PolicyFacts.of(served.task.name, served)).max_bytes,
         send_seconds=send_seconds,
     )
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
-    _connect(settings)
-    _serve(served, settings, host, port, limits, stop)
+    for number in SIGNALS:
+        signal.signal(number, _interrupt)
+    with contextlib.suppress(KeyboardInterrupt):
+        _connect(settings)
+        _serve(served, settings, host, port, limits)
     return 0
+
+
+def _interrupt(*_: object) -> None:
+    """Raise KeyboardInterrupt for a signal: Ray waits without end for what does not start."""
+    raise KeyboardInterrupt
 
 
 app = new_app()
@@ -136,6 +146,11 @@ def _check_exposure(host: str) -> None:
             f"--host must be a loopback address unless {TOKEN_VARIABLE} is set, got {host!r}: "
             "without a token anyone who reaches that address can use the policy"
         )
+    if not re.fullmatch(r"[!-~]*", os.environ.get(TOKEN_VARIABLE, "")):
+        raise BadInputError(
+            f"{TOKEN_VARIABLE} must have only ASCII characters without spaces or line ends, as no "
+            "client can send others"
+        )
 
 
 def _check_port(host: str, port: int) -> None:
@@ -147,10 +162,10 @@ def _check_port(host: str, port: int) -> None:
         with socket.socket(family, socket.SOCK_STREAM) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind((host, port))
-    except OSError as error:
+    except (OSError, ValueError) as error:  # ValueError: no name that could be a host's
         raise BadInputError(
             f"--host and --port must name a free port of this machine, got {host}:{port}: "
-            f"{error.strerror}"
+            f"{getattr(error, 'strerror', None) or error}"
         ) from error
 
 
@@ -158,22 +173,11 @@ def _connect(settings: ServeSettings) -> None:
     """Start a local Ray, or connect to RAY_ADDRESS; refuse replicas that can never start."""
     import ray
 
-    from music_rllib.runtime.quiet import quiet_third_parties
+    from music_rllib.runtime.ray_cluster import start_ray
 
-    options: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.WARNING}
-    address = cluster_address()
-    if address is None:
-        options |= {"address": "local", "include_dashboard": False}
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {number: signal.getsignal(number) for number in SIGNALS}
     try:
-        ray.init(runtime_env={"worker_process_setup_hook": quiet_third_parties}, **options)
-    except (ConnectionError, RuntimeError, ValueError) as error:
-        if address is None:
-            raise
-        raise BadInputError(
-            f"RAY_ADDRESS must be a Ray cluster that can be reached, got {address!r}: "
-            f"{str(error).strip().splitlines()[0]}"
-        ) from error
+        start_ray()
     finally:
         # Ray sets its own handler of SIGTERM, which would end the process at once.
         for number, handler in handlers.items():
@@ -182,7 +186,7 @@ def _connect(settings: ServeSettings) -> None:
     try:
         _check_room(settings, nodes)
     except BadInputError:
-        if address is not None and _waits_for_nodes(settings):
+        if cluster_address() is not None and _waits_for_nodes(settings):
             return
         ray.shutdown()
         raise
@@ -217,15 +221,8 @@ ANSWER_SECONDS = 60.0
 """Time for a replica to answer a request; after it the answer is status 408."""
 
 
-def _serve(
-    policy: Policy,
-    settings: ServeSettings,
-    host: str,
-    port: int,
-    limits: Limits,
-    stop: threading.Event,
-) -> None:
-    """Serve until `stop` is set, then leave Ray."""
+def _serve(policy: Policy, settings: ServeSettings, host: str, port: int, limits: Limits) -> None:
+    """Serve until a signal comes, then leave Ray; where that dies, end the process."""
     import ray
     from ray import serve as ray_serve
 
@@ -242,9 +239,12 @@ def _serve(
             logging_config=QUIET,
         )
         url = f"http://{f'[{host}]' if ':' in host else host}:{port}"
-        print(f"Serving {settings.policy} at {url}", flush=True)
+        stop = threading.Event()
+        for number in SIGNALS:
+            signal.signal(number, lambda *_: stop.set())
+        print(f"Serving {redact(settings.policy)} at {url}", flush=True)
         print(f"POST /act, GET /health, GET /policy; described at {url}/docs", flush=True)
-        stop.wait()
+        _wait(stop)
     finally:
         # Others may serve on a cluster too; a local Ray ends with all that runs on it.
         if listening and cluster_address() is not None:
@@ -252,6 +252,18 @@ def _serve(
         ray.shutdown()
         if listening:
             print("Stopped.", flush=True)
+
+
+def _wait(stop: threading.Event) -> None:
+    """Wait for the signal, or end the process when Ray has died: Ray itself would wait for it."""
+    from music_rllib.runtime.ending import end_process
+    from music_rllib.runtime.ray_watch import LOOK_SECONDS, RayWatch
+
+    watch = RayWatch()
+    while not stop.wait(LOOK_SECONDS):
+        if (died := watch.look()) is not None:
+            print(f"error: {died}", file=sys.stderr, flush=True)
+            end_process(1)
 
 
 def _listen(host: str, port: int, limits: Limits) -> None:

@@ -139,7 +139,7 @@ def request_model(facts: PolicyFacts) -> RequestType:
     body = Annotated[either, Discriminator(_one_or_many)]
     numbers = facts.max_rows * sum(facts.parts.values())
     example = {name: [0.0] * size for name, size in facts.parts.items() if name != "achieved_goal"}
-    return RequestType(body, example, max_bytes=4096 + 32 * numbers)
+    return RequestType(body, example, max_bytes=4096 + 64 * numbers)
 
 
 def _model(

@@ -109,12 +109,12 @@ def process_start(pid: int) -> float:
         psutil.NoSuchProcess: The process does not exist.
     """
     try:
-        stat = Path(f"/proc/{pid}/stat").read_text()
+        stat = Path(f"/proc/{pid}/stat").read_bytes()
     except FileNotFoundError:
         # Not Linux, or no such process. psutil's value depends on the time of day of the boot.
         return float(psutil.Process(pid).create_time())
     # The 22nd field. The third one follows the name, which may contain anything, in parentheses.
-    return int(stat.rpartition(")")[2].split()[19]) / os.sysconf("SC_CLK_TCK")
+    return int(stat.rpartition(b")")[2].split()[19]) / os.sysconf("SC_CLK_TCK")
 
 
 def runs_here(pid: int, started: float) -> bool:

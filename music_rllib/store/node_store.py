@@ -65,8 +65,15 @@ class NodeStore:
     def result(self, key: str) -> RunResult | None:
         """The result of a finished run; None for an imported handoff."""
         with self._advice():
-            result = self._nodes.manifest(key).meta.get("result")
-        return None if result is None else RunResult.model_validate(result)
+            return self._result(key)
+
+    def _result(self, key: str) -> RunResult | None:
+        result = self._nodes.manifest(key).meta.get("result")
+        try:
+            return None if result is None else RunResult.model_validate(result)
+        except ValueError as error:
+            place = f"{self.path(key)}/manifest.json"
+            raise DamagedError(f"{place} must hold a run's result: {error}") from error
 
     def history(self, key: str) -> list[Report]:
         """All reports of a finished run."""
@@ -144,13 +151,12 @@ class NodeStore:
 
     def _check(self, key: str) -> None:
         self._nodes.check(key)
-        manifest = self._nodes.manifest(key)
-        result = manifest.meta.get("result")
+        result = self._result(key)
         # The manifest has no hash of its own, but the history has the values of its result too.
-        if self._local and result is not None and HISTORY in manifest.files:
+        if self._local and result is not None and HISTORY in self._nodes.manifest(key).files:
             last = last_values(self.history(key))
             # As text, because NaN equals nothing.
-            if _as_text(RunResult.model_validate(result).metrics) != _as_text(last):
+            if _as_text(result.metrics) != _as_text(last):
                 raise DamagedError(
                     f"{self.path(key)}/manifest.json must have the last values of {HISTORY}, it "
                     "has others"
@@ -223,21 +229,24 @@ class WorkFolder:
         Raises:
             StorageError: The storage cannot be written; older checkpoints are intact.
         """
-        # A run may save the same step twice, if the first checkpoint is damaged.
+        # A run may save the same step twice: where the first checkpoint was damaged.
         name = f"{env_steps:012d}-{uuid.uuid4().hex[:8]}"
         meta: dict[str, Any] = {"format": FORMAT}
         with self._checkpoints.sealing(name, meta) as folder:
             draft = Draft(folder, self._parts)
             yield draft
             meta["parts"] = draft.needs
-        self._prune()
+        self._prune(name)
 
-    def _prune(self) -> None:
+    def _prune(self, new: str) -> None:
+        """Delete what is too old, and what lies beyond `new`: it was damaged when the run began."""
         names = self._checkpoints.names()
-        for name in names[: -self._keep]:
+        older = [name for name in names if steps_of(name) < steps_of(new)]
+        kept = [*older, new][-self._keep :]
+        for name in set(names) - set(kept):
             self._checkpoints.remove(name)
         needed: set[str] = set()
-        for name in names[-self._keep :]:
+        for name in kept:
             # A checkpoint with a damaged manifest cannot be used, so it needs no parts.
             with contextlib.suppress(DamagedError):
                 needed.update(_needs(self._checkpoints.manifest(name)))

@@ -101,11 +101,11 @@ def open_storage(uri: str) -> tuple[pafs.FileSystem, str]:
     Raises:
         StorageError: The URI is not valid, or the place cannot be reached.
     """
-    if "://" not in uri:
-        uri = str(Path(uri).expanduser().absolute())
     try:
+        if "://" not in uri:
+            uri = str(Path(uri).expanduser().absolute())
         filesystem, root = pafs.FileSystem.from_uri(uri)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RuntimeError) as error:  # RuntimeError: nobody's home
         raise StorageError(
             f"storage must be a folder or an s3:// or gs:// URI that can be reached, "
             f"got {uri!r}: {error}"

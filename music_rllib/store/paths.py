@@ -48,9 +48,11 @@ def resolve_storage(storage: str) -> tuple[str, str | None]:
         The storage, and a notice for the user if it is not relative to the working directory.
 
     Raises:
-        StorageError: The storage begins with the home folder of an unknown user, or is a URI
-            without a bucket.
+        StorageError: The storage begins with the home folder of an unknown user, is a URI without
+            a bucket, or no `file:///FOLDER`.
     """
+    if storage.startswith("file:") and not re.fullmatch(r"file:///[^?#]+", storage):
+        raise StorageError(f"storage must be a folder, or file:///FOLDER, got {storage!r}")
     if "://" in storage:
         host = re.split("[/?]", storage.partition("://")[2])[0]
         if storage.startswith(BUCKETS) and not host.rpartition("@")[2]:

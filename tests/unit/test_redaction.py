@@ -7,6 +7,7 @@ import unicodedata
 from pathlib import Path
 
 import pytest
+import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.table import Table
@@ -18,6 +19,7 @@ from music_rllib.redaction import (
     flat_params,
     printable,
     redact,
+    redact_yaml,
     without_secrets,
 )
 from music_rllib.sweep.cli import main as sweep_main
@@ -41,13 +43,46 @@ from music_rllib.sweep.cli import main as sweep_main
         ("DB_PASSWORD: hunter2", 'DB_PASSWORD: "***"'),
         ("{'api_key': 'k', \"token\": \"t\"}", "{'api_key': '***', \"token\": \"***\"}"),
         ("PGPASSWORD=hunter2 psql", "PGPASSWORD=*** psql"),
-        ("Authorization: Bearer abc.def-g", "Authorization: Bearer ***"),
+        ("Authorization: Bearer abc.def-g", 'Authorization: "***"'),
+        ("sent Bearer abc.def-g", "sent Bearer ***"),
         ("the password must be given", "the password must be given"),
         ("5 tokens = 3 words", "5 tokens = *** words"),
+        ("postgresql://me:pa/ss?#'@host/db", "postgresql://host/db"),
+        ("s3://AKIA:ab/cd@bucket/x", "s3://bucket/x"),
+        ("http://h:5000/a@b and http://h:80?c=d@e", "http://h:5000/a@b and http://h:80?c=d@e"),
+        (r'{"password": "ab\"cd", "a": 1}', '{"password": "***", "a": 1}'),
+        ("authorization: Basic dTpw", 'authorization: "***"'),
+        ("X-Api-Key: abc", 'X-Api-Key: "***"'),
     ],
 )
 def test_uris_lose_their_passwords_and_nothing_else(text: str, expected: str) -> None:
     assert redact(text) == expected
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        "|\n  hunter2\n  hunter2",
+        "correct hunter2 battery",
+        "'it''s hunter2'",
+        '"a\\"hunter2"',
+        "[a, hunter2]",
+        "&a hunter2",
+        "!!str hunter2",
+        "\n  - hunter2\n  - b: hunter2",
+        "",
+    ],
+)
+def test_yaml_keeps_its_layout_without_its_secrets(value: str) -> None:
+    """It is the record of a sweep that its owner reads: comments and order stay."""
+    text = f"# mine\nz: 1  # last\nenv_kwargs:\n db_password: {value}\na: 'b'\n"
+    clean = redact_yaml(text)
+    assert "hunter2" not in clean
+    before, after = yaml.safe_load(text), yaml.safe_load(clean)
+    del before["env_kwargs"]["db_password"], after["env_kwargs"]["db_password"]
+    assert before == after
+    assert clean.startswith("# mine\nz: 1  # last\n")
+    assert redact_yaml("x: [}") == "x: [}"
 
 
 def test_secrets_are_left_out_at_every_depth() -> None:

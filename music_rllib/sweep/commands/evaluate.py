@@ -126,9 +126,11 @@ def _document(
 ) -> dict[str, Any]:
     from dataclasses import asdict
 
+    from music_rllib.redaction import redact
+
     successes = [result.success for result in results if result.success is not None]
     return {
-        "run": place,
+        "run": redact(place),
         "node_key": policy.node_key,
         "task": policy.task.name,
         "env_id": policy.environment.env_id if policy.environment else None,

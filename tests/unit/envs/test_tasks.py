@@ -43,6 +43,7 @@ def test_a_range_is_a_list_of_indices() -> None:
     ("change", "rule"),
     [
         ({"agent_indices": "a:b"}, "range such as 0:3"),
+        ({"agent_indices": "3:0"}, "a range a:b with a <= b, got '3:0'"),
         ({"agent_indices": [0, 0]}, "must not repeat"),
         ({"agent_indices": [3]}, "must not overlap"),
         ({"agent_indices": []}, "agent_indices must be given too"),

@@ -134,7 +134,13 @@ def test_what_the_user_has_set_is_kept(bare: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize(
     ("chosen", "expected"),
-    [({}, "0"), ({LOOPBACK_ONLY: "1"}, "1"), ({"RAY_ADDRESS": "head:6379"}, None)],
+    [
+        ({}, "0"),
+        ({LOOPBACK_ONLY: "1"}, "1"),
+        ({"RAY_ADDRESS": "head:6379"}, None),
+        ({"RAY_ADDRESS": ""}, "0"),
+        ({"RAY_ADDRESS": "local"}, "0"),
+    ],
 )
 def test_a_local_ray_stays_on_loopback_unless_asked(
     bare: pytest.MonkeyPatch, chosen: dict[str, str], expected: str | None

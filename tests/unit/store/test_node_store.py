@@ -15,7 +15,7 @@ from fsspec.implementations.memory import MemoryFileSystem  # type: ignore[impor
 
 from music_rllib.store import object_folder, verified
 from music_rllib.store.files import canonical_json, write_atomically
-from music_rllib.store.node_store import NodeStore
+from music_rllib.store.node_store import NodeStore, steps_of
 from music_rllib.store.object_folder import DamagedError, ObjectFolders, StorageError, open_storage
 from music_rllib.store.run_record import (
     HISTORY,
@@ -221,6 +221,18 @@ def test_a_result_in_the_manifest_that_is_not_the_end_of_the_history(
     assert "manifest.json must have the last values of history.jsonl" in str(error)
 
 
+def test_a_manifest_without_a_sound_result_is_damage(store: NodeStore, produced: Path) -> None:
+    store.publish(KEY, produced, RESULT)
+    path = f"{store.path(KEY)}/manifest.json"
+    with store._fs.open_input_stream(path) as stream:
+        text = stream.read().decode()
+    with store._fs.open_output_stream(path) as sink:
+        sink.write(text.replace('"seconds"', '"secunds"').encode())
+    assert "must hold a run's result" in str(store.damage([KEY])[KEY])
+    with pytest.raises(DamagedError, match="--retrain-damaged"):
+        store.result(KEY)
+
+
 def test_sizes_tell_without_reading(store: NodeStore, produced: Path) -> None:
     store.publish(KEY, produced, RESULT)
     assert store.damage([KEY]) == {}
@@ -371,6 +383,36 @@ def test_a_damaged_checkpoint_is_skipped_aloud(tmp_path: Path) -> None:
     with work.newest(warnings.append) as newest:
         assert newest is not None
         assert (newest.folder / "state").read_text() == "2000"
+
+
+@pytest.mark.parametrize("keep", [1, 2])
+def test_what_is_saved_after_damage_stays_and_replaces_it(store: NodeStore, keep: int) -> None:
+    """The run begins anew, and has fewer steps than the damaged checkpoint for a while."""
+    work = store.work_folder("0" * 20, keep)
+    parts: list[str] = []
+
+    def save(steps: int) -> None:
+        with work.new_checkpoint(steps) as draft:
+            with draft.new_part("segment") as (name, folder):
+                (folder / "data").write_text("x")
+            parts.append(name)
+            draft.needs = list(parts)
+
+    save(8000)
+    if keep == 2:
+        save(9000)
+    for name in work.names():
+        with store._fs.open_output_stream(f"{work.root}/{name}/manifest.json") as stream:
+            stream.write(b"damage")
+    parts.clear()
+    warnings: list[str] = []
+    for steps in (4000, 8000, 12000):
+        save(steps)
+        with work.newest(warnings.append) as newest:
+            assert newest is not None
+            assert list(newest.parts) == parts
+    assert [steps_of(name) for name in work.names()] == [8000, 12000][-keep:]
+    assert warnings == []
 
 
 def test_storage_that_cannot_be(tmp_path: Path) -> None:

@@ -393,6 +393,18 @@ LONG = "x" * 300
         (("plan", "sweep.yaml", "--storage", "s3://"), "storage must name a bucket, got 's3://'"),
         (("evaluate", "x", "--storage", "s3://?region=x"), "storage must name a bucket, got "),
         (("evaluate", "x", "--storage", "~nobody-at-all/x"), "storage must be in a home that is"),
+        (
+            ("evaluate", "x", "--storage", "sweep.yaml"),
+            "--storage must be a place that can be read",
+        ),
+        (
+            ("plan", "sweep.yaml", "--storage", "file:/x"),
+            "storage must be a folder, or file:///FOLDER",
+        ),
+        (
+            ("plan", "sweep.yaml", "--storage", "file:///x?y=1"),
+            "storage must be a folder, or file:///FOLDER, got 'file:///x?y",
+        ),
         (("status", "~nobody-at-all/x"), "storage must be in a home that is known"),
         (("evaluate", f"{LONG}/seed0"), f"'{LONG}/seed0' must be a folder, or the key or label"),
         (("status", LONG), f"SWEEP must be a sweep that was started, got {LONG}"),
