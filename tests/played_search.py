@@ -93,7 +93,12 @@ class Driver:
         self._time += 10.0  # other drivers are looked at each time
         return self._time
 
-    def play(self, stop_after: int | None = None, slots: int = 2) -> None:
+    def play(
+        self,
+        stop_after: int | None = None,
+        slots: int = 2,
+        fails: Callable[[Node], bool] = lambda node: False,
+    ) -> None:
         """Go on to the end, or until so many pieces of runs have been computed."""
         scheduler = self.sweep.scheduler
         searcher = DagSearcher(scheduler, lambda node: {"key": node.key}, self.controller.advance)
@@ -108,7 +113,11 @@ class Driver:
                 node = scheduler.node(suggestion["key"])
                 running.append((node, scheduler.until(node.key)))
             elif running:
-                self._compute(*running.pop(self._rng.randrange(len(running))))
+                node, until = running.pop(self._rng.randrange(len(running)))
+                if fails(node):
+                    scheduler.fail(node.key)
+                else:
+                    self._compute(node, until)
             else:
                 raise AssertionError("Tune would wait for ever")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,7 @@ from music_rllib.config.reading.layers import (
 )
 from music_rllib.config.run_settings import VARIANTS, RunSettings, Variant, handed_over
 from music_rllib.config.schema import Checkpoint, Point, Source, Stage, StageHeader
-from music_rllib.config.search.check import check_search
+from music_rllib.config.search.check import check_search, of_stage
 from music_rllib.envs.tasks import BUILT_IN_TASKS, Task, closest
 from music_rllib.limits import MOST_GRID_POINTS
 from music_rllib.store.handoff import Architecture, HandoffError, open_handoff, read_handoff
@@ -280,8 +280,10 @@ def _check_checkpoint(
                 f"if that is meant, say 'task: {made_for.name}' beside it",
             )
     problems_before = len(findings.problems)
-    theirs = (made_for, checkpoint.manifest.info.architecture)
-    _check_fit(stage, [theirs], str(checkpoint.folder), findings)
+    theirs = checkpoint.manifest.info.architecture
+    runs = [run for _, point in stage.examples() for run in point.runs.values()]
+    pairs = [((made_for, theirs), run) for run in runs]
+    _check_fit(stage, pairs, str(checkpoint.folder), findings)
     if len(findings.problems) > problems_before:
         return
     for needed in {handed_over(run) for point in stage.points for run in point.runs.values()}:
@@ -306,25 +308,44 @@ def _check_stage(stage: Stage, task: Task | None, above: Stage, findings: Findin
                 f"needs a run of {wanted.name} in stage {above.name}, whose tasks are "
                 f"{', '.join(known)}; name one: {{stage: {above.name}, task: ...}}",
             )
-    theirs = [(run.task, run.architecture) for point in above.points for run in point.runs.values()]
-    _check_fit(stage, theirs, f"stage {above.name}", findings)
+    pairs: list[tuple[tuple[Task, Architecture], RunSettings]] = []
+    for values, point in stage.examples():
+        for theirs in _points_at(above, of_stage(values, above.name)):
+            sources = [(run.task, run.architecture) for run in theirs.runs.values()]
+            pairs += itertools.product(sources, point.runs.values())
+    _check_fit(stage, pairs, f"stage {above.name}", findings)
+
+
+def _points_at(stage: Stage, values: Mapping[str, Any]) -> Sequence[Point]:
+    """The stage's points, or the one at searched values; none where these are not valid."""
+    if not values:
+        return stage.points
+    try:
+        return [stage.resolve(values)]
+    except ConfigError:  # a problem of its own
+        return []
 
 
 def _check_fit(
-    stage: Stage, sources: Iterable[tuple[Task, Architecture]], origin: str, findings: Findings
+    stage: Stage,
+    pairs: Iterable[tuple[tuple[Task, Architecture], RunSettings]],
+    origin: str,
+    findings: Findings,
 ) -> None:
     """Settings that shape the handed-over arrays must be equal on both sides."""
     starts_from = VARIANTS[stage.variant].starts_from
-    runs = [run for point in stage.points for run in point.runs.values()]
-    for (task, theirs), run in itertools.product(sources, runs):
+    rules: dict[str, None] = {}
+    for (task, theirs), run in pairs:
         for name in theirs.differences(run.architecture, starts_from):
-            findings.add((), f"needs the same {name} in stage {stage.name} as in {origin}")
+            rules[f"needs the same {name} in stage {stage.name} as in {origin}"] = None
         if starts_from == "estimator" and _split_sizes(task) != _split_sizes(run.task):
-            findings.add(
-                (),
+            rule = (
                 f"needs as many agent and surrounding indices in {run.task.name} as in "
-                f"{task.name} ({origin}): {_split_sizes(run.task)} and {_split_sizes(task)}",
+                f"{task.name} ({origin}): {_split_sizes(run.task)} and {_split_sizes(task)}"
             )
+            rules[rule] = None
+    for rule in rules:
+        findings.add((), rule)
 
 
 def _split_sizes(task: Task) -> tuple[int, int]:

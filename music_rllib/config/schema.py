@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import contextlib
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -11,6 +12,7 @@ from pydantic import Field, model_validator
 
 from music_rllib import names
 from music_rllib.config.analysis import Analysis
+from music_rllib.config.problems import ConfigError
 from music_rllib.config.run_settings import RunSettings, Variant
 from music_rllib.config.search.settings import SearchSettings
 from music_rllib.envs.tasks import Task
@@ -204,6 +206,19 @@ class Stage:
     def evaluation_episodes(self) -> int:
         """Fewest episodes per evaluation of any of its runs."""
         return min(run.evaluation.episodes for point in self.points for run in point.runs.values())
+
+    def examples(self) -> Iterator[tuple[Mapping[str, Any], Point]]:
+        """Points that stand for all that the stage may run, with their searched values.
+
+        Those of the grid; of a search the ends of its space, and each compared value. Values of the
+        source are called `STAGE:setting`. Points that are no valid settings are left out.
+        """
+        yield from (({}, point) for point in self.points)
+        if self.search is not None:
+            for values in (*(at for _, at in self.search.corners()), *self.search.arms()):
+                own = {name: value for name, value in values.items() if ":" not in name}
+                with contextlib.suppress(ConfigError):
+                    yield values, self.resolve(own)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,12 +12,12 @@ from music_rllib.config.schema import SweepConfig
 from music_rllib.experiment.continuation import budget_settings, continued_from
 from music_rllib.experiment.plan import Node
 from music_rllib.experiment.session import Sweep
-from music_rllib.experiment.sweep_files import CONFIG, keep, read
+from music_rllib.experiment.sweep_files import CONFIG, PLAN, keep, read
 from music_rllib.labels import ShortLabels, in_runs
 from music_rllib.redaction import redact
 from music_rllib.store.node_store import NodeStore, steps_of
 from music_rllib.store.object_folder import StorageError
-from music_rllib.store.paths import resolve_storage
+from music_rllib.store.paths import check_answers, resolve_storage
 from music_rllib.version import ALGORITHM_VERSION
 
 FILE = "settings.json"
@@ -69,8 +69,51 @@ def keep_settings(sweep: Sweep) -> None:
         }
         for node in sweep.plan.nodes
     }
-    document = {"algorithm": ALGORITHM_VERSION, "runs": runs}
+    document = {"algorithm": ALGORITHM_VERSION, "runs": runs, "searched": _searched(sweep)}
     keep(sweep, FILE, json.dumps(document, indent=1))
+
+
+def _searched(sweep: Sweep) -> dict[str, dict[str, Any]]:
+    """Settings that no search chooses, by stage and task, of stages that trials alone compute."""
+    planned = {node.stage for node in sweep.plan.nodes if not node.part}
+    return {
+        stage.name: {
+            task: run.model_dump(mode="json") for task, run in stage.points[0].runs.items()
+        }
+        for stage in sweep.config.stages
+        if stage.name not in planned
+    }
+
+
+def _changed_searches(
+    sweep: Sweep, before: Mapping[str, Any], planned: Iterable[str]
+) -> Iterator[tuple[str, dict[str, None]]]:
+    """Stages of which trials' runs would be others, and how they differ from before.
+
+    What a search chooses or compares may be in its space now and not have been: new trials.
+    `planned` are the stages of which other runs have changed.
+    """
+    chosen = [
+        name if ":" in name else f"{stage.name}:{name}"
+        for stage in sweep.config.stages
+        if stage.search is not None
+        for name in (*stage.search.space, *stage.search.compare)
+    ]
+    now = _searched(sweep)
+    changed = [*planned]
+    for stage in sweep.config.stages:
+        after, earlier = now.get(stage.name), before.get(stage.name)
+        if after is None or earlier is None:
+            continue
+        lines = {
+            line: None
+            for task in after.keys() & earlier.keys()
+            for line in _differences(earlier[task], after[task])
+            if not any(f"{stage.name}:{line}".startswith((f"{one}:", f"{one}.")) for one in chosen)
+        }
+        if lines or (stage.source and stage.source.stage in changed):
+            changed.append(stage.name)
+            yield stage.name, lines
 
 
 def check_begun(config: SweepConfig) -> None:
@@ -80,6 +123,7 @@ def check_begun(config: SweepConfig) -> None:
         StorageError: There is no sweep of this name in the storage.
     """
     storage = resolve_storage(config.storage)[0]
+    check_answers(storage)
     if read(storage, f"{config.name}/{CONFIG}") is None:
         raise StorageError(
             f"--resume must find an earlier run of sweep {config.name!r}, there is none in "
@@ -91,17 +135,21 @@ def changes_since(sweep: Sweep) -> Changes | None:
     """What the last run of this sweep computed and this one does not use; None: nothing.
 
     Runs that are new, or that are not in the plan any more, do not count.
+
+    Raises:
+        StorageError: The record of the last run can't be read.
     """
     try:
         before = read(sweep.storage, f"{sweep.config.name}/{FILE}")
         runs: Mapping[str, Any] = before["runs"]
         algorithm = before["algorithm"]
-    except (StorageError, KeyError, TypeError):
-        return None  # the first run of the sweep, or an unreadable file
+    except (KeyError, TypeError):
+        return None  # the first run of the sweep
     keys = {node.key for node in sweep.plan.nodes}
     short = ShortLabels.of(node.label for node in sweep.plan.nodes)
     counts: Counter[str] = Counter()
     lost = []
+    changed_stages: set[str] = set()
     for node in sweep.plan.nodes:
         old = runs.get(node.label)
         if old is None or old["key"] == node.key or old["key"] in keys:
@@ -115,9 +163,18 @@ def changes_since(sweep: Sweep) -> Changes | None:
         if is_longer and continued_from(sweep.store, node) is not None:
             continue
         counts.update(differences)
+        changed_stages.add(node.stage)
         if (progress := _progress(sweep.store, old["key"])) is not None:
             why = _why_not_longer(node) if is_longer and progress == FINISHED else ""
             lost.append(f"{short(node.label)}: {progress}{why}")
+    trials = read(sweep.storage, f"{sweep.config.name}/{PLAN}") or {"nodes": []}
+    for stage, changed in _changed_searches(sweep, before.get("searched", {}), changed_stages):
+        for old in trials["nodes"]:
+            if not old["label"].startswith(f"{stage}/") or old["key"] in keys:
+                continue
+            if (progress := _progress(sweep.store, old["key"])) is not None:
+                counts.update(changed.keys())
+                lost.append(f"{old['label']}: {progress}")
     if not lost:
         return None
     lines = [f"{line} ({in_runs(count)})" for line, count in counts.items()]

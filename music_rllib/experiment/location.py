@@ -17,7 +17,7 @@ from music_rllib.experiment.session import Sweep, open_sweep
 from music_rllib.experiment.sweep_files import IN_STORAGE
 from music_rllib.redaction import redact
 from music_rllib.store.node_store import NodeStore
-from music_rllib.store.paths import check_answers, folder_at, resolve_storage, sweep_folder
+from music_rllib.store.paths import below, check_answers, folder_at, resolve_storage, sweep_folder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +67,7 @@ class SweepLocation:
     @property
     def place(self) -> str:
         """Its folder or URI, for messages."""
-        return f"{redact(self.storage)}/{self.name}"
+        return redact(below(self.storage, self.name))
 
 
 def find_sweep(place: str, storage: str | None) -> SweepLocation:
@@ -98,8 +98,9 @@ def _locate(place: str, storage: str | None) -> SweepLocation:
         return SweepLocation(storage=resolve_storage(config.storage)[0], name=config.name)
     place = place.rstrip("/")
     if storage is None and "://" in place:
-        above, _, name = place.rpartition("/")
-        return SweepLocation(storage=above, name=name)
+        path, mark, options = place.partition("?")
+        above, _, name = path.rstrip("/").rpartition("/")
+        return SweepLocation(storage=f"{above}{mark}{options}", name=name)
     if storage is None and "/" in place:
         folder = Path(resolve_storage(place)[0])
         raise BadInputError(

@@ -123,9 +123,23 @@ class Plan:
 
     @property
     def imports(self) -> tuple[Input, ...]:
-        """Checkpoints from outside that nodes start from, each once."""
-        inputs = {node.input.key: node.input for node in self._nodes.values() if node.input}
-        return tuple(source for source in inputs.values() if source.checkpoint)
+        """Checkpoints from outside that runs start from, each once."""
+        sources = ((s.source, s.tasks[0]) for s in self._stages.values())
+        inputs = [
+            self._input(source, 0, task, 0)[0]
+            for source, task in sources
+            if source and source.checkpoint
+        ]
+        return tuple({one.key: one for one in inputs if one}.values())
+
+    @property
+    def settings(self) -> list[RunSettings]:
+        """Settings of all nodes, and of runs that stand for those of searches."""
+        searched = (point for stage in self.searched for _, point in stage.examples())
+        return [
+            *(node.run for node in self._nodes.values()),
+            *(run for point in searched for run in point.runs.values()),
+        ]
 
     def node(self, key: str) -> Node:
         """The node with this key."""

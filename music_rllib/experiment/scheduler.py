@@ -54,6 +54,10 @@ class Scheduler:
         """Whether the node is in the scheduler."""
         return key in self._nodes
 
+    def is_planned(self, key: str) -> bool:
+        """Whether the node was in the plan before any search asked for it."""
+        return key in self._turns
+
     def node(self, key: str) -> Node:
         """The node with this key."""
         return self._nodes[key]
@@ -152,7 +156,7 @@ class Scheduler:
         self._move(key, Status.STARTED, Status.FINISHED)
 
     def fail(self, key: str) -> list[Node]:
-        """Record that the node failed; the nodes that depend on it are skipped, and returned."""
+        """Record that the node failed; the waiting ones that need it are skipped, and returned."""
         self._move(key, Status.STARTED, Status.FAILED)
         dependants = list(self._dependants({key}))
         for node in dependants:
@@ -161,7 +165,8 @@ class Scheduler:
 
     def _dependants(self, lost: set[str]) -> Iterator[Node]:
         for node in self._nodes.values():  # every node comes after its input
-            if node.input is not None and node.input.key in lost:
+            waits = self._status[node.key] is Status.WAITING
+            if waits and node.input is not None and node.input.key in lost:
                 lost.add(node.key)
                 yield node
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,8 @@ class Sweep:
     folder: Path
     """Folder of the sweep's own files, on this machine."""
     scheduler: Scheduler
+    damaged: Mapping[str, str] = field(default_factory=dict)
+    """Finished nodes to be trained again, by key, and what is wrong with them."""
 
     @property
     def finished(self) -> set[str]:
@@ -50,11 +52,12 @@ def open_sweep(
     plan: Plan,
     storage: str,
     folder: Path,
-    remove_damaged: Callable[[str], None] | None = None,
+    *,
+    lenient: bool = False,
 ) -> Sweep:
     """Open the storage, and find the runs in it that are finished and undamaged.
 
-    With `remove_damaged`, damaged runs are deleted, and it is called with a message about each.
+    Damaged ones are refused, or where `lenient` they wait for `remove_damaged`.
 
     Raises:
         StorageError: The storage can't be reached, or finished runs in it are damaged.
@@ -62,12 +65,8 @@ def open_sweep(
     store = NodeStore(storage)
     labels = _labels(config, plan, storage)
     damaged = store.damage(key for key in labels if store.is_finished(key))
-    if damaged and remove_damaged is None:
+    if damaged and not lenient:
         raise DamagedError(damage_in_words({labels[key]: why for key, why in damaged.items()}))
-    for key, why in damaged.items():
-        store.remove(key)
-        if remove_damaged is not None:
-            remove_damaged(f"{labels[key]}: damaged, is trained again: {why}")
     finished = {node.key for node in plan.nodes if store.is_finished(node.key)}
     return Sweep(
         config=config,
@@ -75,8 +74,18 @@ def open_sweep(
         storage=storage,
         store=store,
         folder=folder,
-        scheduler=Scheduler(plan, finished),
+        scheduler=Scheduler(plan, finished - damaged.keys()),
+        damaged={
+            key: f"{labels[key]}: damaged, is trained again: {damaged[key]}" for key in damaged
+        },
     )
+
+
+def remove_damaged(sweep: Sweep, say: Callable[[str], None]) -> None:
+    """Delete the damaged nodes, and say which; the caller must hold the sweep's lock."""
+    for key, text in sweep.damaged.items():
+        sweep.store.remove(key)
+        say(text)
 
 
 def _labels(config: SweepConfig, plan: Plan, storage: str) -> dict[str, str]:

@@ -15,7 +15,7 @@ from music_rllib.labels import is_meant
 from music_rllib.policy.policy import PolicyError
 from music_rllib.redaction import redact
 from music_rllib.store.object_folder import ObjectFolders, open_storage
-from music_rllib.store.paths import resolve_storage
+from music_rllib.store.paths import below, resolve_storage
 
 _SHORTEST_KEY = 4
 """Characters of a key's beginning that are enough to name it."""
@@ -71,11 +71,11 @@ def _find(wanted: str, storage: str) -> str:
             "label, or its key"
         )
     if keys[0] in finished:
-        return _below(storage, f"nodes/{keys[0]}")
+        return below(storage, f"nodes/{keys[0]}")
     checkpoints = ObjectFolders(filesystem, f"{root}/work/{keys[0]}").names()
     if not checkpoints:
         raise PolicyError(f"{wanted!r} must have a checkpoint, it has none in {storage} yet")
-    return _below(storage, f"work/{keys[0]}/{checkpoints[-1]}")
+    return below(storage, f"work/{keys[0]}/{checkpoints[-1]}")
 
 
 def named_environment(env: str | None) -> str | tuple[Task, ...]:
@@ -87,12 +87,6 @@ def named_environment(env: str | None) -> str | tuple[Task, ...]:
     if env is None:
         return ()
     return declared_tasks(env) if env.endswith((".yaml", ".yml")) else env
-
-
-def _below(storage: str, path: str) -> str:
-    """The place of a path in a storage, whose URI may end with options: `s3://bucket?region=x`."""
-    above, mark, options = storage.partition("?") if "://" in storage else (storage, "", "")
-    return f"{above.rstrip('/')}/{path}{mark}{options}"
 
 
 def _matching(wanted: str, keys: list[str], labels: dict[str, list[str]]) -> list[str]:

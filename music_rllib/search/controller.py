@@ -73,6 +73,13 @@ class SearchController(Listener):
                 {report.env_steps: report for report in reports}
             )
 
+    def tick(self) -> None:
+        """Show other drivers that this one lives, also while Tune asks for nothing."""
+        for search in self.searches:
+            for arm in search.arms:
+                with contextlib.suppress(*DATABASE_ERRORS):
+                    arm.study.sign()
+
     def advance(self) -> bool:
         """Judge the trials that can be judged, and ask the scheduler for what is wanted next.
 
@@ -214,7 +221,7 @@ class SearchController(Listener):
         lost = [run for run in active.runs if states[run.key] in LOST]
         if lost:
             why = f"{lost[0].label} {states[lost[0].key]}"
-            self._end(arm, active, TrialState.FAIL, why)
+            self._end(arm, active, TrialState.FAIL, why, lost=True)
             return True
         if not all(state in DONE or state is Status.PAUSED for state in states.values()):
             return False
@@ -297,19 +304,21 @@ class SearchController(Listener):
         state: TrialState,
         reason: str = "",
         values: Sequence[float] | None = None,
+        *,
+        lost: bool = False,
     ) -> None:
         """Record the end of a trial, and compute those of its runs no further that no other has."""
-        arm.study.end(active.trial, state, values, reason)
+        arm.study.end(active.trial, state, values, reason, lost=lost)
         del arm.active[active.trial.number]
         if state is TrialState.COMPLETE:
             text = ", ".join(f"{value:.4g}" for value in values or ())
         else:
             text = f"{'stopped early' if state is TrialState.PRUNED else 'FAILED'}, {reason}"
         self._say(f"{arm.label} trial {active.trial.number}: {text}")
-        others = (other for arm in arm.search.arms for other in arm.active.values())
-        wanted = {run.key for other in others for run in other.runs}
+        arms = (arm for search in self.searches for arm in search.arms)
+        wanted = {run.key for arm in arms for other in arm.active.values() for run in other.runs}
         for run in active.runs:
-            if run.key in wanted:
+            if run.key in wanted or self._scheduler.is_planned(run.key):
                 continue
             self._reports.pop(run.key, None)
             if self._scheduler.withdraw(run.key):

@@ -216,7 +216,7 @@ class Study:
             return None
         self.refresh()
         if trial.state is TrialState.WAITING:
-            if not self._storage.set_trial_state_values(trial._trial_id, TrialState.RUNNING):
+            if not self._move(trial, TrialState.RUNNING):
                 return None  # another driver was faster
             self._set(trial, record.OWNER, self._me)
         if record.VALUES not in trial.user_attrs:
@@ -247,13 +247,24 @@ class Study:
                 self._storage.set_trial_intermediate_value(trial._trial_id, rung, value)
 
     def end(
-        self, trial: FrozenTrial, state: TrialState, values: Sequence[float] | None, reason: str
+        self,
+        trial: FrozenTrial,
+        state: TrialState,
+        values: Sequence[float] | None,
+        reason: str,
+        *,
+        lost: bool = False,
     ) -> None:
-        """Keep the end of a trial; if another driver has done so already, theirs stays."""
+        """Keep the end of a trial; if another driver has done so already, theirs stays.
+
+        A trial is `lost` where a run of its failed.
+        """
         # Taken over while this driver was silent, and judged already: by the same rules, the same.
         with contextlib.suppress(UpdateFinishedTrialError):
             if reason:
                 self._set(trial, record.REASON, reason)
+            if lost:
+                self._set(trial, record.LOST, True)
             self.refresh()
             self._storage.set_trial_state_values(trial._trial_id, state, values)
 
@@ -290,15 +301,22 @@ class Study:
                     continue
             last = float(signs.get(f"{DRIVER}{owner}", 0.0))
             if self._alone or _is_dead(owner) or now - last > LEASE_SECONDS:
-                self._storage.set_trial_state_values(trial._trial_id, TrialState.WAITING)
+                self._move(trial, TrialState.WAITING)
         self.refresh()
 
     def release(self) -> None:
         """Put this driver's trials back among the waiting ones."""
         for trial in self.trials():
             if trial.state is TrialState.RUNNING and trial.user_attrs.get(record.OWNER) == self._me:
-                self._storage.set_trial_state_values(trial._trial_id, TrialState.WAITING)
+                self._move(trial, TrialState.WAITING)
         self.refresh()
+
+    def _move(self, trial: FrozenTrial, state: TrialState) -> bool:
+        """Give a trial a state; False where another driver was faster, or has ended it."""
+        try:
+            return self._storage.set_trial_state_values(trial._trial_id, state)
+        except UpdateFinishedTrialError:
+            return False
 
 
 def _is_dead(owner: str) -> bool:

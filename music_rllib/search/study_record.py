@@ -15,6 +15,8 @@ LEARNT, BASE = "music_rllib:learnt", "music_rllib:base"
 SEARCH, ARM = "music_rllib:search", "music_rllib:arm"
 # Of a trial.
 OWNER, VALUES, REASON, SCORES = "owner", "values", "reason", "scores"
+LOST = "lost"
+"""It failed because a run of its did, and not by its values."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,7 +16,7 @@ from music_rllib.search.controller import SearchController
 from music_rllib.search.objective import aggregates, interval
 from music_rllib.search.storage import DATABASE_ERRORS
 from music_rllib.search.study import Study
-from music_rllib.search.study_record import REASON, SCORES, VALUES
+from music_rllib.search.study_record import LOST, REASON, SCORES, VALUES
 from music_rllib.search.trials import Arm, Array, Finalist, Search, ranked
 
 IMPORTANCE_TRIALS = 4
@@ -93,6 +93,7 @@ def _trial(search: Search, arm: Arm, trial: FrozenTrial, thorough: bool) -> dict
         "objective": list(trial.values) if trial.state is TrialState.COMPLETE else None,
         "scores": last,
         "reason": trial.user_attrs.get(REASON),
+        "lost": bool(trial.user_attrs.get(LOST)),
     }
     if thorough and trial.state is TrialState.COMPLETE and last:
         document["interval"] = _intervals(search, last)

@@ -72,6 +72,12 @@ def resolve_storage(storage: str) -> tuple[str, str | None]:
     )
 
 
+def below(storage: str, path: str) -> str:
+    """The place of a path in a storage, whose URI may end with options: `s3://bucket?region=x`."""
+    above, mark, options = storage.partition("?") if "://" in storage else (storage, "", "")
+    return f"{above.rstrip('/')}/{path}{mark}{options}"
+
+
 def sweep_folder(storage: str, name: str) -> Path:
     """Local folder of a sweep's own files: in the storage, or in the home folder for a bucket."""
     if storage.startswith("file://"):

@@ -18,6 +18,7 @@ from music_rllib.store.node_store import CONTINUATIONS
 from music_rllib.store.object_folder import open_storage
 from music_rllib.store.paths import sweep_folder
 from music_rllib.sweep.cli_helpers import plan_nodes
+from music_rllib.sweep.driver_lock import has_driver
 
 Item = dict[str, str]
 
@@ -67,7 +68,7 @@ def what_can_go(location: SweepLocation, *, unfinished: bool, everything: bool) 
             what the sweep needs is not known.
     """
     state = location.read(sweep_files.STATE)
-    if sweep_files.is_alive(state):
+    if _is_driven(location, state):
         raise BadInputError(
             f"SWEEP must not be running to be cleaned, {location.name} is: stop it first"
         )
@@ -115,6 +116,10 @@ def what_can_go(location: SweepLocation, *, unfinished: bool, everything: bool) 
     return cleaning
 
 
+def _is_driven(location: SweepLocation, state: Mapping[str, Any] | None) -> bool:
+    return sweep_files.is_alive(state) or has_driver(location.storage, location.name)
+
+
 def _nodes(location: SweepLocation) -> list[dict[str, Any]]:
     """The nodes of a sweep's plan, and the handoffs from outside that they start from."""
     nodes = plan_nodes(location)
@@ -145,7 +150,7 @@ def _users(location: SweepLocation, nodes: Iterable[Mapping[str, Any]]) -> dict[
         for study in studies.keys() & _studies(other).keys():
             theirs |= _keys_of_stage(studies[study], mine)
         shared = theirs & mine.keys()
-        if shared and sweep_files.is_alive(other.read(sweep_files.STATE)):
+        if shared and _is_driven(other, other.read(sweep_files.STATE)):
             raise BadInputError(
                 f"SWEEP must share no runs with a running sweep to be cleaned, {location.name} "
                 f"shares {len(shared)} with {other.name}: stop that first"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import os
@@ -13,6 +14,7 @@ from rich.table import Table
 
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.schema import Stage, SweepConfig
+from music_rllib.config.search.settings import SearchSettings
 from music_rllib.experiment.plan import Plan
 from music_rllib.runtime import machine
 from music_rllib.sweep.views.search_budget import search_budget
@@ -92,16 +94,20 @@ def searched(config: SweepConfig, stage: Stage) -> Iterator[Kind]:
         return
     final = stage.search.final
     source = next((s for s in config.stages if stage.source and s.name == stage.source.stage), None)
-    if source is not None and final is not None:
-        for task in source.tasks:
-            settings = source.points[0].runs[task.name]
-            yield Kind(
-                label=f"{source.name}/{task.name}, fresh seeds",
-                runs=final.seeds,
-                settings=settings,
-                env_steps=settings.env_steps,
-            )
     budget = search_budget(stage, len(config.seeds))
+    if source is not None:
+        most = _sources_of_a_seed(stage.search, source.name)
+        per_seed = len(stage.tasks) * len(config.seeds)
+        trials = min(budget.trial_runs // per_seed, most) if most > 1 else 0
+        counts = {"": trials * len(config.seeds)}
+        if final is not None:
+            finalists = budget.fresh_runs // (len(stage.tasks) * final.seeds)
+            counts[", fresh seeds"] = min(finalists, most) * final.seeds
+        for task, (text, runs) in itertools.product(source.tasks, counts.items()):
+            settings = source.points[0].runs[task.name]
+            label = f"{source.name}/{task.name}{text}"
+            if runs:
+                yield Kind(label=label, runs=runs, settings=settings, env_steps=settings.env_steps)
     runs, fresh_runs = budget.trial_runs, budget.fresh_runs
     longer = final is not None and final.env_steps is not None
     if not longer:
@@ -122,6 +128,18 @@ def searched(config: SweepConfig, stage: Stage) -> Iterator[Kind]:
                 settings=settings,
                 env_steps=budget.fresh_env_steps,
             )
+
+
+def _sources_of_a_seed(search: SearchSettings, source: str) -> int:
+    """How many different runs of the source the trials of a seed may start from, at most."""
+    names = [name for name in (*search.space, *search.compare) if name.startswith(f"{source}:")]
+    sizes = [
+        len(search.compare[name])
+        if name in search.compare
+        else search.space[name].size or search.count
+        for name in names
+    ]
+    return math.prod(sizes)
 
 
 def measure(

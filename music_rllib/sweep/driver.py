@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,7 +30,7 @@ from music_rllib.experiment.listener import Listener
 from music_rllib.experiment.location import SweepLocation
 from music_rllib.experiment.plan import make_plan
 from music_rllib.experiment.scheduler import Status
-from music_rllib.experiment.session import Sweep, keep_record, open_sweep
+from music_rllib.experiment.session import Sweep, keep_record, open_sweep, remove_damaged
 from music_rllib.experiment.sweep_files import as_json
 from music_rllib.redaction import redact
 from music_rllib.results.claims.plan import PlanVersion, as_document
@@ -115,7 +115,7 @@ def run_sweep(
             loaded = load_sweep(path, name=name, storage=storage, seeds=seeds, overrides=overrides)
         if must_exist:
             check_begun(loaded)
-        opened = _open(console, loaded, retrain_damaged=retrain_damaged and not dry_run)
+        opened = _open(console, loaded, lenient=retrain_damaged and not dry_run)
         if dry_run:
             check_searches(opened)
         changes = changes_since(opened)
@@ -126,6 +126,7 @@ def run_sweep(
             if changes is not None and not accept_changes:
                 raise BadInputError(str(changes))
             with hold_driver_lock(opened, partial(_say, console)), early:
+                remove_damaged(opened, partial(_say, console, style="yellow"))
                 code = _drive(console, opened)
             document = sweep_files.read(opened.storage, f"{loaded.name}/{sweep_files.STATE}") or {}
         if as_json:
@@ -155,8 +156,12 @@ def _signal_of(stopped: KeyboardInterrupt | SystemExit) -> int:
     raise stopped
 
 
-def _open(console: Console, config: SweepConfig, *, retrain_damaged: bool) -> Sweep:
-    """Check what can be checked without starting anything, and show the plan."""
+def _open(console: Console, config: SweepConfig, *, lenient: bool) -> Sweep:
+    """Check what can be checked without starting anything, and show the plan.
+
+    Args:
+        lenient: Whether finished runs may be damaged, which are to be trained again.
+    """
     if config.path == DEFAULT_CONFIG:
         console.print(f"No CONFIG given: running the packaged sweep {DEFAULT_CONFIG}.")
     plan = make_plan(config)
@@ -169,7 +174,7 @@ def _open(console: Console, config: SweepConfig, *, retrain_damaged: bool) -> Sw
     check_storage(storage, config.name)
     warn = partial(_say, console, style="yellow")
     folder = sweep_folder(storage, config.name)
-    opened = open_sweep(config, plan, storage, folder, warn if retrain_damaged else None)
+    opened = open_sweep(config, plan, storage, folder, lenient=lenient)
     resolve_store(config.mlflow.tracking_uri, storage)
     console.print(plan_view(config, plan, opened.finished))
     if rows := alpha_rows(plan):
@@ -261,13 +266,21 @@ def _compute_and_report(console: Console, opened: Sweep, tracker: Tracker) -> in
 
             controller = begin_searches(opened, display, mlflow_log, state_file)
         stopped_by = _compute(opened, display, mlflow_log, state_file, controller)
-        failed = bool(opened.scheduler.having(Status.FAILED, Status.SKIPPED)) or (
-            stopped_by is None and not opened.scheduler.complete
-        )
         searches = [] if controller is None else end_searches(opened, controller, tracker)
+        failed = (
+            bool(opened.scheduler.having(Status.FAILED, Status.SKIPPED))
+            or bool(_lost_trials(searches))
+            or (stopped_by is None and not opened.scheduler.complete)
+        )
         state_file.end("stopped" if stopped_by else "failed" if failed else "finished")
     tracker.close("KILLED" if stopped_by else "FAILED" if failed else "FINISHED")
     _show_results(console, opened, tracker, state_file, searches)
+    if lost := _lost_trials(searches):
+        text = (
+            f"Trials that failed because a run did: {lost}. In this study nothing tries them "
+            "again; with another search.study the next command does, and reuses what is finished."
+        )
+        _say(console, text, "yellow")
     if stopped_by is not None:
         _say(console, how_to_continue())
         return 128 + stopped_by
@@ -276,6 +289,11 @@ def _compute_and_report(console: Console, opened: Sweep, tracker: Tracker) -> in
     if report is not None:
         _say(console, report)
     return FAILED if failed else 0
+
+
+def _lost_trials(searches: Sequence[Mapping[str, Any]]) -> int:
+    """Number of trials that failed because a run did, also under earlier drivers."""
+    return sum(t["lost"] for one in searches for arm in one["arms"] for t in arm["trials"])
 
 
 def _take_over_reused(opened: Sweep, display: Display, mlflow_log: MlflowListener) -> None:

@@ -11,6 +11,15 @@ from music_rllib.runtime.ending import end_process
 from music_rllib.store.lease import HeldLease, Lease, LeaseFile
 from music_rllib.store.object_folder import StorageError, open_storage
 
+FILE = "driver.json"
+
+
+def has_driver(storage: str, name: str) -> bool:
+    """Whether a process drives the sweep, or is about to: its `state.json` comes later."""
+    filesystem, root = open_storage(storage)
+    lease = LeaseFile(filesystem, f"{root}/{name}/{FILE}").read()
+    return lease is not None and lease.holds()
+
 
 @contextlib.contextmanager
 def hold_driver_lock(sweep: Sweep, say: Callable[[str], None] = print) -> Iterator[None]:
@@ -28,7 +37,7 @@ def hold_driver_lock(sweep: Sweep, say: Callable[[str], None] = print) -> Iterat
     """
     filesystem, root = open_storage(sweep.storage)
     folder, owner = f"{root}/{sweep.plan.name}", f"sweep {sweep.plan.name!r}"
-    file = LeaseFile(filesystem, f"{folder}/driver.json")
+    file = LeaseFile(filesystem, f"{folder}/{FILE}")
     lease = Lease.of_this_process(owner)
     holder = file.acquire(lease)
     if holder is not None:

@@ -43,9 +43,9 @@ def check_environments(plan: Plan, hang_minutes: float | None = None) -> None:
         TaskError: A task does not fit; with one line per problem.
     """
     runs: dict[str, list[RunSettings]] = {}
-    for node in plan.nodes:
-        if node.run.task.name not in BUILT_IN_TASKS:
-            runs.setdefault(node.run.task.name, []).append(node.run)
+    for run in plan.settings:
+        if run.task.name not in BUILT_IN_TASKS:
+            runs.setdefault(run.task.name, []).append(run)
     problems = []
     for name, of_task in runs.items():
         hindsight = {run.replay.hindsight_episodes for run in of_task if run.replay.hindsight_k > 0}
@@ -133,7 +133,7 @@ def check_hardware(plan: Plan) -> None:
     Raises:
         BadInputError: It has not.
     """
-    if all(node.run.tac.precision == "float32" for node in plan.nodes):
+    if all(run.tac.precision == "float32" for run in plan.settings):
         return
     from music_rllib.tac.kernels.precision import PrecisionError, check_precision
 

@@ -23,12 +23,14 @@ import numpy as np
 import psutil
 import pytest
 from optuna.exceptions import StorageInternalError
+from optuna.trial import TrialState
 
 from music_rllib import names
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.search.settings import FINAL_SEED
 from music_rllib.config.tac_settings import LearnedAlpha
 from music_rllib.experiment import sweep_files
+from music_rllib.experiment.changes import changes_since, keep_settings
 from music_rllib.experiment.scheduler import Status
 from music_rllib.experiment.session import keep_record
 from music_rllib.search.opening import learnings
@@ -69,6 +71,87 @@ def test_the_objective_is_the_aggregate_of_a_trials_runs_recomputed(tmp_path: Pa
         assert driver.sweep.plan.node(mine[0].key).run.tac.alpha == trial["values"]["tac.alpha"]
     best = max(trials, key=lambda trial: float(trial["objective"][0]))
     assert driver.outcome()["arms"][0]["best"] == best["number"]
+
+
+@pytest.mark.parametrize("slots", [1, 2])
+def test_trials_whose_source_fails_end_and_a_later_driver_still_says_so(
+    tmp_path: Path, slots: int
+) -> None:
+    """One seed's failure ends a trial, whose other seeds are withdrawn before theirs fail."""
+    content = document({"trials": 2})
+    driver = Driver(tmp_path, content)
+    driver.play(slots=slots, fails=lambda node: node.stage == "pretrain")
+    assert [(trial["state"], trial["lost"]) for trial in driver.trials()] == [("failed", True)] * 2
+    driver.controller.stop()
+    again = Driver(tmp_path, content)
+    again.play()
+    assert [trial["lost"] for trial in again.trials()] == [True] * 2
+    assert not again.sweep.scheduler.having(Status.FAILED, Status.SKIPPED)
+
+
+@pytest.mark.parametrize("slots", [2, 12])
+def test_searches_that_share_runs_both_end(tmp_path: Path, slots: int) -> None:
+    """What one stops early, the other may still wait for."""
+    values = (1.5, 1.25, 1.75, 2.0, 2.5, 2.25)
+    search = {
+        "space": SPACE,
+        "trials": 6,
+        "startup_trials": 6,
+        "final": None,
+        "points_to_evaluate": [{"tac.entropic_index": q, "tac.alpha": 0.05} for q in values],
+        "pruning": {"rungs": [{"env_steps": 2000}], "warm_up": 2, "keep": 0.5},
+    }
+    stages = [
+        {"name": "a", "variant": "tac", "search": search},
+        {"name": "b", "variant": "tac", "search": search | {"seed": 1}},
+    ]
+    driver = Driver(tmp_path, document({}, stages=stages))
+    driver.play(slots=slots)
+    for found in outcome(driver.controller):
+        assert {trial["state"] for trial in found["arms"][0]["trials"]} == {"judged", "pruned"}
+
+
+def test_a_trial_that_another_driver_has_ended_is_left_to_it(tmp_path: Path) -> None:
+    shared = document({"storage": f"sqlite:///{tmp_path}/x.db", "study": "q"}, seeds=[0])
+    one, other = (Driver(tmp_path, shared | {"name": name}) for name in ("a", "b"))
+    mine, theirs = (driver.controller.searches[0].arms[0].study for driver in (one, other))
+    theirs.trials()  # as they are before the first one is ended
+    first = mine.claim()
+    assert first is not None
+    mine.end(first, TrialState.COMPLETE, [0.5], "")
+    assert theirs.claim() is None
+    theirs.refresh()
+    second = theirs.claim()
+    assert second is not None
+    theirs.trials()
+    mine.release_the_dead(now=time.time() + 1000)
+    taken = mine.claim()
+    assert taken is not None
+    assert taken.number == second.number
+    mine.end(taken, TrialState.COMPLETE, [0.5], "")
+    other.controller.stop()
+    states = [trial.state for trial in mine.as_optuna().trials[:2]]
+    assert states == [TrialState.COMPLETE] * 2
+
+
+def test_other_settings_of_a_searched_stage_are_said_with_what_they_cost(tmp_path: Path) -> None:
+    content = document({"trials": 2}, seeds=[0])
+    first = Driver(tmp_path, content)
+    keep_settings(first.sweep)
+    first.play()
+    keep_record(first.sweep)
+    content["stages"][1]["search"]["trials"] = 3
+    assert changes_since(Driver(tmp_path, content).sweep) is None
+    content["stages"][1]["tac"] = {"lr": 0.0003}
+    found = changes_since(Driver(tmp_path, content).sweep)
+    assert found is not None
+    assert found.differences == ("tac.lr: 0.001 -> 0.0003 (2 runs)",)
+    assert len(found.lost) == 2
+    del content["stages"][1]["tac"]
+    content["stages"][0]["tac"] = {"lr": 0.0003}
+    found = changes_since(Driver(tmp_path, content).sweep)
+    assert found is not None
+    assert len(found.lost) == 3
 
 
 def test_a_run_without_the_metric_fails_its_trial_and_nothing_else(tmp_path: Path) -> None:

@@ -39,15 +39,19 @@ def stop(
     from music_rllib.experiment import sweep_files
     from music_rllib.experiment.location import find_sweep
     from music_rllib.sweep.commands.status import state_of
+    from music_rllib.sweep.driver_lock import has_driver
 
     location = find_sweep(sweep, storage)
     name = location.name
     console = console_for(as_json=json)
     state = state_of(location)["state"]
+    deadline = time.monotonic() + wait
+    while state != "running" and has_driver(location.storage, name) and time.monotonic() < deadline:
+        time.sleep(0.5)  # it is being started
+        state = state_of(location)["state"]
     was_running = state == "running"
     if was_running:
         sweep_files.write(location.storage, f"{name}/{sweep_files.STOP}", '{"stop": true}')
-        deadline = time.monotonic() + wait
         while state == "running" and time.monotonic() < deadline:
             time.sleep(0.5)
             state = state_of(location)["state"]

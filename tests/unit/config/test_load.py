@@ -500,6 +500,25 @@ def checkpoint(folder: Path, task: str = "FetchPush", **changes: Any) -> str:
     return str(folder)
 
 
+@pytest.mark.parametrize(
+    ("name", "setting"),
+    [
+        ("tac.hidden_sizes", "tac.hidden_sizes"),
+        ("pretrain:tac.hidden_sizes", "tac.hidden_sizes"),
+        ("music.hidden_size", "music.hidden_size"),
+    ],
+)
+def test_a_search_may_not_choose_what_the_source_must_share(
+    problems: Callable[[Document], list[str]], name: str, setting: str
+) -> None:
+    """Its trials would fail one after the other when they load the weights."""
+    values = [[64], [128]] if setting == "tac.hidden_sizes" else [64, 128]
+    variant = "music-f" if setting == "tac.hidden_sizes" else "music-r"
+    search = {"space": {name: {"choice": values}}, "trials": 2}
+    lines = problems(with_stage(1, variant=variant, search=search, grid={}))
+    assert [f"needs the same {setting} in stage" in line for line in lines] == [True]
+
+
 def test_a_checkpoint_from_outside_is_checked_before_anything_starts(
     tmp_path: Path,
     load: Callable[..., SweepConfig],

@@ -131,6 +131,24 @@ BAD: list[tuple[Document, str]] = [
     ),
     (
         document(
+            tasks=["Mine"],
+            environments={"Mine": {"env_id": "Nope-v7", "horizon": 5, "success_key": None}},
+            stages=[
+                {
+                    "name": "a",
+                    "variant": "tac",
+                    "search": {
+                        "space": {"tac.lr": {"float": [0.001, 0.01]}},
+                        "trials": 2,
+                        "objective": {"metric": "evaluation/episode_return"},
+                    },
+                }
+            ],
+        ),
+        "environments.Mine: env_id must name an environment that can be made, got 'Nope-v7'",
+    ),
+    (
+        document(
             tasks=["Swing"],
             environments={
                 "Swing": {
@@ -310,8 +328,8 @@ def test_a_damaged_node_that_others_start_from(
     finetune = {"name": "f", "variant": "music-r", "init_from": "pretrain"}
     opened: list[Sweep] = []
 
-    def remember(*arguments: Any) -> Sweep:
-        opened.append(open_sweep(*arguments))
+    def remember(*arguments: Any, **options: Any) -> Sweep:
+        opened.append(open_sweep(*arguments, **options))
         return opened[-1]
 
     monkeypatch.setattr("music_rllib.sweep.driver.open_sweep", remember)

@@ -24,7 +24,7 @@ from music_rllib.experiment.continuation import continuation_key
 from music_rllib.experiment.plan import Node, make_plan
 from music_rllib.experiment.run_info import run_info
 from music_rllib.experiment.scheduler import Status
-from music_rllib.experiment.session import Sweep, keep_record, open_sweep
+from music_rllib.experiment.session import Sweep, keep_record, open_sweep, remove_damaged
 from music_rllib.experiment.sweep_files import as_json
 from music_rllib.labels import ShortLabels
 from music_rllib.redaction import flat_params
@@ -40,7 +40,7 @@ from music_rllib.store.handoff import write_handoff
 from music_rllib.store.object_folder import DamagedError
 from music_rllib.store.paths import sweep_folder
 from music_rllib.store.run_record import HISTORY, Report, RunResult, to_json_lines
-from music_rllib.sweep import clean, cli
+from music_rllib.sweep import clean, cli, driver_lock
 from music_rllib.sweep.listeners.state_file import StateFile
 from music_rllib.sweep.preflight import import_checkpoints
 
@@ -83,7 +83,7 @@ def storage(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.
     memory.pseudo_dirs[:] = [""]
     bucket = (pafs.PyFileSystem(pafs.FSSpecHandler(memory)), "bucket/path")
     # All are loaded by now: one that was loaded later would keep this for good.
-    for module in (object_folder, node_store, sweep_files, clean):
+    for module in (object_folder, node_store, sweep_files, clean, driver_lock):
         monkeypatch.setattr(module, "open_storage", lambda _: bucket)
     for module in (location, paths):
         monkeypatch.setattr(module, "check_answers", lambda _: None)
@@ -398,6 +398,19 @@ def test_clean_lists_and_deletes_what_no_other_sweep_has(
     assert kept == {node.key for node in other.plan.nodes}
     gone = program("status", f"{storage}/mine")
     assert (gone.code, ": other)" in gone.errors) == (2, True)
+
+
+def test_clean_is_refused_while_a_sweep_is_being_started(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    """Its state is still that of its last driver."""
+    sweep = played(storage, tmp_path)
+    with driver_lock.hold_driver_lock(sweep):
+        said = program("clean", f"{storage}/mine", "--all", "--yes")
+        assert (said.code, "mine is: stop it first" in said.errors) == (2, True)
+        assert program("stop", f"{storage}/mine", "--wait", "0").code == 0
+    assert len(sweep.finished) == 9
+    assert program("clean", f"{storage}/mine", "--all", "--yes").code == 0
 
 
 def test_clean_keeps_a_last_checkpoint_that_another_sweep_shares(
@@ -738,7 +751,10 @@ def test_a_damaged_run_is_named_by_every_command_and_trained_again_when_asked(
     assert (said.code, f"DAMAGED {label(bad.label)}: " in said.output) == (1, True)
 
     removed: list[str] = []
-    again = open_sweep(sweep.config, sweep.plan, storage, sweep.folder, removed.append)
+    again = open_sweep(sweep.config, sweep.plan, storage, sweep.folder, lenient=True)
+    assert not sweep.store.is_sound(bad.key)
+    remove_damaged(again, removed.append)
+    assert not sweep.store.is_finished(bad.key)
     assert [line.split(":")[0] for line in removed] == [label(bad.label)]
     assert again.scheduler.next_ready() == bad
     assert len(again.finished) == 8

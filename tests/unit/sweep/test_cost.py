@@ -58,6 +58,30 @@ def test_a_search_counts_with_what_it_runs_at_most(tmp_path: Path) -> None:
     assert (slide.label, slide.runs) == ("t/FetchSlide", 16)
 
 
+@pytest.mark.parametrize(
+    ("space", "sources", "fresh"),
+    [
+        ({"tac.alpha": {"float": [0.01, 0.1]}}, 2, 3),
+        ({"u:tac.alpha": {"choice": [0.1, 0.2, 0.3]}}, 3 * 2, 2 * 3),
+        ({"u:tac.alpha": {"float": [0.01, 0.1]}}, 5 * 2, 2 * 3),
+    ],
+)
+def test_what_trials_start_from_counts(
+    space: dict[str, Any], sources: int, fresh: int, tmp_path: Path
+) -> None:
+    search = {"trials": 5, "space": space, "final": {"trials": 2, "seeds": 3}}
+    stages = [
+        {"name": "u", "variant": "music-u"},
+        {"name": "r", "variant": "music-r", "init_from": "u", "search": search},
+    ]
+    found = {kind.label: kind.runs for kind in kinds(tmp_path, tasks=["FetchPush"], stages=stages)}
+    assert found == {
+        "u/FetchPush": sources,
+        "u/FetchPush, fresh seeds": fresh,
+        "r/FetchPush": 5 * 2 + 2 * 3,
+    }
+
+
 SAMPLE = RunSample(
     start_seconds=5.0, steps_per_second=100.0, evaluation_seconds=3.0, memory=3 * 2**29
 )
