@@ -3,6 +3,11 @@
 FAILED, BAD_INPUT = 1, 2
 
 
+def first_line(error: BaseException) -> str:
+    """The first line of an error's message; its type's name where it has none."""
+    return next(iter(str(error).strip().splitlines()), type(error).__name__)
+
+
 class BadInputError(Exception):
     """A mistake of the user, found before anything is started.
 

@@ -43,16 +43,24 @@ class SweepLocation:
             ConfigError: This version can't make sense of it.
             StorageError: A handoff that it starts from is damaged, or not there.
         """
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, f"{self.name}.json")
+            path.write_text(sweep_files.as_json(self.document()), encoding="utf-8")
+            return load_sweep(path, storage=self.storage, seeds=seeds)
+
+    def document(self) -> Any:
+        """Its configuration as plain data, with handoffs where this machine has them.
+
+        Raises:
+            StorageError: It is damaged, or a handoff is.
+        """
         document = self.read(sweep_files.CONFIG)
         store = NodeStore(self.storage)
         for stage in document["stages"]:
             match stage.get("init_from"):
                 case {"checkpoint": str(place)} as source if place.startswith(IN_STORAGE):
                     source["checkpoint"] = str(store.folder(place.removeprefix(IN_STORAGE)))
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder, f"{self.name}.json")
-            path.write_text(sweep_files.as_json(document), encoding="utf-8")
-            return load_sweep(path, storage=self.storage, seeds=seeds)
+        return document
 
     def open(self) -> Sweep:
         """The sweep with its plan, which includes the searched trials, and its finished runs."""

@@ -1,12 +1,11 @@
 """A sweep's small files below `<storage>/<name>`, in a bucket too, where other machines read them.
 
 `config.json` is the whole configuration, `plan.json` the runs known beforehand, `search.json` the
-results of its searches, `state.json` its progress.
+results of its searches, `state.json` its progress, `analysis_plan.json` the versions of its plan.
 """
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 import time
@@ -15,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from music_rllib.config.problems import shown
+from music_rllib.redaction import redact
 from music_rllib.store.files import write_atomically
 from music_rllib.store.lease import runs_here, this_machine
 from music_rllib.store.object_folder import StorageError, open_storage
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from music_rllib.experiment.session import Sweep
 
 CONFIG, PLAN, SEARCH, STATE = "config.json", "plan.json", "search.json", "state.json"
+ANALYSIS_PLAN = "analysis_plan.json"
 IN_STORAGE = "storage:"
 """In `config.json`, in front of the key of a handoff: its first folder may be on another machine,
 or hold another one by now."""
@@ -154,7 +155,15 @@ def read(storage: str, path: str) -> Any:
 
 
 def remove(storage: str, path: str) -> None:
-    """Delete a file below a storage, if it is there."""
+    """Delete a file below a storage, if it is there.
+
+    Raises:
+        StorageError: It can't be deleted.
+    """
     filesystem, root = open_storage(storage)
-    with contextlib.suppress(FileNotFoundError):
+    try:
         filesystem.delete_file(f"{root}/{path}")
+    except FileNotFoundError:
+        pass
+    except OSError as error:
+        raise StorageError(f"{redact(storage)}/{path} must be deletable: {error}") from error

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import json
+import re
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from itertools import chain
 from pathlib import Path
@@ -10,7 +12,7 @@ from pathlib import Path
 from music_rllib import names
 from music_rllib.envs.tasks import Task
 from music_rllib.report.figures.choice import drawings_of_stages, stage_drawings
-from music_rllib.report.figures.draw import Figures, files, stale_files
+from music_rllib.report.figures.draw import Figures, files
 from music_rllib.report.figures.overview import overview
 from music_rllib.report.figures.plots import METRICS
 from music_rllib.report.limitations import diverged, missing
@@ -110,7 +112,7 @@ def build_report(
 def write_report(report: Report, folder: Path) -> Path:
     """Write the page, `figures/*` (PNG, SVG, PDF), `videos/*` and `tables/*.csv` into `folder`.
 
-    Figures of an earlier report that this one does not have are removed.
+    Files of an earlier report that this one does not have are removed, and no others.
 
     Returns:
         The path of the page.
@@ -118,28 +120,48 @@ def write_report(report: Report, folder: Path) -> Path:
     Raises:
         ReportError: if the folder is not writable.
     """
-    page, figures, tables = folder / PAGE, folder / "figures", folder / "tables"
+    earlier, made = made_files(folder), []
     try:
-        for subfolder in (figures, tables):
-            subfolder.mkdir(parents=True, exist_ok=True)
-        page.write_text(render(report), encoding="utf-8")
-        present = [file.name for file in figures.iterdir()]
-        for stale in stale_files({drawing.name for drawing in report.drawings}, present):
-            (figures / stale).unlink()
-        panels = overview(report.sweep, [analysis.stage for analysis in report.analyses])
-        picture = [(PICTURE, files(panels, []))] if panels else []
-        for name, contents in chain(picture, report.figures.files()):
-            for suffix, content in contents.items():
-                (figures / f"{name}{suffix}").write_bytes(content)
-        if report.films is not None and report.films.films:
-            (folder / "videos").mkdir(exist_ok=True)
-            for film in report.films.films:
-                (folder / "videos" / film.name).write_bytes(film.data)
-        for table in _tables(report):
-            (tables / f"{table.name}.csv").write_text(table.to_csv(), encoding="utf-8")
+        for name, content in _files_of(report):
+            path = folder / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(content)
+            made.append(name)
+        for stale in set(earlier) - set(made):
+            (folder / stale).unlink(missing_ok=True)
+        (folder / _MADE).write_text(json.dumps(made), encoding="utf-8")
     except OSError as error:
         raise ReportError(f"{folder} must be writable: {error}") from error
-    return page
+    return folder / PAGE
+
+
+_MADE = "figures/.made.json"
+"""The list of a report's files, since its folder may have others."""
+_FILE = re.compile(rf"{re.escape(PAGE)}|(?:figures|tables|videos)/[^/.][^/]*")
+
+
+def made_files(folder: Path) -> list[str]:
+    """Names of the files of the report in `folder`, below it; empty where there is none."""
+    try:
+        names = json.loads((folder / _MADE).read_text("utf-8"))
+    except (OSError, ValueError):
+        return []
+    names = names if isinstance(names, list) else []
+    return [name for name in names if isinstance(name, str) and _FILE.fullmatch(name)]
+
+
+def _files_of(report: Report) -> Iterator[tuple[str, bytes]]:
+    """Names, below the report's folder, and contents of its files."""
+    yield PAGE, render(report).encode()
+    panels = overview(report.sweep, [analysis.stage for analysis in report.analyses])
+    picture = [(PICTURE, files(panels, []))] if panels else []
+    for name, contents in chain(picture, report.figures.files()):
+        for suffix, content in contents.items():
+            yield f"figures/{name}{suffix}", content
+    for film in report.films.films if report.films is not None else ():
+        yield f"videos/{film.name}", film.data
+    for table in _tables(report):
+        yield f"tables/{table.name}.csv", table.to_csv().encode()
 
 
 def _tables(report: Report) -> Iterable[Table]:

@@ -14,7 +14,7 @@ import typer
 
 from music_rllib import names
 from music_rllib.command_line import add_command, called_as, new_app, run_app
-from music_rllib.errors import FAILED
+from music_rllib.errors import FAILED, BadInputError
 
 if TYPE_CHECKING:
     from music_rllib.report.location import ReportSource
@@ -137,9 +137,13 @@ def report(
 
         return find_sweep(place, storage=storage, tracking_uri=tracking_uri, **options)
 
+    if add and export is None:
+        raise BadInputError("--add must be given with --export")
+    if serve and (export or output or attach):
+        raise BadInputError("--serve must be given without --export, --output and --attach")
     place, gap = sweeps[0], GAP if difference is None else difference
     if len(sweeps) > 1:
-        _beside(find, sweeps, output, alone=serve or attach or export is not None)
+        _beside(find, sweeps, output, gap, alone=serve or attach or export is not None)
     elif export is not None:
         _export(find(place).sweep, export, format_, add=add)
     elif serve:
@@ -229,7 +233,12 @@ def _command() -> str:
 
 
 def _beside(
-    find: Callable[..., ReportSource], places: Sequence[str], output: Path | None, *, alone: bool
+    find: Callable[..., ReportSource],
+    places: Sequence[str],
+    output: Path | None,
+    difference: float,
+    *,
+    alone: bool,
 ) -> None:
     """Write a report of two sweeps; `alone`: an option was given that takes a single sweep."""
     from music_rllib.report.figures.processes import drawing_processes
@@ -248,6 +257,7 @@ def _beside(
         first, second = (source.sweep for source in sources)
         report = build_report(
             side_by_side(first, second),
+            difference=difference,
             beside=(first, second),
             command=_command(),
             processes=processes,
@@ -289,6 +299,7 @@ def _serve(
 def _attach(source: ReportSource, folder: Path, report: Report) -> None:
     """Keep the report, in `folder`, with the sweep's run in MLflow."""
     from music_rllib.redaction import for_people
+    from music_rllib.report.build import made_files
     from music_rllib.report.tables import note
     from music_rllib.results.claims.answer import answer
     from music_rllib.results.data import ReportError
@@ -298,11 +309,11 @@ def _attach(source: ReportSource, folder: Path, report: Report) -> None:
         raise ReportError("--attach needs a sweep that is read from MLflow, got an exported one")
     sweep, analyses = source.sweep, report.analyses
     last = analyses[-1].stage.name if analyses else ""
-    drawn = sorted((d.name for d in report.drawings), key=lambda name: not name.startswith(last))
-    figure = f"report/figures/{drawn[0]}.png" if drawn else None
+    drawn = sorted(report.drawings, key=lambda drawing: drawing.stage != last)
+    figure = f"report/figures/{drawn[0].name}.png" if drawn else None
     said = answer(sweep, report.study)[1]
     text = note(said, analyses, sweep.run_id, figure)
-    attach(source.store, sweep.run_id, folder, "report", text)
+    attach(source.store, sweep.run_id, folder, made_files(folder), "report", text)
     where = sweep.url(sweep.run_id) or f"run {sweep.run_id}"
     typer.echo(for_people(f"Attached to the sweep's run in MLflow: {where}"))
 

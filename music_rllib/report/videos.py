@@ -10,6 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from music_rllib.envs.tasks import Task
+from music_rllib.errors import first_line
 from music_rllib.report.figures.choice import slug
 from music_rllib.results.analysis import StageAnalysis
 from music_rllib.results.data import ReportError, RunRecord, Sweep
@@ -81,7 +82,7 @@ def make_films(
                 films.append(_film(policy, run, q, seed, Path(folder)))
         # An environment may raise anything, and no video is worth losing the report.
         except Exception as error:
-            reasons.append(f"{run.name}: {str(error).splitlines()[0]}")
+            reasons.append(f"{run.name}: {first_line(error)}")
     return Films(films=films, why_not=reasons[0] if reasons else None)
 
 

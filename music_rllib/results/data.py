@@ -153,8 +153,9 @@ class RunRecord:
 
     @property
     def seconds(self) -> float | None:
-        """Time from start to end, pauses included."""
-        if self.started is None or self.ended is None:
+        """Time from start to end, pauses included; None where it has not ended."""
+        over = self.status not in {"RUNNING", "SCHEDULED"}  # MLflow keeps the end before a resume
+        if not over or self.started is None or self.ended is None:
             return None
         return (self.ended - self.started) / 1000
 

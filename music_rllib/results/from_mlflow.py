@@ -11,6 +11,7 @@ import contextlib
 import functools
 import logging
 import os
+import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -105,8 +106,10 @@ def _sweep(store: TrackingStore, name: str, found: SweepRuns, history: dict[str,
     )
 
 
-def attach(store: TrackingStore, run_id: str, folder: Path, name: str, note: str) -> None:
-    """Log the files of `folder` as artefacts of a run, below `name`, and show `note` on its page.
+def attach(
+    store: TrackingStore, run_id: str, folder: Path, files: Iterable[str], name: str, note: str
+) -> None:
+    """Log `files` of `folder` as artefacts of a run, below `name`, and show `note` on its page.
 
     Raises:
         ReportError: where MLflow does not take them.
@@ -114,7 +117,12 @@ def attach(store: TrackingStore, run_id: str, folder: Path, name: str, note: str
     """
     client = _open(store)
     try:
-        client.log_artifacts(run_id, str(folder), name)
+        with tempfile.TemporaryDirectory() as copy:  # all at once, and nothing else of the folder
+            for file in files:
+                target = Path(copy, file)
+                target.parent.mkdir(exist_ok=True)
+                shutil.copyfile(folder / file, target)
+            client.log_artifacts(run_id, copy, name)
         client.set_tag(run_id, names.TAG_NOTE, note)
     except Exception as error:
         raise _refusal(store, "take the report", error) from error

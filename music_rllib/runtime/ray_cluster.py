@@ -12,6 +12,7 @@ from typing import Any
 import ray
 
 from music_rllib.config.schema import Resources
+from music_rllib.errors import first_line
 from music_rllib.runtime import autoscaler
 from music_rllib.runtime.machine import ClusterError, check_cpus, cluster_address
 from music_rllib.runtime.quiet import quiet_third_parties
@@ -73,7 +74,7 @@ def start_ray(**local_options: Any) -> None:
             **options,
         )
     except Exception as error:  # plain ones, too: for a node that is not up within 30 s
-        cause = next(iter(str(error).strip().splitlines()), type(error).__name__)
+        cause = first_line(error)
         if address is None:
             raise ClusterError(
                 f"Ray did not start on this machine, which may be too busy for it: {cause}"

@@ -11,6 +11,7 @@ from optuna.trial import FrozenTrial, TrialState
 
 from music_rllib.config.problems import ConfigError
 from music_rllib.config.search.settings import FINAL_SEED, SearchSettings
+from music_rllib.errors import first_line
 from music_rllib.experiment.listener import Listener
 from music_rllib.experiment.plan import Node, Run
 from music_rllib.experiment.scheduler import DONE, LOST, Status
@@ -95,7 +96,7 @@ class SearchController(Listener):
         except DATABASE_ERRORS as error:
             # What was begun is begun again next time; runs go on meanwhile.
             if not self._database_lost:
-                cause = str(error.__cause__ or error).strip().splitlines()[0]
+                cause = first_line(error.__cause__ or error)
                 self._say(f"the study's database does not answer, trying again: {redact(cause)}")
             self._database_lost = True
             return True

@@ -16,6 +16,7 @@ from sqlalchemy import create_engine, inspect
 from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError, IntegrityError, ProgrammingError, SQLAlchemyError
 
+from music_rllib.errors import first_line
 from music_rllib.redaction import redact
 from music_rllib.store.object_folder import StorageError
 
@@ -140,7 +141,7 @@ def _saying_what_is_wrong(url: str, setting: str) -> Iterator[None]:
     except StorageError:
         raise
     except (*DATABASE_ERRORS, ArgumentError, ImportError, RuntimeError) as error:
-        cause = str(error.__cause__ or error).strip().splitlines()[0]
+        cause = first_line(error.__cause__ or error)
         raise StorageError(
             f"{setting} must be a database that can be used, got {redact(url)}: {redact(cause)}"
         ) from error

@@ -78,6 +78,14 @@ def below(storage: str, path: str) -> str:
     return f"{above.rstrip('/')}/{path}{mark}{options}"
 
 
+def absolute_database(uri: str) -> str:
+    """An sqlite file's URI that means the same in every working directory; others as they are."""
+    path = uri.removeprefix("sqlite:///")
+    if path == uri or not path or path.startswith(("/", ":")):
+        return uri
+    return f"sqlite:///{Path(path).absolute()}"
+
+
 def sweep_folder(storage: str, name: str) -> Path:
     """Local folder of a sweep's own files: in the storage, or in the home folder for a bucket."""
     if storage.startswith("file://"):

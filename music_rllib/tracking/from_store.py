@@ -73,13 +73,19 @@ def deliver(place: str, tracking_uri: str | None, timeout: float) -> Pending:
     tracker = Tracker(
         sweep_name=location.name,
         storage=location.storage,
-        config=location.read(sweep_files.CONFIG),
+        config=location.document(),
         tracking_uri=tracking_uri or record.tracking_uri,
     )
     outcome = state["driver"]["outcome"] if state else ""
     causes = {failure["run"]: failure["cause"] for failure in state["failures"]} if state else {}
     begun = sweep.store.begun()
     try:
+        for name, file in (
+            (names.ARTEFACT_ANALYSIS_PLAN, sweep_files.ANALYSIS_PLAN),
+            (names.ARTEFACT_SEARCH, sweep_files.SEARCH),
+        ):
+            if (document := location.read(file)) is not None:
+                tracker.put_sweep_artefact(name, sweep_files.as_json(document))
         for node in sweep.plan.nodes:
             if sweep.store.is_finished(node.key):
                 tracker.mirror(run_info(node), partial(finished_run, sweep.store, node))

@@ -167,7 +167,7 @@ class Experiment:
         }
 
     def begin_run(self, run_id: str, tags: Mapping[str, str], params: Mapping[str, str]) -> None:
-        """Mark the run as running, with these tags and params, and remove its failure tag.
+        """Mark the run as running, with these tags and params, and without an earlier end's tags.
 
         MLflow's params are immutable, but a sweep may be continued with other settings, such as
         more seeds: a changed param becomes a tag.
@@ -182,8 +182,8 @@ class Experiment:
         self.set_tags(run_id, {**tags, **changed})
         fresh = [Param(key, value) for key, value in params.items() if key not in known]
         self._client.log_batch(run_id, params=fresh, synchronous=True)
-        if names.TAG_FAILURE in run.data.tags:
-            self._client.delete_tag(run_id, names.TAG_FAILURE)
+        for tag in {names.TAG_FAILURE, names.TAG_PRUNED} & run.data.tags.keys() - tags.keys():
+            self._client.delete_tag(run_id, tag)
         if run.info.status != "RUNNING":
             self._client.update_run(run_id, status="RUNNING")
 

@@ -15,6 +15,7 @@ from music_rllib.errors import TrackingError
 from music_rllib.experiment import sweep_files
 from music_rllib.redaction import redact
 from music_rllib.store.object_folder import StorageError
+from music_rllib.store.paths import absolute_database
 
 if TYPE_CHECKING:
     import requests
@@ -136,7 +137,8 @@ def resolve_store(tracking_uri: str | None, storage: str) -> TrackingStore:
             uri=f"sqlite:///{database}", artefact_root=artefacts, database=database
         )
     is_server = _checked_scheme(tracking_uri) in _SERVERS
-    return TrackingStore(uri=tracking_uri, artefact_root=None if is_server else artefacts)
+    uri = absolute_database(tracking_uri)
+    return TrackingStore(uri=uri, artefact_root=None if is_server else artefacts)
 
 
 def local_folder(storage: str) -> Path | None:

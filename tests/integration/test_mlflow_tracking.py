@@ -28,12 +28,14 @@ from music_rllib import names
 from music_rllib.config.load import load_sweep
 from music_rllib.errors import TrackingError
 from music_rllib.experiment import sweep_files
+from music_rllib.experiment.listener import Failure
 from music_rllib.experiment.location import find_sweep
 from music_rllib.experiment.run_info import RunInfo
 from music_rllib.policy import PolicyNetwork
 from music_rllib.report.location import find_sweep as find_report
 from music_rllib.store.node_store import NodeStore
 from music_rllib.store.run_record import HISTORY, Report, RunResult, last_values, to_json_lines
+from music_rllib.sweep.listeners.state_file import StateFile
 from music_rllib.tracking.cli import app
 from music_rllib.tracking.policy_model import write_model
 from music_rllib.tracking.projection import StoredRun
@@ -475,7 +477,7 @@ def test_the_command_sends_what_the_store_has(
     config = load_sweep(storage / "s.yaml")
     tracker_on(sweep_name="s", config=config.document).close("KILLED")
     plan = find_sweep(str(folder), None).open().plan
-    finished, begun, _ = plan.nodes
+    finished, begun, failed = plan.nodes
     node, store = tmp_path / "node", NodeStore(str(storage))
     node.mkdir()
     history = [report(step, time=step) for step in STEPS]
@@ -484,8 +486,13 @@ def test_the_command_sends_what_the_store_has(
         label=finished.label, env_steps=20_000, seconds=1.0, metrics=last_values(history)
     )
     store.publish(finished.key, node, result)
-    with store.work_folder(begun.key).new_checkpoint(8000) as draft:
-        (draft.folder / HISTORY).write_bytes(to_json_lines(history[:4]))
+    for unfinished in (begun, failed):
+        with store.work_folder(unfinished.key).new_checkpoint(8000) as draft:
+            (draft.folder / HISTORY).write_bytes(to_json_lines(history[:4]))
+    with StateFile(find_sweep(str(folder), None).open()) as state_file:
+        state_file.failed(failed, Failure("boom", tmp_path / "log"))
+        state_file.end("failed")
+    (folder / sweep_files.ANALYSIS_PLAN).write_text("[]")
 
     assert find_report(str(folder), tracking_uri=None).undelivered == 1
     for _ in range(2):  # twice changes nothing
@@ -495,12 +502,17 @@ def test_the_command_sends_what_the_store_has(
         of_node = {run.data.tags.get(names.TAG_NODE_KEY): run for run in runs.values()}
         assert not [key for key in runs["s"].data.tags if key.startswith(names.TAG_CHANGED_PREFIX)]
         assert {run.info.run_name: run.info.status for run in runs.values()} == {
-            "s": "KILLED",
+            "s": "FAILED",
+            of_node[failed.key].info.run_name: "FAILED",
             of_node[finished.key].info.run_name: "FINISHED",
             of_node[begun.key].info.run_name: "KILLED",
         }
         assert logged_steps(client_of(storage), of_node[finished.key]) == STEPS
         assert logged_steps(client_of(storage), of_node[begun.key]) == STEPS[:4]
+        assert of_node[failed.key].data.tags[names.TAG_FAILURE] == "boom"
+        folder_of_plans = str(Path(names.ARTEFACT_ANALYSIS_PLAN).parent)
+        kept = client_of(storage).list_artifacts(runs["s"].info.run_id, folder_of_plans)
+        assert [one.path for one in kept] == [names.ARTEFACT_ANALYSIS_PLAN]
     assert find_report(str(folder), tracking_uri=None).undelivered == 0
 
 

@@ -240,11 +240,3 @@ def _legend_grid(legend: Legend, width: float, scale: float) -> tuple[Legend, in
     rows = math.ceil(len(entries) / columns)
     by_row = (entries[row::rows] for row in range(rows))
     return entries, columns, sum(max(label.count("\n") + 1 for label, _ in row) for row in by_row)
-
-
-def stale_files(kept: set[str], names: Sequence[str]) -> Iterator[str]:
-    """Those file names that belong to figures whose name is not among the `kept`."""
-    for name in names:
-        stem, dot, ending = name.rpartition(".")
-        if dot + ending in ENDINGS and stem.removesuffix(COLUMN) not in kept:
-            yield name

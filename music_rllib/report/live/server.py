@@ -21,11 +21,11 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-from music_rllib.errors import BadInputError
+from music_rllib.errors import BadInputError, first_line
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.location import SweepLocation
+from music_rllib.redaction import for_people
 from music_rllib.report.live.state import Progress
-from music_rllib.results.data import ReportError
 from music_rllib.store.object_folder import StorageError
 
 HOST = "127.0.0.1"
@@ -48,6 +48,8 @@ class LivePage:
         """
         self._make, self._progress = make, progress
         self.html, self.version = make(), 1
+        self._problem: str | None = None
+        """Why the newest page could not be made."""
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._follow, name="live page", daemon=True)
         self._thread.start()
@@ -55,7 +57,8 @@ class LivePage:
     def state(self) -> dict[str, Any]:
         """The sweep's progress and the number of the newest page."""
         try:
-            return {**self._progress.read(), "version": self.version}
+            problem = {} if self._problem is None else {"error": self._problem}
+            return {**self._progress.read(), "version": self.version, **problem}
         except StorageError as error:
             return {"state": "unknown", "error": str(error), "version": self.version}
 
@@ -73,8 +76,10 @@ class LivePage:
             before, began = now, time.monotonic()
             try:
                 html = self._make()
-            except ReportError:  # MLflow is busy or down: try again later
+            except Exception as error:  # MLflow or the storage is busy or down: try again later
+                self._problem = f"The page is an older one: {for_people(first_line(error))}"
                 continue
+            self._problem = None
             took = time.monotonic() - began
             if html != self.html:
                 self.html, self.version = html, self.version + 1
@@ -110,6 +115,11 @@ class Server(ThreadingHTTPServer):
 
     daemon_threads = True
     token: str
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Print nothing about a tab that was closed, or about an address that is none."""
+        if not isinstance(sys.exception(), ConnectionError | ValueError):
+            super().handle_error(request, client_address)
 
 
 def make_server(page: LivePage, found: SweepLocation, folder: Path, port: int) -> Server:

@@ -30,7 +30,8 @@ function ticksOf(low, high, count) {
   const decimals = Math.max(0, -Math.floor(Math.log10(step * 1.0001)) + (step / power === 2.5 ? 1 : 0));
   const text = (value) => {
     for (const [unit, sign] of [[1e9, "G"], [1e6, "M"], [1e3, "k"]]) {
-      if (Math.abs(value) >= unit) return `${+(value / unit).toFixed(2)}${sign}`;
+      const digits = decimals + Math.log10(unit);
+      if (Math.abs(value) >= unit) return `${+(value / unit).toFixed(Math.min(digits, 8))}${sign}`;
     }
     return value.toFixed(Math.min(decimals, 8));
   };

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
@@ -133,16 +134,26 @@ def _x_axes(sweep: Sweep, curve: Curve, known: KnownAxes) -> Mapping[str, Any]:
 
 
 def _mean_at(steps: Array, series: Iterable[tuple[Array, Array]]) -> list[float | None] | None:
-    """Mean over the runs that have reached each step; None if no run has any value."""
+    """Mean over the runs; None if no run has any value.
+
+    Where not all have got as far, it goes on by the mean of those that have: their increments, as
+    the mean of a few runs' values may lie before that of all runs.
+    """
     rows = [
         np.interp(steps, at, values, left=np.nan, right=np.nan) for at, values in series if len(at)
     ]
     if not rows:
         return None
-    reached = ~np.isnan(rows)
-    count = reached.sum(axis=0)
-    total = np.where(reached, rows, 0.0).sum(axis=0)
-    return _plain(np.where(count > 0, total / np.maximum(count, 1), np.nan))
+    means = np.full(len(steps), np.nan)
+    reached = ~np.isnan(rows).all(axis=0)
+    begun = np.asarray(rows)[:, reached]
+    if not begun.size:
+        return _plain(means)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of the mean of no run
+        first, gains = np.nanmean(begun[:, 0]), np.nanmean(np.diff(begun, axis=1), axis=0)
+    means[reached] = first + np.concatenate([[0.0], np.cumsum(gains)])
+    return _plain(means)
 
 
 def _plain(values: Array) -> list[float | None]:

@@ -89,14 +89,16 @@ function showState(state) {
 }
 
 async function look() {
+  let state;
   try {
-    const state = await (await asked("/state")).json();
-    showState(state);
-    if (version && state.version !== version) await renew();
-    version = state.version;
+    state = await (await asked("/state")).json();
   } catch {
     showState({ state: "not to be reached: its page has ended" });
+    return;
   }
+  showState(state);
+  if (version && state.version !== version) await renew();
+  version = state.version;
 }
 
 document.title = `live: ${document.title}`;

@@ -7,7 +7,7 @@ const X_AXES = {
   seconds: "wall time",
   epochs: "epochs of 80,000 steps",
 };
-const choice = { stage: 0, metric: "", x: "steps", smooth: 1, conditions: new Set(), panels: new Set() };
+const choice = { stageName: null, stage: 0, metric: "", x: "steps", smooth: 1, conditions: new Set(), panels: new Set() };
 let data = JSON.parse(document.getElementById("data").textContent);
 
 /** Means over the `width` nearest points; missing values stay missing. */
@@ -65,7 +65,9 @@ function drawNow(box) {
 
 /** Makes a box per panel of each stage, which is drawn when it comes near the window. */
 function fill(parent, wanted) {
-  const boxes = wanted.filter(({ stage, panel }) => !choice.panels.has(data.stages[stage].panels[panel]));
+  // The only one of a stage has no chip by which it could be shown again.
+  const isShown = (names, panel) => names.length < 2 || !choice.panels.has(names[panel]);
+  const boxes = wanted.filter(({ stage, panel }) => isShown(data.stages[stage].panels, panel));
   while (parent.children.length > boxes.length) parent.lastChild.remove();
   boxes.forEach((panel, i) => {
     const box = parent.children[i] ?? element("div", { class: "panel" }, parent);
@@ -154,6 +156,7 @@ function controls() {
   if (data.stages.length > 1) {
     select(row, "stage", data.stages.map((one, i) => [i, one.name]), choice.stage, (value) => {
       choice.stage = +value;
+      choice.stageName = data.stages[choice.stage].name;
       controls();
     });
   }
@@ -172,9 +175,11 @@ function controls() {
 const orders = new Map();
 
 function sortKey(cell) {
-  const text = cell.textContent.trim(), number = parseFloat(text.replaceAll(",", "").replace(/^[^\d.-]+/, ""));
+  const text = cell.textContent.trim();
+  if (/^\d+(:\d\d)+$/.test(text)) return text.split(":").reduce((sum, part) => 60 * sum + +part, 0);
+  const number = parseFloat(text.replaceAll(",", "").replace(/^[^\d.-]+/, ""));
   if (text === "–" || /^(not|no) /.test(text)) return Infinity;
-  return /^[\s>p=<-]*[\d.,]+/.test(text) && !Number.isNaN(number) ? number : text.toLowerCase();
+  return /^[\s>p=<+-]*[\d.,]+/.test(text) && !Number.isNaN(number) ? number : text.toLowerCase();
 }
 
 function sortBy(table, column, down) {
@@ -201,20 +206,23 @@ function sortable() {
         sortBy(table, column, down);
       });
     });
-    if (orders.has(name)) sortBy(table, ...orders.get(name));
+    // Another table of this name may have fewer columns.
+    const [column, down] = orders.get(name) ?? [Infinity];
+    if (column < table.tHead.rows[0].cells.length) sortBy(table, column, down);
   }
 }
 
 // ------------------------------------------------------------------------------------------------
 
 function refresh() {
-  choice.stage = Math.min(choice.stage, Math.max(0, data.stages.length - 1));
+  // By its name: stages that begin later may come before it.
+  const found = data.stages.findIndex((one) => one.name === choice.stageName);
+  choice.stage = found < 0 ? data.main : found;
   controls();
   drawAll();
   sortable();
 }
 
-choice.stage = data.main;
 refresh();
 let width = innerWidth, timer = 0;
 addEventListener("resize", () => {

@@ -19,6 +19,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -26,6 +27,7 @@ import pyarrow as pa
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from music_rllib.config.problems import shown
+from music_rllib.errors import first_line
 from music_rllib.limits import MOST_JSON_BYTES, MOST_YAML_BYTES, read_json, read_regular
 from music_rllib.results.archive.tables import read_table, write_table
 from music_rllib.results.claims.plan import as_document, checked_plans
@@ -51,7 +53,7 @@ _METRICS = {
 }
 """Columns of the table of metrics."""
 
-_PLACES = re.compile(r"^(?P<name>storage: | *tracking_uri: )(?P<place>.+)$", re.MULTILINE)
+_PLACES = re.compile(r"^(?P<name> *(?:storage|tracking_uri): )(?P<place>.+)$", re.MULTILINE)
 _LOCAL = re.compile(r"(sqlite:///)/(?:.*/)?([^/]+/[^/]+)|(?:file://)?/(?:.*/)?([^/]+)/*")
 
 
@@ -86,16 +88,22 @@ def write_archive(sweep: Sweep, folder: Path, file_format: Format = "parquet") -
         )
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        tables = [f"{table}.{kind}" for table in ("runs", "metrics") for kind in get_args(Format)]
-        for stale in (*tables, _SEARCHES, _PLANS):
-            (folder / stale).unlink(missing_ok=True)
-        write_table(_runs_table(sweep.runs), folder / f"runs.{file_format}")
-        write_table(_metrics_table(sweep), folder / f"metrics.{file_format}")
-        if sweep.searches:
-            _write_json([_without_place(found) for found in sweep.searches], folder / _SEARCHES)
-        if sweep.plans:
-            _write_json(as_document(sweep.plans), folder / _PLANS)
-        _write_json(header, folder / _HEADER)
+        # Written beside it first: a full disk must not cost the runs of an earlier export.
+        with TemporaryDirectory(dir=folder, prefix=".new-") as temporary:
+            new = Path(temporary)
+            write_table(_runs_table(sweep.runs), new / f"runs.{file_format}")
+            write_table(_metrics_table(sweep), new / f"metrics.{file_format}")
+            if sweep.searches:
+                _write_json([_without_place(found) for found in sweep.searches], new / _SEARCHES)
+            if sweep.plans:
+                _write_json(as_document(sweep.plans), new / _PLANS)
+            _write_json(header, new / _HEADER)
+            tables = [f"{one}.{kind}" for one in ("runs", "metrics") for kind in get_args(Format)]
+            for stale in (*tables, _SEARCHES, _PLANS):
+                if not (new / stale).exists():
+                    (folder / stale).unlink(missing_ok=True)
+            for file in new.iterdir():
+                file.replace(folder / file.name)
     except OSError as error:
         raise ReportError(f"{folder} must be writable: {error}") from error
 
@@ -157,7 +165,7 @@ def _reason(error: Exception) -> str:
         return f"{place} {rule}, got {shown(finding['input'])}"
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
-    return f"must have {error}" if isinstance(error, KeyError) else str(error).splitlines()[0]
+    return f"must have {error}" if isinstance(error, KeyError) else first_line(error)
 
 
 def _without_place(search: Mapping[str, Any]) -> dict[str, Any]:

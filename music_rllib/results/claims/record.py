@@ -9,7 +9,7 @@ import time
 from collections.abc import Sequence
 
 from music_rllib.experiment.session import Sweep
-from music_rllib.experiment.sweep_files import as_json, keep, read
+from music_rllib.experiment.sweep_files import ANALYSIS_PLAN, as_json, keep, read
 from music_rllib.redaction import redact
 from music_rllib.results.claims.plan import (
     PlanVersion,
@@ -21,7 +21,7 @@ from music_rllib.results.claims.plan import (
 )
 from music_rllib.store.object_folder import StorageError
 
-PLANS, PLANS_TO_READ = "analysis_plan.json", "analysis_plan.md"
+PLANS_TO_READ = "analysis_plan.md"
 
 
 def plans_in(storage: str, name: str) -> tuple[PlanVersion, ...]:
@@ -30,14 +30,14 @@ def plans_in(storage: str, name: str) -> tuple[PlanVersion, ...]:
     Raises:
         StorageError: The versions can't be read, or are not what was recorded.
     """
-    document = read(storage, f"{name}/{PLANS}")
+    document = read(storage, f"{name}/{ANALYSIS_PLAN}")
     try:
         return () if document is None else checked_plans(document)
     except ValueError as error:
         reason = str(error).splitlines()[-1].strip()
         raise StorageError(
-            f"{redact(storage)}/{name}/{PLANS} must hold the versions of an analysis plan as they "
-            f"were recorded: {reason}"
+            f"{redact(storage)}/{name}/{ANALYSIS_PLAN} must hold the versions of an analysis plan "
+            f"as they were recorded: {reason}"
         ) from error
 
 
@@ -53,6 +53,6 @@ def record_plan(sweep: Sweep) -> Sequence[PlanVersion]:
         return before
     versions = with_plan(before, plan, int(time.time() * 1000))
     if len(versions) > len(before):
-        keep(sweep, PLANS, as_json(as_document(versions)))
+        keep(sweep, ANALYSIS_PLAN, as_json(as_document(versions)))
         keep(sweep, PLANS_TO_READ, as_markdown(sweep.config.name, versions))
     return versions

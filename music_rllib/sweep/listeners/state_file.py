@@ -31,7 +31,8 @@ from music_rllib.sweep.cost import searched
 
 LOCAL_SECONDS, REMOTE_SECONDS = 2.0, 15.0
 """Between two writes of `state.json`, in a folder and in a bucket."""
-SHOWN_FAILURES = 20
+MOST_FAILURES = 1000
+"""Failures that are kept, the newest."""
 
 
 class StateFile(Listener):
@@ -208,7 +209,7 @@ class StateFile(Listener):
             "best": best_so_far(judged, sweep.plan, self._results, searches),
             "searches": searches,
             "pruned": [node.key for node in sweep.scheduler.having(Status.PRUNED)],
-            "failures": self._failures[-SHOWN_FAILURES:],
+            "failures": self._failures[-MOST_FAILURES:],
         }
 
     def _to_come(self) -> int:
@@ -243,9 +244,10 @@ class StateFile(Listener):
         try:
             if sweep_files.read(self._sweep.storage, self._stop_path) is None:
                 return False
-            sweep_files.remove(self._sweep.storage, self._stop_path)
         except StorageError:
             return False
+        with contextlib.suppress(StorageError):  # whoever begins next deletes it
+            sweep_files.remove(self._sweep.storage, self._stop_path)
         return True
 
     def _write(self) -> None:

@@ -22,6 +22,7 @@ _STATUSES = (
     *("failed", "skipped"),
 )
 """Statuses of runs, in the order of the columns."""
+SHOWN_FAILURES = 20
 _STYLES = {"finished": "green", "failed": "red", "interrupted": "yellow", "stopped": "yellow"}
 
 
@@ -54,7 +55,7 @@ def status_view(state: Mapping[str, Any], labels: Iterable[str]) -> RenderableTy
         parts.append(Text(f"DAMAGED {label(damaged['run'])}: {damaged['cause']}", style="red"))
     if state["damaged"]:
         parts.append(Text(f"    {TRAIN_AGAIN}", style="dim"))
-    for failure in state["failures"]:
+    for failure in state["failures"][-SHOWN_FAILURES:]:
         parts.append(Text(f"FAILED {label(failure['run'])}: {failure['cause']}", style="red"))
         parts.append(Text(f"    {failure['log']}", style="dim"))
     return Group(*parts)

@@ -6,6 +6,7 @@ import json
 import threading
 import time
 from collections.abc import Iterator
+from itertools import chain, repeat
 from pathlib import Path
 from typing import Any
 from urllib.error import HTTPError
@@ -13,6 +14,7 @@ from urllib.request import Request, urlopen
 
 import pytest
 
+from music_rllib.errors import TrackingError
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.location import SweepLocation
 from music_rllib.report.live import server
@@ -129,6 +131,32 @@ def test_the_page_is_made_anew_while_the_sweep_runs(served: tuple[str, str]) -> 
     while json.loads(ask(f"{address}/state", X_Token=token)[1])["version"] == before["version"]:
         assert time.monotonic() < deadline
         time.sleep(0.05)
+
+
+def test_a_page_that_cannot_be_made_is_said_and_made_later(
+    found: SweepLocation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its thread would end with the first error, and the page stay as it is without a word."""
+    monkeypatch.setattr(server, "LEAST_PAUSE", 0.05)
+    write_state(tmp_path, 100, time.time())
+    answers: Iterator[Any] = chain(["one"], repeat(TrackingError("no answer"), 3), repeat("two"))
+
+    def make() -> str:
+        answer = next(answers)
+        if isinstance(answer, Exception):
+            raise answer
+        return str(answer)
+
+    page = server.LivePage(make, Progress(found))
+    said = set()
+    deadline = time.monotonic() + 60
+    while page.html != "two":
+        said.add(page.state().get("error"))
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    page.close()
+    assert "The page is an older one: no answer" in said
+    assert "error" not in page.state()
 
 
 def test_the_buttons_stop_a_running_sweep_and_resume_a_stopped_one(

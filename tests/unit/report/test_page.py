@@ -18,7 +18,7 @@ import pytest
 from matplotlib.collections import PolyCollection
 
 from music_rllib import names
-from music_rllib.report.build import build_report, write_report
+from music_rllib.report.build import build_report, made_files, write_report
 from music_rllib.report.figures.choice import AGAINST_ENTROPY, INFLUENCE
 from music_rllib.report.figures.draw import TEXT_WIDTH, Figures, drawn_figure, files
 from music_rllib.report.figures.importance import CHANCE, importances, varied
@@ -27,6 +27,7 @@ from music_rllib.report.figures.processes import drawing_processes
 from music_rllib.report.limitations import planned_runs
 from music_rllib.report.page import render
 from music_rllib.report.tables import curves_table
+from music_rllib.report.web.charts import _mean_at
 from music_rllib.results.analysis import THRESHOLDS, analyse
 from music_rllib.results.comparison import Scope, verdict
 from music_rllib.results.conditions import SIDE_BY_SIDE, Condition, find_stages, stage_by_stage
@@ -731,20 +732,56 @@ def test_a_legend_stays_inside_its_figure() -> None:
 def test_figures_of_an_earlier_report_go_and_the_same_sweep_is_the_same_file(
     tmp_path: Path,
 ) -> None:
+    """And what else is in its folder stays."""
     made = []
     for name in ("one", "two"):
-        stale = tmp_path / name / "figures" / "old-stage-success-rate.png"
-        stale.parent.mkdir(parents=True)
-        stale.touch()
+        figures = tmp_path / name / "figures"
+        figures.mkdir(parents=True)
+        own = figures / "mine.png"
+        own.touch()
+        other = compared({"1": [0.5]}, stage="old")
+        write_report(build_report(other), tmp_path / name)
+        assert (figures / "old-success-rate.png").exists()
         write_report(build_report(compared({"1": [0.5]})), tmp_path / name)
-        figures = sorted((tmp_path / name / "figures").iterdir())
-        assert [path.name for path in figures] == [
+        own.unlink()
+        files = sorted(path for path in figures.iterdir() if not path.name.startswith("."))
+        assert [path.name for path in files] == [
             f"{figure}{ending}"
             for figure in ("finetune-success-rate", "overview")
             for ending in ("-column.pdf", "-column.svg", ".pdf", ".png", ".svg")
         ]
-        made.append([path.read_bytes() for path in figures])
+        made.append([path.read_bytes() for path in files])
+        assert {f"figures/{path.name}" for path in files} < set(made_files(tmp_path / name))
     assert made[0] == made[1]
+
+
+def test_a_list_of_files_that_somebody_else_wrote_deletes_nothing_elsewhere(tmp_path: Path) -> None:
+    (tmp_path / "report" / "figures").mkdir(parents=True)
+    kept = tmp_path / "figures" / "x.png"
+    kept.parent.mkdir()
+    kept.touch()
+    listed = ["../figures/x.png", str(kept), "figures/../../figures/x.png", "figures/..", 3]
+    (tmp_path / "report" / "figures" / ".made.json").write_text(json.dumps(listed))
+    assert made_files(tmp_path / "report") == []
+    write_report(build_report(compared({"1": [0.5]})), tmp_path / "report")
+    assert kept.exists()
+
+
+def test_time_goes_on_where_a_quick_run_is_ahead_of_a_slow_one() -> None:
+    """The mean of those that have got as far may lie before that of all."""
+    steps = np.arange(0.0, 500.0, 100.0)
+    slow, quick = (steps[:4], 2 * steps[:4]), (steps, steps)
+    assert _mean_at(steps, [slow, quick]) == [0.0, 150.0, 300.0, 450.0, 550.0]
+    assert _mean_at(steps, [quick, quick]) == steps.tolist()
+    assert _mean_at(steps, []) is None
+    assert _mean_at(steps, [(steps[:2], np.full(2, np.nan))]) == [None] * 5
+
+
+def test_a_run_that_goes_on_has_not_ended() -> None:
+    """MLflow keeps the end that it had before it was resumed."""
+    ended = RunRecord(run_id="r", name="n", status="FINISHED", tags={}, started=1000, ended=3000)
+    assert ended.seconds == 2.0
+    assert replace(ended, status="RUNNING").seconds is None
 
 
 def test_runs_link_to_a_server_s_pages() -> None:

@@ -14,7 +14,7 @@ import pytest
 
 from music_rllib import load_sweep, names
 from music_rllib.results.archive.folder import Format, read_archive, write_archive
-from music_rllib.results.data import Points, columns
+from music_rllib.results.data import Points, ReportError, columns
 from music_rllib.results.frames.tables import frames_of
 
 DOCS = Path(__file__).parents[3] / "docs"
@@ -94,3 +94,25 @@ def test_of_several_values_at_a_step_the_one_logged_last_counts() -> None:
     loss = columns([points])["loss"]
     assert (loss.step.tolist(), loss.value.tolist()) == ([10, 20], [0.1, 0.2])
     assert columns([points])["success"].value.tolist() == [0.4]
+
+
+def test_an_export_names_no_folder_of_the_machine(tmp_path: Path) -> None:
+    config = "storage: /home/anna/r\nstages:\n- search:\n    storage: sqlite:////home/anna/x/s.db\n"
+    config += "mlflow:\n  tracking_uri: sqlite:////home/anna/y/mlflow.db\n"
+    write_archive(replace(read_archive(EXPORT), config=config), tmp_path)
+    assert "anna" not in (tmp_path / "sweep.json").read_text()
+
+
+def test_an_export_that_finds_no_room_leaves_the_earlier_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_archive(read_archive(EXPORT), tmp_path)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("music_rllib.results.archive.folder._write_json", full)
+    with pytest.raises(ReportError, match="No space left"):
+        write_archive(replace(read_archive(EXPORT), runs=[], history={}), tmp_path)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before

@@ -51,6 +51,8 @@ def test_a_relative_storage_is_made_absolute(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert resolve_store(None, "results").database == tmp_path / "results" / "mlflow.db"
+    assert resolve_store("sqlite:///x.db", "results").uri == f"sqlite:///{tmp_path}/x.db"
+    assert resolve_store("sqlite:////x.db", "results").uri == "sqlite:////x.db"
 
 
 def test_a_file_uri_is_the_folder_that_it_names() -> None:
