@@ -31,6 +31,7 @@ import numpy as np
 
 from music_rllib.config.load import load_sweep
 from music_rllib.config.problems import ConfigError
+from music_rllib.envs.make import is_gymnasium_id
 from music_rllib.experiment.plan import make_plan
 from music_rllib.policy import PolicyError, load_policy
 from music_rllib.policy.rollout import open_task
@@ -394,6 +395,7 @@ def main(arguments: list[str] | None = None) -> int:
         sound = folder / "sound"
         sound.mkdir()
         make_sound(sound)
+        is_gymnasium_id("Nothing-v0")  # loads the robotics tasks, as the first unknown id would
         watch, end, number = Watch(folder), time.process_time() + options.seconds, options.case or 0
         while time.process_time() < end:
             case = folder / "case"

@@ -142,7 +142,7 @@ def test_every_query_returns_data_of_a_running_sweep(
     assert not waiting, f"no data for {list(waiting)}"
     assert labels == {"sweep", "task", "q"}
     (success,) = seen["Success rate by q and task A"]
-    assert success["metric"] == {"q": "1", "task": "Point"}
+    assert success["metric"] == {"q": "1", "stage": "pretrain", "task": "Point"}
     assert 0 <= float(success["value"][1]) <= 1
     targets = sweep_program.folder / "results" / TARGETS
     assert not list(targets.iterdir()), "what has ended is not scraped"

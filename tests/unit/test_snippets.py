@@ -33,6 +33,7 @@ MODULES = {
 """What `python -m` starts, and where its application is."""
 OTHERS = {
     ".",
+    "aws",
     "base64",
     "cd",
     "curl",
