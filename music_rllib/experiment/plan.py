@@ -124,11 +124,10 @@ class Plan:
     @property
     def imports(self) -> tuple[Input, ...]:
         """Checkpoints from outside that runs start from, each once."""
-        sources = ((s.source, s.tasks[0]) for s in self._stages.values())
         inputs = [
-            self._input(source, 0, task, 0)[0]
-            for source, task in sources
-            if source and source.checkpoint
+            self._input(stage.source, 0, stage.tasks[0], 0)[0]
+            for stage in self._stages.values()
+            if stage.source and stage.source.checkpoint
         ]
         return tuple({one.key: one for one in inputs if one}.values())
 

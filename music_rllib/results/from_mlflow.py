@@ -129,10 +129,12 @@ def attach(
 
 
 def _refusal(store: TrackingStore, rule: str, error: Exception) -> ReportError:
-    from music_rllib.tracking.mlflow_client import first_line  # with MLflow, which is loaded by now
+    from music_rllib.tracking.mlflow_client import (
+        mlflow_reason,  # with MLflow, which is loaded by now
+    )
 
     return ReportError(
-        f"MLflow at {store.public_uri} must {rule}, it answered: {first_line(error)}"
+        f"MLflow at {store.public_uri} must {rule}, it answered: {mlflow_reason(error)}"
     )
 
 

@@ -10,7 +10,7 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from ipaddress import ip_address
 from typing import TYPE_CHECKING, Annotated
 
@@ -113,12 +113,16 @@ def serve(
         max_body_bytes=request_model(PolicyFacts.of(served.task.name, served)).max_bytes,
         send_seconds=send_seconds,
     )
-    for number in SIGNALS:
-        signal.signal(number, _interrupt)
+    _on_signals(_interrupt)
     with contextlib.suppress(KeyboardInterrupt):
         _connect(settings)
         _serve(served, settings, host, port, limits)
     return 0
+
+
+def _on_signals(handler: Callable[..., None]) -> None:
+    for number in SIGNALS:
+        signal.signal(number, handler)
 
 
 def _interrupt(*_: object) -> None:
@@ -175,13 +179,8 @@ def _connect(settings: ServeSettings) -> None:
 
     from music_rllib.runtime.ray_cluster import start_ray
 
-    handlers = {number: signal.getsignal(number) for number in SIGNALS}
-    try:
-        start_ray()
-    finally:
-        # Ray sets its own handler of SIGTERM, which would end the process at once.
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
+    start_ray()
+    _on_signals(_interrupt)  # Ray's own handler of SIGTERM would end the process at once
     nodes = [node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"]]
     try:
         _check_room(settings, nodes)
@@ -240,8 +239,7 @@ def _serve(policy: Policy, settings: ServeSettings, host: str, port: int, limits
         )
         url = f"http://{f'[{host}]' if ':' in host else host}:{port}"
         stop = threading.Event()
-        for number in SIGNALS:
-            signal.signal(number, lambda *_: stop.set())
+        _on_signals(lambda *_: stop.set())
         print(f"Serving {redact(settings.policy)} at {url}", flush=True)
         print(f"POST /act, GET /health, GET /policy; described at {url}/docs", flush=True)
         _wait(stop)

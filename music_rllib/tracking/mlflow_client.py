@@ -107,7 +107,7 @@ class Experiment:
         except Exception as error:
             raise TrackingError(
                 f"MLflow at {store.public_uri} must accept the experiment {name!r}, "
-                f"it answered: {first_line(error)}"
+                f"it answered: {mlflow_reason(error)}"
             ) from error
 
     def find(self, node_key: str) -> KnownRun | None:
@@ -282,7 +282,7 @@ class Experiment:
         return str(experiment.experiment_id)
 
 
-def first_line(error: Exception) -> str:
+def mlflow_reason(error: Exception) -> str:
     """The first meaningful line of an error's message, redacted, with advice if there is any."""
     lines = [
         line

@@ -8,7 +8,7 @@ import threading
 from dataclasses import dataclass
 
 from music_rllib.store.object_folder import DamagedError
-from music_rllib.tracking.mlflow_client import first_line, is_lasting
+from music_rllib.tracking.mlflow_client import is_lasting, mlflow_reason
 from music_rllib.tracking.projection import RunProjection
 
 logger = logging.getLogger(__name__)
@@ -148,7 +148,7 @@ class Sender(threading.Thread):
             lane.send()
         # The thread must survive every error; what was not sent stays in the queue.
         except Exception as error:
-            reason = first_line(error)
+            reason = mlflow_reason(error)
             if is_lasting(error) or isinstance(error, DamagedError):
                 lane.refused = reason
                 logger.warning("MLflow at %s does not get all of a run: %s", self._store, reason)

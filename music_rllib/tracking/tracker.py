@@ -29,7 +29,7 @@ from music_rllib.experiment.run_info import RunInfo
 from music_rllib.redaction import flat_params, redact, without_secrets
 from music_rllib.store.paths import sweep_folder
 from music_rllib.store.run_record import Report
-from music_rllib.tracking.mlflow_client import Experiment, Status, check_metric_name, first_line
+from music_rllib.tracking.mlflow_client import Experiment, Status, check_metric_name, mlflow_reason
 from music_rllib.tracking.projection import End, RunProjection, Start, StoredRun
 from music_rllib.tracking.provenance import provenance_tags
 from music_rllib.tracking.sender import Pending, Sender
@@ -167,7 +167,7 @@ class Tracker:
         try:
             self._experiment.keep_view(self.sweep_id, content)
         except Exception as error:
-            logger.warning("MLflow's page has no view of the sweep: %s", first_line(error))
+            logger.warning("MLflow's page has no view of the sweep: %s", mlflow_reason(error))
         else:
             self._view = {"viewStateShareKey": self.sweep_id}
 
@@ -239,7 +239,7 @@ class Tracker:
         except Exception as error:
             raise TrackingError(
                 f"MLflow at {self.store.public_uri} must accept the sweep's run, "
-                f"it answered: {first_line(error)}"
+                f"it answered: {mlflow_reason(error)}"
             ) from error
         return parent
 
