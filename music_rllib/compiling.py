@@ -10,6 +10,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from filelock import FileLock, Timeout
 from numba import njit
 from numba.core.caching import FunctionCache
 from numba.extending import register_jitable
@@ -17,6 +18,9 @@ from numba.extending import register_jitable
 logger = logging.getLogger(__name__)
 
 Function = Callable[..., Any]
+
+PATIENCE = 120.0
+"""Seconds that a process waits for another one's machine code; making it takes some 20."""
 
 
 def compiled(function: Function, *, any_order: bool = False) -> Any:
@@ -40,7 +44,7 @@ def kept_on_disk(function: Function) -> Any:
     """
     dispatcher: Any = njit(function, nogil=True, error_model="numpy")
     try:
-        dispatcher._cache = _Cache(function)  # type: ignore[no-untyped-call]
+        dispatcher._cache = _Cache(function)
     except (RuntimeError, OSError) as error:
         logger.warning(
             "compiled code is not kept, so that each run takes longer to start: %s", error
@@ -66,10 +70,34 @@ def sources_of(*modules: ModuleType) -> str:
 
 
 class _Cache(FunctionCache):
-    """Numba's cache, whose write errors are warnings."""
+    """Numba's cache, for which one process compiles as others wait; write errors are warnings."""
+
+    def __init__(self, function: Function) -> None:
+        super().__init__(function)  # type: ignore[no-untyped-call]
+        name = f"{self._impl.filename_base}.lock"
+        self._lock = FileLock(Path(self.cache_path, name), timeout=PATIENCE)
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """What is kept; where that is None, the caller compiles, holds the lock, and saves."""
+        found = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+        if found is None and self._has_waited():
+            found = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+            if found is not None:
+                self._lock.release()
+        return found
 
     def save_overload(self, sig: Any, data: Any) -> None:
         try:
             super().save_overload(sig, data)  # type: ignore[no-untyped-call]
         except OSError as error:
             logger.warning("compiled code could not be kept: %s", error)
+        finally:
+            self._lock.release()
+
+    def _has_waited(self) -> bool:
+        """Acquire the lock; False where that can't be or takes too long, which only costs time."""
+        try:
+            self._lock.acquire()
+        except (OSError, NotImplementedError, Timeout):
+            return False
+        return True

@@ -74,11 +74,13 @@ class Recording:
         """Records a step; raises BadNumberError for a bad number."""
         self._actions[self.steps] = action
         self._rewards[self.steps] = reward
-        if success is not None:
-            self._successes.append(bool(success))
         self.steps += 1
         if not abs(reward) <= LARGEST:
             check_numbers([("reward", reward)], self.place)
+        if success is not None:
+            if success != success:  # NaN, which bool() takes for true
+                check_numbers([("success", success)], self.place)
+            self._successes.append(bool(success))
         self.see(observation)
 
     def finish(self, *, terminated: bool) -> Episode:

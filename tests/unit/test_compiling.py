@@ -38,6 +38,25 @@ def test_the_next_process_finds_what_was_compiled_until_the_source_changes(tmp_p
     assert result_and_hits().startswith("462 0 ")
 
 
+def test_processes_that_begin_together_compile_once(tmp_path: Path) -> None:
+    program, go = tmp_path / "program.py", tmp_path / "go"
+    wait = f"""
+import pathlib, time
+print("ready", flush=True)
+while not pathlib.Path({str(go)!r}).exists():
+    time.sleep(0.001)
+"""
+    program.write_text(PROGRAM.replace("\nbefore", f"{wait}\nbefore"))
+    command = [sys.executable, str(program)]
+    processes = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(3)]
+    for process in processes:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+    go.touch()
+    hits = [process.communicate()[0].split()[1] for process in processes]
+    assert sorted(hits) == ["0", "1", "1"]
+
+
 def test_where_nothing_can_be_written_each_process_compiles(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

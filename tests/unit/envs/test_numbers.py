@@ -48,8 +48,10 @@ def begun(*, zero_goal: bool = False) -> Recording:
     return recording
 
 
-def take(recording: Recording, seen: Any, reward: float = -1.0) -> None:
-    recording.step(np.zeros(2, np.float32), reward, None, seen)
+def take(
+    recording: Recording, seen: Any, reward: float = -1.0, success: float | None = None
+) -> None:
+    recording.step(np.zeros(2, np.float32), reward, success, seen)
 
 
 @pytest.mark.parametrize(
@@ -70,6 +72,17 @@ def test_a_step_that_returns_one_ends_the_episode_with_its_place(
     take(recording, observation())
     with pytest.raises(BadNumberError, match=f"^Env-v0, sub-environment 2, step 2: {named}, every"):
         take(recording, seen, reward)
+
+
+def test_a_success_that_is_nan_ends_the_episode_too() -> None:
+    recording = begun()
+    take(recording, observation(), success=True)
+    take(recording, observation(), success=0.0)
+    with pytest.raises(BadNumberError, match=r"^Env-v0, sub-environment 2, step 3: success is nan"):
+        take(recording, observation(), success=np.nan)
+    successes = recording.finish(terminated=False).successes
+    assert successes is not None
+    assert successes.tolist() == [True, False]
 
 
 def test_large_numbers_that_float32_holds_well_pass_and_so_does_a_goal_nobody_sees() -> None:
