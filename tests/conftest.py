@@ -66,7 +66,6 @@ LONG = (
     "integration/test_direct_updates.py",
     "integration/test_mlflow_tracking.py",
     "integration/test_first_hour.py",
-    "integration/test_mlflow_pages.py",
     "integration/test_learning.py",
     "integration/test_report_in_browser.py",
     "integration/test_secrets.py",

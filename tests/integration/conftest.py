@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -160,25 +161,31 @@ def sweep_document() -> dict[str, Any]:
     return yaml.safe_load(yaml.safe_dump(SWEEP))  # type: ignore[no-any-return]
 
 
-@pytest.fixture
-def sweep_program(tmp_path: Path) -> Program:
+def new_program(folder: Path) -> Program:
     """The program, with the test environments importable in driver and workers."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (REPOSITORY, ENVIRONMENTS)))}
-    return Program(tmp_path, environment)
+    return Program(folder, environment)
+
+
+def mlflow_runs_of(folder: Path) -> dict[str, Any]:
+    """All runs in the embedded MLflow of a sweep in `folder`, by name."""
+    from mlflow import MlflowClient
+
+    client = MlflowClient(f"sqlite:///{folder}/results/mlflow.db")
+    (experiment,) = [e for e in client.search_experiments() if e.name == "points"]
+    found = client.search_runs([experiment.experiment_id])
+    by_name = {run.info.run_name: run for run in found}
+    assert len(by_name) == len(found), "a run is there twice"
+    return by_name
+
+
+@pytest.fixture
+def sweep_program(tmp_path: Path) -> Program:
+    """The program in the test's folder."""
+    return new_program(tmp_path)
 
 
 @pytest.fixture
 def mlflow_runs(tmp_path: Path) -> Callable[[], dict[str, Any]]:
     """All runs in the embedded MLflow of `sweep_program`, by name."""
-
-    def runs() -> dict[str, Any]:
-        from mlflow import MlflowClient
-
-        client = MlflowClient(f"sqlite:///{tmp_path}/results/mlflow.db")
-        (experiment,) = [e for e in client.search_experiments() if e.name == "points"]
-        found = client.search_runs([experiment.experiment_id])
-        by_name = {run.info.run_name: run for run in found}
-        assert len(by_name) == len(found), "a run is there twice"
-        return by_name
-
-    return runs
+    return partial(mlflow_runs_of, tmp_path)

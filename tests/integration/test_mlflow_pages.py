@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from urllib.parse import quote
 
+import pytest
 from mlflow import MlflowClient
 from typer.testing import CliRunner
 
@@ -70,6 +71,7 @@ def _reports(sweep: Sweep, run: int) -> list[Report]:
     ]
 
 
+@pytest.mark.thorough
 def test_pictures_of_a_comparison(require_service: Callable[[str], Path], tmp_path: Path) -> None:
     """As the documentation shows them."""
     chromium, comparison = require_service("chromium"), log_published_sweep(tmp_path)

@@ -41,13 +41,17 @@ __all__ = ["Averages", "Batch", "Learned", "Networks", "learn"]
 
 
 class Networks(NamedTuple):
-    """Those of a module; where it lacks one, another stands in its place, unused."""
+    """Those of a module; where it lacks one, another stands in its place, unused.
+
+    So a module with one critic and one with two have the same compiled code.
+    """
 
     policy: Network
-    critics: tuple[Network, ...]
+    critics: tuple[Network, Network]
+    critic_count: int
     value: Network
     value_target: Network
-    critics_target: tuple[Network, ...]
+    critics_target: tuple[Network, Network]
     policy_target: Network
     scratch: Array
     """[2, R * O] for the gradients between layers, by the most rows and the widest layer."""
@@ -139,10 +143,10 @@ def _pairs(states: Array, actions: Array, others: Array) -> Array:
 
 
 @compiled
-def _ask_critics(critics: tuple[Network, ...], pairs: Array) -> Array:
+def _ask_critics(critics: tuple[Network, Network], count: int, pairs: Array) -> Array:
     """[R, I + A] -> [C, R]."""
-    values = np.empty((len(critics), len(pairs)), pairs.dtype)
-    for c in range(len(critics)):
+    values = np.empty((count, len(pairs)), pairs.dtype)
+    for c in range(count):
         outputs = forward(critics[c], pairs)
         for r in range(len(pairs)):
             values[c, r] = outputs[r, 0]
@@ -173,7 +177,7 @@ def _critic_target(
             next_outputs = forward(networks.policy_target, following)
         sample = sampled(next_outputs, batch.next_noise, rule)
         pairs = _pairs(following, sample.action, sample.action[:0])
-        values = _smallest(_ask_critics(networks.critics_target, pairs), 0)
+        values = _smallest(_ask_critics(networks.critics_target, networks.critic_count, pairs), 0)
         ln_q_pi = ln_q_of_policy(sample.log_density, q, rule.joint)[0]
         for r in range(len(ln_q_pi)):
             values[r] -= alpha * ln_q_pi[r]
@@ -221,7 +225,7 @@ def _asked(networks: Networks, pairs: Array, of_values: Array, action: Array) ->
     inputs = pairs.shape[1] - size
     of_action, part = np.zeros_like(action), np.empty_like(action)
     rows, of_value = np.arange(2 * count), np.empty((2 * count, 1), action.dtype)
-    for c in range(len(networks.critics)):
+    for c in range(networks.critic_count):
         critic = networks.critics[c]
         for r in range(count):
             of_value[r, 0] = of_values[c, r]
@@ -336,7 +340,7 @@ def _differentiate(
     target = _critic_target(networks, batch, rule, states[rows:], outputs[rows:], q, alpha)
 
     pairs = _pairs(states[:rows], batch.actions, sample.action)
-    values = _ask_critics(networks.critics, pairs)
+    values = _ask_critics(networks.critics, networks.critic_count, pairs)
     smallest = _smallest(values, rows)
     losses = learned.losses[k]
     of_values, losses[0] = _of_critics(values, target, smallest, batch.weights, rule.first_critic)
@@ -380,7 +384,7 @@ def _compiled_for(sources: str) -> Any:
         """
         sources  # noqa: B018
         updates = len(batch.actions) // rows
-        learned: Learned = _nothing_learned(batch, rule, updates, rows, len(networks.critics))
+        learned: Learned = _nothing_learned(batch, rule, updates, rows, networks.critic_count)
         for k in range(updates):
             _differentiate(networks, _minibatch(batch, k, rows), rule, q, alpha, learned, k)
             descend(descent)

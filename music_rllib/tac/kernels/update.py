@@ -158,8 +158,9 @@ class DirectUpdate:
         widest = max(module.settings.hidden_sizes)
         scratch = self.flat.values.new_empty(2, 2 * rows * widest).numpy()
         return Networks(
-            policy, critics, value, value_target, critics_target, policy_target, scratch
-        )
+            policy, critics, module.critics.count, value, value_target, critics_target,
+            policy_target, scratch,
+        )  # fmt: skip
 
     def _rule_of(self, module: TACModule) -> Rule:
         settings, normaliser = module.settings, module.normaliser
@@ -194,8 +195,8 @@ def _perceptron(network: Perceptron, flat: FlatParameters, rows: int) -> Network
     return _network(flat, sizes, weights, biases, rows, by_outputs=True)
 
 
-def _critics(network: Critics, flat: FlatParameters, rows: int) -> tuple[Network, ...]:
-    """Each critic by itself, on the parameters of all."""
+def _critics(network: Critics, flat: FlatParameters, rows: int) -> tuple[Network, Network]:
+    """Each critic by itself, on the parameters of all; a single one twice."""
     sizes = [network.weights[0].shape[1], *(weight.shape[2] for weight in network.weights)]
 
     def critic(c: int) -> Network:
@@ -203,7 +204,7 @@ def _critics(network: Critics, flat: FlatParameters, rows: int) -> tuple[Network
         biases = [flat.start(bias) + c * bias[c].numel() for bias in network.biases]
         return _network(flat, sizes, weights, biases, rows, by_outputs=False)
 
-    return tuple(critic(c) for c in range(network.count))
+    return critic(0), critic(network.count - 1)
 
 
 def _network(
