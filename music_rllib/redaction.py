@@ -142,13 +142,13 @@ def _clean(key: str, value: object) -> object:
 def flat_params(settings: Mapping[str, object]) -> dict[str, str]:
     """Nested ``settings`` as MLflow params: dotted names, scalars as text.
 
-    A list of scalars is one param (JSON text). Secrets, lists of records and values above
+    A list is one param (JSON text). Secrets, lists of records and values above
     ``MAX_PARAM_LENGTH`` characters are omitted: the whole configuration is an artefact anyway.
     """
     flat = {}
     for name, value in _leaves(without_secrets(settings), ""):
         if isinstance(value, list):
-            if any(isinstance(item, (Mapping, list)) for item in value):
+            if any(isinstance(item, Mapping) for item in value):
                 continue
             value = json.dumps(value, default=str)
         if len(text := str(value)) <= MAX_PARAM_LENGTH:

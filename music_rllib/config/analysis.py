@@ -104,4 +104,5 @@ class Analysis(StrictModel):
     curve), or its last value."""
     margin: float | None = Field(None, gt=0)
     """Differences below it do not matter: the margin of equivalence tests. null: 0.05 for a success
-    rate; it must be given for a return."""
+    rate; it must be given for a return. One of 1 or more is a return's, beside which 0.05 stays
+    that of success rates."""

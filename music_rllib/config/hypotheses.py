@@ -13,7 +13,7 @@ from pydantic import TypeAdapter
 from music_rllib.config.analysis import SETTINGS_IN_SHORT, Analysis, Hypothesis, parsed
 from music_rllib.config.problems import ConfigError, Findings, lookup, same, shown
 from music_rllib.config.tac_settings import Alpha, in_words
-from music_rllib.names import EVAL_RETURN
+from music_rllib.names import EVAL_RETURN, EVAL_SUCCESS
 from music_rllib.schedules import AdaptiveSchedule
 
 if TYPE_CHECKING:
@@ -47,6 +47,9 @@ def check_analysis(
                     findings.add(path, broken)
     if analysis.margin is None and EVAL_RETURN in metrics:
         findings.add(("analysis", "margin"), "must be given for tasks without success, got null")
+    if (analysis.margin or 0) >= 1 and metrics == {EVAL_SUCCESS}:
+        rule = f"must be < 1 for a success rate (5 % are 0.05), got {analysis.margin:g}"
+        findings.add(("analysis", "margin"), rule)
 
 
 def _compared_runs(stage: Stage) -> list[dict[str, Any]]:

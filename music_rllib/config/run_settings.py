@@ -77,7 +77,8 @@ VARIANTS: Mapping[Variant, VariantRules] = MappingProxyType(
             without_effect=_TRAINING_OF_ESTIMATOR
             | {"music.mi_reward_weight", "music.reward_scale"}
             # The ranks of the trajectories decide what is replayed.
-            | {"replay.hindsight_episodes"},
+            | {"replay.hindsight_episodes", "replay.priority"}
+            | {"replay.priority_exponent", "replay.importance_exponent"},
             starts_from="estimator",
         ),
     }

@@ -110,8 +110,9 @@ class InitFrom(StrictModel):
     stage: str | None = None
     """An earlier stage; a run starts from that stage's run with the same seed."""
     checkpoint: str | None = None
-    """Folder of a handoff from outside the sweep, in place of a stage. It is copied into the
-    storage, from which the sweep goes on and is compared, wherever the folder is by then."""
+    """Local folder of a handoff from outside the sweep, in place of a stage: one that `best` has
+    exported, or a finished run's, `STORAGE/nodes/KEY`. It is copied into the storage, from which
+    the sweep goes on and is compared, wherever the folder is by then."""
     task: str | None = None
     """Task of the run, or of the checkpoint, to start from; null: each run's own task."""
 

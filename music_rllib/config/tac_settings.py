@@ -183,7 +183,7 @@ class TACSettings(StrictModel):
     """Critic in the policy's loss: Q1 (the TAC authors) or min(Q1, Q2) (SAC practice), which
     exploits the overestimates of one critic less."""
     hidden_sizes: tuple[Annotated[int, Field(gt=0)], ...] = Field((256, 256, 256), min_length=1)
-    """Hidden layers (ReLU) of policy, value and critics. 3 x 256 takes three times as long as
+    """Hidden layers (ReLU) of policy, value and critics. 3 x 256 takes nearly four times as long as
     3 x 128."""
     log_std_bounds: tuple[float, float] = (-20.0, 2.0)
     """Range of the policy's log standard deviation. A higher lower end keeps noise in the actions

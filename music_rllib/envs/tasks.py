@@ -100,7 +100,8 @@ class Task(BaseModel):
     """Entries that are the surrounding state y. Both empty: the task has no split and can't be
     used with MUSIC."""
     success_key: str | None = "is_success"
-    """Key of `info` that says whether the goal is reached now; null if there is none."""
+    """Key of `info` that says whether the goal is reached now, which it is not where a step lacks
+    it; null if there is none."""
     env_kwargs: dict[str, JsonValue] = Field(default_factory=dict)
     """Further arguments of `gymnasium.make`."""
     reward_range: tuple[float, float] | None = None

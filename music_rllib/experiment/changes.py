@@ -206,7 +206,10 @@ def _why_not_longer(node: Node) -> str:
     """Why a run with more `env_steps` does not continue from the end of the shorter one."""
     if settings := budget_settings(node.run):
         return f"; {' and '.join(settings)} would have had other values with the new env_steps"
-    return "; it has kept no checkpoint of its end (checkpoints.finished_mb)"
+    return (
+        "; it has kept no checkpoint of its end (checkpoints.finished_mb; or its env_steps were no "
+        "multiple of evaluation.interval and of 1,000)"
+    )
 
 
 def _progress(store: NodeStore, key: str) -> str | None:

@@ -17,7 +17,14 @@ from music_rllib.experiment.session import Sweep, open_sweep
 from music_rllib.experiment.sweep_files import IN_STORAGE
 from music_rllib.redaction import redact
 from music_rllib.store.node_store import NodeStore
-from music_rllib.store.paths import below, check_answers, folder_at, resolve_storage, sweep_folder
+from music_rllib.store.paths import (
+    below,
+    check_answers,
+    folder_at,
+    resolve_storage,
+    storage_and_name,
+    sweep_folder,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,9 +113,8 @@ def _locate(place: str, storage: str | None) -> SweepLocation:
         return SweepLocation(storage=resolve_storage(config.storage)[0], name=config.name)
     place = place.rstrip("/")
     if storage is None and "://" in place:
-        path, mark, options = place.partition("?")
-        above, _, name = path.rstrip("/").rpartition("/")
-        return SweepLocation(storage=f"{above}{mark}{options}", name=name)
+        above, name = storage_and_name(place)
+        return SweepLocation(storage=above, name=name)
     if storage is None and "/" in place:
         folder = Path(resolve_storage(place)[0])
         raise BadInputError(

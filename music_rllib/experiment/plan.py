@@ -112,6 +112,11 @@ class Plan:
         return list(self._nodes.values())
 
     @property
+    def last_stage(self) -> Stage:
+        """The stage that the others lead to."""
+        return list(self._stages.values())[-1]
+
+    @property
     def searched(self) -> tuple[Stage, ...]:
         """Stages whose trials are searched for."""
         return tuple(stage for stage in self._stages.values() if stage.search is not None)
@@ -207,7 +212,7 @@ class Plan:
             return self._input(source, 0, task, seed)[0]
         task = source.task or task
         stage = self._stages[source.stage]
-        source_values = of_stage(values, stage.name)
+        source_values = {**stage.points[0].values, **of_stage(values, stage.name)}
         node_input = self._trial_input(stage.source, values, task, seed)
         settings = stage.resolve(source_values).runs[task.name].model_copy(update={"seed": seed})
         run = self._add_run(stage, 0, source_values, settings, node_input)

@@ -100,7 +100,7 @@ def _episode(
         action = np.clip(policy.act(observation).astype(bounds.dtype), bounds.low, bounds.high)
         observation, reward, terminated, truncated, info = env.step(action)
         total += float(reward)
-        success = info.get(policy.task.success_key) if policy.task.success_key else None
+        success = info.get(policy.task.success_key, False) if policy.task.success_key else None
         if success is not None:
             success = bool(success) and bool(success == success)  # NaN is none
             successes.append(success)

@@ -14,7 +14,7 @@ from music_rllib.results.data import ReportError, Sweep
 from music_rllib.results.from_mlflow import read_mlflow
 from music_rllib.store.node_store import NodeStore, damage_in_words
 from music_rllib.store.object_folder import StorageError
-from music_rllib.store.paths import folder_at, resolve_storage, sweep_folder
+from music_rllib.store.paths import folder_at, resolve_storage, storage_and_name, sweep_folder
 from music_rllib.tracking.store import SweepRecord, TrackingStore, local_folder, resolve_store
 
 
@@ -59,7 +59,7 @@ def find_sweep(
         return ReportSource(sweep=read_archive(folder), folder=folder, store=None)
     name, parent = folder.name, str(folder.parent)
     if "://" in place:
-        storage = place.rstrip("/").rpartition("/")[0]
+        storage, name = storage_and_name(place)
     elif SweepRecord.read(parent, name) is not None:
         storage = parent
     elif "/" in place or place in {".", ".."}:

@@ -173,7 +173,8 @@ def analyse_stages(sweep: Sweep, stages: Sequence[Stage]) -> StageAnalysis | Non
     for task in together.tasks:
         budgets = [sweep.least_budget(task, one.runs) for one in together.compared]
         if len({budget for budget in budgets if np.isfinite(budget)}) > 1:
-            cut_at[task] = min(budgets)
+            shortest = together.compared[budgets.index(min(budgets))]
+            cut_at[task] = sweep.least_end(task, shortest.runs)
     return _analyse(sweep, together, cut_at)
 
 

@@ -247,6 +247,16 @@ class Sweep:
         own = [run for run in runs if self.runs[run].task == task]
         return min((float(self.runs[r].budget or self.last_step(r)) for r in own), default=np.inf)
 
+    def least_end(self, task: str, runs: Iterable[int]) -> float:
+        """Environment steps at which the runs on a task with the smallest budget have ended.
+
+        A last round may end behind the budget, and so its evaluation.
+        """
+        own = [run for run in runs if self.runs[run].task == task]
+        least = self.least_budget(task, own)
+        ends = (self.last_step(run) for run in own if self.runs[run].budget == least)
+        return max([least, *ends])
+
     def url(self, run_id: str) -> str | None:
         """The page of a run, where a server shows it."""
         if not self.source.startswith(("http://", "https://")):

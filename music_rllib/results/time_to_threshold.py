@@ -159,7 +159,7 @@ def races(
     pairs = []
     for first, second in combinations(groups, 2):
         sides = (finished[second], finished[first])
-        budget = sweep.least_budget(task, [*sides[0], *sides[1]])
+        budget = sweep.least_end(task, [*sides[0], *sides[1]])
         x, y = (_earliness(sweep, task, runs, threshold, budget) for runs in sides)
         if len(x) and len(y):
             pairs.append((second, first, x, y, bool(np.isfinite([*x, *y]).any())))

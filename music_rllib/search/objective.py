@@ -54,7 +54,8 @@ def score(objective: Objective, history: Sequence[Report], budget: int) -> float
         return max(numbers) if objective.maximised else min(numbers)
     assert objective.threshold is not None
     reached = (steps for steps, value in values if value >= objective.threshold)
-    return float(next(reached, budget))
+    # A last round may end behind the budget, which is no worse than never.
+    return float(min(next(reached, budget), budget))
 
 
 def aggregate(objective: Objective, scores: Array) -> float:

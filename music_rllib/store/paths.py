@@ -78,6 +78,13 @@ def below(storage: str, path: str) -> str:
     return f"{above.rstrip('/')}/{path}{mark}{options}"
 
 
+def storage_and_name(uri: str) -> tuple[str, str]:
+    """The two of a sweep's URI, which `below` puts together."""
+    path, mark, options = uri.partition("?")
+    above, _, name = path.rstrip("/").rpartition("/")
+    return f"{above}{mark}{options}", name
+
+
 def absolute_database(uri: str) -> str:
     """An sqlite file's URI that means the same in every working directory; others as they are."""
     path = uri.removeprefix("sqlite:///")

@@ -10,7 +10,7 @@ from pathlib import Path
 from music_rllib import names
 from music_rllib.experiment.sweep_files import is_remote
 from music_rllib.redaction import redact
-from music_rllib.store.paths import sweep_folder
+from music_rllib.store.paths import below, sweep_folder
 
 TIMEOUT_SECONDS = 900.0
 """After this time the sweep ends without a report."""
@@ -60,5 +60,5 @@ def report_at_end(storage: str, name: str, tracking_uri: str | None, config: Pat
         if done.returncode == 0 and lines:
             return "\n".join(lines[-2 if lines[-1].startswith("Picture: ") else -1 :])
         reason = lines[-1] if lines else f"it ended with {done.returncode}"
-    place = f"{redact(storage)}/{name}"
+    place = below(redact(storage), name)
     return f"No report: {reason}. Make it with: python -m music_rllib.report {place}"

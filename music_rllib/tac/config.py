@@ -60,6 +60,8 @@ class TACConfig(AlgorithmConfig):
         self.surrounding_indices: tuple[int, ...] = ()
         self.reward_range: tuple[float, float] | None = None
         self.success_key: str | None = "is_success"
+        # Of a step whose info lacks the key; None: an episode without the key counts as none.
+        self.success_if_missing: bool | None = None
         self.moved_distance: float | None = None
         self.framework_str = "torch"
         self.env_runner_cls = TrajectoryEnvRunner

@@ -201,7 +201,8 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
         """Takes one step; returns whether the episode terminated at its end, None before it."""
         with in_environment:
             observation, reward, terminated, truncated, info = env.step(scaled)
-        success = info.get(self._success_key) if self._success_key else None
+        missing = self.config.success_if_missing
+        success = info.get(self._success_key, missing) if self._success_key else None
         recording.step(action, float(reward), success, observation)
         if terminated or truncated or recording.steps == self.layout.horizon:
             return bool(terminated)

@@ -27,7 +27,7 @@ from music_rllib import names
 from music_rllib.errors import TrackingError
 from music_rllib.experiment.run_info import RunInfo
 from music_rllib.redaction import flat_params, redact, without_secrets
-from music_rllib.store.paths import sweep_folder
+from music_rllib.store.paths import below, sweep_folder
 from music_rllib.store.run_record import Report
 from music_rllib.tracking.mlflow_client import Experiment, Status, check_metric_name, mlflow_reason
 from music_rllib.tracking.projection import End, RunProjection, Start, StoredRun
@@ -80,7 +80,7 @@ class Tracker:
         self._checked_names: set[str] = set()
         self._undelivered: Pending | None = None
         self._view: dict[str, str] = {}
-        self._place = f"{redact(storage)}/{sweep_name}"
+        self._place = below(redact(storage), sweep_name)
         self._provenance = provenance_tags()
         try:
             # Earlier versions kept the record on the driver's disk if the storage is a bucket.

@@ -59,7 +59,7 @@ def algorithm_config(run: RunSettings) -> TACConfig:
         **dict(run.music),
     )
     config.replay(moved_distance=run.task.moved_distance, **dict(run.replay))
-    config.success_key = run.task.success_key
+    config.success_key, config.success_if_missing = run.task.success_key, False
     # `TrainingRun` evaluates, at given environment steps.
     config.evaluation(
         evaluation_interval=_NEVER,

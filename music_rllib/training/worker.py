@@ -382,13 +382,13 @@ class RunTrainable(Trainable):
         if not is_continuable(self._job.run) or not most or training.replay_mb > most:
             return
         kept = self._continuation
-        if any(steps_of(name) >= training.env_steps for name in kept.names()):
-            return
         try:
+            if any(steps_of(name) >= training.env_steps for name in kept.names()):
+                return
             with kept.new_checkpoint(training.env_steps) as draft:
                 training.save(draft, alone=True)
                 self._write_history(draft)
-        except StorageError as error:
+        except (StorageError, OSError) as error:
             self._notes.append(f"keeps no checkpoint for longer training: {error}")
 
     def cleanup(self) -> None:

@@ -88,7 +88,8 @@ def test_more_env_steps_are_no_change_where_finished_runs_can_be_gone_on_from(
     assert changes is not None
     assert changes.differences == ("env_steps: 1200 -> 2000 (1 run)",)
     assert changes.lost == (
-        "seed0: is finished; it has kept no checkpoint of its end (checkpoints.finished_mb)",
+        "seed0: is finished; it has kept no checkpoint of its end (checkpoints.finished_mb; or its "
+        "env_steps were no multiple of evaluation.interval and of 1,000)",
     )
 
     (node,) = first.plan.nodes

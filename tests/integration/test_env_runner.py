@@ -36,11 +36,24 @@ class Countdown(gym.Env[Any, Any]):
         return np.array([self.left, 1.0], np.float32), 1.0, self.left == 0, False, {}
 
 
+class SaysSuccessAtTheEnd(Countdown):
+    """Only an episode that terminates says anything of success."""
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        *step, _ = super().step(action)
+        return (*step, {"is_success": True} if self.left == 0 else {})
+
+
 NOISE = {"kind": "gaussian_noise", "std": 0.05, "random_share": 0.3}
 
 
 def runner(
-    env: Any = "FetchPush-v4", *, evaluation: bool = False, seed: int = 0, **settings: Any
+    env: Any = "FetchPush-v4",
+    *,
+    evaluation: bool = False,
+    seed: int = 0,
+    missing: bool | None = None,
+    **settings: Any,
 ) -> TrajectoryEnvRunner:
     config = TACConfig().environment(env).debugging(seed=seed)
     config.env_runners(num_envs_per_env_runner=settings.pop("num_envs", 2))
@@ -48,6 +61,7 @@ def runner(
     config.surrounding_indices = (3, 4, 5) if env == "FetchPush-v4" else ()
     config.training(hidden_sizes=(8,), **settings)
     config.in_evaluation = evaluation
+    config.success_if_missing = missing
     return TrajectoryEnvRunner(
         config=config, worker_index=0, num_workers=0, env_creator=lambda context: env(context)
     )
@@ -102,6 +116,15 @@ def test_state_between_calls_is_all_there_is() -> None:
     for ours, theirs in zip(one.sample(), other.sample(), strict=True):
         np.testing.assert_array_equal(ours.frames, theirs.frames)
         np.testing.assert_array_equal(ours.actions, theirs.actions)
+
+
+def test_where_success_is_declared_a_step_that_does_not_say_it_has_none() -> None:
+    made = runner(SaysSuccessAtTheEnd, num_envs=3, max_episode_steps=6, missing=False)
+    episodes = made.sample(num_episodes=40)
+    assert {episode.terminated for episode in episodes} == {True, False}
+    for episode in episodes:
+        assert episode.successes is not None
+        assert episode.successes.tolist() == [False] * (len(episode) - 1) + [episode.terminated]
 
 
 def test_terminated_episodes_of_different_lengths_and_foreign_action_bounds() -> None:

@@ -122,9 +122,11 @@ def test_params_are_flat_text() -> None:
             "hindsight_k": None,
             "environments": {"My=Env": {"horizon": 50}},
             "stages": [{"name": "pretrain"}],
+            "alpha": {"points": [[0, 0.1], [500, 0.2]]},
         }
     )
     assert params == {
+        "alpha.points": "[[0, 0.1], [500, 0.2]]",
         "seed": "3",
         "tac.entropic_index": "1.5",
         "tac.hidden_sizes": "[256, 256]",

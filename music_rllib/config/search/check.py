@@ -68,16 +68,24 @@ def check_search(
         if rule := _broken_metric(objective.metric, stage):
             several = (position,) if len(search.objectives) > 1 else ()
             in_search.add(("objective", *several, "metric"), rule)
-    above = earlier.get(stage.source.stage) if stage.source and stage.source.stage else None
-    if above is not None and above.search is None and len(above.points) > 1:
-        findings.add(
-            ("init_from",),
-            f"must be a stage without a grid where trials are searched, got {above.name!r}; "
-            f"search its settings as '{above.name}:...'",
-        )
+    above = _source_of(stage, earlier)
+    source = above
+    while source is not None:
+        if source.search is None and len(source.points) > 1:
+            findings.add(
+                ("init_from",),
+                "must lead to stages without a grid where trials are searched, got "
+                f"{source.name!r}; search its settings as '{source.name}:...'",
+            )
+        source = _source_of(source, earlier)
     _check_values(search, above, resolve_at, findings)
     if len(findings.problems) == problems_before:  # the budget is a valid number then
         _check_rungs(search, seeds, most_env_steps(search, stage.points), in_search)
+
+
+def _source_of(stage: Stage, earlier: Mapping[str, Stage | None]) -> Stage | None:
+    """The stage that a stage's runs start from; None if there is none, or an invalid one."""
+    return earlier.get(stage.source.stage) if stage.source and stage.source.stage else None
 
 
 def _broken_metric(metric: str, stage: Stage) -> str | None:

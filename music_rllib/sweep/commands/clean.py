@@ -12,7 +12,8 @@ from music_rllib.sweep.cli_helpers import Place, Storage
 EXAMPLES = """\
 Examples:
   music-rllib clean results/smoke
-      list the checkpoints of runs that were stopped early
+      list the checkpoints of runs that were stopped early, and those from
+      which finished runs would go on with more env_steps
   music-rllib clean results/smoke --yes
       delete them
   music-rllib clean results/smoke --all --yes

@@ -18,11 +18,12 @@ Examples:
   music-rllib run my.yaml --storage /data/results --name first-try
   music-rllib run my.yaml --seeds 10
       the same with seeds 0 to 9: only the new ones are trained
-  music-rllib run my.yaml env_steps=2e5
-      longer: finished runs go on from where they ended
+  music-rllib run my.yaml stages.train.env_steps=2e5
+      longer: finished runs of the stage go on from where they ended
 
 Running a command again continues: finished runs are reused, others go on from
-their last checkpoint. With RAY_ADDRESS=HOST:PORT it runs on that Ray cluster.
+their last checkpoint. With RAY_ADDRESS=HOST:PORT, on a
+node of that Ray cluster, it runs there.
 """
 PLAN_EXAMPLES = """\
 Examples:

@@ -35,14 +35,16 @@ def comparison_view(plan: Plan, sweep_id: str, now: float) -> str:
         now: Seconds since the epoch.
     """
     runs = [node.run for node in plan.nodes]
-    stage = plan.nodes[-1].stage if plan.nodes else plan.searched[-1].name
+    stage = plan.last_stage
     tasks = list({run.task.name: run.task for run in runs}.values())
     metrics = list(dict.fromkeys((*(task.primary_metric for task in tasks), *METRICS)))
-    varied = {name for node in plan.nodes if node.stage == stage for name in node.values}
+    varied = {name for node in plan.nodes if node.stage == stage.name for name in node.values}
+    if stage.search is not None:  # none of its trials is planned yet
+        varied |= {*stage.search.space, *stage.search.compare}
     tags = [names.TAG_ENTROPIC_INDEX, *(tag for name, tag in GROUPED.items() if name in varied)]
     tags += [names.TAG_TASK] if len(tasks) > 1 else []
     state = {
-        "searchFilter": f"tags.sweep_id = '{sweep_id}' and tags.stage = '{stage}'",
+        "searchFilter": f"tags.sweep_id = '{sweep_id}' and tags.stage = '{stage.name}'",
         "orderByKey": "attributes.start_time",
         "orderByAsc": True,
         "startTime": "ALL",

@@ -124,7 +124,9 @@ class TuneEvents(Callback):
         """Keep the traceback `text` in a file, fail the node, and skip what depends on it."""
         # An environment may say anything, its database's password too.
         cause, text = redact(cause), redact(text)
-        log = self._failures / f"{re.sub(r'[^A-Za-z0-9._=,-]+', '_', node.label)}-{node.key}.txt"
+        # A name has 255 bytes at most; the key tells apart what was cut.
+        label = re.sub(r"[^A-Za-z0-9._=,-]+", "_", node.label)[:150]
+        log = self._failures / f"{label}-{node.key}.txt"
         try:
             log.parent.mkdir(parents=True, exist_ok=True)
             log.write_text(f"{node.label} (node {node.key})\n\n{text}\n", encoding="utf-8")

@@ -211,6 +211,19 @@ def test_defaults_that_mean_nothing_to_a_variant_change_nothing(
     assert run_of(load(document)) == run_of(plain)
 
 
+def test_music_p_replays_by_its_ranks_whatever_the_defaults_say(
+    load: Callable[..., SweepConfig],
+) -> None:
+    stages = [{"name": "pretrain", "variant": "music-u"}]
+    stages += [{"name": "ranked", "variant": "music-p", "init_from": "pretrain"}]
+    replay = {"priority": "td_error", "priority_exponent": 0.3}
+    runs = [
+        stage.points[0].runs["FetchPush"]
+        for stage in load(changed(stages=stages, defaults={"replay": replay})).stages
+    ]
+    assert [run.replay.priority for run in runs] == ["td_error", "uniform"]
+
+
 def test_a_users_task(load: Callable[..., SweepConfig]) -> None:
     task = {"env_id": "Pendulum-v1", "horizon": 200, "success_key": None}
     document = changed(
@@ -378,6 +391,10 @@ BAD: list[tuple[Document, str]] = [
     (with_stage(1, init_from={"checkpoint": "~nobody-at-all/x"}), "in a home that is known"),
     (with_stage(1, tasks=["FetchSlide"]), "needs a run of FetchSlide in stage pretrain"),
     (with_stage(1, music={"lr": 0.1}), "music.lr has no effect with variant music-r"),
+    (
+        with_stage(1, variant="music-p", replay={"priority": "td_error"}),
+        "replay.priority has no effect with variant music-p",
+    ),
     (with_stage(1, music={"hidden_size": 64}), "needs the same music.hidden_size in stage finetu"),
     (with_stage(1, name="pretrain"), "stages.pretrain.name must not repeat"),
     (with_stage(1, grid={"seed": [1]}), "seed is never a grid dimension; list them under 'seed"),
@@ -399,6 +416,7 @@ BAD: list[tuple[Document, str]] = [
     (asking("stage = a against q = 1"), "must name one of the stages pretrain, finetune, got 'a'"),
     (asking("q = 1.5 against q = 1", stage="x"), "analysis.stage must be one of pretrain, finet"),
     (asking("q = 1.5 against q = 1", margin=0), "analysis.margin must be > 0, got 0"),
+    (asking("q = 1.5 against q = 1", margin=5), "margin must be < 1 for a success rate (5 % are"),
     (
         asking("q = 1.5 against q = 1") | {"defaults": {"tac": {"gamma": 3.0}}},
         "defaults.tac.gamma must be < 1, got 3.0",

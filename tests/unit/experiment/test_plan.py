@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from music_rllib.config.load import load_sweep
+from music_rllib.config.problems import ConfigError
 from music_rllib.config.run_settings import RunSettings, preset
 from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.experiment import plan as plan_module
@@ -201,3 +202,26 @@ KEYS_OF_VERSION_2 = {
     "finetune/FetchPush/tac.entropic_index=1.5/seed0": "2429de382d2fc45ca2c8",
     "finetune/FetchPush/tac.entropic_index=2/seed0": "f95441a1d346df33391d",
 }
+
+
+def test_a_trial_starts_from_the_runs_of_a_grid_with_one_point(tmp_path: Path) -> None:
+    search = {"space": {"tac.lr": {"float": [1e-4, 1e-2]}}, "trials": 2}
+    stages = [
+        PRETRAIN | {"grid": {"tac.alpha": [0.05]}},
+        {k: v for k, v in FINETUNE.items() if k != "grid"} | {"search": search},
+    ]
+    sweep = plan(tmp_path, stages=stages)
+    (run,) = sweep.add_trial("finetune", 0, {"tac.lr": 0.001}, [0], "trial0")
+    source = sweep.node(str(sweep.node(run.key).source_key))
+    assert source.run.tac.alpha == 0.05
+    assert [node.label for node in sweep.nodes if node.stage == "pretrain"] == [source.label]
+    assert len([one for one in sweep.runs if one.stage == "pretrain"]) == 1
+
+
+def test_a_search_far_behind_a_grid_is_refused(tmp_path: Path) -> None:
+    search = {"space": {"tac.lr": {"float": [1e-4, 1e-2]}}, "trials": 2}
+    far = {"name": "far", "variant": "music-r", "init_from": "finetune", "search": search}
+    pretrain = PRETRAIN | {"grid": {"tac.entropic_index": [1.0, 2.0]}}
+    finetune = {k: v for k, v in FINETUNE.items() if k != "grid"}
+    with pytest.raises(ConfigError, match="must lead to stages without a grid .* got 'pretrain'"):
+        plan(tmp_path, stages=[pretrain, finetune, far])

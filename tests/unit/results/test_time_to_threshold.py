@@ -89,10 +89,22 @@ def test_runs_of_another_length_race_over_the_smaller_budget() -> None:
         sweep,
         runs=[replace(run, params={"env_steps": str(BUDGET)}) for run in sweep.runs[:6]]
         + [replace(run, params={"env_steps": str(half)}) for run in sweep.runs[6:]],
+        history={
+            metric: column.select((column.run < 6) | (column.step <= half))
+            for metric, column in sweep.history.items()
+        },
     )
     (found,) = races(sweep, "Push", {"long": range(6), "short": range(6, 12)}, 0.9)
     assert not found.reached
     assert float(found.estimate.value) == 0.5
+
+
+def test_who_arrives_in_the_last_round_that_ends_behind_the_budget_has_arrived() -> None:
+    sweep = sweep_of(finished(*[BUDGET] * 6, *[None] * 6))
+    params = {"env_steps": str(BUDGET - 1)}
+    sweep = replace(sweep, runs=[replace(run, params=params) for run in sweep.runs])
+    (found,) = races(sweep, "Push", {"late": range(6), "never": range(6, 12)}, 0.9)
+    assert (found.reached, found.decided) == (True, True)
 
 
 def test_only_the_task_s_own_runs_race() -> None:

@@ -57,6 +57,11 @@ def test_a_runs_number(objective: Document, expected: float) -> None:
     assert score(Objective(**objective), history, 5000) == pytest.approx(expected)
 
 
+def test_arriving_behind_the_budget_is_no_worse_than_never() -> None:
+    late = Report(env_steps=5200, seconds=0, timestamp_ms=0, metrics={names.EVAL_SUCCESS: 1.0})
+    assert score(Objective(read="steps_to", threshold=0.9), [late], 5000) == 5000
+
+
 def test_a_trial_is_stopped_only_if_its_interval_says_so() -> None:
     pruning = Pruning(rungs=(Rung(seeds=2),), keep=0.3, confidence=0.9)
     others = {n: np.array([[0.7 + 0.01 * n], [0.72 + 0.01 * n]]) for n in range(6)}

@@ -13,7 +13,13 @@ from music_rllib.config.load import load_sweep
 from music_rllib.config.problems import ConfigError
 from music_rllib.store import paths
 from music_rllib.store.object_folder import StorageError
-from music_rllib.store.paths import check_answers, check_storage, resolve_storage
+from music_rllib.store.paths import (
+    below,
+    check_answers,
+    check_storage,
+    resolve_storage,
+    storage_and_name,
+)
 from music_rllib.sweep.driver import DEFAULT_CONFIG
 
 
@@ -108,3 +114,12 @@ def test_a_bucket_that_does_not_answer_is_given_up(monkeypatch: pytest.MonkeyPat
         assert time.monotonic() - began < 30
         assert "no answer within 1 s" in str(no.value)
         assert "secret" not in str(no.value)
+
+
+@pytest.mark.parametrize(
+    "storage", ["s3://bucket/sweeps", "s3://b?endpoint_override=h:1&scheme=http"]
+)
+def test_a_sweep_s_uri_is_its_storage_s_with_its_options_at_the_end(storage: str) -> None:
+    uri = below(storage, "mine")
+    assert storage_and_name(uri) == (storage, "mine")
+    assert uri.partition("?")[0].endswith("/mine")

@@ -14,6 +14,7 @@ from music_rllib.experiment.plan import Plan, make_plan
 from music_rllib.experiment.run_info import run_name
 from music_rllib.sweep.listeners.mlflow_view import comparison_view
 
+ROOT = Path(__file__).parents[3]
 STAGES: list[dict[str, Any]] = [
     {"name": "pretrain", "variant": "music-u"},
     {
@@ -54,3 +55,14 @@ def test_the_view_has_a_line_for_each_condition_of_the_last_stage(tmp_path: Path
     assert {chart["metricSectionId"] for chart in state["compareRunCharts"]} <= known
     opened = [section["name"] for section in state["compareRunSections"] if section["display"]]
     assert opened == ["Comparison"]
+
+
+def test_the_view_of_a_search_has_its_trials_of_which_none_is_planned_yet() -> None:
+    searched = make_plan(load_sweep(ROOT / "tune_configs" / "search.yaml"))
+    state = json.loads(json.loads(comparison_view(searched, "c0ffee", 1.5))["state"])
+    stage = searched.searched[-1]
+    assert state["searchFilter"].endswith(f"tags.stage = '{stage.name}'")
+    assert stage.search is not None
+    assert "tac.alpha" in stage.search.space
+    grouped = [key["groupByData"] for key in state["groupBy"]["groupByKeys"]]
+    assert names.TAG_ALPHA in grouped
