@@ -8,6 +8,7 @@ within a sweep and between sweeps.
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -16,6 +17,7 @@ from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.schema import Checkpoint, Source, Stage, SweepConfig
 from music_rllib.config.search.check import of_stage, stages_in
 from music_rllib.envs.tasks import Task
+from music_rllib.labels import in_runs
 from music_rllib.store.files import content_key
 from music_rllib.version import ALGORITHM_VERSION
 
@@ -272,6 +274,17 @@ class Plan:
             for name, value in run.values.items()
         }
         return Input(key=run.key, task=task), values
+
+
+def shared_runs(plan: Plan) -> list[str]:
+    """A line about each stage some of whose runs are, to the last setting, an earlier stage's."""
+    counts = Counter((run.stage, plan.node(run.key).stage) for run in plan.runs)
+    return [
+        f"{stage}: {in_runs(count)} that {first} has, too: trained once, and in reports, "
+        f"comparisons and hypotheses {first}'s alone"
+        for (stage, first), count in counts.items()
+        if stage != first
+    ]
 
 
 def short(value: Any) -> str:

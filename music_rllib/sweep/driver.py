@@ -28,7 +28,7 @@ from music_rllib.experiment.changes import (
 from music_rllib.experiment.demand import check_demand
 from music_rllib.experiment.listener import Listener
 from music_rllib.experiment.location import SweepLocation
-from music_rllib.experiment.plan import make_plan
+from music_rllib.experiment.plan import make_plan, shared_runs
 from music_rllib.experiment.scheduler import Status
 from music_rllib.experiment.session import Sweep, keep_record, open_sweep, remove_damaged
 from music_rllib.experiment.sweep_files import as_json
@@ -182,7 +182,8 @@ def _open(console: Console, config: SweepConfig, *, lenient: bool) -> Sweep:
     for row in adaptive_rows(plan):
         _say(console, adaptive_text(row))
     _say(console, f"Storage: {redact(storage)}")
-    for line in filter(None, (remark, *remarks(config), *check_demand(opened), *longer(opened))):
+    notes = (remark, *remarks(config), *shared_runs(plan), *check_demand(opened), *longer(opened))
+    for line in filter(None, notes):
         warn(line)
     return opened
 

@@ -6,6 +6,7 @@ from typing import Any
 
 from music_rllib.config.remarks import remarks
 from music_rllib.experiment.changes import Changes
+from music_rllib.experiment.plan import shared_runs
 from music_rllib.experiment.session import Sweep, plan_document
 from music_rllib.redaction import redact
 from music_rllib.sweep.views.alpha import adaptive_rows, alpha_rows
@@ -41,7 +42,7 @@ def plan_answer(opened: Sweep, changes: Changes | None) -> dict[str, Any]:
         "env_steps_left": sum(node["env_steps"] for node in nodes if not node["finished"]),
         "nodes": nodes,
         "searches": searches,
-        "remarks": remarks(config),
+        "remarks": [*remarks(config), *shared_runs(opened.plan)],
         "alpha": alpha_rows(opened.plan),
         "adaptive": adaptive_rows(opened.plan),
         "changes": None if changes is None else str(changes),

@@ -14,7 +14,7 @@ from music_rllib.config.problems import ConfigError
 from music_rllib.config.run_settings import RunSettings, preset
 from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.experiment import plan as plan_module
-from music_rllib.experiment.plan import Plan, make_plan, node_key
+from music_rllib.experiment.plan import Plan, make_plan, node_key, shared_runs
 
 Document = dict[str, Any]
 
@@ -80,6 +80,11 @@ def test_equal_computations_are_one_node(tmp_path: Path) -> None:
     assert len(sweep.nodes) == 4
     direct = plan(tmp_path, stages=[PRETRAIN, FINETUNE])
     assert {node.key for node in direct.nodes} == {node.key for node in sweep.nodes}
+    assert shared_runs(direct) == []
+    assert shared_runs(sweep) == [
+        "twin: 1 run that pretrain has, too: trained once, and in reports, comparisons and "
+        "hypotheses pretrain's alone"
+    ]
 
 
 def test_another_tasks_estimator(tmp_path: Path) -> None:
@@ -223,5 +228,5 @@ def test_a_search_far_behind_a_grid_is_refused(tmp_path: Path) -> None:
     far = {"name": "far", "variant": "music-r", "init_from": "finetune", "search": search}
     pretrain = PRETRAIN | {"grid": {"tac.entropic_index": [1.0, 2.0]}}
     finetune = {k: v for k, v in FINETUNE.items() if k != "grid"}
-    with pytest.raises(ConfigError, match="must lead to stages without a grid .* got 'pretrain'"):
+    with pytest.raises(ConfigError, match=r"must lead to stages without a grid .* got 'pretrain'"):
         plan(tmp_path, stages=[pretrain, finetune, far])
