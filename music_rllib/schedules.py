@@ -83,8 +83,8 @@ class Measured(StrictModel):
 
     follows: Quantity
     """Success rate of the run's evaluations, at the last step of an episode; or Shannon entropy of
-    the policy over all action dimensions, in nats, averaged over the updates after each round of
-    episodes."""
+    the policy over all action dimensions, in nats, averaged over up to 100 updates after each round
+    of episodes."""
     points: tuple[tuple[float, float], ...] = Field(min_length=2)
     """(measured, value) pairs, joined by straight lines and held beyond both ends. Until the first
     measurement the success rate counts as the lowest of them and the entropy as the highest."""
