@@ -80,7 +80,7 @@ class _Cache(FunctionCache):
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """What is kept; where that is None, the caller compiles, holds the lock, and saves."""
         found = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
-        if found is None and self._has_waited():
+        if found is None and self._acquire():
             found = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
             if found is not None:
                 self._lock.release()
@@ -94,7 +94,7 @@ class _Cache(FunctionCache):
         finally:
             self._lock.release()
 
-    def _has_waited(self) -> bool:
+    def _acquire(self) -> bool:
         """Acquire the lock; False where that can't be or takes too long, which only costs time."""
         try:
             self._lock.acquire()

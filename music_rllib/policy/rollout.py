@@ -102,7 +102,7 @@ def _episode(
         total += float(reward)
         success = info.get(policy.task.success_key, False) if policy.task.success_key else None
         if success is not None:
-            success = bool(success) and bool(success == success)  # NaN is none
+            success = bool(success == success and success)  # NaN is none
             successes.append(success)
         if see:
             see(Moment(env, steps, success, _distance(observation)))

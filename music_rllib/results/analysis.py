@@ -171,10 +171,9 @@ def analyse_stages(sweep: Sweep, stages: Sequence[Stage]) -> StageAnalysis | Non
         return None
     cut_at = {}
     for task in together.tasks:
-        budgets = [sweep.least_budget(task, one.runs) for one in together.compared]
-        if len({budget for budget in budgets if np.isfinite(budget)}) > 1:
-            shortest = together.compared[budgets.index(min(budgets))]
-            cut_at[task] = sweep.least_end(task, shortest.runs)
+        budgets = {sweep.least_budget(task, one.runs) for one in together.compared}
+        if len([budget for budget in budgets if np.isfinite(budget)]) > 1:
+            cut_at[task] = min(sweep.least_end(task, one.runs) for one in together.compared)
     return _analyse(sweep, together, cut_at)
 
 

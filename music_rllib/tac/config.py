@@ -60,7 +60,7 @@ class TACConfig(AlgorithmConfig):
         self.surrounding_indices: tuple[int, ...] = ()
         self.reward_range: tuple[float, float] | None = None
         self.success_key: str | None = "is_success"
-        # Of a step whose info lacks the key; None: an episode without the key counts as none.
+        # Success of a step whose info lacks the key; None leaves the step out of success rates.
         self.success_if_missing: bool | None = None
         self.moved_distance: float | None = None
         self.framework_str = "torch"

@@ -15,7 +15,7 @@ from typing import Any
 import psutil
 import yaml
 
-from tests.integration.conftest import ENVIRONMENTS, REPOSITORY, SWEEP, Program, end
+from tests.integration.conftest import SWEEP, Program, end, program_environment
 
 FIRST_SIGN = 400.0
 """Seconds that a start may take on a busy machine."""
@@ -51,8 +51,7 @@ class OwnProgram(Program):
 
 def program(folder: Path) -> OwnProgram:
     """What runs it in `folder`."""
-    paths = os.pathsep.join(map(str, (REPOSITORY, ENVIRONMENTS)))
-    return OwnProgram(folder, os.environ | {"PYTHONPATH": paths})
+    return OwnProgram(folder, program_environment())
 
 
 def start_until(program: Program, *signs: str) -> subprocess.Popen[str]:

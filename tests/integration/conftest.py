@@ -161,10 +161,9 @@ def sweep_document() -> dict[str, Any]:
     return yaml.safe_load(yaml.safe_dump(SWEEP))  # type: ignore[no-any-return]
 
 
-def new_program(folder: Path) -> Program:
-    """The program, with the test environments importable in driver and workers."""
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (REPOSITORY, ENVIRONMENTS)))}
-    return Program(folder, environment)
+def program_environment() -> dict[str, str]:
+    """This process's, with the test environments importable in driver and workers."""
+    return os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (REPOSITORY, ENVIRONMENTS)))}
 
 
 def mlflow_runs_of(folder: Path) -> dict[str, Any]:
@@ -182,7 +181,7 @@ def mlflow_runs_of(folder: Path) -> dict[str, Any]:
 @pytest.fixture
 def sweep_program(tmp_path: Path) -> Program:
     """The program in the test's folder."""
-    return new_program(tmp_path)
+    return Program(tmp_path, program_environment())
 
 
 @pytest.fixture

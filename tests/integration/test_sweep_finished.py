@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import os
 import re
 import subprocess
 import sys
@@ -30,10 +29,10 @@ from music_rllib.sweep.cli import main
 from music_rllib.tracking.store import resolve_store
 from tests.integration.conftest import (
     ENVIRONMENTS,
-    REPOSITORY,
     SWEEP,
     call,
     metric_steps,
+    program_environment,
     rows,
 )
 from tests.integration.devtools import PATIENCE, Page
@@ -82,7 +81,8 @@ def _run(folder: Path, report: str) -> str:
     done = subprocess.run(
         [sys.executable, "-m", "music_rllib.sweep", "sweep.yaml"],
         cwd=folder,
-        env=_environment() | {names.VARIABLE_REPORT: report},
+        # A screen wide enough for the last columns of tables.
+        env=program_environment() | {names.VARIABLE_REPORT: report, "COLUMNS": "160"},
         capture_output=True,
         text=True,
         check=False,
@@ -161,12 +161,6 @@ def test_each_run_has_its_policy_and_evaluate_finds_it_by_label(
     document = json.loads(output)
     assert (document["task"], document["env_steps"]) == ("Point", 1200)
     assert document["node_key"] == runs[name].data.tags[names.TAG_NODE_KEY]
-
-
-def _environment() -> dict[str, str]:
-    """With the test environments, and a screen wide enough for the last columns of tables."""
-    paths = os.pathsep.join(map(str, (REPOSITORY, ENVIRONMENTS)))
-    return os.environ | {"PYTHONPATH": paths, "COLUMNS": "160"}
 
 
 @pytest.fixture(scope="module")

@@ -19,11 +19,12 @@ from tests.integration.conftest import (
     ENVIRONMENTS,
     POINT,
     SWEEP,
+    Program,
     call,
     listening,
     metric_steps,
     mlflow_runs_of,
-    new_program,
+    program_environment,
     rows,
 )
 
@@ -51,7 +52,7 @@ def ended(tmp_path_factory: pytest.TempPathFactory) -> Ended:
         "environments": {"Broken": point | {"env_kwargs": {"fail_at": 300}}, "Point": point},
         "defaults": SWEEP["defaults"] | {"env_steps": 800},
     }
-    program = new_program(tmp_path_factory.mktemp("ended"))
+    program = Program(tmp_path_factory.mktemp("ended"), program_environment())
     program.write(document)
     program.environment[names.VARIABLE_REPORT] = "on"
     program.environment["POINT_SAYS"] = (

@@ -87,8 +87,8 @@ def claims_of(
             measure = replace(measure, horizon=np.nan)
         is_success = measure.metric == names.EVAL_SUCCESS
         # One of 1 or more can only be meant for returns.
-        is_rates_own = margin is not None and margin < 1
-        own_margin = MARGIN_OF_A_RATE if is_success and not is_rates_own else margin
+        not_for_rates = margin is None or margin >= 1
+        own_margin = MARGIN_OF_A_RATE if is_success and not_for_rates else margin
         for first, second, cells in comparisons:
             columns = [
                 [scores_of(sweep, pair[side], task, m) for pair in cells for task, m in own.items()]

@@ -22,8 +22,8 @@ Examples:
       longer: finished runs of the stage go on from where they ended
 
 Running a command again continues: finished runs are reused, others go on from
-their last checkpoint. With RAY_ADDRESS=HOST:PORT, on a
-node of that Ray cluster, it runs there.
+their last checkpoint. With RAY_ADDRESS=HOST:PORT, on a node
+of that Ray cluster, it runs there.
 """
 PLAN_EXAMPLES = """\
 Examples:
