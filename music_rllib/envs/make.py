@@ -88,6 +88,11 @@ def known_environment(task: Task, vouched: Iterable[Task] = ()) -> Known | None:
     return Known(task.env_id, {}) if package in {"gymnasium", "gymnasium_robotics"} else None
 
 
+def reset_seed(entropy: np.random.SeedSequence) -> int:
+    """Seed of an episode's reset, below 2**31: environments often keep it in a signed integer."""
+    return int(entropy.generate_state(1)[0]) >> 1
+
+
 def is_gymnasium_id(env: object) -> bool:
     """Whether `env` is a Gymnasium id, with `module:` in front or not; no Ray id, and no class."""
     _register_robotics()

@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from music_rllib.envs.make import Env, check_action_space, make_env, observation_sizes
+from music_rllib.envs.make import Env, check_action_space, make_env, observation_sizes, reset_seed
 from music_rllib.envs.tasks import beyond_observation
 from music_rllib.policy.policy import Policy, PolicyError, unknown_environment
 
@@ -82,8 +82,7 @@ def play(
     Equal seeds give equal starts and goals. `see` is called with each moment of each episode.
     """
     for number in range(episodes):
-        reset_seed = int(np.random.SeedSequence((seed, number)).generate_state(1)[0])
-        yield _episode(policy, env, reset_seed, see)
+        yield _episode(policy, env, reset_seed(np.random.SeedSequence((seed, number))), see)
 
 
 def _episode(

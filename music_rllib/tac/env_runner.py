@@ -41,6 +41,7 @@ from music_rllib.envs.make import (
     make_env,
     name_of,
     observation_sizes,
+    reset_seed,
 )
 from music_rllib.envs.numbers import BadNumberError
 from music_rllib.envs.recording import Episode, Recording
@@ -184,7 +185,7 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
         """Resets sub-environment `index`."""
         entropy = np.random.SeedSequence((*self._entropy, self._episodes_started))
         self._episodes_started += 1
-        seed = int(entropy.generate_state(1)[0])
+        seed = reset_seed(entropy)
         with in_environment:
             observation, _ = self.envs[index].reset(seed=seed)
         worker = f" of worker {self.worker_index}" if self.worker_index else ""

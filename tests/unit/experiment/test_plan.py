@@ -196,10 +196,10 @@ def test_keys_are_the_same_on_another_machine(tmp_path: Path) -> None:
 
 
 KEYS = {
-    "pretrain/FetchPush/seed0": "c794936cb2dc8c92c17e",
-    "finetune/FetchPush/tac.entropic_index=1/seed0": "158884ff9a9fb74b58cc",
-    "finetune/FetchPush/tac.entropic_index=1.5/seed0": "1dbd381a355aaa56b154",
-    "finetune/FetchPush/tac.entropic_index=2/seed0": "d8ca6b8b0cbd5aa4dd78",
+    "pretrain/FetchPush/seed0": "ea9428064c458e8b04d9",
+    "finetune/FetchPush/tac.entropic_index=1/seed0": "075b140e74cd7f64f744",
+    "finetune/FetchPush/tac.entropic_index=1.5/seed0": "f7440a76dcf62f5cb095",
+    "finetune/FetchPush/tac.entropic_index=2/seed0": "4077710c934204f6c8da",
 }
 KEYS_OF_VERSION_2 = {
     "pretrain/FetchPush/seed0": "cc3633961479f4eba8e8",
