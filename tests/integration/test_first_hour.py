@@ -106,3 +106,6 @@ def test_the_best_policy_is_played(output: tuple[Path, str]) -> None:
     said(sweep, folder, "best", "results/my_sweep")
     played = ["evaluate", "results/my_sweep/best", "--episodes", "2"]
     assert "2 episodes" in said(sweep, folder, *played)
+    example = [sys.executable, str(ROOT / "examples" / "load_policy.py"), "results/my_sweep/best"]
+    done = subprocess.run(example, cwd=folder, capture_output=True, text=True, check=True)
+    assert re.fullmatch(r"return -\d+, success [01]\n", done.stdout)

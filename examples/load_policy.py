@@ -1,0 +1,21 @@
+"""Load a trained policy without Ray and play an episode.
+
+Usage: python load_policy.py results/NAME/best
+"""
+
+import sys
+
+import gymnasium as gym
+import gymnasium_robotics
+
+from music_rllib.policy import load_policy
+
+gym.register_envs(gymnasium_robotics)
+policy = load_policy(sys.argv[1])
+env = gym.make(policy.task.env_id)
+observation, _ = env.reset(seed=0)
+total, truncated = 0.0, False
+while not truncated:
+    observation, reward, _, truncated, info = env.step(policy.act(observation))
+    total += reward
+print(f"return {total:g}, success {info['is_success']:g}")
