@@ -3,9 +3,23 @@
 FAILED, BAD_INPUT = 1, 2
 
 
+def message_of(error: BaseException) -> str:
+    """An error's message; an environment's own error may fail to give one."""
+    try:
+        return str(error)
+    except Exception as own:
+        return f"(its message can't be read: {type(own).__name__})"
+
+
 def first_line(error: BaseException) -> str:
     """The first line of an error's message; its type's name where it has none."""
-    return next(iter(str(error).strip().splitlines()), type(error).__name__)
+    return next(iter(message_of(error).strip().splitlines()), type(error).__name__)
+
+
+def in_words(error: BaseException) -> str:
+    """`ValueError: message` on one line, of at most 300 characters."""
+    text = f"{type(error).__name__}: {' '.join(message_of(error).split()) or '(no message)'}"
+    return text if len(text) <= 300 else text[:297] + "..."
 
 
 class BadInputError(Exception):

@@ -14,9 +14,13 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from music_rllib.envs.farama_notice import drop_farama_notice
-from music_rllib.envs.numbers import are_usable, check_numbers
-from music_rllib.envs.tasks import BUILT_IN_TASKS, Task
+from music_rllib.envs.goal_rewards import Unlike, directions, first_unlike, lost_by_rounding
+from music_rllib.envs.numbers import LARGEST, BadNumberError, are_usable, check_numbers
+from music_rllib.envs.recording import Recording
+from music_rllib.envs.tasks import BUILT_IN_TASKS, LAST_SEED, Task
+from music_rllib.errors import first_line, in_words
 from music_rllib.replay.buffer import GoalReward
+from music_rllib.replay.trajectories import ReplayLayout
 
 Env = gym.Env[Any, Any]
 
@@ -47,8 +51,9 @@ def _register_robotics() -> None:
 def make_env(env_id: str, **kwargs: Any) -> Env:
     """Makes a Gymnasium environment by its id, with the robotics tasks registered.
 
-    The Fetch tasks get a faster step with the same results (`music_rllib.envs.fetch`). Raises
-    `gymnasium.error.Error` for unknown ids and arguments.
+    The Fetch tasks get a faster step with the same results (`music_rllib.envs.fetch`). Its
+    `close()` ignores exceptions, since nothing depends on it. Raises `gymnasium.error.Error` for
+    unknown ids and arguments.
     """
     _register_robotics()
     # The checker takes a tenth of every step, and helps only an environment's authors.
@@ -56,6 +61,13 @@ def make_env(env_id: str, **kwargs: Any) -> Env:
     from music_rllib.envs.fetch import speed_up  # after the notice is dropped
 
     speed_up(env)
+    own = env.close
+
+    def close() -> None:
+        with contextlib.suppress(Exception):
+            own()  # type: ignore[no-untyped-call]
+
+    env.close = close  # type: ignore[method-assign]
     return env
 
 
@@ -88,9 +100,15 @@ def known_environment(task: Task, vouched: Iterable[Task] = ()) -> Known | None:
     return Known(task.env_id, {}) if package in {"gymnasium", "gymnasium_robotics"} else None
 
 
-def reset_seed(entropy: np.random.SeedSequence) -> int:
-    """Seed of an episode's reset, below 2**31: environments often keep it in a signed integer."""
-    return int(entropy.generate_state(1)[0]) >> 1
+def reset_seed(
+    entropy: np.random.SeedSequence, seed_range: tuple[int, int] = (0, LAST_SEED)
+) -> int:
+    """Seed of an episode's reset, from the smallest to the largest of `seed_range`.
+
+    Environments often keep it in a signed 32-bit integer.
+    """
+    smallest, largest = seed_range
+    return smallest + (int(entropy.generate_state(1)[0]) >> 1) % (largest - smallest + 1)
 
 
 def is_gymnasium_id(env: object) -> bool:
@@ -123,7 +141,11 @@ def _is_flat(space: gym.Space[Any] | None) -> bool:
 
 
 def check_action_space(space: gym.Space[Any]) -> spaces.Box:
-    """Returns the space; raises ValueError unless it is a bounded one-dimensional Box of floats."""
+    """Returns the space; raises ValueError unless it is a bounded one-dimensional Box of floats.
+
+    The policy acts between the bounds: between huge ones, which stand for none, it could choose
+    no ordinary action.
+    """
     if not (
         isinstance(space, spaces.Box)
         and len(space.shape) == 1
@@ -134,7 +156,21 @@ def check_action_space(space: gym.Space[Any]) -> spaces.Box:
             "environment: the action space must be a bounded one-dimensional Box of floats, got "
             f"{space}"
         )
+    if np.abs(np.array([space.low, space.high], np.float64)).max(initial=0.0) > LARGEST:
+        raise ValueError(
+            f"environment: the action space's bounds must be within +-{LARGEST:g}, got {space}; "
+            "declare the range that the environment uses, since the policy's actions fill it"
+        )
     return space
+
+
+def to_bounds(actions: NDArray[np.float32], space: spaces.Box) -> NDArray[Any]:
+    """Actions [B, A] in [-1, 1], scaled to the bounds of `check_action_space` and of its type."""
+    # The range of a float16 may be no float16.
+    wide = np.result_type(space.low.dtype, np.float32)
+    low, high = space.low.astype(wide, copy=False), space.high.astype(wide, copy=False)
+    scaled = low + (actions + 1.0) * 0.5 * (high - low)
+    return np.asarray(np.clip(scaled, low, high).astype(space.dtype))
 
 
 def episode_limit(env: Env, setting: int | None) -> int:
@@ -148,19 +184,11 @@ def episode_limit(env: Env, setting: int | None) -> int:
     return min(limits)
 
 
-def goal_reward_of(env: Env) -> GoalReward:
-    """The environment's reward as a vectorised function of achieved and desired goals.
-
-    Resets `env` and takes one step in it to check the function: HER would silently learn from wrong
-    rewards (HandManipulatePen of Gymnasium-Robotics 1.4.2 mixes up the rows of a batch). Raises
-    ValueError where a row's reward depends on more than its goals, or is not what a step gives.
-    """
+def compute_reward_of(env: Env) -> GoalReward | None:
+    """The environment's `compute_reward` as a function of goals, unchecked; None without one."""
     compute = getattr(env.unwrapped, "compute_reward", None)
     if compute is None or not isinstance(env.observation_space, spaces.Dict):
-        raise ValueError(
-            "replay.hindsight_k must be 0 without a goal environment: "
-            f"{name_of(env)} has no goals with a compute_reward"
-        )
+        return None
 
     def reward(achieved: NDArray[np.float32], desired: NDArray[np.float32]) -> NDArray[Any]:
         rewards = np.asarray(compute(achieved, desired, {}), dtype=np.float32)
@@ -168,13 +196,40 @@ def goal_reward_of(env: Env) -> GoalReward:
             check_numbers([("compute_reward", rewards.ravel())], name_of(env))
         return rewards
 
-    try:
-        problem = _problem_of(reward, env)
-    except Exception as error:
-        raise ValueError(_no_hindsight(env, f"it raises {error!r}")) from error
-    if problem:
-        raise ValueError(_no_hindsight(env, problem))
     return reward
+
+
+def goal_reward_of(env: Env, seed: int = 0) -> GoalReward:
+    """The environment's reward as a vectorised function of achieved and desired goals.
+
+    Resets `env` with `seed` and takes some random steps in it to check the function: HER would
+    silently learn from wrong rewards (HandManipulatePen of Gymnasium-Robotics 1.4.2 mixes up the
+    rows of a batch). Raises ValueError where a row's reward depends on more than its goals, is not
+    what a step gives, or is lost where goals are rounded to float32.
+    """
+    reward = compute_reward_of(env)
+    if reward is None:
+        raise ValueError(
+            "replay.hindsight_k must be 0 without a goal environment: "
+            f"{name_of(env)} has no goals with a compute_reward"
+        )
+    try:
+        problem = _problem_of(reward, env, seed)
+    except BadNumberError as error:
+        raise ValueError(first_line(error)) from error
+    except Exception as error:
+        problem = _BY_ROW, f"it raises {in_words(error)}"
+    if problem:
+        rule, reason = problem
+        raise ValueError(
+            f"replay.hindsight_k must be 0 where {rule}: with {name_of(env)}, {reason}"
+        )
+    return reward
+
+
+_BY_ROW = "compute_reward does not compute each row of a batch independently"
+_WHOLE = "compute_reward is not the whole reward of a step"
+_KEPT = "goals lose digits in float32 on which rewards depend"
 
 
 MOVED_SHARE = 0.2
@@ -182,13 +237,13 @@ MOVED_SHARE = 0.2
 tasks, as for the metric `evaluation/object_moved_share`."""
 
 
-def moved_distance_of(env: Env, reward: GoalReward) -> float | None:
+def moved_distance_of(env: Env, reward: GoalReward, seed: int = 0) -> float | None:
     """The distance between achieved goals for `hindsight_episodes: moved`; resets `env`.
 
     None where the reward decides: a sparse one does not change within the success distance. A dense
     one changes even with the jitter of a resting object, and needs a `distance_threshold`.
     """
-    start = np.asarray(env.reset(seed=0)[0]["achieved_goal"], np.float32)[None]
+    start = np.asarray(env.reset(seed=seed)[0]["achieved_goal"], np.float32)[None]
     jitter = np.float32(1e-6) * np.maximum(1.0, np.abs(start))
     if np.array_equal(reward(start, start + jitter), reward(start, start)):
         return None
@@ -201,31 +256,46 @@ def moved_distance_of(env: Env, reward: GoalReward) -> float | None:
     )
 
 
-def _problem_of(reward: GoalReward, env: Env) -> str | None:
-    """Why hindsight can't use the rewards of goals around the first achieved one; None: it can."""
-    rng, rows = np.random.default_rng(0), 256
-    start = np.asarray(env.reset(seed=0)[0]["achieved_goal"], np.float32)
-    achieved = np.tile(start, (rows, 1))
-    # From within any threshold to far beyond it, in random subsets of the goal's entries.
-    offsets = np.geomspace(1e-3, 1.0, rows)[:, None] * rng.standard_normal(achieved.shape)
-    desired = (achieved + offsets * rng.integers(0, 2, achieved.shape)).astype(np.float32)
+_TRIED_STEPS = 20
+"""Most random steps whose rewards are compared before training; then each episode's are."""
+
+
+def _problem_of(reward: GoalReward, env: Env, seed: int) -> tuple[str, str] | None:
+    """The rule that the rewards of goals around the first achieved one break, and how."""
+    first, rows = env.reset(seed=seed)[0], 256
+    start = np.asarray(first["achieved_goal"])
+    distance = float(np.linalg.norm(start - first["desired_goal"])) or 1.0
+    achieved = np.tile(start.astype(np.float32), (rows, 1))
+    # From within any threshold to far beyond it.
+    offsets = max(1.0, distance) * directions(rows, len(start), 1e-3 / max(1.0, distance), 1.0)
+    desired = (achieved + offsets).astype(np.float32)
     together = reward(achieved, desired)
-    after, given, *_ = env.step(check_action_space(env.action_space).low)
+    unlike = _play_some(reward, env, first)
     alone = [reward(achieved[i : i + 1], desired[i : i + 1]) for i in range(rows)]
-    if together.shape != (rows,) or not np.allclose(together, np.concatenate(alone)):
-        return "rewards change with the batch or the simulator"
-    goals = [np.asarray(after[key], np.float32)[None] for key in ("achieved_goal", "desired_goal")]
-    priced = float(reward(*goals)[0])
-    if not np.isclose(float(given), priced, rtol=1e-4, atol=1e-6):
-        return f"a step gave a reward of {float(given):g}, its goals have one of {priced:g}"
-    return None
+    apart = np.abs(together - np.concatenate(alone)) if together.shape == (rows,) else np.ones(1)
+    if not apart.max() <= 1e-5 * np.abs(together).max():
+        return _BY_ROW, "rewards change with the batch or the simulator"
+    if unlike:
+        return _WHOLE, unlike.problem
+    lost = lost_by_rounding(reward, start, distance)
+    return (_KEPT, lost) if lost else None
 
 
-def _no_hindsight(env: Env, reason: str) -> str:
-    return (
-        "replay.hindsight_k must be 0 where compute_reward does not price every row of a batch by "
-        f"itself, as a step does: with {name_of(env)}, {reason}"
-    )
+def _play_some(reward: GoalReward, env: Env, first: Any) -> Unlike | None:
+    """Play some random steps; the first whose reward is not that of its goals."""
+    observation, goal = observation_sizes(env.observation_space)
+    space, rng = check_action_space(env.action_space), np.random.default_rng(0)
+    size = int(space.shape[0])
+    layout = ReplayLayout(observation=observation, action=size, goal=goal, horizon=_TRIED_STEPS)
+    recording = Recording(layout, name=name_of(env))
+    recording.see(first)
+    terminated = truncated = False
+    while recording.steps < layout.horizon and not (terminated or truncated):
+        action = rng.uniform(-1.0, 1.0, (1, size)).astype(np.float32)
+        after, given, terminated, truncated, info = env.step(to_bounds(action, space)[0])
+        recording.step(action[0], given, info, after)
+    episode = recording.finish(terminated=bool(terminated))
+    return first_unlike(reward, episode.frames[:, observation:], episode.rewards)
 
 
 def name_of(env: Env) -> str:

@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from music_rllib.envs.numbers import LARGEST, are_usable, check_numbers
+from music_rllib.envs.goal_rewards import first_unlike
+from music_rllib.envs.numbers import (
+    LARGEST,
+    BadNumberError,
+    are_usable,
+    check_numbers,
+    number_of,
+    shown,
+    success_of,
+    vector,
+)
+from music_rllib.replay.buffer import GoalReward
 from music_rllib.replay.trajectories import ReplayLayout, Trajectory
 
 Floats = NDArray[np.float32]
@@ -36,10 +48,22 @@ class Recording:
         layout: sizes of its arrays.
         zero_goal: whether desired goals are replaced by zeros.
         name: name of environment and episode, for messages.
+        success: key of `info` that reports success, and the value of a step without it.
+        goal_reward: the rewards that hindsight computes, which the given ones must equal; None
+            without hindsight.
     """
 
-    def __init__(self, layout: ReplayLayout, *, zero_goal: bool, name: str) -> None:
+    def __init__(
+        self,
+        layout: ReplayLayout,
+        *,
+        name: str,
+        zero_goal: bool = False,
+        success: tuple[str | None, bool | None] = (None, None),
+        goal_reward: GoalReward | None = None,
+    ) -> None:
         self._layout, self._zero_goal, self._name = layout, zero_goal, name
+        self._success, self._goal_reward = success, goal_reward
         self._frames = np.zeros((layout.horizon + 1, layout.frame), np.float32)
         self._actions = np.zeros((layout.horizon, layout.action), np.float32)
         self._rewards = np.zeros(layout.horizon, np.float32)
@@ -52,15 +76,27 @@ class Recording:
         return f"{self._name}, step {self.steps}"
 
     def see(self, observation: Any) -> None:
-        """Records the next observation; raises BadNumberError for a bad number."""
+        """Records the next observation; raises BadNumberError for a bad one."""
+        try:
+            self._see(observation)
+        except ValueError as error:
+            raise BadNumberError.at(self.place, error) from None
+
+    def _see(self, observation: Any) -> None:
         frame, layout = self._frames[self.steps], self._layout
         if layout.goal == 0:
-            frame[:] = observation
+            frame[:] = vector(observation, "observation", layout.observation)
         else:
-            frame[: layout.observation] = observation["observation"]
+            try:
+                seen, desired, achieved = (observation[name] for name in _PARTS)
+            except (KeyError, TypeError, IndexError):
+                rule = f"observation must be a dictionary with {', '.join(_PARTS)}"
+                raise ValueError(f"{rule}, got {shown(observation)}") from None
+            frame[: layout.observation] = vector(seen, "observation", layout.observation)
+            desired = vector(desired, "desired_goal", layout.goal)
             if not self._zero_goal:
-                frame[layout.observation : layout.network_input] = observation["desired_goal"]
-            frame[layout.network_input :] = observation["achieved_goal"]
+                frame[layout.observation : layout.network_input] = desired
+            frame[layout.network_input :] = vector(achieved, "achieved_goal", layout.goal)
         if not are_usable(frame):
             given = {"observation": observation} if layout.goal == 0 else observation
             check_numbers([(name, given[name]) for name in _PARTS if name in given], self.place)
@@ -70,26 +106,39 @@ class Recording:
         """[I] the policy's input at the current step."""
         return self._frames[self.steps, : self._layout.network_input]
 
-    def step(self, action: Floats, reward: float, success: float | None, observation: Any) -> None:
-        """Records a step; raises BadNumberError for a bad number."""
+    def step(self, action: Floats, reward: Any, info: Mapping[str, Any], observation: Any) -> None:
+        """Records a step; raises BadNumberError for a bad value."""
+        try:
+            number = number_of(reward, "reward")
+            success = success_of(info, *self._success)
+        except ValueError as error:
+            raise BadNumberError.at(f"{self._name}, step {self.steps + 1}", error) from None
         self._actions[self.steps] = action
-        self._rewards[self.steps] = reward
+        self._rewards[self.steps] = number
         self.steps += 1
-        if not abs(reward) <= LARGEST:
-            check_numbers([("reward", reward)], self.place)
+        if not abs(number) <= LARGEST:
+            check_numbers([("reward", number)], self.place)
         if success is not None:
-            if success != success:  # NaN, which bool() takes for true
-                check_numbers([("success", success)], self.place)
-            self._successes.append(bool(success))
+            self._successes.append(success)
         self.see(observation)
 
     def finish(self, *, terminated: bool) -> Episode:
-        """The finished episode."""
+        """The finished episode; raises BadNumberError where hindsight has other rewards."""
         n = self.steps
-        return Episode(
+        episode = Episode(
             self._frames[: n + 1],
             self._actions[:n],
             self._rewards[:n],
             terminated,
             np.array(self._successes) if self._successes else None,
         )
+        if self._goal_reward is not None and not self._zero_goal:
+            goals = episode.frames[:, self._layout.observation :]
+            unlike = first_unlike(self._goal_reward, goals, episode.rewards)
+            if unlike is not None:
+                raise BadNumberError.at(
+                    f"{self._name}, step {unlike.step}",
+                    "replay.hindsight_k must be 0 where compute_reward is not the whole reward of "
+                    f"a step: {unlike.problem}",
+                )
+        return episode

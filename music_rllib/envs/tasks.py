@@ -56,6 +56,11 @@ Indices = Annotated[
 """Positions in the observation vector: a list, or a half-open range `a:b` as in Python."""
 
 
+LAST_SEED = 2**31 - 1
+"""Largest seed of a reset: environments often keep it in a signed 32-bit integer."""
+Seed = Annotated[int, Field(ge=0, le=LAST_SEED)]
+
+
 def beyond_observation(
     agent_indices: Sequence[int], surrounding_indices: Sequence[int], size: int
 ) -> list[str]:
@@ -107,6 +112,8 @@ class Task(BaseModel):
     reward_range: tuple[float, float] | None = None
     """Smallest and largest reward of a step; null: not known. Changes no result: it tells where
     `tac.target_bounds` cut off values that can be reached."""
+    seed_range: tuple[Seed, Seed] = (0, LAST_SEED)
+    """Smallest and largest seed that the environment's `reset` accepts."""
     mi_reward_weight: float = Field(1.0, ge=0)
     """MUSIC-r's weight of the intrinsic reward where a sweep doesn't set it."""
     moved_distance: float | None = Field(None, gt=0)
@@ -123,6 +130,8 @@ class Task(BaseModel):
     def _range_is_ordered(self) -> Self:
         if self.reward_range is not None and self.reward_range[0] > self.reward_range[1]:
             raise ValueError(f"reward_range must be [smallest, largest], got {self.reward_range}")
+        if self.seed_range[0] > self.seed_range[1]:
+            raise ValueError(f"seed_range must be [smallest, largest], got {self.seed_range}")
         return self
 
     @property
@@ -136,8 +145,13 @@ class Task(BaseModel):
         return bool(self.surrounding_indices)
 
     def identity(self) -> dict[str, Any]:
-        """The settings that define the task, without its name and its training settings."""
+        """The settings that define the task, without its name and its training settings.
+
+        The default `seed_range` is omitted, as runs are older than this setting.
+        """
         excluded = {"name", "reward_range", "mi_reward_weight", "moved_distance"}
+        if self.seed_range == (0, LAST_SEED):
+            excluded.add("seed_range")
         return self.model_dump(mode="json", exclude=excluded)
 
 
@@ -208,8 +222,8 @@ class TaskRegistry(dict[str, Task]):
         )
 
 
-def closest(name: str, known: Iterable[str]) -> str:
+def closest(name: str, known: Iterable[str], cutoff: float = 0.6) -> str:
     """`" (did you mean 'FetchPush'?)"`, or an empty text where no known name is close."""
     by_folded = {candidate.casefold(): candidate for candidate in known}
-    matches = difflib.get_close_matches(name.casefold(), by_folded, n=1, cutoff=0.6)
+    matches = difflib.get_close_matches(name.casefold(), by_folded, n=1, cutoff=cutoff)
     return f" (did you mean {by_folded[matches[0]]!r}?)" if matches else ""

@@ -26,6 +26,8 @@ FORMAT = "music_rllib policy 1"
 MOST_HEADER_BYTES = 1 << 20
 """Largest header of a policy's file, which may come from anywhere; ours have a few thousand."""
 _HEADER = "music_rllib_policy"
+MOST_BOUND = 1e15
+"""Largest bound of an action, as in training: the range of larger ones may be no float32."""
 
 Floats = npt.NDArray[np.float32]
 
@@ -81,6 +83,11 @@ class PolicyNetwork:
         arrays = (*self.weights, *vectors)
         if not all(np.isfinite(array).all() for array in arrays):
             raise ValueError("a policy's arrays must be finite")
+        largest = np.abs([self.low, self.high]).max(initial=0.0)
+        if largest > MOST_BOUND:
+            raise ValueError(
+                f"a policy's actions must be within +-{MOST_BOUND:g}, got a bound of {largest:g}"
+            )
         if not 0 < self.clip < np.inf:
             raise ValueError(f"a policy's inputs must be cut to a positive range, got {self.clip}")
 

@@ -10,7 +10,15 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from music_rllib.envs.make import Env, check_action_space, make_env, observation_sizes, reset_seed
+from music_rllib.envs.make import (
+    Env,
+    check_action_space,
+    make_env,
+    name_of,
+    observation_sizes,
+    reset_seed,
+)
+from music_rllib.envs.numbers import number_of, success_of
 from music_rllib.envs.tasks import beyond_observation
 from music_rllib.policy.policy import Policy, PolicyError, unknown_environment
 
@@ -82,7 +90,8 @@ def play(
     Equal seeds give equal starts and goals. `see` is called with each moment of each episode.
     """
     for number in range(episodes):
-        yield _episode(policy, env, reset_seed(np.random.SeedSequence((seed, number))), see)
+        entropy = np.random.SeedSequence((seed, number))
+        yield _episode(policy, env, reset_seed(entropy, policy.task.seed_range), see)
 
 
 def _episode(
@@ -98,10 +107,13 @@ def _episode(
         bounds = check_action_space(env.action_space)
         action = np.clip(policy.act(observation).astype(bounds.dtype), bounds.low, bounds.high)
         observation, reward, terminated, truncated, info = env.step(action)
-        total += float(reward)
-        success = info.get(policy.task.success_key, False) if policy.task.success_key else None
+        try:
+            total += number_of(reward, "reward")
+            success = success_of(info, policy.task.success_key, missing=False)
+        except ValueError as error:
+            place = f"{name_of(env)}, episode with seed {seed}, step {steps}"
+            raise PolicyError(f"{place}: {error}") from error
         if success is not None:
-            success = bool(success == success and success)  # NaN is none
             successes.append(success)
         if see:
             see(Moment(env, steps, success, _distance(observation)))

@@ -3,18 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import faulthandler
 import os
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import NoReturn
-
-from music_rllib.errors import BAD_INPUT
-
-STDERR = 2
-SLACK = 5.0
-"""Seconds after the limit until only the stack is printed, if code holds Python's lock."""
 
 
 def try_for(seconds: float, *steps: Callable[[], object]) -> None:
@@ -37,26 +30,3 @@ def end_process(code: int) -> NoReturn:
         sys.stdout.flush()
         os.write(sys.stdout.fileno(), show_cursor)
     os._exit(code)
-
-
-@contextlib.contextmanager
-def in_time(seconds: float | None, rule: str) -> Iterator[None]:
-    """End the program, with `rule` and its stack, if this `with` takes longer than `seconds`."""
-    if seconds is None:
-        yield
-        return
-
-    def end() -> None:
-        print(f"error: {rule}; it hangs at:", file=sys.stderr, flush=True)
-        faulthandler.dump_traceback(STDERR, all_threads=True)
-        end_process(BAD_INPUT)
-
-    timer = threading.Timer(seconds, end)
-    timer.daemon = True
-    timer.start()
-    faulthandler.dump_traceback_later(seconds + SLACK, exit=True, file=STDERR)
-    try:
-        yield
-    finally:
-        timer.cancel()
-        faulthandler.cancel_dump_traceback_later()

@@ -165,7 +165,7 @@ def _open(console: Console, config: SweepConfig, *, lenient: bool) -> Sweep:
     if config.path == DEFAULT_CONFIG:
         console.print(f"No CONFIG given: running the packaged sweep {DEFAULT_CONFIG}.")
     plan = make_plan(config)
-    check_environments(plan, config.resources.hang_minutes)
+    played = check_environments(plan, config.resources.hang_minutes)
     if cluster_address() is None:
         check_hardware(plan)
     check_cpus(config.resources)
@@ -182,7 +182,14 @@ def _open(console: Console, config: SweepConfig, *, lenient: bool) -> Sweep:
     for row in adaptive_rows(plan):
         _say(console, adaptive_text(row))
     _say(console, f"Storage: {redact(storage)}")
-    notes = (remark, *remarks(config), *shared_runs(plan), *check_demand(opened), *longer(opened))
+    notes = (
+        remark,
+        *played,
+        *remarks(config),
+        *shared_runs(plan),
+        *check_demand(opened),
+        *longer(opened),
+    )
     for line in filter(None, notes):
         warn(line)
     return opened

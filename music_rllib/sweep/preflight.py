@@ -2,129 +2,172 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
+import os
+import selectors
 import shutil
-from collections.abc import Set
-from contextlib import closing
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import Any
 
 from rich.console import Console
 
 from music_rllib.config.run_settings import RunSettings
-from music_rllib.envs.tasks import BUILT_IN_TASKS, Task, beyond_observation, closest
+from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.errors import BadInputError
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.plan import Plan
 from music_rllib.experiment.scheduler import Scheduler, Status
 from music_rllib.experiment.session import Sweep
-from music_rllib.runtime.ending import in_time
 from music_rllib.runtime.machine import check_reachable, cluster_address
 from music_rllib.runtime.signals import early
 from music_rllib.store.handoff import open_handoff, read_handoff
 from music_rllib.store.node_store import NodeStore
 
-if TYPE_CHECKING:  # the environments are heavy, and most sweeps have none of their own
-    from music_rllib.envs.make import Env
+_TIMEOUT = "Timeout ("
+"""Beginning of the stack that `faulthandler` writes where a call takes too long."""
+_SLACK = 10.0
+"""Seconds that the child process has to end itself where a call takes too long."""
+_HUMAN = "env_kwargs: {render_mode: human} needs a display; leave it out for training"
 
 
 class TaskError(BadInputError, ValueError):
     """A task whose environment can't be made, or is not as the task describes it."""
 
 
-def check_environments(plan: Plan, hang_minutes: float | None = None) -> None:
-    """Make each environment of the user's once, and check that its task describes it.
+def check_environments(plan: Plan, hang_minutes: float | None = None) -> list[str]:
+    """Play each environment of the user's, and check that its task describes it.
+
+    They are played in a child process, since an environment may abort, end or block its process.
 
     Args:
         plan: The sweep's plan.
-        hang_minutes: The program ends where an environment takes longer; None: it waits.
+        hang_minutes: Longest duration of one call of an environment; None: no limit.
+
+    Returns:
+        Remarks, one line each.
 
     Raises:
-        TaskError: A task does not fit; with one line per problem.
+        TaskError: A task does not fit; with one line per problem, and the remarks.
     """
     runs: dict[str, list[RunSettings]] = {}
     for run in plan.settings:
         if run.task.name not in BUILT_IN_TASKS:
             runs.setdefault(run.task.name, []).append(run)
-    problems = []
-    for name, of_task in runs.items():
-        hindsight = {run.replay.hindsight_episodes for run in of_task if run.replay.hindsight_k > 0}
-        rule = f"environments.{name} must be made and played within resources.hang_minutes"
-        with in_time(hang_minutes and 60 * hang_minutes, f"{rule}, {hang_minutes}"):
-            lines = _problems(of_task[0].task, hindsight)
-        problems += [f"environments.{name}: {line}" for line in lines]
+    left: dict[str, dict[str, Any]] = {
+        name: {
+            "task": of_task[0].task.model_dump(mode="json"),
+            "hindsight": sorted(
+                {run.replay.hindsight_episodes for run in of_task if run.replay.hindsight_k > 0}
+            ),
+        }
+        for name, of_task in runs.items()
+    }
+    problems, remarks = [], []
+    while left:
+        for name, wrong, noteworthy in _play(left, hang_minutes):
+            human = left.pop(name)["task"]["env_kwargs"].get("render_mode") == "human"
+            if wrong and human:
+                wrong[0] += f" ({_HUMAN})"
+            problems += [f"environments.{name}: {line}" for line in wrong]
+            remarks += [f"environments.{name}: {line}" for line in noteworthy]
     if problems:
-        raise TaskError("\n".join(problems))
+        raise TaskError("\n".join((*problems, *(f"also: {line}" for line in remarks))))
+    return remarks
 
 
-def _problems(task: Task, hindsight: Set[str]) -> list[str]:
-    """How the environment differs from its task.
-
-    Args:
-        task: The task.
-        hindsight: The `replay.hindsight_episodes` of its runs; empty where none has hindsight.
-    """
-    from music_rllib.envs.make import make_env
-
-    try:
-        env = make_env(task.env_id, **task.env_kwargs)
-    except Exception as error:  # a user's environment may raise anything
-        return [f"env_id must name an environment that can be made, got {task.env_id!r}: {error}"]
-    with closing(env):
+def _play(
+    left: Mapping[str, Mapping[str, Any]], hang_minutes: float | None
+) -> list[tuple[str, list[str], list[str]]]:
+    """Task, problems and remarks of those that a child process played until it ended."""
+    seconds = None if hang_minutes is None else 60 * hang_minutes
+    request = json.dumps({"questions": list(left.values()), "seconds": seconds})
+    answers, end = os.pipe()
+    # The child finds modules where this process does. -P: not in its current folder only.
+    path = os.pathsep.join(str(Path(entry).absolute()) for entry in sys.path)
+    command = [sys.executable, "-P", "-m", "music_rllib.envs.probe", str(end)]
+    with subprocess.Popen(  # noqa: S603
+        command,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        pass_fds=(end,),
+        start_new_session=True,
+        env=os.environ | {"PYTHONPATH": path},
+    ) as process:
+        os.close(end)
         try:
-            return _problems_of(task, env, hindsight)
-        except Exception as error:
-            return [f"env_id must name an environment that can be played, got {error!r}"]
+            assert process.stdin is not None
+            assert process.stderr is not None
+            with contextlib.suppress(BrokenPipeError), process.stdin as stdin:
+                stdin.write(request.encode())
+            heard, errors = _listen(process, answers, process.stderr.fileno(), seconds)
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)  # with what the environments have started
+            os.close(answers)
+    lines = [json.loads(line) for line in heard.decode().split("\n")[:-1]]
+    done = [tuple(line[1:]) for line in lines if line[0] == "done"]
+    if len(done) < len(left):
+        name = next(name for name in left if name not in {name for name, *_ in done})
+        calls = [line[2] for line in lines if line[0] == "call" and line[1] == name]
+        reason = _why_it_ended(process.returncode, calls[-1] if calls else "import", errors)
+        done.append((name, [reason], []))
+    return done
 
 
-def _problems_of(task: Task, env: Env, hindsight: Set[str]) -> list[str]:
-    from music_rllib.envs.make import (
-        check_action_space,
-        goal_reward_of,
-        moved_distance_of,
-        observation_sizes,
-    )
-
-    try:
-        check_action_space(env.action_space)
-        size, goal_size = observation_sizes(env.observation_space)
-    except ValueError as error:
-        return [str(error).removeprefix("environment: ")]
-    problems = beyond_observation(task.agent_indices, task.surrounding_indices, size)
-    limit = env.spec.max_episode_steps if env.spec is not None else None
-    if limit is not None and task.horizon > limit:
-        problems.append(
-            f"horizon must be <= {limit}, the environment's own limit, got {task.horizon}; "
-            f"env_kwargs: {{max_episode_steps: {task.horizon}}} would raise that"
-        )
-    if task.success_key is not None and task.success_key not in (known := _info_keys(task, env)):
-        problems.append(
-            f"success_key must be null or a key of info ({', '.join(sorted(known)) or 'none'}), "
-            f"got {task.success_key!r}{closest(task.success_key, known)}"
-        )
-    if hindsight and not goal_size:
-        problems.append("must have goals for replay.hindsight_k > 0, its observations have none")
-    elif hindsight:
-        try:
-            reward = goal_reward_of(env)
-            if "moved" in hindsight and task.moved_distance is None:
-                moved_distance_of(env, reward)
-        except ValueError as error:
-            problems.append(str(error))
-    return problems
+def _listen(
+    process: subprocess.Popen[bytes], answers: int, errors: int, seconds: float | None
+) -> tuple[bytes, str]:
+    """Answers of the child until it ends, and the last of its standard error."""
+    heard, tail, last, ended = b"", b"", time.monotonic(), None
+    with selectors.DefaultSelector() as selector:
+        selector.register(answers, selectors.EVENT_READ)
+        selector.register(errors, selectors.EVENT_READ)
+        while True:
+            if ended is None and process.poll() is not None:
+                ended = time.monotonic()
+            events = selector.select(0.2 if ended is None else 0.0)
+            for key, _ in events:
+                chunk = os.read(key.fd, 1 << 16)
+                if not chunk:
+                    selector.unregister(key.fd)
+                elif key.fd == answers:
+                    heard, last = heard + chunk, time.monotonic()
+                else:
+                    tail = (tail + chunk)[-(1 << 16) :]
+            # What an environment has started may write on.
+            if ended is not None and (not events or time.monotonic() > ended + 1.0):
+                break
+            # The child ends itself, unless the environment has seen to it that it does not.
+            if seconds is not None and time.monotonic() - last > seconds + _SLACK:
+                process.kill()
+                tail = _TIMEOUT.encode()
+    return heard, tail.decode(errors="replace")
 
 
-def _info_keys(task: Task, env: Env) -> set[str]:
-    """Keys of `info` in an episode of random actions, up to the step that has the success key."""
-    env.reset(seed=0)
-    env.action_space.seed(0)
-    keys: set[str] = set()
-    for _ in range(task.horizon):
-        *_, terminated, truncated, info = env.step(env.action_space.sample())
-        keys.update(info)
-        if task.success_key in keys or terminated or truncated:
-            break
-    return keys
+def _why_it_ended(code: int, call: str, errors: str) -> str:
+    """The rule that an environment breaks whose process has ended within a call."""
+    before = errors.partition("(most recent call first):\n")[0]
+    threads = [thread for thread in errors.split("\n\n") if "envs/probe.py" in thread]
+    places = [line.strip() for line in "".join(threads[:1]).splitlines() if "  File " in line]
+    at = f" at {places[0]}" if places else ""
+    if _TIMEOUT in errors:
+        return f"{call} must return within resources.hang_minutes, it hangs{at}"
+    skipped = ("Fatal Python error", "Thread", "Current thread", " ")
+    lines = [line for line in before.splitlines() if line and not line.startswith(skipped)]
+    said = f": {lines[-1][-200:]}" if lines and code != -signal.SIGKILL else ""
+    if code >= 0:
+        return f"{call} must not end its process, which ended with exit code {code}{said}"
+    name = signal.Signals(-code).name
+    memory = "; the system often does that for lack of memory" if name == "SIGKILL" else ""
+    return f"{call} must not end its process, which died of {name}{at}{memory}{said}"
 
 
 def check_hardware(plan: Plan) -> None:

@@ -79,10 +79,11 @@ class TAC(Algorithm):
     def _make_replay(self) -> TrajectoryReplay:
         settings = self._replay_settings
         runner = self._runner_with_environment()
-        goal_reward = goal_reward_of(runner.env) if settings.hindsight_k > 0 else None
+        seed = self.config.seed_range[0]
+        goal_reward = goal_reward_of(runner.env, seed) if settings.hindsight_k > 0 else None
         moved_distance = self.config.moved_distance
         if goal_reward and settings.hindsight_episodes == "moved" and moved_distance is None:
-            moved_distance = moved_distance_of(runner.env, goal_reward)
+            moved_distance = moved_distance_of(runner.env, goal_reward, seed)
         return TrajectoryReplay(
             runner.layout,
             settings.capacity,

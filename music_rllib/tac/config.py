@@ -15,7 +15,7 @@ from ray.tune.search.sample import Domain
 
 from music_rllib.config.returns import Range, cut_off
 from music_rllib.config.tac_settings import TACSettings
-from music_rllib.envs.tasks import BUILT_IN_TASKS, Indices, check_split
+from music_rllib.envs.tasks import BUILT_IN_TASKS, LAST_SEED, Indices, check_split
 from music_rllib.intrinsic.interface import IntrinsicReward
 from music_rllib.intrinsic.music import Music
 from music_rllib.intrinsic.settings import MusicSettings
@@ -59,6 +59,7 @@ class TACConfig(AlgorithmConfig):
         self.agent_indices: tuple[int, ...] = ()
         self.surrounding_indices: tuple[int, ...] = ()
         self.reward_range: tuple[float, float] | None = None
+        self.seed_range: tuple[int, int] = (0, LAST_SEED)
         self.success_key: str | None = "is_success"
         # Success of a step whose info lacks the key; None leaves the step out of success rates.
         self.success_if_missing: bool | None = None

@@ -36,12 +36,14 @@ from music_rllib.envs.calls import in_environment
 from music_rllib.envs.make import (
     Env,
     check_action_space,
+    compute_reward_of,
     episode_limit,
     is_gymnasium_id,
     make_env,
     name_of,
     observation_sizes,
     reset_seed,
+    to_bounds,
 )
 from music_rllib.envs.numbers import BadNumberError
 from music_rllib.envs.recording import Episode, Recording
@@ -72,7 +74,10 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
         self._settings: TACSettings = self.config.tac_settings()
         music = self.config.music_settings()
         self._zero_goals = music.goals == "zero" and not self.config.in_evaluation
-        self._success_key: str | None = self.config.success_key
+        self._success = (self.config.success_key, self.config.success_if_missing)
+        self._hindsight = (
+            self.config.replay_settings().hindsight_k > 0 and not self.config.in_evaluation
+        )
         # Training and evaluation have independent random streams, and so do the workers.
         self._entropy = (
             seed_or_entropy(self.config.seed),
@@ -185,7 +190,7 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
         """Resets sub-environment `index`."""
         entropy = np.random.SeedSequence((*self._entropy, self._episodes_started))
         self._episodes_started += 1
-        seed = reset_seed(entropy)
+        seed = reset_seed(entropy, self.config.seed_range)
         with in_environment:
             observation, _ = self.envs[index].reset(seed=seed)
         worker = f" of worker {self.worker_index}" if self.worker_index else ""
@@ -194,7 +199,13 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
             f"{'evaluation' if self.config.in_evaluation else 'training'} episode "
             f"{self._episodes_started} (reset with seed {seed})"
         )
-        recording = Recording(self.layout, zero_goal=self._zero_goals, name=name)
+        recording = Recording(
+            self.layout,
+            zero_goal=self._zero_goals,
+            name=name,
+            success=self._success,
+            goal_reward=compute_reward_of(self.envs[index]) if self._hindsight else None,
+        )
         recording.see(observation)
         return recording
 
@@ -202,19 +213,14 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
         """Takes one step; returns whether the episode terminated at its end, None before it."""
         with in_environment:
             observation, reward, terminated, truncated, info = env.step(scaled)
-        missing = self.config.success_if_missing
-        success = info.get(self._success_key, missing) if self._success_key else None
-        recording.step(action, float(reward), success, observation)
+        recording.step(action, reward, info, observation)
         if terminated or truncated or recording.steps == self.layout.horizon:
             return bool(terminated)
         return None
 
     def _to_env(self, actions: Floats) -> Floats:
         """Scales actions [B, A] from [-1, 1] to the environment's bounds."""
-        low, high = self._action_space.low, self._action_space.high
-        scaled = low + (actions + 1.0) * 0.5 * (high - low)
-        clipped: Floats = np.clip(scaled, low, high).astype(self._action_space.dtype)
-        return clipped
+        return to_bounds(actions, self._action_space)
 
     def _act(self, actor: Actor, inputs: Floats, *, explore: bool, random_actions: bool) -> Floats:
         """[B, I] -> [B, A] in [-1, 1]."""

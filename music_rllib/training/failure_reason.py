@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import re
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import psutil
 from ray.exceptions import RayActorError, RayError, RayTaskError
+
+from music_rllib.errors import BadInputError, message_of
 
 _DETAIL = re.compile(r"Worker exit detail: (.*?)(?: Some common causes include|$)", re.MULTILINE)
 _PLACE = re.compile(r"^\s*(pid|ip): (\S+)$", re.MULTILINE)
@@ -28,11 +33,31 @@ def cause_of(error: BaseException | None, text: str, limit: int = 300) -> str:
     elif isinstance(error, RayError):
         lines = _non_empty(str(error))[:2]
     elif isinstance(error, MemoryError):
-        lines = [f"{type(error).__name__}: {str(error) or 'no memory was left'}", _memory()]
+        lines = [f"{type(error).__name__}: {message_of(error) or 'no memory was left'}", _memory()]
     else:
-        first, *rest = _non_empty(str(error)) or ["(no message)"]
+        first, *rest = _non_empty(message_of(error)) or ["(no message)"]
         lines = [f"{type(error).__name__}: {first}", *rest[:1]]
     return "\n".join(line if len(line) <= limit else line[: limit - 3] + "..." for line in lines)
+
+
+def trace_of(error: BaseException) -> str:
+    """The traceback of an exception that a run has raised.
+
+    Raises:
+        SystemExit: The error itself, by which Ray ends the process.
+    """
+    if hasattr(error, "ray_terminate_msg"):
+        raise error
+    return "".join(traceback.format_exception(error))
+
+
+@contextmanager
+def in_words_only() -> Iterator[None]:
+    """Turns an exception into its cause: another process may not be able to read its class."""
+    try:
+        yield
+    except BaseException as error:
+        raise BadInputError(cause_of(error, trace_of(error))) from None
 
 
 def _memory() -> str:

@@ -60,6 +60,7 @@ def algorithm_config(run: RunSettings) -> TACConfig:
     )
     config.replay(moved_distance=run.task.moved_distance, **dict(run.replay))
     config.success_key, config.success_if_missing = run.task.success_key, False
+    config.seed_range = run.task.seed_range
     # `TrainingRun` evaluates, at given environment steps.
     config.evaluation(
         evaluation_interval=_NEVER,

@@ -12,6 +12,7 @@ from ray.exceptions import RayTaskError
 
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.schema import Resources
+from music_rllib.training.failure_reason import in_words_only
 from music_rllib.training.run import TrainingRun
 
 SECONDS = 4.0
@@ -40,7 +41,7 @@ def sample_run(run: RunSettings, resources: Resources, at_once: int) -> RunSampl
     for which there is no place are left out.
 
     Raises:
-        ValueError: The settings do not fit the environment.
+        BadInputError: A run fails.
     """
     bundle = resources.bundle
     options = {"num_cpus": bundle["CPU"], "num_gpus": bundle.get("GPU", 0.0)}
@@ -72,11 +73,16 @@ class _Worker:
         """Build the run and make its first environment steps."""
         # Random steps, without updates, are many times faster than the others, and soon over.
         tac = run.tac.model_copy(update={"random_steps": 0})
-        self._training = TrainingRun(run.model_copy(update={"tac": tac}), gpus=gpus)
-        self._training.algorithm.env_runner.sample(num_episodes=1)
+        with in_words_only():
+            self._training = TrainingRun(run.model_copy(update={"tac": tac}), gpus=gpus)
+            self._training.algorithm.env_runner.sample(num_episodes=1)
 
     def train(self) -> tuple[float, float, int]:
         """The last three numbers of a `RunSample`."""
+        with in_words_only():
+            return self._measure()
+
+    def _measure(self) -> tuple[float, float, int]:
         training = self._training
         training.algorithm.train()
         first, began = training.env_steps, time.perf_counter()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import time
-import traceback
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from functools import cached_property
@@ -31,7 +30,7 @@ from music_rllib.store.run_record import (
     to_json_lines,
 )
 from music_rllib.training.divergence import divergence
-from music_rllib.training.failure_reason import cause_of
+from music_rllib.training.failure_reason import cause_of, trace_of
 from music_rllib.training.hang_watch import RECORD, HangWatch, check_hung
 from music_rllib.training.job import NodeJob
 from music_rllib.training.stop import StopWatch
@@ -111,8 +110,8 @@ class RunTrainable(Trainable):
         """Go on to the next report."""
         try:
             return self._step_or_make_way()
-        except Exception as error:
-            text = redact(traceback.format_exc())
+        except BaseException as error:  # an environment's SystemExit would end the worker
+            text = redact(trace_of(error))
             self._release()
             return self._result(done=True) | {CAUSE: redact(cause_of(error, text)), TRACEBACK: text}
 

@@ -9,6 +9,7 @@ import yaml
 from music_rllib.config.load import load_sweep
 from music_rllib.experiment.plan import make_plan
 from music_rllib.sweep.preflight import TaskError, check_environments
+from tests.integration.conftest import ENVIRONMENTS
 
 PUSH: dict[str, Any] = {
     "env_id": "FetchPush-v4",
@@ -18,11 +19,12 @@ PUSH: dict[str, Any] = {
 }
 
 
-def check(folder: Path, task: dict[str, Any], **replay: Any) -> None:
+def check(folder: Path, *tasks: dict[str, Any], **replay: Any) -> list[str]:
+    names = [f"T{i}" for i in range(len(tasks))]
     document = {
         "name": "s",
-        "tasks": ["Mine"],
-        "environments": {"Mine": task},
+        "tasks": names,
+        "environments": dict(zip(names, tasks, strict=True)),
         "defaults": {"env_steps": 2000},
         # Only one of the stages has hindsight.
         "stages": [
@@ -32,73 +34,136 @@ def check(folder: Path, task: dict[str, Any], **replay: Any) -> None:
     }
     path = folder / "sweep.yaml"
     path.write_text(yaml.safe_dump(document))
-    check_environments(make_plan(load_sweep(path)))
+    return check_environments(make_plan(load_sweep(path)))
 
 
-@pytest.mark.parametrize(
-    "task",
-    [
+def test_tasks_that_fit_pass(tmp_path: Path) -> None:
+    tasks = (
         PUSH,
         PUSH | {"horizon": 20, "success_key": None},
         PUSH | {"horizon": 80, "env_kwargs": {"max_episode_steps": 80}},
-    ],
-)
-def test_a_task_that_fits_passes(task: dict[str, Any], tmp_path: Path) -> None:
-    check(tmp_path, task, hindsight_k=4.0)
+    )
+    assert check(tmp_path, *tasks, hindsight_k=4.0) == []
 
 
-@pytest.mark.parametrize(
-    "task, rule",
-    [
-        (PUSH | {"env_id": "FetchPsh-v4"}, "env_id must name an environment that can be made"),
-        (
-            PUSH | {"surrounding_indices": [30]},
-            "surrounding_indices must be < 25, the size of the observation, got 30",
-        ),
-        (
-            PUSH | {"horizon": 80},
-            "horizon must be <= 50, the environment's own limit, got 80; "
-            "env_kwargs: {max_episode_steps: 80} would raise that",
-        ),
-        (
-            PUSH | {"success_key": "is_succes"},
-            "success_key must be null or a key of info (is_success), "
-            "got 'is_succes' (did you mean 'is_success'?)",
-        ),
-        (
-            {"env_id": "CartPole-v1", "horizon": 100},
-            "the action space must be a bounded one-dimensional Box",
-        ),
-        (
-            {"env_id": "Pendulum-v1", "horizon": 200, "success_key": None},
-            "must have goals for replay.hindsight_k > 0, its observations have none",
-        ),
-        (
-            {"env_id": "HandManipulatePen-v1", "horizon": 100},
-            "replay.hindsight_k must be 0 where compute_reward does not price every row",
-        ),
-    ],
-)
-def test_what_does_not_fit_is_said(task: dict[str, Any], rule: str, tmp_path: Path) -> None:
+MISFITS: list[tuple[dict[str, Any], str]] = [
+    (PUSH | {"env_id": "FetchPsh-v4"}, "env_id must name an environment that can be made"),
+    (
+        PUSH | {"surrounding_indices": [30]},
+        "surrounding_indices must be < 25, the size of the observation, got 30",
+    ),
+    (
+        PUSH | {"horizon": 80},
+        "horizon must be <= 50, the environment's own limit, got 80; "
+        "env_kwargs: {max_episode_steps: 80} would raise that",
+    ),
+    (
+        PUSH | {"success_key": "is_succes"},
+        "success_key must be null or a key of info (is_success), "
+        "got 'is_succes' (did you mean 'is_success'?)",
+    ),
+    (
+        {"env_id": "CartPole-v1", "horizon": 100},
+        "the action space must be a bounded one-dimensional Box",
+    ),
+    (
+        {"env_id": "Pendulum-v1", "horizon": 200, "success_key": None},
+        "must have goals for replay.hindsight_k > 0, its observations have none",
+    ),
+    (
+        {"env_id": "HandManipulatePen-v1", "horizon": 100},
+        "replay.hindsight_k must be 0 where compute_reward does not compute each row",
+    ),
+]
+
+
+def test_what_does_not_fit_is_named(tmp_path: Path) -> None:
     with pytest.raises(TaskError) as caught:
-        check(tmp_path, task, hindsight_k=4.0)
-    (line,) = str(caught.value).splitlines()
-    assert line.startswith(f"environments.Mine: {rule}")
+        check(tmp_path, *(task for task, _ in MISFITS), hindsight_k=4.0)
+    lines = str(caught.value).splitlines()
+    for i, (line, (_, rule)) in enumerate(zip(lines, MISFITS, strict=True)):
+        assert line.startswith(f"environments.T{i}: {rule}")
 
 
 def test_dense_rewards_need_a_distance_for_hindsight_from_moved_episodes(tmp_path: Path) -> None:
     maze = {"env_id": "PointMaze_UMazeDense-v3", "horizon": 100, "success_key": "success"}
-    check(tmp_path, maze, hindsight_k=4.0)
     moved: dict[str, Any] = {"hindsight_k": 4.0, "hindsight_episodes": "moved"}
-    with pytest.raises(TaskError, match="or the task must have a moved_distance: PointMaze_UMaze"):
-        check(tmp_path, maze, **moved)
-    check(tmp_path, maze | {"moved_distance": 0.1}, **moved)
+    with pytest.raises(TaskError) as caught:
+        check(tmp_path, maze, maze | {"moved_distance": 0.1}, **moved)
+    (line,) = str(caught.value).splitlines()
+    assert line.startswith("environments.T0: ")
+    assert "or the task must have a moved_distance: PointMaze_UMaze" in line
 
 
 def test_all_that_does_not_fit_is_said_at_once(tmp_path: Path) -> None:
     task = {"env_id": "Pendulum-v1", "horizon": 300, "agent_indices": [0]}
     with pytest.raises(TaskError) as caught:
-        check(tmp_path, task | {"surrounding_indices": [5]})
+        check(tmp_path, task | {"surrounding_indices": [5]}, hindsight_k=4.0)
     lines = str(caught.value).splitlines()
-    assert [line.split()[1] for line in lines] == ["surrounding_indices", "horizon", "success_key"]
-    assert "(none)" in lines[2]
+    rules = ["surrounding_indices", "horizon", "must", "environments.T0:"]
+    assert [line.split()[1] for line in lines] == rules
+    assert lines[3].startswith("also: environments.T0: success_key 'is_success' was not in info")
+
+
+FATAL = """
+import os, sys, threading, time
+import gymnasium as gym
+from point_env import Point
+
+class Loud(Point):
+    def step(self, action):
+        os.write(1, b"x" * 3_000_000)
+        os.write(2, b"y" * 3_000_000)
+        threading.Thread(target=time.sleep, args=(3600,)).start()
+        return super().step(action)
+
+class Aborts(Point):
+    def reset(self, **arguments):
+        print("\\ncannot open display", file=sys.stderr, flush=True)
+        os.abort()
+
+class Ends(Point):
+    def step(self, action):
+        os._exit(0)
+
+class Stops(Point):
+    def step(self, action):
+        raise KeyboardInterrupt
+
+class UnreadableError(Exception):
+    def __init__(self, first, second):
+        super().__init__(first)
+    def __str__(self):
+        raise ValueError
+
+class Raises(Point):
+    def close(self):
+        raise UnreadableError(1, 2)
+
+for kind in (Loud, Aborts, Ends, Stops, Raises):
+    gym.register(f"{kind.__name__}-v0", entry_point=kind)
+"""
+
+
+def test_an_environment_that_ends_its_process_is_named_and_the_others_are_played(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each would have ended the driver."""
+    (tmp_path / "fatal_env.py").write_text(FATAL)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.syspath_prepend(str(ENVIRONMENTS))
+
+    def lines(*names: str) -> list[str]:
+        return check(tmp_path, *({"env_id": f"fatal_env:{n}-v0", "horizon": 20} for n in names))
+
+    with pytest.raises(TaskError) as caught:
+        lines("Loud", "Aborts", "Ends", "Stops", "Raises")
+    aborted, ended, stopped, _ = str(caught.value).splitlines()
+    assert (
+        "T1: reset(seed=2147483647) must not end its process, which died of SIGABRT at" in aborted
+    )
+    assert aborted.endswith(": cannot open display")
+    assert ended.startswith("environments.T2: step() must not end its process, which ended with")
+    assert "T3: step() must not raise, it raised KeyboardInterrupt" in stopped
+    (closed,) = lines("Loud", "Raises")
+    assert closed.startswith("environments.T1: close() must not raise, it raised UnreadableError")

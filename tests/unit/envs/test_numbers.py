@@ -43,15 +43,14 @@ def observation(**changes: tuple[int, float]) -> dict[str, Any]:
 
 
 def begun(*, zero_goal: bool = False) -> Recording:
-    recording = Recording(LAYOUT, zero_goal=zero_goal, name="Env-v0, sub-environment 2")
+    name, success = "Env-v0, sub-environment 2", ("done", False)
+    recording = Recording(LAYOUT, zero_goal=zero_goal, name=name, success=success)
     recording.see(observation())
     return recording
 
 
-def take(
-    recording: Recording, seen: Any, reward: float = -1.0, success: float | None = None
-) -> None:
-    recording.step(np.zeros(2, np.float32), reward, success, seen)
+def take(recording: Recording, seen: Any, reward: Any = -1.0, **info: Any) -> None:
+    recording.step(np.zeros(2, np.float32), reward, info, seen)
 
 
 @pytest.mark.parametrize(
@@ -74,15 +73,49 @@ def test_a_step_that_returns_one_ends_the_episode_with_its_place(
         take(recording, seen, reward)
 
 
-def test_a_success_that_is_nan_ends_the_episode_too() -> None:
+NO_SUCCESS = ["False", "yes", 0.3, np.nan, 2, None, np.zeros(1), np.array([True]), [1], b"1", 1j]
+
+
+@pytest.mark.parametrize("value", NO_SUCCESS, ids=repr)
+def test_a_success_that_is_neither_true_nor_false_is_refused_with_key_and_value(value: Any) -> None:
     recording = begun()
-    take(recording, observation(), success=True)
-    take(recording, observation(), success=0.0)
-    with pytest.raises(BadNumberError, match=r"^Env-v0, sub-environment 2, step 3: success is nan"):
-        take(recording, observation(), success=np.nan)
+    with pytest.raises(BadNumberError) as caught:
+        take(recording, observation(), done=value)
+    rule = "info['done'] must be a bool, or the number 0 or 1, got "
+    assert str(caught.value).startswith(f"Env-v0, sub-environment 2, step 1: {rule}{value!r}")
+
+
+@pytest.mark.parametrize("kind", [bool, int, float, np.bool_, np.float16, np.uint8, np.array])
+def test_a_success_is_a_bool_or_0_or_1_and_a_step_without_it_has_none(kind: Any) -> None:
+    recording = begun()
+    for info in ({"done": kind(1)}, {"done": kind(0)}, {}):
+        take(recording, observation(), **info)
     successes = recording.finish(terminated=False).successes
     assert successes is not None
-    assert successes.tolist() == [True, False]
+    assert successes.tolist() == [True, False, False]
+
+
+@pytest.mark.parametrize("reward", ["-1", None, np.array([-1.0]), [0.0], 1j], ids=repr)
+def test_a_reward_that_is_no_number_is_refused(reward: Any) -> None:
+    with pytest.raises(BadNumberError, match="step 1: reward must be a number, got"):
+        take(begun(), observation(), reward)
+
+
+@pytest.mark.parametrize(
+    ("seen", "rule"),
+    [
+        (observation() | {"achieved_goal": np.float32(1.0)}, "achieved_goal must have shape (2,)"),
+        (observation() | {"observation": np.zeros((1, 5))}, "observation must have shape (5,)"),
+        (observation() | {"desired_goal": np.array(["1", "2"])}, "desired_goal must have shape"),
+        (observation() | {"observation": np.zeros(5, complex)}, "and hold numbers, got"),
+        ({"observation": np.zeros(5)}, "observation must be a dictionary with observation"),
+        (np.zeros(9), "observation must be a dictionary with observation"),
+    ],
+)
+def test_what_numpy_would_repeat_or_read_as_numbers_is_refused(seen: Any, rule: str) -> None:
+    with pytest.raises(BadNumberError) as caught:
+        begun(zero_goal=True).see(seen)
+    assert rule in str(caught.value)
 
 
 def test_large_numbers_that_float32_holds_well_pass_and_so_does_a_goal_nobody_sees() -> None:

@@ -79,9 +79,14 @@ def test_identity_ignores_what_does_not_change_the_environment() -> None:
         {"agent_indices": (0, 1)},
         {"surrounding_indices": (3, 4)},
         {"success_key": None},
+        {"seed_range": (0, 99)},
         {"env_kwargs": {"reward_type": "dense"}},
     ):
         assert push.model_copy(update=change).identity() != push.identity()
+
+
+def test_a_task_with_the_default_seeds_keeps_the_identity_of_runs_without_this_setting() -> None:
+    assert "seed_range" not in BUILT_IN_TASKS["FetchPush"].identity()
 
 
 def test_an_unknown_task_is_named_with_its_neighbour() -> None:

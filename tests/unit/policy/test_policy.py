@@ -1,5 +1,6 @@
 """Policies of runs: the same actions as the networks that were trained, and nothing executed."""
 
+import dataclasses
 import json
 import pickle
 import shutil
@@ -147,6 +148,10 @@ def test_scales_to_the_environments_bounds() -> None:
     # tanh(0) is the middle, tanh(+-100) the ends.
     np.testing.assert_allclose(network.act([0.0, 0.0]), [0.0, 5.0])
     np.testing.assert_allclose(network.act({"observation": [100.0, -100.0]}), [2.0, 0.0])
+    # Between such bounds every action would be the highest one.
+    huge = np.full(2, np.finfo(np.float32).max)
+    with pytest.raises(ValueError, match=r"actions must be within \+-1e\+15, got a bound of 3\.4"):
+        dataclasses.replace(network, low=-huge, high=huge)
 
 
 @pytest.mark.parametrize(

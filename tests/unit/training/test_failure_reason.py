@@ -5,7 +5,8 @@ import re
 import pytest
 from ray.exceptions import ActorDiedError, OutOfMemoryError, RayActorError, RayTaskError
 
-from music_rllib.training.failure_reason import cause_of
+from music_rllib.errors import BadInputError
+from music_rllib.training.failure_reason import cause_of, in_words_only
 
 DEATH = """The actor died unexpectedly before finishing this task.
 \tclass_name: RunTrainable
@@ -35,6 +36,26 @@ def in_a_task(cause: Exception) -> RayTaskError:
 )
 def test_the_cause_is_what_was_raised(error: BaseException | None, expected: str) -> None:
     assert cause_of(error, "Traceback:\n  File\nKeyError: 'the last line'\n\n") == expected
+
+
+class WordlessError(Exception):
+    """Needs two arguments, and fails to give its message."""
+
+    def __init__(self, first: int, second: int) -> None:
+        super().__init__(first, second)
+
+    def __str__(self) -> str:
+        raise LookupError
+
+
+def test_an_exception_that_has_no_readable_message_keeps_its_name() -> None:
+    assert (
+        cause_of(WordlessError(1, 2), "")
+        == "WordlessError: (its message can't be read: LookupError)"
+    )
+    assert cause_of(SystemExit(3), "") == "SystemExit: 3"
+    with pytest.raises(BadInputError, match=r"^WordlessError: "), in_words_only():
+        raise WordlessError(1, 2)
 
 
 def test_a_worker_that_died_says_where_and_what_to_do() -> None:

@@ -1,0 +1,357 @@
+"""Plays the environments of a sweep before anything is trained, and names what is wrong with them.
+
+This is the program of a child process, since an environment may abort, end or block its process.
+`music_rllib.sweep.preflight` starts it, sends a `Request` on its standard input, and reads JSON
+lines: `["call", task, name]` before a call of an environment and once a second during many, and
+`["done", task, problems, remarks]` at the end of a task.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import faulthandler
+import json
+import os
+import sys
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Protocol, TextIO
+
+import numpy as np
+from gymnasium import spaces
+from pydantic import BaseModel
+
+from music_rllib.envs.make import (
+    Env,
+    check_action_space,
+    goal_reward_of,
+    make_env,
+    moved_distance_of,
+    observation_sizes,
+    reset_seed,
+    to_bounds,
+)
+from music_rllib.envs.numbers import BadNumberError, flag_of, shown
+from music_rllib.envs.recording import Episode, Recording
+from music_rllib.envs.tasks import Task, beyond_observation, closest
+from music_rllib.errors import first_line, in_words
+from music_rllib.replay.buffer import GoalReward
+from music_rllib.replay.trajectories import ReplayLayout
+
+EPISODE_SECONDS = 10.0
+"""Time after which an episode is cut short."""
+MOST_STEPS, MOST_SECONDS = 20_000, 2.0
+"""Limits of the further episodes that are played to see a success and a second reward."""
+REPEATED_STEPS = 50
+"""Steps that are compared with those after an earlier reset with the same seed."""
+_TYPING_ERROR = 0.85
+"""Similarity from which a key is taken for a misspelled one."""
+
+
+class Question(BaseModel):
+    """A task, and the `replay.hindsight_episodes` of its runs; empty without hindsight."""
+
+    task: Task
+    hindsight: tuple[str, ...] = ()
+
+
+class Request(BaseModel):
+    """Tasks that are to be played; a call may take so many seconds, where it is limited."""
+
+    questions: list[Question]
+    seconds: float | None
+
+
+class Watch(Protocol):
+    """Is told of each call of an environment, before it is made."""
+
+    def __call__(self, call: str) -> None: ...
+
+
+class RefusedError(Exception):
+    """The environment breaks a rule, and is not played any longer; the message is one line."""
+
+
+class Probe:
+    """Plays the environment of one task.
+
+    Args:
+        question: the task.
+        watch: is told of each call.
+    """
+
+    def __init__(self, question: Question, watch: Watch) -> None:
+        self._task, self._hindsight, self._watch = question.task, question.hindsight, watch
+        self.problems: list[str] = []
+        """Reasons to refuse the task."""
+        self.remarks: list[str] = []
+        """Matters that a user should know."""
+        self._steps = 0
+        self._keys: Counter[str] = Counter()
+        self._rewards: set[float] = set()
+        self._unused: set[str] = set()
+        self._reward: GoalReward | None = None
+
+    def run(self) -> None:
+        """Find the problems and remarks."""
+        task = self._task
+        try:
+            env: Env = self._call("make", make_env, task.env_id, **task.env_kwargs)
+        except RefusedError as error:
+            cause = str(error).removeprefix("make must not raise, it raised ")
+            rule = "env_id must name an environment that can be made"
+            self.problems.append(f"{rule}, got {task.env_id!r}: {cause}")
+            return
+        try:
+            self._check(env)
+        except RefusedError as error:
+            self.problems.append(str(error))
+        try:
+            # That of `make_env` ignores exceptions.
+            self._call("close()", type(env).close, env)
+        except RefusedError as error:
+            self.remarks.append(f"{error}; the exception is ignored")
+
+    def _call(self, name: str, function: Callable[..., Any], *args: Any, **options: Any) -> Any:
+        self._watch(name)
+        try:
+            return function(*args, **options)
+        except BaseException as error:  # an environment may raise anything, also SystemExit
+            *_, (frame, line) = traceback.walk_tb(error.__traceback__)
+            place = f"{frame.f_code.co_filename}, line {line}"
+            raise RefusedError(
+                f"{name} must not raise, it raised {in_words(error)} ({place})"
+            ) from error
+
+    def _check(self, env: Env) -> None:
+        task = self._task
+        try:
+            action = check_action_space(env.action_space)
+            size, goal = observation_sizes(env.observation_space)
+        except ValueError as error:
+            raise RefusedError(str(error).removeprefix("environment: ")) from None
+        self.problems += beyond_observation(task.agent_indices, task.surrounding_indices, size)
+        limit = env.spec.max_episode_steps if env.spec is not None else None
+        if limit is not None and task.horizon > limit:
+            self.problems.append(
+                f"horizon must be <= {limit}, the environment's own limit, got {task.horizon}; "
+                f"env_kwargs: {{max_episode_steps: {task.horizon}}} would raise that"
+            )
+        if self._hindsight and not goal:
+            self.problems.append(
+                "must have goals for replay.hindsight_k > 0, its observations have none"
+            )
+        self._layout = ReplayLayout(
+            observation=size, action=int(action.shape[0]), goal=goal, horizon=task.horizon
+        )
+        first = self._first_episode(env)
+        if self._hindsight and goal:
+            self._reward = self._goal_reward(env)
+        self._play(env, task.seed_range[0], actions=1, steps=REPEATED_STEPS)
+        self._repeat(env, first)
+        self._play_on(env)
+        self._name_keys()
+
+    def _first_episode(self, env: Env) -> Episode:
+        """An episode of the largest seed, which an environment may refuse."""
+        smallest, largest = self._task.seed_range
+        try:
+            self._reset(env, largest)
+        except RefusedError as error:
+            if largest == smallest:
+                raise
+            self._reset(env, smallest)
+            raise RefusedError(
+                f"reset must accept all seeds of seed_range, {smallest} to {largest}: {error}; "
+                f"seed_range: [{smallest}, N] declares N as the largest"
+            ) from None
+        return self._play(env, largest, actions=0)
+
+    def _goal_reward(self, env: Env) -> GoalReward | None:
+        seed = self._task.seed_range[0]
+        self._watch("compute_reward()")
+        try:
+            reward = goal_reward_of(env, seed)
+            if "moved" in self._hindsight and self._task.moved_distance is None:
+                moved_distance_of(env, reward, seed)
+        except ValueError as error:
+            self.problems.append(first_line(error))
+            return None
+        except BaseException as error:
+            raise RefusedError(f"compute_reward() raised {in_words(error)}") from error
+        return reward
+
+    def _reset(self, env: Env, seed: int) -> Any:
+        result = self._call(f"reset(seed={seed})", env.reset, seed=seed)
+        if not (isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], Mapping)):
+            raise RefusedError(
+                "reset() must return (observation, info) with a dictionary info, as Gymnasium's "
+                f"environments do, got {shown(result)}"
+            )
+        if isinstance(result[0], Mapping) and isinstance(env.observation_space, spaces.Dict):
+            self._unused |= result[0].keys() | env.observation_space.keys()
+        return result[0]
+
+    def _step(self, env: Env, action: Any) -> tuple[Any, Any, bool, bool, Mapping[str, Any]]:
+        try:
+            result = self._call("step()", env.step, action)
+        except RefusedError as error:
+            if not isinstance(error.__cause__, ValueError | TypeError):
+                raise
+            # Perhaps a wrapper of Gymnasium's that expects five values.
+            try:
+                result = env.unwrapped.step(action)
+            except BaseException:
+                raise error from None
+            _check_step(result)
+            raise
+        return _check_step(result)
+
+    def _play(self, env: Env, seed: int, *, actions: int, steps: int | None = None) -> Episode:
+        """Plays an episode of random actions; the same ones for equal `actions`."""
+        observation = self._reset(env, seed)
+        name = f"after reset(seed={seed})"
+        recording = Recording(
+            self._layout,
+            name=name,
+            success=(self._task.success_key, False),
+            goal_reward=self._reward,
+        )
+        rng, end = np.random.default_rng(actions), time.monotonic() + EPISODE_SECONDS
+        space = check_action_space(env.action_space)
+        ended, last = False, min(steps or self._layout.horizon, self._layout.horizon)
+        try:
+            recording.see(observation)
+            while recording.steps < last and not ended and time.monotonic() < end:
+                action = rng.uniform(-1.0, 1.0, (1, self._layout.action)).astype(np.float32)
+                result = self._step(env, to_bounds(action, space)[0])
+                observation, reward, terminated, truncated, info = result
+                self._keys.update(map(str, info))
+                recording.step(action[0], reward, info, observation)
+                ended = terminated or truncated
+            self._steps += recording.steps
+            episode = recording.finish(terminated=ended)
+        except BadNumberError as error:
+            raise RefusedError(first_line(error)) from None
+        self._rewards.update(episode.rewards.tolist())
+        return episode
+
+    def _repeat(self, env: Env, first: Episode) -> None:
+        """Compares an episode with the first one, of the same seed and actions."""
+        seed = self._task.seed_range[1]
+        again = self._play(env, seed, actions=0, steps=min(REPEATED_STEPS, len(first)))
+        steps = min(len(again), len(first))
+        same = [
+            np.array_equal(again.frames[: steps + 1], first.frames[: steps + 1]),
+            np.array_equal(again.rewards[:steps], first.rewards[:steps]),
+        ]
+        if not all(same):
+            unlike = (again.frames[: steps + 1] != first.frames[: steps + 1]).any(axis=1)
+            at = int(np.argmax(unlike)) if unlike.any() else steps
+            place = (
+                "with another observation" if at == 0 else f"the same, and differed by step {at}"
+            )
+            self.remarks.append(
+                f"reset(seed={seed}) must fix an episode; the second time it began {place}. "
+                "A resumed run will differ from an uninterrupted one, and runs with the same seed "
+                "will differ from each other"
+            )
+
+    def _play_on(self, env: Env) -> None:
+        """Plays until a success key and, with hindsight, a second reward have been seen."""
+        end, number = time.monotonic() + MOST_SECONDS, 2
+        while self._steps < MOST_STEPS and time.monotonic() < end:
+            key = self._task.success_key
+            rewards_differ = self._reward is None or len(self._rewards) > 1
+            if rewards_differ and (key is None or key in self._keys or self._misspelled()):
+                break
+            seed = reset_seed(np.random.SeedSequence(number), self._task.seed_range)
+            self._play(env, seed, actions=number)
+            number += 1
+
+    def _misspelled(self) -> str:
+        """The key of all steps that the success key must mean, as `closest` names it."""
+        always = [name for name, count in self._keys.items() if count == self._steps]
+        return closest(self._task.success_key or "", always, _TYPING_ERROR)
+
+    def _name_keys(self) -> None:
+        """Names a success key that was not there, and parts of observations that are not used."""
+        key = self._task.success_key
+        if key is not None and key not in self._keys:
+            known = ", ".join(sorted(self._keys)) or "none"
+            if hint := self._misspelled():
+                self.problems.append(
+                    f"success_key must be null or a key of info ({known}), got {key!r}{hint}"
+                )
+            else:
+                self.remarks.append(
+                    f"success_key {key!r} was not in info in {self._steps} random steps (keys: "
+                    f"{known}){closest(key, self._keys)}; a step without it counts as not reached"
+                )
+        if unused := self._unused - {"observation", "desired_goal", "achieved_goal"}:
+            self.remarks.append(
+                f"the observation's {', '.join(sorted(unused))} is not used: the networks get "
+                "observation and desired_goal"
+            )
+
+
+def _check_step(result: Any) -> tuple[Any, Any, bool, bool, Mapping[str, Any]]:
+    """The five values of a step; RefusedError for others."""
+    rule = "step() must return (observation, reward, terminated, truncated, info)"
+    if not isinstance(result, tuple) or len(result) != 5:
+        number = f"{len(result)} values" if isinstance(result, tuple) else shown(result)
+        old = ", as in gym before 0.26" if isinstance(result, tuple) and len(result) == 4 else ""
+        raise RefusedError(f"{rule}, got {number}{old}")
+    observation, reward, terminated, truncated, info = result
+    if not isinstance(info, Mapping):
+        raise RefusedError(f"{rule} with a dictionary info, got {shown(info)}")
+    try:
+        ends = flag_of(terminated, "step()'s terminated"), flag_of(truncated, "step()'s truncated")
+    except ValueError as error:
+        raise RefusedError(str(error)) from None
+    return observation, reward, *ends, info
+
+
+class _Reporter:
+    """Tells the parent of calls, and ends this process where one takes too long."""
+
+    def __init__(self, answers: TextIO, seconds: float | None) -> None:
+        self._answers, self._seconds = answers, seconds
+        self.task = self._call = ""
+        self._told = 0.0
+
+    def __call__(self, call: str) -> None:
+        now = time.monotonic()
+        if call == self._call and now - self._told < 1.0:
+            return
+        self._call, self._told = call, now
+        self.tell("call", self.task, call)
+        if self._seconds is not None:
+            faulthandler.dump_traceback_later(self._seconds, exit=True)
+
+    def tell(self, *line: Any) -> None:
+        print(json.dumps(line), file=self._answers, flush=True)
+
+
+def main() -> None:
+    """Answer the request on standard input, on the file descriptor that the argument names."""
+    os.set_inheritable(answers := int(sys.argv[1]), False)
+    with contextlib.suppress(OSError):  # of all processes, the system ends this one for memory
+        Path("/proc/self/oom_score_adj").write_text("1000")
+    faulthandler.enable()
+    request = Request.model_validate_json(sys.stdin.read())
+    with os.fdopen(answers, "w", encoding="utf-8") as file:
+        reporter = _Reporter(file, request.seconds)
+        for question in request.questions:
+            reporter.task = question.task.name
+            probe = Probe(question, reporter)
+            probe.run()
+            reporter.tell("done", question.task.name, probe.problems, probe.remarks)
+    os._exit(0)  # whatever threads the environments have left
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,197 @@
+"""What is said of an environment that is played before anything is trained."""
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from music_rllib.envs import probe
+from music_rllib.envs.probe import Probe, Question
+from music_rllib.envs.tasks import Task
+
+
+class Sound(gym.Env[Any, Any]):
+    """A point with a goal."""
+
+    action_space = spaces.Box(-1, 1, (2,), np.float32)
+    observation_space: spaces.Space[Any] = spaces.Dict(
+        {name: spaces.Box(-9, 9, (2,)) for name in ("observation", "achieved_goal", "desired_goal")}
+    )
+
+    def compute_reward(self, achieved: Any, desired: Any, info: Any) -> Any:
+        return -(np.linalg.norm(achieved - desired, axis=-1) > 0.1).astype(np.float32)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.at, self.goal = self.np_random.uniform(-1, 1, (2, 2))
+        return self.seen(), {}
+
+    def seen(self) -> Any:
+        return {"observation": self.at, "achieved_goal": self.at, "desired_goal": self.goal}
+
+    def step(self, action: Any) -> Any:
+        self.at = self.at + 0.1 * action
+        reward = float(self.compute_reward(self.at, self.goal, {}))
+        return self.seen(), reward, False, False, {"is_success": reward == 0}
+
+
+def probed(
+    monkeypatch: pytest.MonkeyPatch, kind: type[Sound], *, hindsight: bool = False, **task: Any
+) -> Probe:
+    monkeypatch.setattr(probe, "MOST_STEPS", 3000)
+    # An id of its own: Gymnasium warns of one that is registered again.
+    name = f"Probed{kind.__name__}{id(kind)}-v0"
+    gym.register(name, entry_point=lambda **_: kind(), max_episode_steps=20)
+    try:
+        declared = Task(name="T", env_id=name, horizon=20, **task)
+        made = Probe(Question(task=declared, hindsight=("all",) * hindsight), lambda call: None)
+        made.run()
+    finally:
+        del gym.registry[name]
+    return made
+
+
+def changed(step: Callable[..., Any]) -> type[Sound]:
+    """An environment whose step is changed afterwards."""
+
+    class Changed(Sound):
+        def step(self, action: Any) -> Any:
+            return step(self, *super().step(action))
+
+    return Changed
+
+
+def test_a_sound_environment_has_no_remarks(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = probed(monkeypatch, Sound, hindsight=True)
+    assert (made.problems, made.remarks) == ([], [])
+
+
+def bonus(env: Sound, seen: Any, reward: float, *rest: Any) -> Any:
+    return seen, reward + 10.0 * (reward == 0), *rest
+
+
+def cost(env: Sound, seen: Any, reward: float, *rest: Any) -> Any:
+    return seen, reward - 1e-3 * abs(float(env.at[0])), *rest
+
+
+def old_step(env: Sound, seen: Any, reward: float, done: bool, _: bool, info: Any) -> Any:
+    return seen, reward, done, info
+
+
+def says(value: Any) -> Callable[..., Any]:
+    return lambda env, *step: (*step[:4], {"is_success": value})
+
+
+def stops(env: Sound, *step: Any) -> Any:
+    raise SystemExit(3)
+
+
+class SmallSeeds(Sound):
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        assert seed is not None
+        if not 5 <= seed < 100:
+            raise IndexError(f"level {seed} is not there")
+        return super().reset(seed=seed)
+
+
+class OldReset(Sound):
+    def reset(self, **arguments: Any) -> Any:
+        return super().reset(**arguments)[0]
+
+
+class OneNumber(Sound):
+    def seen(self) -> Any:
+        return super().seen() | {"achieved_goal": np.float32(1)}
+
+
+@pytest.mark.parametrize(
+    ("kind", "problem"),
+    [
+        (changed(bonus), "a step gave a reward of 10, its goals have one of 0"),
+        (changed(cost), "compute_reward is not the whole reward of a step"),
+        (
+            changed(old_step),
+            "step() must return (observation, reward, terminated, truncated, info)",
+        ),
+        (changed(says("False")), "info['is_success'] must be a bool, or the number 0 or 1, got 'F"),
+        (changed(says(0.7)), "step 1: info['is_success'] must be a bool, or the number 0 or 1"),
+        (changed(stops), "step() must not raise, it raised SystemExit: 3 ("),
+        (OldReset, "reset() must return (observation, info) with a dictionary info"),
+        (OneNumber, "achieved_goal must have shape (2,), as its space declares"),
+        (SmallSeeds, "reset(seed=0) must not raise, it raised IndexError: level 0 is not there"),
+    ],
+)
+def test_what_training_would_stumble_over_is_a_problem(
+    kind: type[Sound], problem: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (line,) = probed(monkeypatch, kind, hindsight=True).problems
+    assert problem in line
+
+
+def test_seeds_are_tried_at_both_ends_of_their_range(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert not probed(monkeypatch, SmallSeeds, hindsight=True, seed_range=(5, 99)).problems
+    (line,) = probed(monkeypatch, SmallSeeds, seed_range=(5, 100)).problems
+    assert line.startswith("reset must accept all seeds of seed_range, 5 to 100: reset(seed=100)")
+    assert line.endswith("seed_range: [5, N] declares N as the largest")
+
+
+class OwnSeeds(Sound):
+    def reset(self, **arguments: Any) -> Any:
+        return super().reset()
+
+
+class Unseeded(Sound):
+    def step(self, action: Any) -> Any:
+        return super().step(action + np.random.default_rng().uniform(-0.1, 0.1, 2))
+
+
+class Extra(Sound):
+    def seen(self) -> Any:
+        return super().seen() | {"force": np.ones(3)}
+
+
+class Stubborn(Sound):
+    def close(self) -> None:
+        raise RuntimeError("it is\ngone")
+
+
+@pytest.mark.parametrize(
+    ("kind", "remark"),
+    [
+        (OwnSeeds, "must fix an episode; the second time it began with another observation"),
+        (
+            Unseeded,
+            "must fix an episode; the second time it began the same, and differed by step 1",
+        ),
+        (Extra, "the observation's force is not used"),
+        (Stubborn, "close() must not raise, it raised RuntimeError: it is gone ("),
+        (
+            changed(lambda env, *step: (*step[:4], {"is_success": True} if step[1] == 9 else {})),
+            "success_key 'is_success' was not in info in 3000 random steps (keys: none)",
+        ),
+        (changed(lambda env, *step: (*step[:4], {"success": 1})), "(did you mean 'success'?)"),
+    ],
+)
+def test_what_a_user_should_know_is_a_remark(
+    kind: type[Sound], remark: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = probed(monkeypatch, kind)
+    assert made.problems == []
+    (line,) = made.remarks
+    assert remark in line
+
+
+def test_a_success_key_that_only_a_success_has_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    def rare(env: Sound, *step: Any) -> Any:
+        return *step[:4], {"is_success": True} if step[1] == 0 else {}
+
+    made = probed(monkeypatch, changed(rare))
+    assert (made.problems, made.remarks) == ([], [])
+
+
+def test_a_misspelled_success_key_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    (line,) = probed(monkeypatch, Sound, success_key="is_succes").problems
+    assert line.endswith("(is_success), got 'is_succes' (did you mean 'is_success'?)")
