@@ -27,6 +27,14 @@ esac
   exit 2
 }
 
+# SQLAlchemy 2.1 takes postgresql:// for psycopg 3, and what is installed is psycopg2.
+for name in MLFLOW_BACKEND_STORE_URI MLFLOW_AUTH_DATABASE_URI; do
+  eval "value=\$$name"
+  case "$value" in
+    postgresql://*) export "$name=postgresql+psycopg2${value#postgresql}" ;;
+  esac
+done
+
 # Readable for this user only, and gone when the server ends.
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT INT TERM

@@ -6,6 +6,7 @@ Every `--help` imports all commands: their modules load heavy libraries inside o
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import os
@@ -54,6 +55,7 @@ class Command(_KeepsExamples, TyperCommand):
         """Run the function and exit with its code."""
         sys.excepthook = _print_unexpected
         try:
+            _check_current_folder()
             code = super().invoke(ctx)
         except BadInputError as error:
             from music_rllib.redaction import for_people
@@ -99,11 +101,29 @@ def add_command(
 
 def run_app(app: typer.Typer, program: str, arguments: Sequence[str] | None = None) -> int:
     """Run the command of `arguments`, by default the process's, and return its exit code."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a terminal without α shows it as \u03b1
+            stream.reconfigure(errors="backslashreplace")
     try:
         app(None if arguments is None else list(arguments), prog_name=program)
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else int(bool(end.code))
     return 0
+
+
+def _check_current_folder() -> None:
+    """Refuse a current folder that is gone, which Ray and relative paths need.
+
+    Raises:
+        BadInputError: The folder was deleted, or may not be read.
+    """
+    try:
+        Path.cwd()
+    except OSError as error:
+        raise BadInputError(
+            f"the current folder must exist and be readable: {error.strerror}. "
+            "Change to another folder"
+        ) from error
 
 
 def called_as() -> list[str]:
@@ -169,7 +189,8 @@ def print_json(document: Any) -> None:
     """Print one JSON document; NaN and infinities, which JSON lacks, become null."""
     from music_rllib.redaction import printable
 
-    print(printable(json.dumps(_finite(document), indent=2, ensure_ascii=False, default=str)))
+    only_ascii = "utf" not in (sys.stdout.encoding or "utf-8").lower()
+    print(printable(json.dumps(_finite(document), indent=2, ensure_ascii=only_ascii, default=str)))
 
 
 def _finite(value: Any) -> Any:

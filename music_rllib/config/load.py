@@ -53,6 +53,7 @@ from music_rllib.envs.tasks import (
     UnknownTaskError,
 )
 from music_rllib.limits import MOST_RUNS, MOST_SEEDS
+from music_rllib.store.paths import expanded
 
 
 def load_sweep(
@@ -96,6 +97,11 @@ def load_sweep(
         options["seeds"] = _parsed_seeds(seeds, document.get("seeds"))
     document |= options
     findings = Findings()
+    if storage is None and isinstance(document.get("storage"), str):  # a shell expands --storage
+        try:
+            document["storage"] = expanded(document["storage"])
+        except ValueError as error:
+            findings.add(("storage",), str(error))
     config = _resolve(file, document, findings)
     if config is None:
         raise ConfigError(problem_lines(findings.problems, file, document, options, origins))

@@ -33,6 +33,12 @@ def remarks(config: SweepConfig) -> list[str]:
             if (text := _cut_off_returns(task, runs)) is not None:
                 places.setdefault(text, []).append(f"{stage.name}/{task.name}")
     lines = [f"{', '.join(where)}: {text}" for text, where in places.items()]
+    lines += [
+        f"{stage.name}: search.trials is {search.trials:,}, and the space has {search.count:,} "
+        f"points: the search ends after {search.count:,} trials"
+        for stage in config.stages
+        if (search := stage.search) is not None and (search.trials or 0) > search.count
+    ]
     if config.analysis is not None:
         stages = {stage.name: stage for stage in config.stages}
         lines += [

@@ -30,7 +30,8 @@ class MlflowSettings(StrictModel):
     """The MLflow server that metrics are logged to."""
 
     tracking_uri: str | None = None
-    """An MLflow server; null: a sqlite file and an artefact folder in the storage."""
+    """An MLflow server or database. null: a sqlite file and an artefact folder in the storage. Not
+    given: the environment variable `MLFLOW_TRACKING_URI`, and null without it."""
 
 
 class Resources(StrictModel):
@@ -96,7 +97,8 @@ class Header(StrictModel):
     seeds: tuple[Seed, ...] = Field((0,), min_length=1)
     """Every trial has runs with each. `5` is short for `[0, 1, 2, 3, 4]`."""
     storage: str = Field("results", min_length=1)
-    """Folder or bucket (`s3://`, `gs://`); the sweep's own folder is `<storage>/<name>`."""
+    """Folder or bucket (`s3://`, `gs://`); the sweep's own folder is `<storage>/<name>`. `$NAME` is
+    replaced by that environment variable."""
     mlflow: MlflowSettings = MlflowSettings()
     resources: Resources = Resources()
     checkpoints: Checkpoints = Checkpoints()

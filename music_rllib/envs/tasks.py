@@ -23,7 +23,15 @@ from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Annotated, Any, Self
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, JsonValue, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    JsonValue,
+    field_validator,
+    model_validator,
+)
 
 from music_rllib import names
 from music_rllib.limits import MOST_INDICES
@@ -108,7 +116,8 @@ class Task(BaseModel):
     """Key of `info` that says whether the goal is reached now, which it is not where a step lacks
     it; null if there is none."""
     env_kwargs: dict[str, JsonValue] = Field(default_factory=dict)
-    """Further arguments of `gymnasium.make`."""
+    """Further arguments of `gymnasium.make`, as YAML reads them: `1e2` is the float 100.0. Only
+    `max_episode_steps: 1e2` becomes an integer."""
     reward_range: tuple[float, float] | None = None
     """Smallest and largest reward of a step; null: not known. Changes no result: it tells where
     `tac.target_bounds` cut off values that can be reached."""
@@ -120,6 +129,13 @@ class Task(BaseModel):
     """Distance, in the goal's units, from which on what is achieved has moved, for
     `replay.hindsight_episodes: moved`. null: where the task's reward no longer takes it for the
     same; with dense rewards a fifth of the environment's `distance_threshold`."""
+
+    @field_validator("env_kwargs")
+    @classmethod
+    def _whole_steps(cls, value: dict[str, JsonValue]) -> dict[str, JsonValue]:
+        steps = value.get("max_episode_steps")
+        whole = isinstance(steps, float) and steps.is_integer()
+        return {**value, "max_episode_steps": int(steps)} if whole else value  # type: ignore[arg-type]
 
     @model_validator(mode="after")
     def _split_is_sound(self) -> Self:

@@ -54,7 +54,7 @@ class Run:
     @property
     def label(self) -> str:
         """`finetune/FetchPush/tac.alpha=0.1,tac.entropic_index=1.5/seed0`, unique in a sweep."""
-        values = ",".join(f"{name}={short(value)}" for name, value in self.values.items())
+        values = ",".join(f"{name}={short(value, name)}" for name, value in self.values.items())
         parts = (self.stage, self.task, self.part, values, f"seed{self.seed}")
         return "/".join(filter(None, parts))
 
@@ -287,14 +287,15 @@ def shared_runs(plan: Plan) -> list[str]:
     ]
 
 
-def short(value: Any) -> str:
-    """A grid value in a few characters."""
+def short(value: Any, setting: str) -> str:
+    """A value of a (dotted) setting in a few characters: `1.5`, `256x256` for layers, `[-20,0]`."""
     if isinstance(value, bool) or value is None:
         return {True: "true", False: "false", None: "null"}[value]
     if isinstance(value, Mapping):
-        return "{" + ",".join(f"{key}:{short(inner)}" for key, inner in value.items()) + "}"
+        return "{" + ",".join(f"{key}:{short(inner, key)}" for key, inner in value.items()) + "}"
     if isinstance(value, list | tuple):
-        return "x".join(short(inner) for inner in value)
+        items = [short(inner, "") for inner in value]
+        return "x".join(items) if setting.endswith("hidden_sizes") else f"[{','.join(items)}]"
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 

@@ -44,7 +44,7 @@ def run_name(node: Node) -> str:
     for name, value in sorted(node.values.items(), key=lambda item: item[0] not in _SHORT):
         last = name.rpartition(".")[2]
         shown = _SHORT.get(name, last if counts[last] == 1 and ":" not in name else name)
-        parts.append(f"{shown}={short(value)}")
+        parts.append(f"{shown}={short(value, name)}")
     seed = f"seed {node.run.seed}"
     return " ".join(filter(None, (*parts, seed, node.run.task.name, node.stage, node.part)))
 

@@ -18,7 +18,7 @@ from music_rllib.labels import ShortLabels
 from music_rllib.redaction import redact, redact_yaml, without_secrets
 from music_rllib.store.node_store import NodeStore, damage_in_words
 from music_rllib.store.object_folder import DamagedError, StorageError
-from music_rllib.store.paths import absolute_database
+from music_rllib.store.paths import database_url
 from music_rllib.store.run_record import RunResult
 
 
@@ -140,7 +140,7 @@ def _configuration(config: SweepConfig) -> dict[str, Any]:
     """The whole configuration without secrets, in words that mean the same elsewhere."""
     document: dict[str, Any] = json.loads(as_json(without_secrets(config.document)))
     if uri := (document.get("mlflow") or {}).get("tracking_uri"):
-        document["mlflow"]["tracking_uri"] = absolute_database(uri)
+        document["mlflow"]["tracking_uri"] = database_url(uri)
     for stage, resolved in zip(document["stages"], config.stages, strict=True):
         if resolved.source and resolved.source.checkpoint:
             stage["init_from"]["checkpoint"] = f"{IN_STORAGE}{resolved.source.checkpoint.key}"

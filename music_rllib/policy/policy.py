@@ -32,6 +32,7 @@ from music_rllib.store.handoff import (
     read_handoff,
 )
 from music_rllib.store.object_folder import MANIFEST, ObjectFolders, StorageError, open_storage
+from music_rllib.store.paths import database_url
 
 RUN_FILE = "run.json"
 """File with a run's settings, in its node and in its checkpoints."""
@@ -243,7 +244,10 @@ def _from_mlflow(uri: str, env: str | Sequence[Task]) -> Policy:
 
     try:
         with TemporaryDirectory() as folder:
-            model = mlflow.artifacts.download_artifacts(uri, dst_path=folder)
+            server = database_url(mlflow.get_tracking_uri())
+            model = mlflow.artifacts.download_artifacts(
+                artifact_uri=uri, dst_path=folder, tracking_uri=server
+            )
             return policy_from_folder(Path(model), env)
     except MlflowException as error:
         raise PolicyError(

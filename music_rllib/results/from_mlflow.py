@@ -18,6 +18,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import unquote
 
 import numpy as np
 from filelock import FileLock
@@ -183,7 +184,7 @@ def _open(store: TrackingStore) -> MlflowClient:
 def _sqlite_file(store: TrackingStore) -> Path | None:
     if not store.uri.startswith("sqlite"):
         return None
-    return Path(store.uri.partition(":///")[2].partition("?")[0])
+    return Path(unquote(store.uri.partition(":///")[2].partition("?")[0]))
 
 
 def _parent(

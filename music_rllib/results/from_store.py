@@ -47,7 +47,7 @@ class Condition:
     @property
     def label(self) -> str:
         """`q = 1.5, alpha = 0.1`, or the stage where nothing varies."""
-        pairs = [f"{symbol(name)} = {short(value)}" for name, value in self.values.items()]
+        pairs = [f"{symbol(name)} = {short(value, name)}" for name, value in self.values.items()]
         return ", ".join(pairs) or self.stage
 
     def estimate(self) -> Estimate:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import socket
+import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,13 @@ if TYPE_CHECKING:
     from music_rllib.config.schema import Resources
 
 REACH_SECONDS = 5.0
+SOCKET_BYTES = 107
+"""Longest path of a UNIX socket on Linux."""
+RAY_FOLDER = "mr-"
+"""Beginning of the name of a local Ray's folder."""
+LONGEST_SOCKET = len(
+    f"/{RAY_FOLDER}12345678/r/session_2026-11-26_07-59-49_813210_4194304/sockets/plasma_store"
+)
 MEMORY_LIMITS = ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory.max")
 """Files with a container's memory limit, for either version of cgroups."""
 
@@ -50,6 +58,29 @@ def check_reachable(address: str) -> None:
         raise ClusterError(
             f"RAY_ADDRESS must be HOST:PORT of a Ray cluster that answers, got {address!r}: {error}"
         ) from error
+
+
+def ray_parent() -> Path:
+    """Folder in which a local Ray may have one: the paths of its sockets below it fit.
+
+    The first that fits of RAY_TMPDIR, the system's folder for temporary files (TMPDIR), /tmp and a
+    few others. Batch systems often set a long TMPDIR.
+
+    Raises:
+        ClusterError: None of them fits and is writable.
+    """
+    given, *last = map(os.environ.get, ("RAY_TMPDIR", "XDG_RUNTIME_DIR", "HOME"))
+    common = ("/tmp", "/var/tmp")  # noqa: S108 - the folder in it gets a random name and mode 0700
+    places = [Path(p).absolute() for p in (given, tempfile.gettempdir(), *common, *last) if p]
+    for place in places:
+        fits = len(os.fsencode(place)) + LONGEST_SOCKET <= SOCKET_BYTES
+        if fits and os.access(place, os.W_OK | os.X_OK):
+            return place
+    most = SOCKET_BYTES - LONGEST_SOCKET
+    raise ClusterError(
+        f"RAY_TMPDIR must be a writable folder with a path of at most {most} bytes, for Ray's "
+        f"sockets; got none among {', '.join(dict.fromkeys(map(str, places)))}"
+    )
 
 
 def check_cpus(resources: Resources) -> int | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import math
+import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,7 +15,13 @@ import ray
 from music_rllib.config.schema import Resources
 from music_rllib.errors import first_line
 from music_rllib.runtime import autoscaler
-from music_rllib.runtime.machine import ClusterError, check_cpus, cluster_address
+from music_rllib.runtime.machine import (
+    RAY_FOLDER,
+    ClusterError,
+    check_cpus,
+    cluster_address,
+    ray_parent,
+)
 from music_rllib.runtime.quiet import quiet_third_parties
 
 OBJECT_STORE_BYTES = 128 * 2**20
@@ -55,6 +62,10 @@ class Room:
         )
 
 
+_files = contextlib.ExitStack()
+"""Removes the folder of this process's local Ray."""
+
+
 def start_ray(**local_options: Any) -> None:
     """Connect to the cluster of RAY_ADDRESS, or start a local Ray with these options.
 
@@ -64,8 +75,13 @@ def start_ray(**local_options: Any) -> None:
     address = cluster_address()
     options: dict[str, Any] = {}
     if address is None:
+        # Ray lets every user write to its folder, sockets included: the one above it is ours alone.
+        folder = tempfile.TemporaryDirectory(
+            prefix=RAY_FOLDER, dir=ray_parent(), ignore_cleanup_errors=True
+        )
+        options = {"_temp_dir": f"{_files.enter_context(folder)}/r", **local_options}
         # Never a Ray that happens to run on this machine.
-        options = {"address": "local", "include_dashboard": False, **local_options}
+        options |= {"address": "local", "include_dashboard": False}
     try:
         ray.init(
             runtime_env={"worker_process_setup_hook": quiet_third_parties},
@@ -74,6 +90,7 @@ def start_ray(**local_options: Any) -> None:
             **options,
         )
     except Exception as error:  # plain ones, too: for a node that is not up within 30 s
+        stop_ray()
         cause = first_line(error)
         if address is None:
             raise ClusterError(
@@ -82,6 +99,12 @@ def start_ray(**local_options: Any) -> None:
         raise ClusterError(
             f"RAY_ADDRESS must be a Ray cluster that can be reached, got {address!r}: {cause}"
         ) from error
+
+
+def stop_ray() -> None:
+    """Leave Ray; a local one ends and leaves no files."""
+    ray.shutdown()
+    _files.close()
 
 
 @contextlib.contextmanager
@@ -96,7 +119,7 @@ def cluster(resources: Resources) -> Iterator[Room]:
     try:
         yield _room(resources)
     finally:
-        ray.shutdown()
+        stop_ray()
 
 
 def check_fits(resources: Resources) -> str | None:

@@ -175,7 +175,9 @@ def _best_trial(
 
 def best_in_words(best: Mapping[str, Any]) -> str:
     """The result of `best_so_far` in a line."""
-    values = ", ".join(f"{symbol(name)} = {short(value)}" for name, value in best["values"].items())
+    values = ", ".join(
+        f"{symbol(name)} = {short(value, name)}" for name, value in best["values"].items()
+    )
     number = with_interval(best["value"], best["interval"])
     runs, planned = best["runs"], best.get("planned", best["runs"])
     level = f" and {best['level']} more" if best.get("level") else ""  # the first of equals

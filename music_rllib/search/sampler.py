@@ -3,13 +3,15 @@
 Each trial has a sampler of its own, seeded by the study's seed and the trial's number, which sees
 the results of exactly the trials up to `number - concurrent`. So it doesn't matter in which order
 runs finish, how many drivers there are, or whether the study was interrupted: the points are the
-same.
+same. No trial has the point of an earlier one, as long as there are others: the sampler is asked
+again, and where it insists, the trial gets the nearest point that is left.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import random
 import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -30,6 +32,10 @@ from music_rllib.config.search.settings import SearchSettings
 from music_rllib.config.search.space import Choice, Dimension, FloatRange, IntRange
 from music_rllib.search.study_record import VALUES
 
+ATTEMPTS = 8
+"""Proposals that a sampler makes for a trial before the nearest point that is left is taken."""
+DRAWS = 200
+"""Random points that are drawn where points cannot be counted."""
 DIGITS = 6
 """Significant digits of a proposed number: more would make a point's hash depend on the last bit of
 a machine's logarithm."""
@@ -50,7 +56,6 @@ class Proposer:
         self._settings = settings
         self._points = list(points)
         self._prior = list(prior)
-        self._grid = settings.grid() if settings.sampler == "grid" else []
 
     def propose(
         self, number: int, judged: Sequence[FrozenTrial], running: Sequence[FrozenTrial]
@@ -62,8 +67,13 @@ class Proposer:
             judged: Trials 0 to `number - concurrent`, all of them ended.
             running: The trials after those and before `number`, whose points are known.
         """
-        if self._grid:
-            return trial_at(self._settings.space, self._grid[number])
+        space = self._settings.space
+        if self._settings.sampler == "grid":
+            return trial_at(space, (self._settings.points or [])[number])
+        tried = {_name(space, trial.user_attrs[VALUES]) for trial in (*judged, *running)}
+        given = self._points[number] if number < len(self._points) else {}
+        if given and _name(space, given) in tried:
+            given = {}
         study = optuna.create_study(
             directions=[
                 "maximize" if o.maximised else "minimize" for o in self._settings.objectives
@@ -79,26 +89,53 @@ class Proposer:
                     distributions=dict(other.distributions),
                 )
             )
-        given = self._points[number] if number < len(self._points) else {}
+        countable = self._settings.points is not None
+        for attempt in range(ATTEMPTS if countable else ATTEMPTS + 2 * DRAWS):
+            if attempt == ATTEMPTS:
+                study.sampler = RandomSampler(seed=self._seed(number) ^ 1)
+            if attempt == ATTEMPTS + DRAWS:  # every point that is left has another value
+                given = {}
+            values = self._asked(study, given)
+            if _name(space, values) not in tried:
+                break
+        else:
+            values = self._nearest(values, tried, given, self._seed(number)) or values
+        system_attrs = dict(study.get_trials(deepcopy=False)[-1].system_attrs)
+        system_attrs.pop("fixed_params", None)
+        return trial_at(space, values, system_attrs=system_attrs)
+
+    def _asked(self, study: optuna.Study, given: Mapping[str, Any]) -> dict[str, Any]:
+        """A point of the sampler's, with the values that are `given`."""
         if given:
             study.enqueue_trial(_encoded(self._settings.space, given))
+        values: dict[str, Any] = {}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ExperimentalWarning)
             trial = study.ask()
-            values: dict[str, Any] = {}
             for name, dimension in self._settings.space.items():
                 if dimension.applies(values):
                     values[name] = _suggest(trial, name, dimension)
                     if name in given and isinstance(dimension, FloatRange):
                         values[name] = float(given[name])  # not rounded: a person wrote it
-        system_attrs = dict(study.get_trials(deepcopy=False)[-1].system_attrs)
-        system_attrs.pop("fixed_params", None)
-        return trial_at(self._settings.space, values, system_attrs=system_attrs)
+        return values
+
+    def _nearest(
+        self, values: Mapping[str, Any], tried: set[str], given: Mapping[str, Any], seed: int
+    ) -> dict[str, Any] | None:
+        """The nearest point that is not tried, one with `given` values if there is any."""
+        space = self._settings.space
+        left = [p for p in self._settings.points or () if _name(space, p) not in tried]
+        fitting = [p for p in left if all(same(p.get(name), given[name]) for name in given)]
+        left = fitting or left
+        random.Random(seed).shuffle(left)
+        return min(left, key=lambda point: _distance(space, values, point), default=None)
+
+    def _seed(self, number: int) -> int:
+        digest = hashlib.sha256(f"{self._settings.seed}/{number}".encode()).digest()
+        return int.from_bytes(digest[:4], "big")
 
     def _sampler(self, number: int) -> BaseSampler:
-        settings = self._settings
-        digest = hashlib.sha256(f"{settings.seed}/{number}".encode()).digest()
-        seed = int.from_bytes(digest[:4], "big")
+        settings, seed = self._settings, self._seed(number)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ExperimentalWarning)
             match settings.sampler:
@@ -120,6 +157,27 @@ class Proposer:
                 case "nsga2":
                     return NSGAIISampler(population_size=settings.population, seed=seed)
         return RandomSampler(seed=seed)
+
+
+def _name(space: Mapping[str, Dimension], values: Mapping[str, Any]) -> str:
+    """A text that equal points share: as their dimensions spell them, to a machine's last bits."""
+    spelt = _encoded(space, values)
+    numbers = (name for name in values if not isinstance(space[name], Choice))
+    return _json(spelt | {name: f"{values[name]:.12g}" for name in numbers})
+
+
+def _distance(
+    space: Mapping[str, Dimension], one: Mapping[str, Any], other: Mapping[str, Any]
+) -> float:
+    """Sum over the dimensions: 1 for another choice, or the share of the range between numbers."""
+    total = 0.0
+    for name, dimension in space.items():
+        if name in one and name in other and not isinstance(dimension, Choice):
+            low, high = dimension.bounds
+            total += abs(one[name] - other[name]) / (high - low)
+        else:
+            total += not same(one.get(name), other.get(name))
+    return total
 
 
 def trial_at(

@@ -19,6 +19,7 @@ from sqlalchemy.exc import ArgumentError, IntegrityError, ProgrammingError, SQLA
 from music_rllib.errors import first_line
 from music_rllib.redaction import redact
 from music_rllib.store.object_folder import StorageError
+from music_rllib.store.paths import database_url, sqlite_url
 
 DATABASE_ERRORS = (StorageInternalError, SQLAlchemyError)
 """Errors of a database that doesn't answer, or not now."""
@@ -104,14 +105,12 @@ def _place(url: str) -> str:
 
 
 def _parsed(url: str, setting: str) -> URL:
-    parsed = make_url(url if "://" in url else f"sqlite:///{Path(url).expanduser()}")
+    parsed = make_url(database_url(url if "://" in url else sqlite_url(Path(url).expanduser())))
     if parsed.password:
         raise StorageError(
             f"{setting} must not hold a password, got one in {redact(url)}: put it into the "
             "environment as PGPASSWORD, or into ~/.pgpass"
         )
-    if parsed.drivername == "postgresql":
-        parsed = parsed.set(drivername="postgresql+psycopg2")
     return parsed
 
 

@@ -68,7 +68,7 @@ class Study:
         self._storage = storage
         self._arm = dict(arm)
         self.identity = Identity(
-            base="/".join((base, *(f"{name}={short(value)}" for name, value in arm.items()))),
+            base="/".join((base, *(f"{name}={short(value, name)}" for name, value in arm.items()))),
             fingerprint=content_key([_of_study(settings), {**determined_by, "arm": self._arm}]),
             search=f"{base} @{content_key([_of_study(settings), determined_by])}",
         )

@@ -68,6 +68,7 @@ def make_api(facts: PolicyFacts, act: Act, token_sha256: str | None = None) -> F
         docs_url=None,
         redoc_url=None,
     )
+    api.add_middleware(_Lenient)
     api.add_middleware(_BodyLimit, limit=body.max_bytes)
     api.add_exception_handler(RequestValidationError, _invalid)
     api.add_exception_handler(StarletteHTTPException, _refused)
@@ -156,6 +157,22 @@ async def _invalid(_: Request, error: Exception) -> JSONResponse:
     more = f" (the first {SHOWN} of {len(findings)} problems)" if len(findings) > SHOWN else ""
     rule = f"the body must be an observation of this task{more}"
     return _failure(422, Failure(error=rule, problems=problems))
+
+
+class _Lenient:
+    """Middleware that takes HEAD for GET, and any body for JSON, whatever its header says."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "http":
+            headers = [header for header in scope["headers"] if header[0] != b"content-type"]
+            # The server itself leaves out the body of an answer to HEAD.
+            method = "GET" if scope["method"] == "HEAD" else scope["method"]
+            json_header = (b"content-type", b"application/json")
+            scope = {**scope, "method": method, "headers": [*headers, json_header]}
+        await self._app(scope, receive, send)
 
 
 class _BodyLimit:

@@ -177,7 +177,7 @@ def _connect(settings: ServeSettings) -> None:
     """Start a local Ray, or connect to RAY_ADDRESS; refuse replicas that can never start."""
     import ray
 
-    from music_rllib.runtime.ray_cluster import start_ray
+    from music_rllib.runtime.ray_cluster import start_ray, stop_ray
 
     start_ray()
     _on_signals(_interrupt)  # Ray's own handler of SIGTERM would end the process at once
@@ -187,7 +187,7 @@ def _connect(settings: ServeSettings) -> None:
     except BadInputError:
         if cluster_address() is not None and _waits_for_nodes(settings):
             return
-        ray.shutdown()
+        stop_ray()
         raise
 
 
@@ -222,9 +222,9 @@ ANSWER_SECONDS = 60.0
 
 def _serve(policy: Policy, settings: ServeSettings, host: str, port: int, limits: Limits) -> None:
     """Serve until a signal comes, then leave Ray; where that dies, end the process."""
-    import ray
     from ray import serve as ray_serve
 
+    from music_rllib.runtime.ray_cluster import stop_ray
     from music_rllib.serve.application import application
 
     listening = False
@@ -247,7 +247,7 @@ def _serve(policy: Policy, settings: ServeSettings, host: str, port: int, limits
         # Others may serve on a cluster too; a local Ray ends with all that runs on it.
         if listening and cluster_address() is not None:
             ray_serve.delete(APPLICATION)
-        ray.shutdown()
+        stop_ray()
         if listening:
             print("Stopped.", flush=True)
 

@@ -19,6 +19,7 @@ import uuid
 from collections.abc import Callable, Container, Iterator
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, Literal
+from urllib.parse import quote
 
 import pyarrow.fs as pafs
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue, ValidationError
@@ -88,6 +89,14 @@ class Manifest(BaseModel):
     """Data of the folder's owner."""
 
 
+def encoded(uri: str) -> str:
+    """A storage for pyarrow, which decodes a bucket's keys; ours are as they are in the bucket."""
+    if "://" not in uri or uri.startswith("file://"):
+        return uri
+    bucket, _, key = uri.partition("://")[2].partition("?")[0].partition("/")
+    return uri.replace(f"{bucket}/{key}", f"{bucket}/{quote(key)}", 1)
+
+
 def open_storage(uri: str) -> tuple[pafs.FileSystem, str]:
     """Open a folder or bucket.
 
@@ -104,7 +113,7 @@ def open_storage(uri: str) -> tuple[pafs.FileSystem, str]:
     try:
         if "://" not in uri:
             uri = str(Path(uri).expanduser().absolute())
-        filesystem, root = pafs.FileSystem.from_uri(uri)
+        filesystem, root = pafs.FileSystem.from_uri(encoded(uri))
     except (OSError, ValueError, RuntimeError) as error:  # RuntimeError: nobody's home
         raise StorageError(
             f"storage must be a folder or an s3:// or gs:// URI that can be reached, "

@@ -85,12 +85,47 @@ def storage_and_name(uri: str) -> tuple[str, str]:
     return f"{above}{mark}{options}", name
 
 
-def absolute_database(uri: str) -> str:
-    """An sqlite file's URI that means the same in every working directory; others as they are."""
-    path = uri.removeprefix("sqlite:///")
-    if path == uri or not path or path.startswith(("/", ":")):
-        return uri
-    return f"sqlite:///{Path(path).absolute()}"
+def sqlite_url(file: Path | str) -> str:
+    """SQLAlchemy's URL of an sqlite file, whatever characters its path has."""
+    if not {"?", "%"} & set(str(file)):
+        return f"sqlite:///{file}"
+    from sqlalchemy.engine import URL
+
+    # With its driver: MLflow makes the parent folder of `sqlite:///...` from the quoted path.
+    return URL.create("sqlite+pysqlite", database=str(file)).render_as_string()
+
+
+def database_url(url: str) -> str:
+    """A database's URL with the driver that is installed, and with an absolute path of sqlite.
+
+    SQLAlchemy 2.0 takes `postgresql://` for psycopg2, and 2.1 for psycopg 3. A relative path would
+    mean another file in every working directory.
+    """
+    scheme, _, path = url.partition("://")
+    if scheme == "postgresql":
+        return f"postgresql+psycopg2://{path}"
+    file, mark, options = path.removeprefix("/").partition("?")
+    if scheme != "sqlite" or not path.startswith("/") or not file or file.startswith(("/", ":")):
+        return url
+    return f"{sqlite_url(Path(unquote(file)).absolute())}{mark}{options}"
+
+
+def expanded(path: str) -> str:
+    """A path or URI with the values of its environment variables, `$NAME` or `${NAME}`.
+
+    Raises:
+        ValueError: A variable is not set, or is empty.
+    """
+
+    def value(match: re.Match[str]) -> str:
+        name = match[1] or match[2]
+        if not (found := os.environ.get(name)):
+            raise ValueError(
+                f"must name environment variables that are set, got {match[0]} in {redact(path)!r}"
+            )
+        return found
+
+    return re.sub(r"\$(?:(\w+)|\{(\w+)\})", value, path)
 
 
 def sweep_folder(storage: str, name: str) -> Path:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +17,7 @@ from music_rllib import names
 from music_rllib.command_line import console_for, how_to_continue, print_json
 from music_rllib.config.load import load_sweep
 from music_rllib.config.remarks import remarks
-from music_rllib.config.schema import SweepConfig
+from music_rllib.config.schema import MlflowSettings, SweepConfig
 from music_rllib.errors import FAILED, BadInputError
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.changes import (
@@ -37,7 +39,12 @@ from music_rllib.results.claims.plan import PlanVersion, as_document
 from music_rllib.results.claims.record import PLANS_TO_READ, record_plan
 from music_rllib.runtime.allocator import give_back_freed_memory
 from music_rllib.runtime.ending import try_for
-from music_rllib.runtime.machine import check_cpus, check_memory_and_gpus, cluster_address
+from music_rllib.runtime.machine import (
+    check_cpus,
+    check_memory_and_gpus,
+    cluster_address,
+    ray_parent,
+)
 from music_rllib.runtime.signals import early
 from music_rllib.store.paths import check_storage, resolve_storage, sweep_folder
 from music_rllib.sweep.driver_lock import hold_driver_lock
@@ -54,7 +61,7 @@ from music_rllib.sweep.report_at_end import report_at_end
 from music_rllib.sweep.views.alpha import adaptive_rows, adaptive_text, alpha_rows, alpha_table
 from music_rllib.sweep.views.plan_json import plan_answer
 from music_rllib.sweep.views.tables import plan_view, results_table, search_views
-from music_rllib.tracking.store import resolve_store
+from music_rllib.tracking.store import VARIABLE, resolve_store
 
 if TYPE_CHECKING:
     from music_rllib.search.controller import SearchController
@@ -113,6 +120,7 @@ def run_sweep(
         else:
             path = config or DEFAULT_CONFIG
             loaded = load_sweep(path, name=name, storage=storage, seeds=seeds, overrides=overrides)
+        loaded = _with_environment(console, loaded)
         if must_exist:
             check_begun(loaded)
         opened = _open(console, loaded, lenient=retrain_damaged and not dry_run)
@@ -136,6 +144,17 @@ def run_sweep(
         _say(console, how_to_continue())
         return 128 + number
     return code
+
+
+def _with_environment(console: Console, config: SweepConfig) -> SweepConfig:
+    """The sweep with MLFLOW_TRACKING_URI for its `mlflow.tracking_uri`, unless that is given."""
+    uri, given = os.environ.get(VARIABLE), config.document.get("mlflow") or {}
+    if not uri or "tracking_uri" in given:
+        return config
+    how = "mlflow.tracking_uri=null keeps a sqlite file in the storage"
+    _say(console, f"MLflow: {redact(uri)}, from {VARIABLE} ({how})")
+    mlflow = MlflowSettings(**given, tracking_uri=uri)
+    return replace(config, mlflow=mlflow, document={**config.document, "mlflow": vars(mlflow)})
 
 
 def _say(console: Console, text: str, style: str = "") -> None:
@@ -168,6 +187,7 @@ def _open(console: Console, config: SweepConfig, *, lenient: bool) -> Sweep:
     played = check_environments(plan, config.resources.hang_minutes)
     if cluster_address() is None:
         check_hardware(plan)
+        ray_parent()
     check_cpus(config.resources)
     check_memory_and_gpus(config.resources)
     storage, remark = resolve_storage(config.storage)

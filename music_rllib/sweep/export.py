@@ -12,10 +12,12 @@ import numpy as np
 import yaml
 
 from music_rllib import names
+from music_rllib.config.run_settings import VARIANTS
 from music_rllib.config.schema import Stage
+from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.errors import BadInputError
 from music_rllib.experiment import sweep_files
-from music_rllib.experiment.plan import Run
+from music_rllib.experiment.plan import Node, Run
 from music_rllib.experiment.session import Sweep
 from music_rllib.labels import in_runs
 from music_rllib.redaction import redact
@@ -150,9 +152,53 @@ def _export(sweep: Sweep, run: Run, folder: Path, chosen: Mapping[str, Any]) -> 
                 if target.is_dir():
                     shutil.rmtree(target)
                 part.replace(target)
-        settings = sweep.plan.node(run.key).run.model_dump(mode="json")
+        document = yaml.safe_dump(sweep_of_run(sweep, run.key, folder), sort_keys=False)
         write_atomically(folder / CHOSEN, sweep_files.as_json(chosen).encode())
-        write_atomically(folder / "run.yaml", yaml.safe_dump(settings, sort_keys=False).encode())
+        write_atomically(folder / "run.yaml", document.encode())
     except OSError as error:
         place = error.filename or folder
         raise StorageError(f"{place} must be writable: {error.strerror}") from error
+
+
+def sweep_of_run(sweep: Sweep, key: str, folder: Path) -> dict[str, Any]:
+    """A sweep's document that trains one run, and the runs that it starts from, to the same keys.
+
+    A handoff from outside that it starts from is copied from a bucket into `folder`.
+    """
+    chain = [sweep.plan.node(key)]
+    while (given := chain[0].input) is not None and given.checkpoint is None:
+        chain.insert(0, sweep.plan.node(given.key))
+    tasks = {node.run.task.name: node.run.task for node in chain}
+    environments = {
+        name: task.model_dump(mode="json", exclude={"name"})
+        for name, task in tasks.items()
+        if name not in BUILT_IN_TASKS
+    }
+    return {
+        "name": f"{sweep.config.name}-best"[:80],
+        "tasks": [chain[-1].run.task.name],
+        "seeds": [chain[-1].run.seed],
+        **({"environments": environments} if environments else {}),
+        "stages": [_stage(sweep, node, folder) for node in chain],
+    }
+
+
+def _stage(sweep: Sweep, node: Node, folder: Path) -> dict[str, Any]:
+    """A stage with all settings of a node, except those that its variant refuses."""
+    run = node.run
+    settings = run.model_dump(mode="json", exclude={"task", "variant", "seed"})
+    for dotted in VARIANTS[run.variant].without_effect:
+        group, _, name = dotted.partition(".")
+        settings[group].pop(name)
+    source: dict[str, Any] = {}
+    if (given := node.input) is not None and given.checkpoint is None:
+        place = {"stage": sweep.plan.node(given.key).stage}
+        source = {"init_from": place | {"task": given.task.name}}
+    elif given is not None:
+        checkpoint = sweep.store.folder(given.key)
+        if sweep_files.is_remote(sweep.storage):  # the copy that this is does not stay
+            checkpoint = shutil.copytree(checkpoint, folder / "source", dirs_exist_ok=True)
+        place = {"checkpoint": str(checkpoint.absolute())}
+        source = {"init_from": place | {"task": given.task.name}}
+    header = {"name": node.stage, "variant": run.variant, "tasks": [run.task.name]}
+    return header | source | settings

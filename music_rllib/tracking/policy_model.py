@@ -98,7 +98,7 @@ def _files(observation_size: int, goal_size: int) -> Mapping[Path, bytes]:
         example = {"observation": example, "desired_goal": goal}
     with TemporaryDirectory() as temporary:
         code, policy = Path(temporary, "policy_model.py"), Path(temporary, _POLICY_FILE.name)
-        code.write_text(Path(network.__file__).read_text() + _MODEL_CODE)
+        code.write_text(Path(network.__file__).read_text(encoding="utf-8") + _MODEL_CODE)
         policy.touch()
         folder = Path(temporary, "model")
         requirements = [f"{name}=={version(name)}" for name in ("mlflow", "numpy", "safetensors")]

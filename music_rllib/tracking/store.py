@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import shutil
 import socket
@@ -15,7 +16,7 @@ from music_rllib.errors import TrackingError
 from music_rllib.experiment import sweep_files
 from music_rllib.redaction import redact
 from music_rllib.store.object_folder import StorageError
-from music_rllib.store.paths import absolute_database
+from music_rllib.store.paths import database_url, sqlite_url
 
 if TYPE_CHECKING:
     import requests
@@ -24,6 +25,8 @@ CONNECT_SECONDS = 3.0
 ANSWER_SECONDS = 5.0
 _DATABASES = ("sqlite", "postgresql", "mysql", "mssql")
 _SERVERS = ("http", "https")
+SETTING, VARIABLE = "mlflow.tracking_uri", "MLFLOW_TRACKING_URI"
+"""The setting of a sweep, and MLflow's own variable, which stands in for an absent setting."""
 _LOW_MEMORY = "MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false"
 """Keeps a server of MLflow 3 from starting job consumers of 2.5 GB, which tracking never uses."""
 RECORD = "tracking/sweep.json"
@@ -122,7 +125,7 @@ def resolve_store(tracking_uri: str | None, storage: str) -> TrackingStore:
     """
     folder = local_folder(storage)
     if folder is None:
-        artefacts = f"{storage.rstrip('/')}/mlartifacts"
+        artefacts = f"{storage.partition('?')[0].rstrip('/')}/mlartifacts"
     else:
         artefacts = (folder / "mlartifacts").as_uri()
     if tracking_uri is None:
@@ -133,11 +136,11 @@ def resolve_store(tracking_uri: str | None, storage: str) -> TrackingStore:
                 "Name an MLflow server there."
             )
         database = folder / "mlflow.db"
-        return TrackingStore(
-            uri=f"sqlite:///{database}", artefact_root=artefacts, database=database
-        )
+        return TrackingStore(uri=sqlite_url(database), artefact_root=artefacts, database=database)
     is_server = _checked_scheme(tracking_uri) in _SERVERS
-    uri = absolute_database(tracking_uri)
+    uri, known = database_url(tracking_uri), database_url(os.environ.get(VARIABLE, ""))
+    if redact(known) == uri:  # a sweep keeps its URI without the password
+        uri = known
     return TrackingStore(uri=uri, artefact_root=None if is_server else artefacts)
 
 
@@ -202,7 +205,7 @@ def _checked_scheme(uri: str) -> str:
     scheme = uri.partition("://")[0].partition("+")[0] if "://" in uri else ""
     if scheme not in (*_SERVERS, *_DATABASES):
         raise TrackingError(
-            "mlflow.tracking_uri must be null (a sqlite file in the storage folder), "
+            f"{_origin(uri)} must be null (a sqlite file in the storage folder), "
             f"http(s)://HOST:PORT or a database URI ({', '.join(_DATABASES)}), got {redact(uri)!r}"
         )
     try:
@@ -212,16 +215,23 @@ def _checked_scheme(uri: str) -> str:
         names_a_host = False
     if scheme in _SERVERS and not names_a_host:
         raise TrackingError(
-            f"mlflow.tracking_uri must name a host and a numeric port, got {redact(uri)!r}"
+            f"{_origin(uri)} must name a host and a numeric port, got {redact(uri)!r}"
         )
     return scheme
 
 
 def _unreachable(store: TrackingStore, reason: str) -> TrackingError:
     return TrackingError(
-        f"mlflow.tracking_uri must name an MLflow server that answers, got {store.public_uri}: "
+        f"{_origin(store.uri)} must name an MLflow server that answers, got {store.public_uri}: "
         f"{reason}. Start that server, correct the URI, or leave it null for a local sqlite file."
     )
+
+
+def _origin(uri: str) -> str:
+    """The name of what has set this URI, for messages."""
+    if uri != database_url(os.environ.get(VARIABLE, "")):
+        return SETTING
+    return f"{SETTING} (from the environment variable {VARIABLE})"
 
 
 def _reason(store: TrackingStore, error: requests.RequestException) -> str:

@@ -2,22 +2,81 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 from urllib.parse import quote
 from urllib.request import urlopen
 
 import pytest
+import requests
 
 from tests.ports import free_port
 
 PATIENCE = 180.0
+SCRIPT = Path(__file__).parents[2] / "cluster" / "mlflow-server.sh"
+USER = "music"
+"""First user of `server_script`."""
+
+
+@contextlib.contextmanager
+def server_script(folder: Path, password: str, *databases: str) -> Iterator[str]:
+    """`cluster/mlflow-server.sh` on loopback, with databases of runs and of users; its URI."""
+    port = free_port()
+    folder.mkdir()
+    runs, users = databases or (f"sqlite:///{folder}/runs.db", f"sqlite:///{folder}/users.db")
+    environment = os.environ | {
+        "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
+        "TMPDIR": str(folder),
+        "MLFLOW_BACKEND_STORE_URI": runs,
+        "MLFLOW_AUTH_DATABASE_URI": users,
+        "MLFLOW_ADMIN_USERNAME": USER,
+        "MLFLOW_ADMIN_PASSWORD": password,
+        "MLFLOW_FLASK_SERVER_SECRET_KEY": "planted-flask-key",
+        "MLFLOW_ARTIFACTS": str(folder / "artefacts"),
+        "MLFLOW_PORT": str(port),
+        "MLFLOW_WORKERS": "1",
+    }
+    with (folder / "log").open("w") as log:
+        process = subprocess.Popen(
+            ["sh", SCRIPT],
+            cwd=folder,
+            env=environment,
+            stdout=log,
+            stderr=log,
+            start_new_session=True,
+        )
+    try:
+        uri = f"http://127.0.0.1:{port}"
+        _wait_for(uri, process, folder / "log")
+        yield uri
+    finally:
+        process.terminate()
+        try:
+            process.wait(timeout=60)
+        finally:
+            # Whatever a hard end left; the group is ours.
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+    assert not list(folder.rglob("basic_auth.ini")), "the server must delete its password's file"
+
+
+def _wait_for(uri: str, process: subprocess.Popen[Any], log: Path) -> None:
+    for _ in range(600):
+        assert process.poll() is None, log.read_text()
+        try:
+            if requests.get(f"{uri}/health", timeout=5).ok:
+                return
+        except requests.ConnectionError:
+            time.sleep(0.2)
+    pytest.fail(log.read_text())
 
 
 class MlflowServer:

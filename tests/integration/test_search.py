@@ -15,10 +15,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import requests
+from sqlalchemy import create_engine, inspect, text
 
 from music_rllib import names
 from music_rllib.search.storage import known_studies
+from music_rllib.store.paths import database_url
+from music_rllib.tracking.store import resolve_store
 from tests.faults import comparison
+from tests.integration.mlflow_server import USER, server_script
 from tests.ports import free_port
 
 pytestmark = pytest.mark.integration
@@ -238,14 +243,12 @@ DRIVER = """
 def test_a_plan_leaves_nothing_in_a_database(
     postgresql: str, sweep_program: Any, sweep_document: Document
 ) -> None:
-    from sqlalchemy import create_engine, inspect
-
     document = searched(sweep_document)
     document["stages"][0]["search"] |= {"storage": postgresql}
     sweep_program.write(document)
     code, _, complaint = command(sweep_program, "plan", "sweep.yaml")
     assert code == 0, complaint
-    engine = create_engine(postgresql.replace("postgresql:", "postgresql+psycopg2:"))
+    engine = create_engine(database_url(postgresql))
     assert inspect(engine).get_table_names() == []
     engine.dispose()
     assert known_studies(postgresql) == []
@@ -270,6 +273,7 @@ def test_two_drivers_on_postgresql_lose_and_double_no_trial(
         )
     ended = [driver.communicate(timeout=240) for driver in drivers]
     assert [driver.returncode for driver in drivers] == [0, 0], ended
+    _check_mlflow(postgresql, tmp_path)
     found = [json.loads(output.splitlines()[-1]) for output, _ in ended]
     (mine, trials), (theirs, the_same) = found
     assert trials == the_same
@@ -277,3 +281,23 @@ def test_two_drivers_on_postgresql_lose_and_double_no_trial(
     assert sorted([*mine, *theirs]) == sorted(f"trial{number}" for number in range(24)), "once each"
     assert mine
     assert theirs
+
+
+def _check_mlflow(postgresql: str, folder: Path) -> None:
+    """The server of `cluster/` and a direct `mlflow.tracking_uri` reach the same database."""
+    from mlflow import MlflowClient
+
+    server, _, _ = postgresql.rpartition("/")
+    engine = create_engine(database_url(postgresql), isolation_level="AUTOCOMMIT")
+    with engine.connect() as connection:
+        for name in ("mlflow", "mlflow_auth"):
+            connection.execute(text(f"CREATE DATABASE {name}"))
+    engine.dispose()
+    databases = (f"{server}/mlflow", f"{server}/mlflow_auth")
+    with server_script(folder / "server", "correct-horse-battery", *databases) as uri:
+        url = f"{uri}/api/2.0/mlflow/experiments/create"
+        assert requests.post(url, json={"name": "shared"}, timeout=60).status_code == 401
+        user = (USER, "correct-horse-battery")
+        requests.post(url, json={"name": "shared"}, auth=user, timeout=60).raise_for_status()
+    store = resolve_store(databases[0], str(folder))
+    assert MlflowClient(store.uri).get_experiment_by_name("shared") is not None

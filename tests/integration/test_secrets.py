@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import stat
-import subprocess
-import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,10 +11,10 @@ import pytest
 import requests
 
 from music_rllib.redaction import redact
-from tests.ports import free_port
+from tests.integration.mlflow_server import USER, server_script
 
 ROOT = Path(__file__).parents[2]
-USER, PASSWORD = "music", "planted-mlflow-password"
+PASSWORD = "planted-mlflow-password"
 PLANTED = {
     "MLFLOW_TRACKING_USERNAME": USER,
     "MLFLOW_TRACKING_PASSWORD": PASSWORD,
@@ -34,54 +29,8 @@ SECRETS = [value for name, value in PLANTED.items() if "planted" in value]
 @pytest.fixture
 def mlflow_server(tmp_path: Path) -> Iterator[str]:
     """`cluster/mlflow-server.sh` on loopback, with sqlite; its URI."""
-    port = free_port()
-    folder = tmp_path / "server"
-    folder.mkdir()
-    environment = os.environ | {
-        "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
-        "TMPDIR": str(folder),
-        "MLFLOW_BACKEND_STORE_URI": f"sqlite:///{folder}/runs.db",
-        "MLFLOW_AUTH_DATABASE_URI": f"sqlite:///{folder}/users.db",
-        "MLFLOW_ADMIN_USERNAME": USER,
-        "MLFLOW_ADMIN_PASSWORD": PASSWORD,
-        "MLFLOW_FLASK_SERVER_SECRET_KEY": "planted-flask-key",
-        "MLFLOW_ARTIFACTS": str(folder / "artefacts"),
-        "MLFLOW_PORT": str(port),
-        "MLFLOW_WORKERS": "1",
-    }
-    with (folder / "log").open("w") as log:
-        process = subprocess.Popen(
-            ["sh", ROOT / "cluster" / "mlflow-server.sh"],
-            cwd=folder,
-            env=environment,
-            stdout=log,
-            stderr=log,
-            start_new_session=True,
-        )
-    try:
-        uri = f"http://127.0.0.1:{port}"
-        wait_for(uri, process, folder / "log")
+    with server_script(tmp_path / "server", PASSWORD) as uri:
         yield uri
-    finally:
-        process.terminate()
-        try:
-            process.wait(timeout=60)
-        finally:
-            # Whatever a hard end left; the group is ours.
-            if process.poll() is None:
-                os.killpg(process.pid, signal.SIGKILL)
-    assert not list(folder.rglob("basic_auth.ini")), "the server must delete its password's file"
-
-
-def wait_for(uri: str, process: subprocess.Popen[Any], log: Path) -> None:
-    for _ in range(600):
-        assert process.poll() is None, log.read_text()
-        try:
-            if requests.get(f"{uri}/health", timeout=5).ok:
-                return
-        except requests.ConnectionError:
-            time.sleep(0.2)
-    pytest.fail(log.read_text())
 
 
 def holders(folder: Path, secrets: list[str]) -> list[tuple[str, str]]:

@@ -18,6 +18,7 @@ import requests
 
 from benchmarks.serve import half_sent, memory, random_policy, storm
 from music_rllib.policy import Policy, load_policy
+from music_rllib.runtime.machine import RAY_FOLDER, ray_parent
 from music_rllib.serve.command import main
 from tests.integration.conftest import listening
 from tests.ports import free_port
@@ -104,9 +105,9 @@ def test_the_token_is_needed_and_kept_out_of_sight(service: Service) -> None:
     health = requests.get(f"{service.url}/health", timeout=60)
     assert health.json() == {"status": "ok", "task": "FetchPush"}
     # What Ray notes of this session: arguments of deployments, environments, logs.
-    sessions = Path(os.environ.get("RAY_TMPDIR", "/tmp"), "ray")
+    folder = ray_parent()
     # An older one may have had the same process id.
-    session = max(sessions.glob(f"session_*_{service.process.pid}"))
+    session = max(folder.glob(f"{RAY_FOLDER}*/r/session_*_{service.process.pid}"))
     notes = [path for path in session.rglob("*") if path.is_file()]
     assert len(notes) > 10
     for path in notes:

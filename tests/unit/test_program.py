@@ -58,6 +58,43 @@ def examples() -> list[list[str]]:
     return found
 
 
+def test_a_terminal_of_ascii_and_a_deleted_folder_make_no_traceback(tmp_path: Path) -> None:
+    folder = tmp_path / "gone"
+    folder.mkdir()
+    (tmp_path / "α.yaml").write_text("name: α\n", encoding="utf-8")
+    code = """
+import io, json, os, sys
+from music_rllib.program import main
+from music_rllib.command_line import console_for, print_json
+raw = sys.stdout = io.TextIOWrapper(io.BytesIO(), "ascii")
+assert main(["plan", "../α.yaml"]) == 2
+console_for().print("α ≥ 1")
+print_json({"α": 1})
+os.rmdir(os.getcwd())
+for call in json.loads(sys.argv[1]):
+    assert main([*call, "x"][:2]) == 2, call
+assert main(["--version"]) == main(["run", "--help"]) == 0
+raw.flush()
+sys.stdout = sys.__stdout__
+print(raw.buffer.getvalue().decode("ascii"))
+"""
+    calls = json.dumps([["plan"], ["run"], ["compare"], ["report"], ["status"], ["best"]])
+    done = subprocess.run(
+        [sys.executable, "-c", code, calls],
+        cwd=folder,
+        env=os.environ | {"PYTHONIOENCODING": "ascii", "PYTHONPATH": str(REPOSITORY)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "\\u03b1 \\u2265 1" in done.stdout
+    assert '"\\u03b1": 1' in done.stdout
+    assert "Traceback" not in done.stderr
+    assert "name must be letters" in done.stderr
+    assert r'"\u03b1"' in done.stderr
+    assert done.stderr.count("the current folder must exist and be readable: No such file") == 6
+
+
 def test_help_has_one_look(capsys: pytest.CaptureFixture[str], monkeypatch: Any) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     for words in commands():

@@ -45,6 +45,7 @@ OTHERS = {
     "pip",
     "prometheus",
 } | {
+    "mkdir",
     "optuna-dashboard",
     "sh",
 }

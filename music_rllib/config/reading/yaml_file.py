@@ -7,6 +7,7 @@ the number 186 and ``010`` is eight. Keys must be text and may not repeat; PyYAM
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -95,6 +96,9 @@ def _rule(error: yaml.YAMLError) -> str:
     return f"must be valid YAML: {getattr(error, 'problem', None) or error}"
 
 
+_LIKE_A_SPACE = re.compile(r"[^\S \t\r\n]|[\u200b\u2060\ufeff]")
+
+
 class _StrictLoader(yaml.SafeLoader):
     """PyYAML's safe loader with the scalars of YAML 1.2 and without repeated keys."""
 
@@ -116,6 +120,44 @@ class _StrictLoader(yaml.SafeLoader):
             return super().compose_node(parent, index)
         finally:
             self._depth -= 1
+
+    def scan_to_next_token(self) -> None:
+        """Skip tabs too, as YAML 1.2 has it: they separate tokens, and never indent a line."""
+        super().scan_to_next_token()
+        while self.peek() == "\t":
+            mark, ahead = self.get_mark(), 0
+            while self.peek(ahead) in {" ", "\t"}:
+                ahead += 1
+            indents = not self.buffer[self.pointer - self.column : self.pointer].strip()
+            if not self.flow_level:
+                if indents and self.peek(ahead) not in "#\r\n\0":
+                    rule = "a tab must not indent a line, use spaces"
+                    raise yaml.scanner.ScannerError(None, None, rule, mark)
+                self.allow_simple_key &= indents
+            self.forward(ahead)
+            super().scan_to_next_token()
+
+    def scan_plain_spaces(self, indent: int, start_mark: Any) -> Any:
+        """Let tabs separate the words of unquoted text, and end its lines."""
+        start = self.pointer
+        while self.peek() in {" ", "\t"}:
+            self.forward()
+        if self.peek() in "\r\n":
+            return super().scan_plain_spaces(indent, start_mark)
+        return [self.buffer[start : self.pointer]]
+
+    def scan_plain(self) -> yaml.ScalarToken:
+        """Refuse characters in unquoted text that look like a space, and are none to YAML."""
+        start, mark = self.pointer, self.get_mark()
+        token: yaml.ScalarToken = super().scan_plain()
+        if found := _LIKE_A_SPACE.search(self.buffer, start, self.pointer):
+            lines = self.buffer[start : found.start()].split("\n")
+            column = len(lines[-1]) + (mark.column if len(lines) == 1 else 0) + 1
+            mark.line += len(lines) - 1
+            what = f"U+{ord(found[0]):04X} ({unicodedata.name(found[0])})"
+            rule = f"column {column} has {what}: replace it by a space, or quote the text"
+            raise yaml.scanner.ScannerError(None, None, rule, mark)
+        return token
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
         """Construct a value; text that does not fit its tag (`!!int x`) is an error of the file."""

@@ -138,7 +138,8 @@ class SearchSettings(StrictModel):
     """Optuna's TPE, CMA-ES (numbers only) and NSGA-II (several objectives), random, or all points
     of a grid in order, at most 100,000."""
     trials: int | None = Field(None, gt=0)
-    """Number of trials; null with `grid`: all points."""
+    """Number of trials, at most the number of points; null with `grid`: all points. No point is
+    tried twice."""
     startup_trials: int = Field(5, gt=0)
     """Random trials before TPE or CMA-ES proposes."""
     population: int = Field(10, gt=1)
@@ -173,11 +174,20 @@ class SearchSettings(StrictModel):
 
     @cached_property
     def count(self) -> int:
-        """Number of trials of each study."""
-        if self.sampler != "grid":
+        """Number of trials of each study: none has the point of another one."""
+        if self.points is None:
             return self.trials or 0
-        points = len(self.grid())
-        return min(self.trials or points, points)
+        return min(self.trials or len(self.points), len(self.points))
+
+    @cached_property
+    def points(self) -> list[dict[str, Any]] | None:
+        """All points; None where they can't be counted, or are more than `MOST_GRID_POINTS`."""
+        if any(dimension.size is None for dimension in self.space.values()):
+            return None
+        try:
+            return self.grid()
+        except ValueError:
+            return None
 
     def grid(self) -> list[dict[str, Any]]:
         """All points, the last dimension varying fastest.

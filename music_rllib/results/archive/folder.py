@@ -54,7 +54,7 @@ _METRICS = {
 """Columns of the table of metrics."""
 
 _PLACES = re.compile(r"^(?P<name> *(?:storage|tracking_uri): )(?P<place>.+)$", re.MULTILINE)
-_LOCAL = re.compile(r"(sqlite:///)/(?:.*/)?([^/]+/[^/]+)|(?:file://)?/(?:.*/)?([^/]+)/*")
+_LOCAL = re.compile(r"(sqlite(?:\+\w+)?:///)/(?:.*/)?([^/]+/[^/]+)|(?:file://)?/(?:.*/)?([^/]+)/*")
 
 
 def _without_folders(place: str) -> str:

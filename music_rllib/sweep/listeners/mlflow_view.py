@@ -13,7 +13,7 @@ from typing import Any
 from music_rllib import names
 from music_rllib.experiment.plan import Plan
 
-VERSIONS = ("3.17",)
+VERSIONS = ("3.17", "3.18")
 """Versions of MLflow whose pages open such a view; others get a plain link."""
 GROUPED = {
     "tac.entropic_index": names.TAG_ENTROPIC_INDEX,

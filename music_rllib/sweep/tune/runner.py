@@ -19,6 +19,7 @@ from music_rllib.experiment.scheduler import Status
 from music_rllib.experiment.session import Sweep
 from music_rllib.runtime.machine import cluster_address
 from music_rllib.runtime.ray_cluster import cluster
+from music_rllib.store.object_folder import encoded
 from music_rllib.store.paths import below
 from music_rllib.sweep.tune.dag_searcher import DagSearcher
 from music_rllib.sweep.tune.events import RESTARTS, TuneEvents
@@ -138,7 +139,7 @@ def _tune_folder(sweep: Sweep) -> Iterator[str]:
             yield folder
         return
     if "://" in sweep.storage:
-        yield below(sweep.storage, sweep.plan.name)
+        yield encoded(below(sweep.storage, sweep.plan.name))
         return
     yield str(sweep.folder)
     shutil.rmtree(sweep.folder / "tune", ignore_errors=True)

@@ -75,7 +75,10 @@ def _group_table(stage: str, group: Mapping[str, Any]) -> Table:
     table = new_table(title, (*_setting_heads(settings), *numbers))
     for row in rows:
         table.add_row(
-            *(short(row["values"][name]) if name in row["values"] else "-" for name in settings),
+            *(
+                short(row["values"][name], name) if name in row["values"] else "-"
+                for name in settings
+            ),
             with_interval(row["value"], row["interval"]),
             seeds_in_words(row["seeds"]),
             f"{row['runs']} of {row['planned']}",

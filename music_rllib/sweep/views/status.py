@@ -90,7 +90,7 @@ def _stages_table(state: Mapping[str, Any]) -> Table:
 def _search_text(search: Mapping[str, Any]) -> Text:
     lines = []
     for arm in search["arms"]:
-        fixed = "".join(f" {name}={short(value)}" for name, value in arm["values"].items())
+        fixed = "".join(f" {name}={short(value, name)}" for name, value in arm["values"].items())
         line = (
             f"Search {search['stage']}{fixed}: {arm['judged']} of {len(arm['trials'])} trials "
             f"judged, {arm['pruned']} stopped early, {arm['failed']} failed, "
@@ -98,7 +98,7 @@ def _search_text(search: Mapping[str, Any]) -> Text:
         )
         if arm["best"] is not None:
             best = arm["trials"][arm["best"]]
-            values = ", ".join(f"{n} = {short(v)}" for n, v in best["values"].items())
+            values = ", ".join(f"{n} = {short(v, n)}" for n, v in best["values"].items())
             numbers = ", ".join(f"{value:.4g}" for value in best["objective"])
             line += f"; best trial {arm['best']}: {numbers} ({values})"
         lines.append(f"{line}\n    study {arm['study']!r} in {search['storage'] or 'study.db'}")

@@ -123,25 +123,30 @@ def _grid_axes(stage: Stage) -> list[str]:
     values: dict[str, dict[str, None]] = {}
     for point in stage.points:
         for name, value in point.values.items():
-            values.setdefault(name, {})[short(value)] = None
+            values.setdefault(name, {})[short(value, name)] = None
     if math.prod(map(len, values.values())) > len(stage.points):  # settings that vary together
-        points = [", ".join(map(short, point.values.values())) for point in stage.points]
+        points = [
+            ", ".join(short(value, name) for name, value in point.values.items())
+            for point in stage.points
+        ]
         return [f"{', '.join(values)}: {'; '.join(points)}"]
     return [f"{name}: {', '.join(choices)}" for name, choices in values.items()]
 
 
 def _search_axes(search: SearchSettings) -> list[str]:
-    axes = [f"{name}: {_dimension_text(dimension)}" for name, dimension in search.space.items()]
+    axes = [
+        f"{name}: {_dimension_text(name, dimension)}" for name, dimension in search.space.items()
+    ]
     axes += [
-        f"{name}: {', '.join(short(value) for value in values)} ({search.mode})"
+        f"{name}: {', '.join(short(value, name) for value in values)} ({search.mode})"
         for name, values in search.compare.items()
     ]
     return [f"searched by {search.sampler}:", *axes]
 
 
-def _dimension_text(dimension: Dimension) -> str:
+def _dimension_text(name: str, dimension: Dimension) -> str:
     if isinstance(dimension, Choice):
-        return ", ".join(short(value) for value in dimension.choice)
+        return ", ".join(short(value, name) for value in dimension.choice)
     low, high = dimension.bounds
     step = "" if dimension.step in (None, 1) else f" by {dimension.step:g}"
     return f"{low:g} to {high:g}{step}{' (log)' if dimension.log else ''}"
@@ -268,7 +273,7 @@ def search_views(searches: Iterable[Mapping[str, Any]]) -> list[RenderableType]:
 
 
 def _trials_table(search: Mapping[str, Any], arm: Mapping[str, Any]) -> Table:
-    fixed = ", ".join(f"{name} = {short(value)}" for name, value in arm["values"].items())
+    fixed = ", ".join(f"{name} = {short(value, name)}" for name, value in arm["values"].items())
     title = (
         f"Trials of {search['stage']}{f' with {fixed}' if fixed else ''}: "
         f"{arm['judged']} judged, {arm['pruned']} stopped early, {arm['failed']} failed"
@@ -299,7 +304,7 @@ def _trials_table(search: Mapping[str, Any], arm: Mapping[str, Any]) -> Table:
 
 
 def _setting_cells(settings: Iterable[str], values: Mapping[str, Any]) -> list[str]:
-    return [short(values[name]) if name in values else "-" for name in settings]
+    return [short(values[name], name) if name in values else "-" for name in settings]
 
 
 def _ranking_table(search: Mapping[str, Any]) -> Table:

@@ -272,6 +272,19 @@ def test_a_hypothesis_about_runs_that_differ_in_more_than_it_says_is_remarked(
     assert "better than stage = alone' compares runs that differ in env_steps, tac.gamma" in remark
 
 
+def test_a_storage_may_name_environment_variables(
+    load: Callable[..., SweepConfig], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SCRATCH", "/scratch/me")
+    assert load(changed(storage="$SCRATCH/a")).storage == "/scratch/me/a"
+    assert load(changed(storage="s3://b/${SCRATCH}-a$")).storage == "s3://b//scratch/me-a$"
+    monkeypatch.setenv("SCRATCH", "")
+    with pytest.raises(ConfigError, match=r"sweep\.yaml:\d+: storage must .* got \$SCRATCH in"):
+        load(changed(storage="$SCRATCH/a"))
+    # A sweep's own folder, or what a shell has expanded already.
+    assert load(changed(storage="$SCRATCH/a"), storage="/x$y/a").storage == "/x$y/a"
+
+
 BAD: list[tuple[Document, str]] = [
     (changed(name=1), "sweep.yaml:1: name must be text, got 1"),
     (changed(name="nodes"), "name must not be 'nodes'"),

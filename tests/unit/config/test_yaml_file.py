@@ -56,8 +56,41 @@ def test_every_number_python_prints_is_read_back(
 
 
 @pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("a:\ty\n", "y"),
+        ("a: y\t# comment\n", "y"),
+        ("a: y \t\n\t# comment\n \t\n", "y"),
+        ("a\t:\t'y'\t\n", "y"),
+        ("a:\t[1,\t2\t]\t# comment\n", [1, 2]),
+        ("a:\n-\ty\n- \t[1]\n", ["y", [1]]),
+        ('{\n\t"a": {\n\t\t"b":\t"c",\n\t\t"d": [\n\t\t]\n\t}\n}\n', {"b": "c", "d": []}),
+        ("a: |\n  x\ty\n", "x\ty\n"),
+        ("a: x\ty\t\n  z\t# comment\n", "x\ty z"),
+        ("a: 'x\u00a0y'  # and\u00a0here\n", "x\u00a0y"),
+    ],
+)
+def test_tabs_may_separate_and_quoted_text_hold_any_space(
+    tmp_path: Path, text: str, value: Any
+) -> None:
+    assert read(tmp_path, text).data == {"a": value}
+
+
+@pytest.mark.parametrize(
     ("text", "message"),
     [
+        ("a:\n\tb: 1\n", "sweep.yaml:2: must be valid YAML: a tab must not indent a line"),
+        ("a:\n  b: 1\n \t c: 1\n", "sweep.yaml:3: must be valid YAML: a tab must not indent"),
+        ("a:\n-\tb: 1\n", "sweep.yaml:2: must be valid YAML"),
+        (
+            "a:\u00a0[0]\nb: 1\n",
+            "sweep.yaml:1: must be valid YAML: column 3 has U+00A0 (NO-",
+        ),
+        ("a: 1\nb:\n\u00a0 c: 1\n", "sweep.yaml:3: must be valid YAML: column 1 has U+00A0"),
+        (
+            "a: x\n  y\u200bz\n",
+            "sweep.yaml:2: must be valid YAML: column 4 has U+200B (ZERO WID",
+        ),
         ("a: 1\nb: 2\na: 3\n", "sweep.yaml:3: must be valid YAML: key 'a' must not repeat"),
         ("a:\n  b: 1\n  b: 2\n", "sweep.yaml:3: must be valid YAML: key 'b' must not repeat"),
         (

@@ -89,6 +89,14 @@ def test_a_task_with_the_default_seeds_keeps_the_identity_of_runs_without_this_s
     assert "seed_range" not in BUILT_IN_TASKS["FetchPush"].identity()
 
 
+def test_the_limit_of_steps_is_an_integer() -> None:
+    """YAML reads 1e2 as a float, which Gymnasium refuses."""
+    given = {"name": "P", "env_id": "FetchPush-v4", "horizon": 5}
+    kwargs = {"max_episode_steps": 1e2, "distance": 1e2}
+    task = Task.model_validate({**given, "env_kwargs": kwargs})
+    assert repr(task.env_kwargs) == "{'max_episode_steps': 100, 'distance': 100.0}"
+
+
 def test_an_unknown_task_is_named_with_its_neighbour() -> None:
     with pytest.raises(UnknownTaskError, match=r"got 'fetchpush' \(did you mean 'FetchPush'\?\)"):
         TaskRegistry()["fetchpush"]

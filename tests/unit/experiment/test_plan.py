@@ -15,6 +15,7 @@ from music_rllib.config.run_settings import RunSettings, preset
 from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.experiment import plan as plan_module
 from music_rllib.experiment.plan import Plan, make_plan, node_key, shared_runs
+from music_rllib.labels import is_meant
 
 Document = dict[str, Any]
 
@@ -70,6 +71,28 @@ def test_the_grid_of_a_source_multiplies(tmp_path: Path) -> None:
         "finetune/FetchPush/pretrain:tac.alpha=0.2,tac.entropic_index=1.5/seed0"
     )
     assert len({run.label for run in sweep.runs}) == len(sweep.runs) == len(sweep.nodes) == 8
+
+
+@pytest.mark.parametrize(
+    ("setting", "value", "label"),
+    [
+        ("tac.hidden_sizes", [256, 128], "256x128"),
+        ("tac.target_bounds", [-20, 0], "[-20,0]"),
+        ("tac.target_bounds", [1, 50.5], "[1,50.5]"),
+        (
+            "tac.alpha",
+            {"schedule": "piecewise", "points": [[0, 0.2], [500, 0.1]]},
+            "{schedule:piecewise,points:[[0,0.2],[500,0.1]]}",
+        ),
+    ],
+)
+def test_only_layers_are_written_with_an_x(
+    tmp_path: Path, setting: str, value: Any, label: str
+) -> None:
+    stage = {"name": "train", "variant": "tac", "grid": {setting: [value]}}
+    sweep = plan(tmp_path, stages=[stage])
+    assert sweep.runs[0].label == f"train/FetchPush/{setting}={label}/seed0"
+    assert is_meant(f"{setting}={label}/seed0", sweep.runs[0].label)
 
 
 def test_equal_computations_are_one_node(tmp_path: Path) -> None:

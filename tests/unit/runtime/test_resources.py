@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import itertools
+import os
+import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,12 +16,45 @@ from pydantic import ValidationError
 
 from music_rllib.config.schema import Resources
 from music_rllib.runtime import autoscaler, ray_cluster
-from music_rllib.runtime.machine import ClusterError
+from music_rllib.runtime.machine import ClusterError, ray_parent
 from music_rllib.runtime.ray_cluster import WAITING, Room, _room, slots
 
 GIB = 2.0**30
 SMALL = {"CPU": 4.0, "memory": 8 * GIB}
 BIG = {"CPU": 16.0, "memory": 60 * GIB, "GPU": 2.0}
+
+
+def test_a_local_ray_has_a_short_folder_of_its_own(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Its sockets are writable by all in a folder that only we may enter, and it is removed."""
+    long = tmp_path / "a-long-name-of-a-job's-folder" / ("x" * 60)
+    long.mkdir(parents=True)
+    monkeypatch.setattr(tempfile, "tempdir", str(long))
+    monkeypatch.setenv("RAY_TMPDIR", str(long))
+    seen: list[tuple[Path, int, int]] = []
+
+    def init(_temp_dir: str, **options: Any) -> None:
+        parent = Path(_temp_dir).parent
+        seen.append((parent, parent.stat().st_mode & 0o777, parent.stat().st_uid))
+        socket = Path(_temp_dir, "session_2026-11-26_07-59-49_813210_4194304/sockets/plasma_store")
+        assert len(os.fsencode(socket)) <= 107
+        if options["num_cpus"] == 2:
+            raise RuntimeError("busy")
+
+    monkeypatch.setattr(ray, "init", init)
+    ray_cluster.start_ray(num_cpus=1)
+    ray_cluster.stop_ray()
+    with pytest.raises(ClusterError, match="busy"):
+        ray_cluster.start_ray(num_cpus=2)
+    for parent, mode, owner in seen:
+        assert (mode, owner, parent.exists()) == (0o700, os.getuid(), False)
+    monkeypatch.setenv("RAY_TMPDIR", "/tmp/x")
+    monkeypatch.setattr(os, "access", lambda path, mode: str(path) == "/tmp/x")
+    assert ray_parent() == Path("/tmp/x")
+    monkeypatch.setattr(os, "access", lambda path, mode: path == long)
+    with pytest.raises(ClusterError, match=r"RAY_TMPDIR must be a writable folder .* at most \d\d"):
+        ray_parent()
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import tracemalloc
 from collections.abc import Callable, Mapping
@@ -16,9 +17,12 @@ from pydantic import ValidationError
 from music_rllib import names
 from music_rllib.config.load import load_sweep
 from music_rllib.config.problems import ConfigError
+from music_rllib.config.remarks import remarks
 from music_rllib.config.search.settings import Objective, Pruning, Rung, SearchSettings
 from music_rllib.search.objective import aggregate, prune, score
+from music_rllib.search.sampler import Proposer, trial_at
 from music_rllib.search.storage import same_database
+from music_rllib.search.study_record import VALUES, fits
 from music_rllib.store.run_record import Report
 from tests.played_search import Document, document
 
@@ -414,6 +418,69 @@ def test_a_rung_may_be_beyond_the_shorter_tasks(tmp_path: Path) -> None:
     path.write_text(yaml.safe_dump(content))
     with pytest.raises(ConfigError, match="must be <= 4500"):
         load_sweep(path)
+
+
+Q = {"float": [1.0, 2.0], "step": 0.25}
+CHOICES: Document = {
+    "tac.alpha": {"choice": [0.1, {"learned": True}, 1]},
+    "tac.bootstrap": {"choice": ["value", "critics"]},
+    "tac.policy_critic": {"choice": ["first", "min"], "when": {"tac.bootstrap": "critics"}},
+}
+"""9 points."""
+ONE_OR_MANY: Document = {
+    "tac.bootstrap": {"choice": ["value", "critics"]},
+    "tac.alpha": {"float": [0.01, 1.0], "log": True, "when": {"tac.bootstrap": "critics"}},
+}
+"""One point, and an interval of others."""
+FEW_OR_MANY: Document = {
+    "tac.batch_size": {"choice": [*range(1, 21)]},
+    "tac.alpha": {"float": [0.01, 1.0], "log": True, "when": {"tac.batch_size": 20}},
+}
+
+
+@pytest.mark.parametrize(
+    ("sampler", "space", "trials"),
+    [
+        ("tpe", {"tac.entropic_index": Q, "tac.batch_size": {"int": [1, 5]}}, 25),
+        ("random", {"tac.entropic_index": Q, "tac.batch_size": {"int": [1, 5]}}, 25),
+        ("cmaes", {"tac.entropic_index": Q, "tac.batch_size": {"int": [1, 5]}}, 25),
+        ("nsga2", CHOICES, 9),
+        ("tpe", CHOICES, 9),
+        ("tpe", ONE_OR_MANY, 12),
+        ("random", FEW_OR_MANY, 30),
+    ],
+)
+def test_no_point_is_tried_twice(sampler: str, space: Document, trials: int) -> None:
+    """A trial's point is a function of those before it: whoever proposes it, in whatever order."""
+    settings = SearchSettings.model_validate(
+        {"sampler": sampler, "space": space, "trials": 1000, "concurrent": 2}
+    )
+    name, dimension = next(iter(settings.space.items()))
+    point = {name: dimension.ends()[0]}
+    given = [point, {}, point]
+    found: list[Document] = []
+    for number in range(trials):
+        shown = [trial_at(settings.space, point, [0.0]) for point in found[: max(0, number - 1)]]
+        running = [trial_at(settings.space, point) for point in found[max(0, number - 1) :]]
+        one, other = (
+            Proposer(settings, given).propose(number, shown, running).user_attrs[VALUES]
+            for _ in range(2)
+        )
+        assert one == other
+        assert fits(one, settings)
+        found.append(one)
+    assert point.items() <= found[0].items()
+    assert len({json.dumps(point, sort_keys=True) for point in found}) == trials
+    assert settings.count == (1000 if space in (ONE_OR_MANY, FEW_OR_MANY) else trials)
+
+
+def test_a_search_ends_with_its_last_point_and_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "sweep.yaml"
+    path.write_text(yaml.safe_dump(document({"space": CHOICES, "trials": 20})))
+    (line,) = remarks(load_sweep(path))
+    assert line == (
+        "finetune: search.trials is 20, and the space has 9 points: the search ends after 9 trials"
+    )
 
 
 @pytest.mark.parametrize(

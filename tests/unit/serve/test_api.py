@@ -86,6 +86,26 @@ def test_one_observation(post: Post) -> None:
     assert post(body | {"achieved_goal": [9, 9]}) == (200, {"action": [10.5, 0.75]})
 
 
+@pytest.mark.parametrize(
+    "headers", [{}, {"Content-Type": "text/plain"}, {"Content-Type": "application/octet-stream"}]
+)
+def test_json_is_taken_whatever_the_header_says(url: str, headers: dict[str, str]) -> None:
+    for body, status in ((json.dumps(GOOD), 200), ("observation=1", 400), ("", 422)):
+        answer = requests.post(f"{url}/act", body, headers=headers, timeout=60)
+        assert answer.status_code == status, answer.text
+
+
+def test_head_is_answered_as_get_without_a_body(url: str) -> None:
+    for page in ("health", "policy", "docs"):
+        head, get = (
+            requests.head(f"{url}/{page}", timeout=60),
+            requests.get(f"{url}/{page}", timeout=60),
+        )
+        assert (head.status_code, head.content) == (200, b"")
+        assert head.headers["Content-Length"] == get.headers["Content-Length"]
+    assert requests.head(f"{url}/act", timeout=60).status_code == 405
+
+
 def test_a_batch_has_one_action_a_row(post: Post) -> None:
     body = {"observation": [[1, 1, 1, 1], [2, 2, 2, 2]], "desired_goal": [[0, 1], [2, 3]]}
     assert post(body) == (200, {"action": [[4.0, 1.0], [8.0, 5.0]]})

@@ -430,6 +430,9 @@ def test_storage_paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert open_storage("results/")[1] == f"{tmp_path}/results"
     assert open_storage("~/results")[1] == "/home/somebody/results"
     assert open_storage("file:///data/results")[1] == "/data/results"
+    assert open_storage("/data/q%201?#")[1] == "/data/q%201?#"
+    for key in ("q%201", "a b#c", "ü/50%", "x+y=1,z"):  # as other clients of a bucket take it
+        assert open_storage(f"s3://k:s%2F1@bucket/{key}?region=x")[1] == f"bucket/{key}"
 
 
 def test_reports_survive_as_json_lines() -> None:

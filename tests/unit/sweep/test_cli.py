@@ -94,6 +94,26 @@ def test_options_replace_name_and_storage(program: Program, tmp_path: Path) -> N
     assert f"Storage: {tmp_path}/elsewhere" in result.output
 
 
+def test_mlflows_own_variable_stands_in_for_an_absent_setting(
+    program: Program, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://me:planted@127.0.0.1:9")
+    result = program(document(), "--dry-run")
+    line = "MLflow: http://127.0.0.1:9, from MLFLOW_TRACKING_URI (mlflow.tracking_uri=null keeps"
+    assert line in result.output
+    assert "planted" not in result.output
+    result = program(document())
+    assert result.exit_code == 2
+    assert "(from the environment variable MLFLOW_TRACKING_URI) must name an MLf" in result.stderr
+    given = program(document(mlflow={"tracking_uri": "http://127.0.0.1:9"}), "--dry-run")
+    null = program(document(), "mlflow.tracking_uri=null", "--dry-run")
+    assert "MLFLOW_TRACKING_URI" not in given.output + null.output
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "./mlruns")
+    result = program(document(), "--dry-run")
+    assert result.exit_code == 2
+    assert "MLFLOW_TRACKING_URI) must be null (a sqlite file" in result.stderr
+
+
 BAD: list[tuple[Document, str]] = [
     (document(colour="red"), "sweep.yaml:1: colour is not a known setting"),
     (

@@ -41,9 +41,11 @@ from music_rllib.store.object_folder import DamagedError
 from music_rllib.store.paths import sweep_folder
 from music_rllib.store.run_record import HISTORY, Report, RunResult, to_json_lines
 from music_rllib.sweep import clean, cli, driver_lock
+from music_rllib.sweep.export import sweep_of_run
 from music_rllib.sweep.listeners.state_file import StateFile
 from music_rllib.sweep.preflight import import_checkpoints
 
+REPOSITORY = Path(__file__).parents[3]
 SWEEP: dict[str, Any] = {
     "name": "mine",
     "tasks": ["FetchPush"],
@@ -293,13 +295,30 @@ def test_best_takes_the_middle_run_of_the_best_condition(
     assert policy["seed"] == 1
     folder = Path(policy["folder"])
     assert (folder / "handoff/handoff.json").is_file()
-    settings = yaml.safe_load((folder / "run.yaml").read_text())
-    assert settings["tac"]["entropic_index"] == 1.5
+    (stage,) = yaml.safe_load((folder / "run.yaml").read_text())["stages"]
+    assert stage["tac"]["entropic_index"] == 1.5
+    server = "mlflow.tracking_uri=http://mlflow:5000"
+    plan = program("plan", str(folder / "run.yaml"), server, "--storage", storage)
+    assert (plan.code, "1 finished earlier and reused, 0 env" in plan.output) == (0, True)
     assert json.loads((folder / "chosen.json").read_text())["node"] == policy["node"]
     assert policy["node"] in sweep.finished
     again = program("best", f"{storage}/mine", "--output", "out")
     assert (again.code, "first by success" in again.output) == (0, True)
     assert "Shannon entropy (nats) -0.32 [-0.37, -0.27], S_q -0.57" in again.output
+
+
+@pytest.mark.parametrize(
+    "name", ["smoke", "paper_figures", "q_entropy_factorial", "proofs/fetch_push_family", "default"]
+)
+def test_what_best_writes_is_the_run_to_the_last_setting(name: str, tmp_path: Path) -> None:
+    shipped = Path(cli.__file__).with_name("default.yaml")
+    file = shipped if name == "default" else Path("tune_configs", f"{name}.yaml")
+    config = load_sweep(REPOSITORY / file, storage=str(tmp_path))
+    sweep = open_sweep(config, make_plan(config), str(tmp_path), tmp_path / config.name)
+    for key in {(node.stage, node.run.task.name): node.key for node in sweep.plan.nodes}.values():
+        path = tmp_path / "run.yaml"
+        path.write_text(yaml.safe_dump(sweep_of_run(sweep, key, tmp_path)))
+        assert make_plan(load_sweep(path)).nodes[-1].key == key
 
 
 def test_a_condition_with_all_its_runs_is_better_than_a_lucky_one(

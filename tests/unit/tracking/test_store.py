@@ -10,8 +10,12 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
 import pytest
+from sqlalchemy import create_engine
+from sqlalchemy.engine import make_url
 
 from music_rllib.errors import TrackingError
+from music_rllib.search.storage import same_database
+from music_rllib.store.paths import database_url, sqlite_url
 from music_rllib.tracking import store as store_module
 from music_rllib.tracking.store import check_reachable, resolve_store
 from tests.ports import free_port
@@ -55,6 +59,28 @@ def test_a_relative_storage_is_made_absolute(
     assert resolve_store("sqlite:////x.db", "results").uri == "sqlite:////x.db"
 
 
+@pytest.mark.parametrize("name", ["q?1", "50%", "100%20off", "#1", "u:p@h", "a b", "ü", "$HOME"])
+def test_a_database_is_the_file_in_the_storage_whatever_its_name(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for store in (resolve_store(None, f"{tmp_path}/{name}"), resolve_store(None, name)):
+        assert make_url(store.uri).database == str(store.database)
+    assert str(make_url(database_url(sqlite_url(f"/{name}/x.db"))).database) == f"/{name}/x.db"
+    (tmp_path / name).mkdir()
+    monkeypatch.chdir(tmp_path / name)
+    assert make_url(database_url("sqlite:///x.db")).database == f"{tmp_path}/{name}/x.db"
+    assert same_database("x.db", f"{tmp_path}/{name}/x.db")
+
+
+def test_postgresql_is_reached_by_the_driver_that_is_installed() -> None:
+    """SQLAlchemy 2.1 takes a URL without a driver for psycopg 3."""
+    for driver in ("", "+psycopg2"):
+        url = make_url(resolve_store(f"postgresql{driver}://me:pw@db:1/x?a=%20b", "results").uri)
+        assert url.drivername == "postgresql+psycopg2"
+        assert (url.password, url.port, url.query) == ("pw", 1, {"a": " b"})
+        create_engine(url).dispose()  # it imports the driver
+
+
 def test_a_file_uri_is_the_folder_that_it_names() -> None:
     store = resolve_store(None, "file:///data/a%20b")
     assert store.database == Path("/data/a b/mlflow.db")
@@ -90,6 +116,21 @@ def test_a_wrong_uri_is_refused_with_its_rule(uri: str, rule: str) -> None:
     with pytest.raises(TrackingError, match=r"mlflow\.tracking_uri") as raised:
         resolve_store(uri, "results")
     assert rule in str(raised.value)
+
+
+def test_what_the_environment_sets_is_named_and_completes_what_a_sweep_kept(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "file:///mlruns")
+    with pytest.raises(TrackingError, match=r"\(from the environment variable MLFLOW_TRACKING_URI"):
+        resolve_store("file:///mlruns", "results")
+    for given, kept in (
+        ("http://u:hunter2@h:5", "http://h:5"),
+        ("postgresql://u:hunter2@h/x", "postgresql+psycopg2://h/x"),
+    ):
+        monkeypatch.setenv("MLFLOW_TRACKING_URI", given)
+        assert "u:hunter2@" in resolve_store(kept, "results").uri
+        assert "hunter2" not in resolve_store(f"{kept}1", "results").uri
 
 
 def test_a_bucket_needs_a_server() -> None:
