@@ -46,6 +46,7 @@ from music_rllib.config.schema import (
     SweepConfig,
 )
 from music_rllib.config.search.settings import FINAL_SEED
+from music_rllib.envs.modules import search_in
 from music_rllib.envs.tasks import (
     BUILT_IN_TASKS,
     Task,
@@ -118,6 +119,8 @@ def _listed_seeds(seeds: Any) -> Any:
 def declared_tasks(path: str | Path) -> tuple[Task, ...]:
     """The tasks that a sweep's YAML file declares under `environments`.
 
+    From then on the modules of environments are looked for beside the file, too.
+
     Raises:
         ConfigError: The file can't be read, or a task is invalid.
     """
@@ -125,6 +128,7 @@ def declared_tasks(path: str | Path) -> tuple[Task, ...]:
     registry = _registry(file.data, findings)
     if findings.problems:
         raise ConfigError(problem_lines(findings.problems, file, file.data, {}))
+    search_in(Path(path).parent)
     return tuple(task for name, task in registry.items() if name not in BUILT_IN_TASKS)
 
 

@@ -2,7 +2,7 @@
 
 Gymnasium-Robotics looks joints, sites and bodies up by name, some fifty times a step, and computes
 Jacobians one by one: half of a step's time is not physics. Here addresses and views of the
-simulator's arrays are found when the environment is made. Observations, rewards and simulation
+simulator's arrays are found once per episode. Observations, rewards and simulation
 equal the original's bit for bit (`test_fast_fetch_steps_equal_the_originals_bit_for_bit`).
 """
 
@@ -14,25 +14,30 @@ from typing import Any
 import gymnasium as gym
 import mujoco
 import numpy as np
+from gymnasium_robotics.envs.fetch import fetch_env
 from gymnasium_robotics.envs.fetch.fetch_env import MujocoFetchEnv
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Goals = dict[str, Floats]
 
-_REPLACED = (
-    "step",
-    "_get_obs",
-    "_set_action",
-    "_mujoco_step",
-    "_step_callback",
-    "generate_mujoco_observations",
-    "compute_reward",
-    "compute_terminated",
-    "compute_truncated",
-    "_is_success",
+_HOOKS = frozenset(
+    {
+        "step",
+        "dt",
+        "_get_obs",
+        "_set_action",
+        "_mujoco_step",
+        "_step_callback",
+        "generate_mujoco_observations",
+        "compute_reward",
+        "compute_terminated",
+        "compute_truncated",
+        "_is_success",
+    }
 )
-"""Methods that `_FastFetch` replaces; an environment that overrides one of them is left alone."""
+"""Methods that the faster step does not call; where one is not the original, it is not used."""
+_PACKAGE = "gymnasium_robotics."
 
 _ROTATION = np.array([1.0, 0.0, 1.0, 0.0])
 """Added to the gripper's orientation, as in the original (MuJoCo normalises the quaternion)."""
@@ -40,25 +45,49 @@ _ALMOST_ZERO = np.finfo(np.float64).eps * 4.0
 
 
 def speed_up(env: gym.Env[Any, Any]) -> None:
-    """Gives a Fetch environment the faster step, in place; does nothing to other environments."""
+    """Gives a Fetch environment the faster step, in place; does nothing to other environments.
+
+    An environment that replaces a method of `_HOOKS`, in its class, in Gymnasium-Robotics' class or
+    on the object, keeps its own step, even if it does so later. A model that is replaced or edited
+    counts from the next reset or step on.
+    """
     unwrapped = env.unwrapped
-    if not isinstance(unwrapped, MujocoFetchEnv) or unwrapped.render_mode == "human":
-        return
-    own = type(unwrapped)
-    if any(getattr(own, name) is not getattr(MujocoFetchEnv, name) for name in _REPLACED):
-        return
-    fast = _FastFetch(unwrapped)
-    unwrapped.step = fast.step
-    unwrapped._get_obs = fast.observe
+    if isinstance(unwrapped, MujocoFetchEnv) and not _HOOKS & vars(unwrapped).keys():
+        fast = _FastFetch(unwrapped)
+        if fast.bind():
+            unwrapped.step, unwrapped._get_obs = fast.step, fast.first_observation
+
+
+def _has_original_hooks(kind: type) -> bool:
+    """Whether a class has the methods of Gymnasium-Robotics, none of them replaced."""
+    functions = [fetch_env.goal_distance]
+    for name in _HOOKS:
+        method = getattr(kind, name)
+        if method is not getattr(MujocoFetchEnv, name):
+            return False
+        functions.append(method.fget if isinstance(method, property) else method)
+    return all(getattr(one, "__module__", "").startswith(_PACKAGE) for one in functions)
 
 
 class _FastFetch:
     """Step and observation of one Fetch environment."""
 
     def __init__(self, env: Any) -> None:
-        model, data = env.model, env.data
-        self._env, self._model, self._data = env, model, data
-        self._dt: float = env.n_substeps * model.opt.timestep
+        self._env = env
+
+    def bind(self) -> bool:
+        """Looks up all names in the environment's current model; False where it does not fit."""
+        env = self._env
+        if env.render_mode == "human" or not _has_original_hooks(type(env)):
+            return False
+        try:
+            self._bind(env, env.model, env.data)
+        except (ValueError, LookupError):  # a robot of another kind
+            return False
+        return True
+
+    def _bind(self, env: Any, model: Any, data: Any) -> None:
+        self._model, self._data = model, data
         self._grip = _id(model, mujoco.mjtObj.mjOBJ_SITE, "robot0:grip")
         self._grip_position = data.site_xpos[self._grip]
         self._has_object: bool = env.has_object
@@ -71,12 +100,36 @@ class _FastFetch:
         self._finger_qpos = [int(model.jnt_qposadr[i]) for i in ids]
         self._finger_qvel = [int(model.jnt_dofadr[i]) for i in ids]
         self._qpos, self._qvel = data.qpos, data.qvel
+        if model.nu not in (0, 2) or model.nmocap != 1:
+            raise ValueError("the Fetch robot has two fingers and one mocap body")
         self._actuators = [self._actuator(i) for i in range(model.nu)]
         mocap, body = _weld(model)
         self._mocap_position, self._mocap_quaternion = data.mocap_pos[mocap], data.mocap_quat[mocap]
         self._hand_position, self._hand_quaternion = data.xpos[body], data.xquat[body]
         self._linear, self._angular = np.zeros((2, 3, model.nv))
-        self._low, self._high = env.action_space.low, env.action_space.high
+
+    def _fits(self) -> bool:
+        """Whether the faster step still applies; binds again if the model is a new one."""
+        env = self._env
+        own = vars(env)
+        if len(_HOOKS & own.keys()) > 2 or own.get("_get_obs") != self.first_observation:
+            return False
+        same = env.model is self._model and env.data is self._data
+        return (same and env.has_object == self._has_object) or self.bind()
+
+    def _give_back(self) -> None:
+        """Leaves the environment its own step from now on."""
+        for name, method in (("step", self.step), ("_get_obs", self.first_observation)):
+            if vars(self._env).get(name) == method:
+                delattr(self._env, name)
+
+    def first_observation(self) -> Goals:
+        """The observation of a reset, which may have built or edited a model."""
+        if self._fits() and self.bind():
+            return self.observe()
+        self._give_back()
+        observation: Goals = self._env._get_obs()
+        return observation
 
     def _actuator(self, index: int) -> tuple[int, int | None]:
         """The index of its control, and the address of the position that its target adds to."""
@@ -86,10 +139,15 @@ class _FastFetch:
 
     def step(self, action: Any) -> tuple[Goals, Any, bool, bool, dict[str, Any]]:
         """Takes one step, as `BaseRobotEnv.step`: [4] -> observation, reward, ..., info."""
-        if np.shape(action) != self._low.shape:
-            raise ValueError("Action dimension mismatch")
         env = self._env
-        self._control(np.minimum(np.maximum(action, self._low), self._high))
+        if not self._fits():
+            self._give_back()
+            result: tuple[Goals, Any, bool, bool, dict[str, Any]] = env.step(action)
+            return result
+        space = env.action_space
+        if np.shape(action) != space.shape:
+            raise ValueError("Action dimension mismatch")
+        self._control(np.minimum(np.maximum(action, space.low), space.high))
         mujoco.mj_step(self._model, self._data, nstep=env.n_substeps)
         if env.block_gripper:
             for address in self._finger_qpos:
@@ -116,7 +174,8 @@ class _FastFetch:
 
     def observe(self) -> Goals:
         """The goal dictionary of the current state, in fresh arrays."""
-        env, dt, qvel = self._env, self._dt, self._qvel
+        env, qvel = self._env, self._qvel
+        dt = env.n_substeps * self._model.opt.timestep
         linear, angular = self._linear, self._angular
         mujoco.mj_jacSite(self._model, self._data, linear, None, self._grip)
         grip_velocity = linear.dot(qvel) * dt

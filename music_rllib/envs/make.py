@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from music_rllib.envs.farama_notice import drop_farama_notice
 from music_rllib.envs.goal_rewards import Unlike, directions, first_unlike, lost_by_rounding
+from music_rllib.envs.modules import make_importable
 from music_rllib.envs.numbers import LARGEST, BadNumberError, are_usable, check_numbers
 from music_rllib.envs.recording import Recording
 from music_rllib.envs.tasks import BUILT_IN_TASKS, LAST_SEED, Task
@@ -53,9 +54,12 @@ def make_env(env_id: str, **kwargs: Any) -> Env:
 
     The Fetch tasks get a faster step with the same results (`music_rllib.envs.fetch`). Its
     `close()` ignores exceptions, since nothing depends on it. Raises `gymnasium.error.Error` for
-    unknown ids and arguments.
+    unknown ids and arguments, and ImportError for a module in front of the id that is not found
+    (`music_rllib.envs.modules`).
     """
     _register_robotics()
+    if ":" in env_id:
+        make_importable(env_id.partition(":")[0])
     # The checker takes a tenth of every step, and helps only an environment's authors.
     env = gym.make(env_id, disable_env_checker=True, **kwargs)
     from music_rllib.envs.fetch import speed_up  # after the notice is dropped

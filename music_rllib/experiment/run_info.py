@@ -10,6 +10,7 @@ from typing import Any
 from music_rllib import names
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.tac_settings import LearnedAlpha, MatchedAlpha, NormalisedAlpha, in_words
+from music_rllib.envs.fingerprint import Fingerprint, digest_of
 from music_rllib.experiment.plan import Node, short
 from music_rllib.schedules import Linear, Measured, Piecewise, value_at
 from music_rllib.store.files import content_key
@@ -49,8 +50,8 @@ def run_name(node: Node) -> str:
     return " ".join(filter(None, (*parts, seed, node.run.task.name, node.stage, node.part)))
 
 
-def run_info(node: Node) -> RunInfo:
-    """How MLflow shows a node."""
+def run_info(node: Node, environment: Fingerprint | None = None) -> RunInfo:
+    """How MLflow shows a node that uses an environment with this fingerprint."""
     run = node.run
     config: dict[str, Any] = run.model_dump(mode="json")
     q, alpha, weight = run.tac.entropic_index, run.tac.alpha, run.music.mi_reward_weight
@@ -60,6 +61,7 @@ def run_info(node: Node) -> RunInfo:
         config=config,
         tags={
             names.TAG_LABEL: node.label,
+            names.TAG_ENVIRONMENT: None if environment is None else digest_of(environment),
             names.TAG_STAGE: node.stage,
             names.TAG_TRIAL: node.trial,
             names.TAG_PART: node.part or None,

@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from music_rllib.config.schema import SweepConfig
+from music_rllib.envs.fingerprint import Fingerprint
 from music_rllib.experiment.continuation import continuation_key
+from music_rllib.experiment.environments import Environments
 from music_rllib.experiment.plan import Plan
 from music_rllib.experiment.scheduler import DONE, Scheduler
 from music_rllib.experiment.sweep_files import CONFIG, IN_STORAGE, PLAN, as_json, keep, read
@@ -34,6 +36,8 @@ class Sweep:
     folder: Path
     """Folder of the sweep's own files, on this machine."""
     scheduler: Scheduler
+    environments: Environments = field(default_factory=Environments)
+    """Environments of its tasks as they are now, if the sweep is to be run."""
     damaged: Mapping[str, str] = field(default_factory=dict)
     """Finished nodes to be trained again, by key, and what is wrong with them."""
 
@@ -54,6 +58,7 @@ def open_sweep(
     storage: str,
     folder: Path,
     *,
+    environments: Mapping[str, Fingerprint] | None = None,
     lenient: bool = False,
 ) -> Sweep:
     """Open the storage, and find the runs in it that are finished and undamaged.
@@ -76,6 +81,7 @@ def open_sweep(
         store=store,
         folder=folder,
         scheduler=Scheduler(plan, finished - damaged.keys()),
+        environments=Environments.of(environments, storage) if environments else Environments(),
         damaged={
             key: f"{labels[key]}: damaged, is trained again: {damaged[key]}" for key in damaged
         },
@@ -117,7 +123,12 @@ def plan_document(sweep: Sweep) -> dict[str, Any]:
         }
         for node in sweep.plan.nodes
     ]
-    return {"storage": redact(sweep.storage), "nodes": nodes, "trials": sweep.plan.trials}
+    return {
+        "storage": redact(sweep.storage),
+        "nodes": nodes,
+        "trials": sweep.plan.trials,
+        "environments": {task: dict(found) for task, found in sweep.environments.now.items()},
+    }
 
 
 def keep_record(sweep: Sweep) -> None:

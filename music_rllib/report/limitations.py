@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from music_rllib import names
+from music_rllib.experiment.environments import mixed
 from music_rllib.labels import ShortLabels, in_runs
 from music_rllib.results.analysis import StageAnalysis
 from music_rllib.results.data import Sweep
@@ -30,9 +31,10 @@ def missing(
 ) -> list[str]:
     """A sentence for everything that is missing, without the runs to come of a `live` sweep."""
     if live:
-        return list(_missing_evidence(sweep, analyses))
+        return [*_mixed_environments(sweep), *_missing_evidence(sweep, analyses)]
     return [
         *_missing_runs(sweep),
+        *_mixed_environments(sweep),
         *_missing_evidence(sweep, analyses),
         *_missing_records(sweep, undelivered),
     ]
@@ -74,6 +76,11 @@ def _missing_runs(sweep: Sweep) -> Iterator[str]:
     for state, text in _STATES.items():
         if states[state]:
             yield f"{in_runs(states[state])} {text}."
+
+
+def _mixed_environments(sweep: Sweep) -> Iterator[str]:
+    tags = ((run, run.tags.get(names.TAG_ENVIRONMENT, "")) for run in sweep.runs)
+    yield from mixed((run.task, run.name, digest) for run, digest in tags if run.is_finished)
 
 
 def _missing_evidence(sweep: Sweep, analyses: Sequence[StageAnalysis]) -> Iterator[str]:

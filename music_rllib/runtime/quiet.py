@@ -3,9 +3,8 @@
 There are two steps, because some libraries read their switches while they are imported:
 
 1. An entry point calls `prepare_environment` first, before `import ray`.
-2. `quiet_third_parties` runs in the driver and, as Ray's setup hook, in every worker::
-
-       ray.init(runtime_env={"worker_process_setup_hook": quiet_third_parties})
+2. `quiet_third_parties` runs in the driver and, in Ray's setup hook (`runtime.ray_cluster`), in
+   every worker.
 
 Each filter names a logger and the beginning of a message, or hides a logger's messages below
 WARNING. New warnings and all errors are still shown.
@@ -13,11 +12,13 @@ WARNING. New warnings and all errors are still shown.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import secrets
 import warnings
 from functools import partial
+from pathlib import Path
 
 from music_rllib.envs.farama_notice import drop_farama_notice
 from music_rllib.runtime.machine import cluster_address
@@ -68,6 +69,11 @@ def prepare_environment() -> None:
     Must run before `import ray`, which reads its configuration once. The workers of a local Ray
     inherit the variables; those of a running cluster do not.
     """
+    # A `types.py` in the current folder would break each Python that a library or Ray starts. Not
+    # in the folder of a package that is not installed: these find it there.
+    with contextlib.suppress(FileNotFoundError):
+        if Path.cwd() != Path(__file__).parents[2]:
+            os.environ.setdefault("PYTHONSAFEPATH", "1")
     # Ray's new progress output prints a table even with verbose=0; the old one is silent then.
     os.environ.setdefault("RAY_AIR_NEW_OUTPUT", "0")
     # No usage data is sent unless the user asks for it.

@@ -6,13 +6,14 @@ import contextlib
 import logging
 import math
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import ray
 
 from music_rllib.config.schema import Resources
+from music_rllib.envs.modules import folders_for_workers, search_in
 from music_rllib.errors import first_line
 from music_rllib.runtime import autoscaler
 from music_rllib.runtime.machine import (
@@ -84,7 +85,7 @@ def start_ray(**local_options: Any) -> None:
         options |= {"address": "local", "include_dashboard": False}
     try:
         ray.init(
-            runtime_env={"worker_process_setup_hook": quiet_third_parties},
+            runtime_env={"worker_process_setup_hook": _worker_setup()},
             log_to_driver=False,
             logging_level=logging.WARNING,
             **options,
@@ -105,6 +106,17 @@ def stop_ray() -> None:
     """Leave Ray; a local one ends and leaves no files."""
     ray.shutdown()
     _files.close()
+
+
+def _worker_setup() -> Callable[[], None]:
+    """What each worker does first."""
+    folders = folders_for_workers()
+
+    def prepare_worker() -> None:
+        quiet_third_parties()
+        search_in(*folders)
+
+    return prepare_worker
 
 
 @contextlib.contextmanager

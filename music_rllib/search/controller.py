@@ -53,6 +53,7 @@ class SearchController(Listener):
         """
         self.searches = list(searches)
         self._scheduler, self._plan, self._store = sweep.scheduler, sweep.plan, sweep.store
+        self._environments = sweep.environments
         self._reused, self._pruned, self._say, self._now = reused, pruned, say, now
         self._reports: dict[str, dict[int, Report]] = {}
         """Reports of unfinished runs, by node key and environment step."""
@@ -196,11 +197,16 @@ class SearchController(Listener):
         for node in self._nodes_of(run):
             new = not self._scheduler.knows(node.key)
             # One that is damaged is handed out: the worker that finds it there says what is wrong.
-            finished = new and self._store.is_sound(node.key)
+            # So does one of another environment.
+            finished = new and self._store.is_sound(node.key) and self._is_of_now(node)
             paused = node.key == run.key and until is not None and until < node.run.env_steps
             self._scheduler.want(node, until if paused else None, finished=finished)
             if finished:
                 self._reused(node)
+
+    def _is_of_now(self, node: Node) -> bool:
+        task, found = node.run.task.name, self._store.environment(node.key)
+        return not self._environments.differences(task, found)
 
     def _want_rung(self, arm: Arm, active: Active) -> None:
         """Ask for the runs up to the trial's rung."""

@@ -132,7 +132,11 @@ def _determined_by(sweep: Sweep, stage: Stage) -> dict[str, Any]:
         {},
     )
     checkpoint = source.checkpoint if source is not None else None
+    # Values of another environment are not this search's. The earliest stands for all the same.
+    tasks = sorted({*point.runs, *source_runs} & sweep.environments.now.keys())
+    environments = {task: sweep.environments.earliest(task) for task in tasks}
     return {
+        **({"environments": environments} if environments else {}),
         "seeds": list(sweep.plan.seeds),
         "runs": {task: node_key(run, None) for task, run in point.runs.items()},
         "source": {task: node_key(run, None) for task, run in source_runs.items()},

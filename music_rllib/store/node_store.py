@@ -26,6 +26,7 @@ from typing import Any, NamedTuple
 
 import pyarrow.fs as pafs
 
+from music_rllib.envs.fingerprint import Fingerprint
 from music_rllib.store.lease import LeaseFile
 from music_rllib.store.object_folder import DamagedError, Manifest, ObjectFolders, open_storage
 from music_rllib.store.run_record import HISTORY, Report, RunResult, from_json_lines, last_values
@@ -82,11 +83,23 @@ class NodeStore:
         except ValueError as error:
             raise DamagedError(f"{self.path(key)}/{HISTORY} must hold reports: {error}") from error
 
-    def publish(self, key: str, folder: Path, result: RunResult | None = None) -> None:
+    def environment(self, key: str) -> Fingerprint | None:
+        """Fingerprint of the environment that a finished run used; None: it is not known."""
+        return _environment(self._nodes.manifest(key))
+
+    def publish(
+        self,
+        key: str,
+        folder: Path,
+        result: RunResult | None = None,
+        environment: Fingerprint | None = None,
+    ) -> None:
         """Copy the files of `folder` to the node `key`, unless it exists already."""
         if self.is_finished(key):
             return
-        meta = {"result": None if result is None else result.model_dump()}
+        meta: dict[str, Any] = {"result": None if result is None else result.model_dump()}
+        if environment is not None:
+            meta["environment"] = dict(environment)
         with self._nodes.sealing(key, meta) as staging:
             # The modes of a temporary folder, which only its owner may read, are not copied.
             for file in filter(Path.is_file, folder.rglob("*")):
@@ -223,7 +236,9 @@ class WorkFolder:
         self._local = isinstance(filesystem, pafs.LocalFileSystem)
 
     @contextlib.contextmanager
-    def new_checkpoint(self, env_steps: int) -> Iterator[Draft]:
+    def new_checkpoint(
+        self, env_steps: int, environment: Fingerprint | None = None
+    ) -> Iterator[Draft]:
         """Yield a draft to fill; it becomes the newest checkpoint when the `with` ends.
 
         Raises:
@@ -232,6 +247,8 @@ class WorkFolder:
         # A run may save the same step twice: where the first checkpoint was damaged.
         name = f"{env_steps:012d}-{uuid.uuid4().hex[:8]}"
         meta: dict[str, Any] = {"format": FORMAT}
+        if environment is not None:
+            meta["environment"] = dict(environment)
         with self._checkpoints.sealing(name, meta) as folder:
             draft = Draft(folder, self._parts)
             yield draft
@@ -287,7 +304,14 @@ class WorkFolder:
         for part in _needs(manifest):
             parts[part] = folder / "parts" / part
             self._parts.fetch(part, parts[part])
-        return Saved(folder / "checkpoint", parts)
+        return Saved(folder / "checkpoint", parts, _environment(manifest))
+
+    def environment(self) -> Fingerprint | None:
+        """Fingerprint of the environment of the newest sound checkpoint; None: it is not known."""
+        for name in reversed(self._checkpoints.names()):
+            with contextlib.suppress(DamagedError):
+                return _environment(self._checkpoints.manifest(name))
+        return None
 
     def history(self) -> list[Report]:
         """Reports of the newest checkpoint whose history is sound; [] if there is none."""
@@ -340,12 +364,18 @@ def _needs(manifest: Manifest) -> list[str]:
     return [str(part) for part in parts] if isinstance(parts, list) else []
 
 
+def _environment(manifest: Manifest) -> Fingerprint | None:
+    found = manifest.meta.get("environment")
+    return {k: str(v) for k, v in found.items()} if isinstance(found, dict) else None
+
+
 class Saved(NamedTuple):
     """A verified copy of a checkpoint on the local disk."""
 
     folder: Path
     parts: Mapping[str, Path]
     """Folder of each part, by its name."""
+    environment: Fingerprint | None = None
 
 
 class Draft:

@@ -18,16 +18,17 @@ from music_rllib.command_line import console_for, how_to_continue, print_json
 from music_rllib.config.load import load_sweep
 from music_rllib.config.remarks import remarks
 from music_rllib.config.schema import MlflowSettings, SweepConfig
+from music_rllib.envs.modules import search_in
 from music_rllib.errors import FAILED, BadInputError
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.changes import (
-    Changes,
     changes_since,
     check_begun,
     keep_settings,
     longer,
 )
 from music_rllib.experiment.demand import check_demand
+from music_rllib.experiment.environments import Answer, changed_text, old_runs
 from music_rllib.experiment.listener import Listener
 from music_rllib.experiment.location import SweepLocation
 from music_rllib.experiment.plan import make_plan, shared_runs
@@ -54,6 +55,7 @@ from music_rllib.sweep.preflight import (
     check_hardware,
     check_ray,
     check_searches,
+    fingerprints,
     import_checkpoints,
     verify_inputs,
 )
@@ -87,6 +89,8 @@ def run_sweep(
     seeds: str | None = None,
     overrides: Sequence[str] = (),
     accept_changes: bool = False,
+    retrain: Sequence[str] = (),
+    keep_runs: bool = False,
     retrain_damaged: bool = False,
     must_exist: bool = False,
     as_json: bool = False,
@@ -102,7 +106,10 @@ def run_sweep(
         name: Replaces the file's `name`.
         seeds: Replaces `seeds`: how many, or a list with commas.
         overrides: `KEY=VALUE` each, laid over the file.
-        accept_changes: Train runs anew whose settings have changed since the sweep ran last.
+        accept_changes: Train runs anew whose settings have changed since the sweep ran last, or
+            whose environment has.
+        retrain: Tasks or labels of runs whose results are deleted, and which are trained again.
+        keep_runs: Use runs whose environment has changed.
         retrain_damaged: Delete finished runs that are damaged, and train them again.
         must_exist: Refuse to begin a sweep; only continue one.
         as_json: Print the plan of a dry run, or the sweep's last `state.json`, on standard output.
@@ -119,6 +126,7 @@ def run_sweep(
             loaded = config.config(seeds)
         else:
             path = config or DEFAULT_CONFIG
+            search_in(path.parent)
             loaded = load_sweep(path, name=name, storage=storage, seeds=seeds, overrides=overrides)
         loaded = _with_environment(console, loaded)
         if must_exist:
@@ -126,16 +134,20 @@ def run_sweep(
         opened = _open(console, loaded, lenient=retrain_damaged and not dry_run)
         if dry_run:
             check_searches(opened)
-        changes = changes_since(opened)
+        changes, old = changes_since(opened), old_runs(opened)
         if dry_run:
-            document = _show_plan(console, opened, changes, measure=measure)
+            texts = [str(changes or ""), changed_text(opened, old)]
+            document = _show_plan(console, opened, "\n".join(filter(None, texts)), measure=measure)
             code = 0
         else:
             if changes is not None and not accept_changes:
                 raise BadInputError(str(changes))
+            answer = Answer.to(opened, old, retrain, all_changed=accept_changes, keep=keep_runs)
             with hold_driver_lock(opened, partial(_say, console)), early:
-                remove_damaged(opened, partial(_say, console, style="yellow"))
-                code = _drive(console, opened)
+                say = partial(_say, console, style="yellow")
+                remove_damaged(opened, say)
+                opened = answer.carry_out(opened, say)
+                code = _drive(console, opened, [run.key for run in answer.again])
             document = sweep_files.read(opened.storage, f"{loaded.name}/{sweep_files.STATE}") or {}
         if as_json:
             print_json(document)
@@ -185,6 +197,7 @@ def _open(console: Console, config: SweepConfig, *, lenient: bool) -> Sweep:
         console.print(f"No CONFIG given: running the packaged sweep {DEFAULT_CONFIG}.")
     plan = make_plan(config)
     played = check_environments(plan, config.resources.hang_minutes)
+    environments = fingerprints(plan)
     if cluster_address() is None:
         check_hardware(plan)
         ray_parent()
@@ -194,7 +207,7 @@ def _open(console: Console, config: SweepConfig, *, lenient: bool) -> Sweep:
     check_storage(storage, config.name)
     warn = partial(_say, console, style="yellow")
     folder = sweep_folder(storage, config.name)
-    opened = open_sweep(config, plan, storage, folder, lenient=lenient)
+    opened = open_sweep(config, plan, storage, folder, environments=environments, lenient=lenient)
     resolve_store(config.mlflow.tracking_uri, storage)
     console.print(plan_view(config, plan, opened.finished))
     if rows := alpha_rows(plan):
@@ -215,12 +228,10 @@ def _open(console: Console, config: SweepConfig, *, lenient: bool) -> Sweep:
     return opened
 
 
-def _show_plan(
-    console: Console, opened: Sweep, changes: Changes | None, *, measure: bool
-) -> dict[str, Any]:
+def _show_plan(console: Console, opened: Sweep, changes: str, *, measure: bool) -> dict[str, Any]:
     """Record the analysis plan and, if asked, measure the cost; the plan as plain data."""
-    if changes is not None:
-        _say(console, str(changes), "yellow")
+    if changes:
+        _say(console, changes, "yellow")
     document = plan_answer(opened, changes)
     document["analysis_plan"] = as_document(_record_analysis_plan(console, opened))
     if measure:
@@ -234,8 +245,11 @@ def _show_plan(
     return document
 
 
-def _drive(console: Console, opened: Sweep) -> int:
-    """Run a sweep whose lock this process holds; the exit code."""
+def _drive(console: Console, opened: Sweep, again: Sequence[str]) -> int:
+    """Run a sweep whose lock this process holds; the exit code.
+
+    MLflow's runs of the keys `again` are out of date, because their results were deleted.
+    """
     give_back_freed_memory()
     # All that may refuse it comes before it is recorded as a sweep that was begun.
     import_checkpoints(opened.plan, opened.store)
@@ -243,6 +257,8 @@ def _drive(console: Console, opened: Sweep) -> int:
     check_searches(opened)
     check_ray(console, opened)
     with _open_tracker(opened) as tracker:
+        for key in again:
+            tracker.forget(key)
         keep_record(opened)
         keep_settings(opened)
         if versions := _record_analysis_plan(console, opened):
@@ -285,7 +301,7 @@ def _compute_and_report(console: Console, opened: Sweep, tracker: Tracker) -> in
         Display(console, opened.plan, opened.scheduler) as display,
         StateFile(opened) as state_file,
     ):
-        mlflow_log = MlflowListener(tracker, opened.store)
+        mlflow_log = MlflowListener(tracker, opened.store, opened.environments.now)
         display.headline = state_file.headline
         _take_over_reused(opened, display, mlflow_log)
         controller = None

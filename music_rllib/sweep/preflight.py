@@ -19,6 +19,8 @@ from typing import Any
 from rich.console import Console
 
 from music_rllib.config.run_settings import RunSettings
+from music_rllib.envs.fingerprint import Fingerprint, fingerprint_of
+from music_rllib.envs.modules import folders_for_workers
 from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.errors import BadInputError
 from music_rllib.experiment import sweep_files
@@ -82,6 +84,21 @@ def check_environments(plan: Plan, hang_minutes: float | None = None) -> list[st
     return remarks
 
 
+def fingerprints(plan: Plan) -> dict[str, Fingerprint]:
+    """The fingerprint of each task's environment, by the task's name; imports those of the user.
+
+    Raises:
+        TaskError: The module of an environment can't be imported.
+    """
+    found = {}
+    for task in {run.task.name: run.task for run in plan.settings}.values():
+        try:
+            found[task.name] = fingerprint_of(task.env_id, task.env_kwargs)
+        except Exception as error:  # a user's module may raise anything
+            raise TaskError(f"environments.{task.name} must be importable: {error}") from error
+    return found
+
+
 def _play(
     left: Mapping[str, Mapping[str, Any]], hang_minutes: float | None
 ) -> list[tuple[str, list[str], list[str]]]:
@@ -90,7 +107,8 @@ def _play(
     request = json.dumps({"questions": list(left.values()), "seconds": seconds})
     answers, end = os.pipe()
     # The child finds modules where this process does. -P: not in its current folder only.
-    path = os.pathsep.join(str(Path(entry).absolute()) for entry in sys.path)
+    entries = (*sys.path, *folders_for_workers())
+    path = os.pathsep.join(str(Path(entry).absolute()) for entry in entries)
     command = [sys.executable, "-P", "-m", "music_rllib.envs.probe", str(end)]
     with subprocess.Popen(  # noqa: S603
         command,

@@ -88,7 +88,8 @@ def deliver(place: str, tracking_uri: str | None, timeout: float) -> Pending:
                 tracker.put_sweep_artefact(name, sweep_files.as_json(document))
         for node in sweep.plan.nodes:
             if sweep.store.is_finished(node.key):
-                tracker.mirror(run_info(node), partial(finished_run, sweep.store, node))
+                info = run_info(node, sweep.store.environment(node.key))
+                tracker.mirror(info, partial(finished_run, sweep.store, node))
             elif node.key in begun:
                 cause = causes.get(node.label)
                 tracker.mirror(run_info(node), partial(_unfinished_run, sweep.store, node, cause))

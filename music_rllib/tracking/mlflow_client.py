@@ -83,6 +83,8 @@ class KnownRun(NamedTuple):
     """Start time in ms since the epoch."""
     complete: bool = False
     """Whether it is finished and all of its data has arrived."""
+    environment: str = ""
+    """Its `names.TAG_ENVIRONMENT`."""
 
 
 class Experiment:
@@ -110,14 +112,26 @@ class Experiment:
                 f"it answered: {mlflow_reason(error)}"
             ) from error
 
-    def find(self, node_key: str) -> KnownRun | None:
+    def find(self, node_key: str, environment: str | None = None) -> KnownRun | None:
         """The run of a node, or the sweep's own run ("").
 
-        Lists all runs of the sweep on the first call.
+        Lists all runs of the sweep on the first call. A run of another environment is deleted (as
+        MLflow does it, so that it can be restored), because another one takes its place.
         """
         if self._known is None:
             self._known = self._list()
-        return self._known.get(node_key)
+        known = self._known.get(node_key)
+        if known and environment and known.environment and known.environment != environment:
+            self.delete(node_key)
+            return None
+        return known
+
+    def delete(self, node_key: str) -> None:
+        """Delete a node's run, if there is one, so that it can still be restored."""
+        known = self.find(node_key)
+        if known is not None and self._known is not None:
+            self._client.delete_run(known.run_id)
+            del self._known[node_key]
 
     def known_id(self, node_key: str) -> str | None:
         """Run id of a node whose run was found or created before; sends no request."""
@@ -134,7 +148,9 @@ class Experiment:
         run = self._client.create_run(
             self.id, start_time=time, tags={**tags, **identity}, run_name=name
         )
-        self._known = known | {node_key: KnownRun(str(run.info.run_id), time)}
+        environment = tags.get(names.TAG_ENVIRONMENT, "")
+        new = KnownRun(str(run.info.run_id), time, environment=environment)
+        self._known = known | {node_key: new}
         return self._known[node_key]
 
     def _list(self) -> dict[str, KnownRun]:
@@ -153,7 +169,9 @@ class Experiment:
                 tags = run.data.tags
                 complete = run.info.status == "FINISHED" and names.TAG_INCOMPLETE not in tags
                 node_key = tags.get(names.TAG_NODE_KEY, "")
-                known.setdefault(node_key, KnownRun(run.info.run_id, run.info.start_time, complete))
+                environment = tags.get(names.TAG_ENVIRONMENT, "")
+                found = KnownRun(run.info.run_id, run.info.start_time, complete, environment)
+                known.setdefault(node_key, found)
             token = page.token
             if not token:
                 return known

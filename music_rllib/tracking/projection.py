@@ -194,7 +194,7 @@ class RunProjection:
         """The run in MLflow, which is found there or created."""
         if self._run is None:
             start = self._start
-            run = self._experiment.find(self.node_key)
+            run = self._experiment.find(self.node_key, start.tags.get(names.TAG_ENVIRONMENT))
             if run is None:
                 tags = {**start.provenance, **start.tags, **self._parent_tag()}
                 run = self._experiment.create(self.node_key, start.name, start.time, tags)
@@ -233,7 +233,8 @@ class RunProjection:
             self._send_stored(first)
 
     def _send_stored(self, read: ReadStoredRun) -> None:
-        known = self._experiment.find(self.node_key)
+        environment = self._start.tags.get(names.TAG_ENVIRONMENT)
+        known = self._experiment.find(self.node_key, environment)
         if self._run is None and known is not None and known.complete:
             self._run = known
             self._artefacts.clear()

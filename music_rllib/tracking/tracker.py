@@ -146,6 +146,13 @@ class Tracker:
         projection.mirror(self._as_start(run), read)
         self._sender.add(projection)
 
+    def forget(self, node_key: str) -> None:
+        """Delete the MLflow run of a node that is trained again; errors are only logged."""
+        try:
+            self._experiment.delete(node_key)
+        except Exception as error:
+            logger.warning("MLflow keeps the earlier run %s: %s", node_key, mlflow_reason(error))
+
     def put_sweep_artefact(self, name: str, content: str) -> None:
         """Add or replace an artefact of the parent run."""
         self._parent.put_artefact(name, content.encode())

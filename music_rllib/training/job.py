@@ -36,6 +36,10 @@ class NodeJob(BaseModel):
     """Name of the sweep, for messages."""
     stop_key: str | None = None
     """Key of the flag that stops the worker; None: nothing does."""
+    environment: dict[str, str] | None = None
+    """Fingerprint of the task's environment in the driver; None: it was not looked at."""
+    same_environments: frozenset[str] = frozenset()
+    """Digests of those in place of which it may be used."""
     hang_minutes: float | None = None
     """Longest duration of one call of the environment; None: there is no limit."""
 

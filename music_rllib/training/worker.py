@@ -30,6 +30,7 @@ from music_rllib.store.run_record import (
     to_json_lines,
 )
 from music_rllib.training.divergence import divergence
+from music_rllib.training.environment import RunEnvironment
 from music_rllib.training.failure_reason import cause_of, trace_of
 from music_rllib.training.hang_watch import RECORD, HangWatch, check_hung
 from music_rllib.training.job import NodeJob
@@ -76,6 +77,7 @@ class RunTrainable(Trainable):
         self._watch: HangWatch | None = None
         self._history: list[Report] = []
         self._notes: list[str] = []
+        self._environment = RunEnvironment(self._job)
         self._stopped = self._waits = False
         self._seconds_before = self._began = self._saved_at = 0.0
         self._unsent = 0
@@ -161,6 +163,7 @@ class RunTrainable(Trainable):
     def _finished_elsewhere(self) -> dict[str, Any]:
         """The result of a run that another sweep, or a worker without a driver, has finished."""
         self._store.verify(self._job.key)
+        self._environment.check("result", self._store.environment(self._job.key))
         self._history = self._store.history(self._job.key)
         if self._held is not None:
             self._clear()
@@ -231,6 +234,7 @@ class RunTrainable(Trainable):
 
         job = self._job
         self._start_watch()
+        self._environment.look()
         training = TrainingRun(job.run, self._source_weights(), job.gpus)
         newest = self._work.newest(self._notes.append)
         if not self._restore(training, newest) and not budget_settings(job.run):
@@ -249,6 +253,10 @@ class RunTrainable(Trainable):
         with newest as saved:
             if saved is None:
                 return False
+            if other_run and (problem := self._environment.problem(saved.environment)):
+                self._notes.append(f"does not continue {other_run}which used another {problem}")
+                return False
+            self._environment.check("checkpoint", saved.environment)
             training.restore(saved, foreign=bool(other_run))
             self._history = from_json_lines((saved.folder / HISTORY).read_bytes())
             self._seconds_before = float((saved.folder / SECONDS).read_text())
@@ -298,14 +306,11 @@ class RunTrainable(Trainable):
             lease.check()
             self._pause(training)
             return False
-        self._history.append(
-            Report(
-                env_steps=training.env_steps,
-                seconds=self._seconds,
-                timestamp_ms=round(time.time() * 1000),
-                metrics=metrics,
-            )
+        now = round(time.time() * 1000)
+        report = Report(
+            env_steps=training.env_steps, seconds=self._seconds, timestamp_ms=now, metrics=metrics
         )
+        self._history.append(report)
         self._notes += divergence(self._job.run, self._history)
         if not training.env_steps and training.will_compile:
             self._notes.append("compiles its updates first, once on a machine: some 20 seconds")
@@ -320,14 +325,11 @@ class RunTrainable(Trainable):
 
     def _checkpoint(self, training: TrainingRun) -> None:
         self._lease.check()
-        with self._work.new_checkpoint(training.env_steps) as draft:
+        with self._work.new_checkpoint(training.env_steps, self._environment.here) as draft:
             training.save(draft)
             self._write_history(draft)
             # The networks that act, for `load_policy`.
-            modules = training.modules()
-            acting: dict[str, Any] = {
-                name: modules[name] for name in ("policy", "normaliser") if name in modules
-            }
+            acting = {k: v for k, v in training.modules().items() if k in {"policy", "normaliser"}}
             with contextlib.suppress(ValueError):  # diverged: the end of the run will say so
                 self._write_outcome(draft.folder, training, acting)
         self._saved_at = time.monotonic()
@@ -349,19 +351,16 @@ class RunTrainable(Trainable):
 
     def _publish(self, training: TrainingRun) -> None:
         self._lease.check()
-        last = self._history[-1]
+        last, metrics = self._history[-1], last_values(self._history)
+        result = RunResult(
+            label=self._job.label, env_steps=last.env_steps, seconds=last.seconds, metrics=metrics
+        )
         self._store.tidy(self._job.key)
         with TemporaryDirectory() as temporary:
             folder = Path(temporary)
             (folder / HISTORY).write_bytes(to_json_lines(self._history))
             self._write_outcome(folder, training, training.modules())
-            result = RunResult(
-                label=self._job.label,
-                env_steps=last.env_steps,
-                seconds=last.seconds,
-                metrics=last_values(self._history),
-            )
-            self._store.publish(self._job.key, folder, result)
+            self._store.publish(self._job.key, folder, result, self._environment.here)
 
     def _write_outcome(
         self, folder: Path, training: TrainingRun, modules: Mapping[str, Mapping[str, Any]]
@@ -384,7 +383,7 @@ class RunTrainable(Trainable):
         try:
             if any(steps_of(name) >= training.env_steps for name in kept.names()):
                 return
-            with kept.new_checkpoint(training.env_steps) as draft:
+            with kept.new_checkpoint(training.env_steps, self._environment.here) as draft:
                 training.save(draft, alone=True)
                 self._write_history(draft)
         except (StorageError, OSError) as error:

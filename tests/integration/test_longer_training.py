@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -9,10 +10,11 @@ import pytest
 
 from music_rllib.config.run_settings import RunSettings, Variant
 from music_rllib.config.schema import Checkpoints
+from music_rllib.envs.fingerprint import digest_of, fingerprint_of
 from music_rllib.experiment.continuation import budget_settings, continuation_key, is_continuable
 from music_rllib.store.node_store import NodeStore
 from music_rllib.store.run_record import from_json_lines
-from music_rllib.training.worker import NOTES, REPORTS
+from music_rllib.training.worker import CAUSE, NOTES, REPORTS
 from tests.integration.test_sweep_trainable import (
     compute,
     job,
@@ -67,6 +69,43 @@ def test_a_damaged_or_missing_end_costs_time_and_no_number(tmp_path: Path) -> No
     assert "a damaged checkpoint is skipped" in notes[0]
     compute(job(tmp_path / "other", long.run))
     assert numbers(tmp_path, long) == numbers(tmp_path / "other", long)
+
+
+@pytest.mark.usefixtures("local_ray")
+def test_nothing_of_another_environment_is_continued_or_reused(tmp_path: Path) -> None:
+    task = settings("tac").task
+    here = dict(fingerprint_of(task.env_id, task.env_kwargs))
+    driver = {"environment": here, "same_environments": frozenset({digest_of(here)})}
+    old = {"environment": here | {"source point_env.py": "old"}}
+    short, long, cut = (
+        job(tmp_path, settings("tac", env_steps=steps)).model_copy(update=driver)
+        for steps in (200, 400, 600)
+    )
+    compute(short)
+    store = NodeStore(str(tmp_path))
+    kept = store.continuation(continuation_key(short.run, None))
+    assert store.environment(short.key) == kept.environment() == here
+    for manifest in Path(tmp_path).rglob("manifest.json"):
+        document = json.loads(manifest.read_text())
+        if "environment" in document["meta"]:
+            document["meta"] |= old
+            manifest.write_text(json.dumps(document))
+    assert (
+        "its result is of another environment (point_env.py changed)" in (compute(short)[-1][CAUSE])
+    )
+    compute(cut, steps=2)
+    work = store.work_folder(cut.key)
+    assert work.environment() == here
+    results = compute(long)
+    assert "does not continue a finished run with fewer env_steps" in results[0][NOTES][0]
+    assert from_json_lines(results[0][REPORTS].encode())[0].env_steps == 0
+    with work.new_checkpoint(500, old["environment"]) as draft:
+        (draft.folder / "history.jsonl").write_bytes(b"")
+    assert "its checkpoint is of another environment" in compute(cut)[-1][CAUSE]
+    answered = {"same_environments": frozenset(map(digest_of, (here, old["environment"])))}
+    assert CAUSE not in compute(short.model_copy(update=answered))[-1]
+    elsewhere = compute(cut.model_copy(update=old))
+    assert "it is not the driver's: point_env.py changed" in elsewhere[-1][CAUSE]
 
 
 @pytest.mark.usefixtures("local_ray")

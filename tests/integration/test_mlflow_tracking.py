@@ -149,6 +149,41 @@ def logged_steps(client: MlflowClient, run: Run, metric: str = names.EVAL_SUCCES
     return [point.step for point in client.get_metric_history(run.info.run_id, metric)]
 
 
+def test_a_run_of_another_environment_takes_the_place_of_the_earlier_one(
+    storage: Path, tracker_on: MakeTracker
+) -> None:
+    """Or of the same one, where its result was deleted to train it again."""
+
+    def info(environment: str) -> RunInfo:
+        return run_info("a", tags={names.TAG_ENVIRONMENT: environment})
+
+    def logged(tracker: Tracker) -> list[int]:
+        assert not tracker.close()
+        (run,) = (
+            r for r in runs_of(client_of(storage)).values() if names.TAG_NODE_KEY in r.data.tags
+        )
+        return logged_steps(client_of(storage), run)
+
+    tracker = tracker_on()
+    tracker.mirror(info("old"), stored([2000, 4000]))
+    assert logged(tracker) == [2000, 4000]
+    tracker = tracker_on()
+    tracker.mirror(info("old"), stored([6000]))
+    assert logged(tracker) == [2000, 4000], "MLflow has all of it"
+    tracker = tracker_on()
+    tracker.mirror(info("new"), stored([2000, 6000]))
+    assert logged(tracker) == [2000, 6000]
+    tracker = tracker_on()
+    tracker.start(info("newest"))
+    tracker.log("a", [report(4000)])
+    assert logged(tracker) == [4000]
+    tracker = tracker_on()
+    tracker.forget("a")
+    tracker.start(info("newest"))
+    tracker.log("a", [report(2000)])
+    assert logged(tracker) == [2000]
+
+
 def artefacts_of(client: MlflowClient, run: Run, folder: str | None = None) -> set[str]:
     return {item.path for item in client.list_artifacts(run.info.run_id, folder)}
 

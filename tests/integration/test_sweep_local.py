@@ -5,6 +5,7 @@ One in which nothing goes wrong is in test_sweep_finished.py.
 
 import json
 import re
+import shutil
 import signal
 from collections.abc import Callable
 from ipaddress import ip_address
@@ -18,6 +19,7 @@ from music_rllib.sweep.cli import main
 from tests.integration.conftest import (
     ENVIRONMENTS,
     POINT,
+    REPOSITORY,
     SWEEP,
     Program,
     call,
@@ -45,7 +47,10 @@ class Ended(NamedTuple):
 
 @pytest.fixture(scope="module")
 def ended(tmp_path_factory: pytest.TempPathFactory) -> Ended:
-    """A sweep on two tasks without success, one of which fails in its 300th step."""
+    """A sweep on two tasks without success, one of which fails in its 300th step.
+
+    Their module lies beside the file, as do some with the names of Python's own.
+    """
     point = POINT | {"success_key": None}
     document = SWEEP | {
         "tasks": ["Broken", "Point"],
@@ -54,6 +59,11 @@ def ended(tmp_path_factory: pytest.TempPathFactory) -> Ended:
     }
     program = Program(tmp_path_factory.mktemp("ended"), program_environment())
     program.write(document)
+    shutil.copy(ENVIRONMENTS / "point_env.py", program.folder)
+    for name in ("random", "types", "queue", "secrets"):
+        (program.folder / f"{name}.py").write_text("raise RuntimeError('not this one')")
+    # `python -m` finds modules in the current folder first, where `music-rllib` does not.
+    program.environment |= {"PYTHONPATH": str(REPOSITORY), "PYTHONSAFEPATH": "1"}
     program.environment[names.VARIABLE_REPORT] = "on"
     program.environment["POINT_SAYS"] = (
         "look at postgresql://me:planted-1@db/screws "

@@ -61,7 +61,10 @@ def compare(
 ) -> int:
     """Values of q, or whatever varies, with 95 % intervals."""
     from music_rllib import names
+    from music_rllib.envs.fingerprint import digest_of
+    from music_rllib.experiment.environments import mixed
     from music_rllib.experiment.location import find_sweep
+    from music_rllib.labels import ShortLabels
     from music_rllib.results.claims.answer import answer
     from music_rllib.results.claims.study import study_of
     from music_rllib.results.claims.tables import study_data
@@ -91,6 +94,7 @@ def compare(
     metrics = {task.primary_metric for each in opened.config.stages for task in each.tasks}
     metrics |= {names.EVAL_EPISODES, *filter(None, [metric])}
     stored = results_of(opened, metrics)
+    short = ShortLabels.of(run.label for run in opened.plan.runs)
     study = study_of(stored, settings.name, metric=given, maximised=maximised or given is None)
     entropies = _entropies({name: scopes(of_stage(name)) for name in names.ENTROPIES})
     groups = [group for scope in scopes(compared) for group in _groups(scope, maximised, entropies)]
@@ -101,6 +105,14 @@ def compare(
         "direction": "maximize" if maximised else "minimize",
         "groups": groups,
         "answer": answer(stored, study),
+        "environments": [
+            *mixed(
+                (run.task, short(run.label), digest_of(found))
+                for one in compared
+                for run in one.runs
+                if (found := opened.store.environment(run.key)) is not None
+            )
+        ],
         **study_data(study),
     }
     if json:

@@ -86,8 +86,25 @@ AcceptChanges = Annotated[
     bool,
     typer.Option(
         "--accept-changes",
-        help="Where settings are others than the last time under this name: train anew what they "
-        "touch. Without it the command says what would be lost, and starts nothing.",
+        help="If settings changed since the last run of this name, or an environment since its "
+        "runs used it, retrain the affected runs. Without it the command names them and starts "
+        "nothing.",
+    ),
+]
+Retrain = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="TASK|RUN",
+        help="Delete the results of a run, by its label or a part of it, or of all runs on a task, "
+        "and train it again. May be repeated.",
+    ),
+]
+KeepRuns = Annotated[
+    bool,
+    typer.Option(
+        "--keep-runs",
+        help="If an environment has changed since runs used it, use these runs as they are. The "
+        "answer is kept in the storage. Without an answer the command starts nothing.",
     ),
 ]
 RetrainDamaged = Annotated[
@@ -110,6 +127,8 @@ def run(
         bool, typer.Option("--dry-run", help="Check everything, show the plan, run nothing.")
     ] = False,
     accept_changes: AcceptChanges = False,
+    retrain: Retrain = None,
+    keep_runs: KeepRuns = False,
     retrain_damaged: RetrainDamaged = False,
     resume: Annotated[
         bool,
@@ -133,6 +152,8 @@ def run(
         seeds=seeds,
         overrides=overrides,
         accept_changes=accept_changes,
+        retrain=retrain or (),
+        keep_runs=keep_runs,
         retrain_damaged=retrain_damaged,
         must_exist=resume,
         as_json=json,
@@ -179,6 +200,8 @@ def resume(
     storage: Storage = None,
     seeds: Seeds = None,
     accept_changes: AcceptChanges = False,
+    retrain: Retrain = None,
+    keep_runs: KeepRuns = False,
     retrain_damaged: RetrainDamaged = False,
     json: Json = False,
 ) -> int:
@@ -193,6 +216,8 @@ def resume(
         find_sweep(sweep, storage),
         seeds=seeds,
         accept_changes=accept_changes,
+        retrain=retrain or (),
+        keep_runs=keep_runs,
         retrain_damaged=retrain_damaged,
         as_json=json,
     )

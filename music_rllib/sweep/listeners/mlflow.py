@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 
 from music_rllib import names
+from music_rllib.envs.fingerprint import Fingerprint
 from music_rllib.experiment.listener import Failure, Listener
 from music_rllib.experiment.plan import Node
 from music_rllib.experiment.run_info import run_info
@@ -18,8 +20,14 @@ from music_rllib.tracking.tracker import Tracker
 class MlflowListener(Listener):
     """Passes on to the tracker what happens to runs."""
 
-    def __init__(self, tracker: Tracker, store: NodeStore) -> None:
-        """Log by `tracker`; finished runs are read from `store`."""
+    def __init__(
+        self, tracker: Tracker, store: NodeStore, environments: Mapping[str, Fingerprint]
+    ) -> None:
+        """Log by `tracker`; finished runs are read from `store`.
+
+        Started ones use the `environments` of their tasks.
+        """
+        self._environments = environments
         self.tracker = tracker
         self._store = store
         self._open: set[str] = set()
@@ -27,7 +35,7 @@ class MlflowListener(Listener):
 
     def started(self, node: Node) -> None:
         """Open the node's MLflow run, or continue the one that it has."""
-        self.tracker.start(run_info(node))
+        self.tracker.start(run_info(node, self._environments.get(node.run.task.name)))
         self._open.add(node.key)
 
     def reported(self, node: Node, reports: list[Report]) -> None:
@@ -36,7 +44,8 @@ class MlflowListener(Listener):
 
     def finished(self, node: Node, result: RunResult | None = None) -> None:
         """Close a run that this sweep or an earlier one has finished, with its policy."""
-        self.tracker.mirror(run_info(node), partial(finished_run, self._store, node))
+        info = run_info(node, self._store.environment(node.key))
+        self.tracker.mirror(info, partial(finished_run, self._store, node))
         self._open.discard(node.key)
 
     def failed(self, node: Node, failure: Failure) -> None:

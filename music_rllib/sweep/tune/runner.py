@@ -70,6 +70,8 @@ def compute(
             checkpoints=sweep.config.checkpoints,
             sweep=sweep.plan.name,
             stop_key=stopping.flag.key,
+            environment=sweep.environments.now.get(node.run.task.name),
+            same_environments=sweep.environments.same(node.run.task.name),
             hang_minutes=resources.hang_minutes,
         ).to_tune(),
         advance=(lambda: False) if controller is None else controller.advance,

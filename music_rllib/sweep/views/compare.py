@@ -22,6 +22,7 @@ def compare_view(document: Mapping[str, Any]) -> RenderableType:
     if not document["groups"]:
         return Text(f"Stage {document['stage']} of {document['sweep']} has no finished run yet.")
     parts: list[RenderableType] = [*map(Text, document["answer"]), Text()]
+    parts += [Text(line, style="yellow") for line in document["environments"]]
     if document["comparisons"]:
         parts.append(_comparisons_table(document["comparisons"]))
     if document["conditions"]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 from music_rllib.config.remarks import remarks
-from music_rllib.experiment.changes import Changes
 from music_rllib.experiment.plan import shared_runs
 from music_rllib.experiment.session import Sweep, plan_document
 from music_rllib.redaction import redact
@@ -13,7 +12,7 @@ from music_rllib.sweep.views.alpha import adaptive_rows, alpha_rows
 from music_rllib.sweep.views.search_budget import search_budget
 
 
-def plan_answer(opened: Sweep, changes: Changes | None) -> dict[str, Any]:
+def plan_answer(opened: Sweep, changes: str) -> dict[str, Any]:
     """The plan of a sweep, with what has changed since the sweep ran last."""
     config = opened.config
     searches = [
@@ -45,5 +44,5 @@ def plan_answer(opened: Sweep, changes: Changes | None) -> dict[str, Any]:
         "remarks": [*remarks(config), *shared_runs(opened.plan)],
         "alpha": alpha_rows(opened.plan),
         "adaptive": adaptive_rows(opened.plan),
-        "changes": None if changes is None else str(changes),
+        "changes": changes or None,
     }

@@ -1,11 +1,15 @@
 """The faster Fetch step against Gymnasium-Robotics' own."""
 
+import itertools
+from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
+from music_rllib.envs.fetch import speed_up
 from music_rllib.envs.make import goal_reward_of, make_env, moved_distance_of
 from music_rllib.envs.tasks import BUILT_IN_TASKS
 
@@ -58,19 +62,96 @@ def test_fast_fetch_steps_equal_the_originals_bit_for_bit(
     assert same(left.qacc_warmstart, right.qacc_warmstart), "the solver's start at the next step"
 
 
-def test_an_environment_with_a_reward_of_its_own_keeps_its_step() -> None:
+Change = Callable[[Any, int], None]
+"""Changes an environment (unwrapped) before its reset of this number."""
+
+
+def cheerful(env: Any, episode: int) -> None:
+    """As a user's script does, on the object."""
+    env.compute_reward = lambda achieved, goal, info: 1.0
+
+
+def rebuilt(env: Any, episode: int) -> None:
+    """As a wrapper with domain randomisation does: a fresh model and data."""
+    initial = {"robot0:slide0": 0.4049, "robot0:slide1": 0.48, "robot0:slide2": 0.0}
+    env.initial_qpos = initial | {"object0:joint": [1.25, 0.53, 0.4, 1.0, 0.0, 0.0, 0.0]}
+    env._initialize_simulation()
+    edited(env, episode)
+
+
+def edited(env: Any, episode: int) -> None:
+    """The model stays and its numbers change, the time step among them."""
+    env.model.geom_size[env.model.geom("object0").id] = 0.02 + 0.005 * episode
+    env.model.opt.timestep = 0.002 / (1 + episode)
+
+
+def heavier_actions(env: Any, episode: int) -> None:
+    env.action_space = gym.spaces.Box(-0.5, 0.5, (4,), np.float32)
+
+
+def other_callback(env: Any, episode: int) -> None:
+    env._step_callback = lambda: env.data.qvel.__imul__(0.5)
+
+
+def other_observation(env: Any, episode: int) -> None:
+    plain = type(env)._get_obs
+
+    def noisy() -> Any:
+        found = plain(env)
+        return found | {"observation": found["observation"] + 1}
+
+    env._get_obs = noisy
+
+
+@pytest.mark.parametrize("fast", [rebuilt, edited, heavier_actions])
+@pytest.mark.parametrize("kept", [cheerful, other_callback, other_observation])
+def test_what_is_changed_between_episodes_counts(fast: Change, kept: Change) -> None:
+    """Whether the faster step can follow a change, or has to give way to it."""
+    envs = [make_env("FetchPush-v4"), original("FetchPush-v4")]
+    assert "step" in vars(envs[0].unwrapped)
+    rng = np.random.default_rng(1)
+    for episode, changes in enumerate([[fast], [fast], [kept], [fast, kept]]):
+        for change, env in itertools.product(changes, envs):
+            change(env.unwrapped, episode)
+        pair = [env.reset(seed=episode)[0] for env in envs]
+        assert all(same(pair[0][key], pair[1][key]) for key in pair[1])
+        for _ in range(5):
+            action = rng.uniform(-1, 1, 4)
+            mine, theirs = (env.step(action) for env in envs)
+            assert all(same(mine[0][key], theirs[0][key]) for key in theirs[0])
+            assert mine[1] == theirs[1]
+        assert ("step" in vars(envs[0].unwrapped)) == (changes == [fast])
+
+
+@pytest.mark.parametrize("on_the_class", [True, False], ids=["their class", "a class of its own"])
+def test_an_environment_with_a_reward_of_its_own_keeps_its_step(
+    on_the_class: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     make_env("FetchReach-v4")  # registers the robotics tasks
+    from gymnasium_robotics.envs.fetch.fetch_env import MujocoFetchEnv
     from gymnasium_robotics.envs.fetch.reach import MujocoFetchReachEnv
+
+    plain = MujocoFetchEnv.compute_reward
 
     class Cheerful(MujocoFetchReachEnv):  # type: ignore[misc]
         def compute_reward(self, achieved_goal: Any, goal: Any, info: Any) -> Any:
-            return super().compute_reward(achieved_goal, goal, info) + 1
+            return plain(self, achieved_goal, goal, info) + 1
 
-    gym.register("CheerfulReach-v0", Cheerful)
-    env = make_env("CheerfulReach-v0")
+    if on_the_class:
+        monkeypatch.setattr(MujocoFetchEnv, "compute_reward", Cheerful.compute_reward)
+    entry = MujocoFetchReachEnv if on_the_class else Cheerful
+    gym.register(f"CheerfulReach{on_the_class}-v0", entry)
+    env = make_env(f"CheerfulReach{on_the_class}-v0")
     assert "step" not in vars(env.unwrapped)
     env.reset(seed=0)
     assert env.step(np.zeros(4, np.float32))[1] in (0.0, 1.0)
+
+
+def test_a_robot_of_another_kind_keeps_its_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = original("FetchPush-v4")
+    monkeypatch.setattr(env.unwrapped, "_model_names", SimpleNamespace(joint_names=["robot0:none"]))
+    speed_up(env)
+    assert "step" not in vars(env.unwrapped)
 
 
 def test_an_action_of_another_size_is_refused() -> None:

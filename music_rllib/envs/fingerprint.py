@@ -1,0 +1,332 @@
+"""What determines an environment beside its settings: source, model files, versions of packages.
+
+A run's key is a hash of its settings, the same on every machine. What the environment computes also
+depends on its code, so a run keeps a *fingerprint* of that, from name to version or content hash:
+
+    {"package gymnasium": "1.2.3", "source lab_env.py": "5b0c…", "file assets/arm.xml": "91d4…"}
+
+- **Sources**: the module in front of the id, the modules of its entry point, of its classes and of
+  the wrappers of its registration, and all that these modules import. A module counts unless it is
+  Python's own or installed (an editable installation counts as source).
+- **Files** in the folder of such a module, or of its package, and below: models (`MODELS`), and any
+  other file whose name stands in the sources or in a model; also files that `env_kwargs` name.
+- **Packages**: versions of those that hold the environment's classes or that the modules import.
+
+The built-in tasks have the versions of Gymnasium-Robotics and MuJoCo alone.
+"""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import hashlib
+import importlib
+import importlib.metadata
+import importlib.util
+import itertools
+import json
+import os
+import re
+import sys
+import warnings
+from collections.abc import Iterable, Iterator, Mapping
+from functools import cache
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import gymnasium as gym
+
+from music_rllib.envs.make import _register_robotics
+from music_rllib.envs.modules import is_installed, make_importable
+from music_rllib.envs.tasks import BUILT_IN_TASKS
+
+Fingerprint = Mapping[str, str]
+
+MODELS = frozenset(
+    {".xml", ".mjcf", ".mjb", ".urdf", ".sdf", ".xacro", ".stl", ".obj", ".msh", ".dae", ".ply"}
+    | {".glb", ".gltf", ".usd", ".usda", ".usdc"}
+)
+"""Endings of files that describe bodies and scenes."""
+MOST_ENTRIES = 5000
+"""Entries of folders that are looked at for the files of one module."""
+MOST_BYTES = 64 * 2**20
+"""Of a larger file its beginning and its size count."""
+_WITHOUT_EFFECT = frozenset(
+    {"music_rllib", "numpy", "matplotlib", "pygame", "PIL", "cv2", "imageio"}
+)
+"""Packages whose versions do not count: they draw, or promise to compute the same."""
+_PACKAGE, _SOURCE, _FILE = "package ", "source ", "file "
+
+
+def fingerprint_of(env_id: str, env_kwargs: Mapping[str, Any]) -> Fingerprint:
+    """The fingerprint of an environment; imports its module and makes nothing.
+
+    Raises:
+        ImportError: A module is not found.
+        gymnasium.error.Error: There is no such environment.
+    """
+    if env_id in {task.env_id for task in BUILT_IN_TASKS.values()}:
+        found = {_PACKAGE + name: _version(name) for name in ("gymnasium-robotics", "mujoco")}
+        return found | _files_of_arguments(env_kwargs)
+    _register_robotics()
+    walk = _Walk()
+    for module in _modules_of(env_id):
+        walk.visit(module, is_root=True)
+    found = walk.packages | walk.sources | walk.files()
+    return dict(sorted((found | _files_of_arguments(env_kwargs)).items()))
+
+
+def digest_of(fingerprint: Fingerprint) -> str:
+    """A short hash of a fingerprint."""
+    return _hash(json.dumps(dict(fingerprint), sort_keys=True).encode())
+
+
+def differences(before: Fingerprint, after: Fingerprint) -> list[str]:
+    """`lab_env.py changed`, `mujoco 3.8.0 -> 3.8.1`, one line for each difference."""
+    lines = []
+    for name in sorted({**before, **after}):
+        old, new = before.get(name), after.get(name)
+        kind, _, what = name.partition(" ")
+        if old == new:
+            continue
+        if old is None or new is None:
+            lines.append(f"{what} is {'new' if old is None else 'no longer used'}")
+        else:
+            lines.append(f"{what} {old} -> {new}" if kind == "package" else f"{what} changed")
+    return lines
+
+
+def on_another_machine(driver: Fingerprint, worker: Fingerprint) -> list[str]:
+    """Differences of a worker from its driver; a file that only one of them has does not count.
+
+    Environments may write models for themselves. A worker that lacks a file fails by itself.
+    """
+    alone = {name for name in driver.keys() ^ worker.keys() if name.startswith(_FILE)}
+    first, second = (
+        {name: value for name, value in one.items() if name not in alone}
+        for one in (driver, worker)
+    )
+    return differences(first, second)
+
+
+def _modules_of(env_id: str) -> Iterator[str]:
+    """Names of the modules that register the environment, define its classes and wrap it."""
+    module = env_id.rpartition(":")[0]
+    if module:
+        make_importable(module)
+        importlib.import_module(module)
+        yield module
+    with warnings.catch_warnings():  # `gymnasium.make` warns of an old version, too
+        warnings.simplefilter("ignore")
+        spec = gym.envs.registration._find_spec(env_id)
+    entries = [spec.entry_point, *(wrapper.entry_point for wrapper in spec.additional_wrappers)]
+    for entry in (*entries, *spec.kwargs.values()):
+        if isinstance(entry, str) and ":" in entry and entry in entries:
+            yield entry.partition(":")[0]
+            entry = gym.envs.registration.load_env_creator(entry)
+        for one in getattr(entry, "__mro__", (getattr(entry, "func", entry),)):
+            if isinstance(name := getattr(one, "__module__", None), str):
+                yield name
+
+
+class _Walk:
+    """The modules that an environment depends on, followed by what they import."""
+
+    def __init__(self) -> None:
+        self.packages: dict[str, str] = {}
+        self.sources: dict[str, str] = {}
+        self._seen: set[tuple[str, bool]] = set()
+        self._folders: dict[Path, Path] = {}
+        """Folders of modules and packages, and those from which they are imported."""
+        self._strings: set[str] = set()
+        """All texts in the sources that may be names of files."""
+
+    def visit(self, name: str, *, is_root: bool = False) -> None:
+        """Add a module, if there is one of this name, and what it imports."""
+        top = name.partition(".")[0]
+        if (name, is_root) in self._seen or top in _WITHOUT_EFFECT:
+            return
+        self._seen.add((name, is_root))
+        file = _file_of(name if is_root or not self._is_elsewhere(top) else top)
+        if file is None:
+            return
+        if not is_installed(str(file)):
+            self._add_source(name, file)
+        elif version := _version_of(top, file):
+            self.packages |= version
+            if is_root and file.suffix == ".py":
+                # What an installed class stands on, such as its simulator.
+                imports = _imports(_parsed(file.read_bytes()).body, _package(name, file))
+                for other in {one.partition(".")[0] for one in imports} - _WITHOUT_EFFECT - {top}:
+                    if (theirs := _file_of(other)) is not None and is_installed(str(theirs)):
+                        self.packages |= _version_of(other, theirs)
+
+    def _is_elsewhere(self, top: str) -> bool:
+        file = _file_of(top)
+        return file is not None and is_installed(str(file))
+
+    def _add_source(self, name: str, file: Path) -> None:
+        depth = name.count(".") + (file.stem == "__init__")
+        root = file.parents[depth]
+        data = file.read_bytes()
+        self.sources[_SOURCE + file.relative_to(root).as_posix()] = _hash(
+            data.replace(b"\r\n", b"\n") if file.suffix == ".py" else data
+        )
+        self._folders[root / name.partition(".")[0] if depth else root] = root
+        if file.suffix != ".py":
+            return
+        tree = _parsed(data)
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                self._strings.add(node.value)
+        above = name.rpartition(".")[0]
+        for other in (*filter(None, [above]), *_imports(ast.walk(tree), _package(name, file))):
+            self.visit(other)
+
+    def files(self) -> dict[str, str]:
+        """Models in the folders of the sources, and files that sources or models name."""
+        found = {
+            path: path.relative_to(root).as_posix()
+            for folder, root in self._folders.items()
+            for path in _entries(folder)
+        }
+        named = {PurePosixPath(text).name for text in self._strings if "." in text[-8:]}
+        models = [path for path in found if path.suffix.lower() in MODELS]
+        for path in (path for path in models if path.suffix.lower() in {".xml", ".urdf", ".mjcf"}):
+            named |= {Path(one).name for one in _FILE_ATTRIBUTE.findall(_text(path))}
+        wanted = {path: found[path] for path in found if path in models or path.name in named}
+        for text, root in itertools.product(self._strings, self._folders):
+            # `../assets/arm.xml`, or with the whole path.
+            if "/" in text and "." in text[-8:] and "\n" not in text and len(text) < 500:
+                path = Path(os.path.normpath(root / text))
+                if path not in found and path.is_file():
+                    wanted[path] = text
+        found_now = {}
+        for path, name in wanted.items():
+            with contextlib.suppress(OSError):  # one that an environment has made for itself
+                found_now[_FILE + name] = _hash_of(path)
+        return found_now
+
+
+_FILE_ATTRIBUTE = re.compile(r"""\b(?:file|filename)\s*=\s*["']([^"']+)["']""")
+
+
+def _imports(nodes: Iterable[ast.AST], package: str) -> Iterator[str]:
+    """Names that statements import: modules, and perhaps attributes of modules."""
+    for node in nodes:
+        if isinstance(node, ast.Try):
+            yield from _imports(node.body, package)
+        elif isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                above = package.rsplit(".", node.level - 1)[0]
+                base = f"{above}.{base}" if base else above
+            yield base
+            yield from (f"{base}.{alias.name}" for alias in node.names)
+        elif isinstance(node, ast.Call) and node.args:
+            called = getattr(node.func, "attr", getattr(node.func, "id", ""))
+            name = getattr(node.args[0], "value", None)
+            if called in {"import_module", "__import__"} and isinstance(name, str):
+                yield name if not name.startswith(".") else f"{package}{name}"
+
+
+def _parsed(data: bytes) -> ast.Module:
+    """The statements of a source; none of one that this Python can't read."""
+    try:
+        return ast.parse(data)
+    except (SyntaxError, ValueError):
+        return ast.Module([], [])
+
+
+def _package(name: str, file: Path) -> str:
+    return name if file.stem == "__init__" else name.rpartition(".")[0]
+
+
+def _file_of(name: str) -> Path | None:
+    """The file of a module; None where there is none, as for one that is built in."""
+    if name in sys.modules:
+        file = getattr(sys.modules[name], "__file__", None)
+    else:
+        try:
+            spec = importlib.util.find_spec(name)
+        except (ImportError, ValueError, AttributeError):
+            return None
+        file = spec.origin if spec and spec.has_location else None
+    return Path(file) if file and Path(file).is_file() else None
+
+
+@cache
+def _version(distribution: str) -> str:
+    return importlib.metadata.version(distribution)
+
+
+def _version_of(top: str, file: Path) -> dict[str, str]:
+    """The version of the distribution that has an installed module; {} for Python's own."""
+    if not {"site-packages", "dist-packages"} & {*file.parts}:
+        return {}
+    try:
+        name = importlib.metadata.metadata(top)["Name"]
+    except importlib.metadata.PackageNotFoundError:
+        names = importlib.metadata.packages_distributions().get(top)
+        if not names:
+            return {}
+        name = sorted(names)[0]
+    return {_PACKAGE + re.sub(r"[-_.]+", "-", name).lower(): _version(name)}
+
+
+def _entries(folder: Path) -> Iterator[Path]:
+    """Files below a folder that are not Python's, nearest first."""
+    left, folders = MOST_ENTRIES, [folder]
+    while folders and left > 0:
+        folder = folders.pop(0)
+        try:
+            entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
+        except OSError:
+            continue
+        names = {entry.name for entry in entries}
+        # The storage of a sweep, or an installation.
+        if {"nodes", "work"} <= names or "pyvenv.cfg" in names:
+            continue
+        left -= len(entries)
+        for entry in entries:
+            path = Path(entry.path)
+            if entry.name.startswith((".", "__pycache__", "node_modules", "mlruns")):
+                continue
+            if entry.is_dir(follow_symlinks=False):
+                folders.append(path)
+            elif entry.is_file() and path.suffix not in {".py", ".pyc"}:
+                yield path
+
+
+def _files_of_arguments(arguments: Any) -> dict[str, str]:
+    """Files that are named in the arguments of an environment."""
+    if isinstance(arguments, Mapping):
+        arguments = list(arguments.values())
+    if isinstance(arguments, list | tuple):
+        parts = map(_files_of_arguments, arguments)
+        return {name: value for part in parts for name, value in part.items()}
+    if not isinstance(arguments, str) or len(arguments) > 1000 or "." not in arguments:
+        return {}
+    path = Path(arguments).expanduser()
+    try:
+        return {_FILE + path.name: _hash_of(path)} if path.is_file() else {}
+    except (OSError, ValueError):
+        return {}
+
+
+def _text(path: Path) -> str:
+    with path.open("rb") as file:
+        return file.read(2**20).decode(errors="replace")
+
+
+def _hash_of(path: Path) -> str:
+    with path.open("rb") as file:
+        data = file.read(MOST_BYTES)
+    size = path.stat().st_size
+    return _hash(data if size <= MOST_BYTES else data + str(size).encode())
+
+
+def _hash(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()[:16]

@@ -1,0 +1,162 @@
+"""What determines an environment is found, wherever it stands."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import gymnasium as gym
+import pytest
+
+from music_rllib.envs import fingerprint as module
+from music_rllib.envs.fingerprint import (
+    Fingerprint,
+    differences,
+    digest_of,
+    fingerprint_of,
+    on_another_machine,
+)
+from music_rllib.envs.make import make_env
+from music_rllib.envs.modules import search_in
+
+FILES = {
+    "lab/__init__.py": "",
+    "lab/envs/__init__.py": "import gymnasium as gym\n"
+    "gym.register('Lab-v0', 'lab.envs.push:Push', additional_wrappers=("
+    "gym.envs.registration.WrapperSpec('Scaled', 'lab_wrappers:Scaled', None),))\n",
+    "lab/envs/push.py": "from ..base import Base\nclass Push(Base):\n    pass\n",
+    "lab/base.py": "import gymnasium as gym, os\nfrom lab import rewards\n"
+    "MODEL = os.path.join(os.path.dirname(__file__), 'assets', 'push.xml')\n"
+    "class Base(gym.Env):\n    def reset(self):\n        import lab_late\n",
+    "lab/rewards.py": "import importlib\nSHIFT = 'shift.json'\n"
+    "helper = lambda: importlib.import_module('lab_dynamic')\n",
+    "lab/assets/push.xml": '<mujoco><include file="robot.inc"/></mujoco>',
+    "lab/assets/robot.inc": "<body/>",
+    "lab/assets/meshes/finger.stl": "solid",
+    "lab/shift.json": "{}",
+    "lab/unused.py": "",
+    "lab/notes.txt": "",
+    "lab_wrappers.py": "import gymnasium as gym\nclass Scaled(gym.Wrapper):\n    pass\n",
+    "lab_late.py": "",
+    "lab_dynamic.py": "",
+    "scene.txt": "",
+    "lab.yaml": "",
+    "results/nodes/a/x.xml": "",
+    "results/work/b": "",
+}
+IMPORTED = ("lab", "lab_wrappers", "lab_late", "lab_dynamic")
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    for name, text in FILES.items():
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    monkeypatch.setattr("music_rllib.envs.modules._folders", {})
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    search_in(tmp_path)
+    yield tmp_path
+    for name in [name for name in sys.modules if name.partition(".")[0] in IMPORTED]:
+        del sys.modules[name]
+    gym.registry.pop("Lab-v0", None)
+
+
+def now(folder: Path) -> Fingerprint:
+    return fingerprint_of("lab.envs:Lab-v0", {"scene": str(folder / "scene.txt"), "size": 2})
+
+
+def test_sources_models_and_packages_that_count_are_found(folder: Path) -> None:
+    found = now(folder)
+    packages = {name for name in found if name.startswith("package ")}
+    assert packages == {"package gymnasium"}
+    assert set(found) - packages == {
+        "source lab/__init__.py",
+        "source lab/envs/__init__.py",
+        "source lab/envs/push.py",
+        "source lab/base.py",
+        "source lab/rewards.py",
+        "source lab_wrappers.py",
+        "source lab_late.py",
+        "source lab_dynamic.py",
+        "file lab/assets/push.xml",
+        "file lab/assets/robot.inc",
+        "file lab/assets/meshes/finger.stl",
+        "file lab/shift.json",
+        "file scene.txt",
+    }
+
+
+def crlf(path: Path) -> None:
+    path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n"))
+
+
+def edited(path: Path) -> None:
+    path.write_text(path.read_text() + "#\n")
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "line"),
+    [
+        ("lab/envs/push.py", edited, "lab/envs/push.py changed"),
+        ("lab/rewards.py", edited, "lab/rewards.py changed"),
+        ("lab_wrappers.py", edited, "lab_wrappers.py changed"),
+        ("lab_late.py", edited, "lab_late.py changed"),
+        ("lab_dynamic.py", edited, "lab_dynamic.py changed"),
+        ("lab/assets/push.xml", edited, "lab/assets/push.xml changed"),
+        ("lab/assets/robot.inc", edited, "lab/assets/robot.inc changed"),
+        ("lab/assets/meshes/finger.stl", edited, "lab/assets/meshes/finger.stl changed"),
+        ("lab/shift.json", Path.unlink, "lab/shift.json is no longer used"),
+        ("scene.txt", edited, "scene.txt changed"),
+        ("lab/unused.py", edited, None),
+        ("lab/notes.txt", edited, None),
+        ("lab.yaml", edited, None),
+        ("results/nodes/a/x.xml", edited, None),
+        ("lab/base.py", crlf, None),
+    ],
+)
+def test_a_change_is_named(
+    folder: Path, name: str, change: Callable[[Path], None], line: str | None
+) -> None:
+    before = now(folder)
+    change(folder / name)
+    after = now(folder)
+    assert differences(before, after) == ([line] if line else [])
+    assert (digest_of(before) == digest_of(after)) == (line is None)
+
+
+def test_versions_of_packages_are_named_and_are_all_of_a_built_in_task(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    before = fingerprint_of("FetchPush-v4", {})
+    assert set(before) == {"package gymnasium-robotics", "package mujoco"}
+    assert fingerprint_of("FetchPush-v4", {"reward_type": "dense"}) == before
+    assert set(fingerprint_of("Pusher-v5", {})) == {"package gymnasium", "package mujoco"}
+    own = module._version
+    monkeypatch.setattr(module, "_version", lambda name: "9" if name == "mujoco" else own(name))
+    assert differences(before, fingerprint_of("FetchPush-v4", {})) == [
+        f"mujoco {before['package mujoco']} -> 9"
+    ]
+
+
+def test_a_model_that_a_worker_has_written_for_itself_is_no_difference() -> None:
+    driver = {"source lab.py": "a", "file a.xml": "1"}
+    assert not on_another_machine(driver, {"source lab.py": "a", "file tmp1.xml": "2"})
+    assert on_another_machine(driver, {"source lab.py": "b", "file a.xml": "2"}) == [
+        "a.xml changed",
+        "lab.py changed",
+    ]
+
+
+def test_a_module_that_is_missing_or_hidden_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("music_rllib.envs.modules._folders", {})
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    search_in(tmp_path)
+    with pytest.raises(ModuleNotFoundError, match=rf"no module 'lab_nowhere'.*{tmp_path}"):
+        make_env("lab_nowhere:Lab-v0")
+    (tmp_path / "queue.py").write_text("raise RuntimeError('hidden')")
+    with pytest.raises(ImportError, match=r"'queue' of .* must have another name: Python has one"):
+        make_env("queue:Lab-v0")

@@ -1,0 +1,168 @@
+"""Results and checkpoints of another environment are never used unasked."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from music_rllib.config.load import load_sweep
+from music_rllib.envs.fingerprint import Fingerprint
+from music_rllib.errors import BadInputError
+from music_rllib.experiment.continuation import continuation_key
+from music_rllib.experiment.environments import (
+    changed_text,
+    keep_old,
+    mixed,
+    old_runs,
+    remove_old,
+    to_retrain,
+)
+from music_rllib.experiment.plan import Node, make_plan
+from music_rllib.experiment.scheduler import Status
+from music_rllib.experiment.session import Sweep, open_sweep
+from music_rllib.store.lease import Lease
+from music_rllib.store.run_record import RunResult
+
+OLD = {"package mujoco": "3.8.0", "source lab_env.py": "a"}
+NEW = {"package mujoco": "3.8.1", "source lab_env.py": "b"}
+RESULT = RunResult(label="l", env_steps=400, seconds=1.0, metrics={})
+
+
+def opened(folder: Path, environment: Fingerprint, name: str = "s", **defaults: Any) -> Sweep:
+    """Two tasks; the second stage starts each of its runs from one on Lab."""
+    lab = {"horizon": 20, "agent_indices": [0], "surrounding_indices": [1]}
+    document = {
+        "name": name,
+        "tasks": ["Lab", "Field"],
+        "environments": {"Lab": {"env_id": "a:A", **lab}, "Field": {"env_id": "b:B", **lab}},
+        "defaults": {
+            "env_steps": 400,
+            "tac": {"random_steps": 100},
+            "evaluation": {"interval": 200},
+            **defaults,
+        },
+        "stages": [
+            {"name": "pretrain", "variant": "music-u", "tasks": ["Lab"]},
+            {
+                "name": "finetune",
+                "variant": "music-r",
+                "tasks": ["Field"],
+                "init_from": {"stage": "pretrain", "task": "Lab"},
+            },
+        ],
+    }
+    path = folder / "sweep.yaml"
+    path.write_text(yaml.safe_dump(document))
+    config, storage = load_sweep(path), str(folder / "results")
+    environments = {"Lab": environment, "Field": {"source field.py": "f"}}
+    return open_sweep(config, make_plan(config), storage, folder, environments=environments)
+
+
+def finish(sweep: Sweep, node: Node, environment: Fingerprint | None, folder: Path) -> None:
+    (folder / "made").mkdir(exist_ok=True)
+    sweep.store.publish(node.key, folder / "made", RESULT, environment)
+
+
+def finished(folder: Path, environment: Fingerprint | None = OLD) -> Sweep:
+    sweep = opened(folder, OLD)
+    pretrain, finetune = sweep.plan.nodes
+    finish(sweep, pretrain, environment, folder)
+    finish(sweep, finetune, sweep.environments.now["Field"], folder)
+    return sweep
+
+
+def text_of(sweep: Sweep) -> str | None:
+    return changed_text(sweep, old_runs(sweep))
+
+
+@pytest.mark.parametrize("name", ["s", "another"])
+def test_a_changed_environment_is_named_with_its_runs_and_under_every_name(
+    tmp_path: Path, name: str
+) -> None:
+    finished(tmp_path)
+    assert text_of(opened(tmp_path, OLD, name)) is None
+    lines = str(text_of(opened(tmp_path, NEW, name))).splitlines()
+    assert lines[:2] == [
+        "the environment of Lab has changed since 1 run used it: mujoco 3.8.0 -> 3.8.1, "
+        "lab_env.py changed",
+        "  pretrain/Lab/seed0: is finished",
+    ]
+    assert [option in lines[2] for option in ("--retrain", "--keep-runs")] == [True, True]
+    assert len(lines) == 3
+
+
+def test_checkpoints_and_ends_of_shorter_runs_count_too(tmp_path: Path) -> None:
+    first = opened(tmp_path, OLD)
+    pretrain = first.plan.nodes[0]
+    place = first.store.continuation(continuation_key(pretrain.run, None))
+    with place.new_checkpoint(400, OLD):
+        pass
+    longer = opened(tmp_path, NEW, env_steps=800)
+    assert "would continue a run of 400 env steps" in str(text_of(longer))
+    with first.store.work_folder(longer.plan.nodes[0].key).new_checkpoint(200, OLD):
+        pass
+    assert "is at 200 env steps" in str(text_of(longer))
+    assert text_of(opened(tmp_path, OLD, env_steps=800)) is None
+    remove_old(longer, to_retrain(longer, old_runs(longer), ["Lab"], all_changed=False))
+    assert not old_runs(longer)
+    assert not place.names()
+
+
+def test_what_is_trained_again_takes_with_it_what_starts_from_it(tmp_path: Path) -> None:
+    finished(tmp_path)
+    sweep = opened(tmp_path, NEW)
+    pretrain, finetune = sweep.plan.nodes
+    runs = old_runs(sweep)
+    assert not to_retrain(sweep, runs, [], all_changed=False)
+    again = to_retrain(sweep, runs, [], all_changed=True)
+    assert [run.label for run in again] == [pretrain.label, finetune.label]
+    assert to_retrain(sweep, runs, ["pretrain/seed0"], all_changed=False) == again
+    assert [r.label for r in to_retrain(sweep, runs, ["Field"], all_changed=False)] == [
+        finetune.label
+    ]
+    with pytest.raises(BadInputError, match=r"--retrain must name a task or a run .* got 'Fild'"):
+        to_retrain(sweep, runs, ["Fild"], all_changed=False)
+    lease = Lease.of_this_process("sweep 'other'")
+    work = sweep.store.work_folder(finetune.key).lease
+    assert work.acquire(lease) is None
+    with pytest.raises(BadInputError, match=r"must not be computed meanwhile, it is by sweep 'oth"):
+        remove_old(sweep, again)
+    assert sweep.store.is_finished(pretrain.key), "nothing was deleted"
+    work.release(lease.owner)
+    sweep = remove_old(sweep, again)
+    assert [sweep.scheduler[node.key] for node in sweep.plan.nodes] == [Status.WAITING] * 2
+    assert not sweep.store.is_finished(pretrain.key)
+
+
+def test_an_answer_is_kept_for_every_sweep_of_the_storage(tmp_path: Path) -> None:
+    finished(tmp_path)
+    sweep = opened(tmp_path, NEW)
+    sweep = keep_old(sweep, old_runs(sweep))
+    assert text_of(sweep) is None
+    for environment in (NEW, OLD):
+        assert text_of(opened(tmp_path, environment, "another")) is None
+    newest = NEW | {"source lab_env.py": "c"}
+    assert "lab_env.py changed" in str(text_of(opened(tmp_path, newest)))
+    first, later = opened(tmp_path, OLD), opened(tmp_path, NEW)
+    assert first.environments.earliest("Lab") == later.environments.earliest("Lab")
+    assert first.environments.earliest("Lab") != opened(tmp_path, newest).environments.earliest(
+        "Lab"
+    )
+
+
+def test_runs_of_earlier_versions_do_not_say_and_are_used(tmp_path: Path) -> None:
+    finished(tmp_path, None)
+    assert text_of(opened(tmp_path, NEW)) is None
+
+
+def test_a_comparison_names_runs_of_several_environments() -> None:
+    runs = [("Lab", "seed0", "aaaaaaaa"), ("Lab", "seed1", "bbbbbbbb"), ("Lab", "seed2", "")]
+    assert not list(mixed([*runs[:1], *runs[2:], ("Field", "seed0", "bbbbbbbb")]))
+    (line,) = mixed(runs)
+    assert line == (
+        "Runs on Lab are compared that used 2 versions of its environment: seed0 (aaaaaa); "
+        "seed1 (bbbbbb)."
+    )
