@@ -89,8 +89,9 @@ class Measured(StrictModel):
     """(measured, value) pairs, joined by straight lines and held beyond both ends. Until the first
     measurement the success rate counts as the lowest of them and the entropy as the highest."""
     smoothing: float = Field(0.0, ge=0)
-    """Environment steps over which measurements are averaged: each one keeps a share
-    exp(-steps since then/smoothing) of the mean before it. 0: only the last one counts."""
+    """Environment steps over which measurements are averaged: the mean of a round of episodes keeps
+    a share exp(-steps since then/smoothing) of the mean before it. 0: only the last measurement
+    counts."""
     monotone: bool = False
     """Whether the highest success rate so far counts, or the lowest entropy so far, after
     smoothing: the value then moves along the points in one direction only."""
@@ -110,33 +111,58 @@ class Follower:
 
     def __init__(self, schedule: Measured) -> None:
         self._schedule = schedule
+        self._before: float | None = None
+        """The smoothed quantity before the current round, and when it was measured."""
+        self._steps_before = self._env_steps = self._count = 0
+        self._sum = 0.0
+        """Of the current round's `_count` measurements, after `_env_steps`."""
         self._mean: float | None = None
-        self._env_steps = 0
         self.measured: float | None = None
         """The quantity, smoothed, and monotone where asked; None before the first measurement."""
 
     def observe(self, quantity: Quantity, measured: float, env_steps: int) -> None:
-        """Add a measurement made after `env_steps`, unless it is of another quantity."""
+        """Add a measurement made after `env_steps`, unless it is of another quantity.
+
+        Measurements after the same `env_steps` form a round; its mean is what is smoothed.
+        """
         schedule = self._schedule
         if quantity != schedule.follows or not math.isfinite(measured):
             return
-        if self._mean is not None and schedule.smoothing > 0:
-            kept = math.exp((self._env_steps - env_steps) / schedule.smoothing)
-            measured += kept * (self._mean - measured)
+        if schedule.smoothing > 0:
+            measured = self._smoothed(measured, env_steps)
         self._mean, self._env_steps = measured, env_steps
         if schedule.monotone and self.measured is not None:
             best = max if schedule.follows == "success_rate" else min
             measured = best(measured, self.measured)
         self.measured = measured
 
+    def _smoothed(self, measured: float, env_steps: int) -> float:
+        """The moving average, with a measurement of the current round or of a new one."""
+        if env_steps != self._env_steps:
+            self._before, self._steps_before = self._mean, self._env_steps
+            self._sum, self._count = 0.0, 0
+        self._sum, self._count = self._sum + measured, self._count + 1
+        mean = self._sum / self._count
+        if self._before is None:
+            return mean
+        kept = math.exp((self._steps_before - env_steps) / self._schedule.smoothing)
+        return mean + kept * (self._before - mean)
+
     def state(self) -> dict[str, float | None]:
         """The state for a checkpoint."""
-        return {"mean": self._mean, "env_steps": self._env_steps, "measured": self.measured}
+        return {
+            "mean": self._mean, "env_steps": self._env_steps, "measured": self.measured,
+            "before": self._before, "steps_before": self._steps_before,
+            "sum": self._sum, "count": self._count,
+        }  # fmt: skip
 
     def load_state(self, state: dict[str, float | None]) -> None:
         """Restore the state of a checkpoint."""
         self._mean, self.measured = state["mean"], state["measured"]
         self._env_steps = int(state["env_steps"] or 0)
+        self._before = state.get("before")  # states of version 3 lack the rest
+        self._steps_before = int(state.get("steps_before") or 0)
+        self._sum, self._count = state.get("sum") or 0.0, int(state.get("count") or 0)
 
 
 def _kind(value: object) -> str | None:
@@ -187,7 +213,10 @@ def value_at(
         case Linear():
             fraction = env_steps / max(total_env_steps, 1)
             progress = (fraction - schedule.begin) / (schedule.finish - schedule.begin)
-            return schedule.start + (schedule.end - schedule.start) * min(max(progress, 0.0), 1.0)
+            if progress >= 1.0:  # by the formula below .1 to .9 would end at .8999999999999999
+                return schedule.end
+            value = schedule.start + (schedule.end - schedule.start) * max(progress, 0.0)
+            return _between(value, schedule.start, schedule.end)
         case Piecewise(interpolation="hold"):
             return next(value for step, value in reversed(schedule.points) if step <= env_steps)
         case Piecewise():
@@ -206,9 +235,15 @@ def _interpolated(points: Sequence[tuple[float, float]], at: float) -> float:
         return held
     for after, value in points[1:]:
         if at < after:
-            return held + (value - held) * (at - before) / (after - before)
+            between = held + (value - held) * (at - before) / (after - before)
+            return _between(between, held, value)
         before, held = after, value
     return held
+
+
+def _between(value: float, one: float, other: float) -> float:
+    """The value, which rounding may have moved beyond one of the ends."""
+    return min(max(value, min(one, other)), max(one, other))
 
 
 def extremes(schedule: float | Linear | Piecewise | Measured) -> tuple[float, float]:

@@ -100,7 +100,7 @@ def contradiction(variant: Variant, fixed: Any, got: Any) -> str:
     return f"must be {json.dumps(fixed)} for {variant}, got {json.dumps(got)}"
 
 
-YOUNGER: tuple[tuple[str, str], ...] = (("tac", "log_std_form"),)
+YOUNGER: tuple[tuple[str, str], ...] = (("tac", "log_std_form"), ("tac", "warmup_steps"))
 """Group and name of settings that are newer than the node keys of finished runs."""
 
 
@@ -202,9 +202,10 @@ class RunSettings(StrictModel):
 
     @model_validator(mode="after")
     def _budget_fits(self) -> Self:
-        if self.tac.random_steps >= self.env_steps:
+        if self.tac.steps_before_updates >= self.env_steps:
+            setting = "random_steps" if self.tac.warmup_steps is None else "warmup_steps"
             raise ValueError(
-                f"env_steps must be > tac.random_steps ({self.tac.random_steps}), "
+                f"env_steps must be > tac.{setting} ({self.tac.steps_before_updates}), "
                 f"or nothing is learned, got {self.env_steps}"
             )
         trajectories = self.num_envs * self.task.horizon

@@ -213,8 +213,11 @@ class TACSettings(StrictModel):
     """Precision of the hidden layers' products in updates; weights, outputs and acting stay
     float32. `bf16` is refused on hardware without it."""
     random_steps: int = Field(1_000, ge=0)
-    """First environment steps, with uniformly random actions and without updates. More give the
-    first updates more varied data, later."""
+    """First environment steps, with uniformly random actions. More give the first updates more
+    varied data, later."""
+    warmup_steps: int | None = Field(None, ge=0)
+    """Environment steps before the first update, which count for no update. null: `random_steps`.
+    0: updates also follow random episodes, as in TAC-2020."""
     normalise_observations: bool = True
     """Whether observations and goals are normalised by their running mean and standard deviation,
     so that inputs of small numbers (metres, here) count as much as large ones."""
@@ -230,6 +233,11 @@ class TACSettings(StrictModel):
     Higher makes actions gentler, perhaps too gentle to push."""
     max_episode_steps: int | None = Field(None, gt=0)
     """Steps after which episodes are truncated; needed if the environment has no time limit."""
+
+    @property
+    def steps_before_updates(self) -> int:
+        """Environment steps without updates."""
+        return self.random_steps if self.warmup_steps is None else self.warmup_steps
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:

@@ -140,7 +140,7 @@ def _seconds(run: RunSettings) -> Iterator[Demand]:
     played = evaluations * evaluation.episodes * run.task.horizon
     yield "evaluation.episodes", evaluation.episodes, played // STEPS_PER_SECOND
     ratio = run.tac.replay_ratio
-    updates = (run.env_steps - run.tac.random_steps) * int(ratio)
+    updates = (run.env_steps - run.tac.steps_before_updates) * int(ratio)
     yield "tac.replay_ratio", ratio, updates // UPDATES_PER_SECOND if ratio > 1 else 0
 
 

@@ -39,24 +39,31 @@ def time_permutations(
     frames: int,
     generator: torch.Generator,
     *,
-    sharing: int = 1,
+    draws: int | None = None,
     inside: Tensor | None = None,
 ) -> Tensor:
     """Random permutations of time, [N, T] integers.
 
     Args:
         generator: source of randomness; its device is the result's.
-        sharing: number of neighbours with the same permutation; the original draws one per
-            minibatch (on two frames it is the identity half the time).
+        draws: number of permutations, each of which an equal share of neighbouring trajectories
+            has (`of_draw`). None: one for each trajectory.
         inside: [N, T] False for padding, which keeps its place: only a trajectory's own frames are
             permuted. None: no padding.
     """
-    rows = trajectories // sharing
+    rows = trajectories if draws is None else draws
     keys = torch.rand(rows, frames, generator=generator, device=generator.device)
     if inside is None:
-        return _order(keys).repeat_interleave(sharing, dim=0)
-    keys = keys.repeat_interleave(sharing, dim=0)
+        permutations = _order(keys)
+        return permutations if draws is None else of_draw(permutations, trajectories)
+    keys = keys if draws is None else of_draw(keys, trajectories)
     return keys.masked_fill(~inside, 1.0).argsort(dim=-1, stable=True)
+
+
+def of_draw(drawn: Tensor, rows: int) -> Tensor:
+    """[draws, ...] -> [rows, ...]: each draw repeated for an equal share of the rows, in order."""
+    owners = torch.arange(rows, device=drawn.device) * len(drawn) // rows
+    return drawn[owners]
 
 
 def _order(keys: Tensor) -> Tensor:

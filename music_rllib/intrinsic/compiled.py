@@ -119,8 +119,8 @@ def _add_pairs(
     slope, other_slope = first.dtype.type(together), first.dtype.type(apart)
     for h in range(of_output.shape[1]):
         unit, other_unit = first[t, h] + second[t, h], first[t, h] + second[other, h]
-        passed = slope if unit > zero else zero
-        other_passed = other_slope if other_unit > zero else zero
+        passed = zero if unit <= zero else slope  # a NaN passes, as in autograd
+        other_passed = zero if other_unit <= zero else other_slope
         of_first[t, h] = passed + other_passed
         of_second[t, h] += passed
         of_output[0, h] += passed * unit + other_passed * other_unit

@@ -7,14 +7,13 @@ from 0.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from music_rllib.functional.mutual_information import donsker_varadhan, shuffle_time
+from music_rllib.functional.mutual_information import donsker_varadhan, of_draw, shuffle_time
 from music_rllib.intrinsic.compiled import Data, Weights, bounds, learn
 from music_rllib.optim.adam import FusedAdam
 from music_rllib.optim.flat import FlatParameters
@@ -122,18 +121,14 @@ class MutualInformationEstimator(nn.Module):
         return donsker_varadhan(self(agent, surrounding), self(agent, shuffled), inside)
 
     def transition_bounds(
-        self, states: Tensor, followers: Tensor, *, swapped: bool = True
+        self, states: Tensor, followers: Tensor, swapped: Sequence[bool] = (True,)
     ) -> Tensor:
         """Bounds on transitions from states [B, D] to `followers` [B, D]: [B] nats.
 
-        Each is of the two-frame trajectory. `swapped` pairs each frame with the surroundings of the
-        other one; False is the identity permutation, which the original draws for half of its
-        minibatches: <= 0.
+        Each is of the two-frame trajectory, shuffled in time as in `two_frames`.
         """
         frames = self.pairs(states, followers)
-        # Not copied from the CPU, which a captured update may not do.
-        times = torch.arange(2, device=frames.device)
-        return self.bound(frames, (times.flip(0) if swapped else times).expand(len(frames), 2))
+        return self.bound(frames, two_frames(len(frames), tuple(swapped), frames.device))
 
     def pairs(self, states: Tensor, followers: Tensor) -> Tensor:
         """[..., B, D] states and followers -> [..., B, 2, d] what is read of them, side by side."""
@@ -171,10 +166,18 @@ class MutualInformationEstimator(nn.Module):
         return Data._make((*(np.ascontiguousarray(each.numpy()) for each in tensors), frames))
 
 
-@functools.lru_cache(maxsize=8)
-def two_frames(rows: int, swapped: bool) -> Tensor:
-    """[B, 2] permutations of two frames, all swapped or all identities."""
-    return torch.tensor([1, 0] if swapped else [0, 1]).repeat(rows, 1)
+def two_frames(rows: int, swapped: tuple[bool, ...], device: torch.device) -> Tensor:
+    """[B, 2] permutations of two frames, by draws that hold for equal shares of the rows.
+
+    True pairs each frame with the surroundings of the other one; False is the identity, whose bound
+    is <= 0.
+    """
+    # Not copied from the CPU, which a captured update may not do.
+    times = torch.arange(2, device=device)
+    kinds = times.flip(0), times
+    if len(swapped) == 1:
+        return kinds[not swapped[0]].expand(rows, 2)
+    return of_draw(torch.stack([kinds[not each] for each in swapped]), rows)
 
 
 def intrinsic_reward(bound: Tensor, scale: float) -> Tensor:

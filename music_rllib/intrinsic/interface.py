@@ -35,6 +35,7 @@ class IntrinsicReward(Protocol):
     def draw(
         self,
         updates: int,
+        transitions: int,
         trajectories: dict[str, Tensor] | None,
         generator: torch.Generator,
         *,
@@ -46,6 +47,7 @@ class IntrinsicReward(Protocol):
 
         Args:
             updates: K.
+            transitions: K*B.
             trajectories: [K*N, T, D] the training data, to which columns may be added; None where
                 nothing is trained.
             generator: the Learner's.
@@ -78,9 +80,14 @@ class IntrinsicReward(Protocol):
         followers: Tensor,
         generator: torch.Generator,
     ) -> Tensor:
-        """[steps] reward of fresh episodes, none of which has been trained on."""
+        """[steps] reward of fresh episodes, none of which has been trained on.
 
-    def priorities(self, episodes: Sequence[Tensor]) -> NDArray[np.float64]:
+        Where `reward` depends on what is drawn, this is its mean over the draws.
+        """
+
+    def priorities(
+        self, episodes: Sequence[Tensor], generator: torch.Generator
+    ) -> NDArray[np.float64]:
         """[T, D] frames of episodes -> one priority each, for the replay."""
 
     def metrics(self) -> dict[str, float]:

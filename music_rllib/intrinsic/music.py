@@ -5,7 +5,9 @@ Shape legend: K updates of a call, B transitions and N trajectories of one, T fr
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,6 +25,9 @@ HELD_OUT_STEPS = "held_out_steps"
 """Metric: the number of steps that the bound on fresh trajectories is averaged over."""
 PRIORITY_CLIP = 2e-4
 """MUSIC-p: largest bound (nats) of one step that counts for its trajectory's priority."""
+WORKER_ROWS = 256
+"""Rows of a minibatch that share a time shuffle with `shuffle: random`: those of one of the
+original's workers, each of which draws its own."""
 
 
 class Music:
@@ -50,35 +55,40 @@ class Music:
     def draw(
         self,
         updates: int,
+        transitions: int,
         trajectories: dict[str, Tensor] | None,
         generator: torch.Generator,
         *,
         first: bool,
-    ) -> Sequence[Hashable]:
-        """Whether each update pairs a frame with the other's surroundings, and the time shuffles.
+    ) -> Sequence[tuple[bool, ...]]:
+        """Whether each update pairs frames with the other's surroundings, and the time shuffles.
 
-        The original draws one shuffle for a whole minibatch (`shuffle: random`), which leaves two
-        frames as they are half of the time.
+        With `shuffle: random` a minibatch of B rows has ceil(B / `WORKER_ROWS`) draws, each for an
+        equal share of its rows, and a draw leaves two frames as they are half of the time.
         """
-        swapped = [True] * updates
-        if self._settings.shuffle == "random":
-            coins = torch.rand(updates, generator=generator, device=generator.device) < 0.5
-            swapped = coins.tolist()
+        swapped: list[tuple[bool, ...]] = [(True,)] * updates
+        if self._is_random and updates:
+            coins = _coins(updates * _draws(transitions // updates), generator)
+            swapped = list(map(tuple, coins.view(updates, -1).tolist()))
         if trajectories is not None:
             observations, inside = trajectories["obs"], trajectories.get("inside")
             if first:
                 self._network.adapt_to(observations)
             rows, frames = observations.shape[:2]
-            sharing = 1 if self._settings.shuffle == "independent" else rows // updates
+            draws = updates * _draws(rows // updates) if self._is_random else None
             trajectories["permutations"] = time_permutations(
-                rows, frames, generator, sharing=sharing, inside=inside
+                rows, frames, generator, draws=draws, inside=inside
             )
         return swapped
 
+    @property
+    def _is_random(self) -> bool:
+        return self._settings.shuffle == "random"
+
     @torch.no_grad()
-    def reward(self, states: Tensor, followers: Tensor, drawn: Hashable) -> Tensor:
+    def reward(self, states: Tensor, followers: Tensor, drawn: Any) -> Tensor:
         """[B] in [-1, 0]."""
-        bounds = self._network.transition_bounds(states, followers, swapped=bool(drawn))
+        bounds = self._network.transition_bounds(states, followers, drawn)
         return intrinsic_reward(bounds, self._settings.reward_scale)
 
     def total(self, task: Tensor, intrinsic: Tensor, weight: float) -> Tensor:
@@ -93,14 +103,14 @@ class Music:
 
     @torch.no_grad()
     def learn(
-        self, states: Tensor, followers: Tensor, drawn: Sequence[Hashable],
+        self, states: Tensor, followers: Tensor, drawn: Sequence[Any],
         trajectories: Mapping[str, Tensor], optimizer: FusedAdam,
     ) -> tuple[Tensor, dict[str, Tensor]]:  # fmt: skip
         """K updates by compiled code."""
         updates, rows = states.shape[:2]
         network = self._network
         pairs = network.pairs(states, followers).flatten(0, 1)
-        swaps = torch.cat([two_frames(rows, bool(swapped)) for swapped in drawn])
+        swaps = two_frames(len(pairs), sum(drawn, ()), pairs.device)
         permutations, inside = trajectories["permutations"], trajectories.get("inside")
         bounds, means = network.learn(
             network.data(pairs, swaps, None),
@@ -118,9 +128,15 @@ class Music:
         followers: Tensor,
         generator: torch.Generator,
     ) -> Tensor:
-        reward = self.reward(states, followers, drawn=True)
+        """With `shuffle: random`, the mean of the rewards of both shuffles.
+
+        The critics learn this mean, since each shuffle is drawn for half of what they learn from.
+        """
+        rewards = [self.reward(states, followers, (True,))]
+        if self._is_random:
+            rewards.append(self.reward(states, followers, (False,)))
         self._measure_held_out(episodes, generator)
-        return reward
+        return torch.stack(rewards).mean(0)
 
     @torch.no_grad()
     def _measure_held_out(self, episodes: Sequence[Trajectory], generator: torch.Generator) -> None:
@@ -137,9 +153,19 @@ class Music:
         self._held_out_sum += float(bounds @ lengths[chosen])
         self._held_out_steps += float(lengths[chosen].sum())
 
-    def priorities(self, episodes: Sequence[Tensor]) -> NDArray[np.float64]:
-        """MUSIC-p: the sum of each episode's per-step bounds, each clipped to [0, 2e-4] nats."""
-        bounds = [self._network.transition_bounds(each[:-1], each[1:]) for each in episodes]
+    @torch.no_grad()
+    def priorities(
+        self, episodes: Sequence[Tensor], generator: torch.Generator
+    ) -> NDArray[np.float64]:
+        """MUSIC-p: the sum of each episode's per-step bounds, each clipped to [0, 2e-4] nats.
+
+        With `shuffle: random` each step has its own draw.
+        """
+        bounds = []
+        for each in episodes:
+            steps = len(each) - 1
+            swapped = _coins(steps, generator).tolist() if self._is_random else (True,)
+            bounds.append(self._network.transition_bounds(each[:-1], each[1:], swapped))
         sums = torch.stack([steps.clamp(0.0, PRIORITY_CLIP).sum() for steps in bounds])
         return sums.cpu().numpy().astype(np.float64)
 
@@ -153,3 +179,13 @@ class Music:
 
     def load_state(self, state: Sequence[float]) -> None:
         self._held_out_sum, self._held_out_steps = state
+
+
+def _draws(rows: int) -> int:
+    """Draws of a minibatch of B rows with `shuffle: random`."""
+    return math.ceil(rows / WORKER_ROWS)
+
+
+def _coins(count: int, generator: torch.Generator) -> Tensor:
+    """[count] booleans, each as likely."""
+    return torch.rand(count, generator=generator, device=generator.device) < 0.5

@@ -27,8 +27,9 @@ class MusicSettings(BaseModel):
     """Factor on the bound before it is clipped to [0, 1] and shifted by -1. Higher: the slightest
     influence earns the whole reward; lower: only much of it earns anything."""
     shuffle: Literal["independent", "random"] = "independent"
-    """Time shuffle: every trajectory its own permutation and two frames always swapped; or the
-    original's one permutation a minibatch, which is the identity half the time on two frames."""
+    """Time shuffle: every trajectory its own permutation and two frames always swapped; or, as in
+    the original, one permutation for 256 rows of a minibatch, the share of one of its workers. On
+    two frames it is the identity half of the time."""
     hidden_size: int = Field(128, gt=0)
     """Hidden units of the estimator. More find subtler dependences, on more data."""
     lr: float = Field(1e-3, gt=0)

@@ -29,7 +29,8 @@ BUSY_LOAD = 0.75
 _WITHOUT_COST: dict[str, bool | set[str]] = {
     "seed": True,
     "env_steps": True,
-    "tac": {"entropic_index", "alpha", "gamma", "tau", "lr", "random_steps", "target_bounds"},
+    "tac": {"entropic_index", "alpha", "gamma", "tau", "lr", "target_bounds"}
+    | {"random_steps", "warmup_steps"},
     "music": {"mi_reward_weight", "lr"},
 }
 """Settings that change what is computed, and not how long it takes."""
@@ -49,7 +50,7 @@ class Kind:
     @property
     def grad_updates(self) -> int:
         """Gradient updates of one run."""
-        learning = self.env_steps - self.settings.tac.random_steps
+        learning = self.env_steps - self.settings.tac.steps_before_updates
         return round(learning * self.settings.tac.replay_ratio)
 
 

@@ -251,7 +251,7 @@ class TAC(Algorithm):
 
     def _updates_due(self) -> list[int]:
         """The updates that the replay ratio asks for, in calls of at most `UPDATES_PER_CALL`."""
-        counted_steps = self.env_steps - self._settings.random_steps
+        counted_steps = self.env_steps - self._settings.steps_before_updates
         due = int(counted_steps * self._settings.replay_ratio) - self.grad_updates
         full, rest = divmod(max(due, 0), UPDATES_PER_CALL)
         return [UPDATES_PER_CALL] * full + ([rest] if rest else [])

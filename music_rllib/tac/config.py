@@ -23,6 +23,7 @@ from music_rllib.replay.settings import ReplaySettings
 from music_rllib.runtime.quiet import quiet_third_parties
 from music_rllib.schedules import Linear, Measured, check_measurable
 from music_rllib.tac.rl_module import ESTIMATOR_MODULE, EstimatorModule, TACModule
+from music_rllib.tac.rllib.settings import without_effect
 from music_rllib.tac.scheduled import ScheduledSettings
 
 _Settings = TypeVar("_Settings", TACSettings, MusicSettings, ReplaySettings)
@@ -195,6 +196,8 @@ class TACConfig(AlgorithmConfig):
         return _checked(prefix, lambda: model.model_validate(values))
 
     def validate(self) -> None:
+        if not self.in_evaluation and (problems := list(without_effect(self))):
+            self._value_error("\n".join(problems))
         super().validate()
         tac, music, replay = self.tac_settings(), self.music_settings(), self.replay_settings()
         if self.in_evaluation:
@@ -204,8 +207,6 @@ class TACConfig(AlgorithmConfig):
                 f"num_learners must be 0 or 1, got {self.num_learners}: one update of TAC is too "
                 "small to be split. Run more trials instead."
             )
-        if self._env_to_module_connector or self._module_to_env_connector:
-            self._value_error("TAC's env runner runs no connectors; wrap the environment instead")
         if music.prioritise_replay and replay.priority != "uniform":
             self._value_error(
                 "replay_priority must be 'uniform' with music_prioritise_replay, "
@@ -268,8 +269,12 @@ class TACConfig(AlgorithmConfig):
     # -- what RLlib builds from it --------------------------------------------------------
 
     def get_default_rl_module_spec(self) -> RLModuleSpec:
-        settings = self.tac_settings().model_dump(mode="json")
-        return RLModuleSpec(module_class=TACModule, model_config={"tac": settings})
+        return RLModuleSpec(module_class=TACModule)
+
+    @property
+    def _model_config_auto_includes(self) -> dict[str, Any]:
+        """RLlib lays a spec's own `model_config` upon it, so that own modules get the settings."""
+        return {"tac": self.tac_settings().model_dump(mode="json")}
 
     def get_multi_rl_module_spec(
         self, *, inference_only: bool = False, **kwargs: Any

@@ -51,6 +51,7 @@ from music_rllib.envs.tasks import beyond_observation
 from music_rllib.replay.trajectories import ReplayLayout
 from music_rllib.runtime.quiet import quiet_third_parties
 from music_rllib.tac.rl_module import Actor, TACModule
+from music_rllib.tac.rllib.callbacks import EpisodeCallbacks
 
 SUCCESS_LAST, SUCCESS_ANY = "success_last_step", "success_any_step"
 DISPLACEMENT, MOVED = "object_displacement", "object_moved"
@@ -63,7 +64,10 @@ Floats = NDArray[np.float32]
 
 
 class TrajectoryEnvRunner(EnvRunner, Checkpointable):
-    """EnvRunner whose `sample()` returns finished `Episode`s. Connectors are not run."""
+    """EnvRunner whose `sample()` returns finished `Episode`s. Connectors are not run.
+
+    RLlib's callbacks of environments and episodes are called (`EpisodeCallbacks`).
+    """
 
     def __init__(self, *, config: Any, **kwargs: Any) -> None:
         quiet_third_parties()  # a remote runner is a process of its own
@@ -88,6 +92,7 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
         self._episodes_started = 0
         self._weights_seq_no = 0
         self.envs: list[Env] = []
+        self._callbacks = EpisodeCallbacks(self)
         if self.worker_index > 0 or self.config.num_env_runners == 0 or self._spaces is None:
             self.make_env()
         self.make_module()
@@ -118,9 +123,12 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
             num_workers=self.num_workers,
         )
         if is_gymnasium_id(self.config.env):
-            return make_env(self.config.env, **context)
-        assert self._env_creator is not None
-        return self._env_creator(context)  # type: ignore[no-any-return]
+            env = make_env(self.config.env, **context)
+        else:
+            assert self._env_creator is not None
+            env = self._env_creator(context)
+        self._callbacks.made(env, context)
+        return env
 
     def make_module(self) -> None:
         spec = self.config.get_rl_module_spec(spaces=self.get_spaces(), inference_only=True)
@@ -167,6 +175,7 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
             if len(episodes) >= (num_episodes or 0) and steps >= (num_timesteps or 0):
                 break
         self._log(episodes, steps)
+        self._callbacks.sampled()
         return episodes
 
     def _play(self, count: int, *, explore: bool, random_actions: bool) -> list[Episode]:
@@ -181,7 +190,8 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
             if not actions.ravel().dot(actions.ravel()) <= actions.size:
                 raise _bad_action(actions, inputs, [recordings[i].place for i in playing])
             for i, action, scaled in zip(playing, actions, self._to_env(actions), strict=True):
-                ended = self._step(self.envs[i], recordings[i], action, scaled)
+                ended = self._step(self._callbacks.watched(i), recordings[i], action, scaled)
+                self._callbacks.stepped(i, action, scaled, ended)
                 if ended is not None:
                     finished[i] = recordings[i].finish(terminated=ended)
         return [finished[i] for i in range(count)]
@@ -191,8 +201,9 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
         entropy = np.random.SeedSequence((*self._entropy, self._episodes_started))
         self._episodes_started += 1
         seed = reset_seed(entropy, self.config.seed_range)
+        self._callbacks.created(index)
         with in_environment:
-            observation, _ = self.envs[index].reset(seed=seed)
+            observation, info = self.envs[index].reset(seed=seed)
         worker = f" of worker {self.worker_index}" if self.worker_index else ""
         name = (
             f"{name_of(self.envs[index])}, sub-environment {index}{worker}, "
@@ -207,6 +218,7 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
             goal_reward=compute_reward_of(self.envs[index]) if self._hindsight else None,
         )
         recording.see(observation)
+        self._callbacks.started(index, observation, info)
         return recording
 
     def _step(self, env: Env, recording: Recording, action: Floats, scaled: Floats) -> bool | None:

@@ -49,6 +49,7 @@ from music_rllib.tac.kernels.update import DirectUpdate
 from music_rllib.tac.normaliser import RunningNormaliser
 from music_rllib.tac.objective import Losses, Objective
 from music_rllib.tac.rl_module import ESTIMATOR_MODULE, TACModule
+from music_rllib.tac.rllib.settings import HOOKS, has_own_loss, needs_gradients
 from music_rllib.tac.scheduled import ScheduledSettings
 
 GRAD_UPDATES = "grad_updates"
@@ -83,7 +84,7 @@ class TACLearner(TorchLearner):
         self._targets: list[Tensor] = [p for _, target in pairs for p in target.parameters()]
         self._captured: CapturedUpdate[UpdateConstants] | None = None
         self._direct: DirectUpdate | None = None
-        if self._rllib_needs_gradients:
+        if needs_gradients(self.config):
             return
         if self._device.type == "cuda":
             self._captured = CapturedUpdate(self._step, CudaRecorder(self._device))
@@ -97,17 +98,15 @@ class TACLearner(TorchLearner):
         return self.config.intrinsic_reward(networks)  # type: ignore[no-any-return]
 
     @property
-    def _rllib_needs_gradients(self) -> bool:
-        """Whether RLlib clips, logs or exchanges gradients."""
-        config = self.config
-        return config.grad_clip is not None or config.log_gradients or config.num_learners > 1
-
-    @property
     def _is_standard(self) -> bool:
-        """Whether `DirectUpdate` has the derivatives of these networks and losses."""
-        own_loss = type(self).compute_loss_for_module is TACLearner.compute_loss_for_module
-        own_networks = type(self._policy_module) is TACModule
-        return own_loss and own_networks and self._settings.precision == "float32"
+        """Whether `DirectUpdate` does all that an update by autograd would do."""
+        own_hooks = any(getattr(type(self), h) is not getattr(TACLearner, h) for h in HOOKS)
+        own_networks = type(self._policy_module) is not TACModule
+        own_loss = ESTIMATOR_MODULE in self.module and has_own_loss(
+            self.module[ESTIMATOR_MODULE].unwrapped()
+        )
+        own = own_hooks or own_networks or own_loss
+        return not own and self._settings.precision == "float32"
 
     @property
     def _policy_module(self) -> TACModule:
@@ -229,9 +228,10 @@ class TACLearner(TorchLearner):
         columns: Minibatch = {mid: dict(b) for mid, b in batch.policy_batches.items()}
         policy = columns[DEFAULT_MODULE_ID]
         policy |= self._policy_noise(policy[Columns.ACTIONS])
-        updates = len(policy[Columns.ACTIONS]) // self._settings.batch_size
+        rows = len(policy[Columns.ACTIONS])
+        updates = rows // self._settings.batch_size
         trajectories, first = columns.get(ESTIMATOR_MODULE), self._grad_updates == 0
-        drawn = self._intrinsic.draw(updates, trajectories, self._generator, first=first)
+        drawn = self._intrinsic.draw(updates, rows, trajectories, self._generator, first=first)
         return Minibatches(columns, drawn)
 
     def _constants(self, minibatch: Minibatches) -> UpdateConstants:
@@ -350,8 +350,8 @@ class TACLearner(TorchLearner):
     @torch.no_grad()
     def trajectory_priorities(self, episodes: Sequence[Trajectory]) -> NDArray[np.float64]:
         """[N] priorities of the episodes in the replay."""
-        frames = [torch.as_tensor(e.frames, device=self._device) for e in episodes]
-        return self._intrinsic.priorities(frames)
+        frames = [torch.tensor(e.frames, device=self._device) for e in episodes]
+        return self._intrinsic.priorities(frames, self._generator)
 
     def take_td_errors(self) -> NDArray[np.float32]:
         """[K*B] absolute TD errors of the last call's transitions, for prioritised replay."""
@@ -366,7 +366,8 @@ class TACLearner(TorchLearner):
         """Updates the running normaliser by [B, I] new network inputs (numpy)."""
         normaliser = self._policy_module.normaliser
         if isinstance(normaliser, RunningNormaliser):
-            normaliser.update(torch.as_tensor(inputs, device=self._device))
+            # A remote Learner gets arrays that can't be written to, of which PyTorch warns.
+            normaliser.update(torch.tensor(inputs, device=self._device))
 
     def get_state(self, *args: Any, **kwargs: Any) -> StateDict:
         state = super().get_state(*args, **kwargs)

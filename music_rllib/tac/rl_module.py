@@ -41,6 +41,14 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
 
     Observations are a one-dimensional Box, or a goal dictionary, whose observation and desired goal
     are the networks' inputs. `model_config["tac"]` is a dumped `TACSettings`.
+
+    All actions, of `act` and of RLlib's `forward_inference` and `forward_exploration`, are in
+    [-1, 1], whatever the environment's bounds: a caller scales them to its action space by
+    `low + (action + 1) / 2 * (high - low)`, as TAC's environment runner does.
+
+    A subclass may have other networks. Its `setup` calls this one's, replaces `policy`, `critics`
+    or `value` by modules with the same inputs and outputs, and then calls
+    `make_target_networks()`; it is given by `rl_module(rl_module_spec=RLModuleSpec(...))`.
     """
 
     def setup(self) -> None:
@@ -86,6 +94,8 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
 
     def actor(self) -> Actor:
         """`act` of arrays by the weights as they are now, on a CPU."""
+        if type(self) is not TACModule:
+            return self._actor_in_torch
         policy, normaliser = self.policy.in_numpy(), self.normaliser
         normalise = normaliser.in_numpy() if isinstance(normaliser, RunningNormaliser) else None
 
@@ -97,6 +107,11 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
 
         return act
 
+    def _actor_in_torch(self, inputs: Floats, noise: Floats | None) -> Floats:
+        drawn = None if noise is None else torch.from_numpy(noise)
+        actions: Floats = self.act(torch.from_numpy(inputs), drawn).numpy()
+        return actions
+
     def _action(self, outputs: Tensor, noise: Tensor | None) -> Tensor:
         mean, log_std = self.distribution(outputs)
         if noise is None or log_std is None:
@@ -104,6 +119,7 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
         return squashed_action(mean, log_std, noise)
 
     def _forward_inference(self, batch: dict[str, Any], **kwargs: Any) -> dict[str, Any]:
+        """Actions in [-1, 1], which the caller scales."""
         return {Columns.ACTIONS: self.act(_network_inputs(batch[Columns.OBS]))}
 
     def _forward_exploration(self, batch: dict[str, Any], **kwargs: Any) -> dict[str, Any]:

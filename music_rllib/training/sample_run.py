@@ -71,8 +71,8 @@ class _Worker:
 
     def start(self, run: RunSettings, gpus: float) -> None:
         """Build the run and make its first environment steps."""
-        # Random steps, without updates, are many times faster than the others, and soon over.
-        tac = run.tac.model_copy(update={"random_steps": 0})
+        # Steps without updates are many times faster than the others, and soon over.
+        tac = run.tac.model_copy(update={"random_steps": 0, "warmup_steps": None})
         with in_words_only():
             self._training = TrainingRun(run.model_copy(update={"tac": tac}), gpus=gpus)
             self._training.algorithm.env_runner.sample(num_episodes=1)

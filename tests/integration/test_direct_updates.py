@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
+import warnings
 from typing import Any
 
 import numpy as np
@@ -12,13 +14,13 @@ from numba import njit
 from ray.rllib.core import DEFAULT_MODULE_ID
 from torch import Tensor
 
-from music_rllib import names
+from music_rllib import TACConfig, names
 from music_rllib.tac.algorithm import TAC
 from music_rllib.tac.kernels import blas
 from music_rllib.tac.kernels.update import DirectUpdate
 from music_rllib.tac.learner import TACLearner
 from tests.integration.test_captured_updates import VARIANTS
-from tests.integration.test_tac_algorithm import build, fingerprint, register_uneven
+from tests.integration.test_tac_algorithm import SMALL, build, fingerprint, register_uneven
 from tests.integration.test_tac_losses import ACTION, BATCH, OBSERVATION, learner, minibatch
 
 DDPG = {
@@ -178,6 +180,50 @@ def test_updates_at_once_have_the_bits_of_one_by_one(backbone: str) -> None:
         assert torch.equal(values, expected[name]), name
 
 
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("policy_critic", ["min", "first"])
+@pytest.mark.parametrize("backbone", list(BACKBONES))
+def test_what_is_not_finite_spoils_what_it_spoils_in_autograd(
+    backbone: str, policy_critic: str, bad: float
+) -> None:
+    """One bad number in each column of a minibatch and each parameter, target networks included."""
+    settings = {**BACKBONES[backbone], "policy_critic": policy_critic, "entropic_index": 1.5}
+    built, batch = ready(**settings, target_bounds=(-0.5, 0.5))
+    module = built.module[DEFAULT_MODULE_ID].unwrapped()
+    places = {**dict(module.named_parameters()), **batch, "weights": torch.ones(BATCH).double()}
+    batch["weights"] = places["weights"]
+    for name, tensor in places.items():
+        for index in (0, tensor.numel() - 1):
+            number = tensor.detach().flatten()[index].clone()
+            tensor.detach().view(-1)[index] = bad
+            # Autograd multiplies a critic that the policy does not use by 0, which leaves NaN.
+            gradients = policy_critic == "min" and np.isnan(bad)
+            expected, found = spoilt(built, batch, gradients)
+            tensor.detach().view(-1)[index] = number
+            assert expected == found, name
+    assert not any(sum(part.values()) for part in spoilt(built, batch, True))
+
+
+def spoilt(
+    built: TACLearner, batch: dict[str, Tensor], gradients: bool
+) -> tuple[dict[str, int], dict[str, int]]:
+    """How many numbers are not finite in autograd's and our losses, measures and gradients."""
+    module = built.module[DEFAULT_MODULE_ID].unwrapped()
+    trained = {n: p for n, p in module.named_parameters() if p.requires_grad}
+    built._losses, built._observed = {}, {}
+    losses = built._losses_of(module.forward_train(batch)["tac"], batch)
+    expected = {**built._losses, **built._observed}
+    direct = DirectUpdate(module)
+    learned = direct.gradients(batch, built._now.entropic_index, float(built._objective.alpha))
+    found = {**learned.losses, **learned.observed}
+    if gradients:
+        grads = torch.autograd.grad(losses.total, list(trained.values()))
+        expected |= dict(zip(trained, grads, strict=True))
+        found |= {name: direct.flat.gradient(p) for name, p in trained.items()}
+    count = [{n: int((~v.isfinite()).sum()) for n, v in part.items()} for part in (expected, found)]
+    return count[0], count[1]
+
+
 @njit  # once for all sizes: compiling it takes seconds
 def product(left: Any, right: Any, transposed: tuple[bool, bool], out: Any) -> None:
     blas.multiply(left, transposed[0], right, transposed[1], out)
@@ -223,22 +269,67 @@ def test_a_training_has_autograds_numbers_to_rounding(
         assert row == pytest.approx(same, rel=1e-3, abs=1e-4)
 
 
-class OwnLoss(TACLearner):
-    def compute_loss_for_module(self, **kwargs: Any) -> Tensor:
-        return super().compute_loss_for_module(**kwargs)
+HOOKS = (
+    "compute_losses",
+    "compute_loss_for_module",
+    "compute_gradients",
+    "postprocess_gradients",
+    "apply_gradients",
+    "configure_optimizers_for_module",
+)
 
 
-def test_what_is_not_standard_is_left_to_autograd() -> None:
+@pytest.mark.parametrize("hook", HOOKS)
+def test_a_learners_own_methods_are_called(hook: str) -> None:
+    calls = []
+
+    def own(self: TACLearner, *args: Any, **kwargs: Any) -> Any:
+        calls.append(hook)
+        return getattr(TACLearner, hook)(self, *args, **kwargs)
+
+    config = TACConfig().environment("FetchReach-v4").training(**SMALL)
+    config.reporting(min_sample_timesteps_per_iteration=1)
+    config.learners(learner_class=type("Own", (TACLearner,), {hook: own}))
+    algo: TAC = config.build_algo()
+    for _ in range(3):
+        algo.train()
+    assert algo.grad_updates == 10
+    assert len(calls) == (1 if hook.startswith("configure") else 10)
+    assert algo.learner_group._learner._direct is None
+
+
+def test_updates_without_own_methods_are_compiled() -> None:
     def direct_of(algo: TAC) -> DirectUpdate | None:
         found: DirectUpdate | None = algo.learner_group._learner._direct
         return found
 
     assert direct_of(build()) is not None
     assert direct_of(build(grad_clip=1.0)) is None
-    config = build().config.copy(copy_frozen=False).learners(learner_class=OwnLoss)
-    own: TAC = config.build_algo()
-    assert direct_of(own) is None
-    own.train()
+
+
+def test_learning_rates_of_rllibs_schedulers_are_used() -> None:
+    config = TACConfig().environment("FetchReach-v4").training(**SMALL)
+    config.reporting(min_sample_timesteps_per_iteration=1)
+    halved = functools.partial(torch.optim.lr_scheduler.ExponentialLR, gamma=0.5)
+    algo: TAC = config.experimental(_torch_lr_scheduler_classes=[halved]).build_algo()
+    for _ in range(4):
+        algo.train()
+    assert algo.learner_group._learner._adam["networks"].param_groups[0]["lr"] == 1e-3 / 4
+
+
+def test_remote_learners_arrays_are_only_read() -> None:
+    """RLlib's arrays of another process can't be written to, of which PyTorch would warn."""
+    algo = build(music={"estimator": "frozen", "prioritise_replay": True})
+    learner_ = algo.learner_group._learner
+    episodes = algo.env_runner.sample(random_actions=True)
+    for episode in episodes:
+        for array in (episode.frames, episode.actions, episode.rewards):
+            array.flags.writeable = False
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        learner_.observe_inputs(episodes[0].frames[:, : learner_._policy_module.input_size])
+        learner_.trajectory_priorities(episodes)
+        learner_.diagnose(episodes)
 
 
 def test_a_converted_module_is_taken_over_anew() -> None:

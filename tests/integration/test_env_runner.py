@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from ray.rllib.callbacks.callbacks import RLlibCallback
 
 from music_rllib.envs.numbers import BadNumberError
 from music_rllib.tac.config import TACConfig
@@ -53,9 +54,10 @@ def runner(
     evaluation: bool = False,
     seed: int = 0,
     missing: bool | None = None,
+    callbacks: dict[str, Any] | None = None,
     **settings: Any,
 ) -> TrajectoryEnvRunner:
-    config = TACConfig().environment(env).debugging(seed=seed)
+    config = TACConfig().environment(env).debugging(seed=seed).callbacks(**(callbacks or {}))
     config.env_runners(num_envs_per_env_runner=settings.pop("num_envs", 2))
     config.music(**{k: settings.pop(k) for k in list(settings) if k in ("goals",)})
     config.surrounding_indices = (3, 4, 5) if env == "FetchPush-v4" else ()
@@ -107,6 +109,88 @@ def test_music_u_sees_no_goals_in_training_but_real_ones_in_evaluation() -> None
     training, evaluating = runner(goals="zero"), runner(goals="zero", evaluation=True)
     assert all((e.frames[:, 25:28] == 0).all() for e in training.sample())
     assert all((e.frames[:, 25:28] != 0).any() for e in evaluating.sample())
+
+
+class Seen(RLlibCallback):  # type: ignore[misc]
+    """Counts calls, logs a metric, and keeps the episodes that it was given."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[str, int]] = []
+        self.made = 0
+        self.samples: list[Any] = []
+
+    def on_environment_created(self, *, env: Any, env_context: Any, **kwargs: Any) -> None:
+        assert env_context.vector_index == self.made
+        self.made += 1
+
+    def on_episode_created(self, *, env_index: int, episode: Any, **kwargs: Any) -> None:
+        self.calls.append(("created", env_index))
+        assert len(episode) == 0
+
+    def on_episode_start(self, *, env_index: int, episode: Any, **kwargs: Any) -> None:
+        self.calls.append(("start", env_index))
+        episode.custom_data["left"] = episode.get_observations(0)[0]
+
+    def on_episode_step(
+        self, *, env_index: int, episode: Any, env: Any, env_runner: Any, rl_module: Any, **_: Any
+    ) -> None:
+        self.calls.append(("step", env_index))
+        assert episode.get_observations(-1)[0] == env.left
+        assert env is env_runner.envs[env_index]
+        assert rl_module is env_runner.module
+        action = episode.get_actions(-1)
+        scaled = episode.get_extra_model_outputs("actions_for_env", -1)
+        np.testing.assert_allclose(scaled, [2 * action[0] - 1, 10 * action[1] + 20], rtol=1e-5)
+
+    def on_episode_end(
+        self, *, env_index: int, episode: Any, metrics_logger: Any, **kwargs: Any
+    ) -> None:
+        self.calls.append(("end", env_index))
+        assert episode.is_done
+        metrics_logger.log_value("from_a_callback", episode.get_return(), reduce="sum")
+
+    def on_sample_end(self, *, samples: list[Any], **kwargs: Any) -> None:
+        self.samples += samples
+
+
+def test_rllibs_callbacks_of_episodes_are_called() -> None:
+    ended: list[bool] = []
+    callbacks = {
+        "callbacks_class": Seen,
+        "on_episode_end": lambda episode, **_: ended.append(episode.is_terminated),
+    }
+    limit: dict[str, Any] = {"max_episode_steps": 20}
+    watched, plain = runner(Countdown, callbacks=callbacks, **limit), runner(Countdown, **limit)
+    (seen,) = watched._callbacks._objects
+    assert isinstance(seen, Seen)
+    episodes = watched.sample()
+    for mine, theirs in zip(episodes, plain.sample(), strict=True):
+        np.testing.assert_array_equal(mine.frames, theirs.frames)
+        np.testing.assert_array_equal(mine.actions, theirs.actions)
+    assert seen.made == 2
+    for index, episode in enumerate(episodes):
+        named = [name for name, at in seen.calls if at == index]
+        assert named == ["created", "start", *["step"] * len(episode), "end"]
+    assert ended == [True, True]
+    lengths = {len(episode) for episode in episodes}
+    assert {len(sample) for sample in seen.samples} == lengths
+    assert {sample.custom_data["left"] for sample in seen.samples} == lengths
+    for sample in seen.samples:
+        assert any(np.array_equal(sample.get_actions(), e.actions) for e in episodes)
+    assert float(watched.get_metrics()["from_a_callback"]) == sum(map(len, episodes))
+
+
+def test_an_episode_that_tac_ends_is_truncated_in_callbacks() -> None:
+    ended = []
+    runner(
+        "FetchReach-v4",
+        max_episode_steps=7,
+        callbacks={"on_episode_end": lambda episode, **_: ended.append(episode)},
+    ).sample(num_episodes=1)
+    (episode,) = ended
+    assert (len(episode), episode.is_truncated, episode.is_terminated) == (7, True, False)
+    assert set(episode.get_observations(-1)) == {"observation", "achieved_goal", "desired_goal"}
+    assert "is_success" in episode.get_infos(-1)
 
 
 def test_state_between_calls_is_all_there_is() -> None:

@@ -7,7 +7,13 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from ray import tune
+from ray.rllib.callbacks.callbacks import RLlibCallback
+from ray.rllib.core.learner.torch.torch_learner import TorchLearner
+from ray.rllib.core.rl_module.rl_module import RLModuleSpec
+from ray.rllib.core.rl_module.torch.torch_rl_module import TorchRLModule
+from torch import nn
 
 from music_rllib import TACConfig, names
 from music_rllib.config.tac_settings import TACSettings
@@ -19,11 +25,31 @@ from music_rllib.replay.settings import ReplaySettings
 from music_rllib.replay.trajectories import Trajectory
 from music_rllib.tac.algorithm import TAC
 from music_rllib.tac.kernels.precision import PrecisionError, has_bf16
+from music_rllib.tac.rl_module import TACModule
 from tests.unit.test_snippets import ROOT, blocks
 
 pytestmark = pytest.mark.usefixtures("local_ray")
 
 HER: dict[str, Any] = {"replay.hindsight_k": 4.0}
+
+
+class OfflineCallbacks(RLlibCallback):  # type: ignore[misc]
+    def on_evaluate_offline_end(self, **kwargs: Any) -> None:
+        pass
+
+
+class OwnNetworks(TACModule):
+    """A policy and a value network of other layers, of a width that the user chooses."""
+
+    def setup(self) -> None:
+        super().setup()
+        width = self.model_config["width"]
+        for name, outputs in (("policy", 2 * self.action_size), ("value", 1)):
+            layers = nn.Linear(self.input_size, width), nn.Tanh(), nn.Linear(width, outputs)
+            setattr(self, name, nn.Sequential(*layers))
+        self.make_target_networks()
+
+
 SMALL: dict[str, Any] = {
     "hidden_sizes": (32, 32),
     "batch_size": 32,
@@ -109,6 +135,32 @@ def test_same_seed_gives_bit_identical_metrics_and_weights(music: dict[str, Any]
     assert first[-3]["loss/critics"] > 0
 
 
+@pytest.mark.parametrize(
+    ("settings", "updates"),
+    [
+        ({}, [0, 20, 40]),
+        ({"warmup_steps": 0}, [20, 40, 60]),
+        ({"warmup_steps": 250}, [0, 0, 10]),
+    ],
+)
+def test_updates_start_with_or_apart_from_the_policys_actions(
+    settings: dict[str, Any], updates: list[int]
+) -> None:
+    algo = build(**settings)
+    random, done = [], []
+    sample = algo.env_runner.sample
+
+    def watched(*, random_actions: bool) -> Any:
+        random.append(random_actions)
+        return sample(random_actions=random_actions)
+
+    algo.env_runner.sample = watched
+    for _ in updates:
+        algo.train()
+        done.append(algo.grad_updates)
+    assert (random, done) == ([True, False, False], updates)
+
+
 RAMP = {"schedule": "linear", "start": 1.0, "end": 2.0, "begin": 0.0}
 
 
@@ -162,6 +214,7 @@ CHANGES: dict[str, tuple[Any, dict[str, Any]]] = {
     "replay_ratio": (0.5, {}),
     "precision": ("bf16", {}),
     "random_steps": (200, {}),
+    "warmup_steps": (0, {}),
     "normalise_observations": (False, {}),
     "observation_clip": (0.5, {}),
     "normaliser_epsilon": (0.3, {}),
@@ -237,6 +290,30 @@ def test_other_backbones_and_per_resume_exactly_too(
     resumed = build(**HER, **settings)
     resumed.restore_from_path(tmp_path / "checkpoint")
     assert fingerprint(resumed, 1) == fingerprint(unbroken, 1)
+
+
+def test_own_networks_act_learn_and_are_restored(tmp_path: Path) -> None:
+    def own() -> TAC:
+        config = TACConfig().environment("FetchReach-v4").training(**SMALL).debugging(seed=0)
+        config.reporting(min_sample_timesteps_per_iteration=1)
+        spec = RLModuleSpec(module_class=OwnNetworks, model_config={"width": 12})
+        algo: TAC = config.rl_module(rl_module_spec=spec).build_algo()
+        return algo
+
+    algo, resumed = own(), own()
+    before = algo.get_network_weights()
+    assert before["policy"]["0.weight"].shape == (12, 13)
+    fingerprint(algo, 3)
+    after = algo.get_network_weights()
+    for network in ("policy", "critics", "value", "value_target"):
+        assert any((after[network][n] != a).any() for n, a in before[network].items()), network
+    inputs = np.ones((2, 13), np.float32)
+    acted = algo.env_runner.module.actor()(inputs, None)
+    module = algo.learner_group._learner.module["default_policy"]
+    np.testing.assert_array_equal(acted, module.act(torch.from_numpy(inputs)).numpy())
+    algo.save_to_path(tmp_path / "checkpoint")
+    resumed.restore_from_path(tmp_path / "checkpoint")
+    assert fingerprint(resumed, 1) == fingerprint(algo, 1)
 
 
 @pytest.mark.parametrize("settings", [HER, DDPG], ids=["tac", "ddpg"])
@@ -396,6 +473,28 @@ def test_a_bad_setting_is_refused_where_it_is_made(settings: dict[str, Any], mes
         (lambda c: c.music(agent_indices=[-1], surrounding_indices=[2]), r"agent_indices.*got -1"),
         (lambda c: c.music(goals="zero").replay(hindsight_k=4.0), "hindsight_k must be 0 with"),
         (lambda c: c.learners(num_learners=2), "num_learners must be 0 or 1, got 2"),
+        (lambda c: c.training(train_batch_size=4), r"\(train_batch_size=4\) has no.*batch_size="),
+        (lambda c: c.training(train_batch_size_per_learner=4), r"set training\(batch_size="),
+        (
+            lambda c: c.training(num_epochs=5, minibatch_size=7),
+            r"num_epochs=5(.|\n)*minibatch_s",
+        ),
+        (lambda c: c.training(learner_connector=print), "Learner runs no connectors; wrap"),
+        (lambda c: c.env_runners(module_to_env_connector=print), "runner runs no connectors; wr"),
+        (lambda c: c.env_runners(rollout_fragment_length=5), "one whole episode in each sub-env"),
+        (lambda c: c.env_runners(gym_env_vectorize_mode="async"), "num_env_runners for processes"),
+        (lambda c: c.environment(clip_rewards=True), "clip_rewards=True.*wrap the environment"),
+        (lambda c: c.environment(normalize_actions=False), r"always scales actions from \[-1, 1\]"),
+        (lambda c: c.rl_module(model_config={"fcnet_hiddens": [4]}), "hidden_sizes=.*TACModule"),
+        (lambda c: c.fault_tolerance(restart_failed_sub_environments=True), "num_env_runners="),
+        (lambda c: c.framework("tf2"), "framework must be 'torch', got 'tf2'"),
+        (lambda c: c.multi_agent(policies={"a", "b"}), "TAC trains one policy"),
+        (lambda c: c.learners(learner_class=TorchLearner), "subclass of TACLearner, got TorchLe"),
+        (
+            lambda c: c.rl_module(rl_module_spec=RLModuleSpec(module_class=TorchRLModule)),
+            "must be a subclass of music_rllib.TACModule, got TorchRLModule",
+        ),
+        (lambda c: c.callbacks(OfflineCallbacks), "on_evaluate_offline_end is never called by TAC"),
         (
             lambda c: c.training(entropic_index={"schedule": "linear", "start": 1.0, "end": 2.0}),
             "a linear schedule needs the budget",

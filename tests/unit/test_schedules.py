@@ -47,9 +47,12 @@ def test_piecewise_interpolates_or_holds_and_keeps_its_last_value() -> None:
     step=st.integers(0, 2000),
 )
 def test_a_schedule_stays_between_its_extremes(start: float, end: float, step: int) -> None:
-    ramp = Linear(start=start, end=end)
-    low, high = extremes(ramp)
-    assert low - 1e-9 <= value_at(ramp, step, 1000) <= high + 1e-9
+    points = ((0, start), (700, end), (2000, start))
+    for made in (Linear(start=start, end=end), Piecewise(points=points)):
+        low, high = extremes(made)
+        assert low <= value_at(made, step, 1000) <= high
+        assert value_at(made, 0, 1000) == start
+    assert value_at(Linear(start=start, end=end), 900 + step, 1000) == end
 
 
 def follower(follows: Quantity = "success_rate", **settings: object) -> tuple[Measured, Follower]:
@@ -80,6 +83,25 @@ def test_what_is_measured_is_averaged_by_its_age() -> None:
     for each in (one, resumed):
         each.observe("success_rate", 0.1, 7000)
     assert resumed.measured == one.measured
+
+
+@given(
+    rounds=st.lists(st.lists(st.floats(-5, 5), min_size=1, max_size=4), min_size=1, max_size=6),
+    cut=st.integers(0, 20),
+)
+def test_what_is_smoothed_is_the_mean_of_each_round(rounds: list[list[float]], cut: int) -> None:
+    made, one = follower("shannon_entropy", smoothing=300.0)
+    seen, expected = 0, None
+    for number, measured in enumerate(rounds):
+        for value in measured:
+            if seen == cut:  # a run that is resumed in the middle of a round
+                state, one = one.state(), Follower(made)
+                one.load_state(state)
+            one.observe("shannon_entropy", value, 200 * number)
+            seen += 1
+        mean, kept = sum(measured) / len(measured), math.exp(-200 / 300)
+        expected = mean if expected is None else kept * expected + (1 - kept) * mean
+        assert one.measured == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(("follows", "best"), [("success_rate", max), ("shannon_entropy", min)])

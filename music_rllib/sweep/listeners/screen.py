@@ -82,7 +82,7 @@ class Display(Listener):
         self._say_of(node, "started")
 
     def _new_throughput(self, node: Node) -> Throughput:
-        return Throughput(node.run.env_steps, node.run.tac.random_steps, self._now())
+        return Throughput(node.run.env_steps, node.run.tac.steps_before_updates, self._now())
 
     def reported(self, node: Node, reports: list[Report]) -> None:
         _, throughput = self._running.setdefault(node.key, (node, self._new_throughput(node)))

@@ -155,11 +155,13 @@ def _ask_critics(critics: tuple[Network, Network], count: int, pairs: Array) -> 
 
 @compiled
 def _smallest(values: Array, first: int) -> Array:
-    """[C, R] -> [R - first] the smallest critic's, from a row on."""
+    """[C, R] -> [R - first] the smallest critic's, from a row on; NaN if any critic's is NaN."""
     smallest = values[0, first:].copy()
     for c in range(1, len(values)):
         for r in range(len(smallest)):
-            smallest[r] = min(smallest[r], values[c, first + r])
+            value = values[c, first + r]
+            if value < smallest[r] or value != value:  # `min` would drop a NaN of a later critic
+                smallest[r] = value
     return smallest
 
 
@@ -194,7 +196,7 @@ def _of_critics(
     """Derivatives by the critics' values [C, 2 B] of critic and policy losses; the critics' loss.
 
     Of 1/2 mean w (Q - y)^2 it is w (Q - y) / B (paper eq. 9); of mean -Q, -1/B (eq. 10). Of `min`
-    the smallest critic has it all; equal ones share it, as autograd's `amin` has it.
+    the smallest critic has it all; equal ones share it, and NaN is passed on, as in `amin`.
     """
     count, rows = len(values), len(target)
     gradient, loss = np.zeros_like(values), 0.0
@@ -211,6 +213,8 @@ def _of_critics(
                 gradient[c, rows + r] = -1.0 / rows if c == 0 else 0.0
             elif values[c, rows + r] == smallest[r]:
                 gradient[c, rows + r] = -1.0 / (rows * sharing)
+            elif sharing == 0:
+                gradient[c, rows + r] = smallest[r]
     return gradient, loss
 
 
@@ -299,15 +303,9 @@ def _minibatch(batch: Batch, k: int, rows: int) -> Batch:
     """Of update k."""
     cut = slice(k * rows, (k + 1) * rows)
     return Batch(
-        batch.observations[cut],
-        batch.actions[cut],
-        batch.rewards[cut],
-        batch.discounts[cut],
-        batch.next_observations[cut],
-        batch.noise[cut],
-        batch.next_noise[cut],
-        batch.weights[cut],
-    )
+        batch.observations[cut], batch.actions[cut], batch.rewards[cut], batch.discounts[cut],
+        batch.next_observations[cut], batch.noise[cut], batch.next_noise[cut], batch.weights[cut],
+    )  # fmt: skip
 
 
 @compiled

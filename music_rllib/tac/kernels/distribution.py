@@ -158,7 +158,7 @@ def through_distribution(
                     # low + (high - low) / 2 (tanh + 1): both factors of 1 - tanh^2 are read off it.
                     at = float(sample.log_std[r, a])
                     of_log_std *= (at - low) * (high - at) * (2.0 / (high - low))
-                elif outputs[r, size + a] < low or outputs[r, size + a] > high:
+                elif not low <= outputs[r, size + a] <= high:
                     of_log_std = 0.0
                 gradient[r, size + a] = of_log_std
             gradient[r, a] = of_u

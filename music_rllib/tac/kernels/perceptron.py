@@ -130,7 +130,7 @@ def backward(
         for r in range(len(rows)):
             row, passed = out[r], below[rows[r]]
             for o in range(len(bias)):
-                row[o] = row[o] if passed[o] > zero else zero
+                row[o] = zero if passed[o] <= zero else row[o]  # NaN passes
             if r < learned:
                 for o in range(len(bias)):
                     bias[o] += row[o]

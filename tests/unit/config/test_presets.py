@@ -189,6 +189,7 @@ CLAIMED: dict[str, dict[str, Any]] = {
             "batch_size": 100,
             "replay_ratio": 1.0,
             "random_steps": 10_000,
+            "warmup_steps": 0,
             "log_std_form": "tanh",
             "log_std_bounds": [-20.0, 2.0],
             "normalise_observations": False,

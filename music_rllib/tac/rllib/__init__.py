@@ -1,0 +1,1 @@
+"""RLlib's settings, hooks and callbacks, as TAC takes them."""
