@@ -25,7 +25,7 @@ ENVIRONMENTS = 4
 """Sub-environments of the programs that gain by several."""
 
 
-def ours(width: int, ratio: float, precision: str = "float32") -> Callable[[], int]:
+def ours(width: int, ratio: float) -> Callable[[], int]:
     """TAC with HER at q = 1 (SAC)."""
     from music_rllib import TACConfig
 
@@ -33,7 +33,6 @@ def ours(width: int, ratio: float, precision: str = "float32") -> Callable[[], i
     config.env_runners(num_envs_per_env_runner=ENVIRONMENTS)
     config.training(
         random_steps=WARM_UP, hidden_sizes=[width] * 3, batch_size=BATCH, replay_ratio=ratio,
-        precision=precision,
     )  # fmt: skip
     config.replay(hindsight_k=4.0).reporting(min_sample_timesteps_per_iteration=1)
     config.debugging(seed=0)
@@ -159,7 +158,6 @@ OFTEN = {1.0: (1, 1), 0.4: (5, 2)}
 """By replay ratio: updates after so many environment steps, where an update is a call."""
 PEERS: dict[str, Callable[[int, float], Callable[[], int]]] = {
     "ours": ours,
-    "ours, bf16": functools.partial(ours, precision="bf16"),
     "RLlib SAC": functools.partial(rllib_sac, plain=False),
     "RLlib SAC, same networks": rllib_sac,
     "SB3 SAC+HER": sb3_sac,

@@ -22,15 +22,13 @@ HIDDEN = (256, 256, 256)
 class RawUpdate:
     """Five networks and their update on data that lies ready in memory."""
 
-    def __init__(
-        self, inputs: int, actions: int, batch: int, *, q: float, alpha: float, bf16: bool = False
-    ) -> None:
+    def __init__(self, inputs: int, actions: int, batch: int, *, q: float, alpha: float) -> None:
         torch.manual_seed(0)
         self.q, self.alpha = q, alpha
-        self.policy = Perceptron(inputs, HIDDEN, 2 * actions, bf16=bf16)
-        self.critics = Critics(inputs + actions, HIDDEN, bf16=bf16)
-        self.value = Perceptron(inputs, HIDDEN, 1, bf16=bf16)
-        self.target = Perceptron(inputs, HIDDEN, 1, bf16=bf16)
+        self.policy = Perceptron(inputs, HIDDEN, 2 * actions)
+        self.critics = Critics(inputs + actions, HIDDEN)
+        self.value = Perceptron(inputs, HIDDEN, 1)
+        self.target = Perceptron(inputs, HIDDEN, 1)
         self.target.requires_grad_(False)
         self.normaliser = RunningNormaliser(inputs, epsilon=0.01, clip=5.0)
         self.normaliser.update(torch.randn(1000, inputs))

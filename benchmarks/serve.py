@@ -152,7 +152,7 @@ class Storm:
     answers: list[tuple[int, float]] = field(default_factory=list)
     """Status and seconds of each request; 0 where the connection broke."""
     healths: list[tuple[int, float]] = field(default_factory=list)
-    """The same of the questions for its health meanwhile, one after the other."""
+    """The same of requests to Serve's own health check meanwhile, one after the other."""
     without_retry: int = 0
     """Answers 503 that don't say when to come again."""
 
@@ -188,7 +188,7 @@ async def storm(url: str, policy: Policy, count: int, token: str | None = None) 
     async def watch(session: aiohttp.ClientSession) -> None:
         while not over.is_set():
             began = time.perf_counter()
-            async with session.get("/health") as answer:
+            async with session.get("/-/healthz") as answer:
                 await answer.read()
             seen.healths.append((answer.status, time.perf_counter() - began))
             await asyncio.sleep(0.1)
@@ -239,7 +239,7 @@ def weather(url: str, policy: Policy, count: int, process: int) -> int:
             shown = [f"{seen.quantile(share, status):.2f}" for share in (0.5, 0.99, 1)]
             print(f"  {status}: {seen.count(status)}, median, 99 % and slowest s {shown}")
     worst = max(seconds for _, seconds in seen.healths)
-    print(f"  /health meanwhile: {len(seen.healths)} times, slowest {worst:.2f} s")
+    print(f"  /-/healthz meanwhile: {len(seen.healths)} times, slowest {worst:.2f} s")
     print(f"  proxy and replica: {before:.0f} MB before, {during:.0f} during, {after:.0f} after")
     print(f"  load average {os.getloadavg()[0]:.1f}")
     bad = len(seen.answers) - seen.count(200, 503) + seen.without_retry

@@ -17,7 +17,6 @@ from music_rllib import TACConfig
 from music_rllib.compiling import compiled
 from music_rllib.tac.algorithm import TAC
 from music_rllib.tac.kernels.blas import multiply
-from music_rllib.tac.kernels.precision import cpu_flags, has_bf16
 
 __all__ = ["rows"]
 
@@ -58,8 +57,6 @@ def algorithm(
     hindsight_k: float = 0.0,
     estimator: str = "none",
     transitions: int = 10_000,
-    gpus: int = 0,
-    graphs: bool = True,
     direct: bool = True,
     **training: Any,
 ) -> TAC:
@@ -74,10 +71,7 @@ def algorithm(
         estimator=estimator,
         mi_reward_weight=weight,
     )
-    config.learners(num_gpus_per_learner=gpus)
     algo: TAC = config.build_algo()
-    if not graphs:
-        algo.learner_group._learner._captured = None
     if not direct:
         algo.learner_group._learner._direct = None
     while len(algo.replay) < 10_000:
@@ -95,9 +89,9 @@ def updates(algo: TAC) -> Callable[[], None]:
     return turn
 
 
-def raw_updates(*, bf16: bool = False) -> Callable[[], None]:
+def raw_updates() -> Callable[[], None]:
     """A turn of `UPDATES` updates in bare torch."""
-    raw = RawUpdate(INPUTS, ACTIONS, BATCH, q=1.5, alpha=0.05, bf16=bf16)
+    raw = RawUpdate(INPUTS, ACTIONS, BATCH, q=1.5, alpha=0.05)
 
     def turn() -> None:
         for _ in range(UPDATES):
@@ -178,16 +172,6 @@ def rows(repeats: int) -> Iterator[Row]:
         yield from _against_the_best(name, taken)
     for name, (peer, limit) in PEERS.items():
         yield _row(name, taken, peer, f"{peer} (time)", at_most=limit)
-    for name in ("raw torch", "TAC, HER") if has_bf16() else ():
-        wanted = 1.5 if "amx_bf16" in cpu_flags() else None
-        faster = compared(taken[name], taken[f"{name}, bf16"])
-        rate, cpu = _rates(taken[f"{name}, bf16"])
-        yield ratio_row(
-            GROUP, f"{name}, bf16", rate, "updates/s", cpu=cpu, against="float32 (speed)",
-            at_least=wanted, **faster,
-        )  # fmt: skip
-    if torch.cuda.is_available():
-        yield from on_gpu(repeats)
 
 
 def _turns() -> dict[str, Turn]:
@@ -197,9 +181,6 @@ def _turns() -> dict[str, Turn]:
         turns |= floors(width)
         if importlib.util.find_spec("jax") is not None:
             turns[f"JAX {width}"] = _by_jax(width)
-    if has_bf16():
-        turns["raw torch, bf16"] = raw_updates(bf16=True)
-        turns["TAC, HER, bf16"] = updates(algorithm(hindsight_k=4.0, precision="bf16"))
     return turns
 
 
@@ -233,31 +214,3 @@ def _by_jax(width: int) -> Turn:
     from benchmarks.jax_update import jax_updates
 
     return jax_updates(INPUTS, ACTIONS, (width,) * 3, BATCH, UPDATES, q=1.5, alpha=0.05)
-
-
-def on_gpu(repeats: int) -> Iterator[Row]:
-    """Updates a second with the Learner on the GPU, captured as a CUDA graph and not."""
-    for batch in (256, 4096):
-        turns = {
-            "captured": updates(algorithm(hindsight_k=4.0, batch_size=batch, gpus=1)),
-            "launched": updates(algorithm(hindsight_k=4.0, batch_size=batch, gpus=1, graphs=False)),
-        }
-        taken = interleaved({name: _waited_for(turn) for name, turn in turns.items()}, repeats)
-        faster = compared(taken["launched"], taken["captured"])
-        rate, cpu = _rates(taken["captured"])
-        row = ratio_row(
-            GROUP, f"TAC, HER, GPU, batch {batch}", rate, "updates/s", cpu=cpu,
-            against="launched from Python (speed)", **faster,
-        )  # fmt: skip
-        yield row
-        assert row.ratio is not None
-        share = 100 * (1 - 1 / row.ratio)
-        yield Row(GROUP, f"time that launching takes, batch {batch}", share, "%")
-
-
-def _waited_for(turn: Callable[[], None]) -> Callable[[], None]:
-    def whole() -> None:
-        turn()
-        torch.cuda.synchronize()
-
-    return whole

@@ -14,7 +14,6 @@ from typing import Any
 import psutil
 
 from benchmarks.measure import Row, Taken, compared, middle, ratio_row, told_turns
-from music_rllib.tac.kernels.precision import has_bf16
 
 __all__ = ["rows"]
 
@@ -99,9 +98,6 @@ def rows(repeats: int) -> Iterator[Row]:
         taken = _in_turns(names, width, ratio, repeats)
         for name in names[1:]:
             yield _row(what, taken["ours"], taken[name], f"{name} (speed)", targets[name])
-    if has_bf16():
-        taken = _in_turns(["ours", "ours, bf16"], 256, 1.0, repeats)
-        yield _row("3 x 256, bf16", taken["ours, bf16"], taken["ours"], "float32 (speed)", None)
 
 
 def _in_turns(names: list[str], width: int, ratio: float, repeats: int) -> dict[str, list[Taken]]:

@@ -53,6 +53,12 @@ performance
 ```
 ```{toctree}
 :hidden:
+:glob:
+:caption: Decisions
+adr/*
+```
+```{toctree}
+:hidden:
 :caption: What came out
 results
 results_appendix

@@ -89,7 +89,7 @@ def page(template: str, figures: dict[str, bytes]) -> str:
         "races": races_table,
         "effects": effects_table,
         "metric": metric_table,
-        "search": lambda sweep: search_text(sweep, figures),
+        "search": search_text,
     }
 
     def fill(match: re.Match[str]) -> str:

@@ -42,12 +42,8 @@ MOST_ROWS_PER_BYTE = 4
 """Rows of an exported table per byte, after its first 100,000: real runs have 0.1 to 0.3."""
 MOST_TABLE_TEXT = 64 << 20
 """Characters in all cells of an exported table."""
-MOST_PAGES = 30_000
-"""Pages of an exported Parquet table."""
-MOST_PAGE_BYTES = 16 << 20
-"""Size of one page after unpacking: Arrow writes pages of 1 MiB."""
 MOST_UNPACKED_BYTES = 32 << 20
-"""Size of all pages after unpacking, to which `MOST_UNPACKED_PER_BYTE` is added."""
+"""Size of an exported Parquet table after unpacking, to which `MOST_UNPACKED_PER_BYTE` is added."""
 MOST_UNPACKED_PER_BYTE = 16
 """Unpacked bytes for each byte of the file: real sweeps have 1.5 to 1.8."""
 MOST_COLUMNS = 10_000

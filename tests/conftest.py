@@ -72,7 +72,6 @@ LONG = (
     "integration/test_docs_site.py",
     "integration/test_dashboards.py",
     "faults/test_damage.py",
-    "integration/test_captured_updates.py",
     "integration/test_serve.py",
     "integration/test_longer_training.py",
     "integration/test_screen.py",

@@ -11,11 +11,12 @@ from music_rllib.experiment.plan import make_plan
 from music_rllib.results.archive.folder import is_archive, read_archive
 from music_rllib.results.archive.merge import of_plan
 from music_rllib.results.data import Sweep
+from music_rllib.version import ALGORITHM_VERSION
 
 ROOT = Path(__file__).parents[2]
 DATA, CONFIGS = ROOT / "docs" / "results" / "data", ROOT / "tune_configs"
-EARLIER = ("2",)
-"""Versions of the algorithm whose runs are shown where there are none of a later one."""
+EARLIER = tuple(str(version) for version in range(int(ALGORITHM_VERSION) - 1, 1, -1))
+"""Earlier versions of the algorithm, the latest first: their runs stand in for missing ones."""
 
 
 @cache

@@ -76,7 +76,7 @@ def provenance(sweep: Sweep) -> str:
         }
     )
     episodes = all_of(run.params.get("evaluation.episodes", "") for run in sweep.runs)
-    algorithm = all_of(run.tags.get(names.TAG_ALGORITHM, EARLIER[0]) for run in sweep.runs)
+    algorithm = all_of(run.tags.get(names.TAG_ALGORITHM, EARLIER[-1]) for run in sweep.runs)
     return (
         f"{episodes} evaluation episodes; algorithm {algorithm}; commit {commits}; "
         f"{', '.join(versions)}."

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from docs.result_pages.figures import figure
 from docs.result_pages.runs import provenance
 from docs.result_pages.words import row, rule
-from music_rllib.report.figures.choice import stage_drawings
 from music_rllib.report.search_tables import search_in_words, search_tables
 from music_rllib.results.analysis import analyse
 from music_rllib.results.comparison import verdict
 from music_rllib.results.data import Sweep
 
 
-def search_text(sweep: Sweep, figures: dict[str, bytes]) -> Iterator[str]:
+def search_text(sweep: Sweep) -> Iterator[str]:
     """How it searched, its ranking on fresh seeds, importances, trials, and what may be said."""
     analyses = {found.stage.name: found for found in analyse(sweep)}
     for search in sweep.searches:
@@ -27,8 +25,4 @@ def search_text(sweep: Sweep, figures: dict[str, bytes]) -> Iterator[str]:
             yield rule(len(found.header))
             yield from (row(*cells) for cells in found.rows)
         yield ""
-        for drawing in stage_drawings(sweep, analyses[search["stage"]]):
-            if drawing.title == "Importance of settings":
-                yield from figure(sweep, drawing, figures)
-                yield ""
     yield provenance(sweep)

@@ -38,7 +38,7 @@ from music_rllib.config.reading.presets import with_preset
 from music_rllib.config.reading.problem_lines import problem_lines
 from music_rllib.config.reading.yaml_file import YamlFile, read_yaml
 from music_rllib.config.resolve import resolve_stage
-from music_rllib.config.run_settings import RunSettings
+from music_rllib.config.run_settings import RunSettings, without_retired
 from music_rllib.config.schema import (
     RESERVED_NAMES,
     Header,
@@ -292,7 +292,7 @@ def _defaults(document: dict[str, Any], findings: Findings) -> dict[str, Any]:
 
 def _check_fields(key: str, value: Any, findings: Findings) -> None:
     """Validate a group's fields alone: rules between groups depend on the variant."""
-    field = RunSettings.model_fields[key]
+    field, value = RunSettings.model_fields[key], without_retired({key: value})[key]
     try:
         from_json(field.rebuild_annotation(), value)
     except ValidationError as error:

@@ -103,6 +103,20 @@ def contradiction(variant: Variant, fixed: Any, got: Any) -> str:
 YOUNGER: tuple[tuple[str, str], ...] = (("tac", "log_std_form"), ("tac", "warmup_steps"))
 """Group and name of settings that are newer than the node keys of finished runs."""
 
+RETIRED: Mapping[tuple[str, str], Any] = MappingProxyType({("tac", "precision"): "float32"})
+"""Group and name of removed settings, with the only value that a sweep's file may still give them.
+Node keys contain them, so that finished runs are found."""
+
+
+def without_retired(settings: Any) -> Any:
+    """A run's settings as plain data, without removed ones that have their last value."""
+    for (section, name), kept in RETIRED.items():
+        group = settings.get(section) if isinstance(settings, dict) else None
+        if isinstance(group, dict) and group.get(name) == kept:
+            others = {key: value for key, value in group.items() if key != name}
+            settings = settings | {section: others}
+    return settings
+
 
 class Evaluation(StrictModel):
     """Deterministic evaluation episodes during a run."""
@@ -144,9 +158,7 @@ class RunSettings(StrictModel):
             log_std_bounds=self.tac.log_std_bounds if self.tac.log_std_form == "tanh" else None,
         )
 
-    def handoff_info(
-        self, node_key: str, env_steps: int, spaces: Spaces | None = None
-    ) -> HandoffInfo:
+    def handoff_info(self, node_key: str, env_steps: int, spaces: Spaces) -> HandoffInfo:
         """The description of a handoff of this run after `env_steps`."""
         return HandoffInfo(
             task=self.task,
@@ -164,11 +176,13 @@ class RunSettings(StrictModel):
         """Everything that determines the numbers, as plain data.
 
         A setting of `YOUNGER` is omitted if it has its default: runs that do not use it keep the
-        identity that they had before it existed.
+        identity that they had before it existed. A removed setting keeps its last value.
         """
         settings = self.model_dump(mode="json") | {"task": self.task.identity()}
         if self.replay.hindsight_episodes == "moved" and self.task.moved_distance is not None:
             settings["task"]["moved_distance"] = self.task.moved_distance
+        for (section, name), kept in RETIRED.items():
+            settings[section][name] = kept
         for section, name in YOUNGER:
             part: BaseModel = getattr(self, section)
             default = type(part).model_fields[name].get_default(call_default_factory=True)

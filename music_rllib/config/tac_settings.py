@@ -209,9 +209,6 @@ class TACSettings(StrictModel):
     replay_ratio: float = Field(1.0, gt=0)
     """Gradient updates per environment step. More learn more from each step and take longer:
     updates are most of a run's time."""
-    precision: Literal["float32", "bf16"] = "float32"
-    """Precision of the hidden layers' products in updates; weights, outputs and acting stay
-    float32. `bf16` is refused on hardware without it."""
     random_steps: int = Field(1_000, ge=0)
     """First environment steps, with uniformly random actions. More give the first updates more
     varied data, later."""

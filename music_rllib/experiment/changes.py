@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from music_rllib.config.run_settings import RETIRED
 from music_rllib.config.schema import SweepConfig
 from music_rllib.experiment.continuation import budget_settings, continued_from
 from music_rllib.experiment.plan import Node
@@ -224,6 +225,7 @@ def _differences(before: Any, after: Any, place: str = "") -> Iterator[str]:
     if isinstance(before, dict) and isinstance(after, dict):
         for key in before | after:
             inner = f"{place}.{key}" if place else str(key)
-            yield from _differences(before.get(key), after.get(key), inner)
+            if (place, key) not in RETIRED:
+                yield from _differences(before.get(key), after.get(key), inner)
     elif before != after:
         yield f"{place}: {json.dumps(before)} -> {json.dumps(after)}"

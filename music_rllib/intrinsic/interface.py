@@ -43,7 +43,7 @@ class IntrinsicReward(Protocol):
     ) -> Sequence[Hashable]:
         """Draws the random numbers of K updates, one value each, for `reward`.
 
-        As a CUDA graph, an update is recorded once per different value, so there should be few.
+        Updates with the same value are relabeled together, so there should be few values.
 
         Args:
             updates: K.

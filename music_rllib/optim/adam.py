@@ -89,8 +89,8 @@ class FusedAdam(torch.optim.Adam):
 
     def __init__(self, parameters: Iterable[Tensor], lr: float) -> None:
         parameters = list(parameters)
-        on_gpu = parameters[0].device.type == "cuda"
-        super().__init__(parameters, lr=lr, fused=True, capturable=on_gpu)
+        self._on_cpu = parameters[0].device.type == "cpu"
+        super().__init__(parameters, lr=lr, fused=True)
         self._cached_state: Any = None
         self._moments: _Moments | None = None
         self._flat: _FlatMoments | None = None
@@ -101,10 +101,9 @@ class FusedAdam(torch.optim.Adam):
         group = self.param_groups[0]
         parameters = group["params"]
         gradients = [parameter.grad for parameter in parameters]
-        # Torch's own step creates the state and skips parameters without gradients. On a GPU, where
-        # steps are captured as a graph, its Python costs nothing.
+        # Torch's own step creates the state, skips parameters without gradients and serves GPUs.
         plain = len(self.state) < len(parameters) or any(gradient is None for gradient in gradients)
-        if plain or group["capturable"] or closure is not None:
+        if plain or not self._on_cpu or closure is not None:
             return super().step(closure)
         moments = self._ordered_moments()
         moments.counts.add_(1)

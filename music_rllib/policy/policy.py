@@ -10,32 +10,26 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pyarrow.fs as pafs
 from numpy.typing import NDArray
 
 from music_rllib.config.problems import shown
-from music_rllib.config.run_settings import RunSettings
-from music_rllib.config.tac_settings import TACSettings
-from music_rllib.envs.make import Known, known_environment, make_env
+from music_rllib.envs.make import Known, known_environment
 from music_rllib.envs.tasks import Task
 from music_rllib.errors import BadInputError
-from music_rllib.limits import MOST_JSON_BYTES, MOST_WEIGHTS_BYTES, read_json, read_regular
+from music_rllib.limits import MOST_WEIGHTS_BYTES
 from music_rllib.policy.network import Floats, PolicyFileError, PolicyNetwork
 from music_rllib.store.handoff import MANIFEST as HANDOFF_FILE
 from music_rllib.store.handoff import (
     HandoffError,
     HandoffInfo,
-    Spaces,
     open_handoff,
     read_handoff,
 )
 from music_rllib.store.object_folder import MANIFEST, ObjectFolders, StorageError, open_storage
 from music_rllib.store.paths import database_url
 
-RUN_FILE = "run.json"
-"""File with a run's settings, in its node and in its checkpoints."""
 MLFLOW_FILE = "policy.safetensors"
 """File with the policy in an MLflow model."""
 _LISTED = 8
@@ -137,12 +131,8 @@ def policy_from_folder(folder: Path, env: str | Sequence[Task] = ()) -> Policy:
     info = manifest.info
     wanted = ["policy", "normaliser"] if info.architecture.normalise_observations else ["policy"]
     parts = read_handoff(handoff_parent, wanted, info.task)
-    if info.observation_clip is None:
-        info = _completed(info, handoff_parent)
     try:
-        network = _network(parts, info, _spaces(info, env))
-    except PolicyError:
-        raise
+        network = _network(parts, info)
     except (ValueError, LookupError) as error:
         raise PolicyError(
             f"{handoff_parent} must fit the task {info.task.name}: {error!r}"
@@ -170,12 +160,8 @@ def _several_policies(folder: Path) -> PolicyError | None:
     )
 
 
-def _network(
-    parts: Mapping[str, Mapping[str, NDArray[Any]]],
-    info: HandoffInfo,
-    spaces: Spaces,
-) -> PolicyNetwork:
-    policy = parts["policy"]
+def _network(parts: Mapping[str, Mapping[str, NDArray[Any]]], info: HandoffInfo) -> PolicyNetwork:
+    policy, spaces = parts["policy"], info.spaces
     # torch's names: the layers are every other entry of a Sequential.
     layers = sorted(int(name.removesuffix(".weight")) for name in policy if "weight" in name)
     features = policy[f"{layers[0]}.weight"].shape[1]
@@ -278,49 +264,7 @@ def _local_copy(place: str) -> Iterator[Path]:
         yield Path(folder)
 
 
-_FILES = {RUN_FILE, HANDOFF_FILE, MLFLOW_FILE, f"artifacts/{MLFLOW_FILE}"}
-
-
-def _completed(info: HandoffInfo, handoff: Path) -> HandoffInfo:
-    """A handoff of an earlier version with what its run's settings say, or else the defaults."""
-    run = _run_settings(handoff / RUN_FILE) or _run_settings(handoff.parent / RUN_FILE)
-    tac = run.tac if run else TACSettings()
-    return info.model_copy(
-        update={
-            "observation_clip": tac.observation_clip,
-            "max_episode_steps": tac.max_episode_steps,
-        }
-    )
-
-
-def _run_settings(path: Path) -> RunSettings | None:
-    """A run's settings; None for a handoff without them."""
-    if not path.is_file():
-        return None
-    try:
-        return RunSettings.model_validate(read_json(read_regular(path, MOST_JSON_BYTES)))
-    except (ValueError, OSError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise PolicyError(f"{path} must hold a run's settings: {reason}") from error
-
-
-def _spaces(info: HandoffInfo, env: str | Sequence[Task]) -> Spaces:
-    """Sizes and action bounds, from the environment where the handoff doesn't have them."""
-    if info.spaces is not None:
-        return info.spaces
-    known = _environment(info.task, env)
-    if known is None:
-        raise PolicyError(unknown_environment(info.task))
-    try:
-        environment = make_env(known.env_id, **known.kwargs)
-    except (gym.error.Error, ImportError, TypeError) as error:
-        raise PolicyError(
-            f"{info.task.name}: the environment {known.env_id} must be there: {error}"
-        ) from error
-    try:
-        return Spaces.of(environment.observation_space, environment.action_space)
-    finally:
-        environment.close()
+_FILES = {HANDOFF_FILE, MLFLOW_FILE, f"artifacts/{MLFLOW_FILE}"}
 
 
 def unknown_environment(task: Task) -> str:

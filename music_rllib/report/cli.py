@@ -28,7 +28,7 @@ Examples:
   music-rllib report smoke --tracking-uri http://mlflow:5000 --output reports
       on a sweep that was logged to a server, from any machine
   music-rllib report results/smoke --serve
-      the same page while it runs, with its progress; stop and resume it there
+      the same page while it runs, with its progress
   music-rllib report results/smoke results/other
       what differs in the settings and in the results of two sweeps
   music-rllib report results/smoke --export published/smoke --format csv
@@ -104,8 +104,7 @@ def report(
         bool,
         typer.Option(
             "--serve",
-            help="Serve the page on loopback while the sweep runs: its progress, and buttons to "
-            "stop and resume it.",
+            help="Serve the page on loopback while the sweep runs, with its progress.",
         ),
     ] = False,
     port: Annotated[
@@ -275,7 +274,7 @@ def _serve(
     from music_rllib.report.live.server import LivePage, make_server, serve
     from music_rllib.report.live.state import Progress
     from music_rllib.report.page import render
-    from music_rllib.store.paths import folder_at, sweep_folder
+    from music_rllib.store.paths import folder_at
 
     sweep = find_sweep(place, None if "/" in place or folder_at(place) else storage)
     progress = Progress(sweep)
@@ -291,9 +290,8 @@ def _serve(
         )
         return render(report, live=True)
 
-    folder = sweep_folder(sweep.storage, sweep.name)
     page = LivePage(make_page, progress)
-    serve(make_server(page, sweep, folder, port), page, typer.echo)
+    serve(make_server(page, port), page, typer.echo)
 
 
 def _attach(source: ReportSource, folder: Path, report: Report) -> None:

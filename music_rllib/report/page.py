@@ -14,15 +14,15 @@ from music_rllib import names
 from music_rllib.report.figures.choice import (
     COST,
     GROUPS,
-    INFLUENCE,
     PERFORMANCE,
     PRIMARY,
+    SENSITIVITY,
     SETTINGS,
     Drawing,
     slug,
 )
 from music_rllib.report.figures.draw import Figures
-from music_rllib.report.figures.importance import FEWEST_RUNS, varied
+from music_rllib.report.figures.sensitivity import varied
 from music_rllib.report.pieces import DASH, TextTable, document
 from music_rllib.report.study import study_tables
 from music_rllib.report.videos import Films
@@ -284,18 +284,14 @@ def _in_ranges(seeds: Sequence[str]) -> str:
 
 
 def _not_drawn(report: Report) -> Iterable[Sequence[str]]:
-    """For each stage the figures of settings that it lacks, and what it would need for them."""
-    drawn = {(drawing.stage, drawing.title) for drawing in report.drawings}
-    for analysis in report.analyses:
-        stage = analysis.stage
-        absent = [title.lower() for title in INFLUENCE if (stage.name, title) not in drawn]
-        if absent and len(stage.conditions) > 1:
+    """For each stage without a figure of its settings, what that would need."""
+    drawn = {drawing.stage for drawing in report.drawings if drawing.title == SENSITIVITY}
+    for stage in (analysis.stage for analysis in report.analyses):
+        if stage.name not in drawn and len(stage.conditions) > 1:
             yield (
                 f"Stage {stage.name}",
-                f"Not drawn: {', '.join(absent)}. This stage varies "
-                f"{', '.join(varied(stage.conditions)) or 'nothing'}; sensitivity needs α or the "
-                "MI weight, the other two need a second setting beside q and finished runs "
-                f"(importance: {FEWEST_RUNS} on a task).",
+                f"Not drawn: sensitivity, which needs α or the MI weight to vary. This stage "
+                f"varies {', '.join(varied(stage.conditions)) or 'nothing'}.",
             )
 
 

@@ -15,7 +15,6 @@ import ray
 from music_rllib.config.schema import Resources
 from music_rllib.envs.modules import folders_for_workers, search_in
 from music_rllib.errors import first_line
-from music_rllib.runtime import autoscaler
 from music_rllib.runtime.machine import (
     RAY_FOLDER,
     ClusterError,
@@ -27,6 +26,10 @@ from music_rllib.runtime.quiet import quiet_third_parties
 
 OBJECT_STORE_BYTES = 128 * 2**20
 """Enough for reports, the only data of workers; Ray's default is a third of the memory."""
+NODE_GROUP = "ray.io/node-group"
+"""Label of nodes that a cluster launcher or KubeRay started."""
+LISTED_MACHINES = "local.cluster.node"
+"""The launcher's node group for listed machines, to which it cannot add others."""
 WAITING = 200
 """Most runs that wait if an autoscaler adds nodes for them; Tune's own default."""
 
@@ -58,8 +61,8 @@ class Room:
         if self.now:
             return None
         return (
-            "no node of the cluster can hold a run yet; its autoscaler is asked for one, which may "
-            "take minutes ('ray status' shows what it does)"
+            "no node of the cluster can hold a run yet; the sweep waits until its autoscaler adds "
+            "one ('ray status' shows what it does, and requests that no node type can meet)"
         )
 
 
@@ -125,7 +128,7 @@ def cluster(resources: Resources) -> Iterator[Room]:
 
     Raises:
         ClusterError: There is no cluster at the address, a local one does not start, or no node can
-            hold a run, neither a present one nor one that an autoscaler would add.
+            hold a run and no autoscaler adds nodes.
     """
     start_ray(num_cpus=check_cpus(resources), object_store_memory=OBJECT_STORE_BYTES)
     try:
@@ -160,10 +163,16 @@ def _room(resources: Resources) -> Room:
     try:
         now = slots(resources, nodes, local=False)
     except ClusterError:
-        if not autoscaler.adds_nodes(resources.bundle):
+        if not grows():
             raise
         return Room(now=0, grows=True, memory=memory)
-    return Room(now=now, grows=autoscaler.is_there(), memory=memory)
+    return Room(now=now, grows=grows(), memory=memory)
+
+
+def grows() -> bool:
+    """Whether the cluster's nodes belong to groups, to which an autoscaler may add nodes."""
+    groups = {node.get("Labels", {}).get(NODE_GROUP) for node in ray.nodes() if node["Alive"]}
+    return bool(groups - {None, LISTED_MACHINES})
 
 
 def slots(resources: Resources, nodes: Sequence[Mapping[str, float]], *, local: bool) -> int:

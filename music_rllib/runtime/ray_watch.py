@@ -71,11 +71,10 @@ def _addresses(cluster: str) -> list[str]:
     """`HOST:PORT` of the head, and the socket of this machine's raylet if there is one."""
     if cluster.startswith("ray://"):
         return [cluster.removeprefix("ray://")]
-    addresses = [ray.get_runtime_context().gcs_address]
-    node = ray._private.worker._global_node
-    if node is not None and node.raylet_socket_name:
-        addresses.append(node.raylet_socket_name.removeprefix("unix://"))
-    return addresses
+    context = ray.get_runtime_context()
+    own = [node for node in ray.nodes() if node["NodeID"] == context.get_node_id()]
+    sockets = [node["RayletSocketName"].removeprefix("unix://") for node in own]
+    return [context.gcs_address, *sockets]
 
 
 def _answers(address: str) -> bool:

@@ -1,7 +1,7 @@
 """A trained policy behind HTTP: `music-rllib serve POLICY`.
 
 `schema` has the requests and answers, `api` is the web application (no Ray), `application` puts it
-on Ray Serve, `load_limits` guards Serve's proxies, `command` is the command line.
+on Ray Serve, `command` is the command line.
 """
 
 TOKEN_VARIABLE = "MUSIC_RLLIB_SERVE_TOKEN"  # noqa: S105 - the name of a variable

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import hmac
 from collections.abc import Awaitable, Callable
@@ -10,14 +11,12 @@ from typing import Annotated, Any
 import numpy as np
 from fastapi import Body, Depends, FastAPI, HTTPException, Request
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import HTMLResponse, JSONResponse
+from fastapi.responses import JSONResponse
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from starlette.exceptions import HTTPException as StarletteHTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 import music_rllib
-from music_rllib.serve.docs_page import docs_page
-from music_rllib.serve.load_limits import announced_bytes
 from music_rllib.serve.schema import (
     Answer,
     Array,
@@ -35,6 +34,8 @@ Act = Callable[[Rows], Awaitable[Array]]
 Failures = dict[int | str, dict[str, Any]]
 """Status to FastAPI's description of the response."""
 
+SEND_SECONDS = 10
+"""Longest pause of a client while it sends a body."""
 SHOWN = 10
 """Most problems of a request that the answer lists."""
 
@@ -64,7 +65,7 @@ def make_api(facts: PolicyFacts, act: Act, token_sha256: str | None = None) -> F
         summary=f"Actions for {facts.task}",
         description=DESCRIPTION,
         version=music_rllib.__version__,
-        # Both load scripts from a CDN; `docs_page` makes a page that needs no network.
+        # Both load scripts from a CDN; the service must work without the internet.
         docs_url=None,
         redoc_url=None,
     )
@@ -107,10 +108,6 @@ def make_api(facts: PolicyFacts, act: Act, token_sha256: str | None = None) -> F
         body.annotation, Body(openapi_examples={"zeros": {"value": body.example}})
     ]
     api.post("/act", dependencies=protected, responses=failures | unauthorised)(act_on)
-
-    @api.get("/docs", include_in_schema=False)
-    async def docs(request: Request) -> HTMLResponse:
-        return HTMLResponse(docs_page(api.openapi(), str(request.base_url)))
 
     return api
 
@@ -176,7 +173,7 @@ class _Lenient:
 
 
 class _BodyLimit:
-    """Middleware that refuses too long bodies before they are kept in memory and parsed."""
+    """Middleware that refuses too long or stalled bodies before they are parsed."""
 
     def __init__(self, app: ASGIApp, limit: int) -> None:
         self._app = app
@@ -190,13 +187,17 @@ class _BodyLimit:
 
         async def counting() -> Message:
             nonlocal received
-            message = await receive()
+            try:
+                message = await asyncio.wait_for(receive(), SEND_SECONDS)
+            except TimeoutError:
+                raise HTTPException(408, f"the body must arrive within {SEND_SECONDS} s") from None
             received += len(message.get("body", b""))
             if received > self._limit:
                 raise HTTPException(413, f"the body must be <= {self._limit} bytes")
             return message
 
-        if announced_bytes(scope) > self._limit:
+        announced = dict(scope["headers"]).get(b"content-length", b"")
+        if announced.isdigit() and int(announced) > self._limit:
             failure = Failure(error=f"the body must be <= {self._limit} bytes")
             await _failure(413, failure)(scope, receive, send)
             return

@@ -21,17 +21,18 @@ from ray.serve import Application
 from ray.serve._private import replica
 from ray.serve.config import BackpressureConfig
 
-from music_rllib.policy import Policy, PolicyNetwork, find_policy, load_policy, named_environment
+from music_rllib.policy import Policy, PolicyNetwork, find_policy, load_policy
 from music_rllib.runtime.allocator import give_back_freed_memory
 from music_rllib.serve import TOKEN_VARIABLE
 from music_rllib.serve.api import make_api, token_hash
-from music_rllib.serve.load_limits import FOR_HEALTH, RETRY_SECONDS, Limits
 from music_rllib.serve.schema import Array, PolicyFacts, Rows, compute
 
 TOGETHER = 64
 """Most requests that are computed together."""
 WAIT_SECONDS = 0.002
 """Time that the first of them waits for others."""
+RETRY_SECONDS = 1
+"""Value of the Retry-After header of a refused request."""
 
 
 class ServeSettings(BaseModel):
@@ -43,14 +44,11 @@ class ServeSettings(BaseModel):
     """Folder or URI of a finished node, an exported policy, or a run's key or label."""
     storage: str = "results"
     """Storage in which keys and labels are looked up."""
-    env: str | None = None
-    """The environment, if the policy's file does not have its spaces: a sweep's YAML file that
-    declares it, or its id."""
     replicas: int = Field(1, ge=1)
     """Processes that compute actions."""
     cpus_per_replica: float = Field(1.0, gt=0)
     """CPUs reserved for each."""
-    max_requests: int = Field(Limits().max_requests, ge=1)
+    max_requests: int = Field(256, ge=1)
     """Most requests of a proxy that wait for a replica; further ones get status 503."""
     token_required: bool = False
     """Refuse to start without a token in the environment; for services beyond loopback."""
@@ -61,7 +59,6 @@ def app(settings: ServeSettings) -> Application:
 
     Raises:
         PolicyError: There is no such policy.
-        ConfigError: The file that declares its environment is invalid.
         ValueError: A token is required and there is none.
     """
     return application(policy_of(settings), settings)
@@ -69,8 +66,7 @@ def app(settings: ServeSettings) -> Application:
 
 def policy_of(settings: ServeSettings) -> Policy:
     """The policy of `settings`; raises the errors of `app`."""
-    place = find_policy(settings.policy, settings.storage)
-    return load_policy(place, named_environment(settings.env))
+    return load_policy(find_policy(settings.policy, settings.storage))
 
 
 def application(policy: Policy, settings: ServeSettings) -> Application:
@@ -86,7 +82,7 @@ def application(policy: Policy, settings: ServeSettings) -> Application:
     # The token's hash, because Ray keeps a deployment's arguments and may show them.
     return deployment.options(
         num_replicas=settings.replicas,
-        max_queued_requests=settings.max_requests + FOR_HEALTH,
+        max_queued_requests=settings.max_requests,
         ray_actor_options={"num_cpus": settings.cpus_per_replica},
     ).bind(policy.to_bytes(), policy.task.name, token_hash(token) if token else None)
 

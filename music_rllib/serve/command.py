@@ -26,7 +26,6 @@ from music_rllib.serve import TOKEN_VARIABLE
 if TYPE_CHECKING:
     from music_rllib.policy import Policy
     from music_rllib.serve.application import ServeSettings
-    from music_rllib.serve.load_limits import Limits
 
 EXAMPLES = f"""\
 Examples:
@@ -54,14 +53,6 @@ def serve(
     storage: Annotated[
         str, typer.Option(metavar="PLACE", help="Where keys and labels are looked up.")
     ] = "results",
-    env: Annotated[
-        str | None,
-        typer.Option(
-            metavar="ENV",
-            help="The environment, where neither this package nor the policy's own file says what "
-            "it takes and gives: a sweep's YAML file that declares it, or its id.",
-        ),
-    ] = None,
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=1, max=2**16 - 1, help="Port to listen on.")] = 8000,
     replicas: Annotated[int, typer.Option(min=1, help="Processes that compute actions.")] = 1,
@@ -70,23 +61,15 @@ def serve(
         typer.Option(
             metavar="N",
             min=1,
-            help="Requests that are answered at a time; further ones get status 503 and are asked "
-            "to come again.",
+            help="Requests that wait for a replica; further ones get status 503 and a Retry-After "
+            "header.",
         ),
     ] = 256,
-    send_seconds: Annotated[
-        int,
-        typer.Option(
-            metavar="S",
-            min=1,
-            help="For a client to send a request, and to take the answer; then it is cut off.",
-        ),
-    ] = 10,
 ) -> int:
     """Serve a trained policy over HTTP, until it is stopped.
 
     POST /act takes a goal observation, or a batch of them, and answers with actions; GET /health,
-    GET /policy. GET /docs describes them on a page, GET /openapi.json for programs.
+    GET /policy. GET /openapi.json describes them.
     """
     _check_exposure(host)
     _check_port(host, port)
@@ -99,24 +82,17 @@ def serve(
             f"Ray Serve must be installed (pip install 'music_rllib[serve]'): {error}"
         ) from error
     from music_rllib.serve.application import ServeSettings, policy_of
-    from music_rllib.serve.load_limits import Limits
-    from music_rllib.serve.schema import PolicyFacts, request_model
 
     settings = ServeSettings(
-        policy=policy, storage=storage, env=env, replicas=replicas, max_requests=max_requests
+        policy=policy, storage=storage, replicas=replicas, max_requests=max_requests
     )
     served = policy_of(settings)
     if cluster is None:
         _check_room(settings, [len(os.sched_getaffinity(0))])
-    limits = Limits(
-        max_requests=max_requests,
-        max_body_bytes=request_model(PolicyFacts.of(served.task.name, served)).max_bytes,
-        send_seconds=send_seconds,
-    )
     _on_signals(_interrupt)
     with contextlib.suppress(KeyboardInterrupt):
         _connect(settings)
-        _serve(served, settings, host, port, limits)
+        _serve(served, settings, host, port)
     return 0
 
 
@@ -177,7 +153,7 @@ def _connect(settings: ServeSettings) -> None:
     """Start a local Ray, or connect to RAY_ADDRESS; refuse replicas that can never start."""
     import ray
 
-    from music_rllib.runtime.ray_cluster import start_ray, stop_ray
+    from music_rllib.runtime.ray_cluster import grows, start_ray, stop_ray
 
     start_ray()
     _on_signals(_interrupt)  # Ray's own handler of SIGTERM would end the process at once
@@ -185,24 +161,14 @@ def _connect(settings: ServeSettings) -> None:
     try:
         _check_room(settings, nodes)
     except BadInputError:
-        if cluster_address() is not None and _waits_for_nodes(settings):
-            return
-        stop_ray()
-        raise
-
-
-def _waits_for_nodes(settings: ServeSettings) -> bool:
-    """Whether an autoscaler will add nodes for the replicas; if so, prints that."""
-    from music_rllib.runtime import autoscaler
-
-    if not autoscaler.adds_nodes({"CPU": settings.cpus_per_replica}, settings.replicas):
-        return False
-    print(
-        f"The cluster has no room for {settings.replicas} replicas yet; its autoscaler is asked "
-        "for more nodes, which may take minutes ('ray status' shows what it does).",
-        flush=True,
-    )
-    return True
+        if cluster_address() is None or not grows():
+            stop_ray()
+            raise
+        print(
+            f"The cluster has no room for {settings.replicas} replicas yet; the service waits "
+            "until its autoscaler adds nodes ('ray status' shows what it does).",
+            flush=True,
+        )
 
 
 def _check_room(settings: ServeSettings, cpus_of_nodes: Sequence[float]) -> None:
@@ -220,7 +186,7 @@ ANSWER_SECONDS = 60.0
 """Time for a replica to answer a request; after it the answer is status 408."""
 
 
-def _serve(policy: Policy, settings: ServeSettings, host: str, port: int, limits: Limits) -> None:
+def _serve(policy: Policy, settings: ServeSettings, host: str, port: int) -> None:
     """Serve until a signal comes, then leave Ray; where that dies, end the process."""
     from ray import serve as ray_serve
 
@@ -229,7 +195,7 @@ def _serve(policy: Policy, settings: ServeSettings, host: str, port: int, limits
 
     listening = False
     try:
-        _listen(host, port, limits)
+        _listen(host, port)
         listening = True
         ray_serve.run(
             application(policy, settings),
@@ -241,7 +207,7 @@ def _serve(policy: Policy, settings: ServeSettings, host: str, port: int, limits
         stop = threading.Event()
         _on_signals(lambda *_: stop.set())
         print(f"Serving {redact(settings.policy)} at {url}", flush=True)
-        print(f"POST /act, GET /health, GET /policy; described at {url}/docs", flush=True)
+        print(f"POST /act, GET /health, GET /policy; described at {url}/openapi.json", flush=True)
         _wait(stop)
     finally:
         # Others may serve on a cluster too; a local Ray ends with all that runs on it.
@@ -264,18 +230,15 @@ def _wait(stop: threading.Event) -> None:
             end_process(1)
 
 
-def _listen(host: str, port: int, limits: Limits) -> None:
+def _listen(host: str, port: int) -> None:
     """Start Serve's proxy; refuse to disturb a Serve that runs on the cluster already."""
     from ray import serve as ray_serve
     from ray.serve.context import _get_global_client
-
-    from music_rllib.serve.load_limits import controller_environment
 
     logging.getLogger("ray.serve").setLevel(logging.ERROR)
     ray_serve.start(
         proxy_location="HeadOnly",
         http_options={"host": host, "port": port, "request_timeout_s": ANSWER_SECONDS},
-        controller_options={"runtime_env": {"env_vars": controller_environment(limits)}},
         logging_config=QUIET,
     )
     # Serve ignores new options where it runs already.

@@ -60,9 +60,9 @@ class Architecture(_Strict):
     bootstrap: str
     normalise_observations: bool
     estimator_hidden_size: int
-    log_std_form: str = "clamp"
-    """Meaning of the policy's outputs; older handoffs, made before there was a choice, lack it."""
-    log_std_bounds: tuple[float, float] | None = None
+    log_std_form: str
+    """Meaning of the policy's outputs."""
+    log_std_bounds: tuple[float, float] | None
     """Range to which the form `tanh` scales; other forms only clip to it."""
 
     def differences(self, other: Architecture, starts_from: str) -> list[str]:
@@ -116,11 +116,11 @@ class HandoffInfo(_Strict):
     node_key: str
     """Key of the source run, a hash of its settings and of its own source."""
     algorithm_version: str = ALGORITHM_VERSION
-    spaces: Spaces | None = None
-    """Spaces of the environment; None in handoffs of earlier versions."""
-    observation_clip: float | None = None
-    """`tac.observation_clip`; None in handoffs of earlier versions."""
-    max_episode_steps: int | None = None
+    spaces: Spaces
+    """Spaces of the environment."""
+    observation_clip: float
+    """`tac.observation_clip`."""
+    max_episode_steps: int | None
     """`tac.max_episode_steps`."""
 
 

@@ -52,7 +52,6 @@ from music_rllib.sweep.driver_lock import hold_driver_lock
 from music_rllib.sweep.listeners.state_file import StateFile
 from music_rllib.sweep.preflight import (
     check_environments,
-    check_hardware,
     check_ray,
     check_searches,
     fingerprints,
@@ -199,7 +198,6 @@ def _open(console: Console, config: SweepConfig, *, lenient: bool) -> Sweep:
     played = check_environments(plan, config.resources.hang_minutes)
     environments = fingerprints(plan)
     if cluster_address() is None:
-        check_hardware(plan)
         ray_parent()
     check_cpus(config.resources)
     check_memory_and_gpus(config.resources)

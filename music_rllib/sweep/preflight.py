@@ -188,22 +188,6 @@ def _why_it_ended(code: int, call: str, errors: str) -> str:
     return f"{call} must not end its process, which died of {name}{at}{memory}{said}"
 
 
-def check_hardware(plan: Plan) -> None:
-    """Check that this machine has the hardware for the runs' precision.
-
-    Raises:
-        BadInputError: It has not.
-    """
-    if all(run.tac.precision == "float32" for run in plan.settings):
-        return
-    from music_rllib.tac.kernels.precision import PrecisionError, check_precision
-
-    try:
-        check_precision("bf16")
-    except PrecisionError as error:
-        raise BadInputError(str(error)) from error
-
-
 def import_checkpoints(plan: Plan, store: NodeStore) -> None:
     """Put handoffs from outside into the store, where workers on any machine find them.
 

@@ -41,10 +41,8 @@ from music_rllib.schedules import Quantity
 from music_rllib.tac import diagnostics
 from music_rllib.tac.fresh_episodes import FreshEpisodes, critic_bias
 from music_rllib.tac.kernels.blas import use_threads
-from music_rllib.tac.kernels.cuda_graphs import CapturedUpdate, CudaRecorder, UpdateConstants
 from music_rllib.tac.kernels.forward import TACForward
-from music_rllib.tac.kernels.minibatches import FlatMinibatch, Minibatch, Minibatches
-from music_rllib.tac.kernels.precision import check_precision
+from music_rllib.tac.kernels.minibatches import Minibatch, Minibatches
 from music_rllib.tac.kernels.update import DirectUpdate
 from music_rllib.tac.normaliser import RunningNormaliser
 from music_rllib.tac.objective import Losses, Objective
@@ -69,7 +67,6 @@ class TACLearner(TorchLearner):
         use_threads(self.config.torch_threads)
         self._adam: dict[str, FusedAdam] = {}
         super().build()
-        check_precision(self._settings.precision, self._device)
         seed = self.config.seed if self.config.seed is not None else torch.seed()
         self._generator = torch.Generator(device=self._device).manual_seed(seed + 7919)
         self._grad_updates = 0
@@ -82,13 +79,9 @@ class TACLearner(TorchLearner):
         pairs = self._policy_module.get_target_network_pairs()
         self._online: list[Tensor] = [p for online, _ in pairs for p in online.parameters()]
         self._targets: list[Tensor] = [p for _, target in pairs for p in target.parameters()]
-        self._captured: CapturedUpdate[UpdateConstants] | None = None
         self._direct: DirectUpdate | None = None
-        if needs_gradients(self.config):
-            return
-        if self._device.type == "cuda":
-            self._captured = CapturedUpdate(self._step, CudaRecorder(self._device))
-        elif self._is_standard:
+        on_cpu = self._device.type == "cpu"
+        if on_cpu and self._is_standard and not needs_gradients(self.config):
             self._direct = DirectUpdate(self._policy_module)
 
     @cached_property
@@ -105,8 +98,7 @@ class TACLearner(TorchLearner):
         own_loss = ESTIMATOR_MODULE in self.module and has_own_loss(
             self.module[ESTIMATOR_MODULE].unwrapped()
         )
-        own = own_hooks or own_networks or own_loss
-        return not own and self._settings.precision == "float32"
+        return not (own_hooks or own_networks or own_loss)
 
     @property
     def _policy_module(self) -> TACModule:
@@ -176,9 +168,8 @@ class TACLearner(TorchLearner):
 
     def _learn_by_autograd(self, minibatches: Minibatches) -> dict[str, Tensor]:
         history = []
-        step = self._captured or self._step
         for minibatch in minibatches.one_by_one():
-            history.append(step(minibatch.flat, self._constants(minibatch)))
+            history.append(self._step(minibatch))
             self._grad_updates += 1
             if self._grad_updates % self._settings.target_update_interval == 0:
                 self._update_targets()
@@ -207,19 +198,16 @@ class TACLearner(TorchLearner):
             return gradients_dict
         return super().postprocess_gradients(gradients_dict)
 
-    def _step(self, minibatch: FlatMinibatch, constants: UpdateConstants) -> dict[str, Tensor]:
-        """Updates every network but the targets by autograd, without waiting for the device.
+    def _step(self, minibatch: Minibatches) -> dict[str, Tensor]:
+        """Updates every network but the targets by autograd, on one minibatch.
 
         Returns `LOSSES` [M], in the order of `_names_of_losses`, and tensors for the diagnostics.
         """
-        columns: Minibatch = {}
-        for (module_id, name), values in minibatch.items():
-            columns.setdefault(module_id, {})[name] = values
         self._losses, self._observed = {}, {}
-        policy = columns[DEFAULT_MODULE_ID]
+        policy, (drawn,) = minibatch.columns[DEFAULT_MODULE_ID], minibatch.drawn
         ends = (policy[Columns.OBS], policy[Columns.NEXT_OBS])
-        rewards = functools.partial(self._intrinsic.reward, *ends, constants.drawn)
-        self._update(self._relabelled(columns, rewards))
+        rewards = functools.partial(self._intrinsic.reward, *ends, drawn)
+        self._update(self._relabelled(minibatch.columns, rewards))
         self._names_of_losses = list(self._losses)
         return {LOSSES: torch.stack(list(self._losses.values())), **self._observed}
 
@@ -233,14 +221,6 @@ class TACLearner(TorchLearner):
         trajectories, first = columns.get(ESTIMATOR_MODULE), self._grad_updates == 0
         drawn = self._intrinsic.draw(updates, rows, trajectories, self._generator, first=first)
         return Minibatches(columns, drawn)
-
-    def _constants(self, minibatch: Minibatches) -> UpdateConstants:
-        alpha = None if isinstance(self._settings.alpha, LearnedAlpha) else self._now.alpha
-        shape = None
-        if (trajectories := minibatch.columns.get(ESTIMATOR_MODULE)) is not None:
-            shape = (trajectories[Columns.OBS].shape[1], "inside" in trajectories)
-        now, (drawn,) = self._now, minibatch.drawn
-        return UpdateConstants(now.entropic_index, now.mi_reward_weight, alpha, drawn, shape)
 
     def _policy_noise(self, actions: Tensor) -> dict[str, Tensor]:
         """Standard normal noise for the policy's actions, and for the next ones where needed."""
@@ -383,14 +363,8 @@ class TACLearner(TorchLearner):
         # RLlib ignores weights with an older sequence number; a restored state replaces newer ones.
         self._weights_seq_no = 0
         super().set_state(state)
-        for optimizer in self._optimizer_parameters:
-            for group in optimizer.param_groups:  # the state may come from another device
-                group["capturable"] = self._device.type == "cuda"
-        if self._captured is not None:
-            self._captured.forget()
         if "tac" in state:
             self._generator.set_state(torch.from_numpy(state["tac"]["generator"].copy()))
             self._grad_updates = int(state["tac"][GRAD_UPDATES])
             self._intrinsic.load_state(state["tac"]["held_out"])
-            if "scheduled" in state["tac"]:  # older states have none
-                self._now.load_state(state["tac"]["scheduled"])
+            self._now.load_state(state["tac"]["scheduled"])

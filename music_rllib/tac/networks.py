@@ -1,16 +1,12 @@
 """The networks of TAC: multi-layer perceptrons, twin critics as one batched network.
 
 Shape legend: B batch, I input features, O outputs, C critics.
-
-With `bf16` the products of all layers but the last are in bfloat16. Its eight significant bits are
-enough for activations, and too few for values, densities and weights.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from itertools import pairwise
 
 import numpy as np
@@ -25,25 +21,21 @@ Floats = NDArray[np.float32]
 class Perceptron(nn.Sequential):
     """ReLU between its layers, a linear output; [..., I] -> [..., O] in float32."""
 
-    def __init__(
-        self, inputs: int, hidden_sizes: Sequence[int], outputs: int, *, bf16: bool = False
-    ) -> None:
+    def __init__(self, inputs: int, hidden_sizes: Sequence[int], outputs: int) -> None:
         layers: list[nn.Module] = []
         for size in hidden_sizes:
             layers += [nn.Linear(inputs, size), nn.ReLU()]
             inputs = size
         super().__init__(*layers, nn.Linear(inputs, outputs))
-        self.bf16 = bf16
         self._linear = [layer for layer in self if isinstance(layer, nn.Linear)]
 
     def forward(self, inputs: Tensor) -> Tensor:
         *hidden_layers, last = self._linear
         hidden = inputs
-        with _precision(self.bf16, inputs):
-            # Not as modules: for acting's few rows, calls take half of the products' time.
-            for layer in hidden_layers:
-                hidden = torch.relu_(F.linear(hidden, layer.weight, layer.bias))
-        return F.linear(hidden.float() if self.bf16 else hidden, last.weight, last.bias)
+        # Not as modules: for acting's few rows, calls take half of the products' time.
+        for layer in hidden_layers:
+            hidden = torch.relu_(F.linear(hidden, layer.weight, layer.bias))
+        return F.linear(hidden, last.weight, last.bias)
 
     def in_numpy(self) -> Callable[[Floats], Floats]:
         """`forward` of the weights as they are now, in float32 on a CPU.
@@ -65,21 +57,15 @@ class Perceptron(nn.Sequential):
         return forward
 
 
-def _precision(bf16: bool, inputs: Tensor) -> AbstractContextManager[None]:
-    return torch.autocast(inputs.device.type, torch.bfloat16) if bf16 else nullcontext()
-
-
 class Critics(nn.Module):
     """C critics of equal shape, evaluated together: one batched matrix product a layer.
 
     C is 2, or 1 for DDPG. The first layer of both reads the same input, so it is a single product.
     """
 
-    def __init__(
-        self, inputs: int, hidden_sizes: Sequence[int], count: int = 2, *, bf16: bool = False
-    ) -> None:
+    def __init__(self, inputs: int, hidden_sizes: Sequence[int], count: int = 2) -> None:
         super().__init__()
-        self.count, self.bf16 = count, bf16
+        self.count = count
         sizes = [inputs, *hidden_sizes, 1]
         self.weights = nn.ParameterList()
         self.biases = nn.ParameterList()
@@ -97,9 +83,8 @@ class Critics(nn.Module):
         less work.
         """
         *hidden_layers, (weight, bias) = self._layers(frozen)
-        with _precision(self.bf16, inputs):
-            hidden = self._hidden(inputs, hidden_layers)
-        return torch.baddbmm(bias, hidden.float() if self.bf16 else hidden, weight).squeeze(-1)
+        hidden = self._hidden(inputs, hidden_layers)
+        return torch.baddbmm(bias, hidden, weight).squeeze(-1)
 
     def _hidden(self, inputs: Tensor, layers: list[tuple[Tensor, Tensor]]) -> Tensor:
         """[B, I] -> [C, B, H]."""

@@ -16,8 +16,6 @@ from torch import Tensor, nn
 _ROUNDING = float(np.finfo(np.float32).eps) / 2
 """Standard deviation, as a share of the mean, up to which a feature counts as constant: it only
 alternates between two neighbouring numbers of float32."""
-_OLD_ROUNDING = 1e-12
-"""Variance, as a share of the squared mean, that sums of squares have by rounding alone."""
 
 Moments = Mapping[str, NDArray[Any]]
 
@@ -99,20 +97,6 @@ def for_another_run(moments: Moments) -> dict[str, NDArray[Any]]:
     as long as the source run was. MUSIC-u's goals are zeros; in MUSIC-f they vary. Until they do,
     they stay 0.
     """
-    moments = in_this_form(moments)
     varied = moments["inverse_std"] > 0
     fresh = {name: np.where(varied, moments[name], 0.0) for name in ("count", "centre", "squares")}
     return {**moments, **fresh}
-
-
-def in_this_form(moments: Moments) -> dict[str, NDArray[Any]]:
-    """The moments, converted where a handoff before version 3 has one count, sums and squares."""
-    if "total_square" not in moments:
-        return dict(moments)
-    rest = {name: np.asarray(a) for name, a in moments.items() if not name.startswith("total")}
-    total = np.asarray(moments["total"], np.float64)
-    count = np.broadcast_to(np.asarray(moments["count"], np.float64), total.shape).copy()
-    centre = total / np.maximum(count, 1.0)
-    variance = np.asarray(moments["total_square"]) / np.maximum(count, 1.0) - centre**2
-    squares = np.where(variance <= _OLD_ROUNDING * centre**2, 0.0, variance * count)
-    return {**rest, "count": count, "centre": centre, "squares": squares}

@@ -58,14 +58,12 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
         sizes = settings.hidden_sizes
         self.input_size, self.action_size = inputs, actions
         self.deterministic = settings.policy == "deterministic"
-        # Acting stays float32: it has few rows, and runs on machines without bfloat16.
-        bf16 = settings.precision == "bf16" and not self.inference_only
         outputs = actions if self.deterministic else 2 * actions
-        self.policy = Perceptron(inputs, sizes, outputs, bf16=bf16)
+        self.policy = Perceptron(inputs, sizes, outputs)
         count = 1 if self.deterministic else 2
-        self.critics = Critics(inputs + actions, sizes, count, bf16=bf16)
+        self.critics = Critics(inputs + actions, sizes, count)
         if settings.bootstrap == "value":
-            self.value = Perceptron(inputs, sizes, 1, bf16=bf16)
+            self.value = Perceptron(inputs, sizes, 1)
         self.normaliser: nn.Module = nn.Identity()
         if settings.normalise_observations:
             self.normaliser = RunningNormaliser(

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from ray.rllib.core import DEFAULT_MODULE_ID
 
-from music_rllib.tac.normaliser import in_this_form
 from music_rllib.tac.rl_module import ESTIMATOR_MODULE
 
 NetworkWeights = dict[str, dict[str, NDArray[Any]]]
@@ -35,16 +34,9 @@ def by_module(
 ) -> dict[str, dict[str, NDArray[Any]]]:
     """The states of the Learner's modules, from the arrays of some networks.
 
-    `weights` may be of an earlier version; `own` are the current arrays of all networks. Raises
-    ValueError for an unknown network, and for missing, unknown or misshapen tensors.
+    `own` are the current arrays of all networks. Raises ValueError for an unknown network, and for
+    missing, unknown or misshapen tensors.
     """
-    if "normaliser" in weights:
-        weights = {**weights, "normaliser": in_this_form(weights["normaliser"])}
-    if ESTIMATOR_MODULE in weights and ESTIMATOR_MODULE in own:
-        # Estimators before version 3 use all inputs raw.
-        raw = {"offset": np.zeros_like, "scale": np.ones_like}
-        defaults = {name: like(own[ESTIMATOR_MODULE][name]) for name, like in raw.items()}
-        weights = {**weights, ESTIMATOR_MODULE: {**defaults, **weights[ESTIMATOR_MODULE]}}
     modules: dict[str, dict[str, NDArray[Any]]] = {}
     for network, arrays in weights.items():
         _check_same_tensors(network, own.get(network), arrays)

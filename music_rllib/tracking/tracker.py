@@ -83,10 +83,7 @@ class Tracker:
         self._place = below(redact(storage), sweep_name)
         self._provenance = provenance_tags()
         try:
-            # Earlier versions kept the record on the driver's disk if the storage is a bucket.
-            record = SweepRecord.read(storage, sweep_name) or SweepRecord.read(
-                str(folder.parent), folder.name
-            )
+            record = SweepRecord.read(storage, sweep_name)
             self.sweep_id = record.sweep_id if record else uuid.uuid4().hex[:16]
             self._sweep_tags = {names.TAG_SWEEP: sweep_name, names.TAG_SWEEP_ID: self.sweep_id}
             SweepRecord(

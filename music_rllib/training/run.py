@@ -129,7 +129,7 @@ class TrainingRun:
     @property
     def will_compile(self) -> bool:
         """Whether its first update compiles, as the first one on a machine does."""
-        return not self._gpus and self.run.tac.precision == "float32" and not is_kept(learn)
+        return not self._gpus and not is_kept(learn)
 
     def advance(self, pause: Callable[[], bool] = lambda: False) -> dict[str, float]:
         """Train until the next report is due; the first one is an evaluation at step 0.
@@ -230,7 +230,7 @@ class TrainingRun:
         self.algorithm.replay.load_packed(state["replay"], parts)
         self._segments = [] if foreign else segments
         self._rounds = defaultdict(list, state["rounds"])
-        self._begun = state.get("begun", True)  # older checkpoints are all of begun runs
+        self._begun = state["begun"]
 
     @property
     def replay_mb(self) -> float:

@@ -19,8 +19,16 @@ from music_rllib.tac.algorithm import TAC
 from music_rllib.tac.kernels import blas
 from music_rllib.tac.kernels.update import DirectUpdate
 from music_rllib.tac.learner import TACLearner
-from tests.integration.test_captured_updates import VARIANTS
-from tests.integration.test_tac_algorithm import SMALL, build, fingerprint, register_uneven
+from tests.integration.test_tac_algorithm import (
+    HER,
+    MUSIC_R,
+    MUSIC_U,
+    PER,
+    SMALL,
+    build,
+    fingerprint,
+    register_uneven,
+)
 from tests.integration.test_tac_losses import ACTION, BATCH, OBSERVATION, learner, minibatch
 
 DDPG = {
@@ -33,6 +41,25 @@ BACKBONES: dict[str, dict[str, Any]] = {
     "TAC": {"bootstrap": "value", "alpha": 0.3},
     "SAC": {"bootstrap": "critics", "alpha": 0.3},
     "DDPG": DDPG,
+}
+RAMP = {"schedule": "linear", "start": 1.0, "end": 2.0}
+BY_ENTROPY = {"follows": "shannon_entropy", "points": [[1.0, 1.0], [3.0, 2.0]]}
+VARIANTS: dict[str, dict[str, Any]] = {
+    "tac": HER,
+    "music-u": {"music": MUSIC_U},
+    "music-r": {"music": MUSIC_R, "entropic_index": 1.5},
+    "episodes of unequal lengths": {"task": "Uneven", "music": MUSIC_U},
+    "frames shuffled as in 2021": {"music": {**MUSIC_U, "shuffle": "random"}},
+    "q measured, alpha scheduled": {"entropic_index": BY_ENTROPY, "alpha": {**RAMP, "start": 0.1}},
+    "alpha learned": {"alpha": {"learned": True}, "bootstrap": "critics"},
+    "ddpg": {
+        **DDPG,
+        "target_bounds": (-200.0, 0.0),
+        "target_update_interval": 2,
+        "action_l2": 1.0,
+    },
+    "per": PER,
+    "widths between bounds": {"log_std_form": "tanh", "log_std_bounds": (-5.0, 2.0)},
 }
 ACTIVE_BOUNDS = {"target_bounds": (-0.5, 0.5), "log_std_bounds": (-0.02, 0.02)}
 
@@ -356,6 +383,6 @@ def test_a_converted_module_is_taken_over_anew() -> None:
 def test_the_library_follows_from_the_machines_description(
     vendor: str, has_mkl: bool, expected: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(blas, "cpu_vendor", lambda: vendor)
+    monkeypatch.setattr(blas, "_cpu_vendor", lambda: vendor)
     monkeypatch.setattr(blas, "_in_mkl", lambda routine: 1 if has_mkl else None)
     assert blas.library() == expected

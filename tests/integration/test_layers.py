@@ -11,7 +11,6 @@ PACKAGE = Path(__file__).parents[2] / "music_rllib"
 
 # Only these may load Ray; everything else is usable, and tested, without it.
 MAY_LOAD_RAY = (
-    "runtime.autoscaler",
     "runtime.ray_cluster",
     "runtime.ray_watch",
     "tac",

@@ -284,16 +284,10 @@ def test_a_cluster_grows_for_runs_that_no_node_of_it_could_hold(
     # Not pytest's folder: Ray's sockets need a short path.
     place = tempfile.TemporaryDirectory(prefix="ray", ignore_cleanup_errors=True)
     with place as folder, growing_head(Path(folder), tmp_path) as head:
-        sweep_document["resources"] = {"gpus_per_run": 1}
-        refused = run_sweep(head, sweep_document, tmp_path)
-        assert refused.returncode == 2, refused.stderr
-        log = (Path(folder) / "log").read_text()
-        assert "resources.gpus_per_run must fit into one node" in refused.stderr, log
-
         document = small(sweep_document) | {"resources": {"cpus_per_run": 2}}
         done = run_sweep(head, document, tmp_path)
         assert (done.returncode, done.stderr) == (0, ""), done.stdout
-        assert "its autoscaler is asked for one" in done.stdout
+        assert "waits until its autoscaler adds one" in done.stdout
 
 
 class Jobs:

@@ -11,7 +11,14 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from music_rllib.config.problems import KeyPath, Problem, known_fields, lookup, shown, unknown
-from music_rllib.config.run_settings import VARIANTS, RunSettings, Variant, contradiction, preset
+from music_rllib.config.run_settings import (
+    VARIANTS,
+    RunSettings,
+    Variant,
+    contradiction,
+    preset,
+    without_retired,
+)
 from music_rllib.envs.tasks import Task
 
 SECTIONS = ("evaluation", "tac", "music", "replay")
@@ -155,6 +162,7 @@ def merge(
             problems.append(Problem(once, rule))
         elif problem := layers.put_dotted(dotted, value, place):
             problems.append(problem)
+    layers.data = without_retired(layers.data)
     # Contradictions of the variant are reported also if other settings are invalid.
     music = layers.data["music"]
     for field, fixed in rules.fixed.items():

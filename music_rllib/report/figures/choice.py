@@ -9,14 +9,7 @@ from dataclasses import dataclass, field, replace
 from itertools import product
 
 from music_rllib import names
-from music_rllib.report.figures.importance import (
-    CHANCE,
-    importance_panel,
-    importances,
-    parallel_panel,
-    sensitivity_panels,
-)
-from music_rllib.report.figures.palette import BARS, Style, styles_by_stage, styles_of
+from music_rllib.report.figures.palette import Style, styles_by_stage, styles_of
 from music_rllib.report.figures.plots import (
     METRICS,
     MOST_BANDS,
@@ -28,6 +21,7 @@ from music_rllib.report.figures.plots import (
     finals_panel,
     profile_panel,
 )
+from music_rllib.report.figures.sensitivity import sensitivity_panels
 from music_rllib.results.analysis import Curve, StageAnalysis, curve
 from music_rllib.results.claims.study import MOST_CONDITIONS
 from music_rllib.results.comparison import SHOW_SEEDS_BELOW, Final, Scope
@@ -48,7 +42,7 @@ _GROUP_OF = {
     names.MI_BOUND: INFORMATION,
     names.MI_REWARD: INFORMATION,
 }
-INFLUENCE = ("Sensitivity", "Importance of settings", "Parallel coordinates")
+SENSITIVITY = "Sensitivity"
 PRIMARY = tuple(metric.title for metric in METRICS[:2])
 """Titles of the curves of primary metrics: success rate and return."""
 OF_ALL_STAGES = tuple(
@@ -110,7 +104,7 @@ def stage_drawings(sweep: Sweep, analysis: StageAnalysis) -> Iterator[Drawing]:
         yield from _finals(stage, title, [one for one in scopes if one.metric == metric_name])
     yield from _against_entropy(sweep, stage)
     if any(len(scope.finals) > 1 for scope in analysis.scopes):
-        yield from _influence(sweep, analysis)
+        yield from _sensitivity(analysis)
 
 
 def _without_trials(sweep: Sweep, stage: Stage) -> Stage:
@@ -298,28 +292,17 @@ def _legend_by_q(stage: Stage) -> Legend:
     return [(f"q = {q}", style._replace(line="solid")) for q, style in styles.items()]
 
 
-def _influence(sweep: Sweep, analysis: StageAnalysis) -> Iterator[Drawing]:
-    """The effect of settings, where more than q varies."""
-    stage = analysis.stage
-    shares = importances(sweep, analysis)
-    parallel = [parallel_panel(scope, stage.conditions) for scope in analysis.scopes]
-    by_q = _legend_by_q(stage)
-    bars = [(n, Style(BARS[n == CHANCE], "s", "solid")) for n in ("setting", CHANCE)]
-    drawings = (
-        (sensitivity_panels(analysis), _SENSITIVITY, by_q),
-        ([importance_panel(*item) for item in shares.items()], _IMPORTANCE, bars),
-        ([panel for panel in parallel if panel is not None], _PARALLEL, by_q),
-    )
-    for title, (panels, caption, legend) in zip(INFLUENCE, drawings, strict=True):
-        if panels:
-            yield Drawing(
-                stage=stage.name,
-                title=title,
-                caption=caption,
-                panels=tuple(panels),
-                legend=legend,
-                group=SETTINGS,
-            )
+def _sensitivity(analysis: StageAnalysis) -> Iterator[Drawing]:
+    """The final values over settings, where more than q varies."""
+    if panels := sensitivity_panels(analysis):
+        yield Drawing(
+            stage=analysis.stage.name,
+            title=SENSITIVITY,
+            caption=_SENSITIVITY,
+            panels=tuple(panels),
+            legend=_legend_by_q(analysis.stage),
+            group=SETTINGS,
+        )
 
 
 _SENSITIVITY = (
@@ -327,8 +310,3 @@ _SENSITIVITY = (
     "the MI reward, linear between the settings that were tried (marks); nothing outside of them "
     "is known."
 )
-_IMPORTANCE = (
-    "Functional ANOVA (Hutter et al. 2014, as in Optuna) over the finished runs. A setting matters "
-    "only as far as it explains more than the seed does."
-)
-_PARALLEL = "A line per condition through its settings to what it ended at; the fainter, the lower."

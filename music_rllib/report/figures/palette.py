@@ -28,8 +28,6 @@ _ANCHORS = (
 )
 _BY_STAGE = tuple(colour for _, colour in (*_ANCHORS[1:], _ANCHORS[0]))
 _UNKNOWN = "#808080"
-BARS = ("#1f7fc4", "#808080")
-"""Colours of bars for settings and for chance."""
 _MARKERS = "osD^vPX"
 _ALIKE = 60.0
 """Distance in RGB below which thin lines look the same, as those of q = 1 and 1.1 do."""

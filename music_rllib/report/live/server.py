@@ -1,29 +1,19 @@
-"""The server of a running sweep's page, on loopback.
-
-A request needs the token of the page's address to read the page and to stop or resume the sweep,
-since other users of the machine can reach its ports, too. Pages of other sites cannot act: they do
-not know the token, and browsers let no foreign page send the header that has it.
-"""
+"""The server of a running sweep's page, on loopback. It only shows; no request changes anything."""
 
 from __future__ import annotations
 
-import hmac
 import json
-import secrets
-import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import urlsplit
 
 from music_rllib.errors import BadInputError, first_line
 from music_rllib.experiment import sweep_files
-from music_rllib.experiment.location import SweepLocation
 from music_rllib.redaction import for_people
 from music_rllib.report.live.state import Progress
 from music_rllib.store.object_folder import StorageError
@@ -33,8 +23,8 @@ LEAST_PAUSE = 10.0
 """Least seconds between two pages."""
 _RELAX = 4.0
 """Pause between two pages as a multiple of the time that the last one took."""
-HEADER = "X-Token"
-"""Name of the header that has the token."""
+READ_SECONDS = 10.0
+"""Longest wait for more of a request, and for the next one on a connection."""
 
 
 class LivePage:
@@ -85,36 +75,10 @@ class LivePage:
                 self.html, self.version = html, self.version + 1
 
 
-def stop(found: SweepLocation) -> None:
-    """Request that the sweep saves its runs and ends."""
-    sweep_files.write(found.storage, f"{found.name}/{sweep_files.STOP}", '{"stop": true}')
-
-
-def resume(found: SweepLocation, folder: Path) -> Path:
-    """Resume the sweep in a new process that outlives the page.
-
-    Returns:
-        The file with the output of that process.
-    """
-    log = folder / "resume.log"
-    folder.mkdir(parents=True, exist_ok=True)
-    command = [sys.executable, "-m", "music_rllib.sweep", "resume", found.name]
-    with log.open("ab") as output:
-        subprocess.Popen(  # noqa: S603
-            [*command, "--storage", found.storage],
-            stdin=subprocess.DEVNULL,
-            stdout=output,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-        )
-    return log
-
-
 class Server(ThreadingHTTPServer):
-    """Answers requests that have its token."""
+    """Answers each connection in a thread."""
 
     daemon_threads = True
-    token: str
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Print nothing about a tab that was closed, or about an address that is none."""
@@ -122,26 +86,23 @@ class Server(ThreadingHTTPServer):
             super().handle_error(request, client_address)
 
 
-def make_server(page: LivePage, found: SweepLocation, folder: Path, port: int) -> Server:
-    """A server on the port, with a new token.
+def make_server(page: LivePage, port: int) -> Server:
+    """A server on the port.
 
     Raises:
         BadInputError: the port is taken.
     """
-    token = secrets.token_urlsafe(24)
-    attributes = {"page": page, "found": found, "folder": folder, "token": token}
+    handler = type("Handler", (_Handler,), {"page": page, "timeout": READ_SECONDS})
     try:
-        server = Server((HOST, port), type("Handler", (_Handler,), attributes))
+        return Server((HOST, port), handler)
     except OSError as error:
         raise BadInputError(f"--port must be free, got {port}: {error.strerror}") from error
-    server.token = token
-    return server
 
 
 def serve(server: Server, page: LivePage, say: Callable[[str], None]) -> None:
     """Serve until Ctrl-C."""
-    say(f"Report: http://{HOST}:{server.server_port}/?token={server.token}")
-    say("Whoever has this address may stop and resume the sweep. Ctrl-C ends the page, not it.")
+    say(f"Report: http://{HOST}:{server.server_port}/")
+    say("Ctrl-C ends the page, not the sweep.")
     try:
         server.serve_forever()
     except KeyboardInterrupt:
@@ -153,46 +114,20 @@ def serve(server: Server, page: LivePage, say: Callable[[str], None]) -> None:
 
 class _Handler(BaseHTTPRequestHandler):
     page: LivePage
-    found: SweepLocation
-    folder: Path
-    token: str
     protocol_version = "HTTP/1.1"
     server_version, sys_version = "music_rllib", ""
 
     def do_GET(self) -> None:
-        url = urlsplit(self.path)
-        token = self.headers.get(HEADER) or parse_qs(url.query).get("token", [""])[0]
-        if not self._allowed(token):
-            return
-        if url.path == "/":
+        path = urlsplit(self.path).path
+        # Another host name that resolves to this machine is an attack (DNS rebinding).
+        if urlsplit(f"//{self.headers.get('Host')}").hostname not in (HOST, "localhost"):
+            self._json(HTTPStatus.FORBIDDEN, {"error": "open the address that the report printed"})
+        elif path == "/":
             self._answer(HTTPStatus.OK, self.page.html, "text/html")
-        elif url.path == "/state":
+        elif path == "/state":
             self._json(HTTPStatus.OK, self.page.state())
         else:
             self._json(HTTPStatus.NOT_FOUND, {"error": "there is no such page"})
-
-    def do_POST(self) -> None:
-        # Not the address' token: a form of another site could send that.
-        if not self._allowed(self.headers.get(HEADER, "")):
-            return
-        state = self.page.state().get("state")
-        if self.path == "/stop" and state == "running":
-            stop(self.found)
-            self._json(HTTPStatus.OK, {"said": "The sweep was told to save its runs and stop."})
-        elif self.path == "/resume" and state not in ("running", "unknown"):
-            log = resume(self.found, self.folder)
-            self._json(HTTPStatus.OK, {"said": f"The sweep goes on; what it prints is in {log}."})
-        else:
-            said = f"The sweep is {state}: there is nothing to do."
-            self._json(HTTPStatus.CONFLICT, {"said": said})
-
-    def _allowed(self, token: str) -> bool:
-        # Another host name that resolves to this machine is an attack (DNS rebinding).
-        host = (self.headers.get("Host") or "").rpartition(":")[0]
-        if host in (HOST, "localhost") and hmac.compare_digest(token.encode(), self.token.encode()):
-            return True
-        self._json(HTTPStatus.FORBIDDEN, {"error": "open the address that the report printed"})
-        return False
 
     def _json(self, status: HTTPStatus, document: Any) -> None:
         text = json.dumps(sweep_files.plain(document), ensure_ascii=False)
@@ -215,4 +150,4 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, *args: Any) -> None:
-        """Log nothing: the address has the token."""
+        """Log nothing: the page asks every two seconds."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections import deque
 from functools import cached_property
 from typing import Any
@@ -10,6 +11,7 @@ from music_rllib import names
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.location import SweepLocation
 from music_rllib.labels import ShortLabels
+from music_rllib.redaction import redact
 from music_rllib.store.object_folder import StorageError
 
 WINDOW = 120.0
@@ -35,7 +37,7 @@ class Progress:
         if state is None:
             return {"sweep": self._found.name, "state": "not started"}
         driver, steps = state["driver"], state["env_steps"]
-        to_come = steps.get("to_come", 0)  # absent from what an earlier version wrote
+        to_come = steps["to_come"]
         left = steps["left"] + to_come
         running = sweep_files.is_alive(state)
         outcome = driver["outcome"]
@@ -45,6 +47,7 @@ class Progress:
             "state": "interrupted" if outcome == "running" and not running else outcome,
             "since": driver["started"],
             "ended": None if running else driver["ended"],
+            "command": self._command(outcome, running=running),
             "done": steps["done"],
             "left": left,
             "at_most": to_come > 0,
@@ -74,6 +77,14 @@ class Progress:
             return bool(self.read()["state"] == "running")
         except StorageError:
             return False
+
+    def _command(self, outcome: str, *, running: bool) -> str | None:
+        """The command that stops a running sweep or resumes a stopped one, without secrets."""
+        if outcome == "finished":
+            return None
+        name, storage = self._found.name, redact(self._found.storage)
+        verb = "stop" if running else "resume"
+        return shlex.join(["music-rllib", verb, name, "--storage", storage])
 
     @cached_property
     def _short(self) -> ShortLabels:

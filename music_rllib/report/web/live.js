@@ -1,10 +1,9 @@
-// The running sweep: its progress every two seconds, new pages, and the stop and resume buttons.
+// The running sweep: its progress every two seconds, and new pages.
 "use strict";
 
-const token = new URLSearchParams(location.search).get("token") ?? "";
-const asked = (path, method = "GET") => fetch(path, { method, headers: { "X-Token": token }, cache: "no-store" });
+const asked = (path) => fetch(path, { cache: "no-store" });
 const PARTS = ["facts", "notes", "answer", "curves", "groups", "searches", "origin"];
-let version = 0, said = "";
+let version = 0;
 
 function time(seconds) {
   if (seconds === null || seconds === undefined) return "–";
@@ -43,18 +42,8 @@ function bar(parent, label, done, whole, text) {
   element("span", { class: "soft" }, row, text);
 }
 
-function act(parent, name, path, enabled) {
-  const button = element("button", { type: "button", id: `${name}-button` }, parent, name);
-  button.disabled = !enabled;
-  button.addEventListener("click", async () => {
-    button.disabled = true;
-    said = (await (await asked(path, "POST")).json()).said ?? "";
-    look();
-  });
-}
-
 function showState(state) {
-  const parent = document.getElementById("live"), focus = document.activeElement?.id;
+  const parent = document.getElementById("live");
   const box = document.createDocumentFragment();
   const head = element("p", {}, box);
   element("strong", {}, head, `The sweep is ${state.state}. `);
@@ -65,10 +54,10 @@ function showState(state) {
     head.append(`${state.done.toLocaleString("en")} env steps done, ${most}${state.left.toLocaleString("en")} to go${speed}${left}. `);
   }
   if (state.error) head.append(state.error);
-  act(head, "stop", "/stop", state.state === "running");
-  head.append(" ");
-  act(head, "resume", "/resume", !["running", "unknown", "finished"].includes(state.state));
-  element("p", { role: "status", class: "soft" }, box, said);
+  if (state.command) {
+    const hint = element("p", { class: "soft" }, box, state.state === "running" ? "To stop it: " : "To resume it: ");
+    element("code", {}, hint, state.command);
+  }
   const bars = element("div", { class: "bars" }, box);
   for (const stage of state.stages ?? []) {
     const counts = Object.entries(stage.runs), all = counts.reduce((sum, [, n]) => sum + n, 0);
@@ -85,7 +74,6 @@ function showState(state) {
     line.append(failure.cause);
   }
   parent.replaceChildren(box);
-  if (focus?.endsWith("-button")) document.getElementById(focus)?.focus();
 }
 
 async function look() {

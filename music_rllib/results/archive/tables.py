@@ -15,14 +15,19 @@ from music_rllib.limits import (
     MOST_ROWS_PER_BYTE,
     MOST_TABLE_ROWS,
     MOST_TABLE_TEXT,
+    MOST_UNPACKED_BYTES,
+    MOST_UNPACKED_PER_BYTE,
     open_regular,
 )
-from music_rllib.results.archive.parquet_pages import check_pages
 
 _FREE_ROWS = 100_000
 """Number of rows that a file of any size may have."""
 _FIRST_BYTES = 1 << 20
 """Number of bytes in which a CSV file's first line ends."""
+_BATCH_ROWS = 65_536
+"""Rows of a Parquet file that are read before the length of its texts is checked."""
+_ENCODINGS = {"PLAIN", "PLAIN_DICTIONARY", "RLE", "RLE_DICTIONARY", "BIT_PACKED"}
+"""Encodings that Arrow writes by default; others store long texts in almost no bytes."""
 _MAY_BE_EMPTY = ("started", "ended")
 
 
@@ -55,13 +60,12 @@ def read_table(file: Path, kinds: Mapping[str, pa.DataType]) -> pa.Table:
         if file.suffix == ".csv":
             table = _from_csv(native, head, kinds)
         else:
-            table = _from_parquet(native, size, file)
+            table = _from_parquet(native, size)
     missing = [name for name in kinds if name not in table.column_names]
     if missing:
         raise ValueError(f"must have the column {missing[0]}, it has {table.column_names[:9]}")
     if len(set(table.column_names)) < table.num_columns:
         raise ValueError("its columns must have different names")
-    _check_texts(table)
     names = table.column_names
     schema = pa.schema([(name, kinds.get(name, pa.string())) for name in names])
     table = table.cast(schema)
@@ -79,27 +83,39 @@ def _check_size(rows: int, columns: int, size: int) -> None:
         raise ValueError(f"must have at most {MOST_COLUMNS} columns, it has {columns}")
 
 
-def _check_texts(table: pa.Table) -> None:
-    """Check the length of all texts: long ones that a dictionary repeats become as many copies."""
-    total = 0
-    for column in table.columns:
-        for chunk in column.chunks:
-            if isinstance(chunk, pa.DictionaryArray):
-                lengths = compute.binary_length(chunk.dictionary).take(chunk.indices)
-                total += compute.sum(lengths).as_py() or 0
-    if total > MOST_TABLE_TEXT:
-        raise ValueError(f"must have at most {MOST_TABLE_TEXT} characters of text, it has {total}")
+def _characters(batch: pa.RecordBatch) -> int:
+    """Characters of all texts; a text that a dictionary repeats counts at each of its uses."""
+    texts = (column for column in batch.columns if isinstance(column, pa.DictionaryArray))
+    lengths = (compute.binary_length(text.dictionary).take(text.indices) for text in texts)
+    return sum(compute.sum(length).as_py() or 0 for length in lengths)
 
 
-def _from_parquet(source: pa.NativeFile, size: int, file: Path) -> pa.Table:
+def _check_metadata(metadata: parquet.FileMetaData, size: int) -> None:
+    """Check the sizes in a Parquet file's footer."""
+    _check_size(metadata.num_rows, metadata.num_columns, size)
+    groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
+    if (rows := sum(group.num_rows for group in groups)) != metadata.num_rows:
+        raise ValueError(f"must have as many rows as it says, {metadata.num_rows}, it has {rows}")
+    columns = [group.column(i) for group in groups for i in range(group.num_columns)]
+    for column in columns:
+        if others := {*column.encodings} - _ENCODINGS:
+            raise ValueError(
+                f"{column.path_in_schema} must be encoded as {', '.join(sorted(_ENCODINGS))}, "
+                f"it is {', '.join(sorted(others))}"
+            )
+    unpacked = [column.total_uncompressed_size for column in columns]
+    most = MOST_UNPACKED_BYTES + MOST_UNPACKED_PER_BYTE * size
+    if sum(unpacked) > most or min(unpacked, default=0) < 0:
+        raise ValueError(f"must have at most {most} bytes when unpacked, it has {sum(unpacked)}")
+
+
+def _from_parquet(source: pa.NativeFile, size: int) -> pa.Table:
     limits: dict[str, Any] = {
         "thrift_string_size_limit": 16 << 20,
         "thrift_container_size_limit": 1_000_000,
     }
     footer = parquet.ParquetFile(source, **limits)
-    _check_size(footer.metadata.num_rows, footer.metadata.num_columns, size)
-    with pa.memory_map(str(file)) as mapped:
-        check_pages(memoryview(mapped.read_buffer()).cast("B"), footer.metadata)
+    _check_metadata(footer.metadata, size)
     schema = footer.schema_arrow
     for field in schema:
         plain = pa.types.is_string(field.type) or pa.types.is_large_string(field.type)
@@ -108,7 +124,14 @@ def _from_parquet(source: pa.NativeFile, size: int, file: Path) -> pa.Table:
     # As dictionaries, so that a text that stands in each row is read once.
     texts = [field.name for field in schema if pa.types.is_string(field.type)]
     source.seek(0)
-    return parquet.ParquetFile(source, read_dictionary=texts, **limits).read()
+    batches, total = [], 0
+    reader = parquet.ParquetFile(source, read_dictionary=texts, **limits)
+    for batch in reader.iter_batches(_BATCH_ROWS):
+        batches.append(batch)
+        total += _characters(batch)
+        if total > MOST_TABLE_TEXT:  # before the next batch: the footer may lie
+            raise ValueError(f"must have at most {MOST_TABLE_TEXT} characters of text")
+    return pa.Table.from_batches(batches, reader.schema_arrow if not batches else None)
 
 
 def _from_csv(source: pa.NativeFile, head: bytes, kinds: Mapping[str, pa.DataType]) -> pa.Table:

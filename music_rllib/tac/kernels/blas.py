@@ -12,6 +12,7 @@ time. It has no such path where the right matrix is transposed.
 from __future__ import annotations
 
 import ctypes
+import functools
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,6 @@ import torch
 from numba import types
 from numba.extending import get_cython_function_address, overload
 from threadpoolctl import threadpool_info, threadpool_limits
-
-from music_rllib.tac.kernels.precision import cpu_vendor
 
 __all__ = ["cuts_products", "library", "multiply", "use_threads"]
 
@@ -40,7 +39,7 @@ _TILE = 12
 
 def library() -> str:
     """`MKL` or `OpenBLAS`, whichever multiplies on this machine."""
-    return "MKL" if cpu_vendor() == "GenuineIntel" and _in_mkl("sgemm") else "OpenBLAS"
+    return "MKL" if _cpu_vendor() == "GenuineIntel" and _in_mkl("sgemm") else "OpenBLAS"
 
 
 def cuts_products() -> bool:
@@ -52,6 +51,17 @@ def cuts_products() -> bool:
 def use_threads(count: int) -> None:
     """Lets OpenBLAS have so many threads; MKL has those of PyTorch."""
     threadpool_limits(count, user_api="blas")
+
+
+@functools.cache
+def _cpu_vendor() -> str:
+    """`GenuineIntel` or `AuthenticAMD`, as /proc/cpuinfo has it; empty without that file."""
+    try:
+        description = Path("/proc/cpuinfo").read_text()
+    except OSError:
+        return ""
+    lines = (line.partition(":") for line in description.splitlines())
+    return next((value.strip() for key, _, value in lines if key.strip() == "vendor_id"), "")
 
 
 def _in_mkl(routine: str) -> int | None:

@@ -5,7 +5,7 @@ Shape legend: K updates, B transitions of a minibatch, N trajectories.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -16,11 +16,10 @@ from torch import Tensor
 
 from music_rllib.intrinsic.interface import IntrinsicReward
 
-__all__ = ["FlatMinibatch", "Minibatch", "Minibatches"]
+__all__ = ["Minibatch", "Minibatches"]
 
 Minibatch = dict[ModuleID, dict[str, Tensor]]
 """Columns by module."""
-FlatMinibatch = Mapping[tuple[ModuleID, str], Tensor]
 
 
 class Minibatches(NamedTuple):
@@ -35,13 +34,6 @@ class Minibatches(NamedTuple):
     def updates(self) -> int:
         """K."""
         return len(self.drawn)
-
-    @property
-    def flat(self) -> FlatMinibatch:
-        """The columns by module and name."""
-        return {
-            (mid, name): v for mid, columns in self.columns.items() for name, v in columns.items()
-        }
 
     def one_by_one(self) -> Iterator[Minibatches]:
         """Those of each update."""

@@ -19,6 +19,7 @@ from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.results.claims.plan import analysis_plan
 from music_rllib.schedules import Linear
 from music_rllib.store.handoff import write_handoff
+from tests.hostile_files import SPACES
 
 Document = dict[str, Any]
 
@@ -71,6 +72,17 @@ def with_stage(position: int, **changes: Any) -> Document:
 
 def run_of(config: SweepConfig, stage: int = 0, point: int = 0) -> RunSettings:
     return next(iter(config.stages[stage].points[point].runs.values()))
+
+
+def test_a_removed_setting_is_ignored_at_the_value_that_is_left_and_refused_at_others(
+    load: Callable[..., SweepConfig], problems: Callable[[Document], list[str]]
+) -> None:
+    def given(precision: str) -> Document:
+        return changed(defaults=SOUND["defaults"] | {"tac": {"lr": 0.002, "precision": precision}})
+
+    assert run_of(load(given("float32"))) == run_of(load(SOUND))
+    (line,) = problems(given("bf16"))
+    assert line.endswith("defaults.tac.precision is not a known setting")
 
 
 def test_a_sound_file_is_resolved_completely(load: Callable[..., SweepConfig]) -> None:
@@ -527,7 +539,7 @@ def checkpoint(folder: Path, task: str = "FetchPush", **changes: Any) -> str:
         }
     )
     arrays = {"mi_estimator": {"w": np.zeros((3, 2), np.float32)}}
-    write_handoff(folder, arrays, run.handoff_info("0" * 20, 50))
+    write_handoff(folder, arrays, run.handoff_info("0" * 20, 50, SPACES))
     return str(folder)
 
 

@@ -15,7 +15,7 @@ from music_rllib.config.run_settings import RunSettings
 from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.policy import PolicyError, PolicyNetwork, find_policy, load_policy, locate
 from music_rllib.policy.network import PolicyFileError
-from music_rllib.store.handoff import write_handoff
+from music_rllib.store.handoff import Spaces, write_handoff
 from music_rllib.store.object_folder import ObjectFolders, open_storage
 from music_rllib.tac.networks import Perceptron
 from music_rllib.tac.normaliser import RunningNormaliser
@@ -23,6 +23,7 @@ from music_rllib.tac.normaliser import RunningNormaliser
 REACH = BUILT_IN_TASKS["FetchReach"]
 KEY, OTHER = "0123456789abcdef0123", "0123ffffffffffffffff"
 INPUTS, ACTIONS, CLIP = 13, 4, 1.5
+SPACES = Spaces(observation_size=10, goal_size=3, action_low=(-1.0,) * 4, action_high=(1.0,) * 4)
 
 
 def _run(**tac: Any) -> RunSettings:
@@ -49,16 +50,15 @@ class Trained:
         with torch.no_grad():
             return torch.tanh(self.policy(states)[..., :ACTIONS]).numpy()
 
-    def write(self, folder: Path, *, settings: bool = True) -> Path:
+    def write(self, folder: Path) -> Path:
         modules = {
             name: {key: tensor.numpy() for key, tensor in module.state_dict().items()}
             for name, module in (("policy", self.policy), ("normaliser", self.normaliser))
         }
         if not self.run.tac.normalise_observations:
             del modules["normaliser"]
-        write_handoff(folder / "handoff", modules, self.run.handoff_info(KEY, 500))
-        if settings:
-            (folder / "run.json").write_text(self.run.model_dump_json())
+        write_handoff(folder / "handoff", modules, self.run.handoff_info(KEY, 500, SPACES))
+        (folder / "run.json").write_text(self.run.model_dump_json())
         return folder
 
     def publish(self, storage: Path, key: str = KEY) -> None:
@@ -107,19 +107,11 @@ def test_says_what_it_is_for(tmp_path: Path) -> None:
     assert policy.action_size == ACTIONS
 
 
-@pytest.mark.parametrize("earlier", [False, True], ids=["its own", "of an earlier version"])
-@pytest.mark.parametrize("inside", ["handoff", ""], ids=["handoff", "node"])
-def test_a_handoff_acts_as_its_run(
-    inside: str, earlier: bool, tmp_path: Path, observations: np.ndarray[Any, Any]
+def test_a_handoff_alone_acts_as_its_run(
+    tmp_path: Path, observations: np.ndarray[Any, Any]
 ) -> None:
-    """Of an earlier version the settings are in the run's file only."""
     trained = Trained(_run(max_episode_steps=20))
-    node = trained.write(tmp_path, settings=earlier)
-    if earlier:
-        manifest = json.loads((node / "handoff" / "handoff.json").read_text())
-        del manifest["info"]["observation_clip"], manifest["info"]["max_episode_steps"]
-        (node / "handoff" / "handoff.json").write_text(json.dumps(manifest))
-    policy = load_policy(node / inside)
+    policy = load_policy(trained.write(tmp_path) / "handoff")
     assert policy.max_episode_steps == 20
     np.testing.assert_allclose(policy.act(observations), trained.act(observations), atol=2e-6)
 
@@ -205,10 +197,10 @@ def test_a_published_node_is_verified(tmp_path: Path) -> None:
     node = tmp_path / "nodes" / KEY
     assert load_policy(node).node_key == KEY
     assert load_policy(node.as_uri()).node_key == KEY
-    settings = json.loads((node / "run.json").read_text())
-    settings["tac"]["observation_clip"] = 0.1
-    (node / "run.json").write_text(json.dumps(settings))
-    with pytest.raises(PolicyError, match=r"run\.json must have"):
+    manifest = json.loads((node / "handoff" / "handoff.json").read_text())
+    manifest["info"]["observation_clip"] = 0.1
+    (node / "handoff" / "handoff.json").write_text(json.dumps(manifest))
+    with pytest.raises(PolicyError, match=r"handoff\.json must have"):
         load_policy(node)
 
 

@@ -19,11 +19,11 @@ from matplotlib.collections import PolyCollection
 
 from music_rllib import names
 from music_rllib.report.build import build_report, made_files, write_report
-from music_rllib.report.figures.choice import AGAINST_ENTROPY, INFLUENCE
+from music_rllib.report.figures.choice import AGAINST_ENTROPY
 from music_rllib.report.figures.draw import TEXT_WIDTH, Figures, drawn_figure, files
-from music_rllib.report.figures.importance import CHANCE, importances, varied
 from music_rllib.report.figures.palette import DARK, LIGHT, colour_of, marker_of
 from music_rllib.report.figures.processes import drawing_processes
+from music_rllib.report.figures.sensitivity import varied
 from music_rllib.report.limitations import planned_runs
 from music_rllib.report.page import render
 from music_rllib.report.tables import curves_table
@@ -832,36 +832,12 @@ def grid_of_settings() -> Sweep:
     return sweep_of(runs)
 
 
-def test_importance_with_many_seeds_is_found_in_seconds() -> None:
-    """As choices their number would be an exponent of the time it takes."""
-    rng = np.random.default_rng(0)
-    sweep = sweep_of(
-        [
-            (one_run(q, seed, params={"tac.alpha": alpha}), climbing(height + rng.normal(0, 0.05)))
-            for q, height in (("1", 0.2), ("1.5", 0.7))
-            for alpha in ("0.1", "0.2", "0.3")
-            for seed in range(30)
-        ]
-    )
-    (shares,) = importances(sweep, analyse(sweep)[0]).values()
-    assert max(shares, key=lambda name: shares[name]) == "q"
-    assert 0 < shares[CHANCE] < 0.2
-
-
-def test_what_matters_is_found_and_drawn() -> None:
+def test_two_varied_settings_give_a_contour_for_each_q() -> None:
     report = build_report(grid_of_settings())
-    (analysis,) = report.analyses
-    (shares,) = importances(report.sweep, analysis).values()
-    assert set(shares) == {"q", "α", "MI weight", CHANCE}
-    assert shares["q"] > 0.8
-    assert shares["MI weight"] < 0.05
-    assert sum(shares.values()) == pytest.approx(1.0)
     panels = {drawing.title: [p.title for p in drawing.panels] for drawing in report.drawings}
     assert panels["Sensitivity"] == ["FetchPush, q = 1", "FetchPush, q = 2"]
-    assert panels["Importance of settings"] == panels["Parallel coordinates"] == ["FetchPush"]
     page = render(report)
-    for title in INFLUENCE:
-        assert page.count(f"<h3>{title}</h3>") == 1
+    assert page.count("<h3>Sensitivity</h3>") == 1
     assert "Not drawn" not in page
 
 
@@ -876,10 +852,9 @@ def test_one_varied_setting_gives_a_line_and_the_page_says_what_is_not_drawn() -
     )
     drawn = {drawing.title for drawing in build_report(lines).drawings}
     assert "Sensitivity" in drawn
-    assert not drawn & set(INFLUENCE[1:])
     only_q = Page(render(build_report(compared({"1": [0.5, 0.6], "2": [0.6, 0.7]})))).text
-    assert "Not drawn: sensitivity, importance of settings, parallel coordinates" in only_q
-    assert "This stage varies q;" in only_q
+    assert "Not drawn: sensitivity" in only_q
+    assert "This stage varies q." in only_q
 
 
 def test_figures_are_the_same_drawn_here_and_in_other_processes() -> None:

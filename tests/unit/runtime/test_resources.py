@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 import tempfile
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +12,7 @@ import ray
 from pydantic import ValidationError
 
 from music_rllib.config.schema import Resources
-from music_rllib.runtime import autoscaler, ray_cluster
+from music_rllib.runtime import ray_cluster
 from music_rllib.runtime.machine import ClusterError, ray_parent
 from music_rllib.runtime.ray_cluster import WAITING, Room, _room, slots
 
@@ -101,119 +98,53 @@ def test_a_machine_without_gpus() -> None:
         slots(Resources(gpus_per_run=1), [SMALL], local=True)
 
 
-@dataclass
-class FakeCluster:
-    """Replaces Ray's answers about a cluster."""
-
-    nodes: list[dict[str, float]]
-    by_type: bool = True
-    """Whether the nodes have an autoscaler's types."""
-    could_add: dict[str, float] = field(default_factory=dict)
-    """The largest node that the autoscaler may start."""
-    asked: list[Mapping[str, float]] = field(default_factory=list)
-
-    def put_in_place(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        nodes = [{"Alive": True, "Resources": node} for node in self.nodes]
-        dead = {"Alive": False, "Resources": {"CPU": 1000.0, "GPU": 1000.0}}
-        monkeypatch.setenv("RAY_ADDRESS", "head:6379")
-        monkeypatch.setattr("ray.nodes", lambda: [*nodes, dead])
-        monkeypatch.setattr(autoscaler, "is_there", lambda: self.by_type)
-        monkeypatch.setattr(autoscaler, "adds_nodes", self.adds_nodes)
-
-    def adds_nodes(self, bundle: Mapping[str, float]) -> bool:
-        self.asked.append(bundle)
-        return all(self.could_add.get(name, 0) >= amount for name, amount in bundle.items())
-
-
 HEAD = {"CPU": 1.0}
 
 
+def put_cluster(
+    monkeypatch: pytest.MonkeyPatch, *nodes: dict[str, float], group: str | None = "workers"
+) -> None:
+    """Replaces Ray's answers about a cluster whose nodes are of a group."""
+    labels = {} if group is None else {"ray.io/node-group": group}
+    alive = [{"Alive": True, "Resources": node, "Labels": labels} for node in nodes]
+    dead = {"CPU": 1000.0, "GPU": 1000.0}
+    monkeypatch.setenv("RAY_ADDRESS", "head:6379")
+    monkeypatch.setattr("ray.nodes", lambda: [*alive, {"Alive": False, "Resources": dead}])
+
+
 @pytest.mark.parametrize("settings", [{"cpus_per_run": 2}, {"gpus_per_run": 1}])
-def test_a_run_that_a_node_is_added_for_is_not_refused(
+def test_a_run_waits_for_a_node_on_a_cluster_that_grows(
     settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As on AWS: a head with one CPU, and workers that are started for waiting runs."""
-    fake = FakeCluster([HEAD], could_add=BIG)
-    fake.put_in_place(monkeypatch)
+    put_cluster(monkeypatch, HEAD)
     room = _room(Resources(**settings))
     assert room == Room(now=0, grows=True)
-    assert fake.asked == [Resources(**settings).bundle]
     assert room.remark is not None
-    assert "autoscaler is asked for one" in room.remark
+    assert "waits until its autoscaler adds one" in room.remark
     assert (room.at_once, room.waiting) == (1, WAITING)
 
 
-def test_what_no_node_that_may_be_added_could_hold_is_refused(
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize("group", [None, "local.cluster.node"])
+def test_it_is_refused_on_a_cluster_of_given_machines(
+    group: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    FakeCluster([HEAD], could_add=SMALL).put_in_place(monkeypatch)
+    put_cluster(monkeypatch, HEAD, group=group)
     with pytest.raises(ClusterError, match=r"gpus_per_run must fit into one node .* 0 GPUs, got 1"):
         _room(Resources(gpus_per_run=1))
 
 
 def test_runs_wait_where_nodes_are_added_for_them(monkeypatch: pytest.MonkeyPatch) -> None:
     """One run fits. If only one more waited, the cluster would grow by one node at a time."""
-    fake = FakeCluster([HEAD])
-    fake.put_in_place(monkeypatch)
+    put_cluster(monkeypatch, HEAD)
     room = _room(Resources())
-    assert (room.now, room.waiting, room.remark, fake.asked) == (1, WAITING, None, [])
+    assert (room.now, room.waiting, room.remark) == (1, WAITING, None)
 
 
 def test_no_more_runs_wait_than_fit_where_nothing_is_added(monkeypatch: pytest.MonkeyPatch) -> None:
-    FakeCluster([SMALL, HEAD], by_type=False).put_in_place(monkeypatch)
+    put_cluster(monkeypatch, SMALL, HEAD, group=None)
     room = _room(Resources())
     assert (room.now, room.at_once, room.waiting, room.remark) == (5, 5, 5, None)
-
-
-@pytest.mark.parametrize(
-    ("version", "by_report", "by_first", "expected"),
-    [
-        (3, {"cpu", "head"}, set(), True),
-        (3, {""}, {"head"}, False),
-        (0, {"head"}, {"head", "cpu"}, True),
-        # Types of nodes that were started by `ray start`.
-        (0, {""}, {"node_abc"}, False),
-        (0, {""}, {"local.cluster.node"}, False),
-        (0, set(), set(), False),
-    ],
-)
-def test_an_autoscaler_is_known_by_the_types_of_its_nodes(
-    version: int,
-    by_report: set[str],
-    by_first: set[str],
-    expected: bool,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    state = autoscaler.State(version, frozenset(by_report), frozenset())
-    monkeypatch.setattr("ray.nodes", lambda: [{"NodeID": "abc"}])
-    monkeypatch.setattr(autoscaler, "_state", lambda: state)
-    monkeypatch.setattr(autoscaler, "_types_of_the_first", lambda: frozenset(by_first))
-    assert autoscaler.is_there() is expected
-
-
-@pytest.mark.parametrize(
-    ("infeasible", "placed_after", "expected"),
-    [
-        (["other:PACK|PENDING", "mine:PACK|PENDING"], 99, False),
-        (["other:PACK|PENDING"], 99, True),
-        ([], 1, True),
-    ],
-)
-def test_the_autoscalers_answer_is_waited_for(
-    infeasible: list[str], placed_after: int, expected: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It reports nothing at first, and never reports a feasible request."""
-    looks = itertools.count(7)
-
-    def state() -> autoscaler.State:
-        version = next(looks)
-        said = frozenset(infeasible) if version > 8 else frozenset()
-        return autoscaler.State(version, frozenset({"cpu"}), said)
-
-    monkeypatch.setattr(autoscaler, "_state", state)
-    waits = itertools.count(1)
-    ready = lambda _: next(waits) > placed_after  # noqa: E731
-    assert autoscaler._feasible("mine", ready) is expected
 
 
 @pytest.mark.parametrize("settings", [{"gpus_per_run": -1}, {"memory_per_run": 0}])

@@ -5,11 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-import yaml
 
-from music_rllib.serve.application import ServeSettings, policy_of
 from music_rllib.serve.command import main
-from tests.hostile_files import INPUTS, PENDULUM, write_policy
 from tests.ports import free_port
 
 
@@ -54,19 +51,3 @@ def test_a_cluster_that_does_not_answer_is_said_at_once(
     assert errors.startswith("error: RAY_ADDRESS ")
     assert message in errors
     assert errors.count("\n") == 1
-
-
-def test_an_environment_of_ones_own_is_named_as_for_evaluate(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """An older policy says nothing of its sizes, so its environment is asked."""
-    own = PENDULUM.model_copy(update={"name": "Mine", "env_kwargs": {"g": 9.0}})
-    place = str(write_policy(tmp_path, own, spaces=None))
-    assert "as --env" in refused(capsys, place, "--port", str(free_port()))
-    declared = tmp_path / "mine.yaml"
-    refusal = refused(capsys, place, "--env", str(declared), "--port", str(free_port()))
-    assert refusal.startswith(f"error: {declared}: ")
-    task = own.model_dump(include={"env_id", "env_kwargs", "horizon", "success_key"})
-    declared.write_text(yaml.safe_dump({"environments": {"Mine": task}}))
-    policy = policy_of(ServeSettings(policy=place, env=str(declared)))
-    assert (policy.input_size, policy.action_size) == (INPUTS, 1)

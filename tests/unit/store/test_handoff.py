@@ -20,12 +20,13 @@ from music_rllib.store.handoff import (
     read_handoff,
     write_handoff,
 )
+from tests.hostile_files import SPACES
 
 PUSH, SLIDE = BUILT_IN_TASKS["FetchPush"], BUILT_IN_TASKS["FetchSlide"]
 RUN = RunSettings.model_validate(
     {"task": PUSH, "variant": "music-u", "seed": 0, "music": preset("music-u", PUSH)}
 )
-INFO = RUN.handoff_info("0" * 20, 6000)
+INFO = RUN.handoff_info("0" * 20, 6000, SPACES)
 WEIGHTS: Weights = {
     "mi_estimator": {"x.weight": np.arange(6, dtype=np.float32).reshape(2, 3)},
     "normaliser": {"count": np.array(7, np.int64), "mean": np.linspace(0, 1, 5)},
@@ -76,16 +77,6 @@ def test_a_task_may_have_another_name_but_nothing_else(handoff: Path) -> None:
     other_split = PUSH.model_copy(update={"surrounding_indices": (3, 4)})
     with pytest.raises(HandoffError, match=r"indices is \[3, 4, 5\] there and \[3, 4\] here"):
         read_handoff(handoff, ["normaliser"], other_split)
-
-
-def test_a_handoff_from_before_there_was_a_choice_has_clamped_widths(handoff: Path) -> None:
-    path = handoff / "handoff.json"
-    manifest = json.loads(path.read_text())
-    for name in ("log_std_form", "log_std_bounds"):
-        del manifest["info"]["architecture"][name]
-    path.write_text(json.dumps(manifest))
-    architecture = open_handoff(handoff)[1].info.architecture
-    assert (architecture.log_std_form, architecture.log_std_bounds) == ("clamp", None)
 
 
 def test_a_node_folder_holds_its_handoff_below(handoff: Path) -> None:

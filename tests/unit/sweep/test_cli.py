@@ -15,6 +15,7 @@ from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.experiment.session import Sweep, open_sweep
 from music_rllib.store.handoff import write_handoff
 from music_rllib.sweep import cli, driver
+from tests.hostile_files import SPACES
 
 Document = dict[str, Any]
 
@@ -296,7 +297,7 @@ def handoff(folder: Path, task_name: str) -> Path:
         {"task": task, "variant": "music-u", "seed": 0, "music": preset("music-u", task)}
     )
     weights = {"mi_estimator": {"w": np.zeros((4, 4), np.float32)}}
-    write_handoff(folder, weights, run.handoff_info("0" * 20, 1))
+    write_handoff(folder, weights, run.handoff_info("0" * 20, 1, SPACES))
     return folder
 
 

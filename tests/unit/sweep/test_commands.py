@@ -44,6 +44,7 @@ from music_rllib.sweep import clean, cli, driver_lock
 from music_rllib.sweep.export import sweep_of_run
 from music_rllib.sweep.listeners.state_file import StateFile
 from music_rllib.sweep.preflight import import_checkpoints
+from tests.hostile_files import SPACES
 
 REPOSITORY = Path(__file__).parents[3]
 SWEEP: dict[str, Any] = {
@@ -457,7 +458,7 @@ def from_handoff(storage: str, tmp_path: Path, name: str = "mine") -> Sweep:
     folder = tmp_path / "given"
     pretrained = resolved(SWEEP | {"stages": [{"name": "p", "variant": "music-u"}]}, tmp_path)
     arrays = {"mi_estimator": {"w": np.zeros((3, 2), np.float32)}}
-    write_handoff(folder, arrays, pretrained.handoff_info("0" * 20, 50))
+    write_handoff(folder, arrays, pretrained.handoff_info("0" * 20, 50, SPACES))
     stage = {"name": "r", "variant": "music-r", "init_from": {"checkpoint": str(folder)}}
     sweep = opened(storage, tmp_path, name=name, seeds=[0], stages=[stage])
     import_checkpoints(sweep.plan, sweep.store)

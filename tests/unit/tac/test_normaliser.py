@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from music_rllib.tac.normaliser import RunningNormaliser, for_another_run, in_this_form
+from music_rllib.tac.normaliser import RunningNormaliser, for_another_run
 
 Numbers = NDArray[Any]
 
@@ -133,26 +133,3 @@ def test_what_the_source_saw_as_a_constant_begins_anew_and_the_rest_goes_on(
     mean, variance = exact_moments(np.concatenate([*before, goals])[:, 0])
     assert moments["centre"][0] == pytest.approx(mean)
     assert moments["squares"][0] / 20_255 == pytest.approx(variance)
-
-
-def test_a_handoff_with_sums_of_squares_goes_on_as_if_it_had_these_moments() -> None:
-    rng = np.random.default_rng(0)
-    data, more = of_music_u(rng, 5000, 1.34), of_music_u(rng, 100, 1.34)
-    new = arrays(fed(data))
-    wide = data.astype(np.float64)
-    old = {name: new[name] for name in ("mean", "inverse_std")} | {
-        "count": np.array(5000.0),
-        "total": wide.sum(0),
-        "total_square": np.square(wide).sum(0),
-    }
-    read = in_this_form(old)
-    assert read.keys() == new.keys()
-    for name, array in new.items():
-        assert read[name].shape == array.shape
-        np.testing.assert_allclose(read[name], array, rtol=1e-9)
-    handed = going_on(for_another_run(old))
-    handed.update(torch.from_numpy(more))
-    expected = going_on(for_another_run(new))
-    expected.update(torch.from_numpy(more))
-    torch.testing.assert_close(handed.inverse_std, expected.inverse_std)
-    torch.testing.assert_close(handed.count, torch.tensor([5100.0, 100.0], dtype=torch.float64))
