@@ -59,15 +59,16 @@ def test_a_search_counts_with_what_it_runs_at_most(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("space", "sources", "fresh"),
+    ("space", "sources", "fresh", "trials"),
     [
-        ({"tac.alpha": {"float": [0.01, 0.1]}}, 2, 3),
-        ({"u:tac.alpha": {"choice": [0.1, 0.2, 0.3]}}, 3 * 2, 2 * 3),
-        ({"u:tac.alpha": {"float": [0.01, 0.1]}}, 5 * 2, 2 * 3),
+        ({"tac.alpha": {"float": [0.01, 0.1]}}, 2, 3, 5),
+        # A space of three points ends after three trials.
+        ({"u:tac.alpha": {"choice": [0.1, 0.2, 0.3]}}, 3 * 2, 2 * 3, 3),
+        ({"u:tac.alpha": {"float": [0.01, 0.1]}}, 5 * 2, 2 * 3, 5),
     ],
 )
 def test_what_trials_start_from_counts(
-    space: dict[str, Any], sources: int, fresh: int, tmp_path: Path
+    space: dict[str, Any], sources: int, fresh: int, trials: int, tmp_path: Path
 ) -> None:
     search = {"trials": 5, "space": space, "final": {"trials": 2, "seeds": 3}}
     stages = [
@@ -78,7 +79,7 @@ def test_what_trials_start_from_counts(
     assert found == {
         "u/FetchPush": sources,
         "u/FetchPush, fresh seeds": fresh,
-        "r/FetchPush": 5 * 2 + 2 * 3,
+        "r/FetchPush": trials * 2 + 2 * 3,
     }
 
 
