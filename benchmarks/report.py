@@ -1,17 +1,14 @@
-"""A report on 500 runs with 500 points each, as a user makes it, from an embedded MLflow."""
+"""A report on 500 runs with 500 points each, as a user makes it."""
 
 from __future__ import annotations
 
 import ctypes
 import os
 import shutil
-import sqlite3
 import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import closing
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -23,10 +20,9 @@ from music_rllib import names
 from music_rllib.config.load import load_sweep
 from music_rllib.config.schema import SweepConfig
 from music_rllib.experiment.plan import make_plan
-from music_rllib.experiment.run_info import run_info
+from music_rllib.experiment.session import keep_record, open_sweep
 from music_rllib.report.build import PAGE
-from music_rllib.tracking.projection import StoredRun
-from music_rllib.tracking.tracker import Tracker
+from music_rllib.store.run_record import HISTORY, Report, RunResult, last_values, to_json_lines
 
 __all__ = ["rows"]
 
@@ -105,32 +101,29 @@ def config(storage: Path) -> SweepConfig:
 
 def make_sweep(storage: Path) -> Path:
     """The folder of a sweep whose curves climb, with noise."""
-    sweep = config(storage)
-    nodes = make_plan(sweep).nodes
-    with Tracker(sweep_name="large", storage=str(storage), config=sweep.document) as tracker:
-        for node in nodes:
-            tracker.mirror(run_info(node), partial(StoredRun, ()))
-        if not tracker.flush(600.0):
-            raise RuntimeError(f"MLflow must take {len(nodes)} runs, {tracker.pending()} are left")
+    sweep, folder = config(storage), storage / "large"
+    opened = open_sweep(sweep, make_plan(sweep), str(storage), folder)
+    keep_record(opened)
     rng, now = np.random.default_rng(0), int(time.time() * 1000)
-    with closing(sqlite3.connect(storage / "mlflow.db")) as database, database:
-        runs = [
-            run
-            for (run,) in database.execute(
-                "SELECT run_uuid FROM tags WHERE key = ?", (names.TAG_NODE_KEY,)
+    for node in opened.plan.nodes:
+        climb = np.clip(np.linspace(0, rng.uniform(0.2, 1.0), POINTS), 0, 1)
+        values = climb[:, np.newaxis] + rng.normal(0, 0.02, (POINTS, len(METRICS)))
+        reports = [
+            Report(
+                env_steps=1000 * (point + 1),
+                seconds=point,
+                timestamp_ms=now + point,
+                metrics=dict(zip(METRICS, map(float, row), strict=True)),
             )
+            for point, row in enumerate(values)
         ]
-        for run in runs:
-            climb = np.clip(np.linspace(0, rng.uniform(0.2, 1.0), POINTS), 0, 1)
-            for metric in METRICS:
-                values = climb + rng.normal(0, 0.02, POINTS)
-                # Key, value, time, run, whether NaN, step.
-                database.executemany(
-                    "INSERT INTO metrics (key, value, timestamp, run_uuid, is_nan, step) "
-                    "VALUES (?, ?, ?, ?, 0, ?)",
-                    [
-                        (metric, float(value), now + i, run, 1000 * (i + 1))
-                        for i, value in enumerate(values)
-                    ],
-                )
-    return storage / "large"
+        with TemporaryDirectory() as made:
+            (Path(made) / HISTORY).write_bytes(to_json_lines(reports))
+            last = RunResult(
+                label=node.label,
+                env_steps=reports[-1].env_steps,
+                seconds=reports[-1].seconds,
+                metrics=last_values(reports),
+            )
+            opened.store.publish(node.key, Path(made), last)
+    return folder

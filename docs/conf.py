@@ -50,6 +50,7 @@ architecture
 api
 reliability
 performance
+adr/0001-mlflow-is-written-never-read
 ```
 ```{toctree}
 :hidden:

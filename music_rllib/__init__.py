@@ -10,7 +10,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from music_rllib.results.frames.tables import load_sweep
+    from music_rllib.results.frames import load_sweep
     from music_rllib.tac.algorithm import TAC
     from music_rllib.tac.config import TACConfig
     from music_rllib.tac.learner import TACLearner
@@ -25,7 +25,7 @@ _HOMES = {
     "TACConfig": "music_rllib.tac.config",
     "TACLearner": "music_rllib.tac.learner",
     "TACModule": "music_rllib.tac.rl_module",
-    "load_sweep": "music_rllib.results.frames.tables",
+    "load_sweep": "music_rllib.results.frames",
 }
 
 

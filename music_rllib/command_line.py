@@ -128,10 +128,10 @@ def _check_current_folder() -> None:
 
 def called_as() -> list[str]:
     """The words that start this program, without arguments, for commands shown in messages."""
-    path = Path(sys.argv[0])
-    if path.name != "__main__.py":
+    path, root = Path(sys.argv[0]), Path(__file__).parents[1]
+    if path.name != "__main__.py" or not path.is_relative_to(root):
         return [PROGRAM]
-    package = path.parent.relative_to(Path(__file__).parents[1])
+    package = path.parent.relative_to(root)
     return ["python", "-m", ".".join(package.parts)]
 
 

@@ -136,6 +136,13 @@ TAG_NODE_KEY = "node_key"
 """Content hash of the run's settings and source, by which a child run is found again."""
 TAG_ENVIRONMENT = "environment"
 """Hash of what determines the run's environment beside its settings: source, models, versions."""
+TAG_PLAN = "plan"
+"""Hash of the sweep's plan, on the parent run: a changed plan has a parent run of its own, since
+MLflow's params never change."""
+TAG_CURRENT = "current"
+"""``yes`` for the parent run of the current plan and for its runs, ``no`` for those of earlier
+plans."""
+CURRENT, SUPERSEDED = "yes", "no"
 TAG_LABEL = "label"
 """The run's label in the sweep, which `sweep evaluate` takes."""
 TAG_STAGE = "stage"
@@ -204,7 +211,7 @@ ARTEFACT_POLICY = "policy.safetensors"
 
 # Environment variables --------------------------------------------------------------------------
 VARIABLE_TRACKING_URI = "MUSIC_RLLIB_TRACKING_URI"
-"""Where the report at a sweep's end reads runs, password included."""
+"""Where the report at a sweep's end is attached, password included."""
 VARIABLE_STORAGE = "MUSIC_RLLIB_STORAGE"
 """Where the report at a sweep's end finds the storage, if that is a bucket."""
 VARIABLE_REPORT = "MUSIC_RLLIB_REPORT"

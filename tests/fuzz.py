@@ -307,7 +307,7 @@ def export(rng: random.Random, sound: Path, folder: Path) -> Callable[[], object
             search_in_words(search)
             list(search_tables(search))
         find_stages(sweep)
-        missing(sweep, [], 0)
+        missing(sweep, [])
         runs_table(sweep).to_csv()
 
     return read

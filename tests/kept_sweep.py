@@ -29,7 +29,7 @@ def kept_sweep(storage: Path, tracking_uri: str | None = None) -> Path:
     config = load_sweep(file)
     folder = storage / "s"
     keep_record(open_sweep(config, make_plan(config), str(storage), folder))
-    record = {"sweep_name": "s", "sweep_id": "0", "tracking_uri": tracking_uri, "storage": ".."}
+    record = {"sweep_name": "s", "sweep_id": "0", "tracking_uri": tracking_uri, "run_id": "1"}
     (folder / "tracking").mkdir()
     (folder / "tracking" / "sweep.json").write_text(json.dumps(record))
     return folder

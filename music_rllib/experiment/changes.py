@@ -11,9 +11,10 @@ from typing import Any
 from music_rllib.config.run_settings import RETIRED
 from music_rllib.config.schema import SweepConfig
 from music_rllib.experiment.continuation import budget_settings, continued_from
+from music_rllib.experiment.earlier import differences
 from music_rllib.experiment.plan import Node
 from music_rllib.experiment.session import Sweep
-from music_rllib.experiment.sweep_files import CONFIG, PLAN, keep, read
+from music_rllib.experiment.sweep_files import CONFIG, PLAN, SETTINGS, keep, read
 from music_rllib.labels import ShortLabels, in_runs
 from music_rllib.redaction import redact
 from music_rllib.store.node_store import NodeStore, steps_of
@@ -21,7 +22,6 @@ from music_rllib.store.object_folder import StorageError
 from music_rllib.store.paths import check_answers, resolve_storage
 from music_rllib.version import ALGORITHM_VERSION
 
-FILE = "settings.json"
 FINISHED = "is finished"
 SHOWN = 10
 """Lines of each list that are shown."""
@@ -71,7 +71,7 @@ def keep_settings(sweep: Sweep) -> None:
         for node in sweep.plan.nodes
     }
     document = {"algorithm": ALGORITHM_VERSION, "runs": runs, "searched": _searched(sweep)}
-    keep(sweep, FILE, json.dumps(document, indent=1))
+    keep(sweep, SETTINGS, json.dumps(document, indent=1))
 
 
 def _searched(sweep: Sweep) -> dict[str, dict[str, Any]]:
@@ -141,7 +141,7 @@ def changes_since(sweep: Sweep) -> Changes | None:
         StorageError: The record of the last run can't be read.
     """
     try:
-        before = read(sweep.storage, f"{sweep.config.name}/{FILE}")
+        before = read(sweep.storage, f"{sweep.config.name}/{SETTINGS}")
         runs: Mapping[str, Any] = before["runs"]
         algorithm = before["algorithm"]
     except (KeyError, TypeError):
@@ -221,11 +221,7 @@ def _progress(store: NodeStore, key: str) -> str | None:
     return f"is at {steps_of(checkpoints[-1]):,} env steps" if checkpoints else None
 
 
-def _differences(before: Any, after: Any, place: str = "") -> Iterator[str]:
-    if isinstance(before, dict) and isinstance(after, dict):
-        for key in before | after:
-            inner = f"{place}.{key}" if place else str(key)
-            if (place, key) not in RETIRED:
-                yield from _differences(before.get(key), after.get(key), inner)
-    elif before != after:
-        yield f"{place}: {json.dumps(before)} -> {json.dumps(after)}"
+def _differences(before: Any, after: Any) -> Iterator[str]:
+    for place, old, new in differences(before, after):
+        if tuple(place.split(".")) not in RETIRED:
+            yield f"{place}: {json.dumps(old)} -> {json.dumps(new)}"

@@ -12,6 +12,7 @@ from music_rllib.config.load import load_sweep
 from music_rllib.config.schema import SweepConfig
 from music_rllib.errors import BadInputError
 from music_rllib.experiment import sweep_files
+from music_rllib.experiment.earlier import in_words
 from music_rllib.experiment.plan import make_plan
 from music_rllib.experiment.session import Sweep, open_sweep
 from music_rllib.experiment.sweep_files import IN_STORAGE
@@ -69,15 +70,34 @@ class SweepLocation:
                     source["checkpoint"] = str(store.folder(place.removeprefix(IN_STORAGE)))
         return document
 
-    def open(self) -> Sweep:
-        """The sweep with its plan, which includes the searched trials, and its finished runs."""
+    def open(self, *, lenient: bool = False) -> Sweep:
+        """The sweep with its plan as it was last run, and its finished runs.
+
+        The plan includes the searched trials. Its keys are of the version of the algorithm that the
+        sweep was run with.
+
+        Args:
+            lenient: Whether finished runs may be damaged, which then count as not finished.
+        """
         config = self.config()
-        plan = make_plan(config)
-        for trial in (self.read(sweep_files.PLAN) or {}).get("trials", ()):
+        recorded = self.read(sweep_files.PLAN) or {}
+        settings = {} if "algorithm" in recorded else self.read(sweep_files.SETTINGS) or {}
+        plan = make_plan(config, algorithm=(recorded | settings).get("algorithm"))
+        for trial in recorded.get("trials", ()):
             plan.add_trial(
                 trial["stage"], trial["trial"], trial["values"], trial["seeds"], trial["part"]
             )
-        return open_sweep(config, plan, self.storage, sweep_folder(self.storage, self.name))
+        folder = sweep_folder(self.storage, self.name)
+        return open_sweep(config, plan, self.storage, folder, lenient=lenient)
+
+    def earlier(self) -> str | None:
+        """A sentence about runs of earlier versions of its plan; None if there are none."""
+        recorded = (self.read(sweep_files.PLAN) or {}).get("earlier", ())
+        if not recorded:
+            return None
+        store = NodeStore(self.storage)
+        known = store.begun() | store.finished(one["key"] for one in recorded)
+        return in_words(one for one in recorded if one["key"] in known)
 
     @property
     def place(self) -> str:

@@ -12,6 +12,7 @@ from typing import Any
 from music_rllib.config.schema import SweepConfig
 from music_rllib.envs.fingerprint import Fingerprint
 from music_rllib.experiment.continuation import continuation_key
+from music_rllib.experiment.earlier import earlier_runs
 from music_rllib.experiment.environments import Environments
 from music_rllib.experiment.plan import Plan
 from music_rllib.experiment.scheduler import DONE, Scheduler
@@ -40,6 +41,8 @@ class Sweep:
     """Environments of its tasks as they are now, if the sweep is to be run."""
     damaged: Mapping[str, str] = field(default_factory=dict)
     """Finished nodes to be trained again, by key, and what is wrong with them."""
+    earlier: list[dict[str, Any]] = field(default_factory=list)
+    """Runs of earlier versions of the plan, as `plan.json` has them."""
 
     @property
     def finished(self) -> set[str]:
@@ -48,8 +51,8 @@ class Sweep:
 
     def results(self) -> dict[str, RunResult]:
         """Results of the finished nodes, by key."""
-        results = {key: self.store.result(key) for key in self.finished}
-        return {key: result for key, result in results.items() if result is not None}
+        results = zip(self.finished, self.store.map(self.store.result, self.finished), strict=True)
+        return {key: result for key, result in results if result is not None}
 
 
 def open_sweep(
@@ -70,10 +73,11 @@ def open_sweep(
     """
     store = NodeStore(storage)
     labels = _labels(config, plan, storage)
-    damaged = store.damage(key for key in labels if store.is_finished(key))
+    published = store.finished(labels)
+    damaged = store.damage(key for key in labels if key in published)
     if damaged and not lenient:
         raise DamagedError(damage_in_words({labels[key]: why for key, why in damaged.items()}))
-    finished = {node.key for node in plan.nodes if store.is_finished(node.key)}
+    finished = published & {node.key for node in plan.nodes}
     return Sweep(
         config=config,
         plan=plan,
@@ -112,7 +116,11 @@ def _labels(config: SweepConfig, plan: Plan, storage: str) -> dict[str, str]:
 
 
 def plan_document(sweep: Sweep) -> dict[str, Any]:
-    """The content of `plan.json`: all nodes, those of searches as far as they are chosen."""
+    """The content of `plan.json`: all nodes, those of searches as far as they are chosen.
+
+    And the nodes of earlier plans that this one does not have.
+    """
+    keys = {node.key for node in sweep.plan.nodes}
     nodes = [
         {
             "key": node.key,
@@ -125,9 +133,11 @@ def plan_document(sweep: Sweep) -> dict[str, Any]:
     ]
     return {
         "storage": redact(sweep.storage),
+        "algorithm": sweep.plan.algorithm,
         "nodes": nodes,
         "trials": sweep.plan.trials,
         "environments": {task: dict(found) for task, found in sweep.environments.now.items()},
+        "earlier": [one for one in sweep.earlier if one["key"] not in keys],
     }
 
 
@@ -143,8 +153,26 @@ def keep_record(sweep: Sweep) -> None:
         given = [redact_yaml(one.replace("=", ": ", 1)) for one in sweep.config.arguments]
         arguments = [f"# {one.replace(': ', '=', 1)}  (command line)\n" for one in given]
         keep(sweep, "sweep.yaml", "".join(arguments) + redact_yaml(sweep.config.text))
-    keep(sweep, CONFIG, as_json(_configuration(sweep.config)))
-    keep(sweep, PLAN, as_json(plan_document(sweep)))
+    configuration = as_json(_configuration(sweep.config))
+    recorded = _recorded_plan(sweep, configuration)
+    with contextlib.suppress(StorageError):  # a damaged record is replaced
+        sweep.earlier[:] = (
+            recorded["earlier"] if recorded else earlier_runs(sweep.plan, sweep.storage)
+        )
+    keep(sweep, CONFIG, configuration)
+    keeps_trials = recorded is not None and sweep.plan.searched and not sweep.plan.trials
+    if not keeps_trials:  # else the record has more runs than the plan has yet
+        keep(sweep, PLAN, as_json(plan_document(sweep)))
+
+
+def _recorded_plan(sweep: Sweep, configuration: str) -> dict[str, Any] | None:
+    """The content of `plan.json` if the plan has not changed since; else None."""
+    with contextlib.suppress(StorageError):
+        plan: dict[str, Any] | None = read(sweep.storage, f"{sweep.config.name}/{PLAN}")
+        same = read(sweep.storage, f"{sweep.config.name}/{CONFIG}") == json.loads(configuration)
+        if same and plan and plan.get("algorithm") == sweep.plan.algorithm and "earlier" in plan:
+            return plan
+    return None
 
 
 def _configuration(config: SweepConfig) -> dict[str, Any]:

@@ -1,7 +1,8 @@
 """A sweep's small files below `<storage>/<name>`, in a bucket too, where other machines read them.
 
-`config.json` is the whole configuration, `plan.json` the runs known beforehand, `search.json` the
-results of its searches, `state.json` its progress, `analysis_plan.json` the versions of its plan.
+`config.json` is the whole configuration, `plan.json` its runs and those of earlier plans,
+`settings.json` their settings, `search.json` the results of its searches, `state.json` its
+progress, `analysis_plan.json` the versions of its analysis plan.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from music_rllib.experiment.session import Sweep
 
 CONFIG, PLAN, SEARCH, STATE = "config.json", "plan.json", "search.json", "state.json"
-ANALYSIS_PLAN = "analysis_plan.json"
+ANALYSIS_PLAN, SETTINGS = "analysis_plan.json", "settings.json"
 IN_STORAGE = "storage:"
 """In `config.json`, in front of the key of a handoff: its first folder may be on another machine,
 or hold another one by now."""
@@ -122,7 +123,9 @@ def _is_list_with(document: Any, keys: Set[str] = frozenset()) -> bool:
 _SOUND: dict[str, Callable[[Any], bool]] = {
     CONFIG: lambda document: _has(document, {"stages"}) and _is_list_with(document["stages"]),
     PLAN: lambda document: (
-        _has(document, {"nodes"}) and _is_list_with(document["nodes"], {"key", "label"})
+        _has(document, {"nodes"})
+        and _is_list_with(document["nodes"], {"key", "label"})
+        and _is_list_with(document.get("earlier", []), {"key", "label", "why"})
     ),
     STATE: lambda document: _has(document, _STATE_KEYS) and _has(document["driver"], _DRIVER_KEYS),
     SEARCH: _is_list_with,

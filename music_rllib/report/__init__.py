@@ -1,1 +1,1 @@
-"""Reports of sweeps, read from MLflow or from an exported folder, without Ray."""
+"""Reports of sweeps, read from their storage or from an exported folder, without Ray."""

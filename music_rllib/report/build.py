@@ -33,7 +33,6 @@ from music_rllib.results.analysis import analyse, analyse_stages
 from music_rllib.results.claims.study import study_of
 from music_rllib.results.comparison import GAP
 from music_rllib.results.data import ReportError, Sweep
-from music_rllib.tracking.store import TrackingStore
 
 PAGE = "report.html"
 PICTURE = "overview"
@@ -54,10 +53,9 @@ def build_report(
     sweep: Sweep,
     *,
     difference: float = GAP,
-    undelivered: int = 0,
     damaged: str | None = None,
     command: str = "",
-    store: TrackingStore | None = None,
+    storage: str | None = None,
     video_seed: int | None = None,
     environments: Sequence[Task] = (),
     beside: tuple[Sweep, Sweep] | None = None,
@@ -69,10 +67,9 @@ def build_report(
     Args:
         sweep: the sweep, with the metrics of `WANTED`.
         difference: the smallest difference in success rate that matters to the reader.
-        undelivered: the number of finished runs that are not yet complete in MLflow.
         damaged: a sentence about finished runs that are damaged in the storage, if there are any.
         command: the command that makes this report.
-        store: the MLflow store that has the policies to film.
+        storage: the storage that has the policies to film; None for an exported sweep.
         video_seed: the seed of filmed episodes; None: no videos.
         environments: tasks of the user that may be filmed, beside the built-in ones.
         beside: the two sweeps that `sweep` puts side by side.
@@ -90,9 +87,9 @@ def build_report(
         study_drawings(study),
     ):
         figures.add(drawing)
-    gaps = missing(sweep, analyses, undelivered, live=live or beside is not None)
+    gaps = missing(sweep, analyses, live=live or beside is not None)
     for one in beside or ():  # each has a configuration of its own
-        gaps += [f"{one.name}: {line}" for line in missing(one, (), 0)]
+        gaps += [f"{one.name}: {line}" for line in missing(one, ())]
     return Report(
         sweep=sweep,
         analyses=analyses,
@@ -105,7 +102,7 @@ def build_report(
         command=command,
         films=None
         if video_seed is None
-        else make_films(sweep, analyses, store, video_seed, environments),
+        else make_films(sweep, analyses, storage, video_seed, environments),
     )
 
 
@@ -129,6 +126,7 @@ def write_report(report: Report, folder: Path) -> Path:
             made.append(name)
         for stale in set(earlier) - set(made):
             (folder / stale).unlink(missing_ok=True)
+        (folder / _MADE).parent.mkdir(exist_ok=True)
         (folder / _MADE).write_text(json.dumps(made), encoding="utf-8")
     except OSError as error:
         raise ReportError(f"{folder} must be writable: {error}") from error

@@ -5,10 +5,11 @@ from __future__ import annotations
 import contextlib
 import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -17,16 +18,16 @@ from music_rllib.command_line import add_command, called_as, new_app, run_app
 from music_rllib.errors import FAILED, BadInputError
 
 if TYPE_CHECKING:
-    from music_rllib.report.location import ReportSource
     from music_rllib.report.page import Report
-    from music_rllib.results.data import Sweep
+    from music_rllib.results.data import RunRecord, Sweep
+    from music_rllib.results.read import SweepRead
 
 EXAMPLES = """\
 Examples:
   music-rllib report results/smoke
       on the sweep in that folder, while it runs or afterwards
-  music-rllib report smoke --tracking-uri http://mlflow:5000 --output reports
-      on a sweep that was logged to a server, from any machine
+  music-rllib report s3://bucket/sweeps/smoke --output reports
+      on a sweep in a bucket, from any machine
   music-rllib report results/smoke --serve
       the same page while it runs, with its progress
   music-rllib report results/smoke results/other
@@ -36,9 +37,8 @@ Examples:
   music-rllib report results/smoke --export published/smoke --add
       the same, and what another machine has exported there stays
 
-Exit codes: 0 the report is written, whatever state the sweep is in; 1 it is, by
-what MLflow has, and finished runs in the sweep's storage are damaged; 2 there
-is no such sweep.
+Exit codes: 0 the report is written, whatever state the sweep is in; 1 it is
+written without finished runs whose files are damaged; 2 there is no such sweep.
 """
 
 
@@ -63,19 +63,11 @@ def report(
         typer.Option(help="Folder for the report; `report` in the sweep's folder by default."),
     ] = None,
     storage: Annotated[
-        str,
-        typer.Option(
-            help="Where a sweep's name is looked for, as in the sweep's YAML file.",
-            envvar=names.VARIABLE_STORAGE,
-            show_envvar=False,
-        ),
-    ] = "results",
-    tracking_uri: Annotated[
         str | None,
         typer.Option(
-            help="Read from this MLflow instead of the sweep's own.",
-            # A password on a command line could be read by everyone on the machine.
-            envvar=names.VARIABLE_TRACKING_URI,
+            help="Folder or URI of results, where SWEEP is a name; `results` by default.",
+            # A key in a URI on a command line could be read by everyone on the machine.
+            envvar=names.VARIABLE_STORAGE,
             show_envvar=False,
         ),
     ] = None,
@@ -131,34 +123,34 @@ def report(
     """
     from music_rllib.results.comparison import GAP
 
-    def find(place: str, **options: Any) -> ReportSource:
-        from music_rllib.report.location import find_sweep
-
-        return find_sweep(place, storage=storage, tracking_uri=tracking_uri, **options)
-
     if add and export is None:
         raise BadInputError("--add must be given with --export")
     if serve and (export or output or attach):
         raise BadInputError("--serve must be given without --export, --output and --attach")
     place, gap = sweeps[0], GAP if difference is None else difference
     if len(sweeps) > 1:
-        _beside(find, sweeps, output, gap, alone=serve or attach or export is not None)
+        _beside(sweeps, storage, output, gap, alone=serve or attach or export is not None)
     elif export is not None:
-        _export(find(place).sweep, export, format_, add=add)
+        _export(place, storage, export, format_, add=add)
     elif serve:
-        _serve(find, place, storage, gap, port)
+        _serve(place, storage, gap, port)
     else:
-        return _report(find, place, output, gap, seed if videos else None, env, attach=attach)
+        video_seed = seed if videos else None
+        return _report(place, storage, output, gap, video_seed, env, attach=attach)
     return 0
 
 
-def _export(sweep: Sweep, folder: Path, table_format: TableFormat, *, add: bool) -> None:
+def _export(
+    place: str, storage: str | None, folder: Path, table_format: TableFormat, *, add: bool
+) -> None:
     from music_rllib.labels import in_runs
     from music_rllib.results.archive.folder import is_archive, read_archive, write_archive
     from music_rllib.results.archive.merge import merged
     from music_rllib.results.data import ReportError
+    from music_rllib.results.read import read_sweep
 
-    earlier = None
+    whole = read_sweep(place, storage).sweep
+    sweep, earlier = whole.having(lambda run: run.status != "SCHEDULED"), None
     if is_archive(folder):
         # What an interrupted export has left may be replaced.
         with contextlib.nullcontext() if add else contextlib.suppress(ReportError):
@@ -169,15 +161,29 @@ def _export(sweep: Sweep, folder: Path, table_format: TableFormat, *, add: bool)
             f"{folder}: it has {earlier.name!r}, not {sweep.name!r}"
         )
     if add and earlier is not None:
-        sweep = merged(earlier, sweep)
+        sweep = merged(earlier.having(partial(_is_kept, whole)), sweep)
     write_archive(sweep, folder, table_format.value)
+    if sweep.earlier:
+        typer.echo(sweep.earlier)
     values = sum(len(column.run) for column in sweep.history.values())
     typer.echo(f"{in_runs(len(sweep.runs))}, {values} values: {folder}")
 
 
+def _is_kept(sweep: Sweep, run: RunRecord) -> bool:
+    """Whether a run of an earlier export stays: unless the sweep has it with other settings.
+
+    A run of an earlier version of the algorithm stays until the sweep has finished its own.
+    """
+    own = next((one for one in sweep.runs if one.name == run.name), run)
+    replaced = own.is_finished or own.tags.get(names.TAG_ALGORITHM) == run.tags.get(
+        names.TAG_ALGORITHM
+    )
+    return own.node_key == run.node_key or not replaced
+
+
 def _report(
-    find: Callable[..., ReportSource],
     place: str,
+    storage: str | None,
     output: Path | None,
     difference: float,
     video_seed: int | None,
@@ -193,14 +199,14 @@ def _report(
         from music_rllib.redaction import for_people, redact
         from music_rllib.report.build import PICTURE, WANTED, build_report, write_report
         from music_rllib.results.comparison import verdict
+        from music_rllib.results.read import read_sweep
 
-        source = find(place, metrics=WANTED, processes=processes)
+        source = read_sweep(place, storage, metrics=WANTED, lenient=True)
         report = build_report(
             source.sweep,
             difference=difference,
-            undelivered=source.undelivered,
             damaged=source.damaged,
-            store=source.store,
+            storage=None if source.opened is None else source.opened.storage,
             video_seed=video_seed,
             environments=() if env is None else declared_tasks(env),
             command=_command(),
@@ -212,12 +218,12 @@ def _report(
     for analysis in report.analyses:
         for line in verdict(analysis.scopes[0], difference):
             typer.echo(for_people(f"{analysis.stage.name}: {line}"))
-    if attach:
-        _attach(source, page.parent, report)
     typer.echo(f"Report: {page.absolute()}")
     picture = page.parent / "figures" / f"{PICTURE}.png"
     if picture.exists():
         typer.echo(f"Picture: {picture.absolute()}")
+    if attach:
+        _attach(source, page.parent, report)
     if source.damaged is not None:
         typer.echo(f"error: {redact(source.damaged)}", err=True)
         return FAILED
@@ -232,8 +238,8 @@ def _command() -> str:
 
 
 def _beside(
-    find: Callable[..., ReportSource],
     places: Sequence[str],
+    storage: str | None,
     output: Path | None,
     difference: float,
     *,
@@ -251,8 +257,9 @@ def _beside(
         from music_rllib.report.build import WANTED, build_report, write_report
         from music_rllib.report.figures.choice import slug
         from music_rllib.report.side_by_side import side_by_side
+        from music_rllib.results.read import read_sweep
 
-        sources = [find(place, metrics=WANTED) for place in places]
+        sources = [read_sweep(place, storage, metrics=WANTED) for place in places]
         first, second = (source.sweep for source in sources)
         report = build_report(
             side_by_side(first, second),
@@ -266,25 +273,23 @@ def _beside(
     typer.echo(f"Report: {page.absolute()}")
 
 
-def _serve(
-    find: Callable[..., ReportSource], place: str, storage: str, difference: float, port: int
-) -> None:
+def _serve(place: str, storage: str | None, difference: float, port: int) -> None:
     from music_rllib.experiment.location import find_sweep
     from music_rllib.report.build import WANTED, build_report
     from music_rllib.report.live.server import LivePage, make_server, serve
     from music_rllib.report.live.state import Progress
     from music_rllib.report.page import render
-    from music_rllib.store.paths import folder_at
+    from music_rllib.results.read import read_stored
 
-    sweep = find_sweep(place, None if "/" in place or folder_at(place) else storage)
+    sweep = find_sweep(place, None if "/" in place else storage)
     progress = Progress(sweep)
 
     def make_page() -> str:
-        source = find(place, metrics=WANTED)
+        source = read_stored(sweep, metrics=WANTED, lenient=True)
         report = build_report(
             source.sweep,
             difference=difference,
-            undelivered=source.undelivered,
+            damaged=source.damaged,
             command=_command(),
             live=progress.is_running(),
         )
@@ -294,26 +299,24 @@ def _serve(
     serve(make_server(page, port), page, typer.echo)
 
 
-def _attach(source: ReportSource, folder: Path, report: Report) -> None:
+def _attach(source: SweepRead, folder: Path, report: Report) -> None:
     """Keep the report, in `folder`, with the sweep's run in MLflow."""
-    from music_rllib.redaction import for_people
     from music_rllib.report.build import made_files
     from music_rllib.report.tables import note
     from music_rllib.results.claims.answer import answer
     from music_rllib.results.data import ReportError
-    from music_rllib.results.from_mlflow import attach
+    from music_rllib.tracking.attach import SweepRun
 
-    if source.store is None:
-        raise ReportError("--attach needs a sweep that is read from MLflow, got an exported one")
-    sweep, analyses = source.sweep, report.analyses
-    last = analyses[-1].stage.name if analyses else ""
+    if source.opened is None:
+        raise ReportError("--attach must be given with a sweep in its storage, got an exported one")
+    run = SweepRun.of(source.opened)
+    last = report.analyses[-1].stage.name if report.analyses else ""
     drawn = sorted(report.drawings, key=lambda drawing: drawing.stage != last)
     figure = f"report/figures/{drawn[0].name}.png" if drawn else None
-    said = answer(sweep, report.study)[1]
-    text = note(said, analyses, sweep.run_id, figure)
-    attach(source.store, sweep.run_id, folder, made_files(folder), "report", text)
-    where = sweep.url(sweep.run_id) or f"run {sweep.run_id}"
-    typer.echo(for_people(f"Attached to the sweep's run in MLflow: {where}"))
+    said = answer(source.sweep, report.study)[1]
+    text = note(said, report.analyses, run.run_id, figure)
+    run.attach(folder, made_files(folder), "report", text)
+    typer.echo(f"Attached to the sweep's run in MLflow: {run.page}")
 
 
 app = new_app()

@@ -20,24 +20,17 @@ SHOWN = 5
 """Largest number of labels in a sentence."""
 _STATES = {
     "RUNNING": "still running (or killed without a word)",
-    "SCHEDULED": "waiting to begin",
     "KILLED": "stopped before the end; the same command continues",
     "FAILED": "failed; see below",
 }
 
 
-def missing(
-    sweep: Sweep, analyses: Sequence[StageAnalysis], undelivered: int, *, live: bool = False
-) -> list[str]:
+def missing(sweep: Sweep, analyses: Sequence[StageAnalysis], *, live: bool = False) -> list[str]:
     """A sentence for everything that is missing, without the runs to come of a `live` sweep."""
-    if live:
-        return [*_mixed_environments(sweep), *_missing_evidence(sweep, analyses)]
-    return [
-        *_missing_runs(sweep),
-        *_mixed_environments(sweep),
-        *_missing_evidence(sweep, analyses),
-        *_missing_records(sweep, undelivered),
-    ]
+    runs = [] if live else [*_missing_runs(sweep)]
+    earlier = filter(None, [sweep.earlier])
+    mixed_environments = _mixed_environments(sweep)
+    return [*runs, *earlier, *mixed_environments, *_missing_evidence(sweep, analyses)]
 
 
 def planned_runs(config: str) -> dict[str, str] | None:
@@ -63,14 +56,16 @@ def planned_runs(config: str) -> dict[str, str] | None:
 
 
 def _missing_runs(sweep: Sweep) -> Iterator[str]:
-    if not sweep.runs:
+    if all(run.status == "SCHEDULED" for run in sweep.runs):
         yield "No run has begun, so there is nothing to draw or compare."
     planned = (None if sweep.config is None else planned_runs(sweep.config)) or {}
     # Another version of this package may have named them, or counted their keys, otherwise.
     known = {text for run in sweep.runs for text in (run.node_key, run.name)}
-    waiting = [name for key, name in planned.items() if known.isdisjoint((key, name))]
+    waiting = [run.name for run in sweep.runs if run.status == "SCHEDULED"]
+    # An export has only the runs that have begun.
+    waiting += [name for key, name in planned.items() if known.isdisjoint((key, name))]
     if waiting:
-        short = ShortLabels.of(planned.values())
+        short = ShortLabels.of([*waiting, *(run.name for run in sweep.runs)])
         yield f"{in_runs(len(waiting))} not begun: {_listed([*map(short, waiting)])}."
     states = Counter(run.status for run in sweep.runs)
     for state, text in _STATES.items():
@@ -101,19 +96,6 @@ def _missing_evidence(sweep: Sweep, analyses: Sequence[StageAnalysis]) -> Iterat
         ]
         if unfinished and len(unfinished) < len(stage.conditions):
             yield f"Stage {stage.name}: no run of {_listed(unfinished)} has finished."
-
-
-def _missing_records(sweep: Sweep, undelivered: int) -> Iterator[str]:
-    if sweep.config is None:
-        yield (
-            "The configuration is not in MLflow (or its artefacts are not reachable from here), so "
-            "it is not known which runs are still to come."
-        )
-    if undelivered:
-        yield (
-            f"Not everything of {in_runs(undelivered)} has reached MLflow yet; send it with "
-            "`python -m music_rllib.tracking deliver` and the sweep's folder, then report again."
-        )
 
 
 def diverged(sweep: Sweep) -> list[str]:

@@ -111,7 +111,7 @@ def render(report: Report, *, live: bool = False) -> str:
 
 def _facts(report: Report) -> Sequence[tuple[str, object]]:
     sweep = report.sweep
-    finished = Counter(run.status for run in sweep.runs)["FINISHED"]
+    states = Counter(run.status for run in sweep.runs)
     stages = [analysis.stage for analysis in report.analyses]
     seeds = sorted(
         len({sweep.runs[run].seed for run in condition.runs})
@@ -124,7 +124,7 @@ def _facts(report: Report) -> Sequence[tuple[str, object]]:
         began = f"{datetime.fromtimestamp(sweep.started / 1000, UTC):%Y-%m-%d %H:%M UTC}"
     return (
         ("Sweep", state_in_words(sweep.status)),
-        ("Runs finished", f"{finished} of {len(sweep.runs)} begun"),
+        ("Runs finished", f"{states['FINISHED']} of {len(sweep.runs) - states['SCHEDULED']} begun"),
         ("Seeds per condition", " to ".join(map(str, ends)) or DASH),
         ("Tasks", ", ".join(dict.fromkeys(t for s in stages for t in s.tasks)) or DASH),
         ("Began", began),

@@ -30,14 +30,12 @@ _MARKS = {"o": "●", "s": "■", "D": "◆", "^": "▲", "v": "▼", "P": "✚"
 
 @dataclass(frozen=True, kw_only=True)
 class Cell:
-    """A table cell with a layout, a code font or a link."""
+    """A table cell with a layout or a code font."""
 
     text: str
     kind: str = ""
     """CSS class: `number` (right-aligned), `long` (wraps over several lines) or empty."""
     code: bool = False
-    url: str | None = None
-    """Target of its link."""
 
 
 def number_cell(text: str) -> Cell:

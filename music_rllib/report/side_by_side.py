@@ -24,7 +24,9 @@ def side_by_side(first: Sweep, second: Sweep) -> Sweep:
     """All runs of both sweeps; stage names begin with the sweep, so that stages are compared."""
     titles = _titles(first, second)
     both = merged(_renamed(first, titles[0]), _renamed(second, titles[1]))
-    return replace(both, name=" and ".join(titles), config=None, plans=(), searches=())
+    return replace(
+        both, name=" and ".join(titles), config=None, plans=(), searches=(), earlier=None
+    )
 
 
 def _titles(first: Sweep, second: Sweep) -> tuple[str, str]:

@@ -13,9 +13,8 @@ from music_rllib.envs.tasks import Task
 from music_rllib.errors import first_line
 from music_rllib.report.figures.choice import slug
 from music_rllib.results.analysis import StageAnalysis
-from music_rllib.results.data import ReportError, RunRecord, Sweep
-from music_rllib.results.from_mlflow import download_policy
-from music_rllib.tracking.store import TrackingStore
+from music_rllib.results.data import RunRecord, Sweep
+from music_rllib.store.paths import below
 
 if TYPE_CHECKING:
     from music_rllib.policy.policy import Policy
@@ -60,16 +59,23 @@ class Films:
 def make_films(
     sweep: Sweep,
     analyses: Sequence[StageAnalysis],
-    store: TrackingStore | None,
+    storage: str | None,
     seed: int,
     environments: Sequence[Task] = (),
 ) -> Films:
     """Film the last stage's policies on the built-in tasks and in the user's `environments`.
 
     It never fails: the result says why a video is missing.
+
+    Args:
+        sweep: the sweep.
+        analyses: the statistics of its stages.
+        storage: the storage that has the policies; None for an exported sweep.
+        seed: the seed of the episodes.
+        environments: tasks of the user.
     """
-    if store is None:
-        return Films(why_not="an exported sweep has no policies; report on the sweep in MLflow")
+    if storage is None:
+        return Films(why_not="an exported sweep has no policies; report on the sweep itself")
     chosen = list(_median_runs(sweep, analyses))
     if not chosen:
         return Films(why_not="no run that was evaluated has finished")
@@ -78,7 +84,7 @@ def make_films(
     for q, run in chosen:
         try:
             with TemporaryDirectory() as folder:
-                policy = _policy(store, sweep.experiment_id, run, Path(folder), environments)
+                policy = _policy(storage, run, environments)
                 films.append(_film(policy, run, q, seed, Path(folder)))
         # An environment may raise anything, and no video is worth losing the report.
         except Exception as error:
@@ -113,19 +119,10 @@ def _median_runs(
                 yield q, sweep.runs[median]
 
 
-def _policy(
-    store: TrackingStore,
-    experiment_id: str,
-    run: RunRecord,
-    folder: Path,
-    environments: Sequence[Task],
-) -> Policy:
+def _policy(storage: str, run: RunRecord, environments: Sequence[Task]) -> Policy:
     from music_rllib.policy.policy import load_policy
 
-    file = download_policy(store, experiment_id, run.run_id, folder)
-    if file is None:
-        raise ReportError("no policy is logged with it")
-    return load_policy(file, environments)
+    return load_policy(below(storage, f"nodes/{run.node_key}"), environments)
 
 
 def _film(policy: Policy, run: RunRecord, q: str, seed: int, folder: Path) -> Film:

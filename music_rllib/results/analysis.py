@@ -6,7 +6,6 @@ threshold take every run as far as it went: one that failed or is still running 
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -16,7 +15,13 @@ import numpy as np
 from music_rllib import names
 from music_rllib.results import statistics as st
 from music_rllib.results.comparison import ALL_TASKS, Scope, scopes_of
-from music_rllib.results.conditions import Condition, Stage, find_stages, stage_by_stage
+from music_rllib.results.conditions import (
+    Condition,
+    Stage,
+    final_scores,
+    find_stages,
+    stage_by_stage,
+)
 from music_rllib.results.data import Ints, Sweep
 from music_rllib.results.statistics import Array, Estimate
 from music_rllib.results.time_to_threshold import (
@@ -117,14 +122,7 @@ def _analyse(
     cut_at = cut_at or {}
     ended = sweep.until(cut_at) if cut_at else sweep
     metrics = {task: sweep.primary_metric(task) for task in stage.tasks}
-    scopes = scopes_of(
-        metrics,
-        [
-            (condition, _final_scores(ended, condition, metrics), ended.episodes(condition.runs))
-            for condition in stage.conditions
-        ],
-        stage.compared,
-    )
+    scopes = stage_scopes(ended, stage)
     cells = [
         (task, threshold)
         for task, metric in metrics.items()
@@ -150,12 +148,27 @@ def _analyse(
     )
 
 
+def stage_scopes(
+    sweep: Sweep, stage: Stage, metric: str | None = None
+) -> tuple[Scope[Condition], ...]:
+    """Comparisons of a stage's conditions by the last values of a metric.
+
+    Without `metric`, by each task's primary one.
+    """
+    metrics = {task: metric or sweep.primary_metric(task) for task in stage.tasks}
+    scored = [
+        (condition, final_scores(sweep, condition, metrics), sweep.episodes(condition.runs))
+        for condition in stage.conditions
+    ]
+    return scopes_of(metrics, scored, stage.compared)
+
+
 def _entropies(sweep: Sweep, condition: Condition, stage: Stage, scope: str) -> Entropies:
     tasks = stage.tasks if scope == ALL_TASKS else (scope,)
     runs = tuple(run for run in condition.runs if sweep.runs[run].task in tasks)
     estimates = []
     for metric in (names.SHANNON_ENTROPY, names.ENTROPY):
-        scores = _final_scores(sweep, replace(condition, runs=runs), dict.fromkeys(tasks, metric))
+        scores = final_scores(sweep, replace(condition, runs=runs), dict.fromkeys(tasks, metric))
         complete = scores[~np.isnan(scores).any(axis=1)]
         estimates.append(st.estimate(complete) if len(complete) else None)
     return Entropies(*estimates)
@@ -175,23 +188,6 @@ def analyse_stages(sweep: Sweep, stages: Sequence[Stage]) -> StageAnalysis | Non
         if len([budget for budget in budgets if np.isfinite(budget)]) > 1:
             cut_at[task] = min(sweep.least_end(task, one.runs) for one in together.compared)
     return _analyse(sweep, together, cut_at)
-
-
-def _final_scores(sweep: Sweep, condition: Condition, metrics: Mapping[str, str]) -> Array:
-    """Last values of finished runs, `[seeds, T]`, NaN where there is none."""
-    tasks = list(metrics)
-    rows: dict[tuple[str, int], Array] = {}
-    seen: Counter[tuple[str, str]] = Counter()
-    for run in condition.runs:
-        record = sweep.runs[run]
-        # A condition of several q has a seed several times, in the same order on every task.
-        key = (record.seed, seen[record.seed, record.task])
-        seen[record.seed, record.task] += 1
-        row = rows.setdefault(key, np.full(len(tasks), np.nan))
-        score = sweep.final(run, metrics[record.task])
-        if record.is_finished and score is not None:
-            row[tasks.index(record.task)] = score
-    return np.array(list(rows.values())).reshape(len(rows), len(tasks))
 
 
 def _waits(sweep: Sweep, stage: Stage, task: str, threshold: float) -> Iterator[Wait]:

@@ -1,18 +1,21 @@
 """Conditions of a sweep: runs that differ in their task and seed only.
 
-A run's settings are its params in MLflow. What varies between a stage's runs on the same task tells
+What varies between a stage's runs on the same task tells
 its conditions apart, and so does what they start from. Runs are grouped by that and not by the
 number of their trial, which changes when a sweep is extended.
 """
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from music_rllib import names
 from music_rllib.results.data import RunRecord, Sweep
+from music_rllib.results.statistics import Array
 
 Values = tuple[tuple[str, str], ...]
 """(setting, value) pairs."""
@@ -49,6 +52,11 @@ class Condition:
     """Positions in `Sweep.runs`."""
 
     @property
+    def is_fresh(self) -> bool:
+        """Whether its runs are those of a search on fresh seeds."""
+        return (SEEDS, FRESH) in self.others
+
+    @property
     def label(self) -> str:
         """`q = 1.5, α = 0.1`."""
         pairs = ((ENTROPIC_INDEX, self.entropic_index), *self.others)
@@ -78,7 +86,7 @@ class Stage:
         """
         if not self.is_search:
             return self.conditions
-        return tuple(one for one in self.conditions if (SEEDS, FRESH) in one.others)
+        return tuple(one for one in self.conditions if one.is_fresh)
 
     @property
     def has_task_reward(self) -> bool:
@@ -171,6 +179,23 @@ def find_stages(sweep: Sweep) -> list[Stage]:
         _stage(sweep.runs, name, runs, {run: told_apart_by(run) for run in runs})
         for name, runs in stages.items()
     ]
+
+
+def final_scores(sweep: Sweep, condition: Condition, metrics: Mapping[str, str]) -> Array:
+    """Last values of finished runs, `[seeds, T]`, NaN where there is none."""
+    tasks = list(metrics)
+    rows: dict[tuple[str, int], Array] = {}
+    seen: Counter[tuple[str, str]] = Counter()
+    for run in condition.runs:
+        record = sweep.runs[run]
+        # A condition of several q has a seed several times, in the same order on every task.
+        key = (record.seed, seen[record.seed, record.task])
+        seen[record.seed, record.task] += 1
+        row = rows.setdefault(key, np.full(len(tasks), np.nan))
+        score = sweep.final(run, metrics[record.task])
+        if record.is_finished and score is not None:
+            row[tasks.index(record.task)] = score
+    return np.array(list(rows.values())).reshape(len(rows), len(tasks))
 
 
 def _stage(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -101,10 +101,10 @@ class RunRecord:
     """One run of the sweep."""
 
     run_id: str
-    """Id of the run in MLflow."""
+    """Key of the run's node; in exports of earlier versions its id in MLflow."""
     name: str
     status: str
-    """Status in MLflow's words: RUNNING, FINISHED, FAILED, KILLED, SCHEDULED."""
+    """RUNNING, FINISHED, FAILED, KILLED or SCHEDULED."""
     started: int | None = None
     """Start in ms since the epoch."""
     ended: int | None = None
@@ -153,8 +153,8 @@ class RunRecord:
 
     @property
     def seconds(self) -> float | None:
-        """Time from start to end, pauses included; None where it has not ended."""
-        over = self.status not in {"RUNNING", "SCHEDULED"}  # MLflow keeps the end before a resume
+        """Time from start to last report, pauses included; None where it has not ended."""
+        over = self.status not in {"RUNNING", "SCHEDULED"}
         if not over or self.started is None or self.ended is None:
             return None
         return (self.ended - self.started) / 1000
@@ -166,12 +166,13 @@ class Sweep:
 
     name: str
     status: str = ""
-    """Status of the sweep's own run in MLflow."""
+    """Status of the sweep, in the words of :class:`RunRecord`."""
     run_id: str = ""
+    """As `experiment_id`, only in exports of earlier versions: those of MLflow."""
     experiment_id: str = ""
     started: int | None = None
     source: str = ""
-    """Place that the sweep was read from, such as MLflow's URI without a password."""
+    """Storage that the sweep was read from, without a password."""
     tags: Mapping[str, str] = field(default_factory=dict, repr=False)
     config: str | None = field(default=None, repr=False)
     """The configuration as YAML; None where it was not kept."""
@@ -181,6 +182,8 @@ class Sweep:
     """Content of `search.json`: trials, importance and ranking of each search."""
     plans: Sequence[PlanVersion] = field(default=(), repr=False)
     """Versions of the analysis plan, in the order of their times."""
+    earlier: str | None = None
+    """A sentence about the runs of earlier plans, which are not part of the sweep."""
 
     def column(self, run: int, metric: str) -> Column:
         """The values of a metric of `runs[run]`; empty where it has none."""
@@ -219,6 +222,18 @@ class Sweep:
         values = self.column(run, metric).value
         return float(values[-1]) if len(values) and np.isfinite(values[-1]) else None
 
+    def having(self, wanted: Callable[[RunRecord], bool]) -> Sweep:
+        """The sweep with the runs that are `wanted`."""
+        kept = np.array([wanted(run) for run in self.runs], dtype=bool)
+        position = np.cumsum(kept) - 1
+        history = {
+            metric: replace(chosen, run=position[chosen.run])
+            for metric, column in self.history.items()
+            if len((chosen := column.select(kept[column.run])).run)
+        }
+        runs = [run for run, is_kept in zip(self.runs, kept, strict=True) if is_kept]
+        return replace(self, runs=runs, history=history)
+
     def on(self, task: str) -> list[int]:
         """Positions of the runs on a task."""
         return [position for position, run in enumerate(self.runs) if run.task == task]
@@ -256,9 +271,3 @@ class Sweep:
         least = self.least_budget(task, own)
         ends = (self.last_step(run) for run in own if self.runs[run].budget == least)
         return max([least, *ends])
-
-    def url(self, run_id: str) -> str | None:
-        """The page of a run, where a server shows it."""
-        if not self.source.startswith(("http://", "https://")):
-            return None
-        return f"{self.source.rstrip('/')}/#/experiments/{self.experiment_id}/runs/{run_id}"

@@ -18,10 +18,12 @@ from music_rllib.config.schema import Stage
 from music_rllib.config.search.settings import SearchSettings
 from music_rllib.experiment.plan import Plan, short
 from music_rllib.labels import in_runs, symbol
+from music_rllib.results import statistics as st
 from music_rllib.results.comparison import with_interval
-from music_rllib.results.from_store import Condition, conditions, entropies
+from music_rllib.results.conditions import Condition, final_scores, find_stages
+from music_rllib.results.data import Sweep
+from music_rllib.results.statistics import Estimate
 from music_rllib.search.objective import interval
-from music_rllib.store.run_record import RunResult
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,16 +39,16 @@ class Measure:
         return names.word_of(self.metric)
 
 
-def measure_of(stage: Stage, plan: Plan, results: Mapping[str, RunResult]) -> Measure:
+def measure_of(stage: Stage, sweep: Sweep) -> Measure:
     """A stage's measure: the metric of its search, else that of its tasks.
 
     The metric of a search is not taken where no run has reported it, as with the budget.
     """
     if stage.search is not None:
         objective = stage.search.objectives[0]
-        done = (results[r.key] for r in plan.runs if r.stage == stage.name and r.key in results)
-        reported = {name for result in done for name in result.metrics}
-        if objective.metric in reported or not reported:
+        own = enumerate(sweep.runs)
+        done = [at for at, run in own if run.stage == stage.name and run.is_finished]
+        if not done or any(len(sweep.column(at, objective.metric).step) for at in done):
             # Fewer steps to a threshold is better, and so is more of what has the threshold.
             maximised = objective.maximised or objective.read == "steps_to"
             return Measure(metric=objective.metric, maximised=maximised)
@@ -92,9 +94,45 @@ def leader(search: Mapping[str, Any]) -> Leader | None:
     )
 
 
-def best_of(candidates: Iterable[Condition], measure: Measure) -> Condition | None:
+@dataclass(frozen=True, kw_only=True)
+class Scored:
+    """A condition of a stage with the mean of its scores."""
+
+    condition: Condition
+    values: Mapping[str, Any]
+    """Settings that differ between the stage's conditions, as the plan has them."""
+    estimate: Estimate
+    """Mean over the tasks that have a result, with its 95 % interval."""
+    runs: int
+    """Number of its runs that have a score."""
+    complete: bool
+    """Whether every planned run is finished, whatever it reported."""
+
+
+def scored_conditions(stage: str, plan: Plan, sweep: Sweep, metric: str) -> list[Scored]:
+    """The conditions of a stage that have a score by a metric."""
+    found = []
+    for condition in (c for one in find_stages(sweep) if one.name == stage for c in one.conditions):
+        tasks = dict.fromkeys(sweep.runs[run].task for run in condition.runs)
+        scores = final_scores(sweep, condition, dict.fromkeys(tasks, metric))
+        known = scores[:, ~np.isnan(scores).all(axis=0)]
+        if known.size:
+            episodes = sweep.episodes(condition.runs) if metric in names.EVAL_RATES else None
+            found.append(
+                Scored(
+                    condition=condition,
+                    values=plan.node(sweep.runs[condition.runs[0]].node_key).values,
+                    estimate=st.estimate(known, episodes),
+                    runs=int(np.sum(~np.isnan(known))),
+                    complete=all(sweep.runs[run].is_finished for run in condition.runs),
+                )
+            )
+    return found
+
+
+def best_of(candidates: Iterable[Scored], measure: Measure) -> Scored | None:
     """The condition with the best mean, among those that have all their runs if there are any."""
-    pairs = [(float(condition.estimate().value), condition) for condition in candidates]
+    pairs = [(float(scored.estimate.value), scored) for scored in candidates]
     pairs = [pair for pair in pairs if math.isfinite(pair[0])]
     pairs = [pair for pair in pairs if pair[1].complete] or pairs
     sign = 1.0 if measure.maximised else -1.0
@@ -104,35 +142,51 @@ def best_of(candidates: Iterable[Condition], measure: Measure) -> Condition | No
 def best_so_far(
     stages: Sequence[Stage],
     plan: Plan,
-    results: Mapping[str, RunResult],
+    sweep: Sweep,
     searches: Sequence[Mapping[str, Any]],
 ) -> dict[str, Any] | None:
     """The best condition of the last of `stages` that has one, as plain data.
 
-    `results` are by node key, and `searches` is the `outcome` of the sweep's searches so far.
+    `sweep` has the runs of the plan, and `searches` is the `outcome` of its searches so far.
     """
     by_stage = {search["stage"]: search for search in searches}
     for stage in reversed(stages):
         if stage.search is None:
-            best, part = _best_condition(stage, plan, results), ""
+            best = _best_condition(stage, plan, sweep)
         else:
             best = _best_trial(stage, stage.search, by_stage.get(stage.name))
-            part = "final" if best and best["on_fresh_seeds"] else "search"
         if best is not None:
-            random = entropies(plan, results, stage.name, part, best["values"])
-            return best | {"entropies": random}
+            return best | {"entropies": _entropies(stage, plan, sweep, best)}
     return None
 
 
-def _best_condition(
-    stage: Stage, plan: Plan, results: Mapping[str, RunResult]
-) -> dict[str, Any] | None:
-    measure = measure_of(stage, plan, results)
-    candidates = [c for c in conditions(plan, results, measure.metric) if c.stage == stage.name]
+def _entropies(
+    stage: Stage, plan: Plan, sweep: Sweep, best: Mapping[str, Any]
+) -> dict[str, dict[str, Any]]:
+    """Entropies of a condition's policies at the end: metric to `value` and `interval`."""
+    found = {}
+    for metric in names.ENTROPIES:
+        for scored in scored_conditions(stage.name, plan, sweep, metric):
+            if is_of(scored, stage, best):
+                estimate = scored.estimate
+                interval = [float(estimate.lower), float(estimate.upper)]
+                found[metric] = {"value": float(estimate.value), "interval": interval}
+    return found
+
+
+def is_of(scored: Scored, stage: Stage, best: Mapping[str, Any]) -> bool:
+    """Whether a stage's condition is the one that :func:`best_so_far` has described."""
+    same_seeds = stage.search is None or scored.condition.is_fresh == best["on_fresh_seeds"]
+    return bool(same_seeds and dict(scored.values) == best["values"])
+
+
+def _best_condition(stage: Stage, plan: Plan, sweep: Sweep) -> dict[str, Any] | None:
+    measure = measure_of(stage, sweep)
+    candidates = scored_conditions(stage.name, plan, sweep, measure.metric)
     best = best_of(candidates, measure)
     if best is None:
         return None
-    estimate = best.estimate()
+    value, planned = float(best.estimate.value), len(best.condition.runs)
     rivals = (c for c in candidates if c is not best and c.complete == best.complete)
     return {
         "stage": stage.name,
@@ -140,11 +194,11 @@ def _best_condition(
         "by": measure.word,
         "metric": measure.metric,
         "direction": "maximize",
-        "value": float(estimate.value),
-        "level": sum(float(c.estimate().value) == float(estimate.value) for c in rivals),
-        "interval": [float(estimate.lower), float(estimate.upper)],
-        "runs": best.planned if best.complete else len(best.runs),
-        "planned": best.planned,
+        "value": value,
+        "level": sum(float(c.estimate.value) == value for c in rivals),
+        "interval": [float(best.estimate.lower), float(best.estimate.upper)],
+        "runs": planned if best.complete else best.runs,
+        "planned": planned,
         "on_fresh_seeds": False,
     }
 

@@ -20,9 +20,10 @@ import shutil
 import uuid
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import pyarrow.fs as pafs
 
@@ -33,8 +34,12 @@ from music_rllib.store.run_record import HISTORY, Report, RunResult, from_json_l
 from music_rllib.store.verified import Verified, fingerprint_of
 
 FORMAT = "music_rllib checkpoint 2"
+K = TypeVar("K")
+V = TypeVar("V")
 KEEP = 2
 """Number of checkpoints of a run that are kept by default."""
+READERS = 16
+"""Largest number of requests to a bucket at a time."""
 SHOWN = 10
 """Number of damaged runs that a message names."""
 CONTINUATIONS = "continuations"
@@ -63,6 +68,10 @@ class NodeStore:
         """Whether the node has been published."""
         return self._nodes.exists(key)
 
+    def finished(self, keys: Iterable[str]) -> set[str]:
+        """The published nodes among `keys`, from one request for all of them."""
+        return self._nodes.existing(dict.fromkeys(keys))
+
     def result(self, key: str) -> RunResult | None:
         """The result of a finished run; None for an imported handoff."""
         with self._advice():
@@ -87,19 +96,33 @@ class NodeStore:
         """Fingerprint of the environment that a finished run used; None: it is not known."""
         return _environment(self._nodes.manifest(key))
 
+    def lines(self, key: str) -> tuple[bytes, dict[str, str], Fingerprint | None]:
+        """The `HISTORY` of a finished run, and its code and environment as `publish` got them."""
+        manifest = self._nodes.manifest(key)
+        known = manifest.meta.get("provenance")
+        provenance = known.items() if isinstance(known, dict) else ()
+        lines = self._nodes.read(key, HISTORY, manifest)
+        return lines, {k: str(value) for k, value in provenance}, _environment(manifest)
+
     def publish(
         self,
         key: str,
         folder: Path,
         result: RunResult | None = None,
         environment: Fingerprint | None = None,
+        provenance: Mapping[str, str] | None = None,
     ) -> None:
-        """Copy the files of `folder` to the node `key`, unless it exists already."""
+        """Copy the files of `folder` to the node `key`, unless it exists already.
+
+        `provenance` are tags that name the code that has made it.
+        """
         if self.is_finished(key):
             return
         meta: dict[str, Any] = {"result": None if result is None else result.model_dump()}
         if environment is not None:
             meta["environment"] = dict(environment)
+        if provenance is not None:
+            meta["provenance"] = dict(provenance)
         with self._nodes.sealing(key, meta) as staging:
             # The modes of a temporary folder, which only its owner may read, are not copied.
             for file in filter(Path.is_file, folder.rglob("*")):
@@ -139,20 +162,32 @@ class NodeStore:
         On a disk, a node that was sound before and whose files have the same inodes, sizes and
         times is not read again.
         """
-        damaged = {}
-        for key in keys:
-            try:
-                fingerprint = self._fingerprint(key)
-                if not self._verified.has(key, fingerprint):
-                    self._check(key)
-                    self._verified.add(key, fingerprint)
-            except DamagedError as error:
-                damaged[key] = error
-            except OSError as error:
-                place = error.filename or self.path(key)
-                damaged[key] = DamagedError(f"{place} must be readable: {error.strerror}")
+        keys = list(keys)
+        errors = zip(keys, self.map(self._damage_of, keys), strict=True)
+        damaged = {key: error for key, error in errors if error is not None}
         self._verified.save()
         return damaged
+
+    def map(self, read: Callable[[K], V], keys: Iterable[K]) -> Iterator[V]:
+        """`read` of each key, in order; several at once where each has to be fetched."""
+        if self._local:
+            yield from map(read, keys)
+            return
+        with ThreadPoolExecutor(READERS) as pool:
+            yield from pool.map(read, keys)
+
+    def _damage_of(self, key: str) -> DamagedError | None:
+        try:
+            fingerprint = self._fingerprint(key)
+            if not self._verified.has(key, fingerprint):
+                self._check(key)
+                self._verified.add(key, fingerprint)
+        except DamagedError as error:
+            return error
+        except OSError as error:
+            place = error.filename or self.path(key)
+            return DamagedError(f"{place} must be readable: {error.strerror}")
+        return None
 
     def _fingerprint(self, key: str) -> str | None:
         if not self._local:
@@ -315,10 +350,14 @@ class WorkFolder:
 
     def history(self) -> list[Report]:
         """Reports of the newest checkpoint whose history is sound; [] if there is none."""
+        return from_json_lines(self.lines())
+
+    def lines(self) -> bytes:
+        """The `HISTORY` of the newest checkpoint that has a sound one; empty if there is none."""
         for name in reversed(self._checkpoints.names()):
-            with contextlib.suppress(DamagedError, ValueError):
-                return from_json_lines(self._checkpoints.read(name, HISTORY))
-        return []
+            with contextlib.suppress(DamagedError, FileNotFoundError):
+                return self._checkpoints.read(name, HISTORY)
+        return b""
 
     def tidy(self) -> None:
         """Delete what killed attempts have left; the caller must hold the lease."""

@@ -16,7 +16,7 @@ import os
 import shutil
 import tempfile
 import uuid
-from collections.abc import Callable, Container, Iterator
+from collections.abc import Callable, Container, Iterable, Iterator
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, Literal
 from urllib.parse import quote
@@ -141,11 +141,17 @@ class ObjectFolders:
         """Sorted names of the sealed folders."""
         selector = pafs.FileSelector(self._root, allow_not_found=True)
         folders = [info.base_name for info in self._fs.get_file_info(selector) if not info.is_file]
-        return sorted(name for name in folders if not name.startswith(".") and self.exists(name))
+        return sorted(self.existing(name for name in folders if not name.startswith(".")))
 
     def exists(self, name: str) -> bool:
         """Whether the folder has been sealed; it may have been damaged since."""
-        return bool(self._fs.get_file_info(f"{self.path(name)}/{MANIFEST}").is_file)
+        return name in self.existing([name])
+
+    def existing(self, names: Iterable[str]) -> set[str]:
+        """The sealed folders among `names`, from one request for all of them."""
+        names = list(names)
+        infos = self._fs.get_file_info([f"{self.path(name)}/{MANIFEST}" for name in names])
+        return {name for name, info in zip(names, infos, strict=True) if info.is_file}
 
     def manifest(self, name: str) -> Manifest:
         """The manifest of a folder."""
@@ -227,9 +233,9 @@ class ObjectFolders:
         with self._fs.open_output_stream(f"{self.path(name)}/{MANIFEST}") as sink:
             sink.write(manifest.model_dump_json(indent=1).encode())
 
-    def read(self, name: str, file: str) -> bytes:
-        """The verified content of one small file."""
-        manifest = self.manifest(name)
+    def read(self, name: str, file: str, manifest: Manifest | None = None) -> bytes:
+        """The verified content of one small file; the folder's `manifest` is read if not given."""
+        manifest = manifest or self.manifest(name)
         if file not in manifest.files:
             raise DamagedError(f"{self.path(name)} must have {file}, it hasn't")
         content = io.BytesIO()

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, TypeAdapter
 
 HISTORY = "history.jsonl"
 """File of a run's reports in its node and in each checkpoint, one JSON object per line."""
@@ -37,6 +36,9 @@ class RunResult(BaseModel):
     """The last reported value of each metric."""
 
 
+_REPORTS = TypeAdapter(list[Report])
+
+
 def to_json_lines(reports: Iterable[Report]) -> bytes:
     """Reports as JSON, one per line."""
     return b"".join(report.model_dump_json().encode() + b"\n" for report in reports)
@@ -48,7 +50,7 @@ def from_json_lines(data: bytes) -> list[Report]:
     Raises:
         ValueError: A line is no report.
     """
-    return [Report.model_validate(json.loads(line)) for line in data.splitlines()]
+    return _REPORTS.validate_json(b"[%s]" % b",".join(data.splitlines()))
 
 
 def last_values(reports: Iterable[Report]) -> dict[str, float]:

@@ -307,8 +307,10 @@ def _compute_and_report(console: Console, opened: Sweep, tracker: Tracker) -> in
             from music_rllib.sweep.searches import begin_searches, end_searches
 
             controller = begin_searches(opened, display, mlflow_log, state_file)
+        tracker.keep_current(node.key for node in opened.plan.nodes)
         stopped_by = _compute(opened, display, mlflow_log, state_file, controller)
         searches = [] if controller is None else end_searches(opened, controller, tracker)
+        tracker.keep_current(node.key for node in opened.plan.nodes)  # with trials since then
         failed = (
             bool(opened.scheduler.having(Status.FAILED, Status.SKIPPED))
             or bool(_lost_trials(searches))

@@ -56,9 +56,11 @@ def report_at_end(storage: str, name: str, tracking_uri: str | None, config: Pat
     except (OSError, subprocess.TimeoutExpired) as error:
         reason = redact(str(error))
     else:
-        lines = (done.stdout if done.returncode == 0 else done.stderr).strip().splitlines()
-        if done.returncode == 0 and lines:
-            return "\n".join(lines[-2 if lines[-1].startswith("Picture: ") else -1 :])
-        reason = lines[-1] if lines else f"it ended with {done.returncode}"
+        marks = ("Report: ", "Picture: ")
+        made = [line for line in done.stdout.splitlines() if line.startswith(marks)]
+        errors = done.stderr.strip().splitlines()
+        if made:  # also where it could not be attached, or where runs are damaged
+            return "\n".join(made if done.returncode == 0 else [*made, *errors[-1:]])
+        reason = errors[-1] if errors else f"it ended with {done.returncode}"
     place = below(redact(storage), name)
     return f"No report: {reason}. Make it with: python -m music_rllib.report {place}"

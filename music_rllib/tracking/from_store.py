@@ -75,6 +75,7 @@ def deliver(place: str, tracking_uri: str | None, timeout: float) -> Pending:
         storage=location.storage,
         config=location.document(),
         tracking_uri=tracking_uri or record.tracking_uri,
+        plan=record.plan,
     )
     outcome = state["driver"]["outcome"] if state else ""
     causes = {failure["run"]: failure["cause"] for failure in state["failures"]} if state else {}
@@ -86,6 +87,7 @@ def deliver(place: str, tracking_uri: str | None, timeout: float) -> Pending:
         ):
             if (document := location.read(file)) is not None:
                 tracker.put_sweep_artefact(name, sweep_files.as_json(document))
+        tracker.keep_current(node.key for node in sweep.plan.nodes)
         for node in sweep.plan.nodes:
             if sweep.store.is_finished(node.key):
                 info = run_info(node, sweep.store.environment(node.key))

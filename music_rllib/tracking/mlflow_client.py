@@ -6,7 +6,7 @@ import logging
 import os
 import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Literal, NamedTuple
@@ -85,6 +85,10 @@ class KnownRun(NamedTuple):
     """Whether it is finished and all of its data has arrived."""
     environment: str = ""
     """Its `names.TAG_ENVIRONMENT`."""
+    current: str = names.CURRENT
+    """`names.TAG_CURRENT`; empty for runs of earlier versions of this package."""
+    parent: str = ""
+    """Id of the parent run; empty for one that this object has created."""
 
 
 class Experiment:
@@ -94,10 +98,13 @@ class Experiment:
     store refuses that. Every method but `known_id` asks the server, and raises MLflow's errors.
     """
 
-    def __init__(self, store: TrackingStore, name: str, sweep_id: str) -> None:
+    def __init__(self, store: TrackingStore, name: str, sweep_id: str, plan: str) -> None:
         self._store = store
         self._name = name
         self._sweep_id = sweep_id
+        self._plan = plan
+        self._earlier: list[KnownRun] = []
+        """Parent runs of other plans of the sweep."""
         self._known: dict[str, KnownRun] | None = None
         """Runs by node key ("" for the sweep's own run); None until the server has listed them."""
         _configure_mlflow()
@@ -142,8 +149,9 @@ class Experiment:
         """A new run that began at `time` (ms since the epoch), for a node or the sweep itself."""
         kind = names.KIND_RUN if node_key else names.KIND_SWEEP
         identity = {names.TAG_KIND: kind, names.TAG_SWEEP_ID: self._sweep_id}
-        if node_key:
-            identity[names.TAG_NODE_KEY] = node_key
+        identity[names.TAG_CURRENT] = names.CURRENT
+        own = (names.TAG_NODE_KEY, node_key) if node_key else (names.TAG_PLAN, self._plan)
+        identity |= [own]
         known, self._known = self._known or {}, None  # listed again if the response gets lost
         run = self._client.create_run(
             self.id, start_time=time, tags={**tags, **identity}, run_name=name
@@ -157,6 +165,7 @@ class Experiment:
         """The sweep's runs by node key; the older run where two have the same key."""
         wanted, token = f"tags.`{names.TAG_SWEEP_ID}` = '{self._sweep_id}'", None
         known: dict[str, KnownRun] = {}
+        self._earlier = []
         while True:
             page = self._client.search_runs(
                 [self.id],
@@ -169,12 +178,52 @@ class Experiment:
                 tags = run.data.tags
                 complete = run.info.status == "FINISHED" and names.TAG_INCOMPLETE not in tags
                 node_key = tags.get(names.TAG_NODE_KEY, "")
-                environment = tags.get(names.TAG_ENVIRONMENT, "")
-                found = KnownRun(run.info.run_id, run.info.start_time, complete, environment)
-                known.setdefault(node_key, found)
+                found = KnownRun(
+                    run.info.run_id,
+                    run.info.start_time,
+                    complete,
+                    environment=tags.get(names.TAG_ENVIRONMENT, ""),
+                    current=tags.get(names.TAG_CURRENT, ""),
+                    parent=tags.get(names.TAG_PARENT_RUN, ""),
+                )
+                if node_key or tags.get(names.TAG_PLAN) == self._plan:
+                    known.setdefault(node_key, found)
+                else:
+                    self._earlier.append(found)
             token = page.token
             if not token:
                 return known
+
+    def keep_current(self, node_keys: Collection[str]) -> None:
+        """Mark the runs of these nodes, and the sweep's own run, as current, and no others.
+
+        A run of an earlier plan that is current again becomes a child of the current parent run.
+        """
+        parent = self.find("")
+        of_plan = {} if parent is None else {names.TAG_PARENT_RUN: parent.run_id}
+        for node_key, run in list((self._known or {}).items()):
+            if not node_key:
+                self._mark(run, {names.TAG_CURRENT: names.CURRENT})
+            elif node_key in node_keys:
+                self._mark(run, {names.TAG_CURRENT: names.CURRENT, **of_plan})
+            else:
+                self._mark(run, {names.TAG_CURRENT: names.SUPERSEDED})
+        for run in self._earlier:
+            self._mark(run, {names.TAG_CURRENT: names.SUPERSEDED})
+
+    def _mark(self, run: KnownRun, tags: Mapping[str, str]) -> None:
+        """Set the tags of a run that it does not have."""
+        has = {names.TAG_CURRENT: run.current, names.TAG_PARENT_RUN: run.parent}
+        changed = dict(tags.items() - has.items())
+        if run.parent == "" and run.current == names.CURRENT:  # created with all of them
+            changed.pop(names.TAG_PARENT_RUN, None)
+        if not changed:
+            return
+        try:
+            self.set_tags(run.run_id, changed)
+        except MlflowException as error:
+            if not is_lasting(error):  # else it was deleted
+                raise
 
     def last_steps(self, run_id: str) -> dict[str, int]:
         """Last step of each metric of the run."""
@@ -298,6 +347,14 @@ class Experiment:
                 "Restore it (mlflow experiments restore) or give the sweep another name."
             )
         return str(experiment.experiment_id)
+
+
+def attach(store: TrackingStore, run_id: str, folder: str, name: str, note: str) -> None:
+    """Upload a folder as a run's artefacts below `name`, and set the description of the run."""
+    _configure_mlflow()
+    client = _open_client(store)
+    client.log_artifacts(run_id, folder, name)
+    client.set_tag(run_id, names.TAG_NOTE, note)
 
 
 def mlflow_reason(error: Exception) -> str:

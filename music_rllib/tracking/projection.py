@@ -51,6 +51,13 @@ class End:
     tags: Mapping[str, str] = field(default_factory=dict)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Current:
+    """The sweep has the runs of these nodes, and no others that it may have had."""
+
+    node_keys: frozenset[str]
+
+
 class StoredRun(NamedTuple):
     """The data of a run in the store."""
 
@@ -61,7 +68,7 @@ class StoredRun(NamedTuple):
 
 
 ReadStoredRun = Callable[[], StoredRun]
-Event = Start | Report | End | ReadStoredRun
+Event = Start | Report | End | Current | ReadStoredRun
 Content = bytes | Callable[[], bytes | None]
 """A file's content, or a function that makes it before the upload; None if there is no file."""
 
@@ -109,6 +116,11 @@ class RunProjection:
             new = list(reports)
             self._reports += new
             self._events += new
+
+    def keep_current(self, node_keys: Iterable[str]) -> None:
+        """The sweep, whose own run this is, has the runs of these nodes and no others."""
+        with self._lock:
+            self._events.append(Current(node_keys=frozenset(node_keys)))
 
     def end(self, end: End) -> None:
         """The run ends without a result in the store; draws its learning curve."""
@@ -227,6 +239,8 @@ class RunProjection:
             self._log([])
             self._experiment.set_tags(run_id, {**first.tags, **self._source_tags()})
             self._experiment.end_run(run_id, first.status, first.time)
+        elif isinstance(first, Current):
+            self._experiment.keep_current(first.node_keys)
         elif isinstance(first, Report):
             self._log([event for event in events if isinstance(event, Report)])
         else:

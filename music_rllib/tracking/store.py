@@ -7,7 +7,7 @@ import shlex
 import shutil
 import socket
 import sys
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 from urllib.parse import unquote, urlsplit
@@ -79,6 +79,11 @@ class SweepRecord:
     sweep_id: str
     tracking_uri: str | None
     """URI without its password; None for the sqlite file in the storage."""
+    experiment_id: str = ""
+    run_id: str = ""
+    """MLflow's id of the parent run of the current plan; empty until it is known."""
+    plan: str = ""
+    """`names.TAG_PLAN` of that run."""
 
     @classmethod
     def read(cls, storage: str, sweep_name: str) -> Self | None:
@@ -92,7 +97,7 @@ class SweepRecord:
             record = sweep_files.read(storage, place)
             if record is None:
                 return None
-            return cls(**{field.name: record[field.name] for field in fields(cls)})
+            return cls(**{key: record[key] for key in cls.__dataclass_fields__ if key in record})
         except (StorageError, TypeError, KeyError) as error:
             raise TrackingError(
                 f"{redact(storage)}/{place} must hold a sweep's record, got: {error}"

@@ -13,7 +13,8 @@ import re
 import shlex
 import time
 import uuid
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -27,11 +28,12 @@ from music_rllib import names
 from music_rllib.errors import TrackingError
 from music_rllib.experiment.run_info import RunInfo
 from music_rllib.redaction import flat_params, redact, without_secrets
+from music_rllib.runtime.provenance import provenance_tags
+from music_rllib.store.files import content_key
 from music_rllib.store.paths import below, sweep_folder
 from music_rllib.store.run_record import Report
 from music_rllib.tracking.mlflow_client import Experiment, Status, check_metric_name, mlflow_reason
 from music_rllib.tracking.projection import End, RunProjection, Start, StoredRun
-from music_rllib.tracking.provenance import provenance_tags
 from music_rllib.tracking.sender import Pending, Sender
 from music_rllib.tracking.store import SweepRecord, check_reachable, mlflow_version, resolve_store
 
@@ -58,6 +60,7 @@ class Tracker:
         storage: str,
         config: Mapping[str, object],
         tracking_uri: str | None = None,
+        plan: str = "",
     ) -> None:
         """Check the store, create the experiment and the parent run, and start the thread.
 
@@ -67,6 +70,8 @@ class Tracker:
             config: All settings of the sweep; they become params and the artefact
                 `config/sweep.yaml` of the parent run.
             tracking_uri: `mlflow.tracking_uri`; None for a sqlite file in `storage`.
+            plan: Identifies the sweep's plan, which has a parent run of its own; by default the
+                hash of the settings that determine it.
 
         Raises:
             TrackingError: The store is not reachable or refuses, the storage is not writable, or
@@ -86,13 +91,18 @@ class Tracker:
             record = SweepRecord.read(storage, sweep_name)
             self.sweep_id = record.sweep_id if record else uuid.uuid4().hex[:16]
             self._sweep_tags = {names.TAG_SWEEP: sweep_name, names.TAG_SWEEP_ID: self.sweep_id}
-            SweepRecord(
+            record = SweepRecord(
                 sweep_name=sweep_name,
                 sweep_id=self.sweep_id,
                 tracking_uri=None if tracking_uri is None else self.store.public_uri,
-            ).write(storage)
-            self._experiment = Experiment(self.store, sweep_name, self.sweep_id)
+                plan=plan or _plan_key(config),
+            )
+            record.write(storage)  # before there is anything in MLflow to be found again
+            self._experiment = Experiment(self.store, sweep_name, self.sweep_id, record.plan)
             self._parent = self._parent_run(sweep_name, config)
+            replace(record, experiment_id=self.experiment_id, run_id=self.parent_run_id).write(
+                storage
+            )
         except BaseException:
             self._lock.release()
             raise
@@ -149,6 +159,11 @@ class Tracker:
             self._experiment.delete(node_key)
         except Exception as error:
             logger.warning("MLflow keeps the earlier run %s: %s", node_key, mlflow_reason(error))
+
+    def keep_current(self, node_keys: Iterable[str]) -> None:
+        """The sweep has the runs of these nodes: mark them, and those of earlier plans."""
+        self._parent.keep_current(node_keys)
+        self._sender.add(self._parent)
 
     def put_sweep_artefact(self, name: str, content: str) -> None:
         """Add or replace an artefact of the parent run."""
@@ -286,6 +301,16 @@ class Tracker:
 def _now() -> int:
     """Now, in ms since the epoch, as MLflow counts."""
     return round(time.time() * 1000)
+
+
+_NOT_PLANNED = {"storage", "resources", "mlflow", "checkpoints", "analysis"}
+"""Top-level settings that do not change which runs a sweep has."""
+
+
+def _plan_key(config: Mapping[str, object]) -> str:
+    """A hash of the settings that determine a sweep's runs."""
+    planned = {name: value for name, value in config.items() if name not in _NOT_PLANNED}
+    return content_key(json.loads(json.dumps(without_secrets(planned), default=str)))
 
 
 def _as_yaml(settings: Mapping[str, object]) -> bytes:

@@ -17,6 +17,7 @@ from music_rllib import names
 from music_rllib.config.run_settings import handed_over
 from music_rllib.experiment.continuation import budget_settings, continuation_key, is_continuable
 from music_rllib.redaction import redact
+from music_rllib.runtime.provenance import provenance_tags
 from music_rllib.store.handoff import Weights, read_handoff, write_handoff
 from music_rllib.store.lease import HeldLease, Lease, LeaseLostError
 from music_rllib.store.node_store import Draft, NodeStore, Saved, WorkFolder, steps_of
@@ -360,7 +361,8 @@ class RunTrainable(Trainable):
             folder = Path(temporary)
             (folder / HISTORY).write_bytes(to_json_lines(self._history))
             self._write_outcome(folder, training, training.modules())
-            self._store.publish(self._job.key, folder, result, self._environment.here)
+            environment = self._environment.here
+            self._store.publish(self._job.key, folder, result, environment, provenance_tags())
 
     def _write_outcome(
         self, folder: Path, training: TrainingRun, modules: Mapping[str, Mapping[str, Any]]

@@ -17,16 +17,18 @@ from music_rllib import names
 from music_rllib.config.load import load_sweep
 from music_rllib.experiment.plan import make_plan
 from music_rllib.experiment.run_info import run_info
+from music_rllib.experiment.session import keep_record, open_sweep
 from music_rllib.report.cli import app
 from music_rllib.results.archive.folder import read_archive
 from music_rllib.results.data import Sweep
 from music_rllib.store.run_record import Report
 from music_rllib.sweep.listeners.mlflow_view import VERSIONS, comparison_view
-from music_rllib.tracking.projection import StoredRun
+from music_rllib.tracking.from_store import finished_run
 from music_rllib.tracking.tracker import Tracker
 from tests.integration.conftest import REPOSITORY
 from tests.integration.devtools import Page
 from tests.integration.mlflow_server import MlflowServer, comparing
+from tests.played_search import publish
 
 NAME = "proof-fetch-push-her"
 
@@ -39,11 +41,13 @@ def log_published_sweep(folder: Path) -> str:
     config = load_sweep(file)
     plan = make_plan(config)
     of_seed = {(run.entropic_index, run.seed): number for number, run in enumerate(sweep.runs)}
+    opened = open_sweep(config, plan, str(folder), folder / NAME)
+    keep_record(opened)
     with Tracker(sweep_name=NAME, storage=str(folder), config=config.document) as tracker:
         for node in plan.nodes:
             key = (f"{node.values['tac.entropic_index']:g}", str(node.run.seed))
-            stored = StoredRun(_reports(sweep, of_seed[key]))
-            tracker.mirror(run_info(node), partial(StoredRun, *stored))
+            publish(opened, node, _reports(sweep, of_seed[key]))
+            tracker.mirror(run_info(node), partial(finished_run, opened.store, node))
         tracker.keep_view(comparison_view(plan, tracker.sweep_id, time.time()), VERSIONS)
         assert tracker.flush(60.0)
     arguments = [str(folder / NAME), "--attach", "--no-videos"]

@@ -32,7 +32,8 @@ from music_rllib.experiment.listener import Failure
 from music_rllib.experiment.location import find_sweep
 from music_rllib.experiment.run_info import RunInfo
 from music_rllib.policy import PolicyNetwork
-from music_rllib.report.location import find_sweep as find_report
+from music_rllib.report.build import PAGE
+from music_rllib.report.cli import main as report_on
 from music_rllib.store.node_store import NodeStore
 from music_rllib.store.run_record import HISTORY, Report, RunResult, last_values, to_json_lines
 from music_rllib.sweep.listeners.state_file import StateFile
@@ -236,7 +237,8 @@ def test_a_resumed_sweep_continues_its_runs(storage: Path, tracker_on: MakeTrack
     cut = runs_of(client)["finetune/a"]
     assert cut.info.status == "KILLED"
 
-    second = tracker_on(config={"name": "smoke", "seeds": [0, 1]})
+    resources = {"num_cpus": 2}  # which do not change what the sweep has
+    second = tracker_on(config={"name": "smoke", "seeds": [0], "resources": resources})
     second.start(run_info("a"))
     second.log("a", later(STEPS[:4]))  # its checkpoint's history, and what it does after that
     second.log("a", later(STEPS[4:]))
@@ -250,8 +252,42 @@ def test_a_resumed_sweep_continues_its_runs(storage: Path, tracker_on: MakeTrack
     assert runs["finetune/a"].info.status == "FINISHED"
     for metric in values(0):
         assert logged_steps(client, runs["finetune/a"], metric) == STEPS
-    assert runs["smoke"].data.params["seeds"] == "[0]"
-    assert runs["smoke"].data.tags[names.TAG_CHANGED_PREFIX + "seeds"] == "[0, 1]"
+    assert runs["smoke"].data.params == {
+        "name": "smoke",
+        "seeds": "[0]",
+        "resources.num_cpus": "2",
+    }
+
+
+def test_a_changed_plan_has_a_run_of_its_own_and_the_view_shows_its_runs_alone(
+    storage: Path, tracker_on: MakeTracker
+) -> None:
+    """Extended, and then back: params never change, and runs of other plans stay where they are."""
+    client, parents = client_of(storage), []
+    plans = ({"a": 600}, {"a": 600, "b": 600}, {"c": 1000}, {"a": 600, "b": 600})
+    for plan in plans:
+        tracker = tracker_on(
+            config={"name": "smoke", "runs": list(plan), "steps": [*plan.values()]}
+        )
+        parents.append(tracker.parent_run_id)
+        for key in plan:
+            tracker.mirror(run_info(key), stored([2000]))
+        tracker.keep_current(plan)
+        assert not tracker.close()
+        found = client.search_runs([tracker.experiment_id])
+        own = [run for run in found if run.data.tags[names.TAG_KIND] == names.KIND_SWEEP]
+        current = [run for run in found if run.data.tags[names.TAG_CURRENT] == names.CURRENT]
+        (parent,) = [run for run in own if run in current]
+        assert parent.info.run_id == tracker.parent_run_id
+        assert parent.data.params["steps"] == str([*plan.values()])
+        children = [run for run in current if run is not parent]
+        assert {run.data.tags[names.TAG_NODE_KEY] for run in children} == set(plan)
+        assert {run.data.tags[names.TAG_PARENT_RUN] for run in children} == {parent.info.run_id}
+        wanted = f"tags.{names.TAG_CURRENT} = '{names.CURRENT}' and tags.kind = 'run'"
+        assert len(client.search_runs([tracker.experiment_id], wanted)) == len(plan)
+    assert len(set(parents)) == 3
+    assert parents[3] == parents[1]
+    assert len(found) == 3 + 3, "each run is there once"
 
 
 def test_another_driver_that_has_the_storage_alone_goes_on_with_the_runs(
@@ -506,7 +542,10 @@ def test_a_deleted_run_does_not_hold_up_the_others(
 
 
 def test_the_command_sends_what_the_store_has(
-    storage: Path, tracker_on: MakeTracker, tmp_path: Path
+    storage: Path,
+    tracker_on: MakeTracker,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     folder = kept_sweep(storage)
     config = load_sweep(storage / "s.yaml")
@@ -529,7 +568,6 @@ def test_the_command_sends_what_the_store_has(
         state_file.end("failed")
     (folder / sweep_files.ANALYSIS_PLAN).write_text("[]")
 
-    assert find_report(str(folder), tracking_uri=None).undelivered == 1
     for _ in range(2):  # twice changes nothing
         done = CliRunner().invoke(app, ["deliver", str(folder)])
         assert (done.exit_code, done.stdout) == (0, f"MLflow has everything of {folder}\n")
@@ -548,7 +586,14 @@ def test_the_command_sends_what_the_store_has(
         folder_of_plans = str(Path(names.ARTEFACT_ANALYSIS_PLAN).parent)
         kept = client_of(storage).list_artifacts(runs["s"].info.run_id, folder_of_plans)
         assert [one.path for one in kept] == [names.ARTEFACT_ANALYSIS_PLAN]
-    assert find_report(str(folder), tracking_uri=None).undelivered == 0
+    # A report is added to the sweep's own run, which it does not have to look for.
+    assert report_on([str(folder), "--attach", "--no-videos"]) == 0
+    run_id = runs["s"].info.run_id
+    assert f"Attached to the sweep's run in MLflow: run {run_id}" in capsys.readouterr().out
+    kept_page = storage / "mlartifacts" / "s" / run_id / "artifacts" / "report" / PAGE
+    assert kept_page.read_bytes() == (folder / "report" / PAGE).read_bytes()
+    described = runs_of(client_of(storage), "s")["s"].data.tags[names.TAG_NOTE]
+    assert described.startswith("**No run that may be compared")
 
 
 def test_a_second_driver_is_refused_until_the_first_lets_go(tracker_on: MakeTracker) -> None:

@@ -101,11 +101,10 @@ def test_what_waits_stays_and_is_told(uri: str, status: int, tmp_path: Path) -> 
     check(done.exit_code, done.stderr, status)
 
 
-def test_a_report_says_so(
-    uri: str, status: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_report_that_is_to_be_attached_says_so(uri: str, status: int, tmp_path: Path) -> None:
     from music_rllib.report.cli import app
 
-    monkeypatch.chdir(tmp_path)
-    done = CliRunner().invoke(app, ["s", "--tracking-uri", uri])
+    folder = kept_sweep(tmp_path, uri)
+    done = CliRunner().invoke(app, [str(folder), "--attach", "--no-videos"])
     check(done.exit_code, done.stderr, status)
+    assert (folder / "report" / "report.html").is_file()

@@ -1,17 +1,14 @@
-"""Reports on a sweep that was logged to a real MLflow store, and their page in a real browser."""
+"""Reports on a sweep in its storage, and their page in a real browser."""
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
 import re
 import shutil
-import sqlite3
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Callable
 from pathlib import Path
 from typing import get_args
 
@@ -21,21 +18,16 @@ from typer.testing import CliRunner, Result
 
 from music_rllib import names
 from music_rllib.config.load import load_sweep
+from music_rllib.experiment.listener import Failure
 from music_rllib.experiment.plan import Node, make_plan
-from music_rllib.experiment.run_info import run_info
+from music_rllib.experiment.session import keep_record, open_sweep
 from music_rllib.report.build import PAGE
 from music_rllib.report.cli import app
-from music_rllib.report.location import find_sweep
-from music_rllib.results import from_mlflow
 from music_rllib.results.archive.folder import Format, read_archive, write_archive
-from music_rllib.results.data import ReportError, Sweep
-from music_rllib.results.from_mlflow import read_mlflow
-from music_rllib.results.mlflow_tables import read_tables
-from music_rllib.store.run_record import Report
-from music_rllib.tracking.projection import StoredRun
-from music_rllib.tracking.store import resolve_store
-from music_rllib.tracking.tracker import Tracker
-from tests.integration.mlflow_server import MlflowServer
+from music_rllib.results.data import RunRecord, Sweep
+from music_rllib.results.read import read_sweep
+from music_rllib.store.run_record import HISTORY, Report, RunResult, last_values, to_json_lines
+from music_rllib.sweep.listeners.state_file import StateFile
 
 STEPS = range(20_000, 100_001, 20_000)
 CONFIG = """
@@ -110,6 +102,7 @@ SEARCHES = [
 FAILED = 3
 """Position of the run that failed."""
 FAILURE = "ValueError: the <simulation> broke"
+CODE = {names.TAG_GIT_COMMIT: "c0ffee"}
 
 
 def values(node: Node, step: int) -> dict[str, float]:
@@ -134,16 +127,17 @@ def nodes(tmp_path_factory: pytest.TempPathFactory) -> list[Node]:
 
 
 @pytest.fixture(scope="module")
-def sweep_folder(nodes: list[Node], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def sweep_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A sweep of two stages; of its six runs one failed and the last has not begun."""
     storage = tmp_path_factory.mktemp("results")
     file = storage / "tiny.yaml"
     file.write_text(CONFIG)
-    with Tracker(
-        sweep_name="tiny", storage=str(storage), config=load_sweep(file).document
-    ) as tracker:
-        for number, node in enumerate(nodes[:-1]):
-            failed = node is nodes[FAILED]
+    config = load_sweep(file, storage=str(storage))
+    sweep = open_sweep(config, make_plan(config), str(storage), storage / "tiny")
+    keep_record(sweep)
+    with StateFile(sweep) as state_file:
+        for number, node in enumerate(sweep.plan.nodes[:-1]):
+            made = tmp_path_factory.mktemp("made")
             reports = [
                 Report(
                     env_steps=step,
@@ -151,14 +145,28 @@ def sweep_folder(nodes: list[Node], tmp_path_factory: pytest.TempPathFactory) ->
                     timestamp_ms=1_700_000_000_000 + 1000 * step + number,
                     metrics=values(node, step),
                 )
-                for step in (STEPS[:2] if failed else STEPS)
+                for step in (STEPS[:2] if number == FAILED else STEPS)
             ]
-            stored = StoredRun(reports)
-            if failed:
-                stored = StoredRun(reports, None, "FAILED", {names.TAG_FAILURE: FAILURE})
-            tracker.mirror(run_info(node), partial(StoredRun, *stored))
-        tracker.put_sweep_artefact(names.ARTEFACT_SEARCH, json.dumps(SEARCHES))
+            (made / HISTORY).write_bytes(to_json_lines(reports))
+            if number == FAILED:
+                with sweep.store.work_folder(node.key).new_checkpoint(STEPS[1]) as draft:
+                    shutil.copy(made / HISTORY, draft.folder)
+                state_file.failed(node, Failure(FAILURE, storage / "log"))
+                continue
+            last = last_values(reports)
+            result = RunResult(label=node.label, env_steps=STEPS[-1], seconds=1.0, metrics=last)
+            sweep.store.publish(node.key, made, result, provenance=CODE)
+        state_file.end("failed")
     return storage / "tiny"
+
+
+@pytest.fixture(scope="module")
+def searched(sweep_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An export of the same sweep that has the results of a search, too."""
+    folder = tmp_path_factory.mktemp("searched")
+    sweep = read_sweep(str(sweep_folder)).sweep
+    write_archive(dataclasses.replace(sweep, searches=SEARCHES), folder)
+    return folder
 
 
 @pytest.fixture(scope="module")
@@ -187,11 +195,13 @@ def run(*arguments: str | Path) -> Result:
 
 
 def check_content(sweep: Sweep, nodes: list[Node]) -> None:
-    """Everything that was logged, and nothing else."""
-    assert [record.node_key for record in sweep.runs] == [node.key for node in nodes[:-1]]
-    assert [record.status for record in sweep.runs[FAILED:]] == ["FAILED", "FINISHED"]
-    assert sweep.runs[FAILED].failure == FAILURE
-    assert sweep.runs[0].budget == 100_000
+    """Everything that was reported, and nothing else."""
+    begun = [run for run in sweep.runs if run.status != "SCHEDULED"]
+    assert [record.node_key for record in begun] == [node.key for node in nodes[:-1]]
+    assert [record.status for record in begun[FAILED:]] == ["FAILED", "FINISHED"]
+    assert begun[FAILED].failure == FAILURE
+    assert begun[0].budget == 100_000
+    assert begun[0].tags[names.TAG_GIT_COMMIT] == "c0ffee"
     assert "init_from: pretrain" in str(sweep.config)
     for position, node in enumerate(nodes[:-1]):
         logged = STEPS[:2] if position == FAILED else STEPS
@@ -206,15 +216,14 @@ def check_content(sweep: Sweep, nodes: list[Node]) -> None:
 # Reading ----------------------------------------------------------------------------------------
 
 
-def test_what_was_logged_is_what_is_read(
+def test_what_was_reported_is_what_is_read(
     sweep_folder: Path, nodes: list[Node], tmp_path: Path
 ) -> None:
-    check_content(find_sweep(str(sweep_folder)).sweep, nodes)
-    by_name = find_sweep("tiny", storage=str(sweep_folder.parent), metrics=[names.MI_BOUND])
+    check_content(read_sweep(str(sweep_folder)).sweep, nodes)
+    by_name = read_sweep("tiny", str(sweep_folder.parent), metrics=[names.MI_BOUND])
     assert set(by_name.sweep.history) == {names.MI_BOUND}
-    assert by_name.undelivered == 0
     (tmp_path / "latest").symlink_to(sweep_folder)
-    assert find_sweep(str(tmp_path / "latest")).folder == sweep_folder
+    assert read_sweep(str(tmp_path / "latest")).folder == sweep_folder
 
 
 @pytest.mark.parametrize("table_format", get_args(Format))
@@ -224,14 +233,14 @@ def test_an_exported_sweep_is_the_same_sweep(
     exported = tmp_path / "published"
     assert run(sweep_folder, "--export", exported, "--format", table_format).exit_code == 0
     check_content(read_archive(exported), nodes)
-    original, again = find_sweep(str(sweep_folder)).sweep, read_archive(exported)
-    assert [vars(record) for record in again.runs] == [vars(record) for record in original.runs]
-    assert {f"metrics.{table_format}", f"runs.{table_format}", "sweep.json", "search.json"} == {
+    original, again = read_sweep(str(sweep_folder)).sweep, read_archive(exported)
+    assert [vars(record) for record in again.runs] == [
+        vars(record) for record in original.runs if record.status != "SCHEDULED"
+    ]
+    assert {f"metrics.{table_format}", f"runs.{table_format}", "sweep.json"} == {
         path.name for path in exported.iterdir()
     }
     assert str(sweep_folder.parent) not in (exported / "sweep.json").read_text()
-    assert list(original.searches) == SEARCHES
-    assert again.searches == [SEARCHES[0] | {"storage": "sqlite:///studies/all.db"}]
     (exported / f"metrics.{table_format}").unlink()
     broken = run(exported)
     assert broken.exit_code == 2
@@ -251,7 +260,12 @@ def test_an_export_of_another_sweep_is_not_replaced(sweep_folder: Path, tmp_path
     assert read_archive(exported).name == "tiny"
 
 
-def test_the_page_shows_what_a_search_found(page: Path) -> None:
+def test_the_page_shows_what_a_search_found(searched: Path, tmp_path: Path) -> None:
+    assert read_archive(searched).searches == [
+        SEARCHES[0] | {"storage": "sqlite:///studies/all.db"}
+    ]
+    assert run(searched, "--output", tmp_path).exit_code == 0
+    page = tmp_path / PAGE
     text = re.sub(r"<[^>]+>", "|", page.read_text().partition("Search of stage")[2])
     cells = [cell for cell in text.split("|") if cell.strip()]
     assert "trials: 1 judged, 1 pruned." in text
@@ -262,7 +276,7 @@ def test_the_page_shows_what_a_search_found(page: Path) -> None:
     assert "0.1 is not among the best &lt;2&gt;" in ranked
 
 
-def test_a_report_needs_neither_ray_nor_mlflow_for_an_exported_sweep(
+def test_a_report_needs_neither_ray_nor_mlflow(
     sweep_folder: Path, page: Path, tmp_path: Path
 ) -> None:
     exported = tmp_path / "published"
@@ -277,88 +291,29 @@ def test_a_report_needs_neither_ray_nor_mlflow_for_an_exported_sweep(
     for name in ("final", "runs", "curves"):
         tables = (page.parent, exported / "report")
         one, other = ((folder / "tables" / f"{name}.csv").read_text() for folder in tables)
-        assert one == other
-
-
-def test_the_report_is_attached_to_the_sweep_s_run(sweep_folder: Path, page: Path) -> None:
-    """`page` is made first: both write the same files."""
-    done = run(sweep_folder, "--attach")
-    sweep = find_sweep(str(sweep_folder)).sweep
-    assert f"Attached to the sweep's run in MLflow: run {sweep.run_id}" in done.stdout
-    kept = sweep_folder.parent / "mlartifacts" / "tiny" / sweep.run_id / "artifacts" / "report"
-    assert (kept / PAGE).read_bytes() == page.read_bytes()
-    assert (kept / "figures" / "finetune-success-rate.svg").is_file()
-
-
-def test_a_report_on_a_database_that_is_being_made_waits_for_its_tables(tmp_path: Path) -> None:
-    """Two that make MLflow's tables at a time crash each other, the sweep too."""
-    store = resolve_store(None, str(tmp_path))
-    make = "import sys; from music_rllib.tracking.tracker import Tracker; "
-    make += "Tracker(sweep_name='s', storage=sys.argv[1], config={}).__enter__().close('FINISHED')"
-    command = [sys.executable, "-c", make, str(tmp_path)]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as sweep:
-        while not (tmp_path / "mlflow.db").exists():
-            assert sweep.poll() is None
-        with pytest.raises(ReportError, match="must be a sweep in MLflow"):
-            read_mlflow(store, "none")
-        _, errors = sweep.communicate(timeout=120)
-        assert (sweep.returncode, "Traceback" in errors) == (0, False)
+        # An export has only the runs that have begun.
+        assert [line for line in one.splitlines() if "SCHEDULED" not in line] == other.splitlines()
 
 
 def test_there_is_no_such_sweep(sweep_folder: Path, tmp_path: Path) -> None:
     other = run("other", "--storage", sweep_folder.parent)
     assert other.exit_code == 2
-    assert "'other' must be a sweep in MLflow at sqlite:///" in other.stderr
-    assert "It has: tiny." in other.stderr
-    nothing = run("tiny", "--storage", tmp_path)
-    assert nothing.exit_code == 2
-    assert f"{tmp_path}/mlflow.db must be the sqlite file" in nothing.stderr
+    assert "SWEEP must be a sweep that was started, got other" in other.stderr
+    assert "(sweeps there: tiny)" in other.stderr
     # A folder is not taken for the name of a sweep in the storage.
     for place in (f"{tmp_path}/tiny", "..", "~nobody-at-all/tiny"):
         nowhere = run(place, "--storage", sweep_folder.parent)
-        assert nowhere.exit_code == 2
-        assert nowhere.stderr.startswith("error: ")
-        assert "sqlite" not in nowhere.stderr
+        assert (nowhere.exit_code, nowhere.stderr.startswith("error: ")) == (2, True)
     assert run("x" * 300, "--serve").exit_code == 2
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.fixture
-def server(sweep_folder: Path) -> Iterator[str]:
-    with MlflowServer(sweep_folder.parent) as server:
-        yield server.uri
-
-
-def test_a_server_gives_the_same_as_its_database(server: str, nodes: list[Node]) -> None:
-    sweep = read_mlflow(resolve_store(server, "unused"), "tiny")
-    check_content(sweep, nodes)
-    assert sweep.url(sweep.run_id) == f"{server}/#/experiments/{sweep.experiment_id}/runs/" + (
-        sweep.run_id
+    exported = run(sweep_folder, "--export", tmp_path / "published")
+    assert exported.exit_code == 0
+    refused = run(tmp_path / "published", "--attach", "--no-videos")
+    assert (refused.exit_code, "--attach must be given with a sweep in its" in refused.stderr) == (
+        2,
+        True,
     )
-
-
-def test_its_tables_alone_give_the_same_as_mlflow(
-    sweep_folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    store = resolve_store(None, str(sweep_folder.parent))
-
-    def found() -> tuple[object, ...]:
-        sweep = read_mlflow(store, "tiny")
-        orders = [(list(run.params), list(run.tags)) for run in sweep.runs]
-        history = {
-            name: [getattr(column, part).tolist() for part in ("run", "step", "value", "time")]
-            for name, column in sweep.history.items()
-        }
-        return dataclasses.replace(sweep, history={}), orders, history
-
-    file = sweep_folder.parent / "mlflow.db"
-    assert read_tables(file, "tiny", None) is not None
-    assert read_tables(file, "other", None) is None
-    without = found()
-    monkeypatch.setattr(from_mlflow, "read_tables", lambda *_: None)
-    assert repr(without) == repr(found())  # NaN is not equal to itself
-    (sweep_folder.parent / "not.db").write_bytes(b"no database" * 99)
-    assert read_tables(sweep_folder.parent / "not.db", "tiny", None) is None
+    never = run(sweep_folder, "--attach", "--no-videos")
+    assert (never.exit_code, "a sweep that was tracked" in never.stderr) == (2, True)
 
 
 # In a browser -----------------------------------------------------------------------------------
@@ -438,28 +393,31 @@ SCRIPT = """"'><script>document.body.dataset.ran = 1</script>
 
 
 @pytest.fixture(scope="module")
-def hostile_store(sweep_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Somebody's MLflow, with a script in each tag, param and name that a report shows."""
-    copy = tmp_path_factory.mktemp("hostile") / "mlflow.db"
-    shutil.copy(sweep_folder.parent / "mlflow.db", copy)
-    shown = (names.TAG_STAGE, names.TAG_TASK, names.TAG_ENTROPIC_INDEX, names.TAG_FAILURE)
-    with contextlib.closing(sqlite3.connect(copy)) as database, database:
-        database.execute("update params set value = value || ?", [SCRIPT])
-        database.execute("update runs set name = name || ?", [SCRIPT])
-        for tag in (*shown, names.TAG_VARIANT, names.TAG_GIT_COMMIT):
-            database.execute("update tags set value = value || ? where key = ?", [SCRIPT, tag])
-    return f"sqlite:///{copy}"
+def hostile_export(searched: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Somebody's export, with a script in each tag, param and name that a report shows."""
+    shown = {names.TAG_STAGE, names.TAG_TASK, names.TAG_ENTROPIC_INDEX, names.TAG_FAILURE}
+    shown |= {names.TAG_VARIANT, names.TAG_GIT_COMMIT}
+
+    def hostile(run: RunRecord) -> RunRecord:
+        return dataclasses.replace(
+            run,
+            name=run.name + SCRIPT,
+            params={name: value + SCRIPT for name, value in run.params.items()},
+            tags={
+                tag: value + SCRIPT if tag in shown else value for tag, value in run.tags.items()
+            },
+        )
+
+    sweep, folder = read_archive(searched), tmp_path_factory.mktemp("hostile")
+    runs = [hostile(run) for run in sweep.runs]
+    write_archive(dataclasses.replace(sweep, name=f"tiny{SCRIPT}", runs=runs), folder)
+    return folder
 
 
-@pytest.mark.parametrize("kind", ["store", "export"])
 def test_a_script_in_somebody_s_sweep_does_not_run(
-    browser: Browser, hostile_store: str, sweep_folder: Path, tmp_path: Path, kind: str
+    browser: Browser, hostile_export: Path, tmp_path: Path
 ) -> None:
-    place: list[str | Path] = ["tiny", "--tracking-uri", hostile_store]
-    if kind == "export":
-        assert run(*place, "--export", tmp_path / "published").exit_code == 0
-        place = [tmp_path / "published"]
-    made = run(*place, "--output", tmp_path / "report")
+    made = run(hostile_export, "--output", tmp_path / "report")
     assert made.exit_code == 0, made.output
     page = tmp_path / "report" / PAGE
     # Without the page's policy, which would stop a script that got into it.

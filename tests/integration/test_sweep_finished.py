@@ -23,10 +23,8 @@ from mlflow import MlflowClient
 
 from music_rllib import load_sweep, names
 from music_rllib.report.build import PAGE
-from music_rllib.results.archive.folder import write_archive
-from music_rllib.results.from_mlflow import read_mlflow
+from music_rllib.report.cli import main as report
 from music_rllib.sweep.cli import main
-from music_rllib.tracking.store import resolve_store
 from tests.integration.conftest import (
     ENVIRONMENTS,
     SWEEP,
@@ -51,8 +49,9 @@ class Finished(NamedTuple):
     experiment_id: str
 
     def runs(self) -> dict[str, Any]:
-        """By name."""
-        found = self.client.search_runs([self.experiment_id])
+        """Those of the current plan, by name."""
+        wanted = f"tags.{names.TAG_CURRENT} = '{names.CURRENT}'"
+        found = self.client.search_runs([self.experiment_id], wanted)
         return {run.info.run_name: run for run in found}
 
 
@@ -250,7 +249,8 @@ def test_a_finer_sweep_reuses_what_is_finished(
     before = [row[:-1] for row in rows(finished.output)]
     assert [row[:-1] for row in again if row[-1] == "reused"] == before
     runs = finished.client.search_runs([finished.experiment_id])
-    assert len(runs) == len(finished.runs()) == 1 + 4, "each is there once"
+    assert len(finished.runs()) == 1 + 4, "each is there once"
+    assert len(runs) == 1 + 1 + 4, "and the sweep's own run of the coarser plan"
     check_frames(finished.folder, tmp_path / "export")
 
     # Under another name there is nothing to train, and MLflow gets all of it once more.
@@ -264,27 +264,12 @@ def test_a_finer_sweep_reuses_what_is_finished(
 
 
 def check_frames(folder: Path, export: Path) -> None:
-    """The same from the storage, from MLflow and from an export."""
-    store = f"sqlite:///{folder}/results/mlflow.db"
-    write_archive(read_mlflow(resolve_store(store, "results"), "points"), export)
-    read = [
-        load_sweep(folder / "results" / "points"),
-        load_sweep("points", tracking_uri=store),
-        load_sweep(export),
-    ]
-    # MLflow has the moment when it was told.
-    told = {"runs": ["started", "ended"], "curves": ["time"], "conditions": []}
-    order = {
-        "runs": ["name"],
-        "curves": ["key", "metric", "env_steps"],
-        "conditions": ["stage", "q"],
-    }
-    for name, columns in told.items():
-        first, *others = (
-            getattr(one, name).drop(columns=columns).sort_values(order[name]) for one in read
-        )
-        assert len(first)
-        for other in others:
-            pd.testing.assert_frame_equal(
-                first.reset_index(drop=name != "runs"), other.reset_index(drop=name != "runs")
-            )
+    """The same from the storage and from an export."""
+    place = folder / "results" / "points"
+    assert report([str(place), "--export", str(export)]) == 0
+    first, other = load_sweep(place), load_sweep(export)
+    for name, order in (("curves", ["key", "metric", "env_steps"]), ("conditions", ["stage", "q"])):
+        one, two = (getattr(read, name).sort_values(order) for read in (first, other))
+        assert len(one)
+        pd.testing.assert_frame_equal(one.reset_index(drop=True), two.reset_index(drop=True))
+    pd.testing.assert_frame_equal(first.runs, other.runs)

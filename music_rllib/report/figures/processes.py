@@ -1,4 +1,4 @@
-"""Worker processes that read a report's values and draw its figures."""
+"""Worker processes that draw a report's figures."""
 
 from __future__ import annotations
 
@@ -15,8 +15,6 @@ _PRELOADED = (
     "matplotlib.backends.backend_pdf",
     "matplotlib.backends.backend_svg",
     "music_rllib.report.figures.draw",
-    "music_rllib.results.from_mlflow",
-    "sqlalchemy",
 )
 
 

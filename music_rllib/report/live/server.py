@@ -66,7 +66,7 @@ class LivePage:
             before, began = now, time.monotonic()
             try:
                 html = self._make()
-            except Exception as error:  # MLflow or the storage is busy or down: try again later
+            except Exception as error:  # the storage is busy or down: try again later
                 self._problem = f"The page is an older one: {for_people(first_line(error))}"
                 continue
             self._problem = None

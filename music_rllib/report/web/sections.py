@@ -204,7 +204,7 @@ def budget(sweep: Sweep, analyses: Sequence[StageAnalysis]) -> TextTable:
         title="Budget and wall time",
         header=("Stage", "Runs", "Env steps done", "Planned", "Wall time, all runs", "Median run"),
         rows=rows,
-        note="h:min:s from each run's start to its end in MLflow, pauses included. Runs that are "
+        note="h:min:s from each run's start to its last report, pauses included. Runs that are "
         "not over count for no time.",
     )
 
@@ -216,7 +216,7 @@ def failures(sweep: Sweep) -> TextTable:
         header=("Run", "Env steps", "Cause"),
         rows=[
             (
-                _run_cell(sweep, position),
+                run.name,
                 f"{sweep.last_step(position):,}",
                 Cell(text=run.failure or "no cause was recorded", kind="long", code=True),
             )
@@ -231,10 +231,10 @@ def all_runs(sweep: Sweep) -> TextTable:
     finals = (sweep.final(i, sweep.primary_metric(run.task)) for i, run in enumerate(sweep.runs))
     return TextTable(
         title=f"All {len(sweep.runs)} runs",
-        header=("Run", "State", "Env steps", "Last evaluation", "Wall time", "MLflow run"),
+        header=("Run", "State", "Env steps", "Last evaluation", "Wall time", "Key"),
         rows=[
             (
-                _run_cell(sweep, position),
+                run.name,
                 state_in_words(run.status),
                 number_cell(f"{sweep.last_step(position):,}"),
                 number_cell(DASH if final is None else number(final)),
@@ -247,7 +247,7 @@ def all_runs(sweep: Sweep) -> TextTable:
 
 
 def origin(sweep: Sweep, command: str) -> TextTable:
-    """MLflow's address, the code and the versions that the numbers come from."""
+    """The storage, the code and the versions that the numbers come from."""
     versions = sorted(
         f"{name.removeprefix(names.TAG_VERSION_PREFIX)} {value}"
         for name, value in sweep.tags.items()
@@ -258,19 +258,12 @@ def origin(sweep: Sweep, command: str) -> TextTable:
         title="Where it comes from",
         header=("What", "Value"),
         rows=[
-            ("MLflow", Cell(text=sweep.source, kind="long", code=True)),
-            ("Experiment", f"{sweep.name}, id {sweep.experiment_id}"),
-            ("Sweep's run", Cell(text=sweep.run_id, url=sweep.url(sweep.run_id))),
+            ("Read from", Cell(text=sweep.source, kind="long", code=True)),
             ("Code", Cell(text=commit, code=True)),
             ("Versions", Cell(text=", ".join(versions) or "unknown", kind="long")),
             ("This report", Cell(text=command, kind="long", code=True)),
         ],
     )
-
-
-def _run_cell(sweep: Sweep, run: int) -> Cell:
-    record = sweep.runs[run]
-    return Cell(text=record.name, url=sweep.url(record.run_id))
 
 
 def _wait_of_each_run(wait: Wait) -> str:
@@ -305,5 +298,5 @@ def _yes_or_no(answer: bool) -> str:
 
 
 def state_in_words(status: str) -> str:
-    """A word for MLflow's status of a run or a sweep."""
+    """A word for the status of a run or a sweep."""
     return {"KILLED": "stopped", "SCHEDULED": "waiting"}.get(status, status.lower())

@@ -1,9 +1,9 @@
-"""A sweep as a folder of plain tables, readable without MLflow and without this package.
+"""A sweep as a folder of plain tables, readable without this package.
 
 `sweep.json`
     the sweep's own run: name, status, tags, configuration.
 `runs.csv` or `runs.parquet`
-    one row per run: its number, MLflow's id, and a column per tag (`tag.`) and param (`param.`).
+    one row per run: its number, its key, and a column per tag (`tag.`) and param (`param.`).
 `metrics.csv` or `metrics.parquet`
     one row per value: the run's number, metric, environment steps, value, time in ms.
 `search.json`

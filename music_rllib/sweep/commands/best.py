@@ -40,10 +40,12 @@ def best(
     there is no ranking yet. It also says how it was chosen.
     """
     from music_rllib.experiment.location import find_sweep
+    from music_rllib.store.paths import sweep_folder
     from music_rllib.sweep.export import export_best
 
-    opened = find_sweep(sweep, storage).open()
-    chosen = export_best(opened, stage, output or opened.folder / "best")
+    found = find_sweep(sweep, storage)
+    folder = output or sweep_folder(found.storage, found.name) / "best"
+    chosen = export_best(found, stage, folder)
     if json:
         print_json(chosen)
         return 0
@@ -51,6 +53,8 @@ def best(
     console.print(chosen["why"], soft_wrap=True)
     if chosen["entropies"]:
         console.print(_entropies_text(chosen["entropies"]), soft_wrap=True)
+    if (earlier := found.earlier()) is not None:
+        console.print(earlier, soft_wrap=True)
     for policy in chosen["policies"]:
         console.print(f"{policy['task']}: {policy['folder']}", soft_wrap=True)
     return 0

@@ -13,7 +13,7 @@ from music_rllib.sweep.cli_helpers import Place, StageName, Storage, find_stage
 
 if TYPE_CHECKING:
     from music_rllib.results.comparison import Final, Scope
-    from music_rllib.results.from_store import Condition
+    from music_rllib.results.conditions import Condition
     from music_rllib.results.statistics import Estimate
 
 EXAMPLES = """\
@@ -61,43 +61,50 @@ def compare(
 ) -> int:
     """Values of q, or whatever varies, with 95 % intervals."""
     from music_rllib import names
-    from music_rllib.envs.fingerprint import digest_of
     from music_rllib.experiment.environments import mixed
     from music_rllib.experiment.location import find_sweep
     from music_rllib.labels import ShortLabels
+    from music_rllib.results.analysis import stage_scopes
     from music_rllib.results.claims.answer import answer
     from music_rllib.results.claims.study import study_of
     from music_rllib.results.claims.tables import study_data
-    from music_rllib.results.frames.from_storage import results_of
-    from music_rllib.results.from_store import conditions, scopes
+    from music_rllib.results.conditions import find_stages
+    from music_rllib.results.read import read_stored
     from music_rllib.search.ranking import measure_of
     from music_rllib.sweep.views.compare import compare_view
 
     location = find_sweep(sweep, storage)
-    opened = location.open()
-    settings = find_stage(opened.config, stage)
-    results = opened.results()
-    measure = measure_of(settings, opened.plan, results)
+    config = location.config()
+    settings = find_stage(config, stage)
+    metrics = {task.primary_metric for each in config.stages for task in each.tasks}
+    metrics |= {names.EVAL_EPISODES, *names.ENTROPIES, *filter(None, [metric])}
+    if settings.search is not None:
+        metrics.add(settings.search.objectives[0].metric)
+    read = read_stored(location, metrics=metrics)
+    stored, opened = read.sweep, read.opened
+    if metric is not None and metric not in stored.history and any(opened.finished):
+        results = opened.results().values()
+        known = sorted({name for result in results for name in result.metrics})
+        raise BadInputError(f"--metric must be one of {', '.join(known)}, got {metric!r}")
+    measure = measure_of(settings, stored)
     # Where no metric is given and nothing is searched, each task has its own.
     given, metric = metric, metric or (measure.metric if settings.search else None)
     maximised = not minimize and (measure.maximised or metric != measure.metric)
-
-    def of_stage(name: str | None) -> list[Condition]:
-        every = conditions(opened.plan, results, name)
-        return [condition for condition in every if condition.stage == settings.name]
-
-    compared = of_stage(metric)
-    if not compared and results and given is not None:
-        known = sorted({name for result in results.values() for name in result.metrics})
-        if given not in known:
-            raise BadInputError(f"--metric must be one of {', '.join(known)}, got {given!r}")
-    metrics = {task.primary_metric for each in opened.config.stages for task in each.tasks}
-    metrics |= {names.EVAL_EPISODES, *filter(None, [metric])}
-    stored = results_of(opened, metrics)
-    short = ShortLabels.of(run.label for run in opened.plan.runs)
     study = study_of(stored, settings.name, metric=given, maximised=maximised or given is None)
-    entropies = _entropies({name: scopes(of_stage(name)) for name in names.ENTROPIES})
-    groups = [group for scope in scopes(compared) for group in _groups(scope, maximised, entropies)]
+    found = next((one for one in find_stages(stored) if one.name == settings.name), None)
+    short = ShortLabels.of(run.name for run in stored.runs)
+    groups: list[dict[str, Any]] = []
+    if found is not None:
+        planned = {
+            condition: {
+                "values": dict(opened.plan.node(stored.runs[condition.runs[0]].node_key).values),
+                "seeds": len({stored.runs[run].seed for run in condition.runs}),
+            }
+            for condition in found.conditions
+        }
+        entropies = {name: stage_scopes(stored, found, name) for name in names.ENTROPIES}
+        for scope in stage_scopes(stored, found, metric):
+            groups += _groups(settings.name, scope, planned, maximised, _entropies(entropies))
     document = {
         "sweep": location.name,
         "stage": settings.name,
@@ -107,13 +114,13 @@ def compare(
         "answer": answer(stored, study),
         "environments": [
             *mixed(
-                (run.task, short(run.label), digest_of(found))
-                for one in compared
-                for run in one.runs
-                if (found := opened.store.environment(run.key)) is not None
+                (run.task, short(run.name), run.tags.get(names.TAG_ENVIRONMENT, ""))
+                for run in stored.runs
+                if run.is_finished and run.stage == settings.name
             )
         ],
         **study_data(study),
+        "earlier": stored.earlier,
     }
     if json:
         print_json(document)
@@ -122,18 +129,17 @@ def compare(
     return 0
 
 
-Entropies = Mapping[tuple[str, str, str], dict[str, dict[str, Any]]]
-"""Scope, part and condition to each entropy's value and interval at the end."""
+Entropies = Mapping[tuple[str, "Condition"], dict[str, dict[str, Any]]]
+"""Scope and condition to each entropy's value and interval at the end."""
 
 
 def _entropies(scopes: Mapping[str, Iterable[Scope[Condition]]]) -> Entropies:
-    entropies: dict[tuple[str, str, str], dict[str, dict[str, Any]]] = {}
+    entropies: dict[tuple[str, Condition], dict[str, dict[str, Any]]] = {}
     for metric, of_metric in scopes.items():
         for scope in of_metric:
             for final in scope.finals:
-                key = (scope.name, final.condition.part, final.condition.label)
                 value = {"value": final.value, "interval": _ends(final.estimate)}
-                entropies.setdefault(key, {})[metric] = value
+                entropies.setdefault((scope.name, final.condition), {})[metric] = value
     return entropies
 
 
@@ -142,12 +148,16 @@ def _ends(estimate: Estimate) -> list[float]:
 
 
 def _groups(
-    scope: Scope[Condition], maximised: bool, entropies: Entropies
+    stage: str,
+    scope: Scope[Condition],
+    planned: Mapping[Condition, Mapping[str, Any]],
+    maximised: bool,
+    entropies: Entropies,
 ) -> Iterator[dict[str, Any]]:
     """The conditions that are compared in a scope, and those of the search apart from them."""
     from music_rllib.results.comparison import verdict
 
-    fresh = any(final.condition.part == "final" for final in scope.compared)
+    fresh = any(final.condition.is_fresh for final in scope.compared)
     searched = [final for final in scope.finals if final not in scope.compared]
     groups = (
         (scope.compared, "on fresh seeds" if fresh else "", verdict(scope, maximised=maximised)),
@@ -159,7 +169,15 @@ def _groups(
                 "part": part,
                 "tasks": scope.name,
                 "metric": scope.metric,
-                "conditions": list(_rows(scope, finals, maximised, entropies)),
+                "conditions": [
+                    {
+                        "stage": stage,
+                        "values": planned[final.condition]["values"],
+                        "planned": planned[final.condition]["seeds"] * scope.tasks,
+                        **row,
+                    }
+                    for final, row in _rows(scope, finals, maximised, entropies)
+                ],
                 "verdict": " ".join(sentences),
             }
 
@@ -169,8 +187,9 @@ def _rows(
     finals: Sequence[Final[Condition]],
     maximised: bool,
     entropies: Entropies,
-) -> Iterator[dict[str, Any]]:
+) -> Iterator[tuple[Final[Condition], dict[str, Any]]]:
     """Conditions with the best first, each with its difference from the best."""
+    from music_rllib.results.claims.study import label_of
     from music_rllib.results.statistics import difference
 
     ordered = sorted(finals, key=lambda final: final.value, reverse=maximised)
@@ -178,20 +197,17 @@ def _rows(
     for final in ordered:
         condition = final.condition
         row = {
-            "stage": condition.stage,
-            "values": dict(condition.values),
-            "label": condition.label,
-            "on_fresh_seeds": condition.part == "final",
+            "label": label_of(condition),
+            "on_fresh_seeds": condition.is_fresh,
             "value": final.value,
             "interval": _ends(final.estimate),
             "seeds": final.scores.mean(axis=1).tolist(),
             "runs": final.runs,
-            "planned": len(condition.seeds) * scope.tasks,
             "gap": None,
             "gap_interval": None,
             "best_is_better_with": None,
             "p_value": None,
-            "entropies": entropies.get((scope.name, condition.part, condition.label), {}),
+            "entropies": entropies.get((scope.name, condition), {}),
         }
         pair = next((p for p in scope.comparisons if {p.first, p.second} == {best, final}), None)
         if pair is not None:
@@ -203,4 +219,4 @@ def _rows(
                 "best_is_better_with": higher if (pair.first is best) == maximised else 1 - higher,
                 "p_value": pair.p_value,
             }
-        yield row
+        yield final, row

@@ -72,20 +72,26 @@ def state_of(location: SweepLocation) -> dict[str, Any]:
     state = location.read(sweep_files.STATE)
     if state is None:
         return {"sweep": location.name, "place": location.place, "state": "not started"}
+    earlier = location.earlier()
     outcome = state["driver"]["outcome"]
     if not sweep_files.is_alive(state):
         outcome = "interrupted" if outcome == "running" else outcome
         _mark_interrupted(state)
     store = NodeStore(location.storage)
+    finished = store.finished(node["key"] for node in plan_nodes(location))
     labels = {
-        node["key"]: node["label"]
-        for node in plan_nodes(location)
-        if store.is_finished(node["key"])
+        node["key"]: node["label"] for node in plan_nodes(location) if node["key"] in finished
     }
     damaged = [
         {"run": labels[key], "cause": str(error)} for key, error in store.damage(labels).items()
     ]
-    return {"place": location.place, "state": outcome, **state, "damaged": damaged}
+    return {
+        "place": location.place,
+        "state": outcome,
+        **state,
+        "damaged": damaged,
+        "earlier": earlier,
+    }
 
 
 def _mark_interrupted(state: dict[str, Any]) -> None:

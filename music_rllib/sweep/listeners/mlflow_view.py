@@ -44,7 +44,8 @@ def comparison_view(plan: Plan, sweep_id: str, now: float) -> str:
     tags = [names.TAG_ENTROPIC_INDEX, *(tag for name, tag in GROUPED.items() if name in varied)]
     tags += [names.TAG_TASK] if len(tasks) > 1 else []
     state = {
-        "searchFilter": f"tags.sweep_id = '{sweep_id}' and tags.stage = '{stage.name}'",
+        "searchFilter": f"tags.sweep_id = '{sweep_id}' and tags.{names.TAG_CURRENT} = "
+        f"'{names.CURRENT}' and tags.stage = '{stage.name}'",
         "orderByKey": "attributes.start_time",
         "orderByAsc": True,
         "startTime": "ALL",

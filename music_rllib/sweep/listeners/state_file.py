@@ -22,6 +22,7 @@ from music_rllib.experiment.listener import Failure, Listener
 from music_rllib.experiment.plan import Node
 from music_rllib.experiment.scheduler import Status
 from music_rllib.experiment.session import Sweep, plan_document
+from music_rllib.results.planned import LastValues
 from music_rllib.search.ranking import best_in_words, best_so_far
 from music_rllib.store.lease import process_start, this_machine
 from music_rllib.store.node_store import steps_of
@@ -47,6 +48,7 @@ class StateFile(Listener):
         """Node key to what a run that is not finished has spent and measured."""
         self._checkpointed = _checkpointed_steps(sweep)
         self._results: dict[str, RunResult] = {}
+        self._last_values = LastValues(sweep.plan)
         self._at_work: set[str] = set()
         """Keys of handed-out nodes that a worker has begun; the others queue for a core in Tune."""
         self._failures: list[dict[str, str]] = []
@@ -61,7 +63,7 @@ class StateFile(Listener):
         }
         self._state: dict[str, Any] = {}
         self._next_update = 0.0
-        self._written_trials = -1
+        self._written_trials = 0
         """Trials in the `plan.json` that was written last."""
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="state_file", daemon=True)
@@ -201,12 +203,13 @@ class StateFile(Listener):
             if VARIANTS[stage.variant].fixed["task_reward"]
             and (stage.search is not None or trials[stage.name] > 1)
         ]
+        now = self._last_values.sweep(self._results)
         self._state = {
             "sweep": sweep.config.name,
             "stages": stages,
             "env_steps": {"done": steps_done, "left": steps_left, "to_come": self._to_come()},
             "running": running,
-            "best": best_so_far(judged, sweep.plan, self._results, searches),
+            "best": best_so_far(judged, sweep.plan, now, searches),
             "searches": searches,
             "pruned": [node.key for node in sweep.scheduler.having(Status.PRUNED)],
             "failures": self._failures[-MOST_FAILURES:],

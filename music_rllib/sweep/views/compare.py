@@ -19,9 +19,11 @@ from music_rllib.sweep.views.text import percent
 
 def compare_view(document: Mapping[str, Any]) -> RenderableType:
     """The answer, the comparisons, and a table for each group of conditions."""
+    earlier = [Text(document["earlier"])] if document["earlier"] else []
     if not document["groups"]:
-        return Text(f"Stage {document['stage']} of {document['sweep']} has no finished run yet.")
-    parts: list[RenderableType] = [*map(Text, document["answer"]), Text()]
+        text = f"Stage {document['stage']} of {document['sweep']} has no finished run yet."
+        return Group(Text(text), *earlier)
+    parts: list[RenderableType] = [*map(Text, document["answer"]), *earlier, Text()]
     parts += [Text(line, style="yellow") for line in document["environments"]]
     if document["comparisons"]:
         parts.append(_comparisons_table(document["comparisons"]))

@@ -43,6 +43,8 @@ def status_view(state: Mapping[str, Any], labels: Iterable[str]) -> RenderableTy
     if to_come := env_steps.get("to_come"):
         budget += f", at most {to_come:,} more that searches may ask for"
     parts.append(Text(budget))
+    if state["earlier"] is not None:
+        parts.append(Text(state["earlier"]))
     if state["best"] is not None:
         parts.append(Text(f"Best so far: {best_in_words(state['best'])}"))
     parts += [_search_text(search) for search in state["searches"]]

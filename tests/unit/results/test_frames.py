@@ -15,7 +15,7 @@ import pytest
 from music_rllib import load_sweep, names
 from music_rllib.results.archive.folder import Format, read_archive, write_archive
 from music_rllib.results.data import Points, ReportError, columns
-from music_rllib.results.frames.tables import frames_of
+from music_rllib.results.frames import frames_of
 
 DOCS = Path(__file__).parents[3] / "docs"
 EXPORT = DOCS / "results" / "data" / "v3-fetch-push-music-f"

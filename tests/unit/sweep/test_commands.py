@@ -22,19 +22,16 @@ from music_rllib.config.run_settings import RunSettings
 from music_rllib.experiment import location, sweep_files
 from music_rllib.experiment.continuation import continuation_key
 from music_rllib.experiment.plan import Node, make_plan
-from music_rllib.experiment.run_info import run_info
 from music_rllib.experiment.scheduler import Status
 from music_rllib.experiment.session import Sweep, keep_record, open_sweep, remove_damaged
 from music_rllib.experiment.sweep_files import as_json
 from music_rllib.labels import ShortLabels
-from music_rllib.redaction import flat_params
 from music_rllib.results.analysis import analyse
 from music_rllib.results.claims.answer import answer
 from music_rllib.results.claims.study import study_of
 from music_rllib.results.claims.tables import claim_rows, mean_rows
 from music_rllib.results.comparison import each_seed, verdict
-from music_rllib.results.data import Points, RunRecord, columns
-from music_rllib.results.data import Sweep as Logged
+from music_rllib.results.read import read_sweep
 from music_rllib.store import node_store, object_folder, paths
 from music_rllib.store.handoff import write_handoff
 from music_rllib.store.object_folder import DamagedError
@@ -185,36 +182,6 @@ def in_one_line(text: str) -> str:
     return " ".join(text.split())
 
 
-def as_logged(sweep: Sweep) -> Logged:
-    """The sweep as its report reads it from MLflow, finished and unfinished runs."""
-    runs, points, results = [], [], sweep.results()
-    for node in sweep.plan.nodes:
-        info, result = run_info(node), results.get(node.key)
-        tags = {name: str(value) for name, value in info.tags.items() if value is not None}
-        runs.append(
-            RunRecord(
-                run_id=node.key,
-                name=info.name,
-                status="FINISHED" if result else "RUNNING",
-                started=0,
-                ended=None,
-                params=flat_params(info.config),
-                tags={**tags, names.TAG_NODE_KEY: node.key},
-            )
-        )
-        last = sorted((result.metrics if result else {names.EVAL_SUCCESS: 0.99}).items())
-        metrics = [metric for metric, _ in last]
-        points.append(Points(metrics, [4000] * len(last), [1] * len(last), [v for _, v in last]))
-    return Logged(
-        **dict.fromkeys(("name", "status", "run_id", "experiment_id", "source"), "mine"),  # type: ignore[arg-type]
-        started=0,
-        tags={},
-        config=None,
-        runs=runs,
-        history=columns(points),
-    )
-
-
 def test_compare_and_the_report_say_the_same_of_the_same_sweep(
     storage: str, tmp_path: Path, program: Program
 ) -> None:
@@ -230,7 +197,8 @@ def test_compare_and_the_report_say_the_same_of_the_same_sweep(
                 finish(sweep, state_file, node, height, tmp_path / "made")
         state_file.end("stopped")
     groups = program("compare", f"{storage}/mine", "--json").document["groups"]
-    (analysis,) = analyse(as_logged(sweep))
+    logged = read_sweep(f"{storage}/mine").sweep
+    (analysis,) = analyse(logged)
     assert [group["tasks"] for group in groups] == ["all tasks", *tasks]
     for group, scope in zip(groups, analysis.scopes, strict=True):
         assert group["metric"] == scope.metric
@@ -253,7 +221,6 @@ def test_compare_and_the_report_say_the_same_of_the_same_sweep(
         assert group["verdict"].replace("tac.entropic_index", "q") == " ".join(verdict(scope))
     # What is claimed, too, from the same curves.
     document = program("compare", f"{storage}/mine", "--json").document
-    logged = as_logged(sweep)
     study = study_of(logged)
     assert document["comparisons"] == json.loads(as_json(claim_rows(study)))
     assert document["conditions"][0]["by_seed"] == mean_rows(study)[0]["by_seed"]

@@ -47,7 +47,8 @@ def test_the_view_has_a_line_for_each_condition_of_the_last_stage(tmp_path: Path
     view = json.loads(comparison_view(plan(tmp_path, ["FetchPush", "FetchSlide"]), "c0ffee", 1.5))
     assert (view["name"], view["createdAt"]) == ("s: comparison", 1500)
     state = json.loads(view["state"])
-    assert state["searchFilter"] == "tags.sweep_id = 'c0ffee' and tags.stage = 'finetune'"
+    current = "tags.sweep_id = 'c0ffee' and tags.current = 'yes'"
+    assert state["searchFilter"] == f"{current} and tags.stage = 'finetune'"
     grouped = [key["groupByData"] for key in state["groupBy"]["groupByKeys"]]
     assert grouped == [names.TAG_ENTROPIC_INDEX, names.TAG_ALPHA, names.TAG_TASK]
     assert state["compareRunCharts"][0]["metricKey"] == names.EVAL_SUCCESS

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import platform
 import subprocess
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 
@@ -24,6 +25,7 @@ PACKAGES = (
 GIT_SECONDS = 5.0
 
 
+@cache
 def provenance_tags() -> dict[str, str]:
     """Tags of the versions that a result depends on, and of the git commit of a checkout."""
     tags = {names.TAG_VERSION_PREFIX + "python": platform.python_version()}

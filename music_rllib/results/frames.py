@@ -1,4 +1,4 @@
-"""A sweep as pandas frames, with the same columns from a storage, from MLflow or an export."""
+"""A sweep as pandas frames, with the same columns from a storage or an export."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import pandas as pd
 
 from music_rllib import names
 from music_rllib.results.analysis import analyse
-from music_rllib.results.archive.folder import is_archive, read_archive
 from music_rllib.results.conditions import find_stages
 from music_rllib.results.data import Sweep, joined
+from music_rllib.results.read import read_sweep
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -64,37 +64,23 @@ class Frames:
     """A row for each value of a metric: `key`, `metric`, `env_steps`, `value`, `time`."""
     conditions: pd.DataFrame = field(repr=False)
     """A row for each condition on each task: the mean of its seeds with its 95 % interval."""
+    earlier: str | None = None
+    """A sentence about runs of earlier versions of the sweep, which the frames do not have."""
 
 
-def load_sweep(
-    place: str | Path, *, tracking_uri: str | None = None, storage: str = "results"
-) -> Frames:
+def load_sweep(place: str | Path, *, storage: str | None = None) -> Frames:
     """Runs, curves and conditions of a sweep, as pandas frames.
 
     Args:
         place: a sweep's folder in a storage (`results/my_sweep`, `s3://bucket/sweeps/my_sweep`), a
             folder that `report --export` wrote, or a sweep's name.
-        tracking_uri: read the sweep of that name from this MLflow instead
-            (`sqlite:///results/mlflow.db`, `http://mlflow:5000`).
-        storage: storage of a sweep that is given by its name.
+        storage: storage of a sweep that is given by its name; None for `results`.
 
     Raises:
-        ReportError: there is no such sweep, or the folder holds something else.
+        BadInputError: there is no such sweep, or the folder holds something else.
         StorageError: the storage can't be read, or finished runs in it are damaged.
-        TrackingError: MLflow does not answer.
     """
-    place = str(place)
-    folder = Path(place).expanduser()
-    if tracking_uri is not None:
-        from music_rllib.results.from_mlflow import read_mlflow
-        from music_rllib.tracking.store import resolve_store
-
-        return frames_of(read_mlflow(resolve_store(tracking_uri, storage), folder.name))
-    if "://" not in place and is_archive(folder):
-        return frames_of(read_archive(folder))
-    from music_rllib.results.frames.from_storage import read_storage
-
-    return frames_of(read_storage(place, storage))
+    return frames_of(read_sweep(str(place), storage).sweep)
 
 
 def frames_of(sweep: Sweep) -> Frames:
@@ -105,6 +91,7 @@ def frames_of(sweep: Sweep) -> Frames:
         runs=_runs(sweep, keys),
         curves=_curves(sweep, keys),
         conditions=_frame(list(_conditions(sweep)), _CONDITION_COLUMNS),
+        earlier=sweep.earlier,
     )
 
 

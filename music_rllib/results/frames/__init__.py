@@ -1,1 +1,0 @@
-"""A sweep as pandas frames, wherever it is kept."""
