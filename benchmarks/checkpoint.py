@@ -15,7 +15,8 @@ import numpy as np
 from benchmarks.measure import Row, taken_by
 from benchmarks.runs import fill, settings
 from benchmarks.sampling import random_trajectory
-from music_rllib.store.node_store import NodeStore, WorkFolder
+from music_rllib.store.node_store import NodeStore
+from music_rllib.store.work_folder import WorkFolder
 from music_rllib.training.run import TrainingRun
 
 __all__ = ["rows"]

@@ -9,7 +9,8 @@ from pydantic import BaseModel
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.experiment.plan import Node, node_key
 from music_rllib.schedules import Linear
-from music_rllib.store.node_store import NodeStore, steps_of
+from music_rllib.store.node_store import NodeStore
+from music_rllib.store.work_folder import steps_of
 
 REPORT_INTERVAL = 1_000
 """Environment steps between two reports, where evaluations are not more frequent."""

@@ -13,7 +13,8 @@ from music_rllib.experiment import sweep_files
 from music_rllib.experiment.continuation import continuation_key, continued_from
 from music_rllib.experiment.scheduler import DONE, Scheduler
 from music_rllib.labels import ShortLabels, in_runs, is_meant
-from music_rllib.store.node_store import NodeStore, WorkFolder, steps_of
+from music_rllib.store.node_store import NodeStore
+from music_rllib.store.work_folder import WorkFolder, steps_of
 
 if TYPE_CHECKING:
     from music_rllib.experiment.session import Sweep

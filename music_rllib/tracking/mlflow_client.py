@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import logging
-import os
 import re
-import warnings
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Literal, NamedTuple
 from urllib.parse import quote
 
-from filelock import FileLock
-from mlflow import MlflowClient
 from mlflow.entities import (
     LoggedModel,
     LoggedModelOutput,
@@ -28,16 +23,12 @@ from mlflow.tracking._tracking_service import utils
 from music_rllib import names
 from music_rllib.errors import TrackingError
 from music_rllib.redaction import redact
+from music_rllib.tracking.connection import configure_mlflow, open_client
 from music_rllib.tracking.policy_model import MODEL_NAME, write_model
 from music_rllib.tracking.store import TrackingStore
 
 MAX_METRICS = 1000
 """MLflow's limit for the metrics of one request."""
-REQUEST_SECONDS = 30
-"""Timeout of one request, unless MLFLOW_HTTP_REQUEST_TIMEOUT sets another."""
-SCHEMA_SECONDS = 120.0
-"""Longest wait for another process that creates the tables of the same sqlite file."""
-
 _LASTING_ERRORS = frozenset(
     {
         "INVALID_PARAMETER_VALUE",
@@ -107,9 +98,9 @@ class Experiment:
         """Parent runs of other plans of the sweep."""
         self._known: dict[str, KnownRun] | None = None
         """Runs by node key ("" for the sweep's own run); None until the server has listed them."""
-        _configure_mlflow()
+        configure_mlflow()
         try:
-            self._client = _open_client(store)
+            self._client = open_client(store)
             self.id = self._find_or_create()
         except TrackingError:
             raise
@@ -351,8 +342,8 @@ class Experiment:
 
 def attach(store: TrackingStore, run_id: str, folder: str, name: str, note: str) -> None:
     """Upload a folder as a run's artefacts below `name`, and set the description of the run."""
-    _configure_mlflow()
-    client = _open_client(store)
+    configure_mlflow()
+    client = open_client(store)
     client.log_artifacts(run_id, folder, name)
     client.set_tag(run_id, names.TAG_NOTE, note)
 
@@ -367,45 +358,6 @@ def mlflow_reason(error: Exception) -> str:
     line = redact(lines[0])
     hint = next((hint for sign, hint in _HINTS.items() if re.search(sign, line)), "")
     return f"{line} {hint}".rstrip()
-
-
-def _configure_mlflow() -> None:
-    """Turn off MLflow's own retries and its notices.
-
-    MLflow's retries would block for minutes, and could create a run twice if a response gets
-    lost. The sender retries instead, and looks for the run first.
-    """
-    os.environ["MLFLOW_HTTP_REQUEST_MAX_RETRIES"] = "0"
-    os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", str(REQUEST_SECONDS))
-    os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
-    os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
-    # Raised by MLflow's use of SQLAlchemy when its database code is imported.
-    warnings.filterwarnings("ignore", r"The ``noload`` loader strategy", DeprecationWarning)
-    # Raised by MLflow's own type hints when its model code is imported.
-    warnings.filterwarnings("ignore", r".*Any type hint is inferred as AnyType", UserWarning)
-    logging.getLogger("alembic").setLevel(logging.WARNING)
-    # It logs tracebacks of errors that it also raises, and that the sender logs in one line.
-    logging.getLogger("mlflow.store.db.utils").setLevel(logging.CRITICAL)
-
-
-def _open_client(store: TrackingStore) -> MlflowClient:
-    """Connect to the store. Only one process at a time may create the tables of a sqlite file.
-
-    MLflow's migration crashes if several processes open a new file at once.
-    """
-    if store.database is None:
-        return MlflowClient(store.uri)
-    try:
-        store.database.parent.mkdir(parents=True, exist_ok=True)
-        with FileLock(f"{store.database}.lock", timeout=SCHEMA_SECONDS):
-            client = MlflowClient(store.uri)
-            client.search_experiments(max_results=1)
-            return client
-    except (OSError, TimeoutError) as error:
-        raise TrackingError(
-            f"{store.database} must be writable for the local MLflow store: {error}. "
-            "Choose another storage folder or name a server in mlflow.tracking_uri."
-        ) from error
 
 
 def _forget_repository(owner: str) -> None:

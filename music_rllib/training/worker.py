@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import time
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
@@ -20,7 +21,7 @@ from music_rllib.redaction import redact
 from music_rllib.runtime.provenance import provenance_tags
 from music_rllib.store.handoff import Weights, read_handoff, write_handoff
 from music_rllib.store.lease import HeldLease, Lease, LeaseLostError
-from music_rllib.store.node_store import Draft, NodeStore, Saved, WorkFolder, steps_of
+from music_rllib.store.node_store import NodeStore
 from music_rllib.store.object_folder import StorageError
 from music_rllib.store.run_record import (
     HISTORY,
@@ -30,6 +31,7 @@ from music_rllib.store.run_record import (
     last_values,
     to_json_lines,
 )
+from music_rllib.store.work_folder import Draft, Saved, WorkFolder, steps_of
 from music_rllib.training.divergence import divergence
 from music_rllib.training.environment import RunEnvironment
 from music_rllib.training.failure_reason import cause_of, trace_of
@@ -83,6 +85,15 @@ class RunTrainable(Trainable):
         self._seconds_before = self._began = self._saved_at = 0.0
         self._unsent = 0
         """Position in the history of the first report that the driver does not have."""
+
+    def reset_config(self, new_config: dict[str, Any]) -> bool:
+        """Take on another run, which starts as it would in a new process."""
+        self.cleanup()
+        self.__dict__.pop("_store", None)
+        self.__dict__.pop("_work", None)
+        self.setup(new_config)
+        gc.collect()  # networks, replay and environments refer to each other in circles
+        return True
 
     @cached_property
     def _store(self) -> NodeStore:

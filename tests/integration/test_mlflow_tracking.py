@@ -620,6 +620,23 @@ def test_a_newcomers_screen_stays_clean(fresh_store: FreshStore) -> None:
     assert fresh_store.screen == ""
 
 
+def test_a_second_store_starts_from_the_tables_of_the_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing of the first store is in it but empty tables."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    for name in ("first", "second"):
+        folder = tmp_path / name
+        folder.mkdir()
+        monkeypatch.chdir(folder)
+        Tracker(sweep_name=f"of {name}", storage=str(folder), config={}).close()
+        experiments = client_of(folder).search_experiments()
+        assert {one.name for one in experiments} == {"Default", f"of {name}"}
+        assert all(str(folder) in str(one.artifact_location) for one in experiments)
+        (kept,) = (tmp_path / "cache" / "music_rllib").iterdir()
+        assert kept.name == f"mlflow-{mlflow.__version__}.db"
+
+
 # A driver that is killed ------------------------------------------------------------------------
 
 DRIVER = """

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
 import re
+import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -36,7 +38,8 @@ from music_rllib.training.worker import CAUSE, NOTES, REPORTS, RunTrainable
 
 pytestmark = pytest.mark.integration
 
-ENVIRONMENTS = Path(__file__).parents[1] / "environments"
+ROOT = Path(__file__).parents[2]
+ENVIRONMENTS = ROOT / "tests" / "environments"
 POINT = Task(
     name="Point",
     env_id="point_env:Point-v0",
@@ -365,3 +368,39 @@ def test_what_runs_take_side_by_side_is_measured(monkeypatch: pytest.MonkeyPatch
     assert 0 < sample.evaluation_seconds < took
     assert sample.steps_per_second > 20
     assert 5 * 2**20 < sample.memory < 2 * 2**30
+
+
+ALONE = """
+import sys
+from pathlib import Path
+from music_rllib.training.job import NodeJob
+from music_rllib.training.worker import RunTrainable
+from music_rllib.runtime.quiet import prepare_environment
+prepare_environment()
+trial = RunTrainable(config={"job": Path(sys.argv[1]).read_text()})
+while not trial.train()["done"]:
+    pass
+"""
+
+
+@pytest.mark.usefixtures("local_ray")
+def test_a_run_in_a_process_that_has_trained_others_has_the_same_numbers(tmp_path: Path) -> None:
+    """The process has trained another run and failed once; a new process is the reference."""
+    storage, reference = tmp_path / "reused", tmp_path / "new"
+    first = job(
+        storage, settings("music-u", seed=4, tac={"hidden_sizes": [8], "random_steps": 100})
+    )
+    bad = job(storage, settings("tac", task=POINT.model_copy(update={"env_id": "point_env:No-v0"})))
+    second = job(storage, settings("music-u"))
+    trial = RunTrainable(config=first.to_tune())
+    for node in (first, bad, second):
+        assert trial.reset(node.to_tune())
+        while not (result := trial.train())["done"]:
+            pass
+    trial.stop()
+    assert CAUSE not in result
+    file = tmp_path / "job.json"
+    file.write_text(job(reference, settings("music-u")).model_dump_json())
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(ENVIRONMENTS)])}
+    subprocess.run([sys.executable, "-c", ALONE, str(file)], env=environment, check=True)
+    assert numbers(storage, second) == numbers(reference, second)

@@ -25,9 +25,9 @@ from music_rllib.experiment.session import Sweep, plan_document
 from music_rllib.results.planned import LastValues
 from music_rllib.search.ranking import best_in_words, best_so_far
 from music_rllib.store.lease import process_start, this_machine
-from music_rllib.store.node_store import steps_of
 from music_rllib.store.object_folder import StorageError
 from music_rllib.store.run_record import Report, RunResult, last_values
+from music_rllib.store.work_folder import steps_of
 from music_rllib.sweep.cost import searched
 
 LOCAL_SECONDS, REMOTE_SECONDS = 2.0, 15.0
