@@ -10,7 +10,7 @@ name, and else of the export docs/results/data/NAME. KIND is
 
 - of a planned study: `verdict`, with the hypothesis, `answer`, `outcomes`, with stages, `seeds`,
   `cells`, `figure`, with the name of one, `hours` or `progress` of its runs;
-- of any sweep: `runs`, `provenance`, `success`, `stages`, `curves`, `races` or `effects`, with
+- of any sweep: `runs`, `provenance`, `success`, `stages`, or `curves`, with
   stages behind NAME if not all are meant, `metric`, with metrics, or `search`.
 
     python -m music_rllib.report results/NAME --export docs/results/data/NAME --add
@@ -24,7 +24,6 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from docs.result_pages.exports import hours_text, progress_text, sweep_called
-from docs.result_pages.races import effects_table, races_table
 from docs.result_pages.runs import metric_table, provenance, runs_table
 from docs.result_pages.searches import search_text
 from docs.result_pages.studies import (
@@ -86,8 +85,6 @@ def page(template: str, figures: dict[str, bytes]) -> str:
         "success": lambda sweep, *stages: success(sweep, figures, stages),
         "stages": stages_table,
         "curves": lambda sweep, *stages: stage_curves(sweep, figures, stages),
-        "races": races_table,
-        "effects": effects_table,
         "metric": metric_table,
         "search": search_text,
     }

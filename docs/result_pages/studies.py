@@ -14,7 +14,12 @@ from music_rllib import names
 from music_rllib.report.figures.choice import slug, stage_drawings
 from music_rllib.report.study import study_drawings
 from music_rllib.results.analysis import THRESHOLDS, StageAnalysis, analyse
-from music_rllib.results.claims.answer import answer, numbers_in_words
+from music_rllib.results.claims.answer import (
+    answer,
+    not_excluded,
+    numbers_in_words,
+    verdict_in_words,
+)
 from music_rllib.results.claims.plan import analysis_plan
 from music_rllib.results.claims.study import Mean, label_of, study_of
 from music_rllib.results.data import Sweep
@@ -35,7 +40,9 @@ def verdict_text(name: str, *words: str) -> str:
         return progress_text(name)
     claims = {claim.hypothesis.text: claim for claim in study_of(sweep).planned if claim.hypothesis}
     claim = claims[hypothesis]
-    return f"**{claim.verdict}**, {numbers_in_words(claim)}; {claim.contrast.seeds[0]} seeds"
+    seeds = claim.contrast.seeds[0]
+    numbers = numbers_in_words(claim)
+    return f"**{verdict_in_words(claim)}**, {numbers}; {seeds} seeds{not_excluded(claim)}"
 
 
 def answer_text(sweep: Sweep) -> Iterator[str]:

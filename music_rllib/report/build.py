@@ -24,7 +24,6 @@ from music_rllib.report.tables import (
     curves_table,
     finals_table,
     improvement_table,
-    races_table,
     runs_table,
     waits_table,
 )
@@ -167,7 +166,6 @@ def _tables(report: Report) -> Iterable[Table]:
     yield from study_csv(report.study)
     yield finals_table(report.analyses)
     yield waits_table(report.analyses)
-    yield races_table(with_stages)
     yield improvement_table(with_stages)
     yield runs_table(report.sweep)
     yield curves_table(report.drawings)

@@ -7,14 +7,18 @@ from collections.abc import Iterator
 from music_rllib.report.figures.choice import SETTINGS, Drawing
 from music_rllib.report.figures.palette import styles_of
 from music_rllib.report.figures.study import alpha_panels, area_profile_panels
-from music_rllib.report.pieces import DASH, TextTable, estimate_cells
+from music_rllib.report.pieces import DASH, TextTable, estimate_cells, number_cell
 from music_rllib.report.tables import Table
-from music_rllib.results.claims.claim import Claim
-from music_rllib.results.claims.contrasts import Verdict
+from music_rllib.results.claims.answer import (
+    interval_in_words,
+    not_excluded,
+    p_in_words,
+    verdict_in_words,
+)
 from music_rllib.results.claims.sensitivity import alpha_sensitivity
 from music_rllib.results.claims.study import Study, label_of
 from music_rllib.results.claims.tables import claim_rows, mean_rows
-from music_rllib.results.comparison import SHOW_SEEDS_BELOW, number, p_text
+from music_rllib.results.comparison import SHOW_SEEDS_BELOW, number
 
 
 def study_tables(study: Study) -> list[TextTable]:
@@ -32,27 +36,25 @@ def _claims_table(study: Study) -> TextTable:
     measures = " or ".join(dict.fromkeys(claim.measure.words for claim in claims))
     return TextTable(
         title=f"Comparisons by the {_kind(study)}",
-        header=("Task", "Pair", "Difference", "95 % interval", "p", "Verdict", "Planned", "Seeds"),
+        header=("Task", "Pair", "Difference", "Interval", "p", "Verdict", "Planned", "Seeds"),
         rows=[
             (
                 claim.task,
                 f"{claim.first} against {claim.second}",
-                *estimate_cells(claim.contrast.difference),
-                *_p_and_verdict(claim),
+                number_cell(f"{float(claim.contrast.difference.value):+.3g}"),
+                interval_in_words(claim),
+                p_in_words(claim).removeprefix("p = ") or DASH,
+                f"{verdict_in_words(claim)}{not_excluded(claim)}",
                 "yes" if claim.planned else "no",
                 " and ".join(map(str, dict.fromkeys(claim.contrast.seeds))),
             )
             for claim in claims
         ],
-        note=f"Differences in {measures}, of a seed where seeds are shared (Student's t, Welch's "
-        "otherwise); equivalence by two one-sided tests. Holm's correction over what was planned, "
-        "and over the rest.",
+        note=f"Differences in {measures}, of paired seeds where both sides have the same ones "
+        "(Student's t, Welch's otherwise); equivalence by two one-sided tests (TOST). The planned "
+        "comparisons, or without a plan all of them, are one family with adjusted p-values (Holm). "
+        "A failed run counts with the worst value.",
     )
-
-
-def _p_and_verdict(claim: Claim) -> tuple[str, str]:
-    within = f" within {claim.margin:g}" if claim.verdict is Verdict.EQUIVALENT else ""
-    return p_text(claim.p_of_verdict), f"{claim.verdict}{within}"
 
 
 def _means_table(study: Study) -> TextTable:
@@ -65,7 +67,7 @@ def _means_table(study: Study) -> TextTable:
             " ".join(map(number, sorted(mean.scores.by_seed.values())))
             if len(mean.scores.by_seed) < SHOW_SEEDS_BELOW
             else DASH,
-            f"{len(mean.scores.by_seed)} of {mean.runs}",
+            f"{mean.scores.finished} of {mean.runs}",
         )
         for mean in study.means
     ]
@@ -73,7 +75,8 @@ def _means_table(study: Study) -> TextTable:
         title=f"{_kind(study).capitalize()} of each condition",
         header=("Task", "Condition", "Measure", "Mean", "95 % interval", "Each seed", "Finished"),
         rows=rows,
-        note="Of finished runs; the area is the mean over the budget, by the trapezoid rule.",
+        note="The area is the mean over the budget, by the trapezoid rule. A failed run counts "
+        "with the worst value.",
     )
 
 
@@ -81,6 +84,8 @@ def study_csv(study: Study) -> Iterator[Table]:
     """The same numbers unrounded, and the primary metric as a function of α."""
     means = [row | {"by_seed": _seed_scores(row["by_seed"])} for row in mean_rows(study)]
     claims = [row | {"seeds": " ".join(map(str, row["seeds"]))} for row in claim_rows(study)]
+    for row in claims:
+        row["in_words"] = "; ".join(filter(None, row["in_words"]))
     for name, rows in (("area_under_curve", means), ("comparisons", claims)):
         columns = " ".join(rows[0]) if rows else ""
         yield Table(name=name, columns=columns, rows=[list(row.values()) for row in rows])

@@ -147,30 +147,6 @@ def waits_table(analyses: Iterable[StageAnalysis]) -> Table:
     )
 
 
-def races_table(analyses: Iterable[StageAnalysis]) -> Table:
-    """Probability that one condition reaches a success rate sooner than another, by pairs."""
-    return Table(
-        name="probability_sooner",
-        columns="stage task threshold first second probability_first_sooner lower upper "
-        "p_value_holm decided reached",
-        rows=[
-            (
-                analysis.stage.name,
-                race.task,
-                race.threshold,
-                race.first,
-                race.second,
-                *_numbers(race.estimate),
-                race.p_value,
-                race.decided,
-                race.reached,
-            )
-            for analysis in analyses
-            for race in analysis.races
-        ],
-    )
-
-
 def runs_table(sweep: Sweep) -> Table:
     """Every run of the sweep, with its last evaluation and entropies."""
     return Table(

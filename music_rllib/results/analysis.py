@@ -25,11 +25,9 @@ from music_rllib.results.conditions import (
 from music_rllib.results.data import Ints, Sweep
 from music_rllib.results.statistics import Array, Estimate
 from music_rllib.results.time_to_threshold import (
-    Race,
     Waits,
     median_wait,
     median_wait_interval,
-    races,
     waits_of,
 )
 
@@ -102,8 +100,6 @@ class StageAnalysis:
     stage: Stage
     scopes: tuple[Scope[Condition], ...]
     waits: tuple[Wait, ...]
-    races: tuple[Race, ...]
-    """Comparisons of each pair of conditions, for each threshold."""
     entropies: Mapping[tuple[str, Condition], Entropies]
     """Entropies by scope and condition."""
     cut_at: Mapping[str, float]
@@ -129,15 +125,11 @@ def _analyse(
         if metric == names.EVAL_SUCCESS
         for threshold in THRESHOLDS
     ]
-    groups = {condition.label: condition.runs for condition in stage.compared}
     return StageAnalysis(
         stage=stage,
         scopes=scopes,
         waits=tuple(
             wait for task, threshold in cells for wait in _waits(sweep, stage, task, threshold)
-        ),
-        races=tuple(
-            race for task, threshold in cells for race in races(sweep, task, groups, threshold)
         ),
         entropies={
             (scope.name, final.condition): _entropies(ended, final.condition, stage, scope.name)

@@ -21,7 +21,7 @@ from music_rllib.results.statistics import SIGNIFICANCE, Array, Estimate
 ALL_TASKS = "all tasks"
 GAP = 0.1
 """Default difference in a rate that a reader would want to be able to see."""
-_AVERAGED = {*names.EVAL_RATES, *names.ENTROPIES}
+AVERAGED = {*names.EVAL_RATES, *names.ENTROPIES}
 """Metrics that have the same unit on every task, so that they can be averaged over tasks."""
 SHOW_SEEDS_BELOW = 10
 """Number of seeds from which on they are not shown one by one."""
@@ -116,7 +116,7 @@ def scopes_of(
         may_be_compared: conditions that are compared with each other.
     """
     columns = [(task, metric, [column]) for column, (task, metric) in enumerate(metrics.items())]
-    if len(columns) > 1 and len(set(metrics.values())) == 1 and columns[0][1] in _AVERAGED:
+    if len(columns) > 1 and len(set(metrics.values())) == 1 and columns[0][1] in AVERAGED:
         columns.insert(0, (ALL_TASKS, columns[0][1], list(range(len(columns)))))
     return tuple(
         _scope(name, metric, [(c, x[:, chosen], n) for c, x, n in conditions], may_be_compared)

@@ -88,6 +88,7 @@ def read_stored(
     state = location.read(sweep_files.STATE) or _NOT_STARTED
     runs = _read_runs(opened, metrics, lenient=lenient)
     pairs = list(zip(opened.plan.nodes, runs, strict=True))
+    causes = _causes(opened, state)
     damage = {node.label: run.damage for node, run in pairs if run.damage is not None}
     provenance = [run.provenance for run in runs if run.provenance]
     configuration = location.read(sweep_files.CONFIG)
@@ -98,7 +99,7 @@ def read_stored(
         source=redact(opened.storage),
         tags=provenance[-1] if provenance else {},
         config=yaml.safe_dump(configuration, sort_keys=False, allow_unicode=True),
-        runs=[_record(node, run, opened.plan.algorithm, state) for node, run in pairs],
+        runs=[_record(node, run, opened.plan.algorithm, state, causes) for node, run in pairs],
         history=columns(run.points for run in runs),
         searches=searches_of(location, opened.config),
         plans=plans_in(location.storage, location.name),
@@ -227,11 +228,27 @@ def _run(lines: bytes, node: Node, metrics: Collection[str] | None) -> _Run:
     return _Run(points, begun=True, started=first, ended=last)
 
 
-def _record(node: Node, run: _Run, algorithm: str, state: Mapping[str, Any]) -> RunRecord:
+def _causes(opened: session.Sweep, state: Mapping[str, Any]) -> dict[str, str]:
+    """Node key to cause, of runs that failed and of those whose source failed."""
+    failed = {failure["run"]: failure["cause"] for failure in state["failures"]}
+    causes: dict[str, str] = {}
+    for node in opened.plan.nodes:  # a source comes before the runs that start from it
+        cause = failed.get(node.label) or causes.get(node.source_key or "")
+        if cause is not None and node.key not in opened.finished:
+            causes[node.key] = cause
+    return causes
+
+
+def _record(
+    node: Node,
+    run: _Run,
+    algorithm: str,
+    state: Mapping[str, Any],
+    causes: Mapping[str, str],
+) -> RunRecord:
     planned = planned_run(node, algorithm)
     tags = {**run.provenance, **planned.tags}
-    causes = (one["cause"] for one in state["failures"] if one["run"] == node.label)
-    cause = next(causes, None) if run.damage is None else str(run.damage)
+    cause = causes.get(node.key) if run.damage is None else str(run.damage)
     if run.finished:
         status = "FINISHED"
     elif cause is not None:

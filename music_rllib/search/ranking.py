@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from music_rllib.config.search.settings import SearchSettings
 from music_rllib.experiment.plan import Plan, short
 from music_rllib.labels import in_runs, symbol
 from music_rllib.results import statistics as st
-from music_rllib.results.comparison import with_interval
+from music_rllib.results.comparison import AVERAGED, with_interval
 from music_rllib.results.conditions import Condition, final_scores, find_stages
 from music_rllib.results.data import Sweep
 from music_rllib.results.statistics import Estimate
@@ -109,10 +109,15 @@ class Scored:
     """Whether every planned run is finished, whatever it reported."""
 
 
-def scored_conditions(stage: str, plan: Plan, sweep: Sweep, metric: str) -> list[Scored]:
-    """The conditions of a stage that have a score by a metric."""
+def scored_conditions(
+    stage: str, plan: Plan, sweep: Sweep, metric: str, task: str | None = None
+) -> list[Scored]:
+    """The conditions of a stage that have a score by a metric, on all tasks or on one."""
     found = []
     for condition in (c for one in find_stages(sweep) if one.name == stage for c in one.conditions):
+        if task is not None:
+            own = tuple(run for run in condition.runs if sweep.runs[run].task == task)
+            condition = replace(condition, runs=own)
         tasks = dict.fromkeys(sweep.runs[run].task for run in condition.runs)
         scores = final_scores(sweep, condition, dict.fromkeys(tasks, metric))
         known = scores[:, ~np.isnan(scores).all(axis=0)]
@@ -166,7 +171,7 @@ def _entropies(
     """Entropies of a condition's policies at the end: metric to `value` and `interval`."""
     found = {}
     for metric in names.ENTROPIES:
-        for scored in scored_conditions(stage.name, plan, sweep, metric):
+        for scored in scored_conditions(stage.name, plan, sweep, metric, best.get("task")):
             if is_of(scored, stage, best):
                 estimate = scored.estimate
                 interval = [float(estimate.lower), float(estimate.upper)]
@@ -181,8 +186,23 @@ def is_of(scored: Scored, stage: Stage, best: Mapping[str, Any]) -> bool:
 
 
 def _best_condition(stage: Stage, plan: Plan, sweep: Sweep) -> dict[str, Any] | None:
+    """The best condition; of a metric whose scale differs between tasks, that of each task.
+
+    The first task's row then has the others under `other_tasks`.
+    """
     measure = measure_of(stage, sweep)
-    candidates = scored_conditions(stage.name, plan, sweep, measure.metric)
+    tasks = list(dict.fromkeys(run.task for run in sweep.runs if run.stage == stage.name))
+    if measure.metric in AVERAGED or len(tasks) < 2:
+        return _best_row(measure, stage, plan, sweep)
+    found = ((task, _best_row(measure, stage, plan, sweep, task)) for task in tasks)
+    rows = [row | {"task": task} for task, row in found if row is not None]
+    return rows[0] | {"other_tasks": rows[1:]} if rows else None
+
+
+def _best_row(
+    measure: Measure, stage: Stage, plan: Plan, sweep: Sweep, task: str | None = None
+) -> dict[str, Any] | None:
+    candidates = scored_conditions(stage.name, plan, sweep, measure.metric, task)
     best = best_of(candidates, measure)
     if best is None:
         return None
@@ -195,7 +215,7 @@ def _best_condition(stage: Stage, plan: Plan, sweep: Sweep) -> dict[str, Any] | 
         "metric": measure.metric,
         "direction": "maximize",
         "value": value,
-        "level": sum(float(c.estimate.value) == value for c in rivals),
+        "level": sum(math.isclose(float(c.estimate.value), value) for c in rivals),
         "interval": [float(best.estimate.lower), float(best.estimate.upper)],
         "runs": planned if best.complete else best.runs,
         "planned": planned,
@@ -213,6 +233,12 @@ def _best_trial(
     estimate = interval(objective, np.asarray(best.scores, float), stage.evaluation_episodes)
     direction = "maximize" if objective.maximised else "minimize"
     runs = int(np.size(best.scores))
+    assert search is not None
+    rivals = (
+        [row["fresh"][0] for row in search["ranking"] if "failure" not in row]
+        if best.fresh
+        else [t["objective"][0] for arm in search["arms"] for t in arm["trials"] if t["objective"]]
+    )
     return {
         "stage": stage.name,
         "values": dict(best.values),
@@ -220,6 +246,7 @@ def _best_trial(
         "metric": objective.metric,
         "direction": direction,
         "value": best.value,
+        "level": sum(math.isclose(value, best.value) for value in rivals) - 1,
         "interval": [float(estimate.lower), float(estimate.upper)],
         "runs": runs,
         "planned": runs,
@@ -229,12 +256,15 @@ def _best_trial(
 
 def best_in_words(best: Mapping[str, Any]) -> str:
     """The result of `best_so_far` in a line."""
+    if others := best.get("other_tasks"):
+        rows = ({**best, "other_tasks": ()}, *others)
+        return "; ".join(f"{row['task']}: {best_in_words(row)}" for row in rows)
     values = ", ".join(
         f"{symbol(name)} = {short(value, name)}" for name, value in best["values"].items()
     )
     number = with_interval(best["value"], best["interval"])
     runs, planned = best["runs"], best.get("planned", best["runs"])
-    level = f" and {best['level']} more" if best.get("level") else ""  # the first of equals
+    level = f" and {best['level']} more" if best.get("level") else ""  # they tie
     text = f"{best['stage']} {values}".rstrip() + f"{level}: {best.get('by', 'success')} {number}, "
     if runs < planned:
         text += f"{runs} of {planned} runs (no condition has all of its runs yet)"

@@ -60,6 +60,27 @@ def export_best(location: SweepLocation, stage_name: str | None, output: Path) -
     searches = searches_of(location, opened.config)
     metric = measure_of(stage, sweep).metric
     best = _best(opened, stage, sweep, metric, searches)
+    others = best.pop("other_tasks", None)
+    if not others:
+        return _export_chosen(opened, stage, sweep, best, metric, output)
+    rows = [best, *others]
+    exported = [
+        _export_chosen(opened, stage, sweep, row, metric, output / row["task"]) for row in rows
+    ]
+    why = (f"{row['task']}: {one['why']}" for row, one in zip(rows, exported, strict=True))
+    policies = [policy for one in exported for policy in one["policies"]]
+    return exported[0] | {"why": "\n".join(why), "policies": policies}
+
+
+def _export_chosen(
+    opened: session.Sweep,
+    stage: Stage,
+    sweep: Sweep,
+    best: Mapping[str, Any],
+    metric: str,
+    output: Path,
+) -> dict[str, Any]:
+    """Export the policies of one condition, on all its tasks or on the one of `best`."""
     scored = _scored(opened, stage, sweep, best, metric)
     if scored is None:
         raise BadInputError(
@@ -71,6 +92,8 @@ def export_best(location: SweepLocation, stage_name: str | None, output: Path) -
     if not scored.complete:
         rest = f", of {len(condition.runs)} planned: no condition has all of its runs"
     fresh = best["on_fresh_seeds"]
+    level = best.get("level", 0)
+    rank = f"ties for first with {level} more" if level else "is first"
     chosen: dict[str, Any] = {
         "sweep": opened.config.name,
         "stage": stage.name,
@@ -81,9 +104,9 @@ def export_best(location: SweepLocation, stage_name: str | None, output: Path) -
         "value": best["value"],
         "interval": best["interval"],
         "success_rate": None if success is None else float(success.estimate.value),
-        "entropies": best["entropies"],
+        "entropies": best.get("entropies", {}),
         "on_fresh_seeds": fresh,
-        "why": f"{stage.name}: {label_of(condition)} is first by {by} on "
+        "why": f"{stage.name}: {label_of(condition)} {rank} by {by} on "
         f"{'fresh seeds' if fresh else 'the seeds that it was chosen by'}; {by} "
         f"({'' if stage.search else 'mean, '}95 %): "
         f"{with_interval(best['value'], best['interval'])} over {in_runs(scored.runs)}{rest}",
@@ -131,7 +154,7 @@ def _scored(
     opened: session.Sweep, stage: Stage, sweep: Sweep, best: Mapping[str, Any], metric: str
 ) -> Scored | None:
     """The runs of the best condition, with their scores by a metric; None if there are none."""
-    candidates = scored_conditions(stage.name, opened.plan, sweep, metric)
+    candidates = scored_conditions(stage.name, opened.plan, sweep, metric, best.get("task"))
     return next((one for one in candidates if is_of(one, stage, best)), None)
 
 

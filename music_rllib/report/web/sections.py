@@ -25,7 +25,7 @@ UNWRAPPED_LETTERS = 40
 
 def performance_tables(analyses: Sequence[StageAnalysis]) -> list[TextTable]:
     """Final values, entropies, steps to a threshold and comparisons of all stages."""
-    tables = (_final_table, _entropy_table, _waits_table, _races_table, _improvement_table)
+    tables = (_final_table, _entropy_table, _waits_table, _improvement_table)
     return [_of_stages([(one.stage.name, table(one)) for one in analyses]) for table in tables]
 
 
@@ -106,33 +106,6 @@ def _waits_table(analysis: StageAnalysis) -> TextTable:
         note="First evaluation at or above the success rate. Runs that never got there count as "
         "not there yet at their last evaluation (Kaplan-Meier median): none is left out. The "
         f"interval is that of the runs' order, which needs {FEWEST_FOR_INTERVAL} of them.",
-    )
-
-
-def _races_table(analysis: StageAnalysis) -> TextTable:
-    rows = [
-        (
-            race.task,
-            f"{race.first} before {race.second}",
-            _percent(race.threshold),
-            *(
-                (*estimate_cells(race.estimate), p_text(race.p_value), _yes_or_no(race.decided))
-                if race.reached
-                else (number_cell(DASH), "not reached by either", DASH, "no")
-            ),
-        )
-        for race in sorted(analysis.races, key=lambda race: (race.threshold, race.task))
-    ]
-    return TextTable(
-        title="Who gets there sooner",
-        header=(
-            *("Task", "Pair", "Success", "Probability"),
-            *("95 % interval", "Permutation", "Decided"),
-        ),
-        rows=rows,
-        note="Probability that a run of the first reaches the success rate in fewer environment "
-        "steps than a run of the second (ties half; whoever ends below it is last). Decided: "
-        f"p < {SIGNIFICANCE:g} after Holm's correction.",
     )
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from music_rllib import names
 from music_rllib.results.claims.claim import Claim
 from music_rllib.results.claims.contrasts import (
+    FEWEST_SEEDS,
     Verdict,
     seeds_for_difference,
     seeds_for_equivalence,
@@ -19,11 +20,11 @@ from music_rllib.results.claims.study import Mean, Study, label_of
 from music_rllib.results.comparison import ALL_TASKS, interval_text, number, p_text
 from music_rllib.results.conditions import Stage
 from music_rllib.results.data import Sweep
-from music_rllib.results.statistics import MAX_SEEDS, SIGNIFICANCE
+from music_rllib.results.statistics import MAX_SEEDS, SIGNIFICANCE, Estimate
 
 MOST_CLAIMS = 4
 """Number of claims with a sentence of their own; the others are in the table."""
-FEWEST_SEEDS = 3
+FEWEST_FOR_SPREAD = 3
 """Least number of seeds whose spread counts; that of two may be ten times too small."""
 
 
@@ -43,17 +44,18 @@ def answer(sweep: Sweep, study: Study) -> list[str]:
     elif not shown:
         only = study.means[0]
         sentences.append(
-            f"Nothing is compared: {label_of(only.condition)} has {only.measure.words} of "
-            f"{number(only.estimate.value)} (95 % {interval_text(only.estimate)})."
+            f"Only one condition has a result: {label_of(only.condition)}, {only.measure.words} "
+            f"{number(only.estimate.value)} ({mean_interval(only.estimate)})."
         )
     if rest := [claim for claim in study.claims if claim not in shown[:MOST_CLAIMS]]:
-        counts = Counter(claim.verdict for claim in rest)
+        counts = Counter(str(claim.verdict) for claim in rest)
         verdicts = ", ".join(f"{n} {verdict}" for verdict, n in counts.items())
         more = f"{len(rest)} more comparisons: {verdicts}"
         sentences.append(f"{more}." if len(rest) > 1 else f"1 more comparison: {rest[0].verdict}.")
     sentences += [_counted(study, shown), _seeds(sweep, study, shown)]
     sentences.append(f"Control: {_control(sweep, study, study.stage)}.")
-    if any(claim.verdict is Verdict.UNDECIDED for claim in study.claims):
+    undecided = (Verdict.UNDECIDED, Verdict.NONE)
+    if any(claim.verdict in undecided and not claim.waiting for claim in study.claims):
         sentences += filter(None, [seeds_needed(shown, study.means, study.family)])
     return [*sentences, *(f"Not tested: {text}." for text in study.untested[:1])]
 
@@ -83,28 +85,60 @@ def _changed(before: AnalysisPlan, after: AnalysisPlan) -> list[str]:
 
 
 def in_words(claim: Claim) -> str:
-    """`q = 1.5 against q = 1 on FetchPush: superior, +0.12 (95 % 0.05 to 0.19; p = 0.002)`."""
-    verdict = str(claim.verdict)
-    if claim.verdict is Verdict.EQUIVALENT:
-        verdict = f"equivalent within {claim.margin:g}"
+    """`q = 1.5 against q = 1 on FetchPush: superior, +0.12 (95% CI 0.05 to 0.19; p = 0.002)`."""
     where = "over all tasks" if claim.task == ALL_TASKS else f"on {claim.task}"
     mean = f", averaged over {len(claim.pairs)} settings" if len(claim.pairs) > 1 else ""
     held = {True: ", as expected", False: ", not as expected", None: ""}[claim.confirmed]
     return (
-        f"{claim.first} against {claim.second} {where}{mean}: {verdict}, {numbers_in_words(claim)}"
-        f"{held}"
+        f"{claim.first} against {claim.second} {where}{mean}: {verdict_in_words(claim)}, "
+        f"{numbers_in_words(claim)}{held}{not_excluded(claim)}"
     )
 
 
-def numbers_in_words(claim: Claim) -> str:
-    """`+0.12 (95 % 0.05 to 0.19; p = 0.002)`."""
+def verdict_in_words(claim: Claim) -> str:
+    """`equivalent within 0.05`, or the reason why there is no verdict."""
+    if claim.verdict is Verdict.EQUIVALENT:
+        return f"equivalent within {claim.margin:g}"
+    return claim.why if claim.verdict is Verdict.NONE else str(claim.verdict)
+
+
+def not_excluded(claim: Claim) -> str:
+    """Rare collapses that a verdict does not exclude; empty if there is nothing to say."""
+    if claim.collapses is None:
+        return ""
+    return f"; it does not exclude collapses in up to {100 * claim.collapses:.0f} % of seeds"
+
+
+def interval_in_words(claim: Claim) -> str:
+    """The interval that belongs to the verdict: `95% CI 0.05 to 0.19`."""
+    if claim.verdict is Verdict.EQUIVALENT:
+        return f"90% CI {interval_text(claim.contrast.within)}"
     difference = claim.contrast.difference
-    is_small = abs(difference.value) < 100
-    gap = f"{float(difference.value):+.2f}" if is_small else number(difference.value)
-    ends = interval_text(difference)
-    if difference.has_interval:
-        ends = f"95 % {ends}"
-    return f"{gap} ({ends}; {p_text(claim.p_of_verdict)})"
+    return f"95% CI {interval_text(difference)}" if difference.has_interval else "no interval"
+
+
+def p_in_words(claim: Claim) -> str:
+    """The p-value of the verdict, then the one adjusted for the family; empty if it is not tested.
+
+    It is named where it is not of a difference: `TOST p = 0.01, adjusted 0.03`.
+    """
+    raw, adjusted, name = claim.contrast.p_value, claim.p_value, ""
+    if claim.verdict is Verdict.EQUIVALENT and claim.contrast.p_equivalent is not None:
+        raw, adjusted, name = claim.contrast.p_equivalent, claim.p_equivalent, "TOST "
+    if min(claim.contrast.seeds) < FEWEST_SEEDS or not claim.contrast.difference.has_interval:
+        return ""
+    if claim.verdict is Verdict.NONE:
+        return "" if claim.p_value is not None else f"unadjusted {p_text(float(raw))}"
+    own, family = p_text(float(raw)), p_text(float(raw) if adjusted is None else adjusted)
+    more = "" if own == family else f", adjusted {family.removeprefix('p = ')}"
+    return f"{name}{own}{more}"
+
+
+def numbers_in_words(claim: Claim) -> str:
+    """`+0.12 (95% CI 0.05 to 0.19; p = 0.002)`."""
+    value = claim.contrast.difference.value
+    gap = f"{float(value):+.2f}" if abs(value) < 100 else f"{float(value):+,.0f}"
+    return f"{gap} ({'; '.join(filter(None, (interval_in_words(claim), p_in_words(claim))))})"
 
 
 def _counted(study: Study, shown: Sequence[Claim]) -> str:
@@ -115,12 +149,13 @@ def _counted(study: Study, shown: Sequence[Claim]) -> str:
     if margins:
         text += f"; a difference below {max(margins):g} does not matter"
     if study.family > 1:
-        text += f"; Holm's correction over {study.family} comparisons"
+        text += f"; p-values adjusted for {study.family} comparisons (Holm)"
     return f"{text}."
 
 
 def _seeds(sweep: Sweep, study: Study, shown: Sequence[Claim]) -> str:
     finished = sum(sweep.runs[run].is_finished for run in study.runs)
+    failed = sum(mean.scores.failed for mean in study.means)
     counts = sorted({n for one in shown for n in one.contrast.seeds})
     if not counts:
         counts = sorted({len(one.scores.by_seed) for one in study.means})
@@ -132,7 +167,11 @@ def _seeds(sweep: Sweep, study: Study, shown: Sequence[Claim]) -> str:
         text += ", compared in pairs" if all(paired) else ", not all of them shared"
     if study.stage is not None and study.stage.is_search:
         text += ", fresh ones that no setting was chosen by"
-    return f"{text}; {finished} of {len(study.runs)} runs are finished."
+    text += f"; {finished} of {len(study.runs)} runs are finished."
+    if failed:
+        runs = "1 failed run counts" if failed == 1 else f"{failed} failed runs count"
+        text += f" {runs} with the worst value of the metric."
+    return text
 
 
 def _control(sweep: Sweep, study: Study, stage: Stage) -> str:
@@ -169,8 +208,8 @@ def seeds_needed(claims: Sequence[Claim], means: Sequence[Mean], family: int) ->
         return None
     if means and all(_at_a_bound(mean, margin) for mean in means):
         return (
-            f"All are within {margin:g} of the ceiling or the floor, where seeds differ less than "
-            "elsewhere: their spread does not tell how many would be needed."
+            f"All conditions are within {margin:g} of the ceiling or the floor, where seeds differ "
+            "less than elsewhere: their spread does not show how many seeds are needed."
         )
     bounded = {(mean.condition, mean.task) for mean in means if _at_a_bound(mean, margin)}
     clear = [
@@ -178,7 +217,7 @@ def seeds_needed(claims: Sequence[Claim], means: Sequence[Mean], family: int) ->
         for claim in claims
         if claim.margin is not None
         and np.isfinite(claim.contrast.spread)
-        and min(claim.contrast.seeds) >= FEWEST_SEEDS
+        and min(claim.contrast.seeds) >= FEWEST_FOR_SPREAD
         and not any(
             all((condition, claim.task) in bounded for condition in side)
             for side in zip(*claim.pairs, strict=True)
@@ -193,10 +232,14 @@ def seeds_needed(claims: Sequence[Claim], means: Sequence[Mean], family: int) ->
     alike = _seeds_text(seeds_for_equivalence(margin, spread, paired=paired, level=level))
     pairs = "paired seeds" if paired else "single seeds"
     return (
-        f"Differences of {pairs} spread by {number(spread)} (standard deviation): a difference of "
-        f"{margin:g} shows with 80 % chance from {shown} on, equivalence within it from {alike} on "
-        "where there is none."
+        f"Differences of {pairs} have a standard deviation of {number(spread)}: for 80 % power, a "
+        f"difference of {margin:g} needs {shown}, and equivalence within it needs {alike}."
     )
+
+
+def mean_interval(estimate: Estimate) -> str:
+    """`95% CI 0.62 to 0.81`, or `no interval`."""
+    return f"95% CI {interval_text(estimate)}" if estimate.has_interval else "no interval"
 
 
 def _at_a_bound(mean: Mean, margin: float) -> bool:
@@ -205,4 +248,6 @@ def _at_a_bound(mean: Mean, margin: float) -> bool:
 
 
 def _seeds_text(needed: int | None) -> str:
-    return f"more than {MAX_SEEDS} seeds" if needed is None else f"{needed} seeds"
+    if needed is None:
+        return f"more than {MAX_SEEDS} seeds"
+    return f"{max(needed, FEWEST_SEEDS)} seeds"

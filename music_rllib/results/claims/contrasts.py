@@ -1,45 +1,58 @@
-"""Contrasts of two conditions: their difference, its tests, and what these decide.
+"""Contrasts of two conditions: their difference, its tests, and the verdicts.
 
 Shapes: `x` and `y` are `[seeds]`, or `[seeds, draws]` for many studies at once (simulations); the
-results have the shape of the draws. Conditions that share their seeds share initial weights,
+results have the shape of the draws. Conditions that share all their seeds share initial weights,
 evaluation goals and pretraining, so their differences are taken seed by seed.
 
-Tests: Student's on the differences of a seed, Welch's without common seeds; two one-sided tests
-(Schuirmann 1987, https://doi.org/10.1007/BF01068419) for equivalence within a margin; scipy's each.
-Where all seeds tie there is no spread to go by, and relabelling them is the exact test.
+Tests: Student's t on the differences of paired seeds, Welch's otherwise; two one-sided tests
+(Schuirmann 1987, https://doi.org/10.1007/BF01068419) for equivalence within a margin. Intervals
+come from the same standard error, so the 95 % interval excludes 0 where p < 0.05, and the 90 %
+interval lies within the margin where the TOST p < 0.05. `benchmarks/decisions.py` simulates their
+error rates.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from math import comb
 
 import numpy as np
 from scipy import stats
 
 from music_rllib.results.statistics import (
+    POWER,
     SIGNIFICANCE,
     Array,
     Estimate,
     fewest_seeds,
-    holm,
     power_of_t_test,
 )
 
-_TIED = 1e-6
-"""Standard deviations below it are rounding errors: the seeds tie."""
+FEWEST_SEEDS = 5
+"""Least number of seeds per condition for a verdict."""
+COLLAPSES = 0.05
+"""Rate of collapses per seed from which a verdict states that it does not exclude it."""
+_COLLAPSED = 5
+"""Robust standard deviations from the median from which a seed counts as collapsed."""
+_SEEDS_FOR_SPREAD = 16
+"""Number of seeds from which collapsed ones are counted: the median absolute deviation of fewer is
+too noisy, and fewer do not exclude collapses of one in ten anyway."""
+_TIED = 1e-9
+"""Standard errors below this share of the scores are rounding errors."""
 
 
 class Verdict(StrEnum):
-    """Outcome of a comparison; each wrong one has a chance of at most 5 %."""
+    """Outcome of a comparison."""
 
     SUPERIOR = "superior"
     WORSE = "worse"
     EQUIVALENT = "equivalent"
-    """The difference is within the margin, whether or not there is some."""
+    """The difference is within the margin, whether or not there is one."""
     UNDECIDED = "undecided"
+    NONE = "no verdict"
+    """Too few seeds, unfinished runs, or a comparison made after the plan."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,25 +60,40 @@ class Contrast:
     """The difference `x - y` and its tests."""
 
     difference: Estimate
-    """Difference of the means, with its 95 % interval."""
+    """Difference of the means, with its 95 % interval; without one the seeds tie or are single."""
+    within: Estimate
+    """The same with its 90 % interval, which belongs to the test of equivalence."""
     p_value: Array
-    """Two-sided p-value of no difference; 1 where there are too few seeds for a test."""
+    """Two-sided p-value of no difference; 1 without an interval."""
     p_equivalent: Array | None
     """p-value of a difference of the margin or more; None without a margin."""
     spread: Array
-    """Standard deviation of a difference between single seeds; NaN where it is not known."""
+    """Standard deviation of a difference between single seeds; NaN if unknown."""
     paired: bool
     seeds: tuple[int, int]
     """Number of seeds of `x` and of `y`."""
 
+    collapsed: Array
+    """Number of seeds that are far from all others, of the side that has more of them."""
+
+    @property
+    def p_values(self) -> tuple[float, float | None]:
+        """p-values of no difference and of no equivalence, of a single study."""
+        return float(self.p_value), None if self.p_equivalent is None else float(self.p_equivalent)
+
+    @property
+    def collapses(self) -> Array:
+        """Upper end, with 80 % confidence, of the rate of collapses per seed.
+
+        Where a side collapses in one seed of ten and none was drawn, no test of these seeds can
+        tell, so a verdict states this rate (Clopper and Pearson; 1 - 0.2^(1/n) without collapses).
+        """
+        seeds = min(self.seeds)
+        return np.asarray(stats.beta.ppf(POWER, self.collapsed + 1, seeds - self.collapsed))
+
 
 def contrast(
-    x: Array,
-    y: Array,
-    *,
-    paired: bool,
-    margin: float | None = None,
-    apart: Estimate | None = None,
+    x: Array, y: Array, *, paired: bool, margin: float | None = None, noise: float = 0.0
 ) -> Contrast:
     """Compare two conditions.
 
@@ -74,9 +102,8 @@ def contrast(
         y: `[n]` or `[n, draws]`; with `paired` of the same seeds in the same order.
         paired: whether seeds are compared in pairs.
         margin: > 0, below which a difference does not matter; None: equivalence is not tested.
-        apart: the difference, with an interval from what is known of each condition alone, such as
-            its evaluation episodes. Where all seeds tie this interval stands, and equivalence is
-            not claimed beyond it.
+        noise: standard error of the difference from the evaluation episodes alone; the standard
+            error used is at least this large, so that seeds that tie are not taken for certain.
 
     Raises:
         ValueError: `margin` is not > 0, or pairs are incomplete.
@@ -87,46 +114,47 @@ def contrast(
         raise ValueError(f"pairs must be complete, got {len(x)} and {len(y)} seeds")
     x, y = np.asarray(x, float), np.asarray(y, float)
     value = np.asarray(x.mean(axis=0) - y.mean(axis=0))
-    if min(len(x), len(y)) < 2:
-        unknown, certain = np.full(value.shape, np.nan), np.ones(value.shape)
-        return Contrast(
-            difference=Estimate(value=value, lower=unknown, upper=unknown),
-            p_value=certain,
-            p_equivalent=None if margin is None else certain,
-            spread=unknown,
-            paired=paired,
-            seeds=(len(x), len(y)),
-        )
-    spread, error, freedom = _student(x, y, paired)
-    tied = spread < _TIED
-    # Ways to relabel tied seeds, none but one of which is as far apart: of pairs each difference
-    # may have the other sign, of groups each choice of seeds counts.
-    ways = 2 ** len(x) if paired else comb(len(x) + len(y), len(x))
+    spread = error = freedom = np.full(value.shape, np.nan)
+    if min(len(x), len(y)) >= 2:
+        spread, error, freedom = _student(x, y, paired)
+        error = np.maximum(error, noise)
+        scale = np.maximum(np.abs(x).max(axis=0), np.abs(y).max(axis=0))
+        error = np.where(error > _TIED * scale, error, np.nan)
+        # Welch's degrees of freedom are unknown where neither side has a spread.
+        freedom = np.where(np.isnan(freedom), len(x) + len(y) - 2, freedom)
 
     def p_greater(difference: Array) -> Array:
         """One-sided p-value of a mean difference as large as this one."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            student = stats.t.sf(difference / error, freedom)
-        return np.where(tied, np.where(difference > _TIED, 1 / ways, 1.0), student)
+        return np.asarray(np.nan_to_num(stats.t.sf(difference / error, freedom), nan=1.0))
 
-    half = stats.t.ppf(1 - SIGNIFICANCE / 2, freedom) * np.where(tied, np.nan, error)
-    lower, upper = value - half, value + half
-    if apart is not None:
-        lower, upper = np.where(tied, apart.lower, lower), np.where(tied, apart.upper, upper)
+    def with_interval(level: float) -> Estimate:
+        half = stats.t.ppf((1 + level) / 2, freedom) * error
+        return Estimate(value=value, lower=value - half, upper=value + half)
+
     p_equivalent = None
     if margin is not None:
         p_equivalent = np.maximum(p_greater(margin + value), p_greater(margin - value))
-        if apart is not None:
-            beyond = (apart.lower <= -margin) | (apart.upper >= margin)
-            p_equivalent = np.where(tied & beyond, 1.0, p_equivalent)
     return Contrast(
-        difference=Estimate(value=value, lower=lower, upper=upper),
+        difference=with_interval(1 - SIGNIFICANCE),
+        within=with_interval(1 - 2 * SIGNIFICANCE),
         p_value=np.minimum(1.0, 2 * p_greater(np.abs(value))),
         p_equivalent=p_equivalent,
-        spread=np.where(tied, np.nan, spread),
+        spread=np.where(spread > 0, spread, np.nan),
         paired=paired,
         seeds=(len(x), len(y)),
+        collapsed=np.max(
+            [_far_off(one, margin or 0.0) for one in ([x - y] if paired else [x, y])], axis=0
+        ),
     )
+
+
+def _far_off(scores: Array, margin: float) -> Array:
+    """Number of scores `[seeds, ...]` far from their median, by the median absolute deviation."""
+    if len(scores) < _SEEDS_FOR_SPREAD:
+        return np.zeros(scores.shape[1:])
+    away = np.abs(scores - np.median(scores, axis=0))
+    spread = 1.4826 * np.median(away, axis=0)  # a standard deviation, of normal scores
+    return np.asarray(np.sum(away > np.maximum(_COLLAPSED * spread, margin), axis=0))
 
 
 def _student(x: Array, y: Array, paired: bool) -> tuple[Array, Array, Array]:
@@ -160,25 +188,37 @@ def verdict_of(difference: float, p_value: float, p_equivalent: float | None) ->
     return Verdict.UNDECIDED
 
 
-def decide(
-    contrasts: Sequence[Contrast], without_test: int = 0
-) -> list[tuple[float, float | None, Verdict]]:
-    """Adjusted p-values of no difference and of no equivalence, and the verdict, of each contrast.
+def adjusted(
+    p_values: Sequence[tuple[float, float | None]], without_test: int = 0
+) -> list[tuple[float, float | None]]:
+    """Adjusted p-values of no difference and of no equivalence of each contrast, as one family.
 
-    Both kinds are adjusted by Holm's method over the contrasts of the list: exactly what is shown
-    together. So many more `without_test`, which were planned, count with p = 1: otherwise a
-    condition whose runs all fail would make the other claims easier.
+    Holm's method over both kinds of test with Shaffer's (1986,
+    https://doi.org/10.1080/01621459.1986.10478341) multiplier: no difference and a difference of
+    the margin exclude each other, so a pair has at most one true hypothesis, and counts once until
+    both are rejected. The chance of any wrong verdict in the family is at most 5 %.
+
+    Args:
+        p_values: those of no difference and of no equivalence, None without a margin, of each
+            contrast of the family: all that is shown together with a verdict.
+        without_test: number of further planned comparisons that can't be tested and count with
+            p = 1; otherwise a condition without results would make the other claims easier.
     """
-    rest = [1.0] * without_test
-    p_values = holm([*(float(one.p_value) for one in contrasts), *rest])[: len(contrasts)]
-    tested = [float(one.p_equivalent) for one in contrasts if one.p_equivalent is not None]
-    adjusted = iter(holm([*tested, *rest]))
-    decisions = []
-    for one, p_value in zip(contrasts, p_values, strict=True):
-        p_equivalent = None if one.p_equivalent is None else next(adjusted)
-        verdict = verdict_of(float(one.difference.value), p_value, p_equivalent)
-        decisions.append((p_value, p_equivalent, verdict))
-    return decisions
+    tests = [
+        (p_value, position, kind)
+        for position, pair in enumerate(p_values)
+        for kind, p_value in enumerate(pair)
+        if p_value is not None
+    ]
+    left = Counter(position for _, position, _ in tests)
+    pairs, largest = len(p_values) + without_test, 0.0
+    found: dict[tuple[int, int], float] = {}
+    for p_value, position, kind in sorted(tests):
+        largest = max(largest, min(1.0, pairs * p_value))
+        found[position, kind] = largest
+        left[position] -= 1
+        pairs -= left[position] == 0
+    return [(found[i, 0], found.get((i, 1))) for i in range(len(p_values))]
 
 
 # Seeds needed -------------------------------------------------------------------------------------

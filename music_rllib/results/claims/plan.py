@@ -8,6 +8,7 @@ on every machine, and can be cited, or committed, before anything runs.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Annotated, Any, Literal, Self
@@ -71,6 +72,14 @@ class AnalysisPlan(_Strict):
     def stages(self) -> frozenset[str]:
         """Names of the stages that the hypotheses are about."""
         return _stages_of(self.hypotheses, self.stage)
+
+    @property
+    def seed_count(self) -> int:
+        """Number of seeds of each condition; 0 where stages differ in theirs."""
+        fresh = re.match(r"(\d+) fresh ones; [^;:]*$", self.seeds)
+        if fresh is not None:
+            return int(fresh[1])
+        return len(self.seeds.split(", ")) if re.fullmatch(r"-?\d+(, -?\d+)*", self.seeds) else 0
 
     @property
     def hash(self) -> str:

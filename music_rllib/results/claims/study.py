@@ -1,8 +1,9 @@
 """Claims of a study: tests of hypotheses that were planned before the runs, and of later ones.
 
 Each condition's runs give a score for each seed, which comparisons take seed by seed
-(:mod:`~music_rllib.results.claims.contrasts`). Planned comparisons are one family for Holm's
-correction, all others that are shown another: looking afterwards costs the plan nothing.
+(:mod:`~music_rllib.results.claims.contrasts`). The planned comparisons are one family, and only
+they have verdicts; without a plan all pairs of conditions are the family. Other comparisons are
+exploratory: they have a difference, an interval and an unadjusted p-value.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 
 from music_rllib.config.analysis import Hypothesis
 from music_rllib.results import statistics as st
-from music_rllib.results.claims.claim import Claim, claims_of, decided
+from music_rllib.results.claims.claim import Claim, claims_of, decided, exploratory
 from music_rllib.results.claims.match import alike_in_the_rest, in_words, matching
 from music_rllib.results.claims.plan import PlanVersion
 from music_rllib.results.claims.scores import Measure, Scores, ended_first, measure_on, scores_of
@@ -37,7 +38,7 @@ class Mean:
     estimate: Estimate
     scores: Scores = field(repr=False)
     runs: int
-    """Number of runs that are planned or begun; the finished ones have scores."""
+    """Number of runs that are planned or begun; finished and failed ones have scores."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,7 +111,7 @@ def study_of(
         if latest is not None and metric is None:
             kind, margin = latest.plan.metric, latest.plan.margin
         measures = {
-            task: replace(measure_on(sweep, task, _runs(chosen), kind, metric), maximised=maximised)
+            task: measure_on(sweep, task, _runs(chosen), kind, metric, maximised=maximised)
             for task in chosen.tasks
         }
         means += _means(sweep, chosen, measures)
@@ -123,7 +124,7 @@ def study_of(
         latest=latest,
         means=tuple(means),
         planned=decided(planned, planned=True, without_test=without_test),
-        afterwards=decided(afterwards, planned=False),
+        afterwards=exploratory(afterwards) if plan else decided(afterwards, planned=False),
         untested=tuple(dict.fromkeys(untested)),
         family=family,
         runs=tuple({run: None for stage in filter(None, [chosen, *about]) for run in _runs(stage)}),
@@ -168,11 +169,19 @@ def _of_plan(
             continue
         runs = [run for pair in cells for condition in pair for run in condition.runs]
         measures = {
-            task: _as_planned(measure_on(sweep, task, runs, version.plan.metric), task, version)
+            task: measure_on(
+                sweep,
+                task,
+                runs,
+                version.plan.metric,
+                horizon=version.plan.budget.get(task, np.inf),
+            )
             for task in dict.fromkeys(sweep.runs[run].task for run in runs)
         }
         labelled = (in_words(hypothesis.first), in_words(hypothesis.second), cells)
-        claims = list(claims_of(sweep, [labelled], measures, version.plan.margin))
+        claims = list(
+            claims_of(sweep, [labelled], measures, version.plan.margin, version.plan.seed_count)
+        )
         if not claims:
             untested.append(f"{text}: no seed has finished in both conditions")
         yield from (replace(claim, hypothesis=hypothesis) for claim in claims)
@@ -191,11 +200,6 @@ def _of_stage(
     for claim in claims_of(sweep, pairs, measures, margin):
         if claim.subject not in known:
             yield claim
-
-
-def _as_planned(measure: Measure, task: str, version: PlanVersion) -> Measure:
-    """The measure over no more than the budget that was planned."""
-    return replace(measure, horizon=min(measure.horizon, version.plan.budget.get(task, np.inf)))
 
 
 def label_of(condition: Condition) -> str:

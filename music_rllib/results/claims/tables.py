@@ -4,6 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
+from music_rllib.results.claims.answer import (
+    interval_in_words,
+    not_excluded,
+    p_in_words,
+    verdict_in_words,
+)
 from music_rllib.results.claims.study import Study, label_of
 
 
@@ -16,7 +22,8 @@ def mean_rows(study: Study) -> list[dict[str, Any]]:
             "condition": label_of(mean.condition),
             "metric": mean.measure.metric,
             "measure": mean.measure.words,
-            "seeds": len(mean.scores.by_seed),
+            "seeds": mean.scores.finished,
+            "failed": mean.scores.failed,
             "runs": mean.runs,
             "value": float(mean.estimate.value),
             "lower": float(mean.estimate.lower),
@@ -38,10 +45,21 @@ def claim_rows(study: Study) -> list[dict[str, Any]]:
             "difference": float(claim.contrast.difference.value),
             "lower": float(claim.contrast.difference.lower),
             "upper": float(claim.contrast.difference.upper),
-            "p_value_holm": claim.p_value,
+            "lower_90": float(claim.contrast.within.lower),
+            "upper_90": float(claim.contrast.within.upper),
+            "p_value": float(claim.contrast.p_value),
+            "p_value_adjusted": claim.p_value,
             "margin": claim.margin,
-            "p_equivalent_holm": claim.p_equivalent,
+            "p_tost": claim.contrast.p_values[1],
+            "p_tost_adjusted": claim.p_equivalent,
             "verdict": str(claim.verdict),
+            "why": claim.why,
+            "collapses_not_excluded": claim.collapses,
+            "in_words": [
+                verdict_in_words(claim) + not_excluded(claim),
+                interval_in_words(claim),
+                p_in_words(claim),
+            ],
             "planned": claim.planned,
             "hypothesis": claim.hypothesis.text if claim.hypothesis else None,
             "as_expected": claim.confirmed,

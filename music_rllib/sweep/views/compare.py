@@ -38,17 +38,17 @@ def compare_view(document: Mapping[str, Any]) -> RenderableType:
 
 def _comparisons_table(rows: Sequence[Mapping[str, Any]]) -> Table:
     task = _task_column(rows)
-    heads = ("first - second", *task, "difference, 95 %", "p", "verdict", "planned")
+    heads = ("first - second", *task, "difference", "interval", "p", "verdict", "planned")
     table = new_table("Comparisons", heads, left=heads)
     for row in rows:
-        equivalent = row["verdict"] == "equivalent"
-        p_value = row["p_equivalent_holm"] if equivalent else row["p_value_holm"]
+        verdict, interval, p_value = row["in_words"]
         table.add_row(
             f"{row['first']} - {row['second']}",
             *(row[name] for name in task),
-            with_interval(row["difference"], (row["lower"], row["upper"])),
-            f"{p_value:.2g}",
-            f"{row['verdict']} (within {row['margin']:g})" if equivalent else row["verdict"],
+            f"{row['difference']:+.3g}",
+            interval,
+            p_value.removeprefix("p = "),
+            verdict,
             "yes" if row["planned"] else "no",
         )
     return table
@@ -65,7 +65,8 @@ def _areas_table(rows: Sequence[Mapping[str, Any]]) -> Table:
             *(row[name] for name in task),
             with_interval(row["value"], (row["lower"], row["upper"])),
             seeds_in_words(list(row["by_seed"].values())),
-            f"{row['seeds']} of {row['runs']}",
+            f"{row['seeds']} of {row['runs']}"
+            + (f", {row['failed']} failed" * (row["failed"] > 0)),
         )
     return table
 

@@ -367,6 +367,28 @@ def test_tasks_without_success_are_judged_by_their_return(
     assert "Best so far: train q = 1: return -0.2" in shown
 
 
+def test_returns_of_different_tasks_are_never_averaged(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    """q = 1 is best on a task with returns of hundreds, q = 2 on one with returns of tenths."""
+    task = {"env_id": "Reacher-v5", "horizon": 50, "success_key": None}
+    tasks = {"Large": task, "Small": {**task, "horizon": 51}}
+    sweep = opened(storage, tmp_path, environments=tasks, tasks=list(tasks))
+    with StateFile(sweep) as state_file:
+        for node in list(sweep.plan.nodes):
+            q = float(node.run.tac.entropic_index)  # type: ignore[arg-type]
+            value = 500 - 100 * q if node.run.task.name == "Large" else q / 10
+            finish(sweep, state_file, node, value, tmp_path / "made", names.EVAL_RETURN)
+        state_file.end("finished")
+    place = f"{storage}/mine"
+    shown = in_one_line(program("status", place).output)
+    assert "Large: train q = 1: return 400" in shown
+    assert "Small: train q = 2: return 0.2" in shown
+    chosen = program("best", place, "--output", "out", "--json").document
+    assert [policy["task"] for policy in chosen["policies"]] == ["Large", "Small"]
+    assert "Small: train: q = 2 is first by return" in chosen["why"]
+
+
 def test_clean_lists_and_deletes_what_no_other_sweep_has(
     storage: str, tmp_path: Path, program: Program
 ) -> None:
