@@ -76,7 +76,7 @@ bench: venv  ## what everything costs, as ratios in one run (BENCH='step environ
 profile: venv  ## write a flame graph of a training run to results/profile.svg
 	@$(BIN)/python -m benchmarks.profile
 
-results: venv  ## rebuild docs/results.md, its appendix and figures from docs/results/data
+results: venv  ## rebuild the results pages, their figures and the README picture
 	@$(BIN)/python -m docs.generate_results
 
 docs: venv  ## build the documentation site in build/docs, with search; open its index.html

@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[1]
 
 project = "music_rllib"
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
-exclude_patterns = ["results/page.md", "results/appendix.md", "search.md"]
+exclude_patterns = ["results/page.md", "results/claims.md", "results/appendix.md", "search.md"]
 root_doc = "index"
 html_theme = "furo"
 html_title = "music_rllib"
@@ -62,8 +62,10 @@ adr/*
 :hidden:
 :caption: What came out
 results
-results_appendix
 results/plan
+lab/claims
+lab/appendix
+lab/measurements
 changelog
 ```
 """
@@ -79,9 +81,9 @@ def _with_links_of_the_site(app: Any, page: str, source: list[str]) -> None:
         name = path.relative_to(ROOT).as_posix()
         for own, file in PAGES.items():
             if name == file:
-                return f"{found[1]}({own}.md{found[3] or ''})"
+                return f"{found[1]}(/{own}.md{found[3] or ''})"
         if path.is_relative_to(ROOT / "docs"):
-            return f"{found[1]}({path.relative_to(ROOT / 'docs')}{found[3] or ''})"
+            return f"{found[1]}(/{path.relative_to(ROOT / 'docs')}{found[3] or ''})"
         return f"`{name}`"
 
     source[0] = _LINK.sub(link, source[0]) + (CONTENTS if page == root_doc else "")

@@ -1,17 +1,20 @@
-"""Writes docs/results.md, its appendix and their figures from the runs in docs/results/data alone.
+"""Write the results pages and their figures from the runs in docs/results/data alone.
 
-python -m docs.generate_results            # writes them
-python -m docs.generate_results --check    # exit code 1 where a page is out of date
+python -m docs.generate_results            # writes them and the picture of the README
+python -m docs.generate_results --check    # exit code 1 if a page is out of date
 
-The pages' words are in docs/results/page.md and appendix.md, the code of tables in result_pages.
-Where a page says `{{ KIND NAME }}`, a table is put of the sweep NAME: of all of its runs that any
+The texts of the pages are in docs/results (`PAGES`), the code of their tables in result_pages. The
+generator replaces `{{ KIND NAME }}` by a table of the sweep NAME: of all of its runs that any
 export in docs/results/data has, whichever sweep computed them, if tune_configs has a sweep of that
 name, and else of the export docs/results/data/NAME. KIND is
 
+- without NAME, over the three studies of q: `headline`, `summary`, `sampled` or `robustness`;
 - of a planned study: `verdict`, with the hypothesis, `answer`, `outcomes`, with stages, `seeds`,
-  `cells`, `figure`, with the name of one, `hours` or `progress` of its runs;
-- of any sweep: `runs`, `provenance`, `success`, `stages`, or `curves`, with
-  stages behind NAME if not all are meant, `metric`, with metrics, or `search`.
+  `cells`, `figure`, with the name of one, `learning`, `equal-total`, `hours` or `progress` of its
+  runs;
+- of any sweep: `totals`, with a pretrained stage and one from scratch, `runs`, `provenance`,
+  `success`, `stages`, or `curves`, with stages behind NAME if not all are meant, `metric`, with
+  metrics, or `search`.
 
     python -m music_rllib.report results/NAME --export docs/results/data/NAME --add
 """
@@ -24,6 +27,8 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from docs.result_pages.exports import hours_text, progress_text, sweep_called
+from docs.result_pages.learning import learning_figure, overview
+from docs.result_pages.robustness import robustness_list
 from docs.result_pages.runs import metric_table, provenance, runs_table
 from docs.result_pages.searches import search_text
 from docs.result_pages.studies import (
@@ -35,9 +40,18 @@ from docs.result_pages.studies import (
     verdict_text,
 )
 from docs.result_pages.success import stage_curves, stages_table, success
+from docs.result_pages.summary import (
+    equal_total_text,
+    headline,
+    sampled_sentence,
+    summary_table,
+)
+from docs.result_pages.totals import totals_table
 
 FOLDER = Path(__file__).parent
-PAGES = {"results.md": "page.md", "results_appendix.md": "appendix.md"}
+PAGES = {"results.md": "page.md", "lab/claims.md": "claims.md", "lab/appendix.md": "appendix.md"}
+"""Pages and their texts in docs/results."""
+PICTURE = FOLDER / "img" / "overview.png"
 FIGURES = FOLDER / "results" / "figures"
 NOTICE = "<!-- Written by docs/generate_results.py from docs/results/{} and docs/results/data. -->"
 NOT_RUN = "*Not run yet.*"
@@ -46,7 +60,7 @@ NOT_RUN = "*Not run yet.*"
 def main() -> int:
     """Writes the pages, or checks them."""
     figures: dict[str, bytes] = {}
-    texts = {FOLDER / name: page(template, figures) for name, template in PAGES.items()}
+    texts = {FOLDER / name: page(name, figures) for name in PAGES}
     if "--check" in sys.argv[1:]:
         stale = [
             str(path)
@@ -64,12 +78,18 @@ def main() -> int:
         old.unlink()
     for name, content in figures.items():
         (FIGURES / name).write_bytes(content)
+    PICTURE.write_bytes(overview())
     return 0
 
 
-def page(template: str, figures: dict[str, bytes]) -> str:
-    """A template with its tables filled in; the figures that it shows go into `figures`."""
+def page(name: str, figures: dict[str, bytes]) -> str:
+    """A page with its tables filled in; the figures that it shows go into `figures`."""
     words: dict[str, Callable[..., str]] = {
+        "headline": headline,
+        "summary": lambda: "\n".join(summary_table()),
+        "sampled": sampled_sentence,
+        "robustness": lambda: "\n".join(robustness_list()),
+        "equal-total": equal_total_text,
         "verdict": verdict_text,
         "progress": progress_text,
         "hours": hours_text,
@@ -80,6 +100,8 @@ def page(template: str, figures: dict[str, bytes]) -> str:
         "seeds": seeds_table,
         "cells": cells,
         "figure": lambda sweep, name: named_figure(sweep, name, figures),
+        "learning": lambda sweep: learning_figure(sweep, figures),
+        "totals": totals_table,
         "runs": runs_table,
         "provenance": lambda sweep: [provenance(sweep)],
         "success": lambda sweep, *stages: success(sweep, figures, stages),
@@ -90,14 +112,18 @@ def page(template: str, figures: dict[str, bytes]) -> str:
     }
 
     def fill(match: re.Match[str]) -> str:
-        kind, name, *rest = match[1].split()
+        kind, *rest = match[1].split()
         if kind in words:
-            return words[kind](name, *rest)
-        sweep = sweep_called(name)
+            return words[kind](*rest)
+        of_sweep, *rest = rest
+        sweep = sweep_called(of_sweep)
         return NOT_RUN if sweep is None else "\n".join(tables[kind](sweep, *rest))
 
-    text = (FOLDER / "results" / template).read_text("utf-8")
-    return f"{NOTICE.format(template)}\n\n{re.sub(r'{{ (.*?) }}', fill, text)}"
+    template = PAGES[name]
+    text = re.sub(r"{{ (.*?) }}", fill, (FOLDER / "results" / template).read_text("utf-8"))
+    to_figures = "../" * name.count("/") + "results/figures/"
+    text = text.replace("](results/figures/", f"]({to_figures}")
+    return f"{NOTICE.format(template)}\n\n{text}"
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from docs.result_pages.words import interval, percent, row, rule, spread, wait_t
 from music_rllib import names
 from music_rllib.report.figures.choice import slug, stage_drawings
 from music_rllib.report.study import study_drawings
+from music_rllib.results import statistics as st
 from music_rllib.results.analysis import THRESHOLDS, StageAnalysis, analyse
 from music_rllib.results.claims.answer import (
     answer,
@@ -21,6 +23,7 @@ from music_rllib.results.claims.answer import (
     verdict_in_words,
 )
 from music_rllib.results.claims.plan import analysis_plan
+from music_rllib.results.claims.scores import scores_of
 from music_rllib.results.claims.study import Mean, label_of, study_of
 from music_rllib.results.data import Sweep
 
@@ -55,11 +58,12 @@ def answer_text(sweep: Sweep) -> Iterator[str]:
 
 def outcomes_table(sweep: Sweep, *stages: str) -> Iterator[str]:
     """One column per condition: what was planned to be counted, and below it what was not."""
-    rates = (f"steps to {percent(rate)}: median [95 %]" for rate in THRESHOLDS)
+    rates = (f"steps after pretraining to {percent(rate)}: median [95 %]" for rate in THRESHOLDS)
     columns = [
         [
             "",
-            "**area under the curve: mean [95 %]**",
+            "**area under the curve, mean action: mean [95 %]**",
+            "the same, sampled policy",
             "success at the end: mean [95 %]",
             *rates,
             "Shannon entropy at the end, nats",
@@ -71,14 +75,14 @@ def outcomes_table(sweep: Sweep, *stages: str) -> Iterator[str]:
         if analysis.stage.name in stages:
             prefix = f"{analysis.stage.name}, " if len(stages) > 1 else ""
             means = study_of(sweep, analysis.stage.name).means
-            columns += [list(_outcomes(analysis, mean, prefix)) for mean in means]
+            columns += [list(_outcomes(sweep, analysis, mean, prefix)) for mean in means]
     header, *lines = zip(*columns, strict=True)
     yield row(*header)
     yield rule(len(header))
     yield from (row(*line) for line in lines)
 
 
-def _outcomes(analysis: StageAnalysis, mean: Mean, prefix: str) -> Iterator[str]:
+def _outcomes(sweep: Sweep, analysis: StageAnalysis, mean: Mean, prefix: str) -> Iterator[str]:
     key = (mean.condition, mean.task)
     (final,) = (
         final
@@ -88,6 +92,9 @@ def _outcomes(analysis: StageAnalysis, mean: Mean, prefix: str) -> Iterator[str]
     )
     yield f"{prefix}{label_of(mean.condition)}"
     yield spread(mean.estimate)
+    measure = replace(mean.measure, metric=names.TRAIN_SUCCESS)
+    sampled = scores_of(sweep, mean.condition, mean.task, measure)
+    yield spread(st.estimate(np.array([*sampled.by_seed.values()])[:, np.newaxis], np.inf))
     yield interval(final)[0]
     for wait in analysis.waits:
         if (wait.condition, wait.task) == key:

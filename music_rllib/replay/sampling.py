@@ -14,7 +14,7 @@ from music_rllib.replay.trajectories import Rows
 MOST_OF_ONE_EPISODE = 0.4
 """Share of a minibatch that `hindsight_episodes: moved` may take from one episode, on average. A
 smaller share stays in effect for longer: a tenth, until eight episodes have moved; a run from
-scratch then learned FetchPush later (docs/results_appendix.md)."""
+scratch then learned FetchPush later (docs/lab/appendix.md)."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from music_rllib.results.claims.plan import analysis_plan
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
-PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
+PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md")), *sorted(DOCS.glob("lab/*.md"))]
 TEXTS = {path.name: path.read_text(encoding="utf-8") for path in PAGES}
 
 
@@ -97,7 +97,8 @@ def test_tests_that_the_documentation_names_exist() -> None:
 
 def test_every_page_is_on_the_documentation_site() -> None:
     contents = (ROOT / "docs" / "conf.py").read_text().split("CONTENTS = ")[1].split()
-    pages = {path.stem for path in (ROOT / "docs").glob("*.md")} - {"search"}
+    of_docs = (path.relative_to(DOCS).with_suffix("") for path in PAGES[1:])
+    pages = {page.as_posix() for page in of_docs} - {"search"}
     assert pages | {"searching", "changelog"} <= set(contents)
 
 

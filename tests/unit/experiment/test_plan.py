@@ -210,7 +210,7 @@ def test_keys_are_the_same_on_another_machine(tmp_path: Path) -> None:
 
     They change with a setting's default, a new setting that is not in `YOUNGER`, or
     `ALGORITHM_VERSION`, and then every run is trained anew: put new ones in only where that is
-    meant. Runs of version 2 are found by theirs for docs/results_appendix.md.
+    meant. Runs of version 2 are found by theirs for docs/lab/appendix.md.
     """
     sweep = plan(tmp_path, stages=[PRETRAIN, FINETUNE])
     assert {node.label: node.key for node in sweep.nodes} == KEYS

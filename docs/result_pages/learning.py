@@ -1,0 +1,118 @@
+"""Learning curves over all environment steps, pretraining included; the picture of the README."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from docs.result_pages.figures import figure
+from docs.result_pages.summary import complete_studies
+from docs.result_pages.totals import steps_before
+from music_rllib import names
+from music_rllib.report.figures.choice import Drawing
+from music_rllib.report.figures.draw import files
+from music_rllib.report.figures.palette import Style, styles_of
+from music_rllib.report.figures.plots import METRICS, Panel, curve_panel
+from music_rllib.results import statistics as st
+from music_rllib.results.analysis import Curve, curve
+from music_rllib.results.conditions import Condition, Stage, find_stages
+from music_rllib.results.data import Sweep
+from music_rllib.results.statistics import Array
+
+PRETRAINING = ("MUSIC-u (pretraining, no reward)", Style("#9a9a9a", "o", "solid"))
+SCRATCH = ("HER alone, q = 1", Style("#4d4d4d", "D", "dashed"))
+(SUCCESS,) = (metric for metric in METRICS if metric.name == names.EVAL_SUCCESS)
+
+
+def learning_figure(sweep: Sweep, figures: dict[str, bytes]) -> Iterator[str]:
+    """The mean action and the sampled policy side by side."""
+    (task,) = {run.task for run in sweep.runs}
+    legend = _legend(sweep)
+    evaluated = [_shifted(sweep, curve(sweep, c, task, names.EVAL_SUCCESS)) for c in legend]
+    sampled = [_shifted(sweep, _sampled(sweep, c, task)) for c in legend]
+    drawing = Drawing(
+        stage="all stages",
+        title="Success",
+        caption="",
+        panels=(
+            _panel("mean action", evaluated, legend),
+            _panel("sampled policy", sampled, legend),
+        ),
+        legend=list(legend.values()),
+    )
+    yield from figure(sweep, drawing, figures)
+
+
+def overview() -> bytes:
+    """A PNG of every complete study, the one with most seeds first."""
+    panels: list[Panel] = []
+    entries: dict[str, Style] = {}
+    studies = sorted(complete_studies(), key=lambda pair: -pair[1].planned[0].contrast.seeds[0])
+    for sweep, study in studies:
+        legend = _legend(sweep)
+        first = study.planned[0]
+        curves = [_shifted(sweep, curve(sweep, c, first.task, SUCCESS.name)) for c in legend]
+        title = f"{first.task}, {first.contrast.seeds[0]} seeds"
+        panels.append(_panel(title, curves, legend))
+        entries |= dict(legend.values())
+    return files(panels, list(entries.items()))[".png"]
+
+
+def _legend(sweep: Sweep) -> dict[Condition, tuple[str, Style]]:
+    """Label and style of each condition: what is compared by q has the colour of its q."""
+    legend: dict[Condition, tuple[str, Style]] = {}
+    for stage in find_stages(sweep):
+        for condition, style in styles_of(stage.conditions).items():
+            legend[condition] = _entry(stage, condition, style)
+    return legend
+
+
+def _entry(stage: Stage, condition: Condition, style: Style) -> tuple[str, Style]:
+    if not stage.has_task_reward:
+        return PRETRAINING
+    return (
+        SCRATCH if stage.variant == "tac" else (f"MUSIC-r, q = {condition.entropic_index}", style)
+    )
+
+
+def _panel(title: str, curves: list[Curve], legend: dict[Condition, tuple[str, Style]]) -> Panel:
+    styles = {condition: style for condition, (_, style) in legend.items()}
+    metric = replace(SUCCESS, target=None)
+    panel = curve_panel(metric, title, curves, styles, with_epochs=False)
+
+    def draw(axes: Axes) -> None:
+        panel.draw(axes)
+        axes.set_xlabel("total environment steps")
+
+    return replace(panel, draw=draw)
+
+
+def _shifted(sweep: Sweep, found: Curve | None) -> Curve:
+    """The curve behind the steps of its runs' pretraining."""
+    assert found is not None, "runs of a complete study have been evaluated"
+    return replace(found, steps=found.steps + steps_before(sweep, found.condition.runs[0]))
+
+
+def _sampled(sweep: Sweep, condition: Condition, task: str) -> Curve | None:
+    """Success of training episodes, means over the steps from evaluation to evaluation."""
+    evaluated = curve(sweep, condition, task, names.EVAL_SUCCESS)
+    if evaluated is None:
+        return None
+    runs = condition.runs
+    values = np.stack([_between(sweep, run, evaluated.steps) for run in runs])
+    return replace(
+        evaluated,
+        steps=evaluated.steps[1:],
+        values=values,
+        estimate=st.estimate(values[:, np.newaxis], np.inf),
+        runs=np.full(values.shape[1], len(runs)),
+    )
+
+
+def _between(sweep: Sweep, run: int, ends: Array) -> Array:
+    steps, values = sweep.finite(run, names.TRAIN_SUCCESS)
+    return np.array([values[(steps > a) & (steps <= b)].mean() for a, b in pairwise(ends)])

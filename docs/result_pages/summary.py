@@ -1,0 +1,162 @@
+"""The answer at the top of the results page: one sentence and one table, from the verdicts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import cache
+
+from docs.result_pages.exports import is_complete, progress_text, sweep_called
+from docs.result_pages.totals import AtEqualTotal, at_equal_total
+from docs.result_pages.words import percent, row, rule
+from music_rllib import names
+from music_rllib.results.claims.answer import not_excluded, numbers_in_words, verdict_in_words
+from music_rllib.results.claims.claim import Claim, claims_of, exploratory
+from music_rllib.results.claims.contrasts import Verdict
+from music_rllib.results.claims.study import Study, study_of
+from music_rllib.results.data import Sweep
+
+STUDIES = ("claims-push", "claims-pick-and-place", "claims-slide")
+PAPER = {
+    ("FetchPush", "q = 1.5", "q = 1"): "Figure 4: faster",
+    ("FetchPickAndPlace", "q = 1.5", "q = 1"): "Figure 5: better",
+    ("FetchSlide", "q = 1.5", "q = 1"): "Figure 6: comparable; text: better",
+}
+SEEDS_FOR_COLLAPSES = 16
+"""Seeds of which one collapses with 80 % chance if one in ten runs does: 1 - 0.9^16 = 0.81."""
+BETWEEN_STAGES = "stage = "
+"""Start of the labels of a comparison of two stages."""
+
+
+@cache
+def complete_studies() -> list[tuple[Sweep, Study]]:
+    """The studies all of whose runs have finished."""
+    sweeps = map(sweep_called, STUDIES)
+    return [(sweep, study_of(sweep)) for sweep in sweeps if sweep and is_complete(sweep)]
+
+
+def sampled(sweep: Sweep, study: Study) -> tuple[Claim, ...]:
+    """The planned comparisons, of the success of training episodes: those sample their actions."""
+    first, *_ = study.planned
+    pairs = [(claim.first, claim.second, claim.pairs) for claim in study.planned]
+    measures = {first.task: replace(first.measure, metric=names.TRAIN_SUCCESS)}
+    return exploratory(list(claims_of(sweep, pairs, measures, first.margin)))
+
+
+def between_q(claims: Sequence[Claim]) -> list[Claim]:
+    """Comparisons of two q."""
+    return [claim for claim in claims if not claim.first.startswith(BETWEEN_STAGES)]
+
+
+def headline() -> str:
+    """One sentence: what q does on each task, by the verdicts on the mean action."""
+    claims = [c for _, study in complete_studies() for c in between_q(study.planned)]
+    better = [pair for c in claims if (pair := winner_and_loser(c)) and pair[0] == "q = 1.5"]
+    parts = [f"q = 1.5 needs fewer steps than {loser} on {task}" for _, loser, task in better]
+    parts = parts or ["q = 1.5 beats neither q = 1 nor q = 2 on any task here"]
+    parts += [
+        f"{pair[1]} needs more steps than {pair[0]} on {pair[2]}"
+        for c in claims
+        if (pair := winner_and_loser(c)) and pair not in better
+    ]
+    for task in dict.fromkeys(claim.task for claim in claims):
+        verdicts = {claim.verdict for claim in claims if claim.task == task}
+        if verdicts == {Verdict.UNDECIDED}:
+            parts.append(f"{task} is open")
+        elif Verdict.EQUIVALENT in verdicts:
+            parts.append(_alike([claim for claim in claims if claim.task == task]))
+    return f"**{'; '.join(parts)}.**"
+
+
+def winner_and_loser(claim: Claim) -> tuple[str, str, str] | None:
+    """Better and worse condition of a decided comparison, and its task."""
+    if claim.verdict is Verdict.SUPERIOR:
+        return claim.first, claim.second, claim.task
+    return (claim.second, claim.first, claim.task) if claim.verdict is Verdict.WORSE else None
+
+
+def _alike(claims: Sequence[Claim]) -> str:
+    """Which q are equivalent on a task."""
+    alike = [claim for claim in claims if claim.verdict is Verdict.EQUIVALENT]
+    seeds = min(claim.contrast.seeds[0] for claim in claims)
+    pairs = " and ".join(f"{claim.first} to {claim.second}" for claim in alike)
+    single = f"{pairs} {'are' if len(alike) > 1 else 'is'} equivalent"
+    who = "all three q are equivalent" if len(alike) == len(claims) else single
+    within = f"on {claims[0].task} {who} within {claims[0].margin:g}"
+    few = ", too few to exclude rare collapses" if seeds < SEEDS_FOR_COLLAPSES else ""
+    return f"{within} ({seeds} seeds{few})"
+
+
+def sampled_sentence() -> str:
+    """Comparisons of two q by the sampled policy whose interval excludes 0, in words."""
+    where: dict[tuple[str, str, str], list[str]] = {}
+    for sweep, study in complete_studies():
+        for claim in between_q(sampled(sweep, study)):
+            gap = claim.contrast.difference
+            if gap.lower > 0 or gap.upper < 0:
+                side = "above" if gap.value > 0 else "below"
+                where.setdefault((claim.first, side, claim.second), []).append(claim.task)
+    parts = [
+        f"{first} is {side} {second} on {' and '.join(tasks)}"
+        for (first, side, second), tasks in where.items()
+    ]
+    return (
+        "For the sampled policy, these 95% intervals exclude 0 (exploratory, not adjusted): "
+        f"{'; '.join(parts) or 'none'}."
+    )
+
+
+def summary_table() -> Iterator[str]:
+    """One row per task and comparison: verdicts on the mean action and on the sampled policy."""
+    yield row("task", "comparison", "the paper", "mean action", "sampled policy", "seeds")
+    yield rule(6)
+    for sweep, study in complete_studies():
+        for claim, other in zip(study.planned, sampled(sweep, study), strict=True):
+            paper = PAPER.get((claim.task, claim.first, claim.second), "Figure 7: worse")
+            comparison = f"{claim.first} against {claim.second}"
+            if claim.first.startswith(BETWEEN_STAGES):
+                paper, comparison = "", "MUSIC-r, q = 1, against HER alone, pretraining not counted"
+            cells = (verdict_cell(claim), verdict_cell(other), claim.contrast.seeds[0])
+            yield row(claim.task, comparison, paper, *cells)
+        for found in equal_totals(sweep, study):
+            mean, other = (one.claim for one in found)
+            comparison = f"the same at {found[0].total:,.0f} steps in all, pretraining counted"
+            cells = (verdict_cell(mean), verdict_cell(other), mean.contrast.seeds[0])
+            yield row(mean.task, comparison, "", *cells)
+
+
+def equal_totals(sweep: Sweep, study: Study) -> Iterator[tuple[AtEqualTotal, AtEqualTotal]]:
+    """Each planned comparison of stages at equal total steps: mean action, sampled policy."""
+    for claim in study.planned:
+        if claim.first.startswith(BETWEEN_STAGES):
+            ((first, second),) = claim.pairs
+            mean, other = (
+                at_equal_total(sweep, first, second, claim.task, metric)
+                for metric in (names.EVAL_SUCCESS, names.TRAIN_SUCCESS)
+            )
+            if mean and other:
+                yield mean, other
+
+
+def verdict_cell(claim: Claim) -> str:
+    """`**worse**, -0.05 (95% CI -0.08 to -0.02; p = 0.003, adjusted 0.0089)`."""
+    verdict = "" if claim.verdict is Verdict.NONE else f"**{verdict_in_words(claim)}**, "
+    return f"{verdict}{numbers_in_words(claim)}{not_excluded(claim)}"
+
+
+def equal_total_text(name: str) -> str:
+    """MUSIC-r against HER alone at equal total steps, in words."""
+    sweep = sweep_called(name)
+    if sweep is None or not is_complete(sweep):
+        return progress_text(name)
+    mean, _ = next(equal_totals(sweep, study_of(sweep)))
+    first, second = map(percent, mean.finals)
+    text = (
+        f"At {mean.total:,.0f} environment steps in all, pretraining counted, the area of MUSIC-r "
+        f"at q = 1 differs from that of HER alone by {numbers_in_words(mean.claim)}; success at "
+        f"the end is {first} against {second}"
+    )
+    if mean.crossing:
+        low, high = sorted(mean.crossing)
+        text += f", and the mean curves cross between {low:,} and {high:,} steps"
+    return f"{text}."

@@ -1,0 +1,122 @@
+"""Comparisons at an equal number of environment steps in all, pretraining included."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from docs.result_pages.words import percent, row, rule
+from music_rllib import names
+from music_rllib.results.claims.answer import numbers_in_words
+from music_rllib.results.claims.claim import Claim, exploratory
+from music_rllib.results.claims.contrasts import contrast
+from music_rllib.results.claims.plan import MARGIN_OF_A_RATE
+from music_rllib.results.claims.scores import Measure, area_under_curve
+from music_rllib.results.conditions import Condition, find_stages
+from music_rllib.results.data import Sweep
+from music_rllib.results.statistics import Array
+
+
+@dataclass(frozen=True)
+class AtEqualTotal:
+    """A pretrained condition against one from scratch, over the same total number of steps."""
+
+    claim: Claim
+    finals: tuple[float, float]
+    """Mean success rates at the total, the pretrained condition first."""
+    crossing: tuple[int, int] | None
+    """First total at which the pretrained condition is ahead, and last at which it is not."""
+
+    @property
+    def total(self) -> float:
+        """Environment steps, pretraining included."""
+        return self.claim.measure.horizon
+
+
+def source_of(sweep: Sweep, run: int) -> int | None:
+    """Position of the run that another one starts from; None for a run from scratch."""
+    key = sweep.runs[run].tags.get(names.TAG_SOURCE_NODE)
+    positions = (i for i, other in enumerate(sweep.runs) if key and other.node_key == key)
+    return next(positions, None)
+
+
+def steps_before(sweep: Sweep, run: int) -> int:
+    """Environment steps of the run's pretraining."""
+    source = source_of(sweep, run)
+    return 0 if source is None else sweep.runs[source].budget or 0
+
+
+def total_area(sweep: Sweep, run: int, metric: str, total: float) -> float:
+    """Mean of a metric over `total` steps, the first of which are the pretraining's."""
+    source, before = source_of(sweep, run), steps_before(sweep, run)
+    own = area_under_curve(*sweep.finite(run, metric), total - before) * (total - before)
+    if source is not None:
+        own += area_under_curve(*sweep.finite(source, metric), before) * before
+    return own / total
+
+
+def at_equal_total(
+    sweep: Sweep, pretrained: Condition, scratch: Condition, task: str, metric: str
+) -> AtEqualTotal | None:
+    """Compare two conditions on their shared seeds; None where they share fewer than two."""
+    sides = [
+        {sweep.runs[i].seed: i for i in condition.runs if sweep.runs[i].task == task}
+        for condition in (pretrained, scratch)
+    ]
+    seeds = [seed for seed in sides[0] if seed in sides[1]]
+    if len(seeds) < 2:
+        return None
+    runs = [[side[seed] for seed in seeds] for side in sides]
+    budgets = (steps_before(sweep, i) + (sweep.runs[i].budget or 0) for side in runs for i in side)
+    total = float(min(budgets))
+    x, y = (np.array([total_area(sweep, i, metric, total) for i in side]) for side in runs)
+    claim = Claim(
+        first=pretrained.label,
+        second=scratch.label,
+        task=task,
+        measure=Measure(kind="auc", metric=metric, horizon=total),
+        margin=MARGIN_OF_A_RATE,
+        contrast=contrast(x, y, paired=True, margin=MARGIN_OF_A_RATE),
+        pairs=[(pretrained, scratch)],
+    )
+    (claim,) = exploratory([claim])
+    first = runs[0][0]
+    grid = sweep.finite(first, metric)[0] + steps_before(sweep, first)
+    grid = grid[grid <= total]
+    means = [_mean_at(sweep, side, metric, grid) for side in runs]
+    ahead = means[0] > means[1]
+    crossing = None
+    if ahead.any() and not ahead.all():
+        crossing = int(grid[ahead.argmax()]), int(grid[~ahead][-1])
+    return AtEqualTotal(claim, (float(means[0][-1]), float(means[1][-1])), crossing)
+
+
+def _mean_at(sweep: Sweep, runs: list[int], metric: str, totals: Array) -> Array:
+    """Mean of the runs' metric at total numbers of steps."""
+    curves = []
+    for run in runs:
+        steps, values = sweep.finite(run, metric)
+        curves.append(np.interp(totals, steps + steps_before(sweep, run), values))
+    return np.asarray(np.mean(curves, axis=0))
+
+
+def totals_table(sweep: Sweep, first: str, second: str) -> Iterator[str]:
+    """Conditions of a pretrained stage against the same conditions of one from scratch."""
+    stages = {stage.name: stage for stage in find_stages(sweep)}
+    yield row("task", "condition", "total steps", "area: difference", "at the end", "seeds")
+    yield rule(6)
+    for task in stages[first].tasks:
+        for pretrained in stages[first].conditions:
+            for scratch in stages[second].conditions:
+                if scratch.entropic_index != pretrained.entropic_index:
+                    continue
+                found = at_equal_total(sweep, pretrained, scratch, task, names.EVAL_SUCCESS)
+                if found is not None:
+                    q = f"q = {pretrained.entropic_index}"
+                    ends = " against ".join(map(percent, found.finals))
+                    seeds = found.claim.contrast.seeds[0]
+                    yield row(
+                        task, q, f"{found.total:,.0f}", numbers_in_words(found.claim), ends, seeds
+                    )
