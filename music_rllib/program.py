@@ -22,7 +22,7 @@ Examples:
   music-rllib status results/reach
   music-rllib report results/reach
 
-'music-rllib COMMAND --help' has each command's arguments and examples.
+'music-rllib COMMAND --help' shows the arguments of a command, with examples.
 
 {EXIT_CODES}"""
 

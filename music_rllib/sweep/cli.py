@@ -26,7 +26,7 @@ COMMANDS: dict[str, tuple[Callable[..., int], str]] = {
 }
 """Name to the function and the examples of its help, in the order of the help."""
 EXIT_CODES = """\
-Exit codes: 0 all is well; 1 a run failed or Ray died, state is kept; 2 bad
+Exit codes: 0 success; 1 a run failed or Ray died, the state is kept; 2 bad
 input or damaged results, nothing was started; 130 stopped by Ctrl-C, 143 by
 SIGTERM.
 """

@@ -16,16 +16,16 @@ Place = Annotated[
     str,
     typer.Argument(
         metavar="SWEEP",
-        help="A sweep's folder (results/smoke, s3://bucket/results/smoke), its name in --storage, "
-        "or its YAML file.",
+        help="Folder of a sweep (results/smoke, s3://bucket/results/smoke), its name in "
+        "--storage, or its YAML file.",
     ),
 ]
 Storage = Annotated[
     str | None,
-    typer.Option(metavar="PLACE", help="Folder or URI of results, where SWEEP is a name."),
+    typer.Option(metavar="PLACE", help="Folder or URI of results, if SWEEP is a name."),
 ]
 StageName = Annotated[
-    str | None, typer.Option(metavar="STAGE", help="Of which stage; the last by default.")
+    str | None, typer.Option(metavar="STAGE", help="Stage; the last one by default.")
 ]
 
 

@@ -13,9 +13,9 @@ from music_rllib.sweep.cli_helpers import Place, StageName, Storage
 EXAMPLES = """\
 Examples:
   music-rllib best results/smoke
-      into results/smoke/best
+      export to results/smoke/best
   music-rllib best s3://bucket/sweeps/search --output policy
-      from a cluster's storage into a local folder
+      export from a bucket to a local folder
   music-rllib evaluate policy --episodes 100
 """
 
@@ -28,16 +28,16 @@ def best(
         Path | None,
         typer.Option(
             metavar="FOLDER",
-            help="Where to put it: 'best' in the sweep's folder by default. Of several tasks each "
-            "has a folder of its own in it.",
+            help="Target folder; by default 'best' in the folder of the sweep. With several "
+            "tasks, each has its own folder inside.",
         ),
     ] = None,
     json: Json = False,
 ) -> int:
-    """Export the best policy with its configuration.
+    """Export the best policy with its configuration, and print how it was chosen.
 
-    After a search that is the first of the ranking on fresh seeds, and the best judged trial where
-    there is no ranking yet. It also says how it was chosen.
+    After a search, the best policy is the first of the ranking on fresh seeds; before the ranking
+    is complete, it is the best trial.
     """
     from music_rllib.experiment.location import find_sweep
     from music_rllib.store.paths import sweep_folder

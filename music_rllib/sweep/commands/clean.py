@@ -1,4 +1,4 @@
-"""`clean`: delete checkpoints and results that nobody needs."""
+"""`clean`: delete checkpoints and results that are no longer needed."""
 
 from __future__ import annotations
 
@@ -30,20 +30,20 @@ def clean(
         bool,
         typer.Option(
             "--unfinished",
-            help="Checkpoints of interrupted runs too: they would begin from scratch.",
+            help="Also delete checkpoints of interrupted runs, which then start from scratch.",
         ),
     ] = False,
     everything: Annotated[
         bool,
         typer.Option(
             "--all",
-            help="The whole sweep: its files, checkpoints and results that no other sweep has.",
+            help="Delete the sweep: its files, checkpoints, and results that no other one uses.",
         ),
     ] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="Delete.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Delete instead of listing.")] = False,
     json: Json = False,
 ) -> int:
-    """List, or delete with --yes, what nobody needs.
+    """List files that are no longer needed, or delete them with --yes.
 
     By default these are the checkpoints of runs that a search stopped early, and those that
     finished runs keep for longer training. An interrupted run may go on from its own.

@@ -1,4 +1,4 @@
-"""`evaluate`: play episodes with a run's policy, count their successes, film them."""
+"""`evaluate`: play episodes with the policy of a run, measure success, record video."""
 
 from __future__ import annotations
 
@@ -39,34 +39,36 @@ def evaluate(
         str,
         typer.Argument(
             metavar="RUN",
-            help="A run's label, key or folder; a checkpoint's folder; a policy's file; or an "
-            "MLflow model (models:/..., runs:/...).",
+            help="Label, key or folder of a run; folder of a checkpoint; policy file; or MLflow "
+            "model (models:/..., runs:/...).",
         ),
     ],
     storage: Annotated[
-        str, typer.Option(metavar="PLACE", help="Where labels and keys are looked up.")
+        str, typer.Option(metavar="PLACE", help="Storage in which labels and keys are looked up.")
     ] = "results",
     env: Annotated[
         str | None,
         typer.Option(
             metavar="ENV",
-            help="The environment, where it is neither a built-in task's nor Gymnasium's own: a "
-            "sweep's YAML file that declares it, or its id. What a policy's file says is not "
-            "enough: making an environment runs its code.",
+            help="Environment of a task that is neither built in nor part of Gymnasium: the sweep "
+            "file that declares it, or its id. The policy file alone is not trusted, because "
+            "making an environment runs its code.",
         ),
     ] = None,
-    episodes: Annotated[int, typer.Option(metavar="N", min=1, help="How many.")] = 20,
+    episodes: Annotated[int, typer.Option(metavar="N", min=1, help="Number of episodes.")] = 20,
     seed: Annotated[
         int, typer.Option(metavar="N", min=0, help="Equal seeds give equal starts and goals.")
     ] = 0,
     video: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Film the first episodes, as .mp4 or .gif."),
+        typer.Option(metavar="FILE", help="Record the first episodes as .mp4 or .gif."),
     ] = None,
-    video_episodes: Annotated[int, typer.Option(metavar="N", min=1, help="How many of them.")] = 3,
+    video_episodes: Annotated[
+        int, typer.Option(metavar="N", min=1, help="Number of recorded episodes.")
+    ] = 3,
     json: Json = False,
 ) -> int:
-    """Play episodes with a run's policy, count and film them.
+    """Play episodes with the policy of a run, measure success, record video.
 
     Deterministic ones; the run may be finished or not. Starts no Ray.
     """

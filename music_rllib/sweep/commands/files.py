@@ -1,4 +1,4 @@
-"""`init`, `presets` and `schema`: help with the writing of a sweep's file."""
+"""`init`, `presets` and `schema`: help to write a sweep file."""
 
 from __future__ import annotations
 
@@ -33,10 +33,13 @@ Editors with the YAML language server read it where a file begins with
 
 def init(
     file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="What to write; never over a file.")
+        Path,
+        typer.Argument(
+            metavar="FILE", help="File to create; an existing file is never overwritten."
+        ),
     ] = Path("sweep.yaml"),
 ) -> int:
-    """Write a commented sweep to begin with."""
+    """Write a commented sweep file to start from."""
     from music_rllib.authoring import starter
 
     text = starter(file)
@@ -53,7 +56,7 @@ def init(
 
 
 def presets(json: Json = False) -> int:
-    """List the presets, settings that a file takes over.
+    """List the presets: sets of settings that a sweep file can use.
 
     By 'preset: NAME' in it.
     """
@@ -71,7 +74,7 @@ def presets(json: Json = False) -> int:
 
 
 def schema() -> int:
-    """Print a JSON Schema of a sweep's file for editors."""
+    """Print the JSON Schema of sweep files, for editors."""
     from music_rllib.authoring.json_schema import json_schema
 
     print_json(json_schema())

@@ -1,4 +1,4 @@
-"""`run`, `plan` and `resume`: train a sweep, show what it would train, continue it."""
+"""`run`, `plan` and `resume`: train a sweep, show its runs, resume it."""
 
 from __future__ import annotations
 
@@ -14,43 +14,43 @@ RUN_EXAMPLES = """\
 Examples:
   music-rllib run my.yaml
   music-rllib run my.yaml tac.alpha=0.1 seeds=5 env_steps=1e6
-      other settings than the file's, in every stage; recorded like the file's
+      replace settings of the file in every stage; the sweep records them
   music-rllib run my.yaml --storage /data/results --name first-try
   music-rllib run my.yaml --seeds 10
-      the same with seeds 0 to 9: only the new ones are trained
+      seeds 0 to 9; only new seeds are trained
   music-rllib run my.yaml stages.train.env_steps=2e5
-      longer: finished runs of the stage go on from where they ended
+      train longer; finished runs of the stage continue from their end
 
-Running a command again continues: finished runs are reused, others go on from
-their last checkpoint. With RAY_ADDRESS=HOST:PORT, on a node
-of that Ray cluster, it runs there.
+Run the command again to resume: finished runs are reused, others resume from
+their last checkpoint. With RAY_ADDRESS=HOST:PORT the sweep runs on that Ray
+cluster.
 """
 PLAN_EXAMPLES = """\
 Examples:
   music-rllib plan my.yaml
   music-rllib plan my.yaml --seeds 12
-      what it would take with 12 seeds; finished runs count as done
+      the plan with 12 seeds; finished runs count as done
   music-rllib plan my.yaml env_steps=1e6 --measure
-      how long it would take here: some seconds of training for each kind of run
+      train each kind of run for some seconds and estimate the total time
   music-rllib plan my.yaml --json
-      every run known beforehand with its key, the same on every machine
+      every planned run with its key, which is the same on every machine
 """
 RESUME_EXAMPLES = """\
 Examples:
   music-rllib resume results/smoke
-      no file needed: the configuration is in the storage
+      no file needed; the configuration is in the storage
   music-rllib resume results/smoke --seeds 10
-      extended by seeds: only the new ones are trained
+      add seeds; only the new ones are trained
   ray job submit --working-dir . -- \\
     python -m music_rllib.sweep resume s3://bucket/sweeps/smoke
-      in a new job, after the head of a cluster has died
+      in a new job, after the head node of a cluster died
 """
 
 Config = Annotated[
     Path | None,
     typer.Argument(
         metavar="CONFIG",
-        help="The sweep, a YAML file. Without one, a small packaged sweep is taken.",
+        help="Sweep file (YAML). Without one, a small packaged sweep runs.",
         show_default=False,
     ),
 ]
@@ -58,8 +58,8 @@ Overrides = Annotated[
     list[str] | None,
     typer.Argument(
         metavar="KEY=VALUE",
-        help="Replace what the file says: a setting in every stage (tac.alpha=0.1), in one "
-        "(stages.finetune.env_steps=1e5), or a key of the file's top (seeds=5).",
+        help="Setting that replaces the file's: in every stage (tac.alpha=0.1), in one stage "
+        "(stages.finetune.env_steps=1e5), or a top-level key (seeds=5).",
         show_default=False,
     ),
 ]
@@ -67,19 +67,19 @@ SweepStorage = Annotated[
     str | None,
     typer.Option(
         metavar="PLACE",
-        help="Folder, or s3:// or gs:// URI, for results; replaces the file's 'storage'. Sweeps "
+        help="Folder or s3:// or gs:// URI for results; replaces 'storage' of the file. Sweeps "
         "with the same storage share finished runs.",
     ),
 ]
 Name = Annotated[
-    str | None, typer.Option(metavar="NAME", help="Name of the sweep; replaces the file's 'name'.")
+    str | None, typer.Option(metavar="NAME", help="Name of the sweep; replaces 'name' of the file.")
 ]
 Seeds = Annotated[
     str | None,
     typer.Option(
         metavar="N",
-        help="So many seeds, the file's first, or a list like 0,1,7. Those that have run are "
-        "reused; the report says how many would likely decide.",
+        help="Number of seeds (the first N of the file) or a list such as 0,1,7. Finished seeds "
+        "are reused.",
     ),
 ]
 AcceptChanges = Annotated[
@@ -111,8 +111,8 @@ RetrainDamaged = Annotated[
     bool,
     typer.Option(
         "--retrain-damaged",
-        help="Where finished runs are not what they were when they ended: delete them and train "
-        "them again. Without it the command names them, and starts nothing.",
+        help="Delete and retrain finished runs whose files are damaged. Without it the command "
+        "names them and starts nothing.",
     ),
 ]
 
@@ -134,8 +134,8 @@ def run(
         bool,
         typer.Option(
             "--resume",
-            help="Start only where there is an earlier run of this sweep to go on with. Without "
-            "it a repeated command goes on just the same.",
+            help="Start only if this sweep has run before. A repeated command resumes the sweep "
+            "with and without this option.",
         ),
     ] = False,
     json: Json = False,
@@ -170,15 +170,15 @@ def plan(
         bool,
         typer.Option(
             "--measure",
-            help="Train each kind of run for some seconds on this machine, and say how long all "
-            "of what is left would take on it.",
+            help="Train each kind of run for some seconds on this machine and estimate the "
+            "remaining time.",
         ),
     ] = False,
     json: Json = False,
 ) -> int:
-    """Check a sweep's file and show what it would run.
+    """Check a sweep file and show the runs that it would train.
 
-    No run is started. What its `analysis` states is kept as an analysis plan in the sweep's folder.
+    No run is started. The `analysis` section is recorded as the analysis plan of the sweep.
     """
     from music_rllib.sweep.driver import run_sweep
 
@@ -205,10 +205,7 @@ def resume(
     retrain_damaged: RetrainDamaged = False,
     json: Json = False,
 ) -> int:
-    """Go on with a sweep that was stopped or killed.
-
-    By the configuration that it has left in its storage.
-    """
+    """Resume a stopped or killed sweep, using the configuration kept in its storage."""
     from music_rllib.experiment.location import find_sweep
     from music_rllib.sweep.driver import run_sweep
 

@@ -18,7 +18,7 @@ EXAMPLES = """\
 Examples:
   music-rllib status results/smoke
   music-rllib status results/smoke --watch
-      again and again, until the sweep ends
+      update the view until the sweep ends
   music-rllib status s3://bucket/sweeps/smoke --json
 """
 
@@ -27,15 +27,15 @@ def status(
     sweep: Place,
     storage: Storage = None,
     watch: Annotated[
-        bool, typer.Option("--watch", help="Show it again every few seconds until it ends.")
+        bool,
+        typer.Option("--watch", help="Update the view every few seconds until the sweep ends."),
     ] = False,
-    interval: Annotated[float, typer.Option(metavar="SECONDS", help="Of --watch.")] = 3.0,
+    interval: Annotated[
+        float, typer.Option(metavar="SECONDS", help="Time between updates of --watch.")
+    ] = 3.0,
     json: Json = False,
 ) -> int:
-    """How far a sweep is.
-
-    Stages, trials, runs, budget spent and left, the best so far.
-    """
+    """Show the progress of a sweep: stages, trials, runs, budget and best result so far."""
     from music_rllib.experiment.location import find_sweep
     from music_rllib.sweep.views.status import status_view
 

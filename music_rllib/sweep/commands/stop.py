@@ -1,4 +1,4 @@
-"""`stop`: ask a running sweep to stop in good order."""
+"""`stop`: ask a running sweep to save its state and stop."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from music_rllib.sweep.cli_helpers import Place, Storage
 EXAMPLES = """\
 Examples:
   music-rllib stop results/smoke
-      runs save their state, and the sweep ends as by Ctrl-C
+      runs save their state and the sweep ends, as with Ctrl-C
   music-rllib stop s3://bucket/sweeps/smoke --wait 0
-      from any machine; don't wait for the end
+      from any machine, without waiting for the end
 """
 
 
@@ -27,14 +27,14 @@ def stop(
         float,
         typer.Option(
             metavar="SECONDS",
-            help="How long to wait for its end; the exit code is 1 if it still runs.",
+            help="Time to wait for the end; the exit code is 1 if the sweep still runs then.",
         ),
     ] = 120.0,
     json: Json = False,
 ) -> int:
     """Ask a running sweep to save its state and stop.
 
-    Wherever it runs: it looks into its storage.
+    The request goes through the storage, so the sweep can run on another machine.
     """
     from music_rllib.experiment import sweep_files
     from music_rllib.experiment.location import find_sweep
