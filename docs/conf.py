@@ -50,7 +50,6 @@ architecture
 api
 reliability
 performance
-adr/0001-mlflow-is-written-never-read
 ```
 ```{toctree}
 :hidden:
