@@ -200,6 +200,7 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
         self.load_state_dict(known, strict=False)
 
     def get_non_inference_attributes(self) -> list[str]:
+        """Networks that acting does not need."""
         targets = [f"{name}_target" for name in self._averaged]
         return ["critics", "value", "log_alpha", *targets]
 

@@ -593,7 +593,7 @@ def test_the_command_sends_what_the_store_has(
     kept_page = storage / "mlartifacts" / "s" / run_id / "artifacts" / "report" / PAGE
     assert kept_page.read_bytes() == (folder / "report" / PAGE).read_bytes()
     described = runs_of(client_of(storage), "s")["s"].data.tags[names.TAG_NOTE]
-    assert described.startswith("**No run that may be compared")
+    assert described.startswith("**Only one condition has a result: q = 1")
 
 
 def test_a_second_driver_is_refused_until_the_first_lets_go(tracker_on: MakeTracker) -> None:
