@@ -8,22 +8,18 @@ from docs.result_pages.figures import figure
 from docs.result_pages.words import THRESHOLD, interval, row, rule, wait_text
 from music_rllib.report.figures.choice import PRIMARY, drawings_of_stages, stage_drawings
 from music_rllib.results.analysis import StageAnalysis, analyse
-from music_rllib.results.comparison import verdict
 from music_rllib.results.conditions import Condition, find_stages
 from music_rllib.results.data import Sweep
 from music_rllib.results.time_to_threshold import median_wait, median_wait_interval, waits_of
 
 
 def success(sweep: Sweep, figures: dict[str, bytes], stages: Sequence[str] = ()) -> Iterator[str]:
-    """Per stage: final success and steps to the threshold, what may be said, and the curves."""
+    """Per stage: final success and steps to the threshold, and the curves."""
     for analysis in analyse(sweep):
         if stages and analysis.stage.name not in stages:
             continue
         yield from success_table(sweep, analysis)
         yield ""
-        for scope in analysis.scopes:
-            yield " ".join(verdict(scope))
-            yield ""
         yield from curves(sweep, analysis, figures)
 
 

@@ -30,7 +30,6 @@ from music_rllib.report.tables import (
 from music_rllib.report.videos import make_films
 from music_rllib.results.analysis import analyse, analyse_stages
 from music_rllib.results.claims.study import study_of
-from music_rllib.results.comparison import GAP
 from music_rllib.results.data import ReportError, Sweep
 
 PAGE = "report.html"
@@ -51,7 +50,6 @@ WANTED = (
 def build_report(
     sweep: Sweep,
     *,
-    difference: float = GAP,
     damaged: str | None = None,
     command: str = "",
     storage: str | None = None,
@@ -65,7 +63,6 @@ def build_report(
 
     Args:
         sweep: the sweep, with the metrics of `WANTED`.
-        difference: the smallest difference in success rate that matters to the reader.
         damaged: a sentence about finished runs that are damaged in the storage, if there are any.
         command: the command that makes this report.
         storage: the storage that has the policies to film; None for an exported sweep.
@@ -97,7 +94,6 @@ def build_report(
         figures=figures,
         differences=() if beside is None else difference_tables(*beside, analyses),
         limitations=[*gaps, *diverged(sweep), *filter(None, [damaged])],
-        difference=difference,
         command=command,
         films=None
         if video_seed is None

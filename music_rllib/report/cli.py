@@ -71,16 +71,6 @@ def report(
             show_envvar=False,
         ),
     ] = None,
-    difference: Annotated[
-        float | None,
-        typer.Option(
-            min=0.001,
-            max=1.0,
-            help="Difference in success rate that you would want to see: the report says how many "
-            "seeds would likely show it.",
-            show_default="0.1",
-        ),
-    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the filmed episodes.")] = 0,
     videos: Annotated[
         bool, typer.Option(help="Film an episode for each q, where this machine can draw.")
@@ -121,22 +111,20 @@ def report(
 
     Self-contained, with its figures (PNG, SVG, PDF) and numbers (CSV).
     """
-    from music_rllib.results.comparison import GAP
-
     if add and export is None:
         raise BadInputError("--add must be given with --export")
     if serve and (export or output or attach):
         raise BadInputError("--serve must be given without --export, --output and --attach")
-    place, gap = sweeps[0], GAP if difference is None else difference
+    place = sweeps[0]
     if len(sweeps) > 1:
-        _beside(sweeps, storage, output, gap, alone=serve or attach or export is not None)
+        _beside(sweeps, storage, output, alone=serve or attach or export is not None)
     elif export is not None:
         _export(place, storage, export, format_, add=add)
     elif serve:
-        _serve(place, storage, gap, port)
+        _serve(place, storage, port)
     else:
         video_seed = seed if videos else None
-        return _report(place, storage, output, gap, video_seed, env, attach=attach)
+        return _report(place, storage, output, video_seed, env, attach=attach)
     return 0
 
 
@@ -185,7 +173,6 @@ def _report(
     place: str,
     storage: str | None,
     output: Path | None,
-    difference: float,
     video_seed: int | None,
     env: Path | None,
     *,
@@ -198,13 +185,12 @@ def _report(
         from music_rllib.config.load import declared_tasks
         from music_rllib.redaction import for_people, redact
         from music_rllib.report.build import PICTURE, WANTED, build_report, write_report
-        from music_rllib.results.comparison import verdict
+        from music_rllib.results.claims.answer import answer
         from music_rllib.results.read import read_sweep
 
         source = read_sweep(place, storage, metrics=WANTED, lenient=True)
         report = build_report(
             source.sweep,
-            difference=difference,
             damaged=source.damaged,
             storage=None if source.opened is None else source.opened.storage,
             video_seed=video_seed,
@@ -215,9 +201,8 @@ def _report(
         page = write_report(report, output or source.folder / "report")
     for note in report.limitations:
         typer.echo(f"missing: {for_people(note)}")
-    for analysis in report.analyses:
-        for line in verdict(analysis.scopes[0], difference):
-            typer.echo(for_people(f"{analysis.stage.name}: {line}"))
+    for line in answer(source.sweep, report.study):
+        typer.echo(for_people(line))
     typer.echo(f"Report: {page.absolute()}")
     picture = page.parent / "figures" / f"{PICTURE}.png"
     if picture.exists():
@@ -241,7 +226,6 @@ def _beside(
     places: Sequence[str],
     storage: str | None,
     output: Path | None,
-    difference: float,
     *,
     alone: bool,
 ) -> None:
@@ -263,7 +247,6 @@ def _beside(
         first, second = (source.sweep for source in sources)
         report = build_report(
             side_by_side(first, second),
-            difference=difference,
             beside=(first, second),
             command=_command(),
             processes=processes,
@@ -273,7 +256,7 @@ def _beside(
     typer.echo(f"Report: {page.absolute()}")
 
 
-def _serve(place: str, storage: str | None, difference: float, port: int) -> None:
+def _serve(place: str, storage: str | None, port: int) -> None:
     from music_rllib.experiment.location import find_sweep
     from music_rllib.report.build import WANTED, build_report
     from music_rllib.report.live.server import LivePage, make_server, serve
@@ -288,7 +271,6 @@ def _serve(place: str, storage: str | None, difference: float, port: int) -> Non
         source = read_stored(sweep, metrics=WANTED, lenient=True)
         report = build_report(
             source.sweep,
-            difference=difference,
             damaged=source.damaged,
             command=_command(),
             live=progress.is_running(),

@@ -67,7 +67,8 @@ def _missing_runs(sweep: Sweep) -> Iterator[str]:
     if waiting:
         short = ShortLabels.of([*waiting, *(run.name for run in sweep.runs)])
         yield f"{in_runs(len(waiting))} not begun: {_listed([*map(short, waiting)])}."
-    states = Counter(run.status for run in sweep.runs)
+    # Damaged runs have a cause as well, and a sentence of their own.
+    states = Counter(r.status for r in sweep.runs if not (r.status == "KILLED" and r.failure))
     for state, text in _STATES.items():
         if states[state]:
             yield f"{in_runs(states[state])} {text}."

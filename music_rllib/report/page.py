@@ -38,8 +38,7 @@ from music_rllib.report.web.sections import (
 )
 from music_rllib.results.analysis import StageAnalysis
 from music_rllib.results.claims.answer import answer, planned_in_words
-from music_rllib.results.claims.study import Study
-from music_rllib.results.comparison import verdict
+from music_rllib.results.claims.study import Study, label_of
 from music_rllib.results.conditions import SIDE_BY_SIDE
 from music_rllib.results.data import Sweep
 
@@ -57,8 +56,6 @@ class Report:
     figures: Figures
     limitations: Sequence[str]
     """Sentences about what the report cannot show, and what is to be taken with care."""
-    difference: float
-    """The smallest difference in success rate that matters to the reader."""
     command: str
     """The command that made this report."""
     films: Films | None = None
@@ -134,58 +131,36 @@ def _facts(report: Report) -> Sequence[tuple[str, object]]:
 # The answer -------------------------------------------------------------------------------------
 
 
-def _main_analysis(report: Report) -> StageAnalysis | None:
-    """Stages against each other, or the last stage that trains for the task, or the last one."""
-    if report.together is not None or not report.analyses:
-        return report.together
-    with_task = [one for one in report.analyses if one.stage.has_task_reward]
-    return (with_task or report.analyses)[-1]
-
-
 def _question(report: Report) -> str:
     """The question of the plan, or the one that the sweep's conditions ask."""
     if report.study.question is not None:
         return report.study.question
-    main = _main_analysis(report)
-    if main is None:
+    if not report.analyses:
         return "Nothing has run yet."
-    stage = main.stage
+    stage = report.study.stage or report.analyses[-1].stage
     metrics = dict.fromkeys(names.word_of(report.sweep.primary_metric(t)) for t in stage.tasks)
     aim = " or ".join("success rate" if word == "success" else word for word in metrics)
     budgets = [b for run in stage.runs if (b := report.sweep.runs[run].budget)]
     steps = f", {statistics.median(budgets):,.0f} environment steps per run" if budgets else ""
     seeds = "1 seed" if len(stage.seeds) == 1 else f"{len(stage.seeds)} seeds"
     where = f"on {_enumerated(stage.tasks)} ({seeds}{steps})"
-    labels = [condition.label for condition in stage.conditions]
+    conditions = stage.compared or stage.conditions
+    labels = [label_of(condition) for condition in conditions]
     if len(labels) == 1:
         return f"What {aim} does {labels[0]} reach {where}?"
     which = _enumerated(labels, "or")
     if len(labels) > 4:
-        settings = _enumerated(varied(stage.conditions) or ["the stage"])
+        settings = _enumerated(varied(conditions) or ["the stage"])
         which = f"{len(labels)} settings of {settings}"
-    return f"Which ends at the higher {aim} {where}: {which}?"
+    return f"Which has the higher {aim}, averaged over training, {where}: {which}?"
 
 
 def _answer(report: Report) -> list[str]:
-    """The study's answer; then for final values the main comparison and that of other stages."""
-    main = _main_analysis(report)
-    if main is None or not main.scopes:
+    """The study's answer without its question, and whether it was planned."""
+    if not report.analyses:
         return []
     planned = planned_in_words(report.study)
-    lines = [*answer(report.sweep, report.study)[1:], f"{planned[0].upper()}{planned[1:]}."]
-    lines.append(f"{_read_at(main)}: {verdict(main.scopes[0], report.difference)[0]}")
-    others = [one for one in report.analyses if one.stage.has_task_reward and one is not main]
-    if report.together is None:
-        lines += [f"Stage {s.stage.name}: {verdict(s.scopes[0])[0]}" for s in others if s.scopes]
-    return lines
-
-
-def _read_at(main: StageAnalysis) -> str:
-    """When final values were read; at the first end where stages have different budgets."""
-    if not main.cut_at:
-        return "At the end of training"
-    steps = sorted({f"{steps:,.0f}" for steps in main.cut_at.values()})
-    return f"After {_enumerated(steps, 'or')} steps, when the first stage ends"
+    return [*answer(report.sweep, report.study)[1:], f"{planned[0].upper()}{planned[1:]}."]
 
 
 # Figures ----------------------------------------------------------------------------------------
@@ -241,7 +216,7 @@ def _figure(title: str, drawings: Sequence[Drawing]) -> Mapping[str, Any]:
 
 
 def _remarks(report: Report) -> Iterable[Sequence[str]]:
-    """A heading for each stage, its peculiarities, and a verdict on each of its tasks."""
+    """A heading for each stage, and its peculiarities."""
     for analysis in [*filter(None, [report.together]), *reversed(report.analyses)]:
         stage = analysis.stage
         remarks = []
@@ -260,9 +235,11 @@ def _remarks(report: Report) -> Iterable[Sequence[str]]:
                 "what usually does; there are no intervals."
             )
         if analysis.cut_at:
-            remarks.append(f"Budgets differ. {_read_at(analysis)}, this is what they had come to:")
-        for scope in analysis.scopes:
-            remarks += verdict(scope, report.difference)
+            steps = sorted({f"{steps:,.0f}" for steps in analysis.cut_at.values()})
+            remarks.append(
+                f"Budgets differ: their final values are those after {_enumerated(steps, 'or')} "
+                "steps, when the first stage ends."
+            )
         heading = f"Stage {stage.name} ({stage.variant}), seeds {_in_ranges(stage.seeds)}"
         if analysis is report.together:
             heading = "Stages side by side, each by the runs of the conditions that all have"
@@ -301,16 +278,13 @@ _METHOD = (
     "A task is judged by its success rate, that of deterministic evaluation episodes at their last "
     "step, or by their return where it has no success. Only finished runs have a final one.",
     "Intervals: 95 %. Of a rate Korn and Graubard's, the exact one over all episodes where seeds "
-    "tie; of a return Student's; of a gap from both of its ends; of a probability of "
-    "improvement Newcombe's. Simulated, they cover 93 % or more from three seeds on, but 85 to "
-    "92 % of skewed returns, and where few seeds fail, but wholly: what no seed has shown is not "
-    "in them. From one seed there is none.",
+    "tie; of a return Student's; of a difference from both of its ends. Simulated, they cover 93 % "
+    "or more from three seeds on, but 85 to 92 % of skewed returns, and where few seeds fail, but "
+    "wholly: what no seed has shown is not in them. From one seed there is none.",
     "The area under a learning curve is the mean over the budget, by the trapezoid rule. It is "
     "compared seed by seed (Student's t; Welch's without common seeds), for a difference and for "
     "equivalence within the margin (two one-sided tests, Schuirmann 1987), with Holm's correction "
     "over what was planned and over the rest.",
-    "Permutation: the exact test over all relabellings of the runs. Three runs against three never "
-    "give less than 0.1.",
     "Probability of improvement and performance profiles: Agarwal et al. 2021, Deep Reinforcement "
     "Learning at the Edge of the Statistical Precipice (arXiv:2108.13264).",
     "Against gradient updates or wall time a curve is at the mean over its runs of the updates, or "

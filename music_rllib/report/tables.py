@@ -97,21 +97,18 @@ def _escaped(text: str) -> str:
 
 
 def improvement_table(analyses: Iterable[StageAnalysis]) -> Table:
-    """Probability of improvement of each pair of conditions."""
+    """Difference of the final values and probability of improvement of each pair."""
     return Table(
         name="probability_of_improvement",
-        columns="stage tasks first second probability_first_higher lower upper gap gap_lower "
-        "gap_upper p_value_holm decided",
+        columns="stage tasks first second probability_first_higher gap gap_lower gap_upper",
         rows=[
             (
                 analysis.stage.name,
                 scope.name,
                 pair.first.condition.label,
                 pair.second.condition.label,
-                *_numbers(pair.estimate),
+                pair.improvement,
                 *_numbers(pair.gap),
-                pair.p_value,
-                pair.decided,
             )
             for analysis in analyses
             for scope in analysis.scopes

@@ -1,32 +1,27 @@
-"""Comparisons of conditions in numbers and in sentences.
+"""Final values of conditions: means with intervals, and differences without a test.
 
-`compare`, the report, its tables and the results page all go through :func:`scopes_of` and
-:func:`verdict`, so that they say the same. A winner is named only on evidence.
+`compare`, the report, its tables and the results page all go through :func:`scopes_of`, so that
+they have the same numbers. Verdicts come from :mod:`music_rllib.results.claims` alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import combinations, count
-from math import comb
+from itertools import combinations
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
 from music_rllib import names
 from music_rllib.results import statistics as st
-from music_rllib.results.statistics import SIGNIFICANCE, Array, Estimate
+from music_rllib.results.statistics import Array, Estimate
 
 ALL_TASKS = "all tasks"
-GAP = 0.1
-"""Default difference in a rate that a reader would want to be able to see."""
 AVERAGED = {*names.EVAL_RATES, *names.ENTROPIES}
 """Metrics that have the same unit on every task, so that they can be averaged over tasks."""
 SHOW_SEEDS_BELOW = 10
 """Number of seeds from which on they are not shown one by one."""
-_MOST_RIVALS = 3
-"""Number of rivals that a sentence names, where there are many."""
 
 
 class Labelled(Protocol):
@@ -67,20 +62,13 @@ class Comparison(Generic[C]):
 
     first: Final[C]
     second: Final[C]
-    estimate: Estimate
+    improvement: float
     """Probability that a run of `first` ends higher than one of `second`, ties half."""
-    p_value: float
-    """p-value of the exact permutation test, with Holm's correction over the scope."""
 
     @property
     def gap(self) -> Estimate:
         """Mean of `first` minus that of `second`."""
         return st.difference(self.first.estimate, self.second.estimate)
-
-    @property
-    def decided(self) -> bool:
-        """Whether so large a difference seldom comes by chance."""
-        return self.p_value < SIGNIFICANCE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,7 +130,6 @@ def _scope(
     ]
     compared = tuple(final for final in finals if final.condition in may_be_compared)
     pairs = [(second, first) for first, second in combinations(compared, 2)]
-    p_values = st.holm([st.improvement_p_value(a.scores, b.scores) for a, b in pairs])
     return Scope(
         name=name,
         metric=metric,
@@ -150,157 +137,10 @@ def _scope(
         finals=tuple(finals),
         compared=compared,
         comparisons=tuple(
-            Comparison(
-                first=a,
-                second=b,
-                estimate=st.probability_of_improvement(a.scores, b.scores),
-                p_value=p_value,
-            )
-            for (a, b), p_value in zip(pairs, p_values, strict=True)
+            Comparison(first=a, second=b, improvement=st.improvement(a.scores, b.scores))
+            for a, b in pairs
         ),
     )
-
-
-# Words ------------------------------------------------------------------------------------------
-
-
-def verdict(scope: Scope[C], gap: float = GAP, *, maximised: bool = True) -> list[str]:
-    """Sentences about one scope: the condition that is ahead, or why none is, and seeds needed.
-
-    Args:
-        scope: conditions and their comparisons.
-        gap: difference in a rate that the reader would want to be able to see.
-        maximised: whether more of the metric is better.
-    """
-    where = "over all tasks together" if scope.name == ALL_TASKS else f"on {scope.name}"
-    if not scope.finals:
-        return [f"No condition has finished {where}: there is nothing to compare yet."]
-    if not scope.compared:
-        return [
-            f"Nothing is ranked {where}: no trial of the search has finished on fresh seeds. On "
-            "those that they are chosen by, trials are not compared: the best is so by luck, too."
-        ]
-    if len(scope.compared) == 1:
-        return [
-            f"Nothing is compared {where}: only {_in_words(scope.compared[0])} has finished runs."
-        ]
-    single = [final for final in scope.compared if final.seeds < 2]
-    if single:
-        every = len(single) == len(scope.compared)
-        which = "every condition" if every else _labels(single)
-        have = "have" if len(single) > 1 and not every else "has"
-        return [
-            f"No winner {where}: {which} {have} a single seed, so there is no interval and no "
-            f"evidence. {_direction(maximised).capitalize()} so far is "
-            f"{_in_words(_best(scope.compared, maximised)[0])}."
-        ]
-    if len({float(score) for final in scope.compared for score in final.scores.ravel()}) == 1:
-        return [
-            f"All conditions are equal {where}: each of their runs ended at "
-            f"{number(scope.compared[0].value)}."
-        ]
-    return [_ranking(scope, where, maximised), *_how_many_seeds(scope, gap)]
-
-
-def _best(finals: Sequence[Final[C]], maximised: bool) -> list[Final[C]]:
-    """The conditions with the best mean; several where they tie."""
-    sign = 1.0 if maximised else -1.0
-    best = max(sign * final.value for final in finals)
-    return [final for final in finals if np.isclose(sign * final.value, best, atol=1e-9)]
-
-
-def _ranking(scope: Scope[C], where: str, maximised: bool) -> str:
-    best, *level = _best(scope.compared, maximised)
-    pairs = [
-        pair
-        for pair in scope.comparisons
-        if best in (pair.first, pair.second) and not {pair.first, pair.second} & set(level)
-    ]
-    # A mean may be better although most runs are worse: that is no evidence for it.
-    undecided = [pair for pair in pairs if not (pair.decided and _agrees(pair, best, maximised))]
-    if not undecided and not level:
-        worst = max(pair.p_value for pair in pairs)
-        return (
-            f"{best.condition.label} is ahead {where}: {_in_words(best)}. So large a gap comes by "
-            f"chance with {p_text(worst)} at most (permutation test, Holm's correction)."
-        )
-    gaps = []
-    for pair in undecided:
-        rival = pair.second if pair.first is best else pair.first
-        gap = st.difference(best.estimate, rival.estimate)
-        text = f"{rival.condition.label} ({number(gap.value)}, {interval_text(gap)}; "
-        gaps.append((abs(float(gap.value)), f"{text}{p_text(pair.p_value)})"))
-    lead = f"{_in_words(best)} is {_direction(maximised)}"
-    if level:
-        lead = f"{_labels([best, *level])} are level at {number(best.value)}"
-    if not gaps:
-        return f"No winner {where}: {lead}."
-    most = sorted(final.seeds for final in scope.compared)[-2:]
-    few = "from so few seeds " if _least_p(scope, *most) >= SIGNIFICANCE else ""
-    return f"No winner {where}: {lead}, but {few}the gap to {_and(_nearest(gaps))} may be chance."
-
-
-def _nearest(gaps: Sequence[tuple[float, str]]) -> list[str]:
-    """Texts of all gaps, or of many those of the smallest ones and the number of the others."""
-    if len(gaps) <= _MOST_RIVALS + 1:
-        return [text for _, text in gaps]
-    smallest = sorted(gaps, key=lambda gap: gap[0])[:_MOST_RIVALS]
-    texts = [text for size, text in gaps if (size, text) in smallest]
-    return [*texts, f"{len(gaps) - _MOST_RIVALS} others"]
-
-
-def _agrees(pair: Comparison[C], best: Final[C], maximised: bool) -> bool:
-    """Whether most runs of `best` are better than those of its rival."""
-    higher = pair.estimate.value > 0.5
-    return bool(higher == (pair.first is best) if maximised else higher == (pair.second is best))
-
-
-def _least_p(scope: Scope[C], first: int, second: int) -> float:
-    """The least adjusted p-value that these numbers of seeds can have."""
-    relabellings: int = comb(first + second, first) ** scope.tasks
-    return len(scope.comparisons) * 2 / relabellings
-
-
-def _how_many_seeds(scope: Scope[C], gap: float) -> list[str]:
-    """A sentence about the seeds that would likely decide what is undecided."""
-    if all(pair.decided for pair in scope.comparisons):
-        return []
-    is_rate = scope.metric in names.EVAL_RATES
-    columns = [
-        column for final in scope.compared for column in np.split(final.scores, scope.tasks, 1)
-    ]
-    # Where a rate has no room for the gap, seeds differ less than they would elsewhere.
-    clear = [c for c in columns if not is_rate or gap <= c.mean() <= 1 - gap]
-    if not clear:
-        ends = sorted({"ceiling" if column.mean() > 0.5 else "floor" for column in columns})
-        return [
-            f"All are within {gap:g} of the {' or '.join(ends)}, where seeds differ less than "
-            "elsewhere: their spread does not tell how many would be needed."
-        ]
-    spread = st.pooled_spread(clear)
-    if not spread:
-        return ["Seeds ended alike: their spread does not tell how many would be needed."]
-    differ = f"Seeds of the same condition differ by {number(spread)} (standard deviation)"
-    seeds = min(final.seeds for final in scope.compared)
-    if not is_rate:
-        least = st.least_difference(seeds, spread, tasks=scope.tasks)
-        return [
-            f"{differ}. With {seeds} seeds per condition a difference of {number(least)} is seen "
-            f"with {st.POWER * 100:.0f} % chance (t test, one comparison)."
-        ]
-    needed = st.seeds_to_decide(gap, spread, tasks=scope.tasks)
-    # With fewer seeds no permutation test could decide anything.
-    fewest = next(n for n in count(2) if _least_p(scope, n, n) < SIGNIFICANCE)
-    if needed is None:
-        outcome = "more than 1000 seeds per condition would be needed"
-    elif (needed := max(needed, fewest)) <= seeds:
-        outcome = f"the {seeds} seeds per condition that there are would mostly show it"
-    else:
-        outcome = (
-            f"about {needed} seeds per condition would show it with {st.POWER * 100:.0f} % "
-            f"chance, {needed - seeds} more than now"
-        )
-    return [f"{differ}. For a difference of {gap:.2f}, {outcome} (t test, one comparison)."]
 
 
 def number(value: float | Array) -> str:
@@ -334,23 +174,3 @@ def p_text(p_value: float) -> str:
 def each_seed(final: Final[C]) -> list[float]:
     """Rising scores of the seeds, means over the tasks; empty where there are many seeds."""
     return sorted(final.scores.mean(axis=1).tolist()) if final.seeds < SHOW_SEEDS_BELOW else []
-
-
-def _direction(maximised: bool) -> str:
-    return "highest" if maximised else "lowest"
-
-
-def _in_words(final: Final[C]) -> str:
-    seeds = "1 seed" if final.seeds == 1 else f"{final.seeds} seeds"
-    return (
-        f"{final.condition.label} with {number(final.value)} "
-        f"({interval_text(final.estimate)}, {seeds})"
-    )
-
-
-def _labels(finals: Iterable[Final[C]]) -> str:
-    return _and([final.condition.label for final in finals])
-
-
-def _and(words: Sequence[str]) -> str:
-    return " and ".join(filter(None, (", ".join(words[:-1]), words[-1])))

@@ -67,7 +67,7 @@ def read_sweep(
         place: A sweep's folder or URI, an exported folder, a sweep's YAML file, or its name.
         storage: The storage in which a name is looked up; None: a folder, or `results`.
         metrics: The metrics to read; None for all.
-        lenient: Whether to read a sweep with damaged runs; these count as failed.
+        lenient: Whether to read a sweep with damaged runs; these count as unfinished.
 
     Raises:
         BadInputError: There is no such sweep.
@@ -248,9 +248,12 @@ def _record(
 ) -> RunRecord:
     planned = planned_run(node, algorithm)
     tags = {**run.provenance, **planned.tags}
-    cause = causes.get(node.key) if run.damage is None else str(run.damage)
+    cause = causes.get(node.key)
     if run.finished:
         status = "FINISHED"
+    elif run.damage is not None:
+        # Not FAILED, which has the worst score: the run has a result that cannot be read.
+        status, tags[names.TAG_FAILURE] = "KILLED", str(run.damage)
     elif cause is not None:
         status, tags[names.TAG_FAILURE] = "FAILED", cause
     elif not run.begun:

@@ -1,4 +1,4 @@
-"""Statistics of few seeds: estimates with intervals that cover, comparisons, seeds needed.
+"""Statistics of few seeds: estimates with intervals that cover, and seeds needed.
 
 Shapes: R runs (seeds) of one condition on each of T tasks. `scores` is `[R, T]` or, for curves,
 `[R, T, points]`, and NaN marks a run that does not exist, so tasks may have different numbers of
@@ -13,17 +13,15 @@ is held by `tests/unit/results/test_coverage.py` and listed in docs/reports.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
-from math import lcm
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from music_rllib.imports import imported_on_use
 
-optimize, stats = imported_on_use("scipy.optimize"), imported_on_use("scipy.stats")
+stats = imported_on_use("scipy.stats")
 
 Array = NDArray[np.float64]
 
@@ -171,115 +169,15 @@ def improvement(x: Array, y: Array) -> float:
         x: `[Rx, T]`.
         y: `[Ry, T]`, the same tasks.
     """
-    return float(np.mean([np.mean(wins) for wins in _wins(x, y)]))
-
-
-def probability_of_improvement(x: Array, y: Array) -> Estimate:
-    """`improvement` with its 95 % interval: Newcombe's (2006) fifth, with Student's quantile.
-
-    It holds the estimate against the variance that each probability would have, so that runs that
-    are all apart do not look certain. Statistics in Medicine 25, 559-573.
-    """
-    tasks = _wins(x, y)
-    value = float(np.mean([np.mean(wins) for wins in tasks]))
-    sizes = [wins.shape for wins in tasks]
-    if min(map(min, sizes)) < 2:
-        return Estimate(value=np.asarray(value), lower=np.array(np.nan), upper=np.array(np.nan))
-    quantile = stats.t.ppf(1 - _TAIL, sum(a + b - 2 for a, b in sizes))
-
-    def too_far(probability: float) -> float:
-        """Above 0 where the estimate is too far from `probability` to come by chance."""
-        p, q = probability, 1 - probability
-        variance = sum(
-            p * q / (a * b) * (1 + ((a + b) / 2 - 1) * (q / (1 + q) + p / (1 + p)))
-            for a, b in sizes
-        )
-        return float((value - p) ** 2 - quantile**2 * variance / len(sizes) ** 2)
-
-    ends = [
-        end
-        if value == end
-        # At 0 and 1 it is 0 as well, so the end is looked for beside them.
-        else optimize.brentq(too_far, end, value + 1e-9 * (end - value))
-        for end in (0.0, 1.0)
-    ]
-    return Estimate(value=np.asarray(value), lower=np.array(ends[0]), upper=np.array(ends[1]))
-
-
-def improvement_p_value(x: Array, y: Array) -> float:
-    """p-value of an exact two-sided permutation test of whether x and y differ.
-
-    The statistic is `improvement`; labels are permuted within each task. Unlike an interval from
-    two or three runs it cannot overstate: with 3 runs against 3 it never falls below .1.
-    """
-    tasks = [(_there(x[:, task]), _there(y[:, task])) for task in range(x.shape[1])]
-    unit = lcm(*(2 * len(a) * len(b) for a, b in tasks))
-    total = np.ones(1)
-    for a, b in tasks:
-        doubled_ranks = np.sort(2 * stats.rankdata([*a, *b])).astype(int)  # ties have halves
-        chances = _chances(tuple(doubled_ranks.tolist()), len(a))
-        spaced = np.zeros(unit + 1)
-        spaced[:: unit // (len(chances) - 1)] = chances
-        total = np.convolve(total, spaced)
-    improvements = np.arange(len(total)) / (len(total) - 1)
-    extreme = np.abs(improvements - 0.5) >= abs(improvement(x, y) - 0.5) - 1e-9
-    return float(min(1.0, total[extreme].sum()))
-
-
-@lru_cache(maxsize=256)
-def _chances(ranks: tuple[int, ...], size: int) -> Array:
-    """Chances of twice Mann and Whitney's U, `[2 m n + 1]`, for `size` ranks drawn by lot.
-
-    They are kept, because all pairs of equal sizes without ties have the same ranks.
-    """
-    ways = np.zeros((size + 1, sum(ranks) + 1))
-    ways[0, 0] = 1
-    for rank in ranks:
-        ways[1:, rank:] += ways[:-1, :-rank]
-    least, rest = size * (size + 1), len(ranks) - size
-    sums = ways[size, least : least + 2 * size * rest + 1]
-    return np.asarray(sums / sums.sum())
-
-
-def holm(p_values: Sequence[float]) -> list[float]:
-    """p-values adjusted for having made several comparisons (Holm 1979)."""
-    order = np.argsort(p_values)
-    scaled = np.asarray(p_values, dtype=float)[order] * np.arange(len(p_values), 0, -1)
-    adjusted = np.empty(len(p_values))
-    adjusted[order] = np.minimum(np.maximum.accumulate(scaled), 1.0)
-    return [float(value) for value in adjusted]
-
-
-def pooled_spread(groups: Sequence[Array]) -> float | None:
-    """Standard deviation between seeds of the same condition and task, over all of `groups`.
-
-    Args:
-        groups: one `[R, T]` per condition.
-
-    Returns:
-        None where no condition has two runs of the same task.
-    """
-    columns = [_there(column) for scores in groups for column in scores.T]
-    freedom = sum(len(column) - 1 for column in columns if len(column))
-    squares = sum(float(np.sum((column - column.mean()) ** 2)) for column in columns if len(column))
-    return float(np.sqrt(squares / freedom)) if freedom else None
-
-
-def power_of(seeds: ArrayLike, difference: float, spread: float, *, tasks: int = 1) -> Array:
-    """Chance that a two-sided t test tells two conditions apart.
-
-    Args:
-        seeds: number for each condition and task, >= 2.
-        difference: between the conditions' means.
-        spread: standard deviation between seeds (:func:`pooled_spread`), > 0.
-        tasks: number of tasks over which the difference is averaged.
-
-    Returns:
-        The chance in the shape of `seeds`.
-    """
-    seeds = np.asarray(seeds, dtype=float)
-    shift = abs(difference) / spread * np.sqrt(seeds * tasks / 2)
-    return power_of_t_test(2 * tasks * (seeds - 1), shift)
+    if x.shape[1] != y.shape[1]:
+        raise ValueError(f"x and y must have the same tasks, got {x.shape[1]} and {y.shape[1]}")
+    shares = []
+    for task in range(x.shape[1]):
+        a, b = _there(x[:, task])[:, np.newaxis], _there(y[:, task])
+        if not (len(a) and len(b)):
+            raise ValueError(f"x and y must have a run of every task, task {task} has none")
+        shares.append(np.mean((a > b) + 0.5 * (a == b)))
+    return float(np.mean(shares))
 
 
 def power_of_t_test(freedom: Array, shift: Array, level: float = SIGNIFICANCE) -> Array:
@@ -303,46 +201,6 @@ def fewest_seeds(power: Callable[[Array], Array]) -> int | None:
     seeds = np.arange(2.0, MAX_SEEDS + 1)  # one seed never decides
     enough = power(seeds) >= POWER
     return int(seeds[enough.argmax()]) if enough.any() else None
-
-
-def seeds_to_decide(difference: float, spread: float, *, tasks: int = 1) -> int | None:
-    """Seeds for each condition and task that show `difference` with a chance of 80 %.
-
-    Arguments are those of :func:`power_of`.
-
-    Returns:
-        The number; None where `MAX_SEEDS` are not enough.
-
-    Raises:
-        ValueError: where `difference` or `spread` is not > 0.
-    """
-    for name, value in (("difference", difference), ("spread", spread)):
-        if not value > 0:
-            raise ValueError(f"{name} must be > 0, got {value}")
-    return fewest_seeds(lambda seeds: power_of(seeds, difference, spread, tasks=tasks))
-
-
-def least_difference(seeds: int, spread: float, *, tasks: int = 1) -> float:
-    """The difference that `seeds` show with a chance of 80 %: the inverse of :func:`power_of`."""
-    low, high = 0.0, 100 * spread  # two seeds show 17 standard deviations
-    return float(
-        optimize.brentq(
-            lambda gap: power_of(seeds, gap, spread, tasks=tasks) - POWER, low, high, rtol=1e-6
-        )
-    )
-
-
-def _wins(x: Array, y: Array) -> list[Array]:
-    """For each task `[Rx, Ry]`: 1 where x is higher, 1/2 where they are equal."""
-    if x.shape[1] != y.shape[1]:
-        raise ValueError(f"x and y must have the same tasks, got {x.shape[1]} and {y.shape[1]}")
-    pairs = []
-    for task in range(x.shape[1]):
-        a, b = _there(x[:, task])[:, np.newaxis], _there(y[:, task])
-        if not (len(a) and len(b)):
-            raise ValueError(f"x and y must have a run of every task, task {task} has none")
-        pairs.append((a > b) + 0.5 * (a == b))
-    return pairs
 
 
 def _there(values: ArrayLike) -> Array:

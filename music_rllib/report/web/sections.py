@@ -12,9 +12,8 @@ from music_rllib import names
 from music_rllib.report.pieces import DASH, Cell, TextTable, estimate_cells, number_cell
 from music_rllib.report.search_tables import search_in_words, search_tables
 from music_rllib.results.analysis import StageAnalysis, Wait
-from music_rllib.results.comparison import SHOW_SEEDS_BELOW, each_seed, number, p_text
+from music_rllib.results.comparison import SHOW_SEEDS_BELOW, each_seed, number
 from music_rllib.results.data import Sweep
-from music_rllib.results.statistics import SIGNIFICANCE
 from music_rllib.results.time_to_threshold import FEWEST_FOR_INTERVAL
 
 UNFOLDED_ROWS = 30
@@ -113,25 +112,19 @@ def _improvement_table(analysis: StageAnalysis) -> TextTable:
     rows = [
         (
             scope.name,
-            f"{pair.first.condition.label} over {pair.second.condition.label}",
+            f"{pair.first.condition.label} - {pair.second.condition.label}",
             *estimate_cells(pair.gap),
-            *estimate_cells(pair.estimate),
-            p_text(pair.p_value),
-            _yes_or_no(pair.decided),
+            number_cell(_percent(pair.improvement)),
         )
         for scope in analysis.scopes
         for pair in scope.comparisons
     ]
     return TextTable(
-        title="Who ends higher",
-        header=(
-            *("Task", "Pair", "Gap", "95 % interval", "Probability", "95 % interval"),
-            *("Permutation", "Decided"),
-        ),
+        title="Differences of the final values",
+        header=("Task", "Pair", "Difference", "95 % interval", "Probability of improvement"),
         rows=rows,
-        note="Gap: of the means. Probability of improvement: that a run of the first ends higher "
-        f"than a run of the second (ties half). Decided: p < {SIGNIFICANCE:g} after Holm's "
-        "correction.",
+        note="Difference of the means, without a test: comparisons are above. Probability of "
+        "improvement: a run of the first ends higher than a run of the second (ties half).",
     )
 
 
@@ -183,7 +176,7 @@ def budget(sweep: Sweep, analyses: Sequence[StageAnalysis]) -> TextTable:
 
 
 def failures(sweep: Sweep) -> TextTable:
-    """The failed runs and the causes of their failures."""
+    """The failed and the damaged runs, with the causes."""
     return TextTable(
         title="What failed and why",
         header=("Run", "Env steps", "Cause"),
@@ -194,7 +187,7 @@ def failures(sweep: Sweep) -> TextTable:
                 Cell(text=run.failure or "no cause was recorded", kind="long", code=True),
             )
             for position, run in enumerate(sweep.runs)
-            if run.status == "FAILED"
+            if run.status == "FAILED" or (run.status == "KILLED" and run.failure)
         ],
     )
 
@@ -264,10 +257,6 @@ def _time_cell(seconds: float | None) -> Cell:
 
 def _percent(share: float) -> str:
     return f"{share * 100:.0f} %"
-
-
-def _yes_or_no(answer: bool) -> str:
-    return "yes" if answer else "no"
 
 
 def state_in_words(status: str) -> str:

@@ -46,7 +46,7 @@ class Study:
     """All claims of one stage and of the hypotheses."""
 
     stage: Stage | None
-    """None where no run has begun."""
+    """None before a run has begun, and without a stage that trains for the task."""
     plan: PlanVersion | None
     """The last version recorded before the first of its runs had finished; None without one."""
     latest: PlanVersion | None

@@ -22,19 +22,17 @@ Examples:
   music-rllib compare results/smoke --metric evaluation/object_displacement
   music-rllib compare results/search --stage finetune --json
 
-Each row is the mean over the seeds that have finished on every task, with its
-95 % interval (docs/reports.md). Runs on the fresh seeds of a search's final
-ranking are never mixed with those its trials were chosen by. A condition is
-said to be ahead only where an exact permutation test, with Holm's correction
-over all pairs, gives p < 0.05 against each other one: three seeds are never
-enough. The report says the same.
+The answer comes first: conditions by the area under their learning curves (the
+mean over the budget), seed by seed if they share seeds, as superior, worse,
+equivalent within a margin or undecided (docs/comparing_q.md). Comparisons that
+the sweep's 'analysis' planned before the runs are kept apart from all others.
 
-First comes the answer: conditions by the area under their learning curves (the
-mean over the budget), seed by seed where they share seeds, as superior, worse,
-equivalent within a margin or undecided (docs/comparing_q.md). What the sweep's
-'analysis' planned before the runs is kept apart from what is compared beyond.
+Tables of final values follow, without a test: the mean over the seeds that have
+finished on every task with its 95 % interval (docs/reports.md), the difference
+from the best mean, and the probability that a run of the best ends better. Runs
+on the fresh seeds of a search are never mixed with those that chose its trials.
+The report has the same numbers.
 """
-IN_THE_SEARCH = "Trials were chosen by these runs, so their order is biased: fresh seeds count."
 
 
 def compare(
@@ -155,15 +153,12 @@ def _groups(
     entropies: Entropies,
 ) -> Iterator[dict[str, Any]]:
     """The conditions that are compared in a scope, and those of the search apart from them."""
-    from music_rllib.results.comparison import verdict
+    from music_rllib.sweep.views.compare import IN_THE_SEARCH
 
     fresh = any(final.condition.is_fresh for final in scope.compared)
     searched = [final for final in scope.finals if final not in scope.compared]
-    groups = (
-        (scope.compared, "on fresh seeds" if fresh else "", verdict(scope, maximised=maximised)),
-        (searched, "in the search", [IN_THE_SEARCH]),
-    )
-    for finals, part, sentences in groups:
+    groups = ((scope.compared, "on fresh seeds" if fresh else ""), (searched, IN_THE_SEARCH))
+    for finals, part in groups:
         if finals:
             yield {
                 "part": part,
@@ -178,7 +173,6 @@ def _groups(
                     }
                     for final, row in _rows(scope, finals, maximised, entropies)
                 ],
-                "verdict": " ".join(sentences),
             }
 
 
@@ -206,17 +200,15 @@ def _rows(
             "gap": None,
             "gap_interval": None,
             "best_is_better_with": None,
-            "p_value": None,
             "entropies": entropies.get((scope.name, condition), {}),
         }
         pair = next((p for p in scope.comparisons if {p.first, p.second} == {best, final}), None)
         if pair is not None:
             gap = difference(best.estimate, final.estimate)
-            higher = float(pair.estimate.value)
+            higher = pair.improvement
             row |= {
                 "gap": float(gap.value),
                 "gap_interval": _ends(gap),
                 "best_is_better_with": higher if (pair.first is best) == maximised else 1 - higher,
-                "p_value": pair.p_value,
             }
         yield final, row

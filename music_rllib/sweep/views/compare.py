@@ -16,6 +16,9 @@ from music_rllib.results.comparison import with_interval
 from music_rllib.sweep.views.tables import new_table, seeds_in_words
 from music_rllib.sweep.views.text import percent
 
+IN_THE_SEARCH = "in the search"
+"""Part of a group of trials on the seeds that they were chosen by."""
+
 
 def compare_view(document: Mapping[str, Any]) -> RenderableType:
     """The answer, the comparisons, and a table for each group of conditions."""
@@ -30,7 +33,9 @@ def compare_view(document: Mapping[str, Any]) -> RenderableType:
     if document["conditions"]:
         parts.append(_areas_table(document["conditions"]))
     for group in document["groups"]:
-        parts += [_group_table(document["stage"], group), Text(group["verdict"])]
+        parts.append(_group_table(document["stage"], group))
+        if group["part"] == IN_THE_SEARCH:
+            parts.append(Text("Trials were chosen by these runs: their order is biased."))
         if any(row["entropies"] for row in group["conditions"]):
             parts.append(_entropies_table(group))
     return Group(*parts)
@@ -73,9 +78,9 @@ def _areas_table(rows: Sequence[Mapping[str, Any]]) -> Table:
 
 def _group_table(stage: str, group: Mapping[str, Any]) -> Table:
     rows = group["conditions"]
-    title = f"{group['metric']} of {stage} on {group['tasks']} {group['part']}".strip()
+    title = f"Final {group['metric']} of {stage} on {group['tasks']} {group['part']}".strip()
     settings = dict.fromkeys(name for row in rows for name in row["values"])
-    numbers = ("mean, 95 %", "each seed", "runs", "gap, 95 %", "P(first\nis better)", "p")
+    numbers = ("mean, 95 %", "each seed", "runs", "best - this, 95 %", "P(best is\nbetter)")
     table = new_table(title, (*_setting_heads(settings), *numbers))
     for row in rows:
         table.add_row(
@@ -88,7 +93,6 @@ def _group_table(stage: str, group: Mapping[str, Any]) -> Table:
             f"{row['runs']} of {row['planned']}",
             "" if row["gap"] is None else with_interval(row["gap"], row["gap_interval"]),
             percent(row["best_is_better_with"]),
-            "" if row["p_value"] is None else f"{row['p_value']:.2g}",
         )
     return table
 

@@ -21,7 +21,9 @@ from music_rllib.experiment.plan import Node, make_plan
 from music_rllib.experiment.session import Sweep, keep_record, open_sweep
 from music_rllib.report import cli as report
 from music_rllib.report.limitations import missing
+from music_rllib.report.web.sections import failures
 from music_rllib.results.analysis import analyse
+from music_rllib.results.claims.study import study_of
 from music_rllib.results.read import read_sweep
 from music_rllib.store.object_folder import DamagedError
 from music_rllib.store.paths import sweep_folder
@@ -268,7 +270,7 @@ def test_a_search_that_is_changed_shows_the_trials_of_its_plan(tmp_path: Path) -
     assert changed.earlier == f"9 runs {NOT_SHOWN} other trials of train."
 
 
-def test_damaged_runs_are_refused_or_count_as_failed(tmp_path: Path) -> None:
+def test_damaged_runs_are_refused_or_count_as_unfinished(tmp_path: Path) -> None:
     opened = play(tmp_path)
     bad = opened.plan.nodes[2]
     (Path(opened.store.path(bad.key)) / HISTORY).write_text("no reports")
@@ -279,7 +281,12 @@ def test_damaged_runs_are_refused_or_count_as_failed(tmp_path: Path) -> None:
     assert read.damaged is not None
     assert bad.label in read.damaged
     assert [run.status for run in read.sweep.runs].count("FINISHED") == 5
-    assert read.sweep.runs[2].status == "FAILED"
+    study = study_of(read.sweep)
+    assert [claim.why for claim in study.claims] == ["1 run is not finished"]
+    assert sum(mean.scores.failed for mean in study.means) == 0, "a damaged run is no bad one"
+    (row,) = failures(read.sweep).rows
+    assert row[0] == bad.label
+    assert missing(read.sweep, ()) == []
 
 
 def test_a_run_is_read_as_it_was_reported_and_with_the_code_that_made_it(tmp_path: Path) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import combinations
-
 import numpy as np
 import pytest
 from hypothesis import assume, given
@@ -108,7 +106,6 @@ def test_one_run_has_no_interval() -> None:
     some = s.estimate(np.array([[0.7, 0.8], [0.9, NAN]]))
     assert not some.has_interval  # the second task's spread is not known
     assert np.isnan(s.estimate(np.empty((0, 1))).value)
-    assert not s.probability_of_improvement(X[:1], Y).has_interval
 
 
 def test_a_curve_is_estimated_point_by_point_with_the_runs_that_are_there() -> None:
@@ -136,88 +133,6 @@ def test_profile() -> None:
     np.testing.assert_allclose(found.value, [1, 3 / 5, 1 / 5, 0])
     exact = stats.binomtest(3, 5).proportion_ci(0.95, method="exact")
     assert (found.lower[1], found.upper[1]) == pytest.approx((exact.low, exact.high))
-
-
-def test_probability_of_improvement_of_clear_and_of_equal_runs() -> None:
-    """Newcombe's variance at the end: 3 x 2 runs all apart, three degrees of freedom."""
-    low, high = np.array([[0.1], [0.2], [0.3]]), np.array([[0.8], [0.9]])
-    value, lower, upper = ends(s.probability_of_improvement(high, low))
-    assert (value, upper) == (1, 1)
-    q = 1 - lower
-    variance = lower * q / 6 * (1 + 1.5 * (q / (1 + q) + lower / (1 + lower)))
-    assert q == pytest.approx(stats.t.ppf(0.975, 3) * np.sqrt(variance), rel=1e-6)
-    assert ends(s.probability_of_improvement(low, high)) == pytest.approx((0, 0, 1 - lower))
-    same = s.probability_of_improvement(low, low)
-    assert same.value == 0.5
-    assert 0.5 - same.lower == pytest.approx(float(same.upper) - 0.5)
-    assert same.lower < 0.2
-
-
-small = st.lists(st.integers(0, 4), min_size=1, max_size=4)
-
-
-@given(small, small)
-def test_p_value_is_that_of_all_relabellings(x: list[int], y: list[int]) -> None:
-    a, b = np.array(x, float)[:, None], np.array(y, float)[:, None]
-    pooled, observed, extreme = np.concatenate([a, b]), abs(s.improvement(a, b) - 0.5), []
-    for chosen in combinations(range(len(pooled)), len(a)):
-        rest = [index for index in range(len(pooled)) if index not in chosen]
-        gap = abs(s.improvement(pooled[list(chosen)], pooled[rest]) - 0.5)
-        extreme.append(gap >= observed - 1e-9)
-    assert s.improvement_p_value(a, b) == pytest.approx(np.mean(extreme))
-
-
-def test_few_runs_are_never_evidence() -> None:
-    """3 against 3, completely apart: 2 of 20 relabellings are as extreme."""
-    low, high = np.arange(3.0)[:, None], 10 + np.arange(3.0)[:, None]
-    assert s.improvement_p_value(high, low) == pytest.approx(0.1)
-    both = np.concatenate([low, low], axis=1), np.concatenate([high, high], axis=1)
-    assert s.improvement_p_value(*both) == pytest.approx(2 / 400)
-    uneven = both[0], np.concatenate([high, [[11.0], [12.0], [NAN]]], axis=1)
-    assert s.improvement_p_value(*uneven) == pytest.approx(2 / 200)
-
-
-def test_holm() -> None:
-    assert s.holm([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.06, 0.06])
-    assert s.holm([0.9, 0.8]) == [1.0, 1.0]
-    assert s.holm([]) == []
-
-
-@pytest.mark.parametrize("effect, seeds", [(0.2, 394), (0.5, 64), (0.8, 26), (1.0, 17)])
-def test_seeds_are_those_of_cohen_s_table(effect: float, seeds: int) -> None:
-    """Cohen 1988, two-sided .05, power .8 (394 by the exact t distribution, his table says 393)."""
-    assert s.seeds_to_decide(effect * 0.3, 0.3) == seeds
-    assert s.power_of(seeds, effect, 1.0) >= 0.8 > s.power_of(seeds - 1, effect, 1.0)
-
-
-def test_seeds_against_a_simulated_experiment() -> None:
-    """Three tasks, each difference averaged; a t test on the averaged difference."""
-    rng = np.random.default_rng(0)
-    x, y = rng.normal(0.0, 1.0, (4000, 9, 3)), rng.normal(0.8, 1.0, (4000, 9, 3))
-    difference = y.mean(axis=(1, 2)) - x.mean(axis=(1, 2))
-    spread = np.sqrt((x.var(axis=1, ddof=1) + y.var(axis=1, ddof=1)).mean(axis=1) / 2)
-    t = difference / (spread * np.sqrt(2 / 27))
-    seen = np.mean(np.abs(t) > stats.t.ppf(0.975, 48))
-    assert s.power_of(9, 0.8, 1.0, tasks=3) == pytest.approx(seen, abs=0.02)
-    assert s.seeds_to_decide(0.8, 1.0, tasks=3) == 9
-    assert s.power_of(9, s.least_difference(9, 2.0, tasks=3), 2.0, tasks=3) == pytest.approx(0.8)
-    assert s.least_difference(2, 1.0) > 3
-
-
-def test_seeds_beyond_reach_and_nonsense() -> None:
-    assert s.seeds_to_decide(0.001, 1.0) is None
-    assert s.seeds_to_decide(50.0, 0.01) == 2
-    with pytest.raises(ValueError, match=r"spread must be > 0, got 0\.0"):
-        s.seeds_to_decide(0.1, 0.0)
-    with pytest.raises(ValueError, match="difference must be > 0"):
-        s.seeds_to_decide(NAN, 1.0)
-
-
-def test_pooled_spread() -> None:
-    """Squares 2 + 2 + 0 over 1 + 2 + 0 degrees of freedom."""
-    groups = [np.array([[0.0, 5.0], [2.0, NAN]]), np.array([[10.0], [11.0], [12.0]])]
-    assert s.pooled_spread(groups) == pytest.approx(np.sqrt(4 / 3))
-    assert s.pooled_spread([np.array([[1.0]])]) is None
 
 
 def test_tasks_must_match() -> None:
