@@ -36,7 +36,7 @@ def answer(sweep: Sweep, study: Study) -> list[str]:
         sentences = [f"Asked: {study.question} ({planned})."]
     if study.stage is None and any(run.status != "SCHEDULED" for run in sweep.runs):
         return [*sentences, "No stage trains for the task, so nothing is compared."]
-    if not study.means:
+    if study.stage is None or not study.means:
         return [*sentences, "No run that may be compared has finished yet."]
     shown = [claim for claim in study.claims if claim.task == ALL_TASKS] or list(study.claims)
     sentences += [f"{in_words(claim)}." for claim in shown[:MOST_CLAIMS]]
