@@ -33,7 +33,7 @@ class Unlike(NamedTuple):
     @property
     def problem(self) -> str:
         """Both values in words."""
-        return f"a step gave a reward of {self.given:g}, its goals have one of {self.priced:g}"
+        return f"a step returned reward {self.given:g}, compute_reward gives {self.priced:g}"
 
 
 def first_unlike(

@@ -47,6 +47,8 @@ MOST_STEPS, MOST_SECONDS = 20_000, 2.0
 """Limits of the further episodes that are played to see a success and a second reward."""
 REPEATED_STEPS = 50
 """Steps that are compared with those after an earlier reset with the same seed."""
+_USED = frozenset({"observation", "desired_goal", "achieved_goal"})
+"""Keys of an observation with goals that the networks and hindsight use."""
 _TYPING_ERROR = 0.85
 """Similarity from which a key is taken for a misspelled one."""
 
@@ -93,6 +95,7 @@ class Probe:
         self._keys: Counter[str] = Counter()
         self._rewards: set[float] = set()
         self._unused: set[str] = set()
+        self._types: set[str] = set()
         self._reward: GoalReward | None = None
 
     def run(self) -> None:
@@ -163,12 +166,26 @@ class Probe:
         except RefusedError as error:
             if largest == smallest:
                 raise
-            self._reset(env, smallest)
+            self._reset_to_smallest(env, smallest)
             raise RefusedError(
                 f"reset must accept all seeds of seed_range, {smallest} to {largest}: {error}; "
                 f"seed_range: [{smallest}, N] declares N as the largest"
             ) from None
         return self._play(env, largest, actions=0)
+
+    def _reset_to_smallest(self, env: Env, seed: int) -> None:
+        """Name `seed_range` if the environment refuses this seed but resets without one."""
+        try:
+            self._reset(env, seed)
+        except RefusedError as error:
+            try:
+                env.reset()
+            except BaseException:  # the seed is not the reason
+                raise error from None
+            raise RefusedError(
+                f"{error}; reset() without a seed works: if only some seeds are allowed, declare "
+                "them with seed_range: [SMALLEST, LARGEST]"
+            ) from None
 
     def _goal_reward(self, env: Env) -> GoalReward | None:
         seed = self._task.seed_range[0]
@@ -225,6 +242,7 @@ class Probe:
         ended, last = False, min(steps or self._layout.horizon, self._layout.horizon)
         try:
             recording.see(observation)
+            self._compare_types(env.observation_space, observation)
             while recording.steps < last and not ended and time.monotonic() < end:
                 action = rng.uniform(-1.0, 1.0, (1, self._layout.action)).astype(np.float32)
                 result = self._step(env, to_bounds(action, space)[0])
@@ -239,6 +257,15 @@ class Probe:
         self._rewards.update(episode.rewards.tolist())
         return episode
 
+    def _compare_types(self, space: spaces.Space[Any], observation: Any) -> None:
+        """Note the parts of a valid observation that are integers for floats, or the opposite."""
+        parts = space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
+        values = observation if isinstance(space, spaces.Dict) else {"observation": observation}
+        for name in parts.keys() & _USED:
+            returned, declared = np.asarray(values[name]).dtype, np.dtype(parts[name].dtype)
+            if returned.kind != declared.kind:
+                self._types.add(f"{name} has type {returned}, its space declares {declared}")
+
     def _repeat(self, env: Env, first: Episode) -> None:
         """Compares an episode with the first one, of the same seed and actions."""
         seed = self._task.seed_range[1]
@@ -251,11 +278,9 @@ class Probe:
         if not all(same):
             unlike = (again.frames[: steps + 1] != first.frames[: steps + 1]).any(axis=1)
             at = int(np.argmax(unlike)) if unlike.any() else steps
-            place = (
-                "with another observation" if at == 0 else f"the same, and differed by step {at}"
-            )
             self.remarks.append(
-                f"reset(seed={seed}) must fix an episode; the second time it began {place}. "
+                f"reset(seed={seed}) must determine the episode; the second time it differed from "
+                f"step {at} on. "
                 "A resumed run will differ from an uninterrupted one, and runs with the same seed "
                 "will differ from each other"
             )
@@ -278,7 +303,7 @@ class Probe:
         return closest(self._task.success_key or "", always, _TYPING_ERROR)
 
     def _name_keys(self) -> None:
-        """Names a success key that was not there, and parts of observations that are not used."""
+        """Name a missing success key, and parts of observations of another type or without use."""
         key = self._task.success_key
         if key is not None and key not in self._keys:
             known = ", ".join(sorted(self._keys)) or "none"
@@ -291,7 +316,8 @@ class Probe:
                     f"success_key {key!r} was not in info in {self._steps} random steps (keys: "
                     f"{known}){closest(key, self._keys)}; a step without it counts as not reached"
                 )
-        if unused := self._unused - {"observation", "desired_goal", "achieved_goal"}:
+        self.remarks += (f"{line}; the networks get float32" for line in sorted(self._types))
+        if unused := self._unused - _USED:
             self.remarks.append(
                 f"the observation's {', '.join(sorted(unused))} is not used: the networks get "
                 "observation and desired_goal"

@@ -250,7 +250,7 @@ def _reason(store: TrackingStore, error: requests.RequestException) -> str:
     try:
         socket.getaddrinfo(host, None)
     except OSError:
-        return f"the host name {host!r} is not known here"
+        return f"the host name {host!r} cannot be resolved"
     if "refused" in str(error):
         return "the connection was refused"
     return f"no connection ({redact(str(error))})"

@@ -219,7 +219,7 @@ def test_a_reward_that_mixes_up_the_rows_of_a_batch_is_refused(env_id: str) -> N
 def test_a_reward_that_a_step_does_not_give_is_refused() -> None:
     """Replayed steps would have one scale, relabelled ones another."""
     env = gym.wrappers.TransformReward(make_env("FetchReach-v4"), lambda reward: 2 * float(reward))
-    with pytest.raises(ValueError, match=r"a step gave a reward of -2, its goals have one of -1"):
+    with pytest.raises(ValueError, match=r"a step returned reward -2, compute_reward gives -1"):
         goal_reward_of(env)
 
 

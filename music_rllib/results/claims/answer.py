@@ -77,7 +77,7 @@ def planned_in_words(study: Study) -> str:
             f"planned {latest.recorded}, when runs had finished already: it counts as thought of "
             "afterwards"
         )
-    return "nothing was planned beforehand: every comparison here was thought of afterwards"
+    return "no comparison was planned in advance: all comparisons are exploratory"
 
 
 def _changed(before: AnalysisPlan, after: AnalysisPlan) -> list[str]:

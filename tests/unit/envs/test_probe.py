@@ -91,8 +91,7 @@ def stops(env: Sound, *step: Any) -> Any:
 
 class SmallSeeds(Sound):
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        assert seed is not None
-        if not 5 <= seed < 100:
+        if seed is not None and not 5 <= seed < 100:
             raise IndexError(f"level {seed} is not there")
         return super().reset(seed=seed)
 
@@ -110,7 +109,7 @@ class OneNumber(Sound):
 @pytest.mark.parametrize(
     ("kind", "problem"),
     [
-        (changed(bonus), "a step gave a reward of 10, its goals have one of 0"),
+        (changed(bonus), "a step returned reward 10, compute_reward gives 0"),
         (changed(cost), "compute_reward is not the whole reward of a step"),
         (
             changed(old_step),
@@ -136,6 +135,9 @@ def test_seeds_are_tried_at_both_ends_of_their_range(monkeypatch: pytest.MonkeyP
     (line,) = probed(monkeypatch, SmallSeeds, seed_range=(5, 100)).problems
     assert line.startswith("reset must accept all seeds of seed_range, 5 to 100: reset(seed=100)")
     assert line.endswith("seed_range: [5, N] declares N as the largest")
+    (line,) = probed(monkeypatch, SmallSeeds).problems
+    assert line.startswith("reset(seed=0) must not raise, it raised IndexError")
+    assert line.endswith("declare them with seed_range: [SMALLEST, LARGEST]")
 
 
 class OwnSeeds(Sound):
@@ -153,6 +155,11 @@ class Extra(Sound):
         return super().seen() | {"force": np.ones(3)}
 
 
+class Truncated(Sound):
+    def seen(self) -> Any:
+        return super().seen() | {"observation": self.at.astype(int)}
+
+
 class Stubborn(Sound):
     def close(self) -> None:
         raise RuntimeError("it is\ngone")
@@ -161,12 +168,13 @@ class Stubborn(Sound):
 @pytest.mark.parametrize(
     ("kind", "remark"),
     [
-        (OwnSeeds, "must fix an episode; the second time it began with another observation"),
+        (OwnSeeds, "must determine the episode; the second time it differed from step 0 on"),
         (
             Unseeded,
-            "must fix an episode; the second time it began the same, and differed by step 1",
+            "must determine the episode; the second time it differed from step 1 on",
         ),
         (Extra, "the observation's force is not used"),
+        (Truncated, "observation has type int64, its space declares float32"),
         (Stubborn, "close() must not raise, it raised RuntimeError: it is gone ("),
         (
             changed(lambda env, *step: (*step[:4], {"is_success": True} if step[1] == 9 else {})),

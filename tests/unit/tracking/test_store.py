@@ -158,7 +158,7 @@ def test_a_server_that_hangs_is_given_up_soon(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_an_unknown_host_is_called_unknown() -> None:
-    with pytest.raises(TrackingError, match=r"'no-such-host\.invalid' is not known"):
+    with pytest.raises(TrackingError, match=r"'no-such-host\.invalid' cannot be resolved"):
         check_reachable(resolve_store("http://no-such-host.invalid:5000", "results"))
 
 
