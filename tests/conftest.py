@@ -37,6 +37,8 @@ prepare_environment()
 quiet_third_parties()
 # Tests start clusters as well; each program of ours that they start decides for itself.
 os.environ.pop(LOCAL_RAY_BEYOND_LOOPBACK)
+# Tests start modules of the repository, which is the current folder.
+os.environ.pop("PYTHONSAFEPATH", None)
 
 # No deadline: the machine is shared. Reproducible where a failure cannot be replayed from the
 # local example database.
@@ -111,6 +113,7 @@ def _leaves_the_working_folder() -> Iterator[None]:
     """A test that goes elsewhere and stays there breaks another one, in some order of the files."""
     before = Path.cwd()
     yield
+    os.environ.pop("PYTHONSAFEPATH", None)  # set by a test that called the program's own start
     if Path.cwd() != before:
         os.chdir(before)
         pytest.fail("the test left another working folder behind: use monkeypatch.chdir")

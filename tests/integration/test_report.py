@@ -186,7 +186,7 @@ def page(sweep_folder: Path) -> Path:
     assert done.stdout.splitlines()[-2:] == [f"Report: {path}", f"Picture: {picture}"]
     assert picture.is_file()
     assert "missing: 1 run not begun: finetune/" in done.stdout
-    assert "Nothing was planned beforehand" in done.stdout
+    assert "No comparison was planned in advance" in done.stdout
     return path
 
 
