@@ -24,7 +24,7 @@ from music_rllib.store.lease import Lease
 from music_rllib.store.node_store import NodeStore
 from music_rllib.training.job import NodeJob
 from music_rllib.training.worker import CAUSE, NOTES, STOPPED, RunTrainable
-from tests.integration.test_sweep_trainable import (
+from tests.integration.sweep.test_sweep_trainable import (
     compute,
     job,
     nothing_in_the_home_folder,

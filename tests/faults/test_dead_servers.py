@@ -14,8 +14,8 @@ from tests.faults import comparison, sweeps
 from tests.faults.sweeps import deliver
 from tests.integration.conftest import Program
 from tests.integration.mlflow_server import USER, MlflowServer
-from tests.integration.test_refusing_mlflow import TODO, refusing
-from tests.integration.test_secrets import PASSWORD, mlflow_server
+from tests.integration.tracking.test_refusing_mlflow import TODO, refusing
+from tests.integration.tracking.test_secrets import PASSWORD, mlflow_server
 
 __all__ = ["mlflow_server"]
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from music_rllib.tac.algorithm import TAC
-from tests.integration.test_tac_algorithm import build, fingerprint
+from tests.integration.algorithm.test_tac_algorithm import build, fingerprint
 
 pytestmark = pytest.mark.usefixtures("local_ray")
 

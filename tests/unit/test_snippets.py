@@ -1,7 +1,7 @@
 """Every command and snippet of README and docs, as far as that shows without running it.
 
 Commands of the package are parsed by the commands themselves, in a folder that is not the
-repository's; tests/integration/test_first_hour.py runs what a newcomer runs.
+repository's; tests/integration/project/test_first_hour.py runs what a newcomer runs.
 """
 
 from __future__ import annotations

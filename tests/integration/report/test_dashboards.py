@@ -20,7 +20,7 @@ import yaml
 from music_rllib.sweep.listeners.prometheus import GAUGES, TARGETS
 from tests.ports import free_port
 
-DASHBOARDS = Path(__file__).parents[2] / "dashboards"
+DASHBOARDS = Path(__file__).parents[3] / "dashboards"
 PATIENCE = 240.0
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from benchmarks.measure import ratio_row
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 
 
 def bench(*arguments: str | Path) -> subprocess.CompletedProcess[str]:

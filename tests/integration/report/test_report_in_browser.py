@@ -29,7 +29,7 @@ from music_rllib.results.data import Sweep
 from tests.integration.devtools import Page
 from tests.unit.report.test_live import write_state
 
-DATA = Path(__file__).parents[2] / "docs" / "results" / "data"
+DATA = Path(__file__).parents[3] / "docs" / "results" / "data"
 LOOK = Path(__file__).with_name("look.js").read_text()
 """Finds text of figures that is cut or too faint, and controls without a name."""
 AXE = Path(axe_core_python.__file__).with_name("axe.min.js").read_text()

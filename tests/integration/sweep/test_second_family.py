@@ -230,7 +230,7 @@ def test_an_environment_without_goals_is_refused() -> None:
 
 # --- the page about it -------------------------------------------------------------------------
 
-PAGE = (Path(__file__).parents[2] / "docs" / "add_an_environment.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[3] / "docs" / "add_an_environment.md").read_text(encoding="utf-8")
 
 
 def test_the_checks_of_the_page_hold() -> None:

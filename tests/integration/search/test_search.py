@@ -29,7 +29,7 @@ from tests.ports import free_port
 pytestmark = pytest.mark.integration
 
 Document = dict[str, Any]
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 
 
 WORTH = names.ALPHA

@@ -38,7 +38,7 @@ from music_rllib.training.worker import CAUSE, NOTES, REPORTS, RunTrainable
 
 pytestmark = pytest.mark.integration
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 ENVIRONMENTS = ROOT / "tests" / "environments"
 POINT = Task(
     name="Point",

@@ -19,7 +19,7 @@ from music_rllib.tac.algorithm import TAC
 from music_rllib.tac.kernels import blas
 from music_rllib.tac.kernels.update import DirectUpdate
 from music_rllib.tac.learner import TACLearner
-from tests.integration.test_tac_algorithm import (
+from tests.integration.algorithm.test_tac_algorithm import (
     HER,
     MUSIC_R,
     MUSIC_U,
@@ -29,7 +29,13 @@ from tests.integration.test_tac_algorithm import (
     fingerprint,
     register_uneven,
 )
-from tests.integration.test_tac_losses import ACTION, BATCH, OBSERVATION, learner, minibatch
+from tests.integration.algorithm.test_tac_losses import (
+    ACTION,
+    BATCH,
+    OBSERVATION,
+    learner,
+    minibatch,
+)
 
 DDPG = {
     "policy": "deterministic",

@@ -7,7 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-PACKAGE = Path(__file__).parents[2] / "music_rllib"
+PACKAGE = Path(__file__).parents[3] / "music_rllib"
 
 # Only these may load Ray; everything else is usable, and tested, without it.
 MAY_LOAD_RAY = (

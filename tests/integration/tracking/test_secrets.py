@@ -13,7 +13,7 @@ import requests
 from music_rllib.redaction import redact
 from tests.integration.mlflow_server import USER, server_script
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 PASSWORD = "planted-mlflow-password"
 PLANTED = {
     "MLFLOW_TRACKING_USERNAME": USER,

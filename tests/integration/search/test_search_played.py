@@ -832,7 +832,7 @@ def test_node_keys_are_the_same_in_another_process(tmp_path: Path) -> None:
     found = subprocess.run(
         [sys.executable, "-c", code, str(tmp_path / "there")],
         env=os.environ | {"PYTHONHASHSEED": "12345", "LC_ALL": "C", "TZ": "Asia/Tokyo"},
-        cwd=Path(__file__).parents[2],
+        cwd=Path(__file__).parents[3],
         capture_output=True,
         check=True,
         text=True,

@@ -26,8 +26,8 @@ from tests.ports import free_port
 
 pytestmark = pytest.mark.integration
 
-REPOSITORY = Path(__file__).parents[2]
-ENVIRONMENTS = Path(__file__).parents[1] / "environments"
+REPOSITORY = Path(__file__).parents[3]
+ENVIRONMENTS = Path(__file__).parents[2] / "environments"
 BIN = Path(sys.executable).parent
 
 

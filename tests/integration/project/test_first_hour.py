@@ -25,7 +25,7 @@ from tests.integration.conftest import call
 
 pytestmark = pytest.mark.e2e
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 SECONDS = {
     "env_steps": 300,
     "num_envs": 2,

@@ -15,7 +15,7 @@ from music_rllib.experiment.continuation import budget_settings, continuation_ke
 from music_rllib.store.node_store import NodeStore
 from music_rllib.store.run_record import from_json_lines
 from music_rllib.training.worker import CAUSE, NOTES, REPORTS
-from tests.integration.test_sweep_trainable import (
+from tests.integration.sweep.test_sweep_trainable import (
     compute,
     job,
     nothing_in_the_home_folder,

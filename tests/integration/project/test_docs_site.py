@@ -12,7 +12,7 @@ import pytest
 
 from tests.integration.devtools import Page
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 """Folder in which the picture is kept, such as docs/img."""
 
 
