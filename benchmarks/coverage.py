@@ -16,8 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from music_rllib.results import statistics as st
-from music_rllib.results.statistics import Array
-from music_rllib.results.time_to_threshold import Waits, median_wait_interval
+from music_rllib.results.statistics import Array, Waits, median_wait_interval
 
 SEEDS = (2, 3, 4, 5, 10, 20)
 

@@ -17,7 +17,7 @@ import numpy as np
 from scipy import stats
 
 from music_rllib.results import statistics as st
-from music_rllib.results.claims.contrasts import COLLAPSES, adjusted, contrast, verdict_of
+from music_rllib.results.claims import COLLAPSES, adjusted, contrast, verdict_of
 from music_rllib.results.statistics import Array
 
 SEEDS = (3, 5, 6, 10, 15, 20, 24, 30)

@@ -38,7 +38,7 @@ from music_rllib.policy.rollout import open_task
 from music_rllib.report.limitations import missing
 from music_rllib.report.search_tables import search_in_words, search_tables
 from music_rllib.report.tables import runs_table
-from music_rllib.results.archive.folder import read_archive
+from music_rllib.results.archive import read_archive
 from music_rllib.results.conditions import find_stages
 from music_rllib.results.data import ReportError
 from music_rllib.store.handoff import HandoffError

@@ -30,7 +30,7 @@ from music_rllib import names
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.envs.tasks import Task
 from music_rllib.policy import load_policy
-from music_rllib.results.archive.folder import Format, write_archive
+from music_rllib.results.archive import Format, write_archive
 from music_rllib.results.data import Points, RunRecord, Sweep, columns
 from music_rllib.store.handoff import Spaces, write_handoff
 from music_rllib.store.object_folder import ObjectFolders, open_storage

@@ -8,8 +8,7 @@ from pathlib import Path
 from music_rllib.config.load import load_sweep
 from music_rllib.config.schema import SweepConfig
 from music_rllib.experiment.plan import make_plan
-from music_rllib.results.archive.folder import is_archive, read_archive
-from music_rllib.results.archive.merge import of_plan
+from music_rllib.results.archive import is_archive, of_plan, read_archive
 from music_rllib.results.data import Sweep
 from music_rllib.version import ALGORITHM_VERSION
 

@@ -8,11 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from docs.result_pages.summary import between_q, complete_studies
-from music_rllib.results.claims.answer import p_in_words
-from music_rllib.results.claims.claim import Claim, decided
-from music_rllib.results.claims.contrasts import Contrast, Verdict, contrast
-from music_rllib.results.claims.scores import scores_of
+from music_rllib.results.answer import p_in_words
+from music_rllib.results.claims import Claim, Contrast, Verdict, contrast, decided
 from music_rllib.results.data import Sweep
+from music_rllib.results.scores import scores_of
 
 MORE = {"claims-slide": 1}
 """Number of hypotheses that were dropped from a study before its first run."""

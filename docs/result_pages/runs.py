@@ -20,9 +20,8 @@ from docs.result_pages.words import (
 from music_rllib import names
 from music_rllib.results import statistics as st
 from music_rllib.results.analysis import analyse
-from music_rllib.results.comparison import number
 from music_rllib.results.data import Sweep
-from music_rllib.results.time_to_threshold import first_passage
+from music_rllib.results.statistics import first_passage, number
 
 
 def runs_table(sweep: Sweep) -> Iterator[str]:

@@ -16,16 +16,11 @@ from music_rllib.report.figures.choice import slug, stage_drawings
 from music_rllib.report.study import study_drawings
 from music_rllib.results import statistics as st
 from music_rllib.results.analysis import THRESHOLDS, StageAnalysis, analyse
-from music_rllib.results.claims.answer import (
-    answer,
-    not_excluded,
-    numbers_in_words,
-    verdict_in_words,
-)
-from music_rllib.results.claims.plan import analysis_plan
-from music_rllib.results.claims.scores import scores_of
-from music_rllib.results.claims.study import Mean, label_of, study_of
+from music_rllib.results.analysis_plan import analysis_plan
+from music_rllib.results.answer import answer, not_excluded, numbers_in_words, verdict_in_words
 from music_rllib.results.data import Sweep
+from music_rllib.results.scores import scores_of
+from music_rllib.results.study import Mean, label_of, study_of
 
 
 def verdict_text(name: str, *words: str) -> str:

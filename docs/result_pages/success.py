@@ -7,10 +7,10 @@ from collections.abc import Iterator, Sequence
 from docs.result_pages.figures import figure
 from docs.result_pages.words import THRESHOLD, interval, row, rule, wait_text
 from music_rllib.report.figures.choice import PRIMARY, drawings_of_stages, stage_drawings
-from music_rllib.results.analysis import StageAnalysis, analyse
+from music_rllib.results.analysis import StageAnalysis, analyse, waits_of
 from music_rllib.results.conditions import Condition, find_stages
 from music_rllib.results.data import Sweep
-from music_rllib.results.time_to_threshold import median_wait, median_wait_interval, waits_of
+from music_rllib.results.statistics import median_wait, median_wait_interval
 
 
 def success(sweep: Sweep, figures: dict[str, bytes], stages: Sequence[str] = ()) -> Iterator[str]:

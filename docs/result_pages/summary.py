@@ -10,11 +10,10 @@ from docs.result_pages.exports import is_complete, progress_text, sweep_called
 from docs.result_pages.totals import AtEqualTotal, at_equal_total
 from docs.result_pages.words import percent, row, rule
 from music_rllib import names
-from music_rllib.results.claims.answer import not_excluded, numbers_in_words, verdict_in_words
-from music_rllib.results.claims.claim import Claim, claims_of, exploratory
-from music_rllib.results.claims.contrasts import Verdict
-from music_rllib.results.claims.study import Study, study_of
+from music_rllib.results.answer import not_excluded, numbers_in_words, verdict_in_words
+from music_rllib.results.claims import Claim, Verdict, claims_of, exploratory
 from music_rllib.results.data import Sweep
+from music_rllib.results.study import Study, study_of
 
 STUDIES = ("claims-push", "claims-pick-and-place", "claims-slide")
 PAPER = {

@@ -9,13 +9,12 @@ import numpy as np
 
 from docs.result_pages.words import percent, row, rule
 from music_rllib import names
-from music_rllib.results.claims.answer import numbers_in_words
-from music_rllib.results.claims.claim import Claim, exploratory
-from music_rllib.results.claims.contrasts import contrast
-from music_rllib.results.claims.plan import MARGIN_OF_A_RATE
-from music_rllib.results.claims.scores import Measure, area_under_curve
+from music_rllib.results.analysis_plan import MARGIN_OF_A_RATE
+from music_rllib.results.answer import numbers_in_words
+from music_rllib.results.claims import Claim, contrast, exploratory
 from music_rllib.results.conditions import Condition, find_stages
 from music_rllib.results.data import Sweep
+from music_rllib.results.scores import Measure, area_under_curve
 from music_rllib.results.statistics import Array
 
 

@@ -8,8 +8,9 @@ from collections.abc import Iterable
 import numpy as np
 
 from music_rllib.results import statistics as st
-from music_rllib.results.comparison import Final, each_seed, number
+from music_rllib.results.analysis import Final, each_seed
 from music_rllib.results.conditions import Condition
+from music_rllib.results.statistics import number
 
 THRESHOLD = 0.9
 """Success rate that the proofs of the appendix wait for."""

@@ -29,8 +29,8 @@ from music_rllib.report.tables import (
 )
 from music_rllib.report.videos import make_films
 from music_rllib.results.analysis import analyse, analyse_stages
-from music_rllib.results.claims.study import study_of
 from music_rllib.results.data import ReportError, Sweep
+from music_rllib.results.study import study_of
 
 PAGE = "report.html"
 PICTURE = "overview"

@@ -132,8 +132,7 @@ def _export(
     place: str, storage: str | None, folder: Path, table_format: TableFormat, *, add: bool
 ) -> None:
     from music_rllib.labels import in_runs
-    from music_rllib.results.archive.folder import is_archive, read_archive, write_archive
-    from music_rllib.results.archive.merge import merged
+    from music_rllib.results.archive import is_archive, merged, read_archive, write_archive
     from music_rllib.results.data import ReportError
     from music_rllib.results.read import read_sweep
 
@@ -185,7 +184,7 @@ def _report(
         from music_rllib.config.load import declared_tasks
         from music_rllib.redaction import for_people, redact
         from music_rllib.report.build import PICTURE, WANTED, build_report, write_report
-        from music_rllib.results.claims.answer import answer
+        from music_rllib.results.answer import answer
         from music_rllib.results.read import read_sweep
 
         source = read_sweep(place, storage, metrics=WANTED, lenient=True)
@@ -285,7 +284,7 @@ def _attach(source: SweepRead, folder: Path, report: Report) -> None:
     """Keep the report, in `folder`, with the sweep's run in MLflow."""
     from music_rllib.report.build import made_files
     from music_rllib.report.tables import note
-    from music_rllib.results.claims.answer import answer
+    from music_rllib.results.answer import answer
     from music_rllib.results.data import ReportError
     from music_rllib.tracking.attach import SweepRun
 

@@ -37,10 +37,10 @@ from music_rllib.report.web.sections import (
     state_in_words,
 )
 from music_rllib.results.analysis import StageAnalysis
-from music_rllib.results.claims.answer import answer, planned_in_words
-from music_rllib.results.claims.study import Study, label_of
+from music_rllib.results.answer import answer, planned_in_words
 from music_rllib.results.conditions import SIDE_BY_SIDE
 from music_rllib.results.data import Sweep
+from music_rllib.results.study import Study, label_of
 
 
 @dataclass(frozen=True, kw_only=True)

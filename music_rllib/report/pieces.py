@@ -14,8 +14,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from jinja2.utils import htmlsafe_json_dumps
 
 from music_rllib.report.figures.palette import DASHES
-from music_rllib.results.comparison import interval_text, number
-from music_rllib.results.statistics import Estimate
+from music_rllib.results.statistics import Estimate, interval_text, number
 
 DASH = "–"
 """Stands in a table where there is no value."""

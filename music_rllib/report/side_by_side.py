@@ -10,11 +10,11 @@ import numpy as np
 from music_rllib import names
 from music_rllib.report.pieces import DASH, TextTable, number_cell
 from music_rllib.results import statistics as st
-from music_rllib.results.analysis import StageAnalysis
-from music_rllib.results.archive.merge import merged
-from music_rllib.results.comparison import Final, interval_text, number
+from music_rllib.results.analysis import Final, StageAnalysis
+from music_rllib.results.archive import merged
 from music_rllib.results.conditions import Condition
 from music_rllib.results.data import RunRecord, Sweep
+from music_rllib.results.statistics import interval_text, number
 
 MOST_VALUES = 6
 """Largest number of a setting's values that are shown for one sweep."""

@@ -9,16 +9,16 @@ from music_rllib.report.figures.palette import styles_of
 from music_rllib.report.figures.study import alpha_panels, area_profile_panels
 from music_rllib.report.pieces import DASH, TextTable, estimate_cells, number_cell
 from music_rllib.report.tables import Table
-from music_rllib.results.claims.answer import (
+from music_rllib.results.answer import (
+    claim_rows,
     interval_in_words,
+    mean_rows,
     not_excluded,
     p_in_words,
     verdict_in_words,
 )
-from music_rllib.results.claims.sensitivity import alpha_sensitivity
-from music_rllib.results.claims.study import Study, label_of
-from music_rllib.results.claims.tables import claim_rows, mean_rows
-from music_rllib.results.comparison import SHOW_SEEDS_BELOW, number
+from music_rllib.results.statistics import SHOW_SEEDS_BELOW, number
+from music_rllib.results.study import Study, alpha_sensitivity, label_of
 
 
 def study_tables(study: Study) -> list[TextTable]:

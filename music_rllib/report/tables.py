@@ -11,10 +11,9 @@ from dataclasses import dataclass
 from music_rllib import names
 from music_rllib.report.figures.choice import Drawing
 from music_rllib.results.analysis import StageAnalysis
-from music_rllib.results.comparison import interval_text, number
 from music_rllib.results.conditions import SIDE_BY_SIDE
 from music_rllib.results.data import Sweep
-from music_rllib.results.statistics import Estimate
+from music_rllib.results.statistics import Estimate, interval_text, number
 
 
 @dataclass(frozen=True, kw_only=True)

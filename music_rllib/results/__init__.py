@@ -1,1 +1,1 @@
-"""Statistics and claims of a sweep's runs, in numbers and in sentences; loads no Ray."""
+"""Results of sweeps: runs, statistics, verdicts, exports."""

@@ -1,4 +1,17 @@
-"""Statistics of every stage of a sweep, on each of its tasks.
+"""Final values of conditions: means with intervals, and differences without a test.
+
+`compare`, the report, its tables and the results page all go through :func:`scopes_of`, so that
+they have the same numbers. Verdicts come from :mod:`music_rllib.results.claims` alone.
+
+
+Steps to a threshold, which some runs never reach: a table of medians, without a test.
+
+A run that ends below the threshold is *censored*: all that is known is that it would have taken
+more than its steps. Leaving it out would make the worst setting look fast, so the median is Kaplan
+and Meier's (1958), which is infinite if fewer than half of the runs reach the threshold.
+
+
+Statistics of every stage of a sweep, on each of its tasks.
 
 A final score is the primary metric of a finished run's last evaluation. Curves and steps to a
 threshold take every run as far as it went: one that failed or is still running is censored there.
@@ -6,16 +19,18 @@ threshold take every run as far as it went: one that failed or is still running 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
 from music_rllib import names
 from music_rllib.results import statistics as st
-from music_rllib.results.comparison import ALL_TASKS, Scope, scopes_of
 from music_rllib.results.conditions import (
+    ALL_TASKS,
+    AVERAGED,
     Condition,
     Stage,
     final_scores,
@@ -23,13 +38,160 @@ from music_rllib.results.conditions import (
     stage_by_stage,
 )
 from music_rllib.results.data import Ints, Sweep
-from music_rllib.results.statistics import Array, Estimate
-from music_rllib.results.time_to_threshold import (
+from music_rllib.results.statistics import (
+    SHOW_SEEDS_BELOW,
+    Array,
+    Estimate,
     Waits,
+    first_passage,
     median_wait,
     median_wait_interval,
-    waits_of,
 )
+
+
+class Labelled(Protocol):
+    """A condition with a label."""
+
+    @property
+    def label(self) -> str: ...
+
+
+C = TypeVar("C", bound=Labelled)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Final(Generic[C]):
+    """Final scores of a condition."""
+
+    condition: C
+    scores: Array = field(repr=False)
+    """`[seeds, T]`, of the seeds that have finished on every task of the scope."""
+    estimate: Estimate
+
+    @property
+    def value(self) -> float:
+        return float(self.estimate.value)
+
+    @property
+    def runs(self) -> int:
+        return int(self.scores.size)
+
+    @property
+    def seeds(self) -> int:
+        return len(self.scores)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Comparison(Generic[C]):
+    """Comparison of the final scores of two conditions."""
+
+    first: Final[C]
+    second: Final[C]
+    improvement: float
+    """Probability that a run of `first` ends higher than one of `second`, ties half."""
+
+    @property
+    def gap(self) -> Estimate:
+        """Mean of `first` minus that of `second`."""
+        return st.difference(self.first.estimate, self.second.estimate)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scope(Generic[C]):
+    """Conditions on one task, or on all tasks together."""
+
+    name: str
+    """The task, or `ALL_TASKS`."""
+    metric: str
+    """Metric whose last value is the score."""
+    tasks: int
+    finals: tuple[Final[C], ...]
+    """Scores of the conditions with a seed that has finished on every task of the scope."""
+    compared: tuple[Final[C], ...]
+    """Scores of those that may be compared: of a search, conditions on fresh seeds."""
+    comparisons: tuple[Comparison[C], ...]
+    """Comparison of each pair of `compared`, a later condition against an earlier one."""
+
+
+def scopes_of(
+    metrics: Mapping[str, str],
+    conditions: Sequence[tuple[C, Array, float]],
+    may_be_compared: Collection[C],
+) -> tuple[Scope[C], ...]:
+    """A scope for each task, after one over all tasks where these have a unit in common.
+
+    Args:
+        metrics: task to the metric of its scores, for T tasks.
+        conditions: each with its scores `[seeds, T]`, NaN for what has not finished, and its
+            evaluation episodes, infinite where they are not known. Seeds that have not finished on
+            every task of a scope are left out of it: otherwise a task could weigh more in one
+            condition than in another.
+        may_be_compared: conditions that are compared with each other.
+    """
+    columns = [(task, metric, [column]) for column, (task, metric) in enumerate(metrics.items())]
+    if len(columns) > 1 and len(set(metrics.values())) == 1 and columns[0][1] in AVERAGED:
+        columns.insert(0, (ALL_TASKS, columns[0][1], list(range(len(columns)))))
+    return tuple(
+        _scope(name, metric, [(c, x[:, chosen], n) for c, x, n in conditions], may_be_compared)
+        for name, metric, chosen in columns
+    )
+
+
+def _scope(
+    name: str,
+    metric: str,
+    conditions: Sequence[tuple[C, Array, float]],
+    may_be_compared: Collection[C],
+) -> Scope[C]:
+    is_rate = metric in names.EVAL_RATES
+    finals = [
+        Final(
+            condition=condition,
+            scores=complete,
+            estimate=st.estimate(complete, episodes if is_rate else None),
+        )
+        for condition, scores, episodes in conditions
+        if len(complete := scores[~np.isnan(scores).any(axis=1)])
+    ]
+    compared = tuple(final for final in finals if final.condition in may_be_compared)
+    pairs = [(second, first) for first, second in combinations(compared, 2)]
+    return Scope(
+        name=name,
+        metric=metric,
+        tasks=conditions[0][1].shape[1] if conditions else 1,
+        finals=tuple(finals),
+        compared=compared,
+        comparisons=tuple(
+            Comparison(first=a, second=b, improvement=st.improvement(a.scores, b.scores))
+            for a, b in pairs
+        ),
+    )
+
+
+def each_seed(final: Final[C]) -> list[float]:
+    """Rising scores of the seeds, means over the tasks; empty where there are many seeds."""
+    return sorted(final.scores.mean(axis=1).tolist()) if final.seeds < SHOW_SEEDS_BELOW else []
+
+
+def waits_of(sweep: Sweep, task: str, runs: Sequence[int], threshold: float) -> Waits | None:
+    """Steps of a task's runs to a success rate; None where none was evaluated."""
+    passages = list(_passages(sweep, task, runs, threshold))
+    if not passages:
+        return None
+    steps, reached = zip(*passages, strict=True)
+    return Waits(steps=np.array(steps), reached=np.array(reached))
+
+
+def _passages(
+    sweep: Sweep, task: str, runs: Sequence[int], threshold: float
+) -> Iterator[tuple[float, bool]]:
+    """:func:`first_passage` of each run on a task that was evaluated."""
+    for run in runs:
+        if sweep.runs[run].task == task:
+            passage = first_passage(*sweep.finite(run, names.EVAL_SUCCESS), threshold)
+            if passage is not None:
+                yield passage
+
 
 THRESHOLDS = (0.5, 0.85)
 """Success rates that steps are counted to; the paper's Figure 4 has 85 %."""

@@ -272,3 +272,8 @@ def _number(text: str) -> tuple[float, str]:
         return float(text.split(" ")[0]), text
     except ValueError:
         return float("inf"), text
+
+
+ALL_TASKS = "all tasks"
+AVERAGED = {*names.EVAL_RATES, *names.ENTROPIES}
+"""Metrics that have the same unit on every task, so that they can be averaged over tasks."""

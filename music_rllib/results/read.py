@@ -1,4 +1,6 @@
-"""The runs, curves and searches of a sweep, read from its storage or from an export.
+"""Runs of a plan as a `Sweep` has them: without a result, or with their last values alone.
+
+The runs, curves and searches of a sweep, read from its storage or from an export.
 
 A sweep is its current plan: every command and every page reads it here, so that all of them show
 the same runs. Runs of earlier versions of the plan are named in a sentence and not read.
@@ -21,17 +23,62 @@ from music_rllib.envs.fingerprint import digest_of
 from music_rllib.errors import first_line
 from music_rllib.experiment import session, sweep_files
 from music_rllib.experiment.location import SweepLocation, find_sweep
-from music_rllib.experiment.plan import Node
+from music_rllib.experiment.plan import Node, Plan
 from music_rllib.experiment.run_info import run_info
-from music_rllib.redaction import redact
-from music_rllib.results.archive.folder import is_archive, read_archive
-from music_rllib.results.claims.record import plans_in
-from music_rllib.results.data import Points, RunRecord, Sweep, columns
-from music_rllib.results.planned import planned_run
-from music_rllib.results.searches import checked_searches
+from music_rllib.redaction import flat_params, redact
+from music_rllib.results.analysis_plan import plans_in
+from music_rllib.results.archive import is_archive, read_archive
+from music_rllib.results.data import Points, RunRecord, Sweep, checked_searches, columns
 from music_rllib.store.node_store import damage_in_words
 from music_rllib.store.object_folder import DamagedError, StorageError
 from music_rllib.store.paths import folder_at, sweep_folder
+from music_rllib.store.run_record import RunResult
+
+
+def planned_run(node: Node, algorithm: str) -> RunRecord:
+    """A run that has not begun."""
+    info = run_info(node)
+    tags = {**info.tags, names.TAG_NODE_KEY: node.key, names.TAG_ALGORITHM: algorithm}
+    return RunRecord(
+        run_id=node.key,
+        name=node.label,
+        status="SCHEDULED",
+        params=flat_params(info.config),
+        tags={name: str(value) for name, value in tags.items() if value is not None},
+    )
+
+
+class LastValues:
+    """A planned sweep with nothing but the results of its runs, without their curves."""
+
+    def __init__(self, plan: Plan) -> None:
+        self._plan = plan
+        self._runs: dict[str, RunRecord] = {}
+        """Runs by node key, whose description takes most of the time."""
+
+    def sweep(self, results: Mapping[str, RunResult]) -> Sweep:
+        """The sweep with these results, by node key, as far as runs have been planned."""
+        nodes = self._plan.nodes
+        for node in nodes:
+            if node.key not in self._runs:
+                self._runs[node.key] = planned_run(node, self._plan.algorithm)
+        return Sweep(
+            name=self._plan.name,
+            runs=[
+                replace(run, status="FINISHED") if node.key in results else run
+                for node in nodes
+                for run in [self._runs[node.key]]
+            ],
+            history=columns(_last_points(results.get(node.key)) for node in nodes),
+        )
+
+
+def _last_points(result: RunResult | None) -> Points:
+    if result is None:
+        return Points((), (), (), ())
+    values = [result.metrics[name] for name in sorted(result.metrics)]
+    steps = [result.env_steps] * len(values)
+    return Points(sorted(result.metrics), steps, [0] * len(values), values)
 
 
 @dataclass(frozen=True, kw_only=True)

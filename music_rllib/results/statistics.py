@@ -13,7 +13,7 @@ is held by `tests/unit/results/test_coverage.py` and listed in docs/reports.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,6 +32,8 @@ MAX_SEEDS = 1000
 """Largest number of seeds that is looked for; more are more than anyone will run."""
 _TAIL = 0.025
 """Probability on either side of a 95 % interval."""
+_COVERAGE = 0.93
+"""Least coverage of the interval of a median."""
 _NO_SPREAD = 1e-12
 """Variances below it are rounding errors: the seeds tie."""
 
@@ -214,3 +216,149 @@ def _ratio(total: ArrayLike, count: ArrayLike) -> Array:
     out: Array = np.full(total.shape, np.nan)
     np.divide(total, count, out=out, where=count > 0)
     return out
+
+
+SHOW_SEEDS_BELOW = 10
+"""Number of seeds from which on they are not shown one by one."""
+
+
+def number(value: float | Array) -> str:
+    """A value in short: two decimals, or none from 100 on."""
+    value = float(value)
+    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.2f}"
+
+
+def with_interval(value: float | None, ends: Sequence[float | None] | None) -> str:
+    """`0.45 [0.3, 0.6]`, or `0.45` without an interval."""
+    if value is None:
+        return "-"
+    low, high = ends or (None, None)
+    if low is None or high is None or low != low or high != high:
+        return f"{value:.3g}"
+    return f"{value:.3g} [{low:.3g}, {high:.3g}]"
+
+
+def interval_text(estimate: Estimate) -> str:
+    """`0.62 to 0.81`, or `no interval`."""
+    if not estimate.has_interval:
+        return "no interval"
+    return f"{number(estimate.lower)} to {number(estimate.upper)}"
+
+
+def p_text(p_value: float) -> str:
+    """`p = 0.03`."""
+    return "p < 0.001" if p_value < 0.001 else f"p = {p_value:.2g}"
+
+
+FEWEST_FOR_INTERVAL = 5
+"""Least number of runs for an interval of the median, which covers 93.75 %; of four 87.5 %."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Waits:
+    """Steps that each of R runs took to a threshold."""
+
+    steps: Array
+    """`[R]` environment steps to the threshold, or to the last evaluation of a run below it."""
+    reached: NDArray[np.bool_]
+    """`[R]`, whether the run reached the threshold; False: it is censored."""
+
+
+def first_passage(steps: Array, values: Array, threshold: float) -> tuple[float, bool] | None:
+    """Steps of the first evaluation with `value >= threshold`, and True.
+
+    Args:
+        steps: `[points]`, rising.
+        values: `[points]`; NaN is below every threshold.
+        threshold: in the unit of `values`.
+
+    Returns:
+        Steps of the last evaluation and False where none is; None for a run without evaluations.
+    """
+    if not len(steps):
+        return None
+    above = np.flatnonzero(values >= threshold)
+    return (float(steps[above[0]]), True) if len(above) else (float(steps[-1]), False)
+
+
+def median_wait(waits: Waits) -> float:
+    """Steps by which half of the runs have reached the threshold.
+
+    A run that is censored at a step at which another one arrives counts as waiting at that step.
+
+    Returns:
+        The steps; infinite where fewer than half arrive, NaN without runs.
+    """
+    if not len(waits.steps):
+        return np.nan
+    below = 1.0
+    for step in np.unique(waits.steps[waits.reached]):
+        waiting = np.sum(waits.steps >= step)
+        arrived = np.sum((waits.steps == step) & waits.reached)
+        below *= 1 - arrived / waiting
+        if below <= 0.5 + 1e-12:
+            return float(step)
+    return np.inf
+
+
+def median_wait_interval(waits: Waits) -> tuple[float, float]:
+    """Interval of the median from the order of the runs, with a coverage of 93 % or more.
+
+    Whatever the distribution, n runs are all below its median with chance 1/2^n. A censored run
+    counts at its last step for the lower end and never for the upper one.
+
+    Returns:
+        Both ends; NaN for fewer than `FEWEST_FOR_INTERVAL` runs.
+    """
+    runs = len(waits.steps)
+    outside = 2 * stats.binom.cdf(np.arange(runs), runs, 0.5)
+    cut = int(np.sum(outside <= 1 - _COVERAGE)) - 1
+    if cut < 0:
+        return np.nan, np.nan
+    soonest = np.sort(waits.steps)
+    latest = np.sort(np.where(waits.reached, waits.steps, np.inf))
+    return float(soonest[cut]), float(latest[runs - 1 - cut])
+
+
+# Seeds needed -------------------------------------------------------------------------------------
+
+
+def seeds_for_difference(
+    difference: float, spread: float, *, paired: bool, level: float = SIGNIFICANCE
+) -> int | None:
+    """Seeds of each condition that show `difference` with a chance of 80 %.
+
+    Args:
+        difference: between the means, > 0.
+        spread: standard deviation of a difference between single seeds, > 0.
+        paired: whether conditions share their seeds.
+        level: of the two-sided test; with Holm's correction the first of k has 5 % / k.
+
+    Returns:
+        The number; None where `MAX_SEEDS` are not enough.
+    """
+    groups = 1 if paired else 2
+    return fewest_seeds(
+        lambda seeds: power_of_t_test(
+            groups * (seeds - 1), difference / spread * np.sqrt(seeds), level
+        )
+    )
+
+
+def seeds_for_equivalence(
+    margin: float, spread: float, *, paired: bool, level: float = SIGNIFICANCE
+) -> int | None:
+    """Seeds that show equivalence within `margin` with a chance of 80 % where all is equal.
+
+    Arguments are those of :func:`seeds_for_difference`; `level` is that of either one-sided test.
+    """
+
+    def power(seeds: Array) -> Array:
+        freedom = (1 if paired else 2) * (seeds - 1)
+        critical = stats.t.ppf(1 - level, freedom)
+        missed = stats.nct.cdf(critical, freedom, margin / spread * np.sqrt(seeds))
+        # Both tests have to reject; the chance that one of them does not is twice that of either.
+        # Far from the centre scipy's cdf is NaN where it would be 0.
+        return np.asarray(1 - 2 * np.nan_to_num(missed, nan=0.0))
+
+    return fewest_seeds(power)

@@ -19,10 +19,9 @@ from music_rllib.config.search.settings import SearchSettings
 from music_rllib.experiment.plan import Plan, short
 from music_rllib.labels import in_runs, symbol
 from music_rllib.results import statistics as st
-from music_rllib.results.comparison import AVERAGED, with_interval
-from music_rllib.results.conditions import Condition, final_scores, find_stages
+from music_rllib.results.conditions import AVERAGED, Condition, final_scores, find_stages
 from music_rllib.results.data import Sweep
-from music_rllib.results.statistics import Estimate
+from music_rllib.results.statistics import Estimate, with_interval
 from music_rllib.search.objective import interval
 
 

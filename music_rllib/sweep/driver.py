@@ -36,8 +36,7 @@ from music_rllib.experiment.scheduler import Status
 from music_rllib.experiment.session import Sweep, keep_record, open_sweep, remove_damaged
 from music_rllib.experiment.sweep_files import as_json
 from music_rllib.redaction import redact
-from music_rllib.results.claims.plan import PlanVersion, as_document
-from music_rllib.results.claims.record import PLANS_TO_READ, record_plan
+from music_rllib.results.analysis_plan import PLANS_TO_READ, PlanVersion, as_document, record_plan
 from music_rllib.runtime.allocator import give_back_freed_memory
 from music_rllib.runtime.ending import try_for
 from music_rllib.runtime.machine import (

@@ -20,12 +20,11 @@ from music_rllib.experiment.location import SweepLocation
 from music_rllib.experiment.plan import Node
 from music_rllib.labels import in_runs
 from music_rllib.redaction import redact
-from music_rllib.results.claims.study import label_of
-from music_rllib.results.comparison import with_interval
 from music_rllib.results.conditions import Condition
 from music_rllib.results.data import RunRecord, Sweep
-from music_rllib.results.planned import LastValues
-from music_rllib.results.read import searches_of
+from music_rllib.results.read import LastValues, searches_of
+from music_rllib.results.statistics import with_interval
+from music_rllib.results.study import label_of
 from music_rllib.search.ranking import (
     Scored,
     best_so_far,

@@ -10,7 +10,7 @@ import pytest
 from music_rllib import names
 from music_rllib.config.load import load_sweep
 from music_rllib.envs.tasks import BUILT_IN_TASKS
-from music_rllib.results.claims.plan import analysis_plan
+from music_rllib.results.analysis_plan import analysis_plan
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"

@@ -9,10 +9,10 @@ import pytest
 from docs.result_pages import summary
 from docs.result_pages.totals import at_equal_total
 from music_rllib import names
-from music_rllib.results.claims.contrasts import Verdict
-from music_rllib.results.claims.study import study_of
+from music_rllib.results.claims import Verdict
 from music_rllib.results.conditions import find_stages
 from music_rllib.results.data import Points, RunRecord, Sweep, columns
+from music_rllib.results.study import study_of
 
 SEEDS = ("0", "1", "2", "3", "4")
 LEVELS = {"pretrain": 0.0, "music-r": 0.9, "her": 0.5}

@@ -22,11 +22,11 @@ from music_rllib.report.figures.plots import (
     profile_panel,
 )
 from music_rllib.report.figures.sensitivity import sensitivity_panels
-from music_rllib.results.analysis import Curve, StageAnalysis, curve
-from music_rllib.results.claims.study import MOST_CONDITIONS
-from music_rllib.results.comparison import SHOW_SEEDS_BELOW, Final, Scope
+from music_rllib.results.analysis import Curve, Final, Scope, StageAnalysis, curve
 from music_rllib.results.conditions import SIDE_BY_SIDE, Condition, Stage, side_by_side
 from music_rllib.results.data import Sweep
+from music_rllib.results.statistics import SHOW_SEEDS_BELOW
+from music_rllib.results.study import MOST_CONDITIONS
 
 FINALS = {names.EVAL_SUCCESS: "Final success rate", names.EVAL_RETURN: "Final return"}
 PROFILES = "Performance profile"

@@ -22,12 +22,11 @@ from matplotlib.ticker import EngFormatter
 from music_rllib import names
 from music_rllib.report.figures.palette import Style, styles_of
 from music_rllib.results import statistics as st
-from music_rllib.results.analysis import Curve
-from music_rllib.results.claims.scores import Measure, measure_on, scores_of
-from music_rllib.results.comparison import SHOW_SEEDS_BELOW, Final, Scope, interval_text, number
+from music_rllib.results.analysis import Curve, Final, Scope
 from music_rllib.results.conditions import Condition
 from music_rllib.results.data import Sweep
-from music_rllib.results.statistics import Array, Estimate
+from music_rllib.results.scores import Measure, measure_on, scores_of
+from music_rllib.results.statistics import SHOW_SEEDS_BELOW, Array, Estimate, interval_text, number
 
 Legend = Sequence[tuple[str, Style]]
 """(label, style) pairs."""

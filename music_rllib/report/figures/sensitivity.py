@@ -14,8 +14,7 @@ from matplotlib.ticker import LogFormatter
 from music_rllib import names
 from music_rllib.report.figures.palette import styles_of
 from music_rllib.report.figures.plots import RATE_LIMITS, Panel
-from music_rllib.results.analysis import StageAnalysis
-from music_rllib.results.comparison import Final, Scope
+from music_rllib.results.analysis import Final, Scope, StageAnalysis
 from music_rllib.results.conditions import ENTROPIC_INDEX, SEEDS, Condition
 from music_rllib.results.statistics import Array
 

@@ -12,9 +12,8 @@ from matplotlib.ticker import LogFormatter
 from music_rllib.report.figures.palette import Style
 from music_rllib.report.figures.plots import RATE_LIMITS, Panel
 from music_rllib.results import statistics as st
-from music_rllib.results.claims.sensitivity import AlphaLine, alpha_sensitivity
-from music_rllib.results.claims.study import MOST_CONDITIONS, Mean
 from music_rllib.results.conditions import Condition
+from music_rllib.results.study import MOST_CONDITIONS, AlphaLine, Mean, alpha_sensitivity
 
 MOST_TICKS = 8
 """Largest number of values of α that each have a tick."""

@@ -14,10 +14,9 @@ from music_rllib.report.figures.choice import Drawing, Facets
 from music_rllib.report.figures.palette import DASHES
 from music_rllib.report.figures.plots import EPOCH
 from music_rllib.results.analysis import Curve
-from music_rllib.results.comparison import SHOW_SEEDS_BELOW
 from music_rllib.results.conditions import SIDE_BY_SIDE
 from music_rllib.results.data import Sweep
-from music_rllib.results.statistics import Array
+from music_rllib.results.statistics import SHOW_SEEDS_BELOW, Array
 
 _FIGURES = 4
 """Number of significant figures: more cannot be seen."""

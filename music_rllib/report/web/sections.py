@@ -11,10 +11,9 @@ from typing import Any
 from music_rllib import names
 from music_rllib.report.pieces import DASH, Cell, TextTable, estimate_cells, number_cell
 from music_rllib.report.search_tables import search_in_words, search_tables
-from music_rllib.results.analysis import StageAnalysis, Wait
-from music_rllib.results.comparison import SHOW_SEEDS_BELOW, each_seed, number
+from music_rllib.results.analysis import StageAnalysis, Wait, each_seed
 from music_rllib.results.data import Sweep
-from music_rllib.results.time_to_threshold import FEWEST_FOR_INTERVAL
+from music_rllib.results.statistics import FEWEST_FOR_INTERVAL, SHOW_SEEDS_BELOW, number
 
 UNFOLDED_ROWS = 30
 """Largest number of rows of a search's table that is shown unfolded."""

@@ -62,7 +62,7 @@ def best(
 
 def _entropies_text(entropies: dict[str, Any]) -> str:
     from music_rllib import names
-    from music_rllib.results.comparison import with_interval
+    from music_rllib.results.statistics import with_interval
 
     words = {names.SHANNON_ENTROPY: "Shannon entropy (nats)", names.ENTROPY: "S_q"}
     texts = (

@@ -12,7 +12,7 @@ from music_rllib.errors import BadInputError
 from music_rllib.sweep.cli_helpers import Place, StageName, Storage, find_stage
 
 if TYPE_CHECKING:
-    from music_rllib.results.comparison import Final, Scope
+    from music_rllib.results.analysis import Final, Scope
     from music_rllib.results.conditions import Condition
     from music_rllib.results.statistics import Estimate
 
@@ -63,11 +63,10 @@ def compare(
     from music_rllib.experiment.location import find_sweep
     from music_rllib.labels import ShortLabels
     from music_rllib.results.analysis import stage_scopes
-    from music_rllib.results.claims.answer import answer
-    from music_rllib.results.claims.study import study_of
-    from music_rllib.results.claims.tables import study_data
+    from music_rllib.results.answer import answer, study_data
     from music_rllib.results.conditions import find_stages
     from music_rllib.results.read import read_stored
+    from music_rllib.results.study import study_of
     from music_rllib.search.ranking import measure_of
     from music_rllib.sweep.views.compare import compare_view
 
@@ -183,8 +182,8 @@ def _rows(
     entropies: Entropies,
 ) -> Iterator[tuple[Final[Condition], dict[str, Any]]]:
     """Conditions with the best first, each with its difference from the best."""
-    from music_rllib.results.claims.study import label_of
     from music_rllib.results.statistics import difference
+    from music_rllib.results.study import label_of
 
     ordered = sorted(finals, key=lambda final: final.value, reverse=maximised)
     best = ordered[0]

@@ -12,7 +12,7 @@ from rich.text import Text
 from music_rllib import names
 from music_rllib.experiment.plan import short
 from music_rllib.labels import symbol
-from music_rllib.results.comparison import with_interval
+from music_rllib.results.statistics import with_interval
 from music_rllib.sweep.views.tables import new_table, seeds_in_words
 from music_rllib.sweep.views.text import percent
 

@@ -23,7 +23,7 @@ from music_rllib.experiment.plan import Node, make_plan
 from music_rllib.experiment.session import keep_record, open_sweep
 from music_rllib.report.build import PAGE
 from music_rllib.report.cli import app
-from music_rllib.results.archive.folder import Format, read_archive, write_archive
+from music_rllib.results.archive import Format, read_archive, write_archive
 from music_rllib.results.data import RunRecord, Sweep
 from music_rllib.results.read import read_sweep
 from music_rllib.store.run_record import HISTORY, Report, RunResult, last_values, to_json_lines

@@ -23,8 +23,7 @@ from music_rllib.report.build import build_report
 from music_rllib.report.live import server
 from music_rllib.report.live.state import Progress
 from music_rllib.report.page import Report, render
-from music_rllib.results.archive.folder import read_archive
-from music_rllib.results.archive.merge import merged
+from music_rllib.results.archive import merged, read_archive
 from music_rllib.results.data import Sweep
 from tests.integration.devtools import Page
 from tests.unit.report.test_live import write_state

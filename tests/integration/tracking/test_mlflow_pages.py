@@ -19,7 +19,7 @@ from music_rllib.experiment.plan import make_plan
 from music_rllib.experiment.run_info import run_info
 from music_rllib.experiment.session import keep_record, open_sweep
 from music_rllib.report.cli import app
-from music_rllib.results.archive.folder import read_archive
+from music_rllib.results.archive import read_archive
 from music_rllib.results.data import Sweep
 from music_rllib.store.run_record import Report
 from music_rllib.sweep.listeners.mlflow_view import VERSIONS, comparison_view

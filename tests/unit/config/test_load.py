@@ -16,7 +16,7 @@ from music_rllib.config.remarks import remarks
 from music_rllib.config.run_settings import VARIANTS, RunSettings, handed_over, preset
 from music_rllib.config.schema import SweepConfig
 from music_rllib.envs.tasks import BUILT_IN_TASKS
-from music_rllib.results.claims.plan import analysis_plan
+from music_rllib.results.analysis_plan import analysis_plan
 from music_rllib.schedules import Linear
 from music_rllib.store.handoff import write_handoff
 from tests.hostile_files import SPACES

@@ -12,7 +12,7 @@ from music_rllib.report.build import PICTURE, build_report, write_report
 from music_rllib.report.figures.overview import overview
 from music_rllib.report.figures.palette import styles_of
 from music_rllib.results.analysis import analyse
-from music_rllib.results.archive.folder import read_archive
+from music_rllib.results.archive import read_archive
 from music_rllib.results.conditions import Condition
 from music_rllib.results.data import Sweep
 

@@ -29,10 +29,10 @@ from music_rllib.report.page import render
 from music_rllib.report.tables import curves_table
 from music_rllib.report.web.charts import _mean_at
 from music_rllib.results.analysis import THRESHOLDS, analyse
-from music_rllib.results.claims.answer import answer
-from music_rllib.results.claims.study import study_of
+from music_rllib.results.answer import answer
 from music_rllib.results.conditions import SIDE_BY_SIDE, find_stages, stage_by_stage
 from music_rllib.results.data import Points, RunRecord, Sweep, columns
+from music_rllib.results.study import study_of
 
 STEPS = range(20_000, 200_001, 20_000)
 CONFIG = """

@@ -10,7 +10,7 @@ from music_rllib.report.build import build_report
 from music_rllib.report.page import render
 from music_rllib.report.pieces import DASH, Cell
 from music_rllib.report.side_by_side import side_by_side
-from music_rllib.results.archive.folder import read_archive
+from music_rllib.results.archive import read_archive
 
 DATA = Path(__file__).parents[3] / "docs" / "results" / "data"
 

@@ -12,9 +12,10 @@ from hypothesis.extra import numpy as st_numpy
 from scipy import stats
 
 from benchmarks import decisions
-from music_rllib.results.claims import contrasts as c
-from music_rllib.results.claims.contrasts import Verdict
-from music_rllib.results.claims.scores import area_under_curve
+from music_rllib.results import claims as c
+from music_rllib.results import statistics as s
+from music_rllib.results.claims import Verdict
+from music_rllib.results.scores import area_under_curve
 from music_rllib.results.statistics import Array
 
 DRAWS = 4000
@@ -69,14 +70,14 @@ def test_rates_of_error_and_coverage_are_nominal(
 def test_a_planted_effect_is_decided_rightly(rng: np.random.Generator) -> None:
     """With the number of seeds that the power functions give, 80 % of studies are right."""
     spread = float(np.hypot(SPREAD, np.sqrt(2 * 0.25 / 1000)))  # and that of the evaluations
-    seeds = c.seeds_for_difference(0.1, spread, paired=True)
+    seeds = s.seeds_for_difference(0.1, spread, paired=True)
     assert seeds is not None
     better = c.contrast(*study(0.1, seeds, rng, paired=True), paired=True, margin=MARGIN)
     assert verdicts(better)[Verdict.SUPERIOR] == pytest.approx(0.84, abs=0.05)
     assert verdicts(better)[Verdict.WORSE] + verdicts(better)[Verdict.EQUIVALENT] < 0.002
     worse = c.contrast(*study(-0.1, seeds, rng, paired=True), paired=True, margin=MARGIN)
     assert verdicts(worse)[Verdict.WORSE] == pytest.approx(0.84, abs=0.05)
-    seeds = c.seeds_for_equivalence(MARGIN, spread, paired=True)
+    seeds = s.seeds_for_equivalence(MARGIN, spread, paired=True)
     assert seeds is not None
     same = c.contrast(*study(0.0, seeds, rng, paired=True), paired=True, margin=MARGIN)
     assert verdicts(same)[Verdict.EQUIVALENT] == pytest.approx(0.82, abs=0.04)

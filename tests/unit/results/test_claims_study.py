@@ -12,14 +12,12 @@ import pytest
 from music_rllib import names
 from music_rllib.report.figures.draw import files
 from music_rllib.report.study import study_csv, study_drawings, study_tables
-from music_rllib.results.claims.answer import answer, seeds_needed
-from music_rllib.results.claims.contrasts import Verdict
-from music_rllib.results.claims.plan import AnalysisPlan, PlanVersion, checked_plans, with_plan
-from music_rllib.results.claims.plan import as_document as plans_as_document
-from music_rllib.results.claims.sensitivity import alpha_sensitivity
-from music_rllib.results.claims.study import Study, study_of
-from music_rllib.results.claims.tables import study_data
+from music_rllib.results.analysis_plan import AnalysisPlan, PlanVersion, checked_plans, with_plan
+from music_rllib.results.analysis_plan import as_document as plans_as_document
+from music_rllib.results.answer import answer, seeds_needed, study_data
+from music_rllib.results.claims import Verdict
 from music_rllib.results.data import Points, RunRecord, Sweep, columns
+from music_rllib.results.study import Study, alpha_sensitivity, study_of
 
 BUDGET = 10_000
 STEPS = np.arange(1000, BUDGET + 1, 1000)

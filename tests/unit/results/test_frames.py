@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 
 from music_rllib import load_sweep, names
-from music_rllib.results.archive.folder import Format, read_archive, write_archive
+from music_rllib.results.archive import Format, read_archive, write_archive
 from music_rllib.results.data import Points, ReportError, columns
 from music_rllib.results.frames import frames_of
 
@@ -112,7 +112,7 @@ def test_an_export_that_finds_no_room_leaves_the_earlier_one(
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("music_rllib.results.archive.folder._write_json", full)
+    monkeypatch.setattr("music_rllib.results.archive._write_json", full)
     with pytest.raises(ReportError, match="No space left"):
         write_archive(replace(read_archive(EXPORT), runs=[], history={}), tmp_path)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before

@@ -23,8 +23,8 @@ from music_rllib.report import cli as report
 from music_rllib.report.limitations import missing
 from music_rllib.report.web.sections import failures
 from music_rllib.results.analysis import analyse
-from music_rllib.results.claims.study import study_of
 from music_rllib.results.read import read_sweep
+from music_rllib.results.study import study_of
 from music_rllib.store.object_folder import DamagedError
 from music_rllib.store.paths import sweep_folder
 from music_rllib.store.run_record import HISTORY, Report, RunResult, last_values, to_json_lines

@@ -10,12 +10,7 @@ from hypothesis.extra import numpy as st_numpy
 from scipy import stats
 
 from music_rllib.results import statistics as s
-from music_rllib.results.time_to_threshold import (
-    Waits,
-    first_passage,
-    median_wait,
-    median_wait_interval,
-)
+from music_rllib.results.statistics import Waits, first_passage, median_wait, median_wait_interval
 
 NAN = np.nan
 # rliable, tests/rliable/metrics_test.py: runs x tasks.

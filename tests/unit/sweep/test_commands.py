@@ -26,12 +26,10 @@ from music_rllib.experiment.scheduler import Status
 from music_rllib.experiment.session import Sweep, keep_record, open_sweep, remove_damaged
 from music_rllib.experiment.sweep_files import as_json
 from music_rllib.labels import ShortLabels
-from music_rllib.results.analysis import analyse
-from music_rllib.results.claims.answer import answer
-from music_rllib.results.claims.study import study_of
-from music_rllib.results.claims.tables import claim_rows, mean_rows
-from music_rllib.results.comparison import each_seed
+from music_rllib.results.analysis import analyse, each_seed
+from music_rllib.results.answer import answer, claim_rows, mean_rows
 from music_rllib.results.read import read_sweep
+from music_rllib.results.study import study_of
 from music_rllib.store import node_store, object_folder, paths
 from music_rllib.store.handoff import write_handoff
 from music_rllib.store.object_folder import DamagedError

@@ -1,28 +1,119 @@
-"""Claims of a study: tests of hypotheses that were planned before the runs, and of later ones.
+"""Conditions of a sweep that a hypothesis is about.
+
+Claims of a study: tests of hypotheses that were planned before the runs, and of later ones.
 
 Each condition's runs give a score for each seed, which comparisons take seed by seed
-(:mod:`~music_rllib.results.claims.contrasts`). The planned comparisons are one family, and only
+(:mod:`~music_rllib.results.claims`). The planned comparisons are one family, and only
 they have verdicts; without a plan all pairs of conditions are the family. Other comparisons are
 exploratory: they have a difference, an interval and an unadjusted p-value.
+
+
+The primary metric against α, a line for each q: what a comparison at one α would have found.
 """
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
 
-from music_rllib.config.analysis import Hypothesis
+from music_rllib.config.analysis import Hypothesis, parsed
+from music_rllib.config.problems import same
 from music_rllib.results import statistics as st
-from music_rllib.results.claims.claim import Claim, claims_of, decided, exploratory
-from music_rllib.results.claims.match import alike_in_the_rest, in_words, matching
-from music_rllib.results.claims.plan import PlanVersion
-from music_rllib.results.claims.scores import Measure, Scores, ended_first, measure_on, scores_of
-from music_rllib.results.conditions import SEEDS, Condition, Stage, find_stages
-from music_rllib.results.data import Sweep
-from music_rllib.results.statistics import Estimate
+from music_rllib.results.analysis_plan import PlanVersion
+from music_rllib.results.claims import Claim, claims_of, decided, exploratory
+from music_rllib.results.conditions import (
+    ALPHA,
+    ENTROPIC_INDEX,
+    IN_WORDS,
+    SEEDS,
+    Condition,
+    Stage,
+    Values,
+    find_stages,
+    whole_setting,
+)
+from music_rllib.results.data import RunRecord, Sweep
+from music_rllib.results.scores import (
+    Measure,
+    Scores,
+    ended_first,
+    measure_on,
+    scores_of,
+)
+from music_rllib.results.statistics import Array, Estimate
+
+
+def in_words(side: Mapping[str, str]) -> str:
+    """One side of a hypothesis as labels have it: `q = 1.5, α = 0.1`."""
+    return ", ".join(f"{_label(name)} = {value}" for name, value in side.items())
+
+
+def _label(name: str) -> str:
+    """The label of a setting or of a part of it: `tac.alpha.value` is α."""
+    return IN_WORDS.get(whole_setting(name), (name, ""))[0]
+
+
+def matching(
+    sweep: Sweep, stages: Mapping[str, Stage], side: Mapping[str, str], stage: str
+) -> list[Condition]:
+    """Conditions that may be compared and have all settings of one side of a hypothesis."""
+    settings = dict(side)
+    chosen = stages.get(settings.pop("stage", stage))
+    return [
+        condition
+        for condition in (chosen.compared if chosen else ())
+        if all(_has(sweep.runs[condition.runs[0]], *setting) for setting in settings.items())
+    ]
+
+
+def _has(run: RunRecord, name: str, value: str) -> bool:
+    _, tag = IN_WORDS.get(name, ("", ""))
+    known = (run.params.get(name), run.tags.get(tag))
+    return any(_same(value, other) for other in known if other is not None)
+
+
+def _same(one: str, other: str) -> bool:
+    return one == other or same(parsed(one), parsed(other))
+
+
+def alike_in_the_rest(
+    first: Sequence[Condition], second: Sequence[Condition], hypothesis: Hypothesis
+) -> list[tuple[Condition, Condition]] | str:
+    """Pairs of conditions that differ only in what the hypothesis names.
+
+    One against one is a pair, whatever else they differ in: each value of q may have been given
+    its own α.
+
+    Returns:
+        The pairs, or in words why there are none.
+    """
+    for side, settings in ((first, hypothesis.first), (second, hypothesis.second)):
+        if not side:
+            return f"no run of {in_words(settings)} has begun that may be compared"
+    if len(first) == len(second) == 1:
+        return [(first[0], second[0])]
+    named = {_label(name) for name in (*hypothesis.first, *hypothesis.second)}
+    firsts, seconds = (
+        {_rest(condition, named): condition for condition in side} for side in (first, second)
+    )
+    pairs = [(one, seconds[rest]) for rest, one in firsts.items() if rest in seconds]
+    if not pairs or len(firsts) < len(first) or len(seconds) < len(second):
+        return (
+            f"{len(first)} and {len(second)} conditions have these settings, and no pairs of them "
+            "are alike in the rest: it must name more"
+        )
+    return pairs
+
+
+def _rest(condition: Condition, named: set[str]) -> Values:
+    """The condition's settings that the hypothesis does not name."""
+    settings = ((ENTROPIC_INDEX, condition.entropic_index), *condition.others)
+    return tuple(pair for pair in settings if pair[0] not in named)
+
 
 MOST_CONDITIONS = 6
 """Number of conditions up to which each is compared with each; more, with a reference."""
@@ -240,3 +331,50 @@ def _means(sweep: Sweep, stage: Stage, measures: Mapping[str, Measure]) -> Itera
                     scores=scores,
                     runs=sum(sweep.runs[run].task == task for run in condition.runs),
                 )
+
+
+@dataclass(frozen=True, kw_only=True)
+class AlphaLine:
+    """Conditions on a task that differ in α only, by rising α."""
+
+    task: str
+    entropic_index: str
+    others: Values
+    """Other settings that tell the line from the others."""
+    means: tuple[Mean, ...]
+    alphas: Array
+    """`[points]`."""
+    estimate: Estimate
+    """`[points]`, of the primary metric over the seeds."""
+
+
+def alpha_sensitivity(means: Sequence[Mean]) -> list[AlphaLine]:
+    """Lines of at least two values of α; a condition whose α is no number is on none."""
+    groups: defaultdict[tuple[str, str, Values], list[tuple[float, Mean]]] = defaultdict(list)
+    for mean in means:
+        others = dict(mean.condition.others)
+        try:
+            alpha = float(others.pop(ALPHA, ""))
+        except ValueError:
+            continue
+        key = (mean.task, mean.condition.entropic_index, tuple(others.items()))
+        groups[key].append((alpha, mean))
+    return [_line(*key, points) for key, points in groups.items() if len(points) > 1]
+
+
+def _line(
+    task: str, entropic_index: str, others: Values, points: Sequence[tuple[float, Mean]]
+) -> AlphaLine:
+    alphas, means = zip(*sorted(points, key=lambda point: point[0]), strict=True)
+    value, lower, upper = (
+        np.array([float(getattr(mean.estimate, end)) for mean in means])
+        for end in ("value", "lower", "upper")
+    )
+    return AlphaLine(
+        task=task,
+        entropic_index=entropic_index,
+        others=others,
+        means=means,
+        alphas=np.array(alphas),
+        estimate=Estimate(value=value, lower=lower, upper=upper),
+    )

@@ -1,1 +1,0 @@
-"""A sweep exported as plain tables: written, read, merged."""
