@@ -23,7 +23,7 @@ from music_rllib.search.opening import open_searches
 from music_rllib.search.summary import outcome
 from music_rllib.store.paths import sweep_folder
 from music_rllib.store.run_record import HISTORY, Report, RunResult, last_values, to_json_lines
-from music_rllib.sweep.tune.dag_searcher import DagSearcher
+from music_rllib.tune.runner import DagSearcher
 
 Document = dict[str, Any]
 Formula = Callable[[RunSettings, float], float]

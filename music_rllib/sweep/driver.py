@@ -361,7 +361,7 @@ def _compute(
     if opened.scheduler.complete and (controller is None or controller.over):
         return None
     from music_rllib.sweep.listeners.prometheus import PrometheusListener
-    from music_rllib.sweep.tune.runner import compute
+    from music_rllib.tune.runner import compute
 
     address = cluster_address()
     display.say("starting a local Ray" if address is None else f"connecting to Ray at {address}")

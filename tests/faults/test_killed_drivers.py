@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from music_rllib.sweep.tune.events import RESTARTS
+from music_rllib.tune.events import RESTARTS
 from tests.faults import comparison, sweeps
 from tests.integration.conftest import Program
 

@@ -17,6 +17,7 @@ MAY_LOAD_RAY = (
     "training",
     "serve.application",
     "sweep",
+    "tune",
 )
 # torch and numpy only: no environments, no tracking.
 PURE = ("functional", "intrinsic", "replay", "runtime.allocator", "schedules")

@@ -11,7 +11,7 @@ from ray.tune.search import Searcher
 from music_rllib.config.load import load_sweep
 from music_rllib.experiment.plan import Plan, make_plan
 from music_rllib.experiment.scheduler import Scheduler, Status
-from music_rllib.sweep.tune.dag_searcher import DagSearcher
+from music_rllib.tune.runner import DagSearcher
 
 
 @pytest.fixture

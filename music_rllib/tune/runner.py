@@ -9,26 +9,85 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ray import tune
 from ray.tune.experiment import Trial
+from ray.tune.search import Searcher
 
 from music_rllib.experiment.listener import Listener
-from music_rllib.experiment.scheduler import Status
+from music_rllib.experiment.plan import Node
+from music_rllib.experiment.scheduler import Scheduler, Status
 from music_rllib.experiment.session import Sweep
 from music_rllib.runtime.machine import cluster_address
 from music_rllib.runtime.ray_cluster import cluster
 from music_rllib.store.object_folder import encoded
 from music_rllib.store.paths import below
-from music_rllib.sweep.tune.dag_searcher import DagSearcher
-from music_rllib.sweep.tune.events import RESTARTS, TuneEvents
-from music_rllib.sweep.tune.stopping import StopSignals
 from music_rllib.training.job import NodeJob
 from music_rllib.training.worker import RunTrainable
+from music_rllib.tune.events import RESTARTS, TuneEvents
+from music_rllib.tune.stopping import StopSignals
 
 if TYPE_CHECKING:
     from music_rllib.search.controller import SearchController
+
+
+class DagSearcher(Searcher):
+    """Suggests each waiting node of a plan to Tune, once its input is published.
+
+    Tune asks whenever it has room for a trial. After `None` it continues with its trials; without
+    any it asks again after a second, which only happens while a search waits for the trials of
+    another driver. After `FINISHED` it never asks again. A failed run does not stop the others.
+    """
+
+    def __init__(
+        self,
+        scheduler: Scheduler,
+        config_of: Callable[[Node], dict[str, Any]],
+        advance: Callable[[], bool] = lambda: False,
+        stopped: Callable[[], bool] = lambda: False,
+    ) -> None:
+        """Suggest the nodes of `scheduler`.
+
+        Args:
+            scheduler: Has the nodes and their statuses.
+            config_of: Makes the Tune config of a node.
+            advance: Lets the searches add nodes to the scheduler; returns whether they may add
+                more later.
+            stopped: Returns whether nothing more is to be suggested.
+        """
+        super().__init__()
+        self._scheduler = scheduler
+        self._config_of = config_of
+        self._advance = advance
+        self._stopped = stopped
+
+    def suggest(self, trial_id: str) -> dict[str, Any] | str | None:
+        """The config of a node that can run, None for "not now", or `FINISHED`."""
+        if self._stopped():
+            return str(Searcher.FINISHED)
+        more = self._advance()
+        node = self._scheduler.next_ready()
+        if node is None:
+            done = self._scheduler.all_handed_out and not more
+            return str(Searcher.FINISHED) if done else None
+        self._scheduler.start(node.key)
+        return self._config_of(node)
+
+    def on_trial_complete(
+        self, trial_id: str, result: dict[str, Any] | None = None, error: bool = False
+    ) -> None:
+        """Do nothing: the callback `TuneEvents`, which has the cause, moves the node.
+
+        Tune calls it before it asks for the next suggestion.
+        """
+
+    def save_to_dir(self, checkpoint_dir: str, session_str: str = "default") -> None:
+        """Save nothing."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Tune pickles the searcher into its snapshot, which nobody reads.
+        return {}
 
 
 def compute(
