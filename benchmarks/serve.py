@@ -85,12 +85,12 @@ def random_policy(task: str = "FetchPush", hidden: int = 256) -> bytes:
 
 @contextmanager
 def service(policy: str, replicas: int) -> Iterator[tuple[str, int]]:
-    """`python -m music_rllib.serve` on a free port of loopback; gives its URL and process id."""
+    """`music-rllib serve` on a free port of loopback; gives its URL and process id."""
     with socket.create_server(("127.0.0.1", 0)) as probe:
         port = probe.getsockname()[1]
     arguments = ["--port", str(port), "--replicas", str(replicas)]
     process = subprocess.Popen(
-        [sys.executable, "-m", "music_rllib.serve", policy, *arguments],
+        [sys.executable, "-m", "music_rllib", "serve", policy, *arguments],
         stdout=subprocess.PIPE,
         text=True,
         env={name: value for name, value in os.environ.items() if name != "RAY_ADDRESS"},

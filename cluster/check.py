@@ -412,7 +412,7 @@ def _unknown(given: Any, known: Any, place: str = "") -> Problems:
 
 
 def check_sweep(_: dict[str, Any], path: Path) -> Problems:
-    """As `python -m music_rllib.sweep` does."""
+    """As `music-rllib run` does."""
     from music_rllib.config.load import load_sweep
     from music_rllib.config.problems import ConfigError
 

@@ -610,7 +610,7 @@ def run(arguments: list[str]) -> tuple[object, str]:
                 from music_rllib.report.cli import app
 
                 return app(arguments[1:], standalone_mode=False), said.getvalue()
-            from music_rllib.sweep.cli import main
+            from music_rllib.program import main
 
             return main(arguments), said.getvalue()
         except BaseException as error:

@@ -16,6 +16,7 @@ from music_rllib.config.problems import ConfigError
 from music_rllib.config.run_settings import RunSettings, Variant
 from music_rllib.config.search.settings import SearchSettings
 from music_rllib.envs.tasks import Task
+from music_rllib.errors import BadInputError
 from music_rllib.schedules import StrictModel
 from music_rllib.store.handoff import HandoffManifest
 
@@ -243,3 +244,15 @@ class SweepConfig:
     checkpoints: Checkpoints
     analysis: Analysis | None
     stages: tuple[Stage, ...]
+
+    def stage(self, name: str | None = None) -> Stage:
+        """The stage with this name; the last one without a name.
+
+        Raises:
+            BadInputError: The sweep has no such stage.
+        """
+        stages = {stage.name: stage for stage in self.stages}
+        name = name or self.stages[-1].name
+        if name not in stages:
+            raise BadInputError(f"--stage must be one of {', '.join(stages)}, got {name!r}")
+        return stages[name]

@@ -70,6 +70,11 @@ class SweepLocation:
                     source["checkpoint"] = str(store.folder(place.removeprefix(IN_STORAGE)))
         return document
 
+    def nodes(self) -> list[dict[str, Any]]:
+        """The runs in its `plan.json`; empty if it has none."""
+        nodes: list[dict[str, Any]] = (self.read(sweep_files.PLAN) or {"nodes": []})["nodes"]
+        return nodes
+
     def open(self, *, lenient: bool = False) -> Sweep:
         """The sweep with its plan as it was last run, and its finished runs.
 

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from music_rllib.command_line import add_command, new_app, run_app
 from music_rllib.errors import BadInputError
 from music_rllib.redaction import redact
 from music_rllib.runtime.machine import check_reachable, cluster_address
@@ -104,15 +103,6 @@ def _on_signals(handler: Callable[..., None]) -> None:
 def _interrupt(*_: object) -> None:
     """Raise KeyboardInterrupt for a signal: Ray waits without end for what does not start."""
     raise KeyboardInterrupt
-
-
-app = new_app()
-add_command(app, "serve", serve, EXAMPLES)
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run `python -m music_rllib.serve` and return its exit code."""
-    return run_app(app, "python -m music_rllib.serve", arguments)
 
 
 def _check_exposure(host: str) -> None:

@@ -1,14 +1,14 @@
-"""`python -m music_rllib.sweep`."""
+"""`python -m music_rllib.sweep`: `music-rllib` as jobs of a cluster start it.
 
-from music_rllib.runtime.quiet import prepare_environment, quiet_third_parties
+Without a command in front, a sweep file is run; without arguments, the packaged sweep.
+"""
 
-# Ray and MLflow read their environment while they are imported.
-prepare_environment()
-quiet_third_parties()
+import sys
 
-import sys  # noqa: E402
-
-from music_rllib.sweep.cli import main  # noqa: E402
+from music_rllib.program import main
 
 if __name__ == "__main__":
-    sys.exit(main())
+    arguments = sys.argv[1:]
+    if not arguments or arguments[0].endswith((".yaml", ".yml")):
+        arguments = ["run", *arguments]
+    sys.exit(main(arguments, "python -m music_rllib.sweep"))

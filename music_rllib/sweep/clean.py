@@ -17,7 +17,6 @@ from music_rllib.redaction import redact
 from music_rllib.store.node_store import CONTINUATIONS
 from music_rllib.store.object_folder import open_storage
 from music_rllib.store.paths import sweep_folder
-from music_rllib.sweep.cli_helpers import plan_nodes
 from music_rllib.sweep.driver_lock import has_driver
 
 Item = dict[str, str]
@@ -122,7 +121,7 @@ def _is_driven(location: SweepLocation, state: Mapping[str, Any] | None) -> bool
 
 def _nodes(location: SweepLocation) -> list[dict[str, Any]]:
     """The nodes of a sweep's plan, and the handoffs from outside that they start from."""
-    nodes = plan_nodes(location)
+    nodes = location.nodes()
     imported = {node["input"]: None for node in nodes if str(node["input"]).startswith(IMPORTED)}
     return [
         *nodes,

@@ -35,7 +35,6 @@ from music_rllib.search.ranking import (
 )
 from music_rllib.store.files import write_atomically
 from music_rllib.store.object_folder import StorageError
-from music_rllib.sweep.cli_helpers import find_stage
 
 CHOSEN = "chosen.json"
 
@@ -54,7 +53,7 @@ def export_best(location: SweepLocation, stage_name: str | None, output: Path) -
         StorageError: The folder can't be written.
     """
     opened = location.open()
-    stage = find_stage(opened.config, stage_name)
+    stage = opened.config.stage(stage_name)
     sweep = LastValues(opened.plan).sweep(opened.results())
     searches = searches_of(location, opened.config)
     metric = measure_of(stage, sweep).metric

@@ -14,6 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from music_rllib.command_line import WIDTH, console_for
+from music_rllib.program import main as sweep_main
 from music_rllib.redaction import (
     MAX_PARAM_LENGTH,
     flat_params,
@@ -22,7 +23,6 @@ from music_rllib.redaction import (
     redact_yaml,
     without_secrets,
 )
-from music_rllib.sweep.cli import main as sweep_main
 
 
 @pytest.mark.parametrize(

@@ -25,9 +25,8 @@ from music_rllib.config.load import load_sweep
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 MODULES = {
-    "music_rllib.sweep": "music_rllib.sweep.cli",
+    "music_rllib.sweep": "music_rllib.program",
     "music_rllib.report": "music_rllib.report.cli",
-    "music_rllib.serve": "music_rllib.serve.command",
     "music_rllib.tracking": "music_rllib.tracking.cli",
 }
 """What `python -m` starts, and where its application is."""
@@ -114,7 +113,8 @@ def check(words: list[str]) -> None:
     if program == "music-rllib":
         parse(application("music_rllib.program"), program, words[1:])
     elif program == "python" and words[1:2] == ["-m"] and words[2] in MODULES:
-        parse(application(MODULES[words[2]]), words[2], words[3:])
+        by_default = ["run"] * (words[2] == "music_rllib.sweep" and words[3].endswith(".yaml"))
+        parse(application(MODULES[words[2]]), words[2], [*by_default, *words[3:]])
     elif program == "python" and words[1:2] == ["-m"]:
         assert importlib.util.find_spec(words[2]), words
     elif program == "make":
@@ -157,7 +157,7 @@ def test_commands_are_what_the_programs_take(
         "make tset",
         "ray job submit --workingdir . -- python x.py",
         "python -m music_rllib.sweep run tune_configs/smok.yaml",
-        "docker compose exec head sh -c 'python -m music_rllib.serve x --prot 1'",
+        "docker compose exec head sh -c 'music-rllib serve x --prot 1'",
     ],
 )
 def test_wrong_commands_are_found(command: str) -> None:

@@ -9,7 +9,7 @@ import typer
 
 from music_rllib.command_line import Json, console_for, print_json
 from music_rllib.errors import BadInputError
-from music_rllib.sweep.cli_helpers import Place, StageName, Storage, find_stage
+from music_rllib.sweep.commands.arguments import Place, StageName, Storage
 
 if TYPE_CHECKING:
     from music_rllib.results.analysis import Final, Scope
@@ -72,7 +72,7 @@ def compare(
 
     location = find_sweep(sweep, storage)
     config = location.config()
-    settings = find_stage(config, stage)
+    settings = config.stage(stage)
     metrics = {task.primary_metric for each in config.stages for task in each.tasks}
     metrics |= {names.EVAL_EPISODES, *names.ENTROPIES, *filter(None, [metric])}
     if settings.search is not None:

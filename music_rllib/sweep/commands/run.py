@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from music_rllib.command_line import Json
-from music_rllib.sweep.cli_helpers import Place, Storage
+from music_rllib.sweep.commands.arguments import Place, Storage
 
 RUN_EXAMPLES = """\
 Examples:

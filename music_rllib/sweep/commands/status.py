@@ -9,7 +9,7 @@ import typer
 
 from music_rllib.command_line import Json, console_for, print_json
 from music_rllib.errors import FAILED, BadInputError
-from music_rllib.sweep.cli_helpers import Place, Storage, plan_nodes
+from music_rllib.sweep.commands.arguments import Place, Storage
 
 if TYPE_CHECKING:
     from music_rllib.experiment.location import SweepLocation
@@ -61,7 +61,7 @@ def status(
 
 
 def _labels(location: SweepLocation) -> list[str]:
-    return [node["label"] for node in plan_nodes(location)]
+    return [node["label"] for node in location.nodes()]
 
 
 def state_of(location: SweepLocation) -> dict[str, Any]:
@@ -78,10 +78,8 @@ def state_of(location: SweepLocation) -> dict[str, Any]:
         outcome = "interrupted" if outcome == "running" else outcome
         _mark_interrupted(state)
     store = NodeStore(location.storage)
-    finished = store.finished(node["key"] for node in plan_nodes(location))
-    labels = {
-        node["key"]: node["label"] for node in plan_nodes(location) if node["key"] in finished
-    }
+    finished = store.finished(node["key"] for node in location.nodes())
+    labels = {node["key"]: node["label"] for node in location.nodes() if node["key"] in finished}
     damaged = [
         {"run": labels[key], "cause": str(error)} for key, error in store.damage(labels).items()
     ]

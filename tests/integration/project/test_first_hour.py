@@ -19,8 +19,8 @@ import pytest
 import yaml
 
 from music_rllib import load_sweep
+from music_rllib.program import main as sweep
 from music_rllib.report.cli import main as report
-from music_rllib.sweep.cli import main as sweep
 from tests.integration.conftest import call
 
 pytestmark = pytest.mark.e2e

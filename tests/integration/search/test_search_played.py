@@ -33,10 +33,10 @@ from music_rllib.experiment import sweep_files
 from music_rllib.experiment.changes import changes_since, keep_settings
 from music_rllib.experiment.scheduler import Status
 from music_rllib.experiment.session import keep_record
+from music_rllib.program import main
 from music_rllib.search.opening import learnings
 from music_rllib.search.summary import outcome
 from music_rllib.store.object_folder import StorageError
-from music_rllib.sweep import cli
 from music_rllib.sweep.listeners.state_file import StateFile
 from tests.played_search import SPACE, Document, Driver, document, points, searched, success
 
@@ -393,7 +393,7 @@ def recorded(folder: Path, content: Document) -> Driver:
 
 def answered(capsys: pytest.CaptureFixture[str], *arguments: str) -> Document:
     capsys.readouterr()
-    code = cli.main([*arguments, "--json"])
+    code = main([*arguments, "--json"])
     output, errors = capsys.readouterr()
     assert code == 0, errors
     found: Document = json.loads(output)

@@ -1,4 +1,4 @@
-"""`python -m music_rllib.serve` as a user starts it: one service on loopback for all tests."""
+"""`music-rllib serve` as a user starts it: one service on loopback for all tests."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ import requests
 
 from benchmarks.serve import half_sent, random_policy, storm
 from music_rllib.policy import Policy, load_policy
+from music_rllib.program import main
 from music_rllib.runtime.machine import RAY_FOLDER, ray_parent
-from music_rllib.serve.command import main
 from tests.integration.conftest import listening
 from tests.ports import free_port
 
@@ -38,7 +38,7 @@ class Service(NamedTuple):
 def start(*arguments: str, token: str | None = None) -> subprocess.Popen[str]:
     environment = {**os.environ, **({"MUSIC_RLLIB_SERVE_TOKEN": token} if token else {})}
     return subprocess.Popen(
-        [sys.executable, "-m", "music_rllib.serve", *arguments],
+        [sys.executable, "-m", "music_rllib", "serve", *arguments],
         env=environment,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -169,7 +169,7 @@ def test_bad_input_is_one_line(
     places = {"policy": service.file, "folder": tmp_path, "taken": taken}
     if "--port" not in arguments:
         arguments = [*arguments, "--port", str(free_port())]
-    code = main([argument.format(**places) for argument in arguments])
+    code = main(["serve", *(argument.format(**places) for argument in arguments)])
     output, errors = capsys.readouterr()
     assert (code, output) == (2, "")
     assert message in errors

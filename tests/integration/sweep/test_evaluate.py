@@ -18,7 +18,7 @@ from music_rllib.envs.tasks import BUILT_IN_TASKS, Task
 from music_rllib.policy import Policy, PolicyNetwork, load_policy
 from music_rllib.policy.rollout import open_task, play
 from music_rllib.policy.video import FORMATS, VideoError, film, find_renderer, write_video
-from music_rllib.sweep.cli import main
+from music_rllib.program import main
 from tests.integration.conftest import ENVIRONMENTS
 
 REACH = BUILT_IN_TASKS["FetchReach"]

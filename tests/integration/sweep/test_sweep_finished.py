@@ -22,9 +22,9 @@ import yaml
 from mlflow import MlflowClient
 
 from music_rllib import load_sweep, names
+from music_rllib.program import main
 from music_rllib.report.build import PAGE
 from music_rllib.report.cli import main as report
-from music_rllib.sweep.cli import main
 from tests.integration.conftest import (
     ENVIRONMENTS,
     SWEEP,

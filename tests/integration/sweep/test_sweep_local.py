@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import pytest
 
 from music_rllib import names
-from music_rllib.sweep.cli import main
+from music_rllib.program import main
 from tests.integration.conftest import (
     ENVIRONMENTS,
     POINT,

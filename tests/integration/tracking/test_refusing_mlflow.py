@@ -14,7 +14,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from music_rllib.sweep import cli
+from music_rllib.program import main
 from music_rllib.tracking.cli import app as tracking
 from tests.integration.conftest import SWEEP
 from tests.kept_sweep import kept_sweep
@@ -88,7 +88,7 @@ def test_a_sweep_says_so_and_starts_nothing(
     document = {key: value for key, value in SWEEP.items() if key != "environments"}
     document |= {"tasks": ["FetchPush"], "mlflow": {"tracking_uri": uri}}
     Path("sweep.yaml").write_text(yaml.safe_dump(document))
-    code = cli.main(["run", "sweep.yaml"])
+    code = main(["run", "sweep.yaml"])
     check(code, capsys.readouterr().err, status)
     assert not Path("results", "nodes").exists()
     kept = [path for path in Path("results").rglob("*") if path.is_file()]

@@ -14,10 +14,10 @@ from music_rllib.envs.make import known_environment
 from music_rllib.envs.tasks import BUILT_IN_TASKS, Task
 from music_rllib.policy import Policy, PolicyError, load_policy
 from music_rllib.policy.rollout import open_task
+from music_rllib.program import main as sweep_main
 from music_rllib.store.handoff import HandoffError
 from music_rllib.store.handoff import read_handoff as read_handoff_of
 from music_rllib.store.object_folder import DamagedError, ObjectFolders, open_storage
-from music_rllib.sweep.cli import main as sweep_main
 from tests.hostile_files import INPUTS, PENDULUM, STRANGE, seal_policy, write_policy
 
 

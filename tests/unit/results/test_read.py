@@ -19,6 +19,7 @@ from music_rllib.experiment.changes import keep_settings
 from music_rllib.experiment.listener import Failure
 from music_rllib.experiment.plan import Node, make_plan
 from music_rllib.experiment.session import Sweep, keep_record, open_sweep
+from music_rllib.program import main
 from music_rllib.report import cli as report
 from music_rllib.report.limitations import missing
 from music_rllib.report.web.sections import failures
@@ -28,7 +29,6 @@ from music_rllib.results.study import study_of
 from music_rllib.store.object_folder import DamagedError
 from music_rllib.store.paths import sweep_folder
 from music_rllib.store.run_record import HISTORY, Report, RunResult, last_values, to_json_lines
-from music_rllib.sweep import cli
 from music_rllib.sweep.listeners.state_file import StateFile
 
 CODE = {names.TAG_GIT_COMMIT: "c0ffee", f"{names.TAG_VERSION_PREFIX}torch": "2.0"}
@@ -126,13 +126,13 @@ class Shown:
         self.compared, self.status = (
             self._json(capsys, command) for command in ("compare", "status")
         )
-        assert cli.main(["best", self.place, "--json"]) == 0
+        assert main(["best", self.place, "--json"]) == 0
         self.best = json.loads(capsys.readouterr().out)
         self.read = read_sweep(self.place).sweep
         self.frames = load_frames(self.place)
 
     def _json(self, capsys: pytest.CaptureFixture[str], command: str) -> Any:
-        assert cli.main([command, self.place, "--json"]) == 0
+        assert main([command, self.place, "--json"]) == 0
         return json.loads(capsys.readouterr().out)
 
     def agreed(self) -> dict[str, tuple[int, float]]:

@@ -1,4 +1,4 @@
-"""`python -m music_rllib.serve` with input that it refuses, before any Ray is started."""
+"""`music-rllib serve` rejects bad input before it starts Ray."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from music_rllib.serve.command import main
+from music_rllib.program import main
 from tests.ports import free_port
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     """What is said to arguments that are answered with code 2."""
-    code = main(arguments)
+    code = main(["serve", *arguments])
     output, errors = capsys.readouterr()
     assert (code, output) == (2, "")
     return errors

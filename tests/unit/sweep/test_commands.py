@@ -26,6 +26,7 @@ from music_rllib.experiment.scheduler import Status
 from music_rllib.experiment.session import Sweep, keep_record, open_sweep, remove_damaged
 from music_rllib.experiment.sweep_files import as_json
 from music_rllib.labels import ShortLabels
+from music_rllib.program import main
 from music_rllib.results.analysis import analyse, each_seed
 from music_rllib.results.answer import answer, claim_rows, mean_rows
 from music_rllib.results.read import read_sweep
@@ -35,7 +36,7 @@ from music_rllib.store.handoff import write_handoff
 from music_rllib.store.object_folder import DamagedError
 from music_rllib.store.paths import sweep_folder
 from music_rllib.store.run_record import HISTORY, Report, RunResult, to_json_lines
-from music_rllib.sweep import clean, cli, driver_lock
+from music_rllib.sweep import clean, driver, driver_lock
 from music_rllib.sweep.export import sweep_of_run
 from music_rllib.sweep.listeners.state_file import StateFile
 from music_rllib.sweep.preflight import import_checkpoints
@@ -92,7 +93,7 @@ def storage(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.
 def program(capsys: pytest.CaptureFixture[str]) -> Program:
     def run(*arguments: str) -> Said:
         capsys.readouterr()
-        code = cli.main(arguments)
+        code = main(arguments)
         return Said(code, *capsys.readouterr())
 
     return run
@@ -283,8 +284,7 @@ def test_best_takes_the_middle_run_of_the_best_condition(
     "name", ["smoke", "paper_figures", "q_entropy_factorial", "proofs/fetch_push_family", "default"]
 )
 def test_what_best_writes_is_the_run_to_the_last_setting(name: str, tmp_path: Path) -> None:
-    shipped = Path(cli.__file__).with_name("default.yaml")
-    file = shipped if name == "default" else Path("tune_configs", f"{name}.yaml")
+    file = driver.DEFAULT_CONFIG if name == "default" else Path("tune_configs", f"{name}.yaml")
     config = load_sweep(REPOSITORY / file, storage=str(tmp_path))
     sweep = open_sweep(config, make_plan(config), str(tmp_path), tmp_path / config.name)
     for key in {(node.stage, node.run.task.name): node.key for node in sweep.plan.nodes}.values():
