@@ -19,10 +19,10 @@ from benchmarks.measure import Row, Taken, middle, taken_by
 from music_rllib import names
 from music_rllib.config.load import load_sweep
 from music_rllib.config.schema import SweepConfig
+from music_rllib.experiment.open_sweep import keep_record, open_sweep
 from music_rllib.experiment.plan import make_plan
-from music_rllib.experiment.session import keep_record, open_sweep
 from music_rllib.report.build import PAGE
-from music_rllib.store.run_record import HISTORY, Report, RunResult, last_values, to_json_lines
+from music_rllib.store.history import HISTORY, Report, RunResult, last_values, to_json_lines
 
 __all__ = ["rows"]
 

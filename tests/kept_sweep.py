@@ -8,8 +8,8 @@ from pathlib import Path
 import yaml
 
 from music_rllib.config.load import load_sweep
+from music_rllib.experiment.open_sweep import keep_record, open_sweep
 from music_rllib.experiment.plan import make_plan
-from music_rllib.experiment.session import keep_record, open_sweep
 
 __all__ = ["kept_sweep"]
 

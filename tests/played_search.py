@@ -16,13 +16,13 @@ from ray.tune.search import Searcher
 from music_rllib import names
 from music_rllib.config.load import load_sweep
 from music_rllib.config.run_settings import RunSettings
+from music_rllib.experiment.open_sweep import OpenSweep, open_sweep
 from music_rllib.experiment.plan import Node, make_plan
-from music_rllib.experiment.session import Sweep, open_sweep
 from music_rllib.search.controller import SearchController
 from music_rllib.search.opening import open_searches
 from music_rllib.search.summary import outcome
+from music_rllib.store.history import HISTORY, Report, RunResult, last_values, to_json_lines
 from music_rllib.store.paths import sweep_folder
-from music_rllib.store.run_record import HISTORY, Report, RunResult, last_values, to_json_lines
 from music_rllib.tune.runner import DagSearcher
 
 Document = dict[str, Any]
@@ -72,7 +72,7 @@ class Driver:
         path.write_text(yaml.safe_dump(content, sort_keys=False))
         config = load_sweep(path, storage=str(folder / "results"))
         plan = make_plan(config)
-        self.sweep: Sweep = open_sweep(
+        self.sweep: OpenSweep = open_sweep(
             config, plan, config.storage, sweep_folder(config.storage, config.name)
         )
         self._time = time.time()  # as another driver's clock, which judges whether this one lives
@@ -154,7 +154,7 @@ class Driver:
         return found
 
 
-def publish(sweep: Sweep, node: Node, reports: list[Report]) -> None:
+def publish(sweep: OpenSweep, node: Node, reports: list[Report]) -> None:
     folder = sweep.folder / "made"
     folder.mkdir(parents=True, exist_ok=True)
     (folder / HISTORY).write_bytes(to_json_lines(reports))

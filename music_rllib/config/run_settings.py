@@ -232,7 +232,7 @@ class RunSettings(StrictModel):
 
 
 def handed_over(run: RunSettings) -> tuple[str, ...]:
-    """Names of the modules that `run` takes over from its source, as in `TrainingRun.modules`."""
+    """Names of the networks whose weights `run` takes over from its source."""
     match VARIANTS[run.variant].starts_from:
         case "scratch":
             return ()

@@ -12,8 +12,8 @@ from music_rllib.config.run_settings import RETIRED
 from music_rllib.config.schema import SweepConfig
 from music_rllib.experiment.continuation import budget_settings, continued_from
 from music_rllib.experiment.earlier import differences
+from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.plan import Node
-from music_rllib.experiment.session import Sweep
 from music_rllib.experiment.sweep_files import CONFIG, PLAN, SETTINGS, keep, read
 from music_rllib.labels import ShortLabels, in_runs
 from music_rllib.redaction import redact
@@ -57,7 +57,7 @@ def _indented(lines: tuple[str, ...]) -> list[str]:
     return [f"  {line}" for line in lines[:SHOWN]] + more
 
 
-def keep_settings(sweep: Sweep) -> None:
+def keep_settings(sweep: OpenSweep) -> None:
     """Write the settings that `changes_since` compares with into the sweep's folder.
 
     Raises:
@@ -75,7 +75,7 @@ def keep_settings(sweep: Sweep) -> None:
     keep(sweep, SETTINGS, json.dumps(document, indent=1))
 
 
-def _searched(sweep: Sweep) -> dict[str, dict[str, Any]]:
+def _searched(sweep: OpenSweep) -> dict[str, dict[str, Any]]:
     """Settings that no search chooses, by stage and task, of stages that trials alone compute."""
     planned = {node.stage for node in sweep.plan.nodes if not node.part}
     return {
@@ -88,7 +88,7 @@ def _searched(sweep: Sweep) -> dict[str, dict[str, Any]]:
 
 
 def _changed_searches(
-    sweep: Sweep, before: Mapping[str, Any], planned: Iterable[str]
+    sweep: OpenSweep, before: Mapping[str, Any], planned: Iterable[str]
 ) -> Iterator[tuple[str, dict[str, None]]]:
     """Stages of which trials' runs would be others, and how they differ from before.
 
@@ -133,7 +133,7 @@ def check_begun(config: SweepConfig) -> None:
         )
 
 
-def changes_since(sweep: Sweep) -> Changes | None:
+def changes_since(sweep: OpenSweep) -> Changes | None:
     """What the last run of this sweep computed and this one does not use; None: nothing.
 
     Runs that are new, or that are not in the plan any more, do not count.
@@ -189,7 +189,7 @@ def changes_since(sweep: Sweep) -> Changes | None:
     )
 
 
-def longer(sweep: Sweep) -> list[str]:
+def longer(sweep: OpenSweep) -> list[str]:
     """A line about runs that continue finished ones with fewer `env_steps`, if there are any."""
     if not sweep.store.has_continuations():
         return []

@@ -19,7 +19,7 @@ from music_rllib.errors import BadInputError
 from music_rllib.runtime import machine as local
 
 if TYPE_CHECKING:
-    from music_rllib.experiment.session import Sweep
+    from music_rllib.experiment.open_sweep import OpenSweep
 
 FLOAT = 4
 """Bytes of a number."""
@@ -54,7 +54,7 @@ class Machine:
     """Bytes that its system grants one process at once, used or not."""
 
 
-def check_demand(sweep: Sweep) -> list[str]:
+def check_demand(sweep: OpenSweep) -> list[str]:
     """Check that the unfinished runs fit into memory.
 
     Returns:
@@ -75,7 +75,9 @@ def check_demand(sweep: Sweep) -> list[str]:
     return list(long_runs(runs))
 
 
-def _cluster_machine(address: str, sweep: Sweep, runs: list[tuple[str, RunSettings]]) -> Machine:
+def _cluster_machine(
+    address: str, sweep: OpenSweep, runs: list[tuple[str, RunSettings]]
+) -> Machine:
     """The cluster's largest node; it is only asked for its memory where the runs need much."""
     name = "the cluster's largest node"
     address_space = 2**47  # bytes: no limit

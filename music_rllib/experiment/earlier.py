@@ -41,7 +41,7 @@ def earlier_runs(plan: Plan, storage: str) -> list[dict[str, Any]]:
     ]
 
 
-def in_words(earlier: Iterable[Mapping[str, Any]]) -> str | None:
+def earlier_text(earlier: Iterable[Mapping[str, Any]]) -> str | None:
     """A sentence about runs of earlier plans; None if there are none."""
     counts = Counter(one["why"] for one in earlier)
     if not counts:

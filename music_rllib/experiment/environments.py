@@ -17,7 +17,7 @@ from music_rllib.store.node_store import NodeStore
 from music_rllib.store.work_folder import WorkFolder, steps_of
 
 if TYPE_CHECKING:
-    from music_rllib.experiment.session import Sweep
+    from music_rllib.experiment.open_sweep import OpenSweep
 
 FILE = "environments.json"
 """File of a storage: which environments the user takes for the same."""
@@ -84,7 +84,7 @@ class OldRun:
     """`lab_env.py changed`, from then to now; empty for the same environment."""
 
 
-def old_runs(sweep: Sweep) -> list[OldRun]:
+def old_runs(sweep: OpenSweep) -> list[OldRun]:
     """All runs that have something in the storage, in the order of the plan."""
     runs, known = [], set()
     for node in sweep.plan.nodes:
@@ -121,7 +121,7 @@ def _progress(
 
 
 def _run(
-    sweep: Sweep,
+    sweep: OpenSweep,
     key: str,
     label: str,
     task: str,
@@ -139,7 +139,7 @@ def _run(
     )
 
 
-def changed_text(sweep: Sweep, runs: Iterable[OldRun]) -> str | None:
+def changed_text(sweep: OpenSweep, runs: Iterable[OldRun]) -> str | None:
     """A message with what has changed, the runs that it concerns, and what to do; None: nothing."""
     groups: dict[tuple[str, tuple[str, ...]], list[OldRun]] = {}
     for run in runs:
@@ -161,7 +161,7 @@ def changed_text(sweep: Sweep, runs: Iterable[OldRun]) -> str | None:
 
 
 def to_retrain(
-    sweep: Sweep, runs: Sequence[OldRun], named: Sequence[str], *, all_changed: bool
+    sweep: OpenSweep, runs: Sequence[OldRun], named: Sequence[str], *, all_changed: bool
 ) -> list[OldRun]:
     """The runs to train again: named ones, changed ones if asked, and those that start from them.
 
@@ -195,7 +195,7 @@ class Answer:
     @classmethod
     def to(
         cls,
-        sweep: Sweep,
+        sweep: OpenSweep,
         runs: Sequence[OldRun],
         retrain: Sequence[str],
         *,
@@ -213,7 +213,7 @@ class Answer:
             raise BadInputError(text)
         return cls(again=again, left=left)
 
-    def carry_out(self, sweep: Sweep, say: Callable[[str], None]) -> Sweep:
+    def carry_out(self, sweep: OpenSweep, say: Callable[[str], None]) -> OpenSweep:
         """Delete, record the answer and say so; the caller must hold the sweep's lock.
 
         Raises:
@@ -228,7 +228,7 @@ class Answer:
         return keep_old(sweep, kept) if kept else sweep
 
 
-def remove_old(sweep: Sweep, runs: Sequence[OldRun]) -> Sweep:
+def remove_old(sweep: OpenSweep, runs: Sequence[OldRun]) -> OpenSweep:
     """Delete results and checkpoints of runs; the sweep in which they wait.
 
     Raises:
@@ -248,7 +248,7 @@ def remove_old(sweep: Sweep, runs: Sequence[OldRun]) -> Sweep:
     return replace(sweep, scheduler=Scheduler(sweep.plan, finished))
 
 
-def keep_old(sweep: Sweep, runs: Iterable[OldRun]) -> Sweep:
+def keep_old(sweep: OpenSweep, runs: Iterable[OldRun]) -> OpenSweep:
     """Record that runs of other environments are used; the sweep that uses them.
 
     Raises:

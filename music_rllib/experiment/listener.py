@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from music_rllib.experiment.plan import Node
-from music_rllib.store.run_record import Report, RunResult
+from music_rllib.store.history import Report, RunResult
 
 
 class Failure(NamedTuple):

@@ -13,8 +13,8 @@ from music_rllib.config.schema import SweepConfig
 from music_rllib.errors import BadInputError
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.earlier import in_words
+from music_rllib.experiment.open_sweep import OpenSweep, open_sweep
 from music_rllib.experiment.plan import make_plan
-from music_rllib.experiment.session import Sweep, open_sweep
 from music_rllib.experiment.sweep_files import IN_STORAGE
 from music_rllib.redaction import redact
 from music_rllib.store.node_store import NodeStore
@@ -75,7 +75,7 @@ class SweepLocation:
         nodes: list[dict[str, Any]] = (self.read(sweep_files.PLAN) or {"nodes": []})["nodes"]
         return nodes
 
-    def open(self, *, lenient: bool = False) -> Sweep:
+    def open(self, *, lenient: bool = False) -> OpenSweep:
         """The sweep with its plan as it was last run, and its finished runs.
 
         The plan includes the searched trials. Its keys are of the version of the algorithm that the

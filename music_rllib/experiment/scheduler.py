@@ -93,7 +93,7 @@ class Scheduler:
             return True
         return self._status[node.input.key] in DONE
 
-    def want(self, node: Node, until: int | None, *, finished: bool) -> None:
+    def request(self, node: Node, until: int | None, *, finished: bool) -> None:
         """Add a node that a search asks for, or let one that is there be computed further.
 
         Args:
@@ -120,7 +120,7 @@ class Scheduler:
                 self._until[key] = until
             self._move(key, self._status[key], Status.WAITING)
 
-    def recall(self, node: Node, *, finished: bool) -> None:
+    def add_pruned(self, node: Node, *, finished: bool) -> None:
         """Add a node of a trial that ended earlier, which is not to be computed."""
         if node.key not in self._nodes:
             self._add(node, Status.REUSED if finished else Status.PRUNED)
@@ -140,7 +140,7 @@ class Scheduler:
         more = until is None or until > env_steps
         self._move(key, Status.STARTED, Status.WAITING if more else Status.PAUSED)
 
-    def withdraw(self, key: str) -> bool:
+    def prune(self, key: str) -> bool:
         """Compute the node no further; False where it is not waiting or paused."""
         if self._status[key] not in (Status.WAITING, Status.PAUSED):
             return False

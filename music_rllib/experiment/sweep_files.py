@@ -21,7 +21,7 @@ from music_rllib.store.lease import runs_here, this_machine
 from music_rllib.store.object_folder import StorageError, open_storage
 
 if TYPE_CHECKING:
-    from music_rllib.experiment.session import Sweep
+    from music_rllib.experiment.open_sweep import OpenSweep
 
 CONFIG, PLAN, SEARCH, STATE = "config.json", "plan.json", "search.json", "state.json"
 ANALYSIS_PLAN, SETTINGS = "analysis_plan.json", "settings.json"
@@ -58,7 +58,7 @@ def as_json(document: Any) -> str:
     return json.dumps(plain(document), indent=1, ensure_ascii=False, default=str)
 
 
-def keep(sweep: Sweep, name: str, text: str) -> None:
+def keep(sweep: OpenSweep, name: str, text: str) -> None:
     """Write a file of the sweep, on this machine and, where that is a bucket, in its storage.
 
     Raises:

@@ -26,7 +26,7 @@ from music_rllib import names
 from music_rllib.config.analysis import Hypothesis
 from music_rllib.config.schema import Stage, SweepConfig
 from music_rllib.config.tac_settings import in_words
-from music_rllib.experiment.session import Sweep
+from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.sweep_files import ANALYSIS_PLAN, as_json, keep, read
 from music_rllib.redaction import redact
 from music_rllib.store.files import content_key
@@ -268,7 +268,7 @@ def plans_in(storage: str, name: str) -> tuple[PlanVersion, ...]:
         ) from error
 
 
-def record_plan(sweep: Sweep) -> Sequence[PlanVersion]:
+def record_plan(sweep: OpenSweep) -> Sequence[PlanVersion]:
     """Keep the plan of the sweep's file, as a new version where it changed; return all versions.
 
     Raises:

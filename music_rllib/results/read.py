@@ -21,18 +21,19 @@ from music_rllib import names
 from music_rllib.config.schema import SweepConfig
 from music_rllib.envs.fingerprint import digest_of
 from music_rllib.errors import first_line
-from music_rllib.experiment import session, sweep_files
+from music_rllib.experiment import sweep_files
 from music_rllib.experiment.location import SweepLocation, find_sweep
+from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.plan import Node, Plan
 from music_rllib.experiment.run_info import run_info
 from music_rllib.redaction import flat_params, redact
 from music_rllib.results.analysis_plan import plans_in
 from music_rllib.results.archive import is_archive, read_archive
 from music_rllib.results.data import Points, RunRecord, Sweep, checked_searches, columns
+from music_rllib.store.history import RunResult
 from music_rllib.store.node_store import damage_in_words
 from music_rllib.store.object_folder import DamagedError, StorageError
 from music_rllib.store.paths import folder_at, sweep_folder
-from music_rllib.store.run_record import RunResult
 
 
 def planned_run(node: Node, algorithm: str) -> RunRecord:
@@ -88,7 +89,7 @@ class SweepRead:
     sweep: Sweep
     folder: Path
     """Folder of the sweep on this machine, for its report."""
-    opened: session.Sweep | None = None
+    opened: OpenSweep | None = None
     """The plan with its storage; None for an export."""
     damaged: str | None = None
     """A sentence about finished runs with damaged files; None if there are none."""
@@ -98,7 +99,7 @@ class SweepRead:
 class StoredSweep(SweepRead):
     """A sweep that was read from its storage."""
 
-    opened: session.Sweep
+    opened: OpenSweep
 
 
 def read_sweep(
@@ -211,9 +212,7 @@ class _Run(NamedTuple):
     damage: DamagedError | None = None
 
 
-def _read_runs(
-    opened: session.Sweep, metrics: Collection[str] | None, *, lenient: bool
-) -> list[_Run]:
+def _read_runs(opened: OpenSweep, metrics: Collection[str] | None, *, lenient: bool) -> list[_Run]:
     """The runs of the plan, in its order; unfinished ones up to their last checkpoint."""
     store, finished, begun = opened.store, opened.finished, opened.store.begun()
     damaged = store.damage(opened.damaged)
@@ -275,7 +274,7 @@ def _run(lines: bytes, node: Node, metrics: Collection[str] | None) -> _Run:
     return _Run(points, begun=True, started=first, ended=last)
 
 
-def _causes(opened: session.Sweep, state: Mapping[str, Any]) -> dict[str, str]:
+def _causes(opened: OpenSweep, state: Mapping[str, Any]) -> dict[str, str]:
     """Node key to cause, of runs that failed and of those whose source failed."""
     failed = {failure["run"]: failure["cause"] for failure in state["failures"]}
     causes: dict[str, str] = {}

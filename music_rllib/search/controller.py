@@ -13,16 +13,16 @@ from music_rllib.config.problems import ConfigError
 from music_rllib.config.search.settings import FINAL_SEED, SearchSettings
 from music_rllib.errors import first_line
 from music_rllib.experiment.listener import Listener
+from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.plan import Node, Run
 from music_rllib.experiment.scheduler import DONE, LOST, Status
-from music_rllib.experiment.session import Sweep
 from music_rllib.redaction import redact
 from music_rllib.search.objective import aggregates, prune, score
 from music_rllib.search.storage import DATABASE_ERRORS
 from music_rllib.search.study_record import SCORES, VALUES
 from music_rllib.search.trials import Active, Arm, Array, Finalist, Search, ranked, up_to
+from music_rllib.store.history import Report
 from music_rllib.store.object_folder import DamagedError
-from music_rllib.store.run_record import Report
 
 POLL_SECONDS = 1.0
 """Time between two looks at the trials of other drivers."""
@@ -33,7 +33,7 @@ class SearchController(Listener):
 
     def __init__(
         self,
-        sweep: Sweep,
+        sweep: OpenSweep,
         searches: Sequence[Search],
         *,
         reused: Callable[[Node], None] = lambda node: None,
@@ -168,7 +168,7 @@ class SearchController(Listener):
                 for node in (node for run in runs for node in self._nodes_of(run)):
                     if not self._scheduler.knows(node.key):
                         finished = self._store.is_finished(node.key)
-                        self._scheduler.recall(node, finished=finished)
+                        self._scheduler.add_pruned(node, finished=finished)
                         if finished:
                             self._reused(node)
 
@@ -200,7 +200,7 @@ class SearchController(Listener):
             # So does one of another environment.
             finished = new and self._store.is_sound(node.key) and self._is_of_now(node)
             paused = node.key == run.key and until is not None and until < node.run.env_steps
-            self._scheduler.want(node, until if paused else None, finished=finished)
+            self._scheduler.request(node, until if paused else None, finished=finished)
             if finished:
                 self._reused(node)
 
@@ -328,7 +328,7 @@ class SearchController(Listener):
             if run.key in wanted or self._scheduler.is_planned(run.key):
                 continue
             self._reports.pop(run.key, None)
-            if self._scheduler.withdraw(run.key):
+            if self._scheduler.prune(run.key):
                 self._pruned(self._plan.node(run.key), reason)
 
     # -- the final ranking -------------------------------------------------------------------

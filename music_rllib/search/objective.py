@@ -16,7 +16,7 @@ from music_rllib.config.search.settings import Objective, Pruning
 from music_rllib.imports import imported_on_use
 from music_rllib.results import statistics as st
 from music_rllib.results.statistics import Array, Estimate
-from music_rllib.store.run_record import Report
+from music_rllib.store.history import Report
 
 stats = imported_on_use("scipy.stats")
 

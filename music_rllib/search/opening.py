@@ -9,8 +9,8 @@ from typing import Any
 from music_rllib.config.schema import Stage
 from music_rllib.config.search.check import most_env_steps
 from music_rllib.config.search.settings import Rung, SearchSettings, WarmStart
+from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.plan import node_key
-from music_rllib.experiment.session import Sweep
 from music_rllib.search.storage import known_studies, names_of, open_studies, same_database
 from music_rllib.search.study import Study
 from music_rllib.search.trials import Arm, Search
@@ -20,7 +20,7 @@ STUDY_FILE = "study.db"
 """File in the sweep's folder."""
 
 
-def check_studies(sweep: Sweep) -> None:
+def check_studies(sweep: OpenSweep) -> None:
     """Check that the searches' databases and the studies that they learn from are there.
 
     Nothing is made, so that a sweep that is only planned leaves nothing.
@@ -45,13 +45,13 @@ def check_studies(sweep: Sweep) -> None:
         above.append((base, storage))
 
 
-def _base(sweep: Sweep, stage: Stage) -> str:
+def _base(sweep: OpenSweep, stage: Stage) -> str:
     """The beginning of the names of a stage's studies."""
     assert stage.search is not None
     return f"{stage.search.study or sweep.config.name}/{stage.name}"
 
 
-def _storage(sweep: Sweep, settings: SearchSettings) -> str:
+def _storage(sweep: OpenSweep, settings: SearchSettings) -> str:
     return settings.storage or str(sweep.folder / STUDY_FILE)
 
 
@@ -65,7 +65,7 @@ def _check_warm_start(warm: WarmStart, known: Sequence[str], made: Sequence[str]
         raise no_study_error(warm, known)
 
 
-def open_searches(sweep: Sweep) -> list[Search]:
+def open_searches(sweep: OpenSweep) -> list[Search]:
     """Open the studies of a sweep's searched stages, which are made where they are missing.
 
     Raises:
@@ -74,7 +74,7 @@ def open_searches(sweep: Sweep) -> list[Search]:
     return [_open_search(sweep, stage) for stage in sweep.plan.searched]
 
 
-def _open_search(sweep: Sweep, stage: Stage) -> Search:
+def _open_search(sweep: OpenSweep, stage: Stage) -> Search:
     settings = stage.search
     assert settings is not None
     sweep.folder.mkdir(parents=True, exist_ok=True)
@@ -104,7 +104,7 @@ def learnings(searches: Sequence[Search]) -> list[str]:
     ]
 
 
-def _rungs(sweep: Sweep, stage: Stage, settings: SearchSettings) -> tuple[Rung, ...]:
+def _rungs(sweep: OpenSweep, stage: Stage, settings: SearchSettings) -> tuple[Rung, ...]:
     """The rungs of a trial; the last one is its end."""
     seeds, env_steps = len(sweep.plan.seeds), most_env_steps(settings, stage.points)
     end = Rung(seeds=seeds)
@@ -119,7 +119,7 @@ def _rungs(sweep: Sweep, stage: Stage, settings: SearchSettings) -> tuple[Rung, 
     return (*dict.fromkeys(rung for rung in rungs if rung != end), end)
 
 
-def _determined_by(sweep: Sweep, stage: Stage) -> dict[str, Any]:
+def _determined_by(sweep: OpenSweep, stage: Stage) -> dict[str, Any]:
     """Plain data of what the stage's runs have in common, apart from what is searched."""
     (point,) = stage.points
     source = stage.source

@@ -16,7 +16,7 @@ from music_rllib.config.search.settings import Rung, SearchSettings
 from music_rllib.experiment.plan import Run
 from music_rllib.search.study import Study
 from music_rllib.search.study_record import VALUES
-from music_rllib.store.run_record import Report
+from music_rllib.store.history import Report
 
 Array = NDArray[np.float64]
 

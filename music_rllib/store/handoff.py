@@ -38,7 +38,7 @@ from music_rllib.version import ALGORITHM_VERSION
 if TYPE_CHECKING:
     import gymnasium as gym
 
-Weights = Mapping[str, Mapping[str, npt.NDArray[Any]]]
+NetworkWeights = Mapping[str, Mapping[str, npt.NDArray[Any]]]
 """Arrays by module name and array name."""
 
 MANIFEST = "handoff.json"
@@ -154,8 +154,8 @@ class HandoffManifest(_Strict):
         return hashlib.sha256(canonical_json(content).encode()).hexdigest()[:20]
 
 
-def write_handoff(folder: Path, modules: Weights, info: HandoffInfo) -> HandoffManifest:
-    """Write `modules`, as `TrainingRun.modules` gives them, and their manifest into `folder`.
+def write_handoff(folder: Path, modules: NetworkWeights, info: HandoffInfo) -> HandoffManifest:
+    """Write network weights and their manifest into `folder`.
 
     Raises:
         ValueError: An array contains NaN or infinity: the run diverged, and none may start from it.

@@ -26,8 +26,8 @@ from typing import Any, TypeVar
 import pyarrow.fs as pafs
 
 from music_rllib.envs.fingerprint import Fingerprint
+from music_rllib.store.history import HISTORY, Report, RunResult, from_json_lines, last_values
 from music_rllib.store.object_folder import DamagedError, ObjectFolders, open_storage
-from music_rllib.store.run_record import HISTORY, Report, RunResult, from_json_lines, last_values
 from music_rllib.store.verified import Verified, fingerprint_of
 from music_rllib.store.work_folder import KEEP, WorkFolder, environment_of
 

@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 import pyarrow.fs as pafs
 
 from music_rllib.envs.fingerprint import Fingerprint
+from music_rllib.store.history import HISTORY, Report, from_json_lines
 from music_rllib.store.lease import LeaseFile
 from music_rllib.store.object_folder import DamagedError, Manifest, ObjectFolders
-from music_rllib.store.run_record import HISTORY, Report, from_json_lines
 
 FORMAT = "music_rllib checkpoint 2"
 KEEP = 2
@@ -41,7 +41,7 @@ class WorkFolder:
     @contextlib.contextmanager
     def new_checkpoint(
         self, env_steps: int, environment: Fingerprint | None = None
-    ) -> Iterator[Draft]:
+    ) -> Iterator[NewCheckpoint]:
         """Yield a draft to fill; it becomes the newest checkpoint when the `with` ends.
 
         Raises:
@@ -53,7 +53,7 @@ class WorkFolder:
         if environment is not None:
             meta["environment"] = dict(environment)
         with self._checkpoints.sealing(name, meta) as folder:
-            draft = Draft(folder, self._parts)
+            draft = NewCheckpoint(folder, self._parts)
             yield draft
             meta["parts"] = draft.needs
         self._prune(name)
@@ -76,7 +76,7 @@ class WorkFolder:
     @contextlib.contextmanager
     def newest(
         self, warn: Callable[[str], None] = warnings.warn, most: int | None = None
-    ) -> Iterator[Saved | None]:
+    ) -> Iterator[SavedCheckpoint | None]:
         """Yield a verified local copy of the newest sound checkpoint, or None.
 
         Args:
@@ -96,7 +96,7 @@ class WorkFolder:
                 return
         yield None
 
-    def _fetch(self, name: str, folder: Path) -> Saved:
+    def _fetch(self, name: str, folder: Path) -> SavedCheckpoint:
         manifest = self._checkpoints.fetch(name, folder / "checkpoint")
         if manifest.meta.get("format") != FORMAT:
             raise DamagedError(
@@ -107,7 +107,7 @@ class WorkFolder:
         for part in _needs(manifest):
             parts[part] = folder / "parts" / part
             self._parts.fetch(part, parts[part])
-        return Saved(folder / "checkpoint", parts, environment_of(manifest))
+        return SavedCheckpoint(folder / "checkpoint", parts, environment_of(manifest))
 
     def environment(self) -> Fingerprint | None:
         """Fingerprint of the environment of the newest sound checkpoint; None: it is not known."""
@@ -177,7 +177,7 @@ def environment_of(manifest: Manifest) -> Fingerprint | None:
     return {k: str(v) for k, v in found.items()} if isinstance(found, dict) else None
 
 
-class Saved(NamedTuple):
+class SavedCheckpoint(NamedTuple):
     """A verified copy of a checkpoint on the local disk."""
 
     folder: Path
@@ -186,7 +186,7 @@ class Saved(NamedTuple):
     environment: Fingerprint | None = None
 
 
-class Draft:
+class NewCheckpoint:
     """A checkpoint that is being written to `folder`, with its new parts in `parts`."""
 
     def __init__(self, folder: Path, parts: ObjectFolders) -> None:

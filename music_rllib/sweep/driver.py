@@ -31,9 +31,9 @@ from music_rllib.experiment.demand import check_demand
 from music_rllib.experiment.environments import Answer, changed_text, old_runs
 from music_rllib.experiment.listener import Listener
 from music_rllib.experiment.location import SweepLocation
+from music_rllib.experiment.open_sweep import OpenSweep, keep_record, open_sweep, remove_damaged
 from music_rllib.experiment.plan import make_plan, shared_runs
 from music_rllib.experiment.scheduler import Status
-from music_rllib.experiment.session import Sweep, keep_record, open_sweep, remove_damaged
 from music_rllib.experiment.sweep_files import as_json
 from music_rllib.redaction import redact
 from music_rllib.results.analysis_plan import PLANS_TO_READ, PlanVersion, as_document, record_plan
@@ -185,7 +185,7 @@ def _signal_of(stopped: KeyboardInterrupt | SystemExit) -> int:
     raise stopped
 
 
-def _open(console: Console, config: SweepConfig, *, lenient: bool) -> Sweep:
+def _open(console: Console, config: SweepConfig, *, lenient: bool) -> OpenSweep:
     """Check what can be checked without starting anything, and show the plan.
 
     Args:
@@ -225,7 +225,9 @@ def _open(console: Console, config: SweepConfig, *, lenient: bool) -> Sweep:
     return opened
 
 
-def _show_plan(console: Console, opened: Sweep, changes: str, *, measure: bool) -> dict[str, Any]:
+def _show_plan(
+    console: Console, opened: OpenSweep, changes: str, *, measure: bool
+) -> dict[str, Any]:
     """Record the analysis plan and, if asked, measure the cost; the plan as plain data."""
     if changes:
         _say(console, changes, "yellow")
@@ -242,7 +244,7 @@ def _show_plan(console: Console, opened: Sweep, changes: str, *, measure: bool) 
     return document
 
 
-def _drive(console: Console, opened: Sweep, again: Sequence[str]) -> int:
+def _drive(console: Console, opened: OpenSweep, again: Sequence[str]) -> int:
     """Run a sweep whose lock this process holds; the exit code.
 
     MLflow's runs of the keys `again` are out of date, because their results were deleted.
@@ -264,7 +266,7 @@ def _drive(console: Console, opened: Sweep, again: Sequence[str]) -> int:
         return _compute_and_report(console, opened, tracker)
 
 
-def _record_analysis_plan(console: Console, opened: Sweep) -> Sequence[PlanVersion]:
+def _record_analysis_plan(console: Console, opened: OpenSweep) -> Sequence[PlanVersion]:
     """Keep the analysis plan before anything runs; all of its versions."""
     versions = record_plan(opened)
     if versions:
@@ -275,7 +277,7 @@ def _record_analysis_plan(console: Console, opened: Sweep) -> Sequence[PlanVersi
     return versions
 
 
-def _open_tracker(opened: Sweep) -> Tracker:
+def _open_tracker(opened: OpenSweep) -> Tracker:
     from music_rllib.sweep.listeners.mlflow_view import VERSIONS, comparison_view
     from music_rllib.tracking.tracker import Tracker
 
@@ -289,7 +291,7 @@ def _open_tracker(opened: Sweep) -> Tracker:
     return tracker
 
 
-def _compute_and_report(console: Console, opened: Sweep, tracker: Tracker) -> int:
+def _compute_and_report(console: Console, opened: OpenSweep, tracker: Tracker) -> int:
     """Compute what is left and show the results; the exit code."""
     from music_rllib.sweep.listeners.mlflow import MlflowListener
     from music_rllib.sweep.listeners.screen import Display
@@ -339,7 +341,7 @@ def _lost_trials(searches: Sequence[Mapping[str, Any]]) -> int:
     return sum(t["lost"] for one in searches for arm in one["arms"] for t in arm["trials"])
 
 
-def _take_over_reused(opened: Sweep, display: Display, mlflow_log: MlflowListener) -> None:
+def _take_over_reused(opened: OpenSweep, display: Display, mlflow_log: MlflowListener) -> None:
     """List the reused runs, and log to MLflow those that it does not have."""
     reused = opened.scheduler.having(Status.REUSED)
     for node in reused[:LISTED_REUSED_RUNS]:
@@ -351,7 +353,7 @@ def _take_over_reused(opened: Sweep, display: Display, mlflow_log: MlflowListene
 
 
 def _compute(
-    opened: Sweep,
+    opened: OpenSweep,
     display: Display,
     mlflow_log: MlflowListener,
     state_file: StateFile,
@@ -394,7 +396,7 @@ def _compute(
 
 def _show_results(
     console: Console,
-    opened: Sweep,
+    opened: OpenSweep,
     tracker: Tracker,
     state_file: StateFile,
     searches: Sequence[dict[str, Any]],

@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Callable, Iterator
 
 from music_rllib.errors import FAILED
-from music_rllib.experiment.session import Sweep
+from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.runtime.ending import end_process
 from music_rllib.store.lease import HeldLease, Lease, LeaseFile
 from music_rllib.store.object_folder import StorageError, open_storage
@@ -22,7 +22,7 @@ def has_driver(storage: str, name: str) -> bool:
 
 
 @contextlib.contextmanager
-def hold_driver_lock(sweep: Sweep, say: Callable[[str], None] = print) -> Iterator[None]:
+def hold_driver_lock(sweep: OpenSweep, say: Callable[[str], None] = print) -> Iterator[None]:
     """Hold the lease of the sweep's driver, which one process on any machine can have at a time.
 
     A process that was suspended, and finds that another one drives the sweep by now, ends at once:

@@ -15,8 +15,9 @@ from music_rllib.config.run_settings import VARIANTS
 from music_rllib.config.schema import Stage
 from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.errors import BadInputError
-from music_rllib.experiment import session, sweep_files
+from music_rllib.experiment import sweep_files
 from music_rllib.experiment.location import SweepLocation
+from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.plan import Node
 from music_rllib.labels import in_runs
 from music_rllib.redaction import redact
@@ -71,7 +72,7 @@ def export_best(location: SweepLocation, stage_name: str | None, output: Path) -
 
 
 def _export_chosen(
-    opened: session.Sweep,
+    opened: OpenSweep,
     stage: Stage,
     sweep: Sweep,
     best: Mapping[str, Any],
@@ -129,7 +130,7 @@ def _export_chosen(
 
 
 def _best(
-    opened: session.Sweep,
+    opened: OpenSweep,
     stage: Stage,
     sweep: Sweep,
     metric: str,
@@ -149,7 +150,7 @@ def _best(
 
 
 def _scored(
-    opened: session.Sweep, stage: Stage, sweep: Sweep, best: Mapping[str, Any], metric: str
+    opened: OpenSweep, stage: Stage, sweep: Sweep, best: Mapping[str, Any], metric: str
 ) -> Scored | None:
     """The runs of the best condition, with their scores by a metric; None if there are none."""
     candidates = scored_conditions(stage.name, opened.plan, sweep, metric, best.get("task"))
@@ -166,7 +167,7 @@ def _middle_run(sweep: Sweep, condition: Condition, task: str, metric: str) -> R
     return sweep.runs[sorted(scores)[len(scores) // 2][2]] if scores else None
 
 
-def _export(opened: session.Sweep, key: str, folder: Path, chosen: Mapping[str, Any]) -> None:
+def _export(opened: OpenSweep, key: str, folder: Path, chosen: Mapping[str, Any]) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(dir=folder) as temporary:
@@ -184,7 +185,7 @@ def _export(opened: session.Sweep, key: str, folder: Path, chosen: Mapping[str, 
         raise StorageError(f"{place} must be writable: {error.strerror}") from error
 
 
-def sweep_of_run(sweep: session.Sweep, key: str, folder: Path) -> dict[str, Any]:
+def sweep_of_run(sweep: OpenSweep, key: str, folder: Path) -> dict[str, Any]:
     """A sweep's document that trains one run, and the runs that it starts from, to the same keys.
 
     A handoff from outside that it starts from is copied from a bucket into `folder`.
@@ -207,7 +208,7 @@ def sweep_of_run(sweep: session.Sweep, key: str, folder: Path) -> dict[str, Any]
     }
 
 
-def _stage(sweep: session.Sweep, node: Node, folder: Path) -> dict[str, Any]:
+def _stage(sweep: OpenSweep, node: Node, folder: Path) -> dict[str, Any]:
     """A stage with all settings of a node, except those that its variant refuses."""
     run = node.run
     settings = run.model_dump(mode="json", exclude={"task", "variant", "seed"})

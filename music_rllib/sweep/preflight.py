@@ -24,9 +24,9 @@ from music_rllib.envs.modules import folders_for_workers
 from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.errors import BadInputError
 from music_rllib.experiment import sweep_files
+from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.plan import Plan
 from music_rllib.experiment.scheduler import Scheduler, Status
-from music_rllib.experiment.session import Sweep
 from music_rllib.runtime.machine import check_reachable, cluster_address
 from music_rllib.runtime.signals import early
 from music_rllib.store.handoff import open_handoff, read_handoff
@@ -221,7 +221,7 @@ def verify_inputs(scheduler: Scheduler, store: NodeStore) -> None:
             store.verify(key)
 
 
-def check_searches(opened: Sweep) -> None:
+def check_searches(opened: OpenSweep) -> None:
     """Check that the studies of the searches can be opened."""
     if opened.plan.searched:
         from music_rllib.search.opening import check_studies
@@ -229,7 +229,7 @@ def check_searches(opened: Sweep) -> None:
         check_studies(opened)
 
 
-def check_ray(console: Console, opened: Sweep) -> None:
+def check_ray(console: Console, opened: OpenSweep) -> None:
     """Check that Ray answers and can hold a run, unless nothing is left to compute."""
     begun = (opened.folder / sweep_files.CONFIG).is_file()
     if opened.scheduler.complete and (begun or not opened.plan.searched):

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from music_rllib import names
+from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.plan import Node
-from music_rllib.experiment.session import Sweep
 from music_rllib.experiment.sweep_files import SEARCH, as_json, keep
 from music_rllib.search.controller import SearchController
 from music_rllib.search.opening import learnings, open_searches
@@ -18,7 +18,7 @@ from music_rllib.tracking.tracker import Tracker
 
 
 def begin_searches(
-    opened: Sweep, display: Display, mlflow_log: MlflowListener, state_file: StateFile
+    opened: OpenSweep, display: Display, mlflow_log: MlflowListener, state_file: StateFile
 ) -> SearchController:
     """Open the searches, recall their earlier trials, and plan the first runs."""
 
@@ -39,7 +39,7 @@ def begin_searches(
 
 
 def end_searches(
-    opened: Sweep, controller: SearchController, tracker: Tracker
+    opened: OpenSweep, controller: SearchController, tracker: Tracker
 ) -> list[dict[str, Any]]:
     """Stop the searches, and keep their outcome in the sweep's folder and in MLflow."""
     controller.stop()

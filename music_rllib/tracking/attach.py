@@ -11,7 +11,7 @@ from pathlib import Path
 
 from music_rllib import names
 from music_rllib.errors import TrackingError
-from music_rllib.experiment.session import Sweep
+from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.tracking.store import SweepRecord, TrackingStore, check_reachable, resolve_store
 
 
@@ -24,7 +24,7 @@ class SweepRun:
     run_id: str
 
     @classmethod
-    def of(cls, sweep: Sweep) -> SweepRun:
+    def of(cls, sweep: OpenSweep) -> SweepRun:
         """The run that the sweep's record names.
 
         Raises:

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from music_rllib import names
-from music_rllib.store.run_record import Report
+from music_rllib.store.history import Report
 
 # Okabe and Ito's colours, told apart by colour-blind readers; line styles tell them apart in grey.
 BLUE, VERMILION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"

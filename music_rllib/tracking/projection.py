@@ -20,7 +20,7 @@ from typing import NamedTuple
 from mlflow.entities import Metric
 
 from music_rllib import names
-from music_rllib.store.run_record import Report
+from music_rllib.store.history import Report
 from music_rllib.tracking.curve import learning_curve_png
 from music_rllib.tracking.mlflow_client import MAX_METRICS, Experiment, KnownRun, Status
 

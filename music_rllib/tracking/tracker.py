@@ -30,8 +30,8 @@ from music_rllib.experiment.run_info import RunInfo
 from music_rllib.redaction import flat_params, redact, without_secrets
 from music_rllib.runtime.provenance import provenance_tags
 from music_rllib.store.files import content_key
+from music_rllib.store.history import Report
 from music_rllib.store.paths import below, sweep_folder
-from music_rllib.store.run_record import Report
 from music_rllib.tracking.mlflow_client import Experiment, Status, check_metric_name, mlflow_reason
 from music_rllib.tracking.projection import End, RunProjection, Start, StoredRun
 from music_rllib.tracking.sender import Pending, Sender

@@ -9,7 +9,7 @@ import numpy as np
 from music_rllib import names
 from music_rllib.config.returns import Range, have_diverged, reward_of_step
 from music_rllib.config.run_settings import RunSettings
-from music_rllib.store.run_record import Report
+from music_rllib.store.history import Report
 
 
 def divergence(run: RunSettings, reports: Sequence[Report]) -> list[str]:

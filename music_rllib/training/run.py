@@ -21,7 +21,7 @@ from music_rllib.intrinsic.music import HELD_OUT_STEPS
 from music_rllib.replay.segments import Segment, new_segments
 from music_rllib.store.handoff import Spaces
 from music_rllib.store.state_io import read_arrays, read_state, write_arrays, write_state
-from music_rllib.store.work_folder import Draft, Saved
+from music_rllib.store.work_folder import NewCheckpoint, SavedCheckpoint
 from music_rllib.tac.algorithm import TAC
 from music_rllib.tac.config import TACConfig
 from music_rllib.tac.env_runner import DISPLACEMENT, MOVED, SUCCESS_ANY, SUCCESS_LAST
@@ -83,7 +83,7 @@ class TrainingRun:
 
     Args:
         run: The settings.
-        handoff: Weights to start from, by module name (`TAC.set_network_weights`).
+        handoff: Weights to start from, by network (`TAC.set_network_weights`).
         gpus: The networks train on a GPU where it is more than 0.
 
     Raises:
@@ -177,8 +177,8 @@ class TrainingRun:
             names.SYSTEM_MEMORY: self._process.memory_info().rss / 2**20,
         }
 
-    def modules(self) -> dict[str, dict[str, NDArray[Any]]]:
-        """Weights of every network, by module name, as a handoff carries them."""
+    def network_weights(self) -> dict[str, dict[str, NDArray[Any]]]:
+        """Weights of every network, by its name, as a handoff carries them."""
         return self.algorithm.get_network_weights()
 
     @property
@@ -186,7 +186,7 @@ class TrainingRun:
         """The environment's observation and action spaces."""
         return Spaces.of(*self.algorithm.env_runner.get_spaces()[DEFAULT_MODULE_ID])
 
-    def save(self, draft: Draft, *, alone: bool = False) -> None:
+    def save(self, draft: NewCheckpoint, *, alone: bool = False) -> None:
         """Write everything that `restore` needs to continue exactly from here.
 
         Of the replay, these are the trajectories that no earlier checkpoint of this run has, or all
@@ -213,7 +213,7 @@ class TrainingRun:
         }
         write_state(draft.folder, state)
 
-    def restore(self, saved: Saved, *, foreign: bool = False) -> None:
+    def restore(self, saved: SavedCheckpoint, *, foreign: bool = False) -> None:
         """Continue from what `save` wrote. Only before the first `advance`.
 
         After the checkpoint of another, `foreign` run, the next `save` writes all trajectories.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable
 
-from music_rllib.store.run_record import Report, last_values
+from music_rllib.store.history import Report, last_values
 
 
 class Throughput:

@@ -19,11 +19,8 @@ from music_rllib.config.run_settings import handed_over
 from music_rllib.experiment.continuation import budget_settings, continuation_key, is_continuable
 from music_rllib.redaction import redact
 from music_rllib.runtime.provenance import provenance_tags
-from music_rllib.store.handoff import Weights, read_handoff, write_handoff
-from music_rllib.store.lease import HeldLease, Lease, LeaseLostError
-from music_rllib.store.node_store import NodeStore
-from music_rllib.store.object_folder import StorageError
-from music_rllib.store.run_record import (
+from music_rllib.store.handoff import NetworkWeights, read_handoff, write_handoff
+from music_rllib.store.history import (
     HISTORY,
     Report,
     RunResult,
@@ -31,7 +28,10 @@ from music_rllib.store.run_record import (
     last_values,
     to_json_lines,
 )
-from music_rllib.store.work_folder import Draft, Saved, WorkFolder, steps_of
+from music_rllib.store.lease import HeldLease, Lease, LeaseLostError
+from music_rllib.store.node_store import NodeStore
+from music_rllib.store.object_folder import StorageError
+from music_rllib.store.work_folder import NewCheckpoint, SavedCheckpoint, WorkFolder, steps_of
 from music_rllib.training.divergence import divergence
 from music_rllib.training.environment import RunEnvironment
 from music_rllib.training.failure_reason import cause_of, trace_of
@@ -258,7 +258,7 @@ class RunTrainable(Trainable):
     def _restore(
         self,
         training: TrainingRun,
-        newest: AbstractContextManager[Saved | None],
+        newest: AbstractContextManager[SavedCheckpoint | None],
         other_run: str = "",
     ) -> bool:
         """Continue from a checkpoint of this or of another run; False where there is none."""
@@ -275,7 +275,7 @@ class RunTrainable(Trainable):
         self._notes.append(f"continues {other_run}at {training.env_steps:,} env steps")
         return True
 
-    def _source_weights(self) -> Weights | None:
+    def _source_weights(self) -> NetworkWeights | None:
         job = self._job
         if job.source_key is None or job.source_task is None:
             return None
@@ -341,12 +341,14 @@ class RunTrainable(Trainable):
             training.save(draft)
             self._write_history(draft)
             # The networks that act, for `load_policy`.
-            acting = {k: v for k, v in training.modules().items() if k in {"policy", "normaliser"}}
+            acting = {
+                k: v for k, v in training.network_weights().items() if k in {"policy", "normaliser"}
+            }
             with contextlib.suppress(ValueError):  # diverged: the end of the run will say so
                 self._write_outcome(draft.folder, training, acting)
         self._saved_at = time.monotonic()
 
-    def _write_history(self, draft: Draft) -> None:
+    def _write_history(self, draft: NewCheckpoint) -> None:
         (draft.folder / SECONDS).write_text(repr(self._seconds))
         (draft.folder / HISTORY).write_bytes(to_json_lines(self._history))
 
@@ -371,7 +373,7 @@ class RunTrainable(Trainable):
         with TemporaryDirectory() as temporary:
             folder = Path(temporary)
             (folder / HISTORY).write_bytes(to_json_lines(self._history))
-            self._write_outcome(folder, training, training.modules())
+            self._write_outcome(folder, training, training.network_weights())
             environment = self._environment.here
             self._store.publish(self._job.key, folder, result, environment, provenance_tags())
 

@@ -16,9 +16,9 @@ from music_rllib.experiment.listener import Failure, Listener
 from music_rllib.experiment.plan import Node
 from music_rllib.experiment.scheduler import Scheduler
 from music_rllib.redaction import redact
+from music_rllib.store.history import from_json_lines
 from music_rllib.store.node_store import NodeStore
 from music_rllib.store.object_folder import DamagedError
-from music_rllib.store.run_record import from_json_lines
 from music_rllib.training.failure_reason import cause_of
 from music_rllib.training.hang_watch import RECORD
 from music_rllib.training.job import NodeJob

@@ -16,9 +16,9 @@ from ray.tune.experiment import Trial
 from ray.tune.search import Searcher
 
 from music_rllib.experiment.listener import Listener
+from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.plan import Node
 from music_rllib.experiment.scheduler import Scheduler, Status
-from music_rllib.experiment.session import Sweep
 from music_rllib.runtime.machine import cluster_address
 from music_rllib.runtime.ray_cluster import cluster
 from music_rllib.store.object_folder import encoded
@@ -91,7 +91,7 @@ class DagSearcher(Searcher):
 
 
 def compute(
-    sweep: Sweep,
+    sweep: OpenSweep,
     listeners: Sequence[Listener],
     on_stop: Callable[[], None],
     on_ray_gone: Callable[[str | None], None],
@@ -177,7 +177,7 @@ def compute(
     return None if done else stopping.received
 
 
-def _may_share_processes(sweep: Sweep) -> bool:
+def _may_share_processes(sweep: OpenSweep) -> bool:
     """Whether runs may follow one another in a process, which saves seconds of imports each.
 
     A user's environment may keep state in its module, so its runs get a new process each.
@@ -201,7 +201,7 @@ def _trial_name(trial: Trial) -> str:
 
 
 @contextlib.contextmanager
-def _tune_folder(sweep: Sweep) -> Iterator[str]:
+def _tune_folder(sweep: OpenSweep) -> Iterator[str]:
     """A folder for the files of Tune, which nobody reads; all machines of the cluster reach it."""
     if cluster_address() is None:
         # Not in the storage: a full one must not end the runs that have no need of it.

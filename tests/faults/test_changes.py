@@ -18,18 +18,18 @@ from music_rllib.config.schema import SweepConfig
 from music_rllib.experiment import changes as changes_module
 from music_rllib.experiment.changes import changes_since, keep_settings, longer
 from music_rllib.experiment.continuation import continuation_key
+from music_rllib.experiment.open_sweep import OpenSweep, open_sweep
 from music_rllib.experiment.plan import make_plan
-from music_rllib.experiment.session import Sweep, open_sweep
 from music_rllib.store import lease as lease_module
+from music_rllib.store.history import RunResult
 from music_rllib.store.lease import Lease, LeaseFile
 from music_rllib.store.object_folder import StorageError
-from music_rllib.store.run_record import RunResult
 from music_rllib.sweep.driver_lock import hold_driver_lock
 
 RESULT = RunResult(label="l", env_steps=1200, seconds=1.0, metrics={})
 
 
-def opened(folder: Path, document: dict[str, Any]) -> Sweep:
+def opened(folder: Path, document: dict[str, Any]) -> OpenSweep:
     path = folder / "sweep.yaml"
     path.write_text(yaml.safe_dump(document, sort_keys=False))
     config: SweepConfig = load_sweep(path)
@@ -37,7 +37,7 @@ def opened(folder: Path, document: dict[str, Any]) -> Sweep:
     return open_sweep(config, make_plan(config), str(storage), storage / config.name)
 
 
-def finish(sweep: Sweep, folder: Path, *labels: str) -> None:
+def finish(sweep: OpenSweep, folder: Path, *labels: str) -> None:
     (folder / "made").mkdir(exist_ok=True)
     for node in sweep.plan.nodes:
         if node.label in labels:

@@ -10,8 +10,8 @@ from music_rllib.envs.fingerprint import Fingerprint
 from music_rllib.experiment.listener import Failure, Listener
 from music_rllib.experiment.plan import Node
 from music_rllib.experiment.run_info import run_info
+from music_rllib.store.history import Report, RunResult
 from music_rllib.store.node_store import NodeStore
-from music_rllib.store.run_record import Report, RunResult
 from music_rllib.tracking.from_store import finished_run
 from music_rllib.tracking.mlflow_client import Status
 from music_rllib.tracking.tracker import Tracker

@@ -20,7 +20,7 @@ from music_rllib.experiment.listener import Failure, Listener
 from music_rllib.experiment.plan import Node
 from music_rllib.experiment.scheduler import Scheduler, Status
 from music_rllib.store.files import write_atomically
-from music_rllib.store.run_record import Report, RunResult
+from music_rllib.store.history import Report, RunResult
 from music_rllib.tracking.sender import Pending
 
 TARGETS = ".prometheus"

@@ -15,7 +15,7 @@ from music_rllib.experiment.listener import Failure, Listener
 from music_rllib.experiment.plan import Node, Plan
 from music_rllib.experiment.scheduler import Scheduler, Status
 from music_rllib.labels import ShortLabels
-from music_rllib.store.run_record import Report, RunResult
+from music_rllib.store.history import Report, RunResult
 from music_rllib.sweep.views.tables import new_table
 from music_rllib.sweep.views.text import clock, evaluated_in_words, measured, percent
 from music_rllib.training.throughput import Throughput

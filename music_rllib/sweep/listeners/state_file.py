@@ -19,14 +19,14 @@ from typing import Any, Self
 from music_rllib.config.run_settings import VARIANTS
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.listener import Failure, Listener
+from music_rllib.experiment.open_sweep import OpenSweep, plan_document
 from music_rllib.experiment.plan import Node
 from music_rllib.experiment.scheduler import Status
-from music_rllib.experiment.session import Sweep, plan_document
 from music_rllib.results.read import LastValues
 from music_rllib.search.ranking import best_in_words, best_so_far
+from music_rllib.store.history import Report, RunResult, last_values
 from music_rllib.store.lease import process_start, this_machine
 from music_rllib.store.object_folder import StorageError
-from music_rllib.store.run_record import Report, RunResult, last_values
 from music_rllib.store.work_folder import steps_of
 from music_rllib.sweep.cost import searched
 
@@ -39,7 +39,7 @@ MOST_FAILURES = 1000
 class StateFile(Listener):
     """Keeps `state.json` up to date, and looks for `stop.json`, in a thread of its own."""
 
-    def __init__(self, sweep: Sweep) -> None:
+    def __init__(self, sweep: OpenSweep) -> None:
         """Describe `sweep`."""
         self._sweep = sweep
         self.searches: Callable[[], list[dict[str, Any]]] = list
@@ -262,7 +262,7 @@ class StateFile(Listener):
             sweep_files.keep(self._sweep, sweep_files.PLAN, plan)
 
 
-def _checkpointed_steps(sweep: Sweep) -> dict[str, int]:
+def _checkpointed_steps(sweep: OpenSweep) -> dict[str, int]:
     """Node key to the env steps in the last checkpoint of a run that is not finished."""
     begun = sweep.store.begun()
     nodes = (node for node in sweep.plan.nodes if node.key in begun)

@@ -5,14 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 from music_rllib.config.remarks import remarks
+from music_rllib.experiment.open_sweep import OpenSweep, plan_document
 from music_rllib.experiment.plan import shared_runs
-from music_rllib.experiment.session import Sweep, plan_document
 from music_rllib.redaction import redact
 from music_rllib.sweep.views.alpha import adaptive_rows, alpha_rows
 from music_rllib.sweep.views.search_budget import search_budget
 
 
-def plan_answer(opened: Sweep, changes: str) -> dict[str, Any]:
+def plan_answer(opened: OpenSweep, changes: str) -> dict[str, Any]:
     """The plan of a sweep, with what has changed since the sweep ran last."""
     config = opened.config
     searches = [

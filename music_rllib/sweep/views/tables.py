@@ -19,7 +19,7 @@ from music_rllib.experiment.plan import Node, Plan, short
 from music_rllib.experiment.scheduler import Status
 from music_rllib.labels import ShortLabels, in_runs
 from music_rllib.results.statistics import SHOW_SEEDS_BELOW, with_interval
-from music_rllib.store.run_record import RunResult
+from music_rllib.store.history import RunResult
 from music_rllib.sweep.views.search_budget import search_budget
 from music_rllib.sweep.views.text import clock, measured, percent
 

@@ -19,14 +19,14 @@ from typer.testing import CliRunner, Result
 from music_rllib import names
 from music_rllib.config.load import load_sweep
 from music_rllib.experiment.listener import Failure
+from music_rllib.experiment.open_sweep import keep_record, open_sweep
 from music_rllib.experiment.plan import Node, make_plan
-from music_rllib.experiment.session import keep_record, open_sweep
 from music_rllib.report.build import PAGE
 from music_rllib.report.cli import app
 from music_rllib.results.archive import Format, read_archive, write_archive
 from music_rllib.results.data import RunRecord, Sweep
 from music_rllib.results.read import read_sweep
-from music_rllib.store.run_record import HISTORY, Report, RunResult, last_values, to_json_lines
+from music_rllib.store.history import HISTORY, Report, RunResult, last_values, to_json_lines
 from music_rllib.sweep.listeners.state_file import StateFile
 
 STEPS = range(20_000, 100_001, 20_000)

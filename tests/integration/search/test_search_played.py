@@ -31,8 +31,8 @@ from music_rllib.config.search.settings import FINAL_SEED
 from music_rllib.config.tac_settings import LearnedAlpha
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.changes import changes_since, keep_settings
+from music_rllib.experiment.open_sweep import keep_record
 from music_rllib.experiment.scheduler import Status
-from music_rllib.experiment.session import keep_record
 from music_rllib.program import main
 from music_rllib.search.opening import learnings
 from music_rllib.search.summary import outcome

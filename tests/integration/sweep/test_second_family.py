@@ -281,7 +281,7 @@ def test_the_hand_is_trained_to_the_end_of_its_budget(variant: Variant, hindsigh
     metrics: dict[str, float] = {}
     while not training.finished:
         metrics |= training.advance()
-    modules = training.modules()
+    modules = training.network_weights()
     training.close()
     assert metrics[names.ENV_STEPS] == 200
     assert metrics[names.GRAD_UPDATES] == 20

@@ -28,8 +28,8 @@ from music_rllib.experiment.plan import node_key
 from music_rllib.intrinsic.music import HELD_OUT_STEPS
 from music_rllib.policy import find_policy, load_policy
 from music_rllib.store.handoff import read_handoff
+from music_rllib.store.history import from_json_lines
 from music_rllib.store.node_store import NodeStore
-from music_rllib.store.run_record import from_json_lines
 from music_rllib.training import run as run_module
 from music_rllib.training import sample_run
 from music_rllib.training.job import NodeJob
@@ -163,7 +163,7 @@ def test_music_f_begins_with_the_agent_that_it_was_handed(tmp_path: Path) -> Non
     folder = Path(NodeStore(str(tmp_path)).path(source.key))
     expected = read_handoff(folder, handed_over(node.run), POINT)
     assert set(expected) == {"policy", "critics", "value", "value_target", "normaliser"}
-    found = begun.modules()
+    found = begun.network_weights()
     # MUSIC-u's goals were zeros: of these the moments are no start (observation 4, goal 2).
     for name in ("count", "centre", "squares"):
         expected["normaliser"][name][4:] = 0.0
@@ -173,7 +173,7 @@ def test_music_f_begins_with_the_agent_that_it_was_handed(tmp_path: Path) -> Non
     begun.advance()
     begun.advance()
     inputs = begun.algorithm.replay.packed(0)["frames"][:, :6]
-    counts = begun.modules()["normaliser"]["count"]
+    counts = begun.network_weights()["normaliser"]["count"]
     np.testing.assert_array_equal(counts - np.array([630.0] * 4 + [0.0] * 2), len(inputs))
     normalised = begun.algorithm.env_runner.module.normaliser(torch.from_numpy(inputs)).numpy()
     np.testing.assert_allclose(normalised[:, 4:].std(axis=0), 1.0, rtol=1e-5)
@@ -189,7 +189,7 @@ def test_the_first_report_is_of_the_untrained_policy_and_changes_no_training() -
         while not run.finished:
             reports.append(run.advance())
         run.close()
-        return reports, run.modules()["policy"]
+        return reports, run.network_weights()["policy"]
 
     reports, policy = trained(looked_at=True)
     first, *rest = reports
@@ -214,7 +214,7 @@ def test_a_task_says_from_which_distance_on_something_has_moved() -> None:
         while not run.finished:
             run.advance()
         run.close()
-        return run.modules()["policy"]["0.weight"]
+        return run.network_weights()["policy"]["0.weight"]
 
     # Farther than anything gets there, and as far as the reward tells apart.
     np.testing.assert_array_equal(weights(100.0, "moved"), weights(None, "all"))
@@ -298,7 +298,9 @@ def test_a_nan_from_the_environment_is_named_and_the_last_checkpoint_stays(tmp_p
         again = TrainingRun(node.run)
         again.restore(saved)
         assert again.env_steps == 200
-        assert all(np.isfinite(a).all() for m in again.modules().values() for a in m.values())
+        assert all(
+            np.isfinite(a).all() for m in again.network_weights().values() for a in m.values()
+        )
         again.close()
 
 

@@ -15,13 +15,13 @@ from typer.testing import CliRunner
 
 from music_rllib import names
 from music_rllib.config.load import load_sweep
+from music_rllib.experiment.open_sweep import keep_record, open_sweep
 from music_rllib.experiment.plan import make_plan
 from music_rllib.experiment.run_info import run_info
-from music_rllib.experiment.session import keep_record, open_sweep
 from music_rllib.report.cli import app
 from music_rllib.results.archive import read_archive
 from music_rllib.results.data import Sweep
-from music_rllib.store.run_record import Report
+from music_rllib.store.history import Report
 from music_rllib.sweep.listeners.mlflow_view import VERSIONS, comparison_view
 from music_rllib.tracking.from_store import finished_run
 from music_rllib.tracking.tracker import Tracker

@@ -34,8 +34,8 @@ from music_rllib.experiment.run_info import RunInfo
 from music_rllib.policy import PolicyNetwork
 from music_rllib.report.build import PAGE
 from music_rllib.report.cli import main as report_on
+from music_rllib.store.history import HISTORY, Report, RunResult, last_values, to_json_lines
 from music_rllib.store.node_store import NodeStore
-from music_rllib.store.run_record import HISTORY, Report, RunResult, last_values, to_json_lines
 from music_rllib.sweep.listeners.state_file import StateFile
 from music_rllib.tracking.cli import app
 from music_rllib.tracking.policy_model import write_model
@@ -642,7 +642,7 @@ def test_a_second_store_starts_from_the_tables_of_the_first(
 DRIVER = """
 import sys, time
 from music_rllib import names
-from music_rllib.store.run_record import Report
+from music_rllib.store.history import Report
 from music_rllib.experiment.run_info import RunInfo
 from music_rllib.tracking.tracker import Tracker
 tracker = Tracker(sweep_name="smoke", storage=sys.argv[1], config={"name": "smoke", "seeds": [0]})

@@ -83,8 +83,8 @@ def test_a_password_in_the_tracking_uri_is_not_kept(
 ) -> None:
     """It should be in the environment; where it is not, the copy of the file leaves it out."""
     from music_rllib.config.load import load_sweep
+    from music_rllib.experiment.open_sweep import keep_record, open_sweep
     from music_rllib.experiment.plan import make_plan
-    from music_rllib.experiment.session import keep_record, open_sweep
 
     document = sweep_document
     document["mlflow"] = {"tracking_uri": "http://music:planted-in-a-uri@localhost:1"}

@@ -20,18 +20,18 @@ from music_rllib.experiment.environments import (
     remove_old,
     to_retrain,
 )
+from music_rllib.experiment.open_sweep import OpenSweep, open_sweep
 from music_rllib.experiment.plan import Node, make_plan
 from music_rllib.experiment.scheduler import Status
-from music_rllib.experiment.session import Sweep, open_sweep
+from music_rllib.store.history import RunResult
 from music_rllib.store.lease import Lease
-from music_rllib.store.run_record import RunResult
 
 OLD = {"package mujoco": "3.8.0", "source lab_env.py": "a"}
 NEW = {"package mujoco": "3.8.1", "source lab_env.py": "b"}
 RESULT = RunResult(label="l", env_steps=400, seconds=1.0, metrics={})
 
 
-def opened(folder: Path, environment: Fingerprint, name: str = "s", **defaults: Any) -> Sweep:
+def opened(folder: Path, environment: Fingerprint, name: str = "s", **defaults: Any) -> OpenSweep:
     """Two tasks; the second stage starts each of its runs from one on Lab."""
     lab = {"horizon": 20, "agent_indices": [0], "surrounding_indices": [1]}
     document = {
@@ -61,12 +61,12 @@ def opened(folder: Path, environment: Fingerprint, name: str = "s", **defaults: 
     return open_sweep(config, make_plan(config), storage, folder, environments=environments)
 
 
-def finish(sweep: Sweep, node: Node, environment: Fingerprint | None, folder: Path) -> None:
+def finish(sweep: OpenSweep, node: Node, environment: Fingerprint | None, folder: Path) -> None:
     (folder / "made").mkdir(exist_ok=True)
     sweep.store.publish(node.key, folder / "made", RESULT, environment)
 
 
-def finished(folder: Path, environment: Fingerprint | None = OLD) -> Sweep:
+def finished(folder: Path, environment: Fingerprint | None = OLD) -> OpenSweep:
     sweep = opened(folder, OLD)
     pretrain, finetune = sweep.plan.nodes
     finish(sweep, pretrain, environment, folder)
@@ -74,7 +74,7 @@ def finished(folder: Path, environment: Fingerprint | None = OLD) -> Sweep:
     return sweep
 
 
-def text_of(sweep: Sweep) -> str | None:
+def text_of(sweep: OpenSweep) -> str | None:
     return changed_text(sweep, old_runs(sweep))
 
 

@@ -17,8 +17,8 @@ from music_rllib import names
 from music_rllib.config.load import load_sweep
 from music_rllib.experiment.changes import keep_settings
 from music_rllib.experiment.listener import Failure
+from music_rllib.experiment.open_sweep import OpenSweep, keep_record, open_sweep
 from music_rllib.experiment.plan import Node, make_plan
-from music_rllib.experiment.session import Sweep, keep_record, open_sweep
 from music_rllib.program import main
 from music_rllib.report import cli as report
 from music_rllib.report.limitations import missing
@@ -26,9 +26,9 @@ from music_rllib.report.web.sections import failures
 from music_rllib.results.analysis import analyse
 from music_rllib.results.read import read_sweep
 from music_rllib.results.study import study_of
+from music_rllib.store.history import HISTORY, Report, RunResult, last_values, to_json_lines
 from music_rllib.store.object_folder import DamagedError
 from music_rllib.store.paths import sweep_folder
-from music_rllib.store.run_record import HISTORY, Report, RunResult, last_values, to_json_lines
 from music_rllib.sweep.listeners.state_file import StateFile
 
 CODE = {names.TAG_GIT_COMMIT: "c0ffee", f"{names.TAG_VERSION_PREFIX}torch": "2.0"}
@@ -59,7 +59,7 @@ def reports(q: float, seed: int, steps: int) -> list[Report]:
 
 def opened_sweep(
     folder: Path, stage: dict[str, Any], steps: int = 2000, seeds: int = 3, name: str = "s"
-) -> Sweep:
+) -> OpenSweep:
     """A sweep that a driver has begun, with one stage."""
     content = {
         "name": name,
@@ -78,7 +78,7 @@ def opened_sweep(
     return opened
 
 
-def publish(sweep: Sweep, node: Node, history: list[Report]) -> None:
+def publish(sweep: OpenSweep, node: Node, history: list[Report]) -> None:
     """As if the run had been trained."""
     with TemporaryDirectory() as folder:
         (Path(folder) / HISTORY).write_bytes(to_json_lines(history))
@@ -100,7 +100,7 @@ def play(
     *,
     name: str = "s",
     stops_after: int | None = None,
-) -> Sweep:
+) -> OpenSweep:
     """A driver's whole run of a sweep, or its first runs; the next one has a checkpoint."""
     opened = opened_sweep(folder, {"grid": {"tac.entropic_index": list(qs)}}, steps, seeds, name)
     left = [node for node in opened.plan.nodes if not opened.store.is_finished(node.key)]
@@ -246,7 +246,7 @@ def test_a_running_sweep_shows_its_runs_as_running(tmp_path: Path) -> None:
 def test_a_search_that_is_changed_shows_the_trials_of_its_plan(tmp_path: Path) -> None:
     """As its driver records it; and a driver that only begins loses no trial of the record."""
 
-    def begun(low: float) -> Sweep:
+    def begun(low: float) -> OpenSweep:
         search = {"space": {"tac.alpha": {"float": [low, 0.5]}}, "trials": 3}
         return opened_sweep(tmp_path, {"search": search})
 

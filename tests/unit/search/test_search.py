@@ -23,7 +23,7 @@ from music_rllib.search.objective import aggregate, prune, score
 from music_rllib.search.sampler import Proposer, trial_at
 from music_rllib.search.storage import same_database
 from music_rllib.search.study_record import VALUES, fits
-from music_rllib.store.run_record import Report
+from music_rllib.store.history import Report
 from tests.played_search import Document, document
 
 

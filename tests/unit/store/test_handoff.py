@@ -15,7 +15,7 @@ from music_rllib.config.run_settings import RunSettings, preset
 from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.store.handoff import (
     HandoffError,
-    Weights,
+    NetworkWeights,
     open_handoff,
     read_handoff,
     write_handoff,
@@ -27,7 +27,7 @@ RUN = RunSettings.model_validate(
     {"task": PUSH, "variant": "music-u", "seed": 0, "music": preset("music-u", PUSH)}
 )
 INFO = RUN.handoff_info("0" * 20, 6000, SPACES)
-WEIGHTS: Weights = {
+WEIGHTS: NetworkWeights = {
     "mi_estimator": {"x.weight": np.arange(6, dtype=np.float32).reshape(2, 3)},
     "normaliser": {"count": np.array(7, np.int64), "mean": np.linspace(0, 1, 5)},
 }
@@ -164,7 +164,7 @@ def test_a_diverged_run_hands_nothing_over(tmp_path: Path) -> None:
 
 
 def test_the_content_hash_follows_weights_and_task_only(tmp_path: Path) -> None:
-    def content_hash(name: str, weights: Weights, **changes: Any) -> str:
+    def content_hash(name: str, weights: NetworkWeights, **changes: Any) -> str:
         info = INFO.model_copy(update=changes)
         return write_handoff(tmp_path / name, weights, info).content_hash
 

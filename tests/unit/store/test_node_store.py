@@ -15,9 +15,7 @@ from fsspec.implementations.memory import MemoryFileSystem  # type: ignore[impor
 
 from music_rllib.store import object_folder, verified
 from music_rllib.store.files import canonical_json, write_atomically
-from music_rllib.store.node_store import NodeStore
-from music_rllib.store.object_folder import DamagedError, ObjectFolders, StorageError, open_storage
-from music_rllib.store.run_record import (
+from music_rllib.store.history import (
     HISTORY,
     Report,
     RunResult,
@@ -25,6 +23,8 @@ from music_rllib.store.run_record import (
     last_values,
     to_json_lines,
 )
+from music_rllib.store.node_store import NodeStore
+from music_rllib.store.object_folder import DamagedError, ObjectFolders, StorageError, open_storage
 from music_rllib.store.work_folder import steps_of
 
 KEY = "0123456789abcdef0123"

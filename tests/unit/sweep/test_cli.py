@@ -12,7 +12,7 @@ import yaml
 
 from music_rllib.config.run_settings import RunSettings, preset
 from music_rllib.envs.tasks import BUILT_IN_TASKS
-from music_rllib.experiment.session import Sweep, open_sweep
+from music_rllib.experiment.open_sweep import OpenSweep, open_sweep
 from music_rllib.program import main
 from music_rllib.store.handoff import write_handoff
 from music_rllib.sweep import driver
@@ -348,9 +348,9 @@ def test_a_damaged_node_that_others_start_from(
     program: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     finetune = {"name": "f", "variant": "music-r", "init_from": "pretrain"}
-    opened: list[Sweep] = []
+    opened: list[OpenSweep] = []
 
-    def remember(*arguments: Any, **options: Any) -> Sweep:
+    def remember(*arguments: Any, **options: Any) -> OpenSweep:
         opened.append(open_sweep(*arguments, **options))
         return opened[-1]
 

@@ -21,9 +21,9 @@ from music_rllib.config.load import load_sweep
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.experiment import location, sweep_files
 from music_rllib.experiment.continuation import continuation_key
+from music_rllib.experiment.open_sweep import OpenSweep, keep_record, open_sweep, remove_damaged
 from music_rllib.experiment.plan import Node, make_plan
 from music_rllib.experiment.scheduler import Status
-from music_rllib.experiment.session import Sweep, keep_record, open_sweep, remove_damaged
 from music_rllib.experiment.sweep_files import as_json
 from music_rllib.labels import ShortLabels
 from music_rllib.program import main
@@ -33,9 +33,9 @@ from music_rllib.results.read import read_sweep
 from music_rllib.results.study import study_of
 from music_rllib.store import node_store, object_folder, paths
 from music_rllib.store.handoff import write_handoff
+from music_rllib.store.history import HISTORY, Report, RunResult, to_json_lines
 from music_rllib.store.object_folder import DamagedError
 from music_rllib.store.paths import sweep_folder
-from music_rllib.store.run_record import HISTORY, Report, RunResult, to_json_lines
 from music_rllib.sweep import clean, driver, driver_lock
 from music_rllib.sweep.export import sweep_of_run
 from music_rllib.sweep.listeners.state_file import StateFile
@@ -99,7 +99,7 @@ def program(capsys: pytest.CaptureFixture[str]) -> Program:
     return run
 
 
-def opened(storage: str, tmp_path: Path, **changes: Any) -> Sweep:
+def opened(storage: str, tmp_path: Path, **changes: Any) -> OpenSweep:
     path = tmp_path / "sweep.yaml"
     path.write_text(yaml.safe_dump(SWEEP | changes))
     config = load_sweep(path, storage=storage)
@@ -110,7 +110,7 @@ def opened(storage: str, tmp_path: Path, **changes: Any) -> Sweep:
 
 
 def finish(
-    sweep: Sweep,
+    sweep: OpenSweep,
     state_file: StateFile,
     node: Node,
     value: float,
@@ -136,7 +136,7 @@ def finish(
 HEIGHTS = {1.0: 0.2, 1.5: 0.8, 2.0: 0.3}
 
 
-def played(storage: str, tmp_path: Path, runs: int = 9, seeds: int = 3) -> Sweep:
+def played(storage: str, tmp_path: Path, runs: int = 9, seeds: int = 3) -> OpenSweep:
     sweep = opened(storage, tmp_path, seeds=list(range(seeds)))
     with StateFile(sweep) as state_file:
         for node in list(sweep.plan.nodes)[:runs]:
@@ -446,7 +446,7 @@ def test_clean_keeps_a_last_checkpoint_that_another_sweep_shares(
     assert not last.names()
 
 
-def from_handoff(storage: str, tmp_path: Path, name: str = "mine") -> Sweep:
+def from_handoff(storage: str, tmp_path: Path, name: str = "mine") -> OpenSweep:
     """A sweep of one run from a handoff in `tmp_path`, which has been taken into the storage."""
     folder = tmp_path / "given"
     pretrained = resolved(SWEEP | {"stages": [{"name": "p", "variant": "music-u"}]}, tmp_path)

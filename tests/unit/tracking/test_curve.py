@@ -9,7 +9,7 @@ import sys
 import numpy as np
 
 from music_rllib import names
-from music_rllib.store.run_record import Report
+from music_rllib.store.history import Report
 from music_rllib.tracking.curve import learning_curve, learning_curve_png
 
 

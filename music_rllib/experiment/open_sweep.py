@@ -19,14 +19,14 @@ from music_rllib.experiment.scheduler import DONE, Scheduler
 from music_rllib.experiment.sweep_files import CONFIG, IN_STORAGE, PLAN, as_json, keep, read
 from music_rllib.labels import ShortLabels
 from music_rllib.redaction import redact, redact_yaml, without_secrets
+from music_rllib.store.history import RunResult
 from music_rllib.store.node_store import NodeStore, damage_in_words
 from music_rllib.store.object_folder import DamagedError, StorageError
 from music_rllib.store.paths import database_url
-from music_rllib.store.run_record import RunResult
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sweep:
+class OpenSweep:
     """A planned sweep, its storage open."""
 
     config: SweepConfig
@@ -63,7 +63,7 @@ def open_sweep(
     *,
     environments: Mapping[str, Fingerprint] | None = None,
     lenient: bool = False,
-) -> Sweep:
+) -> OpenSweep:
     """Open the storage, and find the runs in it that are finished and undamaged.
 
     Damaged ones are refused, or where `lenient` they wait for `remove_damaged`.
@@ -78,7 +78,7 @@ def open_sweep(
     if damaged and not lenient:
         raise DamagedError(damage_in_words({labels[key]: why for key, why in damaged.items()}))
     finished = published & {node.key for node in plan.nodes}
-    return Sweep(
+    return OpenSweep(
         config=config,
         plan=plan,
         storage=storage,
@@ -92,7 +92,7 @@ def open_sweep(
     )
 
 
-def remove_damaged(sweep: Sweep, say: Callable[[str], None]) -> None:
+def remove_damaged(sweep: OpenSweep, say: Callable[[str], None]) -> None:
     """Delete the damaged nodes, and say which; the caller must hold the sweep's lock."""
     for key, text in sweep.damaged.items():
         sweep.store.remove(key)
@@ -115,7 +115,7 @@ def _labels(config: SweepConfig, plan: Plan, storage: str) -> dict[str, str]:
     return labels
 
 
-def plan_document(sweep: Sweep) -> dict[str, Any]:
+def plan_document(sweep: OpenSweep) -> dict[str, Any]:
     """The content of `plan.json`: all nodes, those of searches as far as they are chosen.
 
     And the nodes of earlier plans that this one does not have.
@@ -141,7 +141,7 @@ def plan_document(sweep: Sweep) -> dict[str, Any]:
     }
 
 
-def keep_record(sweep: Sweep) -> None:
+def keep_record(sweep: OpenSweep) -> None:
     """Write the configuration and the plan into the sweep's folder.
 
     Raises:
@@ -165,7 +165,7 @@ def keep_record(sweep: Sweep) -> None:
         keep(sweep, PLAN, as_json(plan_document(sweep)))
 
 
-def _recorded_plan(sweep: Sweep, configuration: str) -> dict[str, Any] | None:
+def _recorded_plan(sweep: OpenSweep, configuration: str) -> dict[str, Any] | None:
     """The content of `plan.json` if the plan has not changed since; else None."""
     with contextlib.suppress(StorageError):
         plan: dict[str, Any] | None = read(sweep.storage, f"{sweep.config.name}/{PLAN}")
