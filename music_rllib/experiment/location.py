@@ -12,7 +12,7 @@ from music_rllib.config.load import load_sweep
 from music_rllib.config.schema import SweepConfig
 from music_rllib.errors import BadInputError
 from music_rllib.experiment import sweep_files
-from music_rllib.experiment.earlier import in_words
+from music_rllib.experiment.earlier import earlier_text
 from music_rllib.experiment.open_sweep import OpenSweep, open_sweep
 from music_rllib.experiment.plan import make_plan
 from music_rllib.experiment.sweep_files import IN_STORAGE
@@ -102,7 +102,7 @@ class SweepLocation:
             return None
         store = NodeStore(self.storage)
         known = store.begun() | store.finished(one["key"] for one in recorded)
-        return in_words(one for one in recorded if one["key"] in known)
+        return earlier_text(one for one in recorded if one["key"] in known)
 
     @property
     def place(self) -> str:
