@@ -92,7 +92,7 @@ def measure(name: str, repeats: int) -> Iterator[Row]:
     import torch
 
     from benchmarks.measure import start_ray
-    from music_rllib.runtime.allocator import keep_freed_memory
+    from music_rllib.runtime.process import keep_freed_memory
 
     quiet_third_parties()
     torch.set_num_threads(1)

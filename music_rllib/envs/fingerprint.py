@@ -36,7 +36,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from music_rllib.envs.make import _register_robotics
+from music_rllib.envs.make import register_robotics
 from music_rllib.envs.modules import is_installed, make_importable
 from music_rllib.envs.tasks import BUILT_IN_TASKS
 
@@ -68,7 +68,7 @@ def fingerprint_of(env_id: str, env_kwargs: Mapping[str, Any]) -> Fingerprint:
     if env_id in {task.env_id for task in BUILT_IN_TASKS.values()}:
         found = {_PACKAGE + name: _version(name) for name in ("gymnasium-robotics", "mujoco")}
         return found | _files_of_arguments(env_kwargs)
-    _register_robotics()
+    register_robotics()
     walk = _Walk()
     for module in _modules_of(env_id):
         walk.visit(module, is_root=True)

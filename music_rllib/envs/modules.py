@@ -1,8 +1,8 @@
-"""Where the module of a user's environment is looked for, beside the installed ones.
+"""Find the module of a user's environment.
 
-`env_id: lab_env:Lab-v0` imports `lab_env` first. It may be installed or on PYTHONPATH, lie beside
-the sweep's file, or in the current folder. The folders come last in `sys.path`, and only when a
-module is asked for, so that a `random.py` or `queue.py` there never replaces Python's own.
+`env_id: lab_env:Lab-v0` imports `lab_env` first. The module may be installed, be on PYTHONPATH, or
+lie beside the sweep's file or in the current folder. These two folders are appended to `sys.path`
+when a module is needed, so that a `random.py` there never replaces Python's own.
 """
 
 from __future__ import annotations
@@ -19,15 +19,16 @@ _folders: dict[str, None] = {}
 
 
 def search_in(*folders: str | Path) -> None:
-    """Adds folders in which `make_importable` looks; relative ones start at the current folder."""
+    """Add folders that `make_importable` searches."""
     with contextlib.suppress(FileNotFoundError):  # the current folder was deleted
         _folders.update(dict.fromkeys(str(Path(folder).absolute()) for folder in folders))
 
 
 def folders_for_workers() -> tuple[str, ...]:
-    """The folders for `search_in` in a worker, those below the current folder also relative to it.
+    """The folders for `search_in` in a worker.
 
-    The working folder of a Ray job lies elsewhere on another node, and has the same content.
+    Folders below the current one are also given relative to it, since the working folder of a Ray
+    job has the same content on every node, but not the same path.
     """
     search_in(".")
     with contextlib.suppress(FileNotFoundError):
@@ -38,10 +39,10 @@ def folders_for_workers() -> tuple[str, ...]:
 
 
 def make_importable(module: str) -> None:
-    """Lets a module of the user's be imported, from one of the folders if it is not installed.
+    """Make a user's module importable from one of the folders, unless it is installed.
 
     Raises:
-        ImportError: There is no such module, or an installed one of the same name hides it.
+        ImportError: There is no such module, or an installed one has the same name.
     """
     search_in(".")
     sys.path += [folder for folder in _folders if folder not in sys.path]
@@ -66,7 +67,7 @@ def make_importable(module: str) -> None:
 
 
 def is_installed(file: str) -> bool:
-    """Whether a module's file is of Python itself or of an installed package."""
+    """Whether a module's file belongs to Python or to an installed package."""
     path = Path(file)
     return not path.is_absolute() or any(map(path.resolve().is_relative_to, _installed()))
 
@@ -78,3 +79,15 @@ def _installed() -> tuple[Path, ...]:
     folders += [*site.getsitepackages(), site.getusersitepackages()]
     folders += [one for one in sys.path if Path(one).name in {"site-packages", "dist-packages"}]
     return tuple({Path(one).resolve() for one in folders})
+
+
+def drop_farama_notice() -> None:
+    """Remove the notice about the Adroit hand, which `gymnasium_robotics` prints on import."""
+    try:
+        import farama_notifications as farama
+    except ImportError:
+        return
+    notice = getattr(farama, "GYMNASIUM_ROBOTICS_ADROIT_WARNING", None)
+    versions = farama.notifications.get("gymnasium_robotics", {})
+    for version in [version for version, text in versions.items() if text == notice]:
+        del versions[version]

@@ -24,19 +24,23 @@ import numpy as np
 from gymnasium import spaces
 from pydantic import BaseModel
 
+from music_rllib.envs.episodes import Episode, Recording
 from music_rllib.envs.make import (
     Env,
-    check_action_space,
     goal_reward_of,
     make_env,
     moved_distance_of,
-    observation_sizes,
     reset_seed,
+)
+from music_rllib.envs.tasks import Task, beyond_observation, closest
+from music_rllib.envs.values import (
+    BadNumberError,
+    check_action_space,
+    flag_of,
+    observation_sizes,
+    shown,
     to_bounds,
 )
-from music_rllib.envs.numbers import BadNumberError, flag_of, shown
-from music_rllib.envs.recording import Episode, Recording
-from music_rllib.envs.tasks import Task, beyond_observation, closest
 from music_rllib.errors import first_line, in_words
 from music_rllib.replay.buffer import GoalReward
 from music_rllib.replay.trajectories import ReplayLayout

@@ -1,1 +1,1 @@
-"""The process and the machine: Ray clusters, signals, memory, third-party noise."""
+"""The process and the machine: Ray, signals, memory, third-party messages."""

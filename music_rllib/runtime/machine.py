@@ -1,4 +1,4 @@
-"""This machine, and the Ray cluster that the environment names. Loads no Ray."""
+"""Resources of this machine, and the address of a Ray cluster. Does not import Ray."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ if TYPE_CHECKING:
 
 REACH_SECONDS = 5.0
 SOCKET_BYTES = 107
-"""Longest path of a UNIX socket on Linux."""
+"""Maximum length of a UNIX socket's path on Linux."""
 RAY_FOLDER = "mr-"
-"""Beginning of the name of a local Ray's folder."""
+"""Prefix of a local Ray's folder."""
 LONGEST_SOCKET = len(
     f"/{RAY_FOLDER}12345678/r/session_2026-11-26_07-59-49_813210_4194304/sockets/plasma_store"
 )
 MEMORY_LIMITS = ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory.max")
-"""Files with a container's memory limit, for either version of cgroups."""
+"""Files with a container's memory limit, of both versions of cgroups."""
 
 
 class ClusterError(BadInputError, RuntimeError):
-    """Ray cannot be reached, or cannot hold a single run."""
+    """Ray cannot be reached, or cannot hold a run."""
 
 
 def cluster_address() -> str | None:
@@ -39,10 +39,10 @@ def cluster_address() -> str | None:
 
 
 def check_reachable(address: str) -> None:
-    """Connect to a cluster's address once, as Ray itself would retry for minutes.
+    """Connect to a cluster's address once; Ray itself would retry for minutes.
 
     Raises:
-        ClusterError: Nothing answers, or it is no address of a cluster.
+        ClusterError: There is no answer, or it is not an address of a cluster.
     """
     if address == "auto":
         return
@@ -61,13 +61,13 @@ def check_reachable(address: str) -> None:
 
 
 def ray_parent() -> Path:
-    """Folder in which a local Ray may have one: the paths of its sockets below it fit.
+    """Parent folder for a local Ray, short enough for the paths of its sockets.
 
-    The first that fits of RAY_TMPDIR, the system's folder for temporary files (TMPDIR), /tmp and a
-    few others. Batch systems often set a long TMPDIR.
+    The first suitable one of RAY_TMPDIR, TMPDIR, /tmp and a few others. Batch systems often set a
+    long TMPDIR.
 
     Raises:
-        ClusterError: None of them fits and is writable.
+        ClusterError: None is short enough and writable.
     """
     given, *last = map(os.environ.get, ("RAY_TMPDIR", "XDG_RUNTIME_DIR", "HOME"))
     common = ("/tmp", "/var/tmp")  # noqa: S108 - the folder in it gets a random name and mode 0700
@@ -84,7 +84,7 @@ def ray_parent() -> Path:
 
 
 def check_cpus(resources: Resources) -> int | None:
-    """Number of CPUs for a local Ray; None to let Ray decide, or if a cluster is used.
+    """Number of CPUs for a local Ray; None if Ray decides, or with a cluster.
 
     Raises:
         ClusterError: This machine has fewer CPUs than `resources` asks for.
@@ -102,7 +102,7 @@ def check_cpus(resources: Resources) -> int | None:
 
 
 def check_memory_and_gpus(resources: Resources) -> None:
-    """Check that this machine can hold a run, unless a cluster is used.
+    """Check that this machine can hold a run; with a cluster, do nothing.
 
     Raises:
         ClusterError: This machine has less memory or fewer GPUs than a run reserves.
@@ -136,7 +136,7 @@ def memory() -> int:
 
 
 def claimable() -> int:
-    """Bytes that Linux by default lets a process allocate at once: all memory and swap."""
+    """Bytes that Linux lets a process allocate at once by default: memory and swap."""
     return int(psutil.virtual_memory().total + psutil.swap_memory().total)
 
 

@@ -1,4 +1,4 @@
-"""Tags that name the code of a run: git commit and package versions."""
+"""Tags with the versions of packages and the git commit of a run."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ GIT_SECONDS = 5.0
 
 @cache
 def provenance_tags() -> dict[str, str]:
-    """Tags of the versions that a result depends on, and of the git commit of a checkout."""
+    """Versions of the packages that determine a result, and the git commit of a checkout."""
     tags = {names.TAG_VERSION_PREFIX + "python": platform.python_version()}
     for package in PACKAGES:
         try:
@@ -41,8 +41,8 @@ def provenance_tags() -> dict[str, str]:
 def git_commit(file: Path) -> str | None:
     """Commit of the repository that tracks `file`, with `-dirty` if it has uncommitted changes.
 
-    None if no repository tracks it: the virtual environment of an installed package may lie in a
-    checkout of something else, whose commit would mislead.
+    None if no repository tracks it. The virtual environment of an installed package may be inside
+    the checkout of another project.
     """
     folder = file.resolve().parent
     if _git(folder, "ls-files", "--error-unmatch", file.name) is None:

@@ -1,13 +1,8 @@
-"""Hides third-party notices that a user cannot act on, in the driver and in workers.
+"""Hide third-party messages that a user cannot act on, in the driver and in workers.
 
-There are two steps, because some libraries read their switches while they are imported:
-
-1. An entry point calls `prepare_environment` first, before `import ray`.
-2. `quiet_third_parties` runs in the driver and, in Ray's setup hook (`runtime.ray_cluster`), in
-   every worker.
-
-Each filter names a logger and the beginning of a message, or hides a logger's messages below
-WARNING. New warnings and all errors are still shown.
+An entry point calls `prepare_environment` before `import ray`, because Ray and MLflow read their
+environment variables when they are imported. `quiet_third_parties` runs in the driver and, in Ray's
+setup hook (`runtime.ray_cluster`), in every worker. New warnings and all errors are still shown.
 """
 
 from __future__ import annotations
@@ -20,26 +15,24 @@ import warnings
 from functools import partial
 from pathlib import Path
 
-from music_rllib.envs.farama_notice import drop_farama_notice
+from music_rllib.envs.modules import drop_farama_notice
 from music_rllib.runtime.machine import cluster_address
 
-# Logger -> beginnings of messages at WARNING level. All are about our own use of the library and
-# expected, and a user can do nothing about them.
+# Logger -> beginnings of expected messages at WARNING level about this package's use of a library.
 _EXPECTED_NOTICES: dict[str, tuple[str, ...]] = {
-    # Once per algorithm class; the new API stack is the one this package is written for.
+    # Once per algorithm class; this package uses the new API stack.
     "ray.rllib.algorithms.algorithm_config": ("You are running ",),
     # RLModule's own constructor builds the deprecated object (rllib/core/rl_module/rl_module.py).
     "ray._common.deprecation": (
         "DeprecationWarning: `RLModule(config=[RLModuleConfig object])` has been deprecated.",
     ),
-    # GPUtil is unmaintained, and psutil measures our processes. Tune also warns of any callback
-    # that takes half a second, as all do on a busy machine ("The `...").
+    # GPUtil is unmaintained, and psutil measures our processes. On a busy machine, Tune also warns
+    # about every callback that takes half a second ("The `...").
     "ray.tune.utils.util": ("Install gputil for GPU system monitoring.", "The `"),
 }
 
-# Loggers whose INFO messages repeat what the command line says, or mean nothing to a user.
+# Loggers whose INFO messages repeat the program's output, or mean nothing to a user.
 _CHATTY_LOGGERS = (
-    "ray._private.worker",  # "Started a local Ray instance."
     "ray.tune.tune",  # "Wrote the latest version of all result files ..."
     "ray.tune.trainable.trainable",  # "Trainable.setup took ..."
     "ray.train._internal.storage",  # "Checkpoint successfully created at ..."
@@ -52,25 +45,25 @@ _CHATTY_LOGGERS = (
 )
 
 LOCAL_RAY_BEYOND_LOOPBACK = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
-"""If "0", Ray's address is 127.0.0.1, and no other node can join. Ray reads it when imported."""
+"""If "0", Ray listens on 127.0.0.1 only. It is named after the systems with this default."""
 
 
 def _is_shown(beginnings: tuple[str, ...], record: logging.LogRecord) -> bool:
     return record.levelno >= logging.ERROR or not record.getMessage().startswith(beginnings)
 
 
-# Made once, because a logger ignores a filter that it has already.
+# Created once, because a logger ignores a filter that it already has.
 _FILTERS = {name: partial(_is_shown, texts) for name, texts in _EXPECTED_NOTICES.items()}
 
 
 def prepare_environment() -> None:
     """Set environment variables for Ray and MLflow, unless the user has set them.
 
-    Must run before `import ray`, which reads its configuration once. The workers of a local Ray
-    inherit the variables; those of a running cluster do not.
+    Call it before `import ray`. The workers of a local Ray inherit the variables; those of a
+    running cluster do not.
     """
-    # A `types.py` in the current folder would break each Python that a library or Ray starts. Not
-    # in the folder of a package that is not installed: these find it there.
+    # A `types.py` in the current folder would break every Python process that Ray starts. In the
+    # folder of a checkout that is not installed, these processes need the current folder.
     with contextlib.suppress(FileNotFoundError):
         if Path.cwd() != Path(__file__).parents[2]:
             os.environ.setdefault("PYTHONSAFEPATH", "1")
@@ -81,16 +74,15 @@ def prepare_environment() -> None:
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
     # MLflow reads the commit through GitPython, which prints a long warning if git is missing.
     os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
-    # A local Ray would begin with a worker per CPU, which no run can use: theirs have a setup hook.
+    # A local Ray would start a worker per CPU without the setup hook, which no run can use.
     os.environ.setdefault("RAY_prestart_worker_first_driver", "0")
     if cluster_address() is not None:
         return
-    # By default every process of a local Ray listens on all addresses, its `/metrics` without a
-    # token. Ray's setting for this is named after the systems on which it is the default.
+    # By default every process of a local Ray listens on all addresses, and `/metrics` needs no
+    # token.
     os.environ.setdefault(LOCAL_RAY_BEYOND_LOOPBACK, "0")
-    # By default Ray writes a token file into the home folder, says so, and every `ray start` on
-    # the machine behaves differently from then on. A token in the environment closes the local Ray
-    # to other users of the machine, and leaves nothing behind.
+    # By default Ray writes a token file into the home folder, which changes later `ray start`s. A
+    # token in the environment keeps other users out of the local Ray and leaves no file.
     if "RAY_AUTH_MODE" not in os.environ:
         os.environ["RAY_AUTH_MODE"] = "token"
         if "RAY_AUTH_TOKEN" not in os.environ and "RAY_AUTH_TOKEN_PATH" not in os.environ:
@@ -98,14 +90,14 @@ def prepare_environment() -> None:
 
 
 def quiet_third_parties() -> None:
-    """Hide known third-party notices in this process. Calling it again changes nothing."""
+    """Hide known third-party messages in this process. Further calls change nothing."""
     for name, is_shown in _FILTERS.items():
         logging.getLogger(name).addFilter(is_shown)
     for name in _CHATTY_LOGGERS:
         logger = logging.getLogger(name)
         if logger.level != logging.WARNING:  # setting it empties the cache of every logger
             logger.setLevel(logging.WARNING)
-    # RLlib registers its wrapper environment again for every environment runner that it builds.
+    # RLlib registers its wrapper environment again for every environment runner.
     warnings.filterwarnings(
         "ignore", message=r".*Overriding environment rllib-(single|multi)-agent-env-v0"
     )

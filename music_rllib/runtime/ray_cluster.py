@@ -1,15 +1,19 @@
-"""Connects to Ray: a local Ray for the sweep, or the cluster that the environment names."""
+"""Ray: a local one for the sweep, or the cluster that RAY_ADDRESS names."""
 
 from __future__ import annotations
 
 import contextlib
 import logging
 import math
+import os
+import socket
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import psutil
 import ray
 
 from music_rllib.config.schema import Resources
@@ -25,18 +29,21 @@ from music_rllib.runtime.machine import (
 from music_rllib.runtime.quiet import quiet_third_parties
 
 OBJECT_STORE_BYTES = 128 * 2**20
-"""Enough for reports, the only data of workers; Ray's default is a third of the memory."""
+"""Enough for reports, the only data that workers send; Ray's default is a third of the memory."""
 NODE_GROUP = "ray.io/node-group"
 """Label of nodes that a cluster launcher or KubeRay started."""
 LISTED_MACHINES = "local.cluster.node"
 """The launcher's node group for listed machines, to which it cannot add others."""
 WAITING = 200
-"""Most runs that wait if an autoscaler adds nodes for them; Tune's own default."""
+"""Maximum number of waiting runs if an autoscaler adds nodes for them; Tune's own default."""
+LOOK_SECONDS = 5.0
+"""Time between two checks of a cluster, and timeout of each."""
+DAEMONS = ("gcs_server", "raylet")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Room:
-    """The capacity of a cluster."""
+class Capacity:
+    """The capacity of a cluster, in runs."""
 
     now: int
     """Number of runs that the present nodes can hold at once; 0 only if the cluster grows."""
@@ -47,12 +54,12 @@ class Room:
 
     @property
     def at_once(self) -> int:
-        """Number of runs at a time to count on."""
+        """Number of simultaneous runs to expect."""
         return max(self.now, 1)
 
     @property
     def waiting(self) -> int:
-        """Number of runs that may wait for a place, beside those that have one."""
+        """Maximum number of runs that wait for resources while others train."""
         return max(self.now, WAITING) if self.grows else self.now
 
     @property
@@ -65,6 +72,8 @@ class Room:
             "one ('ray status' shows what it does, and requests that no node type can meet)"
         )
 
+
+# -- connecting -------------------------------------------------------------------------------
 
 _files = contextlib.ExitStack()
 """Removes the folder of this process's local Ray."""
@@ -79,12 +88,12 @@ def start_ray(**local_options: Any) -> None:
     address = cluster_address()
     options: dict[str, Any] = {}
     if address is None:
-        # Ray lets every user write to its folder, sockets included: the one above it is ours alone.
+        # Every user can write to Ray's folder and its sockets, so its parent is private.
         folder = tempfile.TemporaryDirectory(
             prefix=RAY_FOLDER, dir=ray_parent(), ignore_cleanup_errors=True
         )
         options = {"_temp_dir": f"{_files.enter_context(folder)}/r", **local_options}
-        # Never a Ray that happens to run on this machine.
+        # Never another Ray that runs on this machine.
         options |= {"address": "local", "include_dashboard": False}
     try:
         ray.init(
@@ -93,7 +102,7 @@ def start_ray(**local_options: Any) -> None:
             logging_level=logging.WARNING,
             **options,
         )
-    except Exception as error:  # plain ones, too: for a node that is not up within 30 s
+    except Exception as error:  # Ray raises a plain Exception if a node needs more than 30 s
         stop_ray()
         cause = first_line(error)
         if address is None:
@@ -106,13 +115,12 @@ def start_ray(**local_options: Any) -> None:
 
 
 def stop_ray() -> None:
-    """Leave Ray; a local one ends and leaves no files."""
+    """Disconnect from Ray; a local one ends and its files are removed."""
     ray.shutdown()
     _files.close()
 
 
 def _worker_setup() -> Callable[[], None]:
-    """What each worker does first."""
     folders = folders_for_workers()
 
     def prepare_worker() -> None:
@@ -123,7 +131,7 @@ def _worker_setup() -> Callable[[], None]:
 
 
 @contextlib.contextmanager
-def cluster(resources: Resources) -> Iterator[Room]:
+def cluster(resources: Resources) -> Iterator[Capacity]:
     """Connect to Ray for this `with`, and yield its capacity.
 
     Raises:
@@ -132,16 +140,19 @@ def cluster(resources: Resources) -> Iterator[Room]:
     """
     start_ray(num_cpus=check_cpus(resources), object_store_memory=OBJECT_STORE_BYTES)
     try:
-        yield _room(resources)
+        yield _capacity(resources)
     finally:
         stop_ray()
 
 
+# -- capacity ---------------------------------------------------------------------------------
+
+
 def check_fits(resources: Resources) -> str | None:
-    """Check that Ray can hold a run, if that is not obvious without asking it.
+    """Check that Ray can hold a run, unless that is certain without asking Ray.
 
     Returns:
-        `Room.remark`.
+        `Capacity.remark`.
 
     Raises:
         ClusterError: Ray cannot be reached, or cannot hold a run.
@@ -149,24 +160,24 @@ def check_fits(resources: Resources) -> str | None:
     if resources.bundle.keys() != {"CPU"} or (
         cluster_address() is not None and resources.cpus_per_run > 1
     ):
-        with cluster(resources) as room:
-            return room.remark
+        with cluster(resources) as capacity:
+            return capacity.remark
     return None
 
 
-def _room(resources: Resources) -> Room:
+def _capacity(resources: Resources) -> Capacity:
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
     kinds = ("memory", "object_store_memory")
     memory = int(max(sum(node.get(kind, 0) for kind in kinds) for node in nodes))
-    if cluster_address() is None:
-        return Room(now=slots(resources, nodes, local=True), memory=memory)
+    local = cluster_address() is None
+    may_grow = not local and grows()
     try:
-        now = slots(resources, nodes, local=False)
+        now = slots(resources, nodes, local=local)
     except ClusterError:
-        if not grows():
+        if not may_grow:
             raise
-        return Room(now=0, grows=True, memory=memory)
-    return Room(now=now, grows=grows(), memory=memory)
+        now = 0
+    return Capacity(now=now, grows=may_grow, memory=memory)
 
 
 def grows() -> bool:
@@ -209,3 +220,89 @@ _SETTINGS = {
     "memory": ("memory_per_run", "GiB of memory for Ray", 2**30),
 }
 """Ray's resource -> setting, unit in messages, and size of the unit."""
+
+
+# -- a Ray that dies --------------------------------------------------------------------------
+
+
+def silence_seconds() -> float:
+    """Seconds after which a silent cluster counts as dead, before Ray itself ends the process.
+
+    A head whose state is in Redis may return within this time.
+    """
+    setting = "RAY_gcs_rpc_server_reconnect_timeout_s"
+    return float(os.environ.get(setting, "60")) * 2 / 3
+
+
+class RayWatch:
+    """Detect that the connected Ray has died; Ray itself would wait forever.
+
+    It watches the daemons of a local Ray, or connects to a cluster's addresses.
+    """
+
+    def __init__(self) -> None:
+        self._address = cluster_address()
+        self._daemons: dict[psutil.Process, str] = {}
+        for child in [] if self._address else psutil.Process().children():
+            with contextlib.suppress(psutil.NoSuchProcess):
+                if (name := child.name()) in DAEMONS:
+                    self._daemons[child] = name
+        addresses = _addresses(self._address) if self._address else []
+        self._checked = time.monotonic()
+        self._answered = dict.fromkeys(addresses, self._checked)
+        """Time of the last answer of each address."""
+
+    def look(self) -> str | None:
+        """A sentence that names what has died; None if nothing has."""
+        for daemon, name in self._daemons.items():
+            if not _is_alive(daemon):
+                return (
+                    f"the local Ray has died: its {name} (process {daemon.pid}) is gone; often the "
+                    "system killed it for lack of memory"
+                )
+        now = time.monotonic()
+        if now - self._checked < LOOK_SECONDS:
+            return None
+        if now - self._checked > 3 * LOOK_SECONDS:  # this machine slept, and the cluster may have
+            self._answered = dict.fromkeys(self._answered, now)
+        for address, answered in self._answered.items():
+            if _answers(address):
+                self._answered[address] = time.monotonic()
+            elif time.monotonic() - answered > silence_seconds():
+                return (
+                    f"the Ray cluster at {self._address} has died or can't be reached: {address} "
+                    f"has not answered for {time.monotonic() - answered:.0f} s"
+                )
+        self._checked = time.monotonic()
+        return None
+
+
+def _addresses(cluster: str) -> list[str]:
+    """`HOST:PORT` of the head, and the socket of this machine's raylet if there is one."""
+    if cluster.startswith("ray://"):
+        return [cluster.removeprefix("ray://")]
+    context = ray.get_runtime_context()
+    own = [node for node in ray.nodes() if node["NodeID"] == context.get_node_id()]
+    sockets = [node["RayletSocketName"].removeprefix("unix://") for node in own]
+    return [context.gcs_address, *sockets]
+
+
+def _answers(address: str) -> bool:
+    try:
+        if address.startswith("/"):
+            with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
+                connection.settimeout(LOOK_SECONDS)
+                connection.connect(address)
+            return True
+        host, _, port = address.rpartition(":")
+        socket.create_connection((host.strip("[]"), int(port)), timeout=LOOK_SECONDS).close()
+    except OSError:
+        return False
+    return True
+
+
+def _is_alive(process: psutil.Process) -> bool:
+    try:
+        return bool(process.is_running() and process.status() != psutil.STATUS_ZOMBIE)
+    except psutil.NoSuchProcess:
+        return False

@@ -19,7 +19,7 @@ import typer
 from music_rllib.errors import BadInputError
 from music_rllib.redaction import redact
 from music_rllib.runtime.machine import check_reachable, cluster_address
-from music_rllib.runtime.signals import SIGNALS
+from music_rllib.runtime.process import SIGNALS
 from music_rllib.serve import TOKEN_VARIABLE
 
 if TYPE_CHECKING:
@@ -210,8 +210,8 @@ def _serve(policy: Policy, settings: ServeSettings, host: str, port: int) -> Non
 
 def _wait(stop: threading.Event) -> None:
     """Wait for the signal, or end the process when Ray has died: Ray itself would wait for it."""
-    from music_rllib.runtime.ending import end_process
-    from music_rllib.runtime.ray_watch import LOOK_SECONDS, RayWatch
+    from music_rllib.runtime.process import end_process
+    from music_rllib.runtime.ray_cluster import LOOK_SECONDS, RayWatch
 
     watch = RayWatch()
     while not stop.wait(LOOK_SECONDS):

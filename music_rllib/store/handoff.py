@@ -92,7 +92,7 @@ class Spaces(_Strict):
         Raises:
             ValueError: Training does not support such spaces.
         """
-        from music_rllib.envs.make import check_action_space, observation_sizes
+        from music_rllib.envs.values import check_action_space, observation_sizes
 
         observation_size, goal_size = observation_sizes(observations)
         bounds = check_action_space(actions)

@@ -37,15 +37,13 @@ from music_rllib.experiment.scheduler import Status
 from music_rllib.experiment.sweep_files import as_json
 from music_rllib.redaction import redact
 from music_rllib.results.analysis_plan import PLANS_TO_READ, PlanVersion, as_document, record_plan
-from music_rllib.runtime.allocator import give_back_freed_memory
-from music_rllib.runtime.ending import try_for
 from music_rllib.runtime.machine import (
     check_cpus,
     check_memory_and_gpus,
     cluster_address,
     ray_parent,
 )
-from music_rllib.runtime.signals import early
+from music_rllib.runtime.process import early, give_back_freed_memory, try_for
 from music_rllib.store.paths import check_storage, resolve_storage, sweep_folder
 from music_rllib.sweep.driver_lock import hold_driver_lock
 from music_rllib.sweep.listeners.state_file import StateFile

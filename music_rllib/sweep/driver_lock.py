@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 
 from music_rllib.errors import FAILED
 from music_rllib.experiment.open_sweep import OpenSweep
-from music_rllib.runtime.ending import end_process
+from music_rllib.runtime.process import end_process
 from music_rllib.store.lease import HeldLease, Lease, LeaseFile
 from music_rllib.store.object_folder import StorageError, open_storage
 

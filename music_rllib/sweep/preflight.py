@@ -28,7 +28,7 @@ from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.plan import Plan
 from music_rllib.experiment.scheduler import Scheduler, Status
 from music_rllib.runtime.machine import check_reachable, cluster_address
-from music_rllib.runtime.signals import early
+from music_rllib.runtime.process import early
 from music_rllib.store.handoff import open_handoff, read_handoff
 from music_rllib.store.node_store import NodeStore
 

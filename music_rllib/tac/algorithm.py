@@ -35,9 +35,9 @@ from ray.rllib.utils.metrics import (
 )
 from ray.rllib.utils.typing import StateDict
 
+from music_rllib.envs.episodes import Episode
 from music_rllib.envs.make import goal_reward_of, moved_distance_of
-from music_rllib.envs.numbers import BadNumberError
-from music_rllib.envs.recording import Episode
+from music_rllib.envs.values import BadNumberError
 from music_rllib.replay.buffer import TrajectoryReplay
 from music_rllib.replay.trajectories import Transitions
 from music_rllib.schedules import value_at

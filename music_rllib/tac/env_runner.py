@@ -32,22 +32,19 @@ from ray.rllib.utils.metrics import (
 from ray.rllib.utils.typing import StateDict
 
 from music_rllib.config.tac_settings import GaussianNoise, TACSettings
-from music_rllib.envs.calls import in_environment
+from music_rllib.envs.episodes import Episode, Recording
 from music_rllib.envs.make import (
     Env,
-    check_action_space,
     compute_reward_of,
     episode_limit,
+    in_environment,
     is_gymnasium_id,
     make_env,
     name_of,
-    observation_sizes,
     reset_seed,
-    to_bounds,
 )
-from music_rllib.envs.numbers import BadNumberError
-from music_rllib.envs.recording import Episode, Recording
 from music_rllib.envs.tasks import beyond_observation
+from music_rllib.envs.values import BadNumberError, check_action_space, observation_sizes, to_bounds
 from music_rllib.replay.trajectories import ReplayLayout
 from music_rllib.runtime.quiet import quiet_third_parties
 from music_rllib.tac.rl_module import Actor, TACModule

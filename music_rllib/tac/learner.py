@@ -35,7 +35,7 @@ from music_rllib.config.tac_settings import LearnedAlpha, TACSettings
 from music_rllib.intrinsic.interface import IntrinsicReward
 from music_rllib.optim.adam import FusedAdam
 from music_rllib.replay.trajectories import Trajectory
-from music_rllib.runtime.allocator import keep_freed_memory
+from music_rllib.runtime.process import keep_freed_memory
 from music_rllib.runtime.quiet import quiet_third_parties
 from music_rllib.schedules import Quantity
 from music_rllib.tac import diagnostics

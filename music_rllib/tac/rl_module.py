@@ -14,7 +14,7 @@ from ray.rllib.utils.typing import StateDict
 from torch import Tensor, nn
 
 from music_rllib.config.tac_settings import LearnedAlpha, TACSettings
-from music_rllib.envs.make import observation_sizes
+from music_rllib.envs.values import observation_sizes
 from music_rllib.functional.squashed_gaussian import (
     bounded_log_std,
     deterministic_action,

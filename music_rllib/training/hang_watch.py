@@ -48,7 +48,7 @@ class HangWatch:
         """
         import faulthandler
 
-        from music_rllib.envs.calls import in_environment
+        from music_rllib.envs.make import in_environment
 
         self._calls = in_environment
         folder = Path(mkdtemp(prefix="music-hang-"))  # the watching process removes it

@@ -137,14 +137,14 @@ def compute(
         stopped=lambda: stopping.received is not None,
     )
     with (
-        cluster(resources) as room,
+        cluster(resources) as capacity,
         _tune_folder(sweep) as folder,
-        _quiet_tune(room.waiting),
+        _quiet_tune(capacity.waiting),
         stopping,
     ):
-        if room.remark is not None:
+        if capacity.remark is not None:
             for listener in listeners:
-                listener.remarked(room.remark)
+                listener.remarked(capacity.remark)
         tuner = tune.Tuner(
             RunTrainable,
             tune_config=tune.TuneConfig(

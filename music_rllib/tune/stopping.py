@@ -16,9 +16,8 @@ from ray.tune.experiment import Trial
 
 from music_rllib.command_line import say_stopped_at_once
 from music_rllib.errors import FAILED
-from music_rllib.runtime.ending import end_process
-from music_rllib.runtime.ray_watch import RayWatch
-from music_rllib.runtime.signals import SIGNALS, early
+from music_rllib.runtime.process import SIGNALS, early, end_process
+from music_rllib.runtime.ray_cluster import RayWatch
 from music_rllib.training.stop import StopFlag
 from music_rllib.training.worker import STOPPED
 

@@ -19,7 +19,7 @@ from tests.integration.conftest import ENVIRONMENTS, REPOSITORY, Program
 
 WORKER = """
 import sys, time
-from music_rllib.envs.calls import in_environment
+from music_rllib.envs.make import in_environment
 from music_rllib.training.hang_watch import HangWatch
 from point_env import Hanging
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from ray.rllib.callbacks.callbacks import RLlibCallback
 
-from music_rllib.envs.numbers import BadNumberError
+from music_rllib.envs.values import BadNumberError
 from music_rllib.tac.config import TACConfig
 from music_rllib.tac.env_runner import TrajectoryEnvRunner
 from music_rllib.tac.normaliser import RunningNormaliser

@@ -18,7 +18,7 @@ from torch import nn
 from music_rllib import TACConfig, names
 from music_rllib.config.tac_settings import TACSettings
 from music_rllib.envs.make import make_env
-from music_rllib.envs.numbers import BadNumberError
+from music_rllib.envs.values import BadNumberError
 from music_rllib.intrinsic.music import HELD_OUT_STEPS
 from music_rllib.intrinsic.settings import MusicSettings
 from music_rllib.replay.settings import ReplaySettings

@@ -12,7 +12,6 @@ PACKAGE = Path(__file__).parents[3] / "music_rllib"
 # Only these may load Ray; everything else is usable, and tested, without it.
 MAY_LOAD_RAY = (
     "runtime.ray_cluster",
-    "runtime.ray_watch",
     "tac",
     "training",
     "serve.application",
@@ -20,7 +19,7 @@ MAY_LOAD_RAY = (
     "tune",
 )
 # torch and numpy only: no environments, no tracking.
-PURE = ("functional", "intrinsic", "replay", "runtime.allocator", "schedules")
+PURE = ("functional", "intrinsic", "replay", "runtime.process", "schedules")
 # Read by the command line before anything heavy is needed.
 LIGHT = ("", "command_line", "errors", "names", "runtime.quiet")
 

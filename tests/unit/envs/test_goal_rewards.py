@@ -8,7 +8,7 @@ import pytest
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from music_rllib.envs.goal_rewards import first_unlike, lost_by_rounding
+from music_rllib.envs.episodes import first_mismatch, lost_by_rounding
 from music_rllib.envs.make import goal_reward_of
 
 Floats = NDArray[Any]
@@ -41,13 +41,13 @@ def test_rewards_of_rounded_goals_pass_at_any_scale_and_others_do_not(
         return scale * np.asarray(reward(achieved, desired))
 
     given = scaled(goals[1:, 3:], goals[1:, :3]).astype(np.float32)
-    assert first_unlike(scaled, kept, given) is None
+    assert first_mismatch(scaled, kept, given) is None
     # A cost of a thousandth of the reward's range, in one step only.
     cost = 1e-3 * np.float32(np.ptp(given)) * (np.arange(50) == 30)
-    unlike = first_unlike(scaled, kept, given - cost)
-    assert unlike is not None
-    assert unlike.step == 31
-    other_scale = first_unlike(scaled, kept, np.float32(0.5) * given)
+    found = first_mismatch(scaled, kept, given - cost)
+    assert found is not None
+    assert found[0] == 31
+    other_scale = first_mismatch(scaled, kept, np.float32(0.5) * given)
     assert other_scale is not None
 
 
@@ -62,14 +62,14 @@ def test_a_step_at_the_threshold_is_not_refused_for_its_rounding() -> None:
     kept = goals.astype(np.float32)
     rounded = sparse(kept[1:, 3:].astype(float), kept[1:, :3].astype(float))
     assert (rounded != given).mean() > 0.2
-    assert first_unlike(sparse, kept[:200], given[:199].astype(np.float32)) is None
+    assert first_mismatch(sparse, kept[:200], given[:199].astype(np.float32)) is None
 
 
 def test_a_reward_may_belong_to_the_goal_before_its_step() -> None:
     goals = episode()
     goals[:, :3] += np.arange(51)[:, None]
     given = dense(goals[1:, 3:], goals[:-1, :3]).astype(np.float32)
-    assert first_unlike(dense, goals.astype(np.float32), given) is None
+    assert first_mismatch(dense, goals.astype(np.float32), given) is None
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box
 
-from music_rllib.envs.make import check_action_space, reset_seed, to_bounds
+from music_rllib.envs.make import reset_seed
+from music_rllib.envs.values import check_action_space, to_bounds
 
 
 def test_reset_seeds_fit_into_a_signed_integer_and_rarely_repeat() -> None:

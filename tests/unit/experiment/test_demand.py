@@ -18,7 +18,7 @@ from music_rllib.experiment.demand import (
     least_memory,
     long_runs,
 )
-from music_rllib.runtime.ray_cluster import Room
+from music_rllib.runtime.ray_cluster import Capacity
 from music_rllib.tac.networks import Critics, Perceptron
 
 GIB = 2**30
@@ -121,7 +121,7 @@ def test_a_cluster_is_asked_only_where_it_matters(
     from music_rllib.experiment import demand
 
     asked: list[Any] = []
-    room = Room(now=1, memory=4 * GIB)
+    room = Capacity(now=1, memory=4 * GIB)
 
     @contextlib.contextmanager
     def cluster(resources: Any) -> Any:
@@ -143,5 +143,5 @@ def test_a_cluster_is_asked_only_where_it_matters(
     with pytest.raises(DemandError, match=r"of the cluster's largest node, 4\.0 GiB, got"):
         check(**huge)
     assert asked == ["those"]
-    room = Room(now=0, grows=True, memory=4 * GIB)
+    room = Capacity(now=0, grows=True, memory=4 * GIB)
     assert check(**huge) == []

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from music_rllib.config.schema import Resources
 from music_rllib.runtime import ray_cluster
 from music_rllib.runtime.machine import ClusterError, ray_parent
-from music_rllib.runtime.ray_cluster import WAITING, Room, _room, slots
+from music_rllib.runtime.ray_cluster import WAITING, Capacity, _capacity, slots
 
 GIB = 2.0**30
 SMALL = {"CPU": 4.0, "memory": 8 * GIB}
@@ -118,11 +118,11 @@ def test_a_run_waits_for_a_node_on_a_cluster_that_grows(
 ) -> None:
     """As on AWS: a head with one CPU, and workers that are started for waiting runs."""
     put_cluster(monkeypatch, HEAD)
-    room = _room(Resources(**settings))
-    assert room == Room(now=0, grows=True)
-    assert room.remark is not None
-    assert "waits until its autoscaler adds one" in room.remark
-    assert (room.at_once, room.waiting) == (1, WAITING)
+    capacity = _capacity(Resources(**settings))
+    assert capacity == Capacity(now=0, grows=True)
+    assert capacity.remark is not None
+    assert "waits until its autoscaler adds one" in capacity.remark
+    assert (capacity.at_once, capacity.waiting) == (1, WAITING)
 
 
 @pytest.mark.parametrize("group", [None, "local.cluster.node"])
@@ -131,20 +131,20 @@ def test_it_is_refused_on_a_cluster_of_given_machines(
 ) -> None:
     put_cluster(monkeypatch, HEAD, group=group)
     with pytest.raises(ClusterError, match=r"gpus_per_run must fit into one node .* 0 GPUs, got 1"):
-        _room(Resources(gpus_per_run=1))
+        _capacity(Resources(gpus_per_run=1))
 
 
 def test_runs_wait_where_nodes_are_added_for_them(monkeypatch: pytest.MonkeyPatch) -> None:
     """One run fits. If only one more waited, the cluster would grow by one node at a time."""
     put_cluster(monkeypatch, HEAD)
-    room = _room(Resources())
-    assert (room.now, room.waiting, room.remark) == (1, WAITING, None)
+    capacity = _capacity(Resources())
+    assert (capacity.now, capacity.waiting, capacity.remark) == (1, WAITING, None)
 
 
 def test_no_more_runs_wait_than_fit_where_nothing_is_added(monkeypatch: pytest.MonkeyPatch) -> None:
     put_cluster(monkeypatch, SMALL, HEAD, group=None)
-    room = _room(Resources())
-    assert (room.now, room.at_once, room.waiting, room.remark) == (5, 5, 5, None)
+    capacity = _capacity(Resources())
+    assert (capacity.now, capacity.at_once, capacity.waiting, capacity.remark) == (5, 5, 5, None)
 
 
 @pytest.mark.parametrize("settings", [{"gpus_per_run": -1}, {"memory_per_run": 0}])
