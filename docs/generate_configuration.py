@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import annotated_types
+from json_schema import docstrings, json_schema
 from pydantic import AfterValidator, BaseModel, BeforeValidator
 from pydantic.fields import FieldInfo
 
-from music_rllib.authoring import SCHEMA
-from music_rllib.authoring.json_schema import docstrings, json_schema
 from music_rllib.config.analysis import Analysis
+from music_rllib.config.presets import SCHEMA
 from music_rllib.config.run_settings import VARIANTS, Evaluation, RunSettings
 from music_rllib.config.schema import (
     Checkpoints,
@@ -29,7 +29,7 @@ from music_rllib.config.schema import (
     Resources,
     StageHeader,
 )
-from music_rllib.config.search.settings import (
+from music_rllib.config.search import (
     Final,
     Objective,
     Pruning,
@@ -37,7 +37,7 @@ from music_rllib.config.search.settings import (
     SearchSettings,
     WarmStart,
 )
-from music_rllib.config.search.space import Choice, FloatRange, IntRange
+from music_rllib.config.space import Choice, FloatRange, IntRange
 from music_rllib.config.tac_settings import (
     GaussianNoise,
     LearnedAlpha,

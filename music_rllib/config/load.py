@@ -17,26 +17,25 @@ from typing import Any
 from pydantic import ValidationError
 
 from music_rllib.config.hypotheses import check_analysis
-from music_rllib.config.problems import (
-    ConfigError,
-    Findings,
-    Problem,
-    from_json,
-    in_words,
-    shown,
-    unknown,
-)
-from music_rllib.config.reading.layers import (
+from music_rllib.config.layers import (
     LAYER_KEYS,
     SECTIONS,
     all_settings,
     for_a_grid,
     known_settings,
 )
-from music_rllib.config.reading.overrides import lay_overrides, parse_overrides
-from music_rllib.config.reading.presets import with_preset
-from music_rllib.config.reading.problem_lines import problem_lines
-from music_rllib.config.reading.yaml_file import YamlFile, read_yaml
+from music_rllib.config.overrides import lay_overrides, parse_overrides
+from music_rllib.config.presets import with_preset
+from music_rllib.config.problems import (
+    ConfigError,
+    Findings,
+    Problem,
+    from_json,
+    in_words,
+    problem_lines,
+    shown,
+    unknown,
+)
 from music_rllib.config.resolve import resolve_stage
 from music_rllib.config.run_settings import RunSettings, without_retired
 from music_rllib.config.schema import (
@@ -45,7 +44,8 @@ from music_rllib.config.schema import (
     Stage,
     SweepConfig,
 )
-from music_rllib.config.search.settings import FINAL_SEED
+from music_rllib.config.search import FINAL_SEED
+from music_rllib.config.yaml_file import YamlFile, read_yaml
 from music_rllib.envs.modules import search_in
 from music_rllib.envs.tasks import (
     BUILT_IN_TASKS,

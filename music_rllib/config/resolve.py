@@ -11,6 +11,15 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from music_rllib.config.layers import (
+    LAYER_KEYS,
+    PlacedPoint,
+    all_settings,
+    field_by_field,
+    for_a_grid,
+    known_settings,
+    merge,
+)
 from music_rllib.config.problems import (
     ConfigError,
     Findings,
@@ -21,18 +30,9 @@ from music_rllib.config.problems import (
     shown,
     unknown,
 )
-from music_rllib.config.reading.layers import (
-    LAYER_KEYS,
-    PlacedPoint,
-    all_settings,
-    field_by_field,
-    for_a_grid,
-    known_settings,
-    merge,
-)
 from music_rllib.config.run_settings import VARIANTS, RunSettings, Variant, handed_over
 from music_rllib.config.schema import Checkpoint, Point, Source, Stage, StageHeader
-from music_rllib.config.search.check import check_search, of_stage
+from music_rllib.config.search_check import check_search, of_stage
 from music_rllib.envs.tasks import BUILT_IN_TASKS, Task, closest
 from music_rllib.limits import MOST_GRID_POINTS
 from music_rllib.store.handoff import Architecture, HandoffError, open_handoff, read_handoff

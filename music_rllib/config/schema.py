@@ -14,7 +14,7 @@ from music_rllib import names
 from music_rllib.config.analysis import Analysis
 from music_rllib.config.problems import ConfigError
 from music_rllib.config.run_settings import RunSettings, Variant
-from music_rllib.config.search.settings import SearchSettings
+from music_rllib.config.search import SearchSettings
 from music_rllib.envs.tasks import Task
 from music_rllib.errors import BadInputError
 from music_rllib.schedules import StrictModel

@@ -15,7 +15,7 @@ from typing import Any
 
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.schema import Checkpoint, Source, Stage, SweepConfig
-from music_rllib.config.search.check import of_stage, stages_in
+from music_rllib.config.search_check import of_stage, stages_in
 from music_rllib.envs.tasks import Task
 from music_rllib.labels import in_runs
 from music_rllib.store.files import content_key

@@ -10,7 +10,7 @@ import numpy as np
 from optuna.trial import FrozenTrial, TrialState
 
 from music_rllib.config.problems import ConfigError
-from music_rllib.config.search.settings import FINAL_SEED, SearchSettings
+from music_rllib.config.search import FINAL_SEED, SearchSettings
 from music_rllib.errors import first_line
 from music_rllib.experiment.listener import Listener
 from music_rllib.experiment.open_sweep import OpenSweep

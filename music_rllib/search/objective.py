@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from music_rllib import names
-from music_rllib.config.search.settings import Objective, Pruning
+from music_rllib.config.search import Objective, Pruning
 from music_rllib.imports import imported_on_use
 from music_rllib.results import statistics as st
 from music_rllib.results.statistics import Array, Estimate

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from music_rllib.config.schema import Stage
-from music_rllib.config.search.check import most_env_steps
-from music_rllib.config.search.settings import Rung, SearchSettings, WarmStart
+from music_rllib.config.search import Rung, SearchSettings, WarmStart
+from music_rllib.config.search_check import most_env_steps
 from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.plan import node_key
 from music_rllib.search.storage import known_studies, names_of, open_studies, same_database

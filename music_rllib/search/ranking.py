@@ -15,7 +15,7 @@ import numpy as np
 
 from music_rllib import names
 from music_rllib.config.schema import Stage
-from music_rllib.config.search.settings import SearchSettings
+from music_rllib.config.search import SearchSettings
 from music_rllib.experiment.plan import Plan, short
 from music_rllib.labels import in_runs, symbol
 from music_rllib.results import statistics as st

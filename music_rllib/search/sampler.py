@@ -28,8 +28,8 @@ from optuna.samplers import BaseSampler, CmaEsSampler, NSGAIISampler, RandomSamp
 from optuna.trial import FrozenTrial, TrialState, create_trial
 
 from music_rllib.config.problems import same
-from music_rllib.config.search.settings import SearchSettings
-from music_rllib.config.search.space import Choice, Dimension, FloatRange, IntRange
+from music_rllib.config.search import SearchSettings
+from music_rllib.config.space import Choice, Dimension, FloatRange, IntRange
 from music_rllib.search.study_record import VALUES
 
 ATTEMPTS = 8

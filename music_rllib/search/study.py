@@ -23,7 +23,7 @@ from optuna.storages import BaseStorage
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState, create_trial
 
-from music_rllib.config.search.settings import SearchSettings
+from music_rllib.config.search import SearchSettings
 from music_rllib.experiment.plan import short
 from music_rllib.search import study_record as record
 from music_rllib.search.sampler import Proposer, trial_at

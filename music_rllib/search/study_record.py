@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from music_rllib.config.search.settings import SearchSettings
+from music_rllib.config.search import SearchSettings
 
 # Of a study.
 FINGERPRINT, SETTINGS = "music_rllib:fingerprint", "music_rllib:settings"

@@ -9,7 +9,7 @@ import numpy as np
 import optuna
 from optuna.trial import FrozenTrial, TrialState
 
-from music_rllib.config.search.settings import SearchSettings
+from music_rllib.config.search import SearchSettings
 from music_rllib.redaction import redact
 from music_rllib.results.statistics import improvement
 from music_rllib.search.controller import SearchController

@@ -12,7 +12,7 @@ from optuna.trial import FrozenTrial, TrialState
 
 from music_rllib import names
 from music_rllib.config.schema import Stage
-from music_rllib.config.search.settings import Rung, SearchSettings
+from music_rllib.config.search import Rung, SearchSettings
 from music_rllib.experiment.plan import Run
 from music_rllib.search.study import Study
 from music_rllib.search.study_record import VALUES

@@ -10,7 +10,7 @@ from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
 from music_rllib.config.problems import same
-from music_rllib.config.search.settings import SearchSettings, WarmStart
+from music_rllib.config.search import SearchSettings, WarmStart
 from music_rllib.redaction import redact
 from music_rllib.search.storage import open_studies, studies_of
 from music_rllib.search.study_record import ARM, SEARCH, VALUES, Identity, fits

@@ -14,7 +14,7 @@ from rich.table import Table
 
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.schema import Stage, SweepConfig
-from music_rllib.config.search.settings import SearchSettings
+from music_rllib.config.search import SearchSettings
 from music_rllib.experiment.plan import Plan
 from music_rllib.runtime import machine
 from music_rllib.sweep.views.search_budget import search_budget

@@ -40,7 +40,7 @@ def init(
     ] = Path("sweep.yaml"),
 ) -> int:
     """Write a commented sweep file to start from."""
-    from music_rllib.authoring import starter
+    from music_rllib.config.presets import starter
 
     text = starter(file)
     try:
@@ -60,7 +60,7 @@ def presets(json: Json = False) -> int:
 
     By 'preset: NAME' in it.
     """
-    from music_rllib.config.reading.presets import SHIPPED, shipped_presets
+    from music_rllib.config.presets import SHIPPED, shipped_presets
 
     shipped = shipped_presets()
     if json:
@@ -75,7 +75,7 @@ def presets(json: Json = False) -> int:
 
 def schema() -> int:
     """Print the JSON Schema of sweep files, for editors."""
-    from music_rllib.authoring.json_schema import json_schema
+    from music_rllib.config.presets import SCHEMA
 
-    print_json(json_schema())
+    typer.echo(SCHEMA.read_text(encoding="utf-8"), nl=False)
     return 0

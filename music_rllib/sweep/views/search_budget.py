@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from music_rllib.config.schema import Stage
-from music_rllib.config.search.check import most_env_steps
+from music_rllib.config.search_check import most_env_steps
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,8 +12,8 @@ from rich.text import Text
 
 from music_rllib import names
 from music_rllib.config.schema import Source, Stage, SweepConfig
-from music_rllib.config.search.settings import SearchSettings
-from music_rllib.config.search.space import Choice, Dimension
+from music_rllib.config.search import SearchSettings
+from music_rllib.config.space import Choice, Dimension
 from music_rllib.envs.tasks import Task
 from music_rllib.experiment.plan import Node, Plan, short
 from music_rllib.experiment.scheduler import Status

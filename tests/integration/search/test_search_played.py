@@ -27,7 +27,7 @@ from optuna.trial import TrialState
 
 from music_rllib import names
 from music_rllib.config.run_settings import RunSettings
-from music_rllib.config.search.settings import FINAL_SEED
+from music_rllib.config.search import FINAL_SEED
 from music_rllib.config.tac_settings import LearnedAlpha
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.changes import changes_since, keep_settings

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from music_rllib.config.load import load_sweep
+from music_rllib.config.presets import SHIPPED, shipped_presets
 from music_rllib.config.problems import ConfigError
-from music_rllib.config.reading.presets import SHIPPED, shipped_presets
-from music_rllib.config.reading.yaml_file import read_yaml
 from music_rllib.config.remarks import remarks
+from music_rllib.config.yaml_file import read_yaml
 from music_rllib.functional.actor_critic import critic_target
 from tests.unit.functional.entropies import gaussian_entropy, joint_entropy
 

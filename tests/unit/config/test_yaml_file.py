@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from music_rllib.config.problems import ConfigError
-from music_rllib.config.reading.yaml_file import YamlFile, read_yaml
+from music_rllib.config.yaml_file import YamlFile, read_yaml
 
 
 def read(tmp_path: Path, text: str) -> YamlFile:

@@ -18,7 +18,7 @@ from music_rllib import names
 from music_rllib.config.load import load_sweep
 from music_rllib.config.problems import ConfigError
 from music_rllib.config.remarks import remarks
-from music_rllib.config.search.settings import Objective, Pruning, Rung, SearchSettings
+from music_rllib.config.search import Objective, Pruning, Rung, SearchSettings
 from music_rllib.search.objective import aggregate, prune, score
 from music_rllib.search.sampler import Proposer, trial_at
 from music_rllib.search.storage import same_database

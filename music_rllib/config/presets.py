@@ -1,21 +1,41 @@
-"""Presets: YAML files of settings that a sweep's `preset: NAME` puts below its `defaults`."""
+"""Files of the package to start a sweep from: presets, the starter file, the JSON Schema.
+
+A preset is a YAML file of settings that a sweep's `preset: NAME` puts below its `defaults`.
+"""
 
 from __future__ import annotations
 
+import re
+import shlex
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import music_rllib
+from music_rllib.config.layers import SECTIONS
 from music_rllib.config.problems import ConfigError, shown
-from music_rllib.config.reading.layers import SECTIONS
-from music_rllib.config.reading.yaml_file import YamlFile, read_yaml
+from music_rllib.config.schema import RESERVED_NAMES
+from music_rllib.config.yaml_file import YamlFile, read_yaml
 from music_rllib.envs.tasks import closest
 
 FOLDER = "presets"
 """Folder beside the sweep's file, whose presets come before the package's of the same name."""
 SHIPPED = Path(music_rllib.__file__).with_name(FOLDER)
 """The package's own presets, one file each."""
+SCHEMA = Path(__file__).with_name("sweep.schema.json")
+"""JSON Schema of a sweep's file, for editors; docs/generate_configuration.py writes it."""
+
+
+def starter(file: Path) -> str:
+    """The text of a commented sweep that is written as `file`."""
+    name = re.sub(r"[^A-Za-z0-9._-]+", "_", file.stem).strip("._-")[:80] or "sweep"
+    if name in RESERVED_NAMES:
+        name = f"{name}_sweep"
+    # Quoted, since a name like 123 or true would not be text.
+    known = {"name: NAME": f'name: "{name}"', "NAME": name, "FILE": shlex.quote(str(file))}
+    text = Path(__file__).with_name("starter.yaml").read_text(encoding="utf-8")
+    lines = re.sub("|".join(known), lambda found: known[found[0]], text)
+    return f"# yaml-language-server: $schema={SCHEMA.as_uri()}\n{lines}"
 
 
 def shipped_presets() -> dict[str, str]:

@@ -14,8 +14,8 @@ from pydantic import BaseModel, create_model
 from pydantic.json_schema import GenerateJsonSchema
 from pydantic_core import core_schema
 
-from music_rllib.config.reading.layers import LAYER_KEYS, all_settings
-from music_rllib.config.reading.presets import shipped_presets
+from music_rllib.config.layers import LAYER_KEYS, all_settings
+from music_rllib.config.presets import shipped_presets
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.schema import Header, InitFrom, StageHeader
 from music_rllib.envs.tasks import BUILT_IN_TASKS, Task
@@ -26,7 +26,7 @@ def docstrings(model: type[BaseModel]) -> dict[str, str]:
     texts = {}
     for kind in reversed(model.__mro__):
         # Models that `json_schema` creates have no source.
-        if not kind.__module__.startswith("music_rllib.") or kind.__module__ == __name__:
+        if not kind.__module__.startswith("music_rllib."):
             continue
         (definition,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
         assert isinstance(definition, ast.ClassDef)

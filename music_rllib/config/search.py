@@ -10,8 +10,8 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Discriminator, Field, JsonValue, Tag, model_validator
 
-from music_rllib.config.reading.layers import varied_by
-from music_rllib.config.search.space import Choice, Dimension, listed
+from music_rllib.config.layers import varied_by
+from music_rllib.config.space import Choice, Dimension, listed
 from music_rllib.schedules import StrictModel
 
 FINAL_SEED = 1_000_000

@@ -12,10 +12,10 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from music_rllib.config.layers import LAYER_KEYS, SECTIONS, all_settings, varied_by
 from music_rllib.config.problems import ConfigError, KeyPath, shown, unknown
-from music_rllib.config.reading.layers import LAYER_KEYS, SECTIONS, all_settings, varied_by
-from music_rllib.config.reading.yaml_file import read_value
 from music_rllib.config.schema import Header, StageHeader
+from music_rllib.config.yaml_file import read_value
 
 TOP = (*Header.model_fields, "preset", "environments", "defaults", "stages")
 

@@ -7,12 +7,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from music_rllib import names
+from music_rllib.config.layers import PlacedPoint
 from music_rllib.config.problems import ConfigError, Findings, KeyPath, shown
-from music_rllib.config.reading.layers import PlacedPoint
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.schema import Point, Stage
-from music_rllib.config.search.settings import SearchSettings
-from music_rllib.config.search.space import Choice
+from music_rllib.config.search import SearchSettings
+from music_rllib.config.space import Choice
 from music_rllib.envs.tasks import closest
 
 ResolveAt = Callable[[PlacedPoint, Findings], Point]

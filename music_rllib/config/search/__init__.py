@@ -1,1 +1,0 @@
-"""The `search` section of a stage: its settings, its space, and their checks."""
