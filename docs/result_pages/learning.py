@@ -19,7 +19,7 @@ from music_rllib.report.figures.palette import Style, styles_of
 from music_rllib.report.figures.plots import METRICS, Panel, curve_panel
 from music_rllib.results import statistics as st
 from music_rllib.results.analysis import Curve, curve
-from music_rllib.results.conditions import Condition, Stage, find_stages
+from music_rllib.results.conditions import Condition, StageRuns, find_stages
 from music_rllib.results.data import Sweep
 from music_rllib.results.statistics import Array
 
@@ -71,7 +71,7 @@ def _legend(sweep: Sweep) -> dict[Condition, tuple[str, Style]]:
     return legend
 
 
-def _entry(stage: Stage, condition: Condition, style: Style) -> tuple[str, Style]:
+def _entry(stage: StageRuns, condition: Condition, style: Style) -> tuple[str, Style]:
     if not stage.has_task_reward:
         return PRETRAINING
     return (

@@ -20,7 +20,7 @@ from music_rllib.results.analysis_plan import analysis_plan
 from music_rllib.results.answer import answer, not_excluded, numbers_in_words, verdict_in_words
 from music_rllib.results.data import Sweep
 from music_rllib.results.scores import scores_of
-from music_rllib.results.study import Mean, label_of, study_of
+from music_rllib.results.study import Mean, study_of
 
 
 def verdict_text(name: str, *words: str) -> str:
@@ -85,15 +85,15 @@ def _outcomes(sweep: Sweep, analysis: StageAnalysis, mean: Mean, prefix: str) ->
         for final in scope.finals
         if (final.condition, scope.name) == key
     )
-    yield f"{prefix}{label_of(mean.condition)}"
+    yield f"{prefix}{mean.condition.short_label}"
     yield spread(mean.estimate)
     measure = replace(mean.measure, metric=names.TRAIN_SUCCESS)
     sampled = scores_of(sweep, mean.condition, mean.task, measure)
     yield spread(st.estimate(np.array([*sampled.by_seed.values()])[:, np.newaxis], np.inf))
     yield interval(final)[0]
-    for wait in analysis.waits:
+    for wait in analysis.times:
         if (wait.condition, wait.task) == key:
-            yield wait_text(wait.median, wait.lower, wait.upper)
+            yield wait_text(wait.median)
     for entropy in analysis.entropies[mean.task, mean.condition]:
         yield spread(entropy) if entropy else ""
     yield f"{len(mean.scores.by_seed)} of {mean.runs}"
@@ -102,7 +102,7 @@ def _outcomes(sweep: Sweep, analysis: StageAnalysis, mean: Mean, prefix: str) ->
 def seeds_table(sweep: Sweep) -> Iterator[str]:
     """The area under the curve of every seed."""
     means = study_of(sweep).means
-    yield row("seed", *(label_of(mean.condition) for mean in means))
+    yield row("seed", *(mean.condition.short_label for mean in means))
     yield rule(1 + len(means))
     for seed in sorted({seed for mean in means for seed in mean.scores.by_seed}, key=int):
         scores = (mean.scores.by_seed.get(seed) for mean in means)

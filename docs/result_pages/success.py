@@ -7,10 +7,9 @@ from collections.abc import Iterator, Sequence
 from docs.result_pages.figures import figure
 from docs.result_pages.words import THRESHOLD, interval, row, rule, wait_text
 from music_rllib.report.figures.choice import PRIMARY, drawings_of_stages, stage_drawings
-from music_rllib.results.analysis import StageAnalysis, analyse, waits_of
+from music_rllib.results.analysis import StageAnalysis, analyse, time_to_threshold
 from music_rllib.results.conditions import Condition, find_stages
 from music_rllib.results.data import Sweep
-from music_rllib.results.statistics import median_wait, median_wait_interval
 
 
 def success(sweep: Sweep, figures: dict[str, bytes], stages: Sequence[str] = ()) -> Iterator[str]:
@@ -67,23 +66,21 @@ def outcomes(
                 (
                     f"{done} of {len(runs)}",
                     *interval(finals.get(condition)),
-                    *waits(sweep, task, runs),
+                    *_times(sweep, condition, task),
                 ),
             )
 
 
-def waits(sweep: Sweep, task: str, runs: Sequence[int]) -> tuple[str, str]:
-    """Median of the steps to the threshold, censored where it was not reached, and each run's."""
-    told = waits_of(sweep, task, runs, THRESHOLD)
-    if told is None:
+def _times(sweep: Sweep, condition: Condition, task: str) -> tuple[str, str]:
+    """Median number of steps to the threshold, with censored runs, and the steps of each run."""
+    found = time_to_threshold(sweep, condition, task, THRESHOLD)
+    if found is None:
         return "", ""
     each = ", ".join(
         f"{'' if there else '> '}{steps:,.0f}"
-        for steps, there in sorted(zip(told.steps, told.reached, strict=True))
+        for steps, there in sorted(zip(found.steps, found.reached, strict=True))
     )
-    if not told.reached.any():
-        return "not reached", each
-    return wait_text(median_wait(told), *median_wait_interval(told)), each
+    return wait_text(found.median) if found.reached.any() else "not reached", each
 
 
 def curves(sweep: Sweep, analysis: StageAnalysis, figures: dict[str, bytes]) -> Iterator[str]:

@@ -8,8 +8,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from music_rllib.results import statistics as st
-from music_rllib.results.analysis import Final, each_seed
-from music_rllib.results.conditions import Condition
+from music_rllib.results.analysis import FinalScores
 from music_rllib.results.statistics import number
 
 THRESHOLD = 0.9
@@ -26,12 +25,12 @@ def rule(columns: int) -> str:
     return "|" + "---|" * columns
 
 
-def interval(final: Final[Condition] | None) -> tuple[str, str]:
+def interval(final: FinalScores | None) -> tuple[str, str]:
     """A final rate with its interval, and each seed's; empty where none has finished."""
     if final is None:
         return "", ""
     found = final.estimate
-    value, each = percent(final.value), ", ".join(f"{100 * x:.0f}" for x in each_seed(final))
+    value, each = percent(final.value), ", ".join(f"{100 * x:.0f}" for x in final.each_seed)
     if not found.has_interval:
         return f"{value} (one seed)", each
     return f"{value} [{percent(float(found.lower))}, {percent(float(found.upper))}]", each
@@ -50,15 +49,13 @@ def percent(share: float) -> str:
     return f"{100 * share:.0f} %"
 
 
-def wait_text(median: float, low: float, high: float) -> str:
+def wait_text(median: st.Estimate) -> str:
     """A median number of steps with its interval, if it has one."""
-    ends = "" if np.isnan(low) else f" [{steps_text(low)}, {steps_text(high)}]"
-    return f"{steps_text(median)}{ends}"
-
-
-def steps_text(steps: float) -> str:
-    """`42,600`, or that they were not reached."""
-    return f"{steps:,.0f}" if np.isfinite(steps) else "not reached"
+    value, low, high = (
+        f"{steps:,.0f}" if np.isfinite(steps) else "not reached"
+        for steps in (median.value, median.lower, median.upper)
+    )
+    return value if np.isnan(median.lower) else f"{value} [{low}, {high}]"
 
 
 def clock(seconds: float | None) -> str:

@@ -40,7 +40,7 @@ from music_rllib.results.analysis import StageAnalysis
 from music_rllib.results.answer import answer, planned_in_words
 from music_rllib.results.conditions import SIDE_BY_SIDE
 from music_rllib.results.data import Sweep
-from music_rllib.results.study import Study, label_of
+from music_rllib.results.study import Study
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,7 +145,7 @@ def _question(report: Report) -> str:
     seeds = "1 seed" if len(stage.seeds) == 1 else f"{len(stage.seeds)} seeds"
     where = f"on {_enumerated(stage.tasks)} ({seeds}{steps})"
     conditions = stage.compared or stage.conditions
-    labels = [label_of(condition) for condition in conditions]
+    labels = [condition.short_label for condition in conditions]
     if len(labels) == 1:
         return f"What {aim} does {labels[0]} reach {where}?"
     which = _enumerated(labels, "or")

@@ -10,9 +10,8 @@ import numpy as np
 from music_rllib import names
 from music_rllib.report.pieces import DASH, TextTable, number_cell
 from music_rllib.results import statistics as st
-from music_rllib.results.analysis import Final, StageAnalysis
+from music_rllib.results.analysis import FinalScores, StageAnalysis
 from music_rllib.results.archive import merged
-from music_rllib.results.conditions import Condition
 from music_rllib.results.data import RunRecord, Sweep
 from music_rllib.results.statistics import interval_text, number
 
@@ -130,7 +129,7 @@ def _results_table(analyses: Sequence[StageAnalysis], titles: tuple[str, str]) -
     )
 
 
-def _mean(final: Final[Condition] | None) -> str:
+def _mean(final: FinalScores | None) -> str:
     if final is None or np.isnan(final.value):
         return DASH
     return f"{number(final.value)} ({interval_text(final.estimate)})"

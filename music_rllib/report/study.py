@@ -18,7 +18,7 @@ from music_rllib.results.answer import (
     verdict_in_words,
 )
 from music_rllib.results.statistics import SHOW_SEEDS_BELOW, number
-from music_rllib.results.study import Study, alpha_sensitivity, label_of
+from music_rllib.results.study import Study, alpha_sensitivity
 
 
 def study_tables(study: Study) -> list[TextTable]:
@@ -61,7 +61,7 @@ def _means_table(study: Study) -> TextTable:
     rows = [
         (
             mean.task,
-            label_of(mean.condition),
+            mean.condition.short_label,
             mean.measure.words,
             *estimate_cells(mean.estimate),
             " ".join(map(number, sorted(mean.scores.by_seed.values())))
@@ -125,7 +125,7 @@ def study_drawings(study: Study) -> Iterator[Drawing]:
             title=f"Performance profile of the {kind}",
             caption="Share of finished runs above each value, with 95 % bands at each point.",
             panels=tuple(profiles),
-            legend=[(label_of(condition), styles[condition]) for condition in shown],
+            legend=[(condition.short_label, styles[condition]) for condition in shown],
         )
     if lines := alpha_panels(study.means, styles):
         by_q = {one.entropic_index: styles[one] for one in reversed(shown)}

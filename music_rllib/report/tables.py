@@ -111,7 +111,7 @@ def improvement_table(analyses: Iterable[StageAnalysis]) -> Table:
             )
             for analysis in analyses
             for scope in analysis.scopes
-            for pair in scope.comparisons
+            for pair in scope.differences
         ],
     )
 
@@ -127,18 +127,16 @@ def waits_table(analyses: Iterable[StageAnalysis]) -> Table:
                 wait.task,
                 wait.condition.label,
                 wait.threshold,
-                wait.runs,
-                wait.reached,
-                wait.median,
-                wait.lower,
-                wait.upper,
+                len(wait.steps),
+                int(wait.reached.sum()),
+                *_numbers(wait.median),
                 " ".join(
                     f"{'' if reached else '>'}{steps:.0f}"
-                    for steps, reached in zip(wait.waits.steps, wait.waits.reached, strict=True)
+                    for steps, reached in zip(wait.steps, wait.reached, strict=True)
                 ),
             )
             for analysis in analyses
-            for wait in analysis.waits
+            for wait in analysis.times
         ],
     )
 

@@ -1,30 +1,19 @@
-"""Final values of conditions: means with intervals, and differences without a test.
+"""Final values, times to a threshold and learning curves of every stage, on each of its tasks.
 
-`compare`, the report, its tables and the results page all go through :func:`scopes_of`, so that
-they have the same numbers. Verdicts come from :mod:`music_rllib.results.claims` alone.
-
-
-Steps to a threshold, which some runs never reach: a table of medians, without a test.
-
-A run that ends below the threshold is *censored*: all that is known is that it would have taken
-more than its steps. Leaving it out would make the worst setting look fast, so the median is Kaplan
-and Meier's (1958), which is infinite if fewer than half of the runs reach the threshold.
-
-
-Statistics of every stage of a sweep, on each of its tasks.
-
-A final score is the primary metric of a finished run's last evaluation. Curves and steps to a
-threshold take every run as far as it went: one that failed or is still running is censored there.
+These are tables and figures without a test; verdicts come from :mod:`music_rllib.results.study`.
+Final values are the last evaluations of finished runs. Curves and times to a threshold use all
+evaluations of every run; a run that failed or is still running is censored at its last one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
-from typing import Generic, NamedTuple, Protocol, TypeVar
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from music_rllib import names
 from music_rllib.results import statistics as st
@@ -32,38 +21,25 @@ from music_rllib.results.conditions import (
     ALL_TASKS,
     AVERAGED,
     Condition,
-    Stage,
+    StageRuns,
     final_scores,
     find_stages,
     stage_by_stage,
 )
 from music_rllib.results.data import Ints, Sweep
-from music_rllib.results.statistics import (
-    SHOW_SEEDS_BELOW,
-    Array,
-    Estimate,
-    Waits,
-    first_passage,
-    median_wait,
-    median_wait_interval,
-)
+from music_rllib.results.statistics import Array, Estimate
 
-
-class Labelled(Protocol):
-    """A condition with a label."""
-
-    @property
-    def label(self) -> str: ...
-
-
-C = TypeVar("C", bound=Labelled)
+THRESHOLDS = (0.5, 0.85)
+"""Success rates of the times to a threshold; the paper's Figure 4 uses 85%."""
+CURVE_POINTS = 101
+"""Largest number of points of a curve in a figure."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Final(Generic[C]):
+class FinalScores:
     """Final scores of a condition."""
 
-    condition: C
+    condition: Condition
     scores: Array = field(repr=False)
     """`[seeds, T]`, of the seeds that have finished on every task of the scope."""
     estimate: Estimate
@@ -80,24 +56,30 @@ class Final(Generic[C]):
     def seeds(self) -> int:
         return len(self.scores)
 
+    @property
+    def each_seed(self) -> list[float]:
+        """Sorted means over the tasks of each seed; empty if there are too many to show."""
+        means = self.scores.mean(axis=1)
+        return sorted(means.tolist()) if self.seeds < st.SHOW_SEEDS_BELOW else []
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Comparison(Generic[C]):
-    """Comparison of the final scores of two conditions."""
+class FinalDifference:
+    """Difference of the final scores of two conditions, without a test."""
 
-    first: Final[C]
-    second: Final[C]
+    first: FinalScores
+    second: FinalScores
     improvement: float
-    """Probability that a run of `first` ends higher than one of `second`, ties half."""
+    """Probability that a run of `first` ends higher than a run of `second`; ties count half."""
 
     @property
     def gap(self) -> Estimate:
-        """Mean of `first` minus that of `second`."""
+        """Mean of `first` minus mean of `second`."""
         return st.difference(self.first.estimate, self.second.estimate)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scope(Generic[C]):
+class Scope:
     """Conditions on one task, or on all tasks together."""
 
     name: str
@@ -105,121 +87,33 @@ class Scope(Generic[C]):
     metric: str
     """Metric whose last value is the score."""
     tasks: int
-    finals: tuple[Final[C], ...]
-    """Scores of the conditions with a seed that has finished on every task of the scope."""
-    compared: tuple[Final[C], ...]
-    """Scores of those that may be compared: of a search, conditions on fresh seeds."""
-    comparisons: tuple[Comparison[C], ...]
-    """Comparison of each pair of `compared`, a later condition against an earlier one."""
+    finals: tuple[FinalScores, ...]
+    """Scores of the conditions that have a seed which has finished on every task of the scope."""
+    compared: tuple[FinalScores, ...]
+    """Scores of the conditions that may be compared: in a search, those on fresh seeds."""
 
-
-def scopes_of(
-    metrics: Mapping[str, str],
-    conditions: Sequence[tuple[C, Array, float]],
-    may_be_compared: Collection[C],
-) -> tuple[Scope[C], ...]:
-    """A scope for each task, after one over all tasks where these have a unit in common.
-
-    Args:
-        metrics: task to the metric of its scores, for T tasks.
-        conditions: each with its scores `[seeds, T]`, NaN for what has not finished, and its
-            evaluation episodes, infinite where they are not known. Seeds that have not finished on
-            every task of a scope are left out of it: otherwise a task could weigh more in one
-            condition than in another.
-        may_be_compared: conditions that are compared with each other.
-    """
-    columns = [(task, metric, [column]) for column, (task, metric) in enumerate(metrics.items())]
-    if len(columns) > 1 and len(set(metrics.values())) == 1 and columns[0][1] in AVERAGED:
-        columns.insert(0, (ALL_TASKS, columns[0][1], list(range(len(columns)))))
-    return tuple(
-        _scope(name, metric, [(c, x[:, chosen], n) for c, x, n in conditions], may_be_compared)
-        for name, metric, chosen in columns
-    )
-
-
-def _scope(
-    name: str,
-    metric: str,
-    conditions: Sequence[tuple[C, Array, float]],
-    may_be_compared: Collection[C],
-) -> Scope[C]:
-    is_rate = metric in names.EVAL_RATES
-    finals = [
-        Final(
-            condition=condition,
-            scores=complete,
-            estimate=st.estimate(complete, episodes if is_rate else None),
+    @property
+    def differences(self) -> tuple[FinalDifference, ...]:
+        """A difference for each pair of `compared`, the later condition minus the earlier one."""
+        return tuple(
+            FinalDifference(first=a, second=b, improvement=st.improvement(a.scores, b.scores))
+            for b, a in combinations(self.compared, 2)
         )
-        for condition, scores, episodes in conditions
-        if len(complete := scores[~np.isnan(scores).any(axis=1)])
-    ]
-    compared = tuple(final for final in finals if final.condition in may_be_compared)
-    pairs = [(second, first) for first, second in combinations(compared, 2)]
-    return Scope(
-        name=name,
-        metric=metric,
-        tasks=conditions[0][1].shape[1] if conditions else 1,
-        finals=tuple(finals),
-        compared=compared,
-        comparisons=tuple(
-            Comparison(first=a, second=b, improvement=st.improvement(a.scores, b.scores))
-            for a, b in pairs
-        ),
-    )
-
-
-def each_seed(final: Final[C]) -> list[float]:
-    """Rising scores of the seeds, means over the tasks; empty where there are many seeds."""
-    return sorted(final.scores.mean(axis=1).tolist()) if final.seeds < SHOW_SEEDS_BELOW else []
-
-
-def waits_of(sweep: Sweep, task: str, runs: Sequence[int], threshold: float) -> Waits | None:
-    """Steps of a task's runs to a success rate; None where none was evaluated."""
-    passages = list(_passages(sweep, task, runs, threshold))
-    if not passages:
-        return None
-    steps, reached = zip(*passages, strict=True)
-    return Waits(steps=np.array(steps), reached=np.array(reached))
-
-
-def _passages(
-    sweep: Sweep, task: str, runs: Sequence[int], threshold: float
-) -> Iterator[tuple[float, bool]]:
-    """:func:`first_passage` of each run on a task that was evaluated."""
-    for run in runs:
-        if sweep.runs[run].task == task:
-            passage = first_passage(*sweep.finite(run, names.EVAL_SUCCESS), threshold)
-            if passage is not None:
-                yield passage
-
-
-THRESHOLDS = (0.5, 0.85)
-"""Success rates that steps are counted to; the paper's Figure 4 has 85 %."""
-CURVE_POINTS = 101
-"""Largest number of points of a curve; more cannot be told apart in a figure."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Wait:
-    """Environment steps until a condition reaches a success rate on a task."""
+class TimeToThreshold:
+    """Environment steps until the R runs of a condition reach a success rate on a task."""
 
     condition: Condition
     task: str
     threshold: float
-    waits: Waits
-    median: float
-    """Median over the runs; infinite where fewer than half of them reached the rate."""
-    lower: float
-    """Lower end of its interval; NaN, as `upper`, where there are too few runs."""
-    upper: float
-
-    @property
-    def runs(self) -> int:
-        return len(self.waits.steps)
-
-    @property
-    def reached(self) -> int:
-        return int(self.waits.reached.sum())
+    steps: Array
+    """`[R]` environment steps to the threshold, or to the last evaluation of a censored run."""
+    reached: NDArray[np.bool_]
+    """`[R]`, whether the run reached the threshold; False: the run is censored."""
+    median: Estimate
+    """Infinite if fewer than half of the runs reached the threshold."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -239,9 +133,9 @@ class Curve:
 
 
 class Entropies(NamedTuple):
-    """Entropies of a condition's policies at the end, means over finished runs; None without one.
+    """Final entropies of a condition's policies, means over finished runs; None without one.
 
-    S_q has the run's own q and form, so that its values at different q are not to be compared.
+    S_q depends on the run's own q and form: values at different q are not comparable.
     """
 
     shannon: Estimate | None
@@ -250,7 +144,7 @@ class Entropies(NamedTuple):
 
     @property
     def numbers(self) -> list[float]:
-        """Mean and both ends of the interval of each entropy; NaN where there is none."""
+        """Mean and both ends of the interval of each entropy; NaN without an entropy."""
         triples = ((one.value, one.lower, one.upper) if one else (np.nan,) * 3 for one in self)
         return [float(number) for triple in triples for number in triple]
 
@@ -259,40 +153,54 @@ class Entropies(NamedTuple):
 class StageAnalysis:
     """Statistics of one stage."""
 
-    stage: Stage
-    scopes: tuple[Scope[Condition], ...]
-    waits: tuple[Wait, ...]
+    stage: StageRuns
+    scopes: tuple[Scope, ...]
+    times: tuple[TimeToThreshold, ...]
     entropies: Mapping[tuple[str, Condition], Entropies]
     """Entropies by scope and condition."""
     cut_at: Mapping[str, float]
-    """Environment steps at which final scores were read on a task; without tasks on which they are
-    those of the runs' ends."""
+    """Environment steps at which final scores of a task were read; other tasks: at each run's
+    end."""
 
 
 def analyse(sweep: Sweep) -> list[StageAnalysis]:
-    """The statistics of each stage."""
+    """Compute the statistics of each stage."""
     return [_analyse(sweep, stage) for stage in find_stages(sweep)]
 
 
+def analyse_stages(sweep: Sweep, stages: Sequence[StageRuns]) -> StageAnalysis | None:
+    """Compare stages with each other (:func:`stage_by_stage`); None if they share nothing.
+
+    If the stages have different budgets on a task, all are read at the end of the smallest one.
+    """
+    together = stage_by_stage(sweep, stages)
+    if together is None:
+        return None
+    cut_at = {}
+    for task in together.tasks:
+        budgets = {sweep.least_budget(task, one.runs) for one in together.compared}
+        if np.isfinite(list(budgets)).sum() > 1:
+            cut_at[task] = min(sweep.least_end(task, one.runs) for one in together.compared)
+    return _analyse(sweep, together, cut_at)
+
+
 def _analyse(
-    sweep: Sweep, stage: Stage, cut_at: Mapping[str, float] | None = None
+    sweep: Sweep, stage: StageRuns, cut_at: Mapping[str, float] | None = None
 ) -> StageAnalysis:
     cut_at = cut_at or {}
     ended = sweep.until(cut_at) if cut_at else sweep
-    metrics = {task: sweep.primary_metric(task) for task in stage.tasks}
     scopes = stage_scopes(ended, stage)
-    cells = [
-        (task, threshold)
-        for task, metric in metrics.items()
-        if metric == names.EVAL_SUCCESS
+    rated = [task for task in stage.tasks if sweep.primary_metric(task) == names.EVAL_SUCCESS]
+    times = (
+        time_to_threshold(sweep, condition, task, threshold)
+        for task in rated
         for threshold in THRESHOLDS
-    ]
+        for condition in stage.conditions
+    )
     return StageAnalysis(
         stage=stage,
         scopes=scopes,
-        waits=tuple(
-            wait for task, threshold in cells for wait in _waits(sweep, stage, task, threshold)
-        ),
+        times=tuple(one for one in times if one is not None),
         entropies={
             (scope.name, final.condition): _entropies(ended, final.condition, stage, scope.name)
             for scope in scopes
@@ -302,22 +210,48 @@ def _analyse(
     )
 
 
-def stage_scopes(
-    sweep: Sweep, stage: Stage, metric: str | None = None
-) -> tuple[Scope[Condition], ...]:
-    """Comparisons of a stage's conditions by the last values of a metric.
+def stage_scopes(sweep: Sweep, stage: StageRuns, metric: str | None = None) -> tuple[Scope, ...]:
+    """Final values of a stage's conditions: a scope for each task.
 
-    Without `metric`, by each task's primary one.
+    The first scope covers all tasks if their metric has the same unit. A seed that has not finished
+    on every task of a scope is left out of it; otherwise tasks would have unequal weights.
+
+    Args:
+        sweep: The runs.
+        stage: The stage.
+        metric: The metric to read; None: each task's primary one.
     """
     metrics = {task: metric or sweep.primary_metric(task) for task in stage.tasks}
-    scored = [
-        (condition, final_scores(sweep, condition, metrics), sweep.episodes(condition.runs))
-        for condition in stage.conditions
-    ]
-    return scopes_of(metrics, scored, stage.compared)
+    scores = {condition: final_scores(sweep, condition, metrics) for condition in stage.conditions}
+    parts = [(task, metrics[task], [column]) for column, task in enumerate(metrics)]
+    if len(parts) > 1 and len(set(metrics.values())) == 1 and parts[0][1] in AVERAGED:
+        parts.insert(0, (ALL_TASKS, parts[0][1], list(range(len(parts)))))
+    return tuple(
+        _scope(sweep, stage, name, own, {c: matrix[:, columns] for c, matrix in scores.items()})
+        for name, own, columns in parts
+    )
 
 
-def _entropies(sweep: Sweep, condition: Condition, stage: Stage, scope: str) -> Entropies:
+def _scope(
+    sweep: Sweep, stage: StageRuns, name: str, metric: str, scores: Mapping[Condition, Array]
+) -> Scope:
+    finals = []
+    for condition, matrix in scores.items():
+        complete = matrix[~np.isnan(matrix).any(axis=1)]
+        if len(complete):
+            episodes = sweep.episodes(condition.runs) if metric in names.EVAL_RATES else None
+            estimate = st.estimate(complete, episodes)
+            finals.append(FinalScores(condition=condition, scores=complete, estimate=estimate))
+    return Scope(
+        name=name,
+        metric=metric,
+        tasks=len(stage.tasks) if name == ALL_TASKS else 1,
+        finals=tuple(finals),
+        compared=tuple(final for final in finals if final.condition in stage.compared),
+    )
+
+
+def _entropies(sweep: Sweep, condition: Condition, stage: StageRuns, scope: str) -> Entropies:
     tasks = stage.tasks if scope == ALL_TASKS else (scope,)
     runs = tuple(run for run in condition.runs if sweep.runs[run].task in tasks)
     estimates = []
@@ -328,43 +262,40 @@ def _entropies(sweep: Sweep, condition: Condition, stage: Stage, scope: str) -> 
     return Entropies(*estimates)
 
 
-def analyse_stages(sweep: Sweep, stages: Sequence[Stage]) -> StageAnalysis | None:
-    """Stages compared with each other (:func:`stage_by_stage`); None where there is nothing to.
-
-    Where one has a smaller budget on a task, the others are read at its end.
-    """
-    together = stage_by_stage(sweep, stages)
-    if together is None:
+def time_to_threshold(
+    sweep: Sweep, condition: Condition, task: str, threshold: float
+) -> TimeToThreshold | None:
+    """Environment steps of a condition's runs to a success rate; None if none was evaluated."""
+    passages = list(_passages(sweep, condition, task, threshold))
+    if not passages:
         return None
-    cut_at = {}
-    for task in together.tasks:
-        budgets = {sweep.least_budget(task, one.runs) for one in together.compared}
-        if len([budget for budget in budgets if np.isfinite(budget)]) > 1:
-            cut_at[task] = min(sweep.least_end(task, one.runs) for one in together.compared)
-    return _analyse(sweep, together, cut_at)
+    steps, reached = map(np.array, zip(*passages, strict=True))
+    return TimeToThreshold(
+        condition=condition,
+        task=task,
+        threshold=threshold,
+        steps=steps,
+        reached=reached,
+        median=st.censored_median(steps, reached),
+    )
 
 
-def _waits(sweep: Sweep, stage: Stage, task: str, threshold: float) -> Iterator[Wait]:
-    for condition in stage.conditions:
-        waits = waits_of(sweep, task, condition.runs, threshold)
-        if waits is not None:
-            lower, upper = median_wait_interval(waits)
-            yield Wait(
-                condition=condition,
-                task=task,
-                threshold=threshold,
-                waits=waits,
-                median=median_wait(waits),
-                lower=lower,
-                upper=upper,
-            )
+def _passages(
+    sweep: Sweep, condition: Condition, task: str, threshold: float
+) -> Iterator[tuple[float, bool]]:
+    """Steps of each evaluated run to the threshold, and whether it was reached."""
+    for run in condition.runs:
+        if sweep.runs[run].task == task:
+            passage = st.first_passage(*sweep.finite(run, names.EVAL_SUCCESS), threshold)
+            if passage is not None:
+                yield passage
 
 
 def curve(sweep: Sweep, condition: Condition, task: str, metric: str) -> Curve | None:
-    """Learning curve of a condition on a task; None where no run has the metric.
+    """Learning curve of a condition on a task; None if no run has the metric.
 
-    Where a run was not evaluated at a step of the others, its value lies on the straight line
-    between its own evaluations; before the first and after the last of them it has none.
+    A run that was not evaluated at a step of the other runs is interpolated linearly between its
+    own evaluations. It has no value before the first and after the last of them.
     """
     runs = [run for run in condition.runs if sweep.runs[run].task == task]
     series = [pair for run in runs if len((pair := sweep.finite(run, metric))[0])]
@@ -376,14 +307,12 @@ def curve(sweep: Sweep, condition: Condition, task: str, metric: str) -> Curve |
     values = np.stack(
         [np.interp(grid, steps, own, left=np.nan, right=np.nan) for steps, own in series]
     )
+    episodes = sweep.episodes(runs) if metric in names.EVAL_RATES else None
     return Curve(
         condition=condition,
         task=task,
         steps=grid,
         values=values,
-        estimate=st.estimate(
-            values[:, np.newaxis],
-            sweep.episodes(runs) if metric in names.EVAL_RATES else None,
-        ),
+        estimate=st.estimate(values[:, np.newaxis], episodes),
         runs=np.sum(~np.isnan(values), axis=0),
     )

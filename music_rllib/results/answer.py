@@ -14,7 +14,7 @@ import numpy as np
 from music_rllib import names
 from music_rllib.results.analysis_plan import AnalysisPlan, is_controlled
 from music_rllib.results.claims import FEWEST_SEEDS, Claim, Verdict
-from music_rllib.results.conditions import ALL_TASKS, Stage
+from music_rllib.results.conditions import ALL_TASKS, StageRuns
 from music_rllib.results.data import Sweep
 from music_rllib.results.statistics import (
     MAX_SEEDS,
@@ -26,7 +26,7 @@ from music_rllib.results.statistics import (
     seeds_for_difference,
     seeds_for_equivalence,
 )
-from music_rllib.results.study import Mean, Study, label_of
+from music_rllib.results.study import Mean, Study
 
 MOST_CLAIMS = 4
 """Number of claims with a sentence of their own; the others are in the table."""
@@ -52,7 +52,7 @@ def answer(sweep: Sweep, study: Study) -> list[str]:
     elif not shown:
         only = study.means[0]
         sentences.append(
-            f"Only one condition has a result: {label_of(only.condition)}, {only.measure.words} "
+            f"Only one condition has a result: {only.condition.short_label}, {only.measure.words} "
             f"{number(only.estimate.value)} ({mean_interval(only.estimate)})."
         )
     if rest := [claim for claim in study.claims if claim not in shown[:MOST_CLAIMS]]:
@@ -182,7 +182,7 @@ def _seeds(sweep: Sweep, study: Study, shown: Sequence[Claim]) -> str:
     return text
 
 
-def _control(sweep: Sweep, study: Study, stage: Stage) -> str:
+def _control(sweep: Sweep, study: Study, stage: StageRuns) -> str:
     """What is done for different q to be compared fairly."""
     version = study.plan or study.latest
     if version is not None:
@@ -267,7 +267,7 @@ def mean_rows(study: Study) -> list[dict[str, Any]]:
         {
             "stage": study.stage.name if study.stage else "",
             "task": mean.task,
-            "condition": label_of(mean.condition),
+            "condition": mean.condition.short_label,
             "metric": mean.measure.metric,
             "measure": mean.measure.words,
             "seeds": mean.scores.finished,

@@ -1,8 +1,8 @@
 """Conditions of a sweep: runs that differ in their task and seed only.
 
-What varies between a stage's runs on the same task tells
-its conditions apart, and so does what they start from. Runs are grouped by that and not by the
-number of their trial, which changes when a sweep is extended.
+Conditions are told apart by the settings that vary between a stage's runs on the same task, and by
+those of the runs that they start from. The number of a trial does not count: it changes when a
+sweep is extended.
 """
 
 from __future__ import annotations
@@ -22,20 +22,22 @@ Values = tuple[tuple[str, str], ...]
 
 ENTROPIC_INDEX = "q"
 ALPHA = "α"
+ALL_TASKS = "all tasks"
+AVERAGED = {*names.EVAL_RATES, *names.ENTROPIES}
+"""Metrics with the same unit on every task, which can be averaged over tasks."""
 SIDE_BY_SIDE = "stages side by side"
 SEEDS, FRESH, SEARCHED = "seeds", "fresh", "search"
-"""Setting of a search's conditions, and its values: fresh seeds, and those that trials used."""
-_WITHOUT_TASK_REWARD = ("music-u",)
+"""Setting of a search's conditions, and its values: fresh seeds, and the seeds of the trials."""
 IN_WORDS = {
     "tac.entropic_index": (ENTROPIC_INDEX, names.TAG_ENTROPIC_INDEX),
     "tac.alpha": (ALPHA, names.TAG_ALPHA),
     "music.mi_reward_weight": ("MI weight", names.TAG_MI_REWARD_WEIGHT),
 }
-"""Settings that may be schedules, and so several params: a label, and a tag with the words."""
+"""Settings that can be schedules and then span several params: label, and tag with the words."""
 
 
 def whole_setting(param: str) -> str:
-    """The setting that a param is a part of: `tac.alpha` for `tac.alpha.value`, else `param`."""
+    """The setting that a param belongs to: `tac.alpha` for `tac.alpha.value`, else `param`."""
     wholes = (setting for setting in IN_WORDS if f"{param}.".startswith(f"{setting}."))
     return next(wholes, param)
 
@@ -45,9 +47,9 @@ class Condition:
     """Runs that differ in their task and seed only."""
 
     entropic_index: str
-    """q in words, which decides the colour; empty where the runs have several."""
+    """q in words, which decides the color; empty if the runs have several."""
     others: Values
-    """Other settings that tell the condition from the others of its stage."""
+    """Other settings that tell the condition apart in its stage."""
     runs: tuple[int, ...]
     """Positions in `Sweep.runs`."""
 
@@ -62,10 +64,16 @@ class Condition:
         pairs = ((ENTROPIC_INDEX, self.entropic_index), *self.others)
         return ", ".join(f"{name} = {value}" for name, value in pairs if value)
 
+    @property
+    def short_label(self) -> str:
+        """The label without the seeds of a search, of which only the fresh ones are compared."""
+        others = tuple(pair for pair in self.others if pair[0] != SEEDS)
+        return replace(self, others=others).label
+
 
 @dataclass(frozen=True, kw_only=True)
-class Stage:
-    """The conditions of one stage, by rising q, on its tasks."""
+class StageRuns:
+    """The runs of one stage as conditions, by increasing q."""
 
     name: str
     variant: str
@@ -80,9 +88,9 @@ class Stage:
 
     @property
     def compared(self) -> tuple[Condition, ...]:
-        """Conditions that may be compared: of a search only those on fresh seeds.
+        """Conditions that may be compared: in a search, only those on fresh seeds.
 
-        The best of a search's trials is best by selection, too, on the seeds that chose it.
+        Selection biases the best of a search's trials upwards on the seeds that selected it.
         """
         if not self.is_search:
             return self.conditions
@@ -91,15 +99,15 @@ class Stage:
     @property
     def has_task_reward(self) -> bool:
         """Whether its runs are trained for success."""
-        return self.variant not in _WITHOUT_TASK_REWARD
+        return self.variant != "music-u"
 
 
-def side_by_side(stages: Sequence[Stage]) -> Stage | None:
+def stages_together(stages: Sequence[StageRuns]) -> StageRuns | None:
     """One stage with the conditions of all that train for the task; None for fewer than two."""
     stages = [stage for stage in stages if stage.has_task_reward]
     if len(stages) < 2:
         return None
-    return Stage(
+    return StageRuns(
         name=SIDE_BY_SIDE,
         variant=" and ".join(dict.fromkeys(stage.variant for stage in stages)),
         tasks=tuple(dict.fromkeys(task for stage in stages for task in stage.tasks)),
@@ -113,13 +121,13 @@ def side_by_side(stages: Sequence[Stage]) -> Stage | None:
     )
 
 
-def stage_by_stage(sweep: Sweep, stages: Sequence[Stage]) -> Stage | None:
-    """One stage with a condition for each stage that trains for the task, over what all share.
+def stage_by_stage(sweep: Sweep, stages: Sequence[StageRuns]) -> StageRuns | None:
+    """One stage with a condition for each stage that trains for the task.
 
-    On each task a condition has the runs of those q and settings that every stage has there. The
-    result is None where the stages share nothing.
+    On each task, a condition has the runs of the settings that every stage has there. The result
+    is None if the stages share nothing.
     """
-    together = side_by_side(stages)
+    together = stages_together(stages)
     stages = [stage for stage in stages if stage.has_task_reward]
     cells = [
         {
@@ -147,8 +155,8 @@ def stage_by_stage(sweep: Sweep, stages: Sequence[Stage]) -> Stage | None:
     return replace(together, conditions=tuple(conditions))
 
 
-def find_stages(sweep: Sweep) -> list[Stage]:
-    """The sweep's stages, in the order in which their first runs began."""
+def find_stages(sweep: Sweep) -> list[StageRuns]:
+    """The sweep's stages, in the order of their first runs."""
     stages: defaultdict[str, list[int]] = defaultdict(list)
     for position, run in enumerate(sweep.runs):
         stages[run.stage].append(position)
@@ -159,8 +167,8 @@ def find_stages(sweep: Sweep) -> list[Stage]:
     }
     by_key = {run.node_key: position for position, run in enumerate(sweep.runs)}
 
-    def told_apart_by(run: int) -> Values:
-        """Values of what varies in the run's stage and, named after it, in its source's stage."""
+    def varied_values(run: int) -> Values:
+        """Values that vary in the run's stage, and in the stage of the run that it starts from."""
         record = sweep.runs[run]
         own = tuple((n, settings[run][n]) for n in varying[record.stage] if n in settings[run])
         if part := record.tags.get(names.TAG_PART):
@@ -171,18 +179,24 @@ def find_stages(sweep: Sweep) -> list[Stage]:
         stage = sweep.runs[source].stage
         of_source = (
             (name if ":" in name else f"{stage}: {name}", value)
-            for name, value in told_apart_by(source)
+            for name, value in varied_values(source)
         )
         return (*own, *of_source)
 
     return [
-        _stage(sweep.runs, name, runs, {run: told_apart_by(run) for run in runs})
+        _stage(sweep.runs, name, runs, {run: varied_values(run) for run in runs})
         for name, runs in stages.items()
     ]
 
 
 def final_scores(sweep: Sweep, condition: Condition, metrics: Mapping[str, str]) -> Array:
-    """Last values of finished runs, `[seeds, T]`, NaN where there is none."""
+    """Last values of finished runs, `[seeds, T]`; NaN if missing.
+
+    Args:
+        sweep: The runs.
+        condition: The condition.
+        metrics: Task to metric, for T tasks.
+    """
     tasks = list(metrics)
     rows: dict[tuple[str, int], Array] = {}
     seen: Counter[tuple[str, str]] = Counter()
@@ -200,14 +214,14 @@ def final_scores(sweep: Sweep, condition: Condition, metrics: Mapping[str, str])
 
 def _stage(
     records: Sequence[RunRecord], name: str, runs: Sequence[int], values: Mapping[int, Values]
-) -> Stage:
+) -> StageRuns:
     groups: defaultdict[tuple[str, Values], list[int]] = defaultdict(list)
     for run in runs:
         others = dict(values[run])
         q = others.pop(ENTROPIC_INDEX, records[run].entropic_index)
         groups[q, tuple(others.items())].append(run)
     ordered = sorted(groups.items(), key=lambda item: _order(*item[0]))
-    return Stage(
+    return StageRuns(
         name=name,
         variant=records[runs[0]].variant,
         tasks=tuple(dict.fromkeys(records[run].task for run in runs)),
@@ -230,7 +244,7 @@ def _varying(runs: Sequence[tuple[str, Mapping[str, str]]]) -> list[str]:
 
 
 def _all_settings(records: Sequence[RunRecord]) -> list[dict[str, str]]:
-    """The settings of each run; words that stand for several things are told in full."""
+    """The settings of each run; words with several meanings are followed by the full value."""
     of_runs = [_settings(record) for record in records]
     meanings: defaultdict[tuple[str, str], set[str]] = defaultdict(set)
     for settings in of_runs:
@@ -246,7 +260,7 @@ def _all_settings(records: Sequence[RunRecord]) -> list[dict[str, str]]:
 
 
 def _settings(run: RunRecord) -> dict[str, tuple[str, str]]:
-    """Settings, in words and in full, that may tell conditions apart: not the seed or the task."""
+    """Settings that can tell conditions apart, in words and in full; not the seed or the task."""
     settings: dict[str, tuple[str, str]] = {}
     for param, value in sorted(run.params.items()):
         if param == "seed" or param.startswith("task."):
@@ -272,8 +286,3 @@ def _number(text: str) -> tuple[float, str]:
         return float(text.split(" ")[0]), text
     except ValueError:
         return float("inf"), text
-
-
-ALL_TASKS = "all tasks"
-AVERAGED = {*names.EVAL_RATES, *names.ENTROPIES}
-"""Metrics that have the same unit on every task, so that they can be averaged over tasks."""

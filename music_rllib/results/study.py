@@ -31,7 +31,7 @@ from music_rllib.results.conditions import (
     IN_WORDS,
     SEEDS,
     Condition,
-    Stage,
+    StageRuns,
     Values,
     find_stages,
     whole_setting,
@@ -58,7 +58,7 @@ def _label(name: str) -> str:
 
 
 def matching(
-    sweep: Sweep, stages: Mapping[str, Stage], side: Mapping[str, str], stage: str
+    sweep: Sweep, stages: Mapping[str, StageRuns], side: Mapping[str, str], stage: str
 ) -> list[Condition]:
     """Conditions that may be compared and have all settings of one side of a hypothesis."""
     settings = dict(side)
@@ -136,7 +136,7 @@ class Mean:
 class Study:
     """All claims of one stage and of the hypotheses."""
 
-    stage: Stage | None
+    stage: StageRuns | None
     """None before a run has begun, and without a stage that trains for the task."""
     plan: PlanVersion | None
     """The last version recorded before the first of its runs had finished; None without one."""
@@ -222,12 +222,12 @@ def study_of(
     )
 
 
-def _runs(stage: Stage) -> list[int]:
+def _runs(stage: StageRuns) -> list[int]:
     """The runs of a stage's conditions that may be compared."""
     return [run for condition in stage.compared for run in condition.runs]
 
 
-def _planned(sweep: Sweep, stages: Mapping[str, Stage]) -> PlanVersion | None:
+def _planned(sweep: Sweep, stages: Mapping[str, StageRuns]) -> PlanVersion | None:
     """The last version of the plan that was recorded before any result."""
     for version in reversed(sweep.plans):
         runs = [run for name in version.plan.stages & stages.keys() for run in stages[name].runs]
@@ -242,7 +242,7 @@ def _same_test(one: PlanVersion, other: PlanVersion) -> bool:
 
 def _of_plan(
     sweep: Sweep,
-    stages: Mapping[str, Stage],
+    stages: Mapping[str, StageRuns],
     version: PlanVersion,
     known: Sequence[str],
     untested: list[str],
@@ -280,14 +280,14 @@ def _of_plan(
 
 def _of_stage(
     sweep: Sweep,
-    stage: Stage,
+    stage: StageRuns,
     measures: Mapping[str, Measure],
     margin: float | None,
     others: Sequence[Claim],
 ) -> Iterator[Claim]:
     """The undecided claims of a stage's pairs of conditions, on what no other claim is about."""
     known = {claim.subject for claim in others}
-    pairs = [(label_of(x), label_of(y), [(x, y)]) for x, y in _pairs(stage.compared)]
+    pairs = [(x.short_label, y.short_label, [(x, y)]) for x, y in _pairs(stage.compared)]
     for claim in claims_of(sweep, pairs, measures, margin):
         if claim.subject not in known:
             yield claim
@@ -317,7 +317,7 @@ def _pairs(conditions: Sequence[Condition]) -> list[tuple[Condition, Condition]]
     return [(one, other) for one, other in pairs if one is not other]
 
 
-def _means(sweep: Sweep, stage: Stage, measures: Mapping[str, Measure]) -> Iterator[Mean]:
+def _means(sweep: Sweep, stage: StageRuns, measures: Mapping[str, Measure]) -> Iterator[Mean]:
     for task, measure in measures.items():
         for condition in stage.compared:
             scores = scores_of(sweep, condition, task, measure)

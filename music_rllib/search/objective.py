@@ -88,7 +88,7 @@ def interval(objective: Objective, scores: Array, episodes: int | None = None) -
     freedom = scores.size - scores.shape[1]
     squares = float(np.sum((scores - scores.mean(axis=0)) ** 2))
     variance = squares / max(freedom, 1) / _runs_behind(objective, scores)
-    return st.interval(
+    return st.interval_of_mean(
         aggregate(objective, scores),
         variance,
         freedom,

@@ -25,7 +25,6 @@ from music_rllib.results.conditions import Condition
 from music_rllib.results.data import RunRecord, Sweep
 from music_rllib.results.read import LastValues, searches_of
 from music_rllib.results.statistics import with_interval
-from music_rllib.results.study import label_of
 from music_rllib.search.ranking import (
     Scored,
     best_so_far,
@@ -105,7 +104,7 @@ def _export_chosen(
         "success_rate": None if success is None else float(success.estimate.value),
         "entropies": best.get("entropies", {}),
         "on_fresh_seeds": fresh,
-        "why": f"{stage.name}: {label_of(condition)} {rank} by {by} on "
+        "why": f"{stage.name}: {condition.short_label} {rank} by {by} on "
         f"{'fresh seeds' if fresh else 'the seeds that it was chosen by'}; {by} "
         f"({'' if stage.search else 'mean, '}95 %): "
         f"{with_interval(best['value'], best['interval'])} over {in_runs(scored.runs)}{rest}",

@@ -22,8 +22,8 @@ from music_rllib.report.figures.plots import (
     profile_panel,
 )
 from music_rllib.report.figures.sensitivity import sensitivity_panels
-from music_rllib.results.analysis import Curve, Final, Scope, StageAnalysis, curve
-from music_rllib.results.conditions import SIDE_BY_SIDE, Condition, Stage, side_by_side
+from music_rllib.results.analysis import Curve, FinalScores, Scope, StageAnalysis, curve
+from music_rllib.results.conditions import SIDE_BY_SIDE, Condition, StageRuns, stages_together
 from music_rllib.results.data import Sweep
 from music_rllib.results.statistics import SHOW_SEEDS_BELOW
 from music_rllib.results.study import MOST_CONDITIONS
@@ -107,7 +107,7 @@ def stage_drawings(sweep: Sweep, analysis: StageAnalysis) -> Iterator[Drawing]:
         yield from _sensitivity(analysis)
 
 
-def _without_trials(sweep: Sweep, stage: Stage) -> Stage:
+def _without_trials(sweep: Sweep, stage: StageRuns) -> StageRuns:
     """The stage, or the ranked conditions of a search if there are any: its trials are too many."""
     if stage.compared in ((), stage.conditions):
         return stage
@@ -116,7 +116,7 @@ def _without_trials(sweep: Sweep, stage: Stage) -> Stage:
     return replace(stage, conditions=stage.compared, seeds=ranked)
 
 
-def _finals(stage: Stage, title: str, scopes: Sequence[Scope[Condition]]) -> Iterator[Drawing]:
+def _finals(stage: StageRuns, title: str, scopes: Sequence[Scope]) -> Iterator[Drawing]:
     if not scopes:
         return
     yield Drawing(
@@ -142,17 +142,17 @@ def _finals(stage: Stage, title: str, scopes: Sequence[Scope[Condition]]) -> Ite
     )
 
 
-def _finals_panels(stage: Stage, scope: Scope[Condition]) -> Iterator[Panel]:
+def _finals_panels(stage: StageRuns, scope: Scope) -> Iterator[Panel]:
     facets = Facets.of(stage)
     labels = {condition: facets.label(condition) for condition in stage.conditions}
-    panels: dict[str, list[Final[Condition]]] = {}
+    panels: dict[str, list[FinalScores]] = {}
     for final in scope.finals:
         panels.setdefault(facets.title(scope.name, final.condition), []).append(final)
     for title, shown in panels.items():
         yield finals_panel(title, scope, shown, facets.styles, labels)
 
 
-def _against_entropy(sweep: Sweep, stage: Stage) -> Iterator[Drawing]:
+def _against_entropy(sweep: Sweep, stage: StageRuns) -> Iterator[Drawing]:
     by_q = _styles_by_q(stage)
     # Other settings move the points, so that colour stands for q alone.
     styles = {condition: by_q[condition.entropic_index] for condition in stage.conditions}
@@ -168,9 +168,9 @@ def _against_entropy(sweep: Sweep, stage: Stage) -> Iterator[Drawing]:
         )
 
 
-def drawings_of_stages(sweep: Sweep, stages: Sequence[Stage]) -> Iterator[Drawing]:
+def drawings_of_stages(sweep: Sweep, stages: Sequence[StageRuns]) -> Iterator[Drawing]:
     """Curves of all stages that train for the task, together; none for a single stage."""
-    together = side_by_side(stages)
+    together = stages_together(stages)
     if together is not None:
         yield from _curves(sweep, together, OF_ALL_STAGES)
 
@@ -192,7 +192,7 @@ class Facets:
     """Of all conditions of the stage; the same in each panel."""
 
     @classmethod
-    def of(cls, stage: Stage) -> Facets:
+    def of(cls, stage: StageRuns) -> Facets:
         """One panel for a task, unless it would have too many conditions."""
         setting = facet_of(stage.conditions)
         rest = {condition: _without(condition, setting) for condition in stage.conditions}
@@ -236,7 +236,7 @@ def facet_of(conditions: Sequence[Condition]) -> str:
     return min(most, key=lambda name: most[name], default="")
 
 
-def _curves(sweep: Sweep, stage: Stage, metrics: Sequence[Metric]) -> Iterator[Drawing]:
+def _curves(sweep: Sweep, stage: StageRuns, metrics: Sequence[Metric]) -> Iterator[Drawing]:
     """The learning curves of a stage, of each metric that it has."""
     facets = Facets.of(stage)
     labels = {facets.label(condition): style for condition, style in facets.styles.items()}
@@ -267,7 +267,7 @@ def _curves(sweep: Sweep, stage: Stage, metrics: Sequence[Metric]) -> Iterator[D
             )
 
 
-def _caption(stage: Stage, metric: Metric, lines: int) -> str:
+def _caption(stage: StageRuns, metric: Metric, lines: int) -> str:
     seeds = len(stage.seeds)
     if lines > MOST_BANDS:
         band = f"Mean over up to {seeds} seeds, without bands, which would hide each other."
@@ -283,11 +283,11 @@ def _caption(stage: Stage, metric: Metric, lines: int) -> str:
     return f"{band} {thin}{target}"
 
 
-def _styles_by_q(stage: Stage) -> dict[str, Style]:
+def _styles_by_q(stage: StageRuns) -> dict[str, Style]:
     return {c.entropic_index: style for c, style in styles_of(stage.conditions).items()}
 
 
-def _legend_by_q(stage: Stage) -> Legend:
+def _legend_by_q(stage: StageRuns) -> Legend:
     styles = _styles_by_q(stage)
     return [(f"q = {q}", style._replace(line="solid")) for q, style in styles.items()]
 

@@ -12,7 +12,7 @@ from music_rllib import names
 from music_rllib.report.figures.palette import Style, styles_by_stage, styles_of
 from music_rllib.report.figures.plots import METRICS, Panel, curve_panel, legend_handles
 from music_rllib.results.analysis import Curve, curve
-from music_rllib.results.conditions import Condition, Stage
+from music_rllib.results.conditions import Condition, StageRuns
 from music_rllib.results.data import Sweep
 
 MOST_LINES = 8
@@ -22,7 +22,7 @@ SEEN = 0.25
 _METRICS = {metric.name: metric for metric in METRICS}
 
 
-def overview(sweep: Sweep, stages: Sequence[Stage]) -> tuple[Panel, ...]:
+def overview(sweep: Sweep, stages: Sequence[StageRuns]) -> tuple[Panel, ...]:
     """For each task its primary metric, the displacement of objects, and the MI bound.
 
     The success rate is left out while it is below `SEEN` and objects have been moved.
@@ -31,7 +31,7 @@ def overview(sweep: Sweep, stages: Sequence[Stage]) -> tuple[Panel, ...]:
     return tuple(panel for task in tasks for panel in _task_panels(sweep, stages, task))
 
 
-def _task_panels(sweep: Sweep, stages: Sequence[Stage], task: str) -> Iterator[Panel]:
+def _task_panels(sweep: Sweep, stages: Sequence[StageRuns], task: str) -> Iterator[Panel]:
     legend = _legend([stage for stage in stages if task in stage.tasks])
     primary = sweep.primary_metric(task)
     curves = {
@@ -50,7 +50,7 @@ def _task_panels(sweep: Sweep, stages: Sequence[Stage], task: str) -> Iterator[P
             yield _panel(metric, task, found, legend)
 
 
-def _legend(stages: Sequence[Stage]) -> dict[Condition, tuple[str, Style]]:
+def _legend(stages: Sequence[StageRuns]) -> dict[Condition, tuple[str, Style]]:
     """Label and style of each condition: by q if one stage has the task, otherwise by stage."""
     several = len(stages) > 1
     legend: dict[Condition, tuple[str, Style]] = {}

@@ -22,7 +22,7 @@ from matplotlib.ticker import EngFormatter
 from music_rllib import names
 from music_rllib.report.figures.palette import Style, styles_of
 from music_rllib.results import statistics as st
-from music_rllib.results.analysis import Curve, Final, Scope
+from music_rllib.results.analysis import Curve, FinalScores, Scope
 from music_rllib.results.conditions import Condition
 from music_rllib.results.data import Sweep
 from music_rllib.results.scores import Measure, measure_on, scores_of
@@ -136,7 +136,7 @@ def curve_panel(
     return Panel(title=title, draw=draw, **({"top": _TOP_WITH_EPOCHS} if epochs else {}))
 
 
-def profile_panel(scope: Scope[Condition], siblings: tuple[Condition, ...]) -> Panel:
+def profile_panel(scope: Scope, siblings: tuple[Condition, ...]) -> Panel:
     """Share of finished runs that end above each success rate."""
     styles = styles_of(siblings)
     thresholds = np.linspace(0.0, 1.0, 41)
@@ -160,8 +160,8 @@ def profile_panel(scope: Scope[Condition], siblings: tuple[Condition, ...]) -> P
 
 def finals_panel(
     title: str,
-    scope: Scope[Condition],
-    shown: Sequence[Final[Condition]],
+    scope: Scope,
+    shown: Sequence[FinalScores],
     styles: Mapping[Condition, Style],
     labels: Mapping[Condition, str],
 ) -> Panel:
@@ -327,9 +327,7 @@ def _band(
     )
 
 
-def _draw_final(
-    axes: Axes, row: int, final: Final[Condition], style: Style, label: str
-) -> list[Artist]:
+def _draw_final(axes: Axes, row: int, final: FinalScores, style: Style, label: str) -> list[Artist]:
     colour, marker, _ = style
     scores = final.scores.ravel()
     places = np.full(len(scores), row + 0.22)

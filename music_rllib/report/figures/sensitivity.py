@@ -14,7 +14,7 @@ from matplotlib.ticker import LogFormatter
 from music_rllib import names
 from music_rllib.report.figures.palette import styles_of
 from music_rllib.report.figures.plots import RATE_LIMITS, Panel
-from music_rllib.results.analysis import Final, Scope, StageAnalysis
+from music_rllib.results.analysis import FinalScores, Scope, StageAnalysis
 from music_rllib.results.conditions import ENTROPIC_INDEX, SEEDS, Condition
 from music_rllib.results.statistics import Array
 
@@ -39,7 +39,7 @@ def varied(conditions: Sequence[Condition]) -> list[str]:
     return [name for name, found in values.items() if len(found) > 1 and name != SEEDS]
 
 
-Positions = Mapping[Final[Condition], tuple[float, ...]]
+Positions = Mapping[FinalScores, tuple[float, ...]]
 """Finals with their values of the settings on a figure's axes."""
 
 
@@ -71,14 +71,14 @@ def _position(condition: Condition, settings: Sequence[str]) -> tuple[float, ...
     return tuple(values) if len(values) == len(settings) else None
 
 
-def _by_q(positions: Positions) -> dict[str, list[Final[Condition]]]:
-    groups: dict[str, list[Final[Condition]]] = {}
+def _by_q(positions: Positions) -> dict[str, list[FinalScores]]:
+    groups: dict[str, list[FinalScores]] = {}
     for final in positions:
         groups.setdefault(final.condition.entropic_index, []).append(final)
     return groups
 
 
-def _contours(scope: Scope[Condition], positions: Positions) -> Iterator[Panel]:
+def _contours(scope: Scope, positions: Positions) -> Iterator[Panel]:
     for q, finals in _by_q(positions).items():
         points: dict[tuple[float, ...], list[float]] = {}
         for final in finals:
@@ -90,7 +90,7 @@ def _contours(scope: Scope[Condition], positions: Positions) -> Iterator[Panel]:
         yield _contour(f"{scope.name}, q = {q}", where, values, _range(scope), scope.metric)
 
 
-def _range(scope: Scope[Condition]) -> tuple[float, float]:
+def _range(scope: Scope) -> tuple[float, float]:
     """[0, 1] for a rate, the range of the final values otherwise."""
     if scope.metric in names.EVAL_RATES:
         return 0.0, 1.0
@@ -130,7 +130,7 @@ def _is_wide(values: Array) -> bool:
 
 
 def _lines(
-    scope: Scope[Condition],
+    scope: Scope,
     positions: Positions,
     setting: str,
     conditions: tuple[Condition, ...],

@@ -11,7 +11,7 @@ from typing import Any
 from music_rllib import names
 from music_rllib.report.pieces import DASH, Cell, TextTable, estimate_cells, number_cell
 from music_rllib.report.search_tables import search_in_words, search_tables
-from music_rllib.results.analysis import StageAnalysis, Wait, each_seed
+from music_rllib.results.analysis import StageAnalysis, TimeToThreshold
 from music_rllib.results.data import Sweep
 from music_rllib.results.statistics import FEWEST_FOR_INTERVAL, SHOW_SEEDS_BELOW, number
 
@@ -43,7 +43,7 @@ def _final_table(analysis: StageAnalysis) -> TextTable:
             final.condition.label,
             names.word_of(scope.metric),
             *estimate_cells(final.estimate),
-            " ".join(map(number, each_seed(final))) or DASH,
+            " ".join(map(number, final.each_seed)) or DASH,
             final.seeds,
             final.runs,
         )
@@ -87,12 +87,14 @@ def _waits_table(analysis: StageAnalysis) -> TextTable:
             wait.task,
             wait.condition.label,
             _percent(wait.threshold),
-            f"{wait.reached} of {wait.runs}",
-            number_cell("not reached" if math.isinf(wait.median) else f"{wait.median:,.0f}"),
+            f"{wait.reached.sum()} of {len(wait.reached)}",
+            number_cell(
+                "not reached" if math.isinf(wait.median.value) else f"{wait.median.value:,.0f}"
+            ),
             _wait_interval(wait),
             _wait_of_each_run(wait),
         )
-        for wait in sorted(analysis.waits, key=lambda wait: (wait.threshold, wait.task))
+        for wait in sorted(analysis.times, key=lambda wait: (wait.threshold, wait.task))
     ]
     return TextTable(
         title="Environment steps to a success rate",
@@ -116,7 +118,7 @@ def _improvement_table(analysis: StageAnalysis) -> TextTable:
             number_cell(_percent(pair.improvement)),
         )
         for scope in analysis.scopes
-        for pair in scope.comparisons
+        for pair in scope.differences
     ]
     return TextTable(
         title="Differences of the final values",
@@ -231,18 +233,19 @@ def origin(sweep: Sweep, command: str) -> TextTable:
     )
 
 
-def _wait_of_each_run(wait: Wait) -> str:
-    if wait.runs >= SHOW_SEEDS_BELOW:
+def _wait_of_each_run(wait: TimeToThreshold) -> str:
+    if len(wait.steps) >= SHOW_SEEDS_BELOW:
         return DASH
-    runs = sorted(zip(wait.waits.steps, wait.waits.reached, strict=True))
+    runs = sorted(zip(wait.steps, wait.reached, strict=True))
     return " ".join(f"{'' if reached else '>'}{steps:,.0f}" for steps, reached in runs)
 
 
-def _wait_interval(wait: Wait) -> str:
-    if math.isnan(wait.lower) or not wait.reached:
+def _wait_interval(wait: TimeToThreshold) -> str:
+    lower, upper = float(wait.median.lower), float(wait.median.upper)
+    if math.isnan(lower) or not wait.reached.any():
         return "no interval"
-    upper = "beyond the budget" if math.isinf(wait.upper) else f"{wait.upper:,.0f}"
-    return upper if math.isinf(wait.lower) else f"{wait.lower:,.0f} to {upper}"
+    end = "beyond the budget" if math.isinf(upper) else f"{upper:,.0f}"
+    return end if math.isinf(lower) else f"{lower:,.0f} to {end}"
 
 
 def _time_cell(seconds: float | None) -> Cell:

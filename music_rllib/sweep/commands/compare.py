@@ -12,7 +12,7 @@ from music_rllib.errors import BadInputError
 from music_rllib.sweep.commands.arguments import Place, StageName, Storage
 
 if TYPE_CHECKING:
-    from music_rllib.results.analysis import Final, Scope
+    from music_rllib.results.analysis import FinalScores, Scope
     from music_rllib.results.conditions import Condition
     from music_rllib.results.statistics import Estimate
 
@@ -130,7 +130,7 @@ Entropies = Mapping[tuple[str, "Condition"], dict[str, dict[str, Any]]]
 """Scope and condition to each entropy's value and interval at the end."""
 
 
-def _entropies(scopes: Mapping[str, Iterable[Scope[Condition]]]) -> Entropies:
+def _entropies(scopes: Mapping[str, Iterable[Scope]]) -> Entropies:
     entropies: dict[tuple[str, Condition], dict[str, dict[str, Any]]] = {}
     for metric, of_metric in scopes.items():
         for scope in of_metric:
@@ -146,7 +146,7 @@ def _ends(estimate: Estimate) -> list[float]:
 
 def _groups(
     stage: str,
-    scope: Scope[Condition],
+    scope: Scope,
     planned: Mapping[Condition, Mapping[str, Any]],
     maximised: bool,
     entropies: Entropies,
@@ -176,21 +176,20 @@ def _groups(
 
 
 def _rows(
-    scope: Scope[Condition],
-    finals: Sequence[Final[Condition]],
+    scope: Scope,
+    finals: Sequence[FinalScores],
     maximised: bool,
     entropies: Entropies,
-) -> Iterator[tuple[Final[Condition], dict[str, Any]]]:
+) -> Iterator[tuple[FinalScores, dict[str, Any]]]:
     """Conditions with the best first, each with its difference from the best."""
     from music_rllib.results.statistics import difference
-    from music_rllib.results.study import label_of
 
     ordered = sorted(finals, key=lambda final: final.value, reverse=maximised)
     best = ordered[0]
     for final in ordered:
         condition = final.condition
         row = {
-            "label": label_of(condition),
+            "label": condition.short_label,
             "on_fresh_seeds": condition.is_fresh,
             "value": final.value,
             "interval": _ends(final.estimate),
@@ -201,7 +200,7 @@ def _rows(
             "best_is_better_with": None,
             "entropies": entropies.get((scope.name, condition), {}),
         }
-        pair = next((p for p in scope.comparisons if {p.first, p.second} == {best, final}), None)
+        pair = next((p for p in scope.differences if {p.first, p.second} == {best, final}), None)
         if pair is not None:
             gap = difference(best.estimate, final.estimate)
             higher = pair.improvement

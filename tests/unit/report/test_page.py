@@ -135,7 +135,7 @@ def test_stages_of_other_budgets_are_read_where_the_shortest_ends() -> None:
         runs.append((one_run("1", seed), climbing(final)))
     made = build_report(sweep_of(runs))
     assert made.together is not None
-    (comparison,) = made.together.scopes[0].comparisons
+    (comparison,) = made.together.scopes[0].differences
     assert float(comparison.gap.value) == pytest.approx(0)
     page = unescape(render(made))
     assert "final values are those after 100,000 steps, when the first stage ends." in page
@@ -226,7 +226,7 @@ TRIALS = [("1", 0, "trial0", 0.5), ("1.2", 0, "trial1", 1.0), ("1.4", 0, "trial2
 def test_trials_of_a_search_are_not_compared_on_the_seeds_that_chose_them() -> None:
     sweep = searched(*TRIALS)
     (analysis,) = analyse(sweep)
-    assert analysis.scopes[0].comparisons == ()
+    assert analysis.scopes[0].differences == ()
     assert len(analysis.scopes[0].finals) == 3, "they are in the table all the same"
     assert "No run that may be compared has finished yet." in said_about(sweep)
 
@@ -286,8 +286,8 @@ def test_a_run_that_failed_has_no_final_rate_but_counts_as_waiting() -> None:
     (final,) = analysis.scopes[0].finals
     assert final.seeds == 1
     assert float(final.estimate.value) == pytest.approx(0.9)
-    half = next(wait for wait in analysis.waits if wait.threshold == THRESHOLDS[0])
-    assert (half.reached, half.runs, half.median) == (1, 2, 120_000)
+    half = next(one for one in analysis.times if one.threshold == THRESHOLDS[0])
+    assert (sum(half.reached), len(half.reached), float(half.median.value)) == (1, 2, 120_000)
 
 
 def test_over_all_tasks_only_seeds_that_finished_on_each_count() -> None:
@@ -542,7 +542,7 @@ def test_a_task_without_success_is_judged_by_its_return_everywhere() -> None:
     assert list(drawn) == ["Return", "Final return"]
     assert "return of an episode" in render(report)
     assert {row[3] for row in curves_table(report.drawings).rows} == {names.EVAL_RETURN}
-    assert not report.analyses[0].waits, "there is no success rate to wait for"
+    assert not report.analyses[0].times, "the task has no success rate"
     assert row_of(render(report), "Reacher", "q = 1.5", "return") == [
         *("-5.00", "-5.98 to -4.02", "-6.00 -5.50 -5.00 -4.50 -4.00", "5", "5")
     ]
@@ -614,7 +614,7 @@ def test_stages_are_compared_over_the_conditions_that_all_of_them_have() -> None
     report = build_report(sweep)
     assert report.together is not None
     (scope,) = report.together.scopes
-    (pair,) = scope.comparisons
+    (pair,) = scope.differences
     assert [final.runs for final in (pair.first, pair.second)] == [4, 4]
     # At the end: 1 and 0.8 against 0.9 and 0.6, twice each.
     assert pair.improvement == 12 / 16

@@ -10,7 +10,6 @@ from hypothesis.extra import numpy as st_numpy
 from scipy import stats
 
 from music_rllib.results import statistics as s
-from music_rllib.results.statistics import Waits, first_passage, median_wait, median_wait_interval
 
 NAN = np.nan
 # rliable, tests/rliable/metrics_test.py: runs x tasks.
@@ -130,50 +129,39 @@ def test_profile() -> None:
     assert (found.lower[1], found.upper[1]) == pytest.approx((exact.low, exact.high))
 
 
-def test_tasks_must_match() -> None:
-    with pytest.raises(ValueError, match="same tasks, got 2 and 1"):
-        s.improvement(X, Y[:, :1])
-    with pytest.raises(ValueError, match="task 0 has none"):
-        s.improvement(np.array([[NAN]]), np.array([[1.0]]))
+# Times to a threshold ----------------------------------------------------------------------------
 
 
-# Steps to a threshold ---------------------------------------------------------------------------
-
-
-def waits(steps: list[float], reached: list[bool]) -> Waits:
-    return Waits(steps=np.array(steps, dtype=float), reached=np.array(reached, dtype=bool))
+def median(steps: list[float], reached: list[bool]) -> tuple[float, float, float]:
+    return ends(s.censored_median(np.array(steps, dtype=float), np.array(reached, dtype=bool)))
 
 
 def test_first_passage() -> None:
     steps, values = np.array([1.0, 2, 3, 4]), np.array([0.2, NAN, 0.9, 0.5])
-    assert first_passage(steps, values, 0.9) == (3, True)
-    assert first_passage(steps, values, 0.95) == (4, False)
-    assert first_passage(steps[:0], values[:0], 0.5) is None
+    assert s.first_passage(steps, values, 0.9) == (3, True)
+    assert s.first_passage(steps, values, 0.95) == (4, False)
+    assert s.first_passage(steps[:0], values[:0], 0.5) is None
 
 
-def test_kaplan_and_meier_by_hand() -> None:
-    """Freireich et al. 1963, the 6-MP arm of the leukaemia trial: median 23 weeks."""
+def test_kaplan_meier_median_by_hand() -> None:
+    """Freireich et al. 1963, the 6-MP arm of the leukemia trial: median 23 weeks."""
     weeks = [6, 6, 6, 7, 10, 13, 16, 22, 23, 6, 9, 10, 11, 17, 19, 20, 25, 32, 32, 34, 35]
-    assert median_wait(waits([float(w) for w in weeks], [True] * 9 + [False] * 12)) == 23
-    assert median_wait(waits([10, 20, 30, 40], [True, True, False, False])) == 20
-    assert median_wait(waits([10, 40, 40, 40], [True, False, False, False])) == np.inf
-    assert np.isnan(median_wait(waits([], [])))
+    assert median([float(w) for w in weeks], [True] * 9 + [False] * 12)[0] == 23
+    assert median([10, 20, 30, 40], [True, True, False, False])[0] == 20
+    assert median([10, 40, 40, 40], [True, False, False, False])[0] == np.inf
 
 
-def test_runs_that_never_arrive_make_it_slower_and_not_faster() -> None:
-    arrived = waits([10, 20, 30], [True] * 3)
-    with_lost = waits([10, 20, 30, 100, 100], [True] * 3 + [False] * 2)
-    assert median_wait(arrived) == 20
-    assert median_wait(with_lost) == 30
-    assert median_wait_interval(with_lost) == (10, np.inf)
-    # The one that was stopped at 5 may have been the last: 10 is an end no more.
-    assert median_wait_interval(waits([5, 10, 20, 30, 40], [False] + [True] * 4)) == (5, np.inf)
+def test_censored_runs_increase_the_median() -> None:
+    assert median([10, 20, 30], [True] * 3)[0] == 20
+    assert median([10, 20, 30, 100, 100], [True] * 3 + [False] * 2) == (30, 10, np.inf)
+    # The run that was stopped at 5 may have been the last one: 10 is no end of the interval.
+    assert median([5, 10, 20, 30, 40], [False] + [True] * 4)[1:] == (5, np.inf)
 
 
-def test_the_interval_of_a_median_leaves_out_as_many_runs_as_may_be() -> None:
-    """Both outermost of n are on one side of the median with chance 2 / 2^n: 12.5 % of four."""
+def test_the_interval_of_a_median_leaves_out_as_many_runs_as_possible() -> None:
+    """The outermost of n runs are on one side of the median with probability 2 / 2^n."""
     steps = [float(step) for step in range(1, 13)]
-    assert all(np.isnan(median_wait_interval(waits(steps[:4], [True] * 4))))
-    assert median_wait_interval(waits(steps[:5], [True] * 5)) == (1, 5)
-    assert median_wait_interval(waits(steps[:11], [True] * 11)) == (3, 9)
-    assert median_wait_interval(waits(steps, [True] * 12)) == (3, 10)
+    assert np.isnan(median(steps[:4], [True] * 4)[1:]).all()
+    assert median(steps[:5], [True] * 5)[1:] == (1, 5)
+    assert median(steps[:11], [True] * 11)[1:] == (3, 9)
+    assert median(steps, [True] * 12)[1:] == (3, 10)

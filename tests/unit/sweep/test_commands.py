@@ -27,7 +27,7 @@ from music_rllib.experiment.scheduler import Status
 from music_rllib.experiment.sweep_files import as_json
 from music_rllib.labels import ShortLabels
 from music_rllib.program import main
-from music_rllib.results.analysis import analyse, each_seed
+from music_rllib.results.analysis import analyse
 from music_rllib.results.answer import answer, claim_rows, mean_rows
 from music_rllib.results.read import read_sweep
 from music_rllib.results.study import study_of
@@ -206,8 +206,8 @@ def test_compare_and_the_report_say_the_same_of_the_same_sweep(
             row = rows[final.condition.label]
             assert (row["value"], row["runs"]) == (final.value, final.runs)
             assert row["interval"] == [final.estimate.lower, final.estimate.upper]
-            assert sorted(row["seeds"]) == each_seed(final)
-        for pair in scope.comparisons:
+            assert sorted(row["seeds"]) == final.each_seed
+        for pair in scope.differences:
             labels = (pair.first.condition.label, pair.second.condition.label)
             if best not in labels:
                 continue
