@@ -6,20 +6,25 @@ python docs/generate_configuration.py --check    # exit code 1 where it is out o
 
 from __future__ import annotations
 
+import ast
+import inspect
 import json
 import sys
+import textwrap
 import types
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import annotated_types
-from json_schema import docstrings, json_schema
-from pydantic import AfterValidator, BaseModel, BeforeValidator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, create_model
 from pydantic.fields import FieldInfo
+from pydantic.json_schema import GenerateJsonSchema
+from pydantic_core import core_schema
 
 from music_rllib.config.analysis import Analysis
-from music_rllib.config.presets import SCHEMA
+from music_rllib.config.layers import LAYER_KEYS, all_settings
+from music_rllib.config.presets import SCHEMA, shipped_presets
 from music_rllib.config.run_settings import VARIANTS, Evaluation, RunSettings
 from music_rllib.config.schema import (
     Checkpoints,
@@ -45,7 +50,7 @@ from music_rllib.config.tac_settings import (
     NormalisedAlpha,
     TACSettings,
 )
-from music_rllib.envs.tasks import Task
+from music_rllib.envs.tasks import BUILT_IN_TASKS, Task
 from music_rllib.intrinsic.settings import MusicSettings
 from music_rllib.replay.settings import ReplaySettings
 from music_rllib.schedules import Linear, Measured, Piecewise
@@ -367,6 +372,84 @@ _SCHEDULES = (Linear, Piecewise, Measured)
 
 def _bare(annotation: Any) -> Any:
     return get_args(annotation)[0] if get_origin(annotation) is Annotated else annotation
+
+
+# --- the JSON Schema ---------------------------------------------------------------------------
+
+
+def docstrings(model: type[BaseModel]) -> dict[str, str]:
+    """Field of a settings model to the text of the docstring below it, on one line."""
+    texts = {}
+    for kind in reversed(model.__mro__):
+        # Models that `json_schema` creates have no source.
+        if not kind.__module__.startswith("music_rllib."):
+            continue
+        (definition,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
+        assert isinstance(definition, ast.ClassDef)
+        for field, below in zip(definition.body, definition.body[1:], strict=False):
+            match field, below:
+                case ast.AnnAssign(target=ast.Name(name)), ast.Expr(ast.Constant(text)):
+                    texts[name] = " ".join(str(text).split())
+    return texts
+
+
+class _Described(GenerateJsonSchema):
+    """Describes fields by the docstrings below them."""
+
+    def model_schema(self, schema: core_schema.ModelSchema) -> dict[str, Any]:
+        document = super().model_schema(schema)
+        fields = schema["cls"].model_fields
+        for name, text in docstrings(schema["cls"]).items():
+            alias = fields[name].alias if name in fields else None
+            if (field := document["properties"].get(alias or name)) is not None:
+                field["description"] = text
+        return document
+
+
+def json_schema() -> dict[str, Any]:
+    """The JSON Schema of a sweep's file: names, types, defaults, descriptions.
+
+    It accepts more than the program: rules between settings are checked when a sweep is loaded.
+    """
+    settings: dict[str, Any] = {}
+    for name in LAYER_KEYS:
+        field = RunSettings.model_fields[name]
+        settings[name] = (field.rebuild_annotation(), field.get_default())
+    layer = create_model("Settings", **settings)
+    stage = create_model(
+        "Stage",
+        __base__=StageHeader,
+        **settings | {"init_from": (InitFrom | str | None, None)},
+    )
+    definition = create_model("TaskDefinition", __base__=Task, name=(str, "its key"))
+    sweep = create_model(
+        "Sweep",
+        __base__=Header,
+        seeds=(int | tuple[int, ...], (0,)),
+        preset=(str | None, None),
+        environments=(dict[str, definition], {}),
+        defaults=(layer, layer()),
+        stages=(tuple[stage, ...], ...),
+    )
+    document: dict[str, Any] = sweep.model_json_schema(schema_generator=_Described)
+    _add_suggestions(document)
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **document}
+
+
+def _add_suggestions(document: dict[str, Any]) -> None:
+    """Add values and descriptions that an editor can offer and types do not have."""
+    properties, parts = document["properties"], document["$defs"]
+    for keys in (properties, parts["Stage"]["properties"]):
+        for kind in keys["tasks"].get("anyOf", [keys["tasks"]]):
+            if kind.get("type") == "array":
+                kind["items"] = {"type": "string", "examples": list(BUILT_IN_TASKS)}
+    properties["preset"]["examples"] = list(shipped_presets())
+    properties["preset"]["description"] = "Settings below `defaults`, by name or by path."
+    properties["environments"]["description"] = "Tasks of your own."
+    properties["defaults"]["description"] = "Settings of every stage."
+    properties["stages"]["description"] = "What is trained, in order."
+    grid = parts["Stage"]["properties"]["grid"]
+    grid["properties"] = {name: {"type": "array"} for name in all_settings() if "." in name}
 
 
 def main() -> int:
