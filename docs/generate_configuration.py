@@ -35,7 +35,7 @@ from music_rllib.config.schema import (
     StageHeader,
 )
 from music_rllib.config.search import (
-    Final,
+    FinalRanking,
     Objective,
     Pruning,
     Rung,
@@ -182,7 +182,7 @@ def document() -> str:
                 *rows(Pruning, "pruning.", skip=("rungs",)),
                 ("pruning.rungs", "list", "required", docstrings(Pruning)["rungs"]),
                 *rows(Rung, "pruning.rungs[]."),
-                *rows(Final, "final."),
+                *rows(FinalRanking, "final."),
                 *rows(WarmStart, "warm_start."),
             ]
         ),

@@ -16,7 +16,7 @@ def first_line(error: BaseException) -> str:
     return next(iter(message_of(error).strip().splitlines()), type(error).__name__)
 
 
-def in_words(error: BaseException) -> str:
+def one_line(error: BaseException) -> str:
     """`ValueError: message` on one line, of at most 300 characters."""
     text = f"{type(error).__name__}: {' '.join(message_of(error).split()) or '(no message)'}"
     return text if len(text) <= 300 else text[:297] + "..."

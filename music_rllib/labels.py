@@ -51,7 +51,7 @@ def _symbol(match: re.Match[str]) -> str:
     return next((symbol for symbol, name in SYMBOLS.items() if name == match[1]), match[1])
 
 
-def is_meant(wanted: str, label: str) -> bool:
+def label_matches(wanted: str, label: str) -> bool:
     """Whether every part of `wanted` is a part of `label`, short or whole, in any order."""
     parts = [_items(part) for part in label.split("/")]
     return all(

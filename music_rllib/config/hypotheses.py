@@ -12,7 +12,7 @@ from pydantic import TypeAdapter
 
 from music_rllib.config.analysis import SETTINGS_IN_SHORT, Analysis, Hypothesis, parsed
 from music_rllib.config.problems import ConfigError, Findings, lookup, same, shown
-from music_rllib.config.tac_settings import Alpha, in_words
+from music_rllib.config.tac_settings import Alpha, setting_text
 from music_rllib.names import EVAL_RETURN, EVAL_SUCCESS
 from music_rllib.schedules import AdaptiveSchedule
 
@@ -56,7 +56,7 @@ def _compared_runs(stage: Stage) -> list[dict[str, Any]]:
     """A run of each point of a grid, or compared value of a search; none if one is invalid."""
     points = list(stage.points)
     if stage.search is not None and stage.search.compare:
-        own = [{k: v for k, v in arm.items() if ":" not in k} for arm in stage.search.arms()]
+        own = [{k: v for k, v in arm.items() if ":" not in k} for arm in stage.search.compared()]
         try:
             points = [stage.resolve(arm) for arm in own]
         except ConfigError:
@@ -153,7 +153,7 @@ def _value(run: Mapping[str, Any], name: str) -> Any:
     """
     value = lookup(run, name.split("."))
     if isinstance(value, Mapping) and name in SETTINGS_IN_SHORT.values():
-        return in_words(_SCHEDULE.validate_python(value))
+        return setting_text(_SCHEDULE.validate_python(value))
     return value
 
 

@@ -16,7 +16,7 @@ from music_rllib.config.run_settings import (
     RunSettings,
     Variant,
     contradiction,
-    preset,
+    variant_music,
     without_retired,
 )
 from music_rllib.envs.tasks import Task
@@ -141,7 +141,7 @@ def merge(
     layers, problems = Layers(), []
     rules = VARIANTS[variant]
     idle = Problem((), f"has no effect with variant {variant}")
-    for field, value in preset(variant, task).items():
+    for field, value in variant_music(variant, task).items():
         layers.put(("music", field), value, ("music", field))
     task_path = (*stage_path, "per_task", task.name)
     own = stage["per_task"].get(task.name) or {}

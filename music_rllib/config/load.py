@@ -31,8 +31,8 @@ from music_rllib.config.problems import (
     Findings,
     Problem,
     from_json,
-    in_words,
     problem_lines,
+    problems_of,
     shown,
     unknown,
 )
@@ -296,7 +296,7 @@ def _check_fields(key: str, value: Any, findings: Findings) -> None:
     try:
         from_json(field.rebuild_annotation(), value)
     except ValidationError as error:
-        for path, rule in in_words(error, value, lambda at: known_settings((key, *at))):
+        for path, rule in problems_of(error, value, lambda at: known_settings((key, *at))):
             if path or not isinstance(value, dict):
                 rule = for_a_grid(rule, (key, *path), {key: value})
                 findings.add(("defaults", key, *path), rule)

@@ -103,7 +103,7 @@ def known_fields(model: type[BaseModel], path: KeyPath) -> Iterable[str]:
     return model.model_fields
 
 
-def in_words(
+def problems_of(
     error: ValidationError, document: Any, known: Callable[[KeyPath], Iterable[str]]
 ) -> list[Problem]:
     """Translate pydantic's error about `document` into problems, with paths relative to it.
@@ -259,7 +259,7 @@ class Findings:
         try:
             return cast("Model", from_json(kind, value))
         except ValidationError as error:
-            for problem in in_words(error, value, lambda at: known_fields(kind, at)):
+            for problem in problems_of(error, value, lambda at: known_fields(kind, at)):
                 self.add(problem.path, problem.rule)
             return None
 

@@ -26,12 +26,12 @@ from music_rllib.config.problems import (
     KeyPath,
     Problem,
     from_json,
-    in_words,
+    problems_of,
     shown,
     unknown,
 )
 from music_rllib.config.run_settings import VARIANTS, RunSettings, Variant, handed_over
-from music_rllib.config.schema import Checkpoint, Point, Source, Stage, StageHeader
+from music_rllib.config.schema import ImportedHandoff, Point, Source, Stage, StageHeader
 from music_rllib.config.search_check import check_search, of_stage
 from music_rllib.envs.tasks import BUILT_IN_TASKS, Task, closest
 from music_rllib.limits import MOST_GRID_POINTS
@@ -137,7 +137,7 @@ class _StageSettings:
             try:
                 runs[task.name] = from_json(RunSettings, data)
             except ValidationError as error:
-                for path, rule in in_words(error, data, known_settings):
+                for path, rule in problems_of(error, data, known_settings):
                     # Settings that contradict their variant can't be consistent among themselves.
                     if not (problems and path == ("music",)):
                         origin = layers.origin(path, self.path)
@@ -246,7 +246,7 @@ def _source(header: StageHeader, find_tasks: FindTasks, findings: Findings) -> S
         rule = f"must be in a home that is known, got {shown(given.checkpoint)}"
         findings.add(("checkpoint",), rule)
         return None
-    return Source(checkpoint=Checkpoint(folder=folder, manifest=manifest), task=task)
+    return Source(checkpoint=ImportedHandoff(folder=folder, manifest=manifest), task=task)
 
 
 def _check_source(
@@ -269,7 +269,7 @@ def _check_source(
 
 
 def _check_checkpoint(
-    stage: Stage, checkpoint: Checkpoint, task: Task | None, findings: Findings
+    stage: Stage, checkpoint: ImportedHandoff, task: Task | None, findings: Findings
 ) -> None:
     made_for = checkpoint.manifest.info.task
     for wanted in [task] if task else stage.tasks:

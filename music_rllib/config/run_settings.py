@@ -21,7 +21,7 @@ from music_rllib.schedules import StrictModel, check_measurable
 from music_rllib.store.handoff import Architecture, HandoffInfo, Spaces
 
 Variant = Literal["tac", "music-u", "music-r", "music-f", "music-p"]
-Source = Literal["scratch", "estimator", "agent"]
+StartsFrom = Literal["scratch", "estimator", "agent"]
 """Source of the runs of a variant: nothing, a trained estimator, or a whole trained agent."""
 
 
@@ -32,7 +32,7 @@ class VariantRules(NamedTuple):
     """Fields of `MusicSettings` that no layer of the configuration may contradict."""
     without_effect: frozenset[str]
     """Dotted settings without effect: ignored in `defaults`, refused in a stage."""
-    starts_from: Source = "scratch"
+    starts_from: StartsFrom = "scratch"
     """The part of the run of `init_from` that is taken over."""
 
     @property
@@ -85,7 +85,7 @@ VARIANTS: Mapping[Variant, VariantRules] = MappingProxyType(
 )
 
 
-def preset(variant: Variant, task: Task) -> dict[str, Any]:
+def variant_music(variant: Variant, task: Task) -> dict[str, Any]:
     """Fields of `MusicSettings` that the variant sets on this task, below all other layers."""
     music = dict(VARIANTS[variant].fixed)
     if variant == "music-u":

@@ -151,7 +151,7 @@ IMPORTED = "handoff-"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Checkpoint:
+class ImportedHandoff:
     """A handoff from outside the sweep."""
 
     folder: Path
@@ -170,7 +170,7 @@ class Source:
 
     stage: str | None = None
     """An earlier stage; each run starts from that stage's run with the same seed..."""
-    checkpoint: Checkpoint | None = None
+    checkpoint: ImportedHandoff | None = None
     """... or all runs start from this handoff."""
     task: Task | None = None
     """Task of the source; None: the run's own."""
@@ -219,7 +219,7 @@ class Stage:
         """
         yield from (({}, point) for point in self.points)
         if self.search is not None:
-            for values in (*(at for _, at in self.search.corners()), *self.search.arms()):
+            for values in (*(at for _, at in self.search.corners()), *self.search.compared()):
                 own = {name: value for name, value in values.items() if ":" not in name}
                 with contextlib.suppress(ConfigError):
                     yield values, self.resolve(own)

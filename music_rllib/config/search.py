@@ -17,7 +17,7 @@ from music_rllib.schedules import StrictModel
 FINAL_SEED = 1_000_000
 """First fresh seed of final rankings. Seeds of a search are smaller."""
 
-MOST_GRID_POINTS = 100_000
+MOST_SEARCH_POINTS = 100_000
 """Largest grid with `sampler: grid`: more than anyone can train, and still quick to list."""
 
 
@@ -94,7 +94,7 @@ class Pruning(StrictModel):
     """Number of first trials that always continue."""
 
 
-class Final(StrictModel):
+class FinalRanking(StrictModel):
     """Runs of the best trials on fresh seeds, which had no part in choosing them."""
 
     trials: int = Field(3, gt=0)
@@ -157,7 +157,7 @@ class SearchSettings(StrictModel):
     in the space, and a setting with `when` must stand beside the settings that it depends on."""
     pruning: Pruning | None = None
     """When trials are stopped early; null: every trial runs to its end on all seeds."""
-    final: Final | None = Final()
+    final: FinalRanking | None = FinalRanking()
     """The final ranking on fresh seeds; null: none, and the best value found is biased upwards."""
     study: str | None = Field(None, min_length=1)
     """Name under which drivers share a study; null: the sweep's name."""
@@ -181,7 +181,7 @@ class SearchSettings(StrictModel):
 
     @cached_property
     def points(self) -> list[dict[str, Any]] | None:
-        """All points; None where they can't be counted, or are more than `MOST_GRID_POINTS`."""
+        """All points; None where they can't be counted, or are more than `MOST_SEARCH_POINTS`."""
         if any(dimension.size is None for dimension in self.space.values()):
             return None
         try:
@@ -193,15 +193,15 @@ class SearchSettings(StrictModel):
         """All points, the last dimension varying fastest.
 
         Raises:
-            ValueError: There are more than `MOST_GRID_POINTS`.
+            ValueError: There are more than `MOST_SEARCH_POINTS`.
         """
         points: list[dict[str, Any]] = [{}]
         for name, dimension in self.space.items():
             exists = [dimension.applies(point) for point in points]
             size = sum((dimension.size or 0) if there else 1 for there in exists)
-            if size > MOST_GRID_POINTS:  # counted before any of them is made
+            if size > MOST_SEARCH_POINTS:  # counted before any of them is made
                 raise ValueError(
-                    f"space must have at most {MOST_GRID_POINTS:,} points with sampler: grid, "
+                    f"space must have at most {MOST_SEARCH_POINTS:,} points with sampler: grid, "
                     f"got {size:,} up to {name}"
                 )
             values = dimension.values() or ()
@@ -212,7 +212,7 @@ class SearchSettings(StrictModel):
             ]
         return points
 
-    def arms(self) -> list[dict[str, Any]]:
+    def compared(self) -> list[dict[str, Any]]:
         """Settings of each compared value; one empty mapping in `search` mode."""
         choices = [[(name, value) for value in values] for name, values in self.compare.items()]
         return [dict(pairs) for pairs in itertools.product(*choices)]

@@ -276,15 +276,15 @@ class TACSettings(StrictModel):
         return self
 
 
-def in_words(
+def setting_text(
     value: float | Linear | Piecewise | Measured | LearnedAlpha | MatchedAlpha | NormalisedAlpha,
 ) -> str:
     """Short text for a constant, a schedule or a coefficient: `1.5`, `1 to 2`, `learned`."""
     match value:
         case MatchedAlpha():
-            return f"{in_words(value.value)} matched at {value.matched_width:g}"
+            return f"{setting_text(value.value)} matched at {value.matched_width:g}"
         case NormalisedAlpha():
-            return f"{in_words(value.value)} normalised"
+            return f"{setting_text(value.value)} normalised"
         case Linear():
             return f"{value.start:g} to {value.end:g}"
         case Measured():

@@ -26,7 +26,7 @@ from music_rllib.envs.values import (
     observation_sizes,
     to_bounds,
 )
-from music_rllib.errors import first_line, in_words
+from music_rllib.errors import first_line, one_line
 from music_rllib.replay.buffer import GoalReward
 from music_rllib.replay.trajectories import ReplayLayout
 
@@ -218,7 +218,7 @@ def goal_reward_of(env: Env, seed: int = 0) -> GoalReward:
     except BadNumberError as error:
         raise ValueError(first_line(error)) from error
     except Exception as error:
-        problem = _BY_ROW, f"it raises {in_words(error)}"
+        problem = _BY_ROW, f"it raises {one_line(error)}"
     if problem:
         rule, reason = problem
         raise ValueError(

@@ -41,7 +41,7 @@ from music_rllib.envs.values import (
     shown,
     to_bounds,
 )
-from music_rllib.errors import first_line, in_words
+from music_rllib.errors import first_line, one_line
 from music_rllib.replay.buffer import GoalReward
 from music_rllib.replay.trajectories import ReplayLayout
 
@@ -130,7 +130,7 @@ class Probe:
             *_, (frame, line) = traceback.walk_tb(error.__traceback__)
             place = f"{frame.f_code.co_filename}, line {line}"
             raise RefusedError(
-                f"{name} must not raise, it raised {in_words(error)} ({place})"
+                f"{name} must not raise, it raised {one_line(error)} ({place})"
             ) from error
 
     def _check(self, env: Env) -> None:
@@ -202,7 +202,7 @@ class Probe:
             self.problems.append(first_line(error))
             return None
         except BaseException as error:
-            raise RefusedError(f"compute_reward() raised {in_words(error)}") from error
+            raise RefusedError(f"compute_reward() raised {one_line(error)}") from error
         return reward
 
     def _reset(self, env: Env, seed: int) -> Any:

@@ -12,7 +12,7 @@ from music_rllib.errors import BadInputError
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.continuation import continuation_key, continued_from
 from music_rllib.experiment.scheduler import DONE, Scheduler
-from music_rllib.labels import ShortLabels, in_runs, is_meant
+from music_rllib.labels import ShortLabels, in_runs, label_matches
 from music_rllib.store.node_store import NodeStore
 from music_rllib.store.work_folder import WorkFolder, steps_of
 
@@ -170,7 +170,7 @@ def to_retrain(
     """
     chosen = {run.key for run in runs if all_changed and run.differences}
     for name in named:
-        fits = {run.key for run in runs if is_meant(name, run.label)}
+        fits = {run.key for run in runs if label_matches(name, run.label)}
         if not fits:
             known = ", ".join(run.label for run in runs[:SHOWN]) or "none"
             raise BadInputError(

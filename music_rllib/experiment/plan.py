@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from music_rllib.config.run_settings import RunSettings
-from music_rllib.config.schema import Checkpoint, Source, Stage, SweepConfig
+from music_rllib.config.schema import ImportedHandoff, Source, Stage, SweepConfig
 from music_rllib.config.search_check import of_stage, stages_in
 from music_rllib.envs.tasks import Task
 from music_rllib.labels import in_runs
@@ -30,7 +30,7 @@ class Input:
     """A node of the plan, or the node that holds an imported checkpoint."""
     task: Task
     """Task that the networks were trained on."""
-    checkpoint: Checkpoint | None = None
+    checkpoint: ImportedHandoff | None = None
     """The checkpoint to import as `key`; None: `key` is a node of the plan."""
 
 

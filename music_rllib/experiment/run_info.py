@@ -9,7 +9,12 @@ from typing import Any
 
 from music_rllib import names
 from music_rllib.config.run_settings import RunSettings
-from music_rllib.config.tac_settings import LearnedAlpha, MatchedAlpha, NormalisedAlpha, in_words
+from music_rllib.config.tac_settings import (
+    LearnedAlpha,
+    MatchedAlpha,
+    NormalisedAlpha,
+    setting_text,
+)
 from music_rllib.envs.fingerprint import Fingerprint, digest_of
 from music_rllib.experiment.plan import Node, short
 from music_rllib.schedules import Linear, Measured, Piecewise, value_at
@@ -68,9 +73,9 @@ def run_info(node: Node, environment: Fingerprint | None = None) -> RunInfo:
             names.TAG_VARIANT: run.variant,
             names.TAG_TASK: run.task.name,
             names.TAG_SEED: run.seed,
-            names.TAG_ENTROPIC_INDEX: in_words(q),
-            names.TAG_ALPHA: in_words(alpha),
-            names.TAG_MI_REWARD_WEIGHT: in_words(weight),
+            names.TAG_ENTROPIC_INDEX: setting_text(q),
+            names.TAG_ALPHA: setting_text(alpha),
+            names.TAG_MI_REWARD_WEIGHT: setting_text(weight),
             names.TAG_CONFIG_HASH: content_key(config),
             names.TAG_ALGORITHM: ALGORITHM_VERSION,
             names.TAG_SOURCE_NODE: node.source_key,

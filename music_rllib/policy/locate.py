@@ -11,7 +11,7 @@ import pyarrow.fs as pafs
 
 from music_rllib.config.load import declared_tasks
 from music_rllib.envs.tasks import Task
-from music_rllib.labels import is_meant
+from music_rllib.labels import label_matches
 from music_rllib.policy.policy import PolicyError
 from music_rllib.redaction import redact
 from music_rllib.store.object_folder import ObjectFolders, open_storage
@@ -98,7 +98,7 @@ def _matching(wanted: str, keys: list[str], labels: dict[str, list[str]]) -> lis
     by_prefix = [key for key in keys if key.startswith(wanted)]
     if len(wanted) >= _SHORTEST_KEY and by_prefix:
         return by_prefix
-    return [key for key in keys if any(is_meant(wanted, label) for label in labels.get(key, ()))]
+    return [key for key in keys if any(label_matches(wanted, one) for one in labels.get(key, ()))]
 
 
 def _labels(filesystem: pafs.FileSystem, root: str) -> Iterator[tuple[str, str]]:

@@ -25,7 +25,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, model_validator
 from music_rllib import names
 from music_rllib.config.analysis import Hypothesis
 from music_rllib.config.schema import Stage, SweepConfig
-from music_rllib.config.tac_settings import in_words
+from music_rllib.config.tac_settings import setting_text
 from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.sweep_files import ANALYSIS_PLAN, as_json, keep, read
 from music_rllib.redaction import redact
@@ -221,7 +221,7 @@ def _control(stage: Stage) -> str:
         each = f" for each value of {', '.join(search.compare)}" if search.compare else ""
         return f"{tuned} tuned{each}, with {search.count} trials"
     runs = [run for point in stage.points for run in point.runs.values()]
-    pairs = {(in_words(run.tac.entropic_index), in_words(run.tac.alpha)) for run in runs}
+    pairs = {(setting_text(run.tac.entropic_index), setting_text(run.tac.alpha)) for run in runs}
     words = sorted({alpha for _, alpha in pairs})
     if len(words) > 1 and len(dict(pairs)) == len(pairs):
         own = ", ".join(f"{alpha} at q = {q}" for q, alpha in sorted(pairs))

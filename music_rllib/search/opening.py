@@ -80,7 +80,7 @@ def _open_search(sweep: OpenSweep, stage: Stage) -> Search:
     sweep.folder.mkdir(parents=True, exist_ok=True)
     storage = open_studies(_storage(sweep, settings))
     search = Search(stage=stage, settings=settings, rungs=_rungs(sweep, stage, settings))
-    for position, values in enumerate(settings.arms()):
+    for position, values in enumerate(settings.compared()):
         study = Study(
             storage,
             _base(sweep, stage),

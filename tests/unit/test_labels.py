@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 
-from music_rllib.labels import ShortLabels, is_meant, symbol
+from music_rllib.labels import ShortLabels, label_matches, symbol
 
 LABEL = "finetune/FetchPush/pretrain:tac.alpha=0.1,tac.entropic_index=1.5,tac.tau=0.05/seed0"
 
@@ -28,7 +28,7 @@ LABEL = "finetune/FetchPush/pretrain:tac.alpha=0.1,tac.entropic_index=1.5,tac.ta
     ],
 )
 def test_parts_of_a_label_in_any_order(wanted: str, meant: bool) -> None:
-    assert is_meant(wanted, LABEL) is meant
+    assert label_matches(wanted, LABEL) is meant
 
 
 @pytest.mark.parametrize("stages", [["a"], ["a", "b"]])
@@ -39,7 +39,7 @@ def test_what_is_shown_means_one_run(stages: list[str], tasks: list[str]) -> Non
     labels = ["/".join(cell) for cell in cells]
     short = ShortLabels.of(labels)
     for label in labels:
-        assert [other for other in labels if is_meant(short(label), other)] == [label]
+        assert [other for other in labels if label_matches(short(label), other)] == [label]
     assert len(short(labels[0]).split("/")) == 2 + (len(stages) > 1) + (len(tasks) > 1)
     assert "q=1/" in short(labels[0])
 

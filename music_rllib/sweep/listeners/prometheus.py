@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from music_rllib import names
-from music_rllib.config.tac_settings import in_words
+from music_rllib.config.tac_settings import setting_text
 from music_rllib.experiment.listener import Failure, Listener
 from music_rllib.experiment.plan import Node
 from music_rllib.experiment.scheduler import Scheduler, Status
@@ -151,7 +151,7 @@ class PrometheusListener(Listener):
             "stage": node.stage,
             "variant": node.run.variant,
             "task": node.run.task.name,
-            "q": in_words(node.run.tac.entropic_index),
+            "q": setting_text(node.run.tac.entropic_index),
             "seed": str(node.run.seed),
             "run": node.label,
         }

@@ -8,7 +8,7 @@ from typing import Any
 
 from rich.table import Table
 
-from music_rllib.config.tac_settings import MatchedAlpha, NormalisedAlpha, alpha_at, in_words
+from music_rllib.config.tac_settings import MatchedAlpha, NormalisedAlpha, alpha_at, setting_text
 from music_rllib.envs.make import make_env
 from music_rllib.envs.tasks import Task
 from music_rllib.experiment.plan import Node, Plan
@@ -40,8 +40,8 @@ def _alpha_row(node: Node, action_dimensions: int) -> dict[str, Any]:
     q_at_end = _final_q(tac.entropic_index, budget)
     return {
         "stage": node.stage,
-        "alpha": in_words(tac.alpha),
-        "q": in_words(tac.entropic_index),
+        "alpha": setting_text(tac.alpha),
+        "q": setting_text(tac.entropic_index),
         "q_at_start": q_at_start,
         "at_start": alpha_at(tac, q_at_start, 0, budget, action_dimensions),
         "at_end": alpha_at(tac, q_at_end, budget, budget, action_dimensions),

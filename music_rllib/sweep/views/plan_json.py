@@ -20,7 +20,7 @@ def plan_answer(opened: OpenSweep, changes: str) -> dict[str, Any]:
             "stage": stage.name,
             "mode": stage.search.mode,
             "sampler": stage.search.sampler,
-            "studies": len(stage.search.arms()),
+            "studies": len(stage.search.compared()),
             "trials": stage.search.count,
             "runs_at_most": search_budget(stage, len(config.seeds)).runs,
             "space": stage.search.model_dump(mode="json", by_alias=True)["space"],

@@ -38,7 +38,7 @@ def search_budget(stage: Stage, seeds: int) -> SearchBudget:
     assert search is not None
     env_steps = most_env_steps(search, stage.points)
     fresh_runs, fresh_env_steps = 0, env_steps
-    runs_per_seed = len(search.arms()) * len(stage.tasks)
+    runs_per_seed = len(search.compared()) * len(stage.tasks)
     if (final := search.final) is not None:
         finalists = min(final.most(len(search.points_to_evaluate)), search.count)
         fresh_runs = finalists * final.seeds * runs_per_seed

@@ -71,7 +71,7 @@ def _stage_cells(
     stage: Stage, plan: Plan, nodes: Mapping[str, Node], finished: Collection[str], seeds: int
 ) -> list[str]:
     if stage.search is not None:
-        studies, budget = len(stage.search.arms()), search_budget(stage, seeds)
+        studies, budget = len(stage.search.compared()), search_budget(stage, seeds)
         trials = stage.search.count
         return [
             f"{studies} x {trials}" if studies > 1 else str(trials),

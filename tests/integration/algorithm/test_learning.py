@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from music_rllib import TACConfig, names
-from music_rllib.config.run_settings import RunSettings, preset
+from music_rllib.config.run_settings import RunSettings, variant_music
 from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.tac.algorithm import TAC
 from music_rllib.training.run import TrainingRun
@@ -53,7 +53,7 @@ def music_u(**settings: Any) -> RunSettings:
         task=task,
         variant="music-u",
         tac=tac,
-        music={**preset("music-u", task), "batch_trajectories": 32},
+        music={**variant_music("music-u", task), "batch_trajectories": 32},
         env_steps=12_000,
         evaluation={"interval": 12_000, "episodes": 20},
         **settings,

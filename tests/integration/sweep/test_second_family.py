@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from music_rllib import names
 from music_rllib.config.load import load_sweep
-from music_rllib.config.run_settings import Evaluation, RunSettings, Variant, preset
+from music_rllib.config.run_settings import Evaluation, RunSettings, Variant, variant_music
 from music_rllib.envs.make import goal_reward_of, make_env
 from music_rllib.envs.tasks import BUILT_IN_TASKS, Task
 from music_rllib.experiment.plan import make_plan
@@ -265,7 +265,7 @@ def run_settings(variant: Variant, *, hindsight_k: float = 0.0) -> RunSettings:
                 "random_steps": task.horizon,
                 "replay_ratio": 0.2,
             },
-            "music": preset(variant, task)
+            "music": variant_music(variant, task)
             | ({"batch_trajectories": 4} if variant != "tac" else {}),
             "replay": {"capacity": 1_000, "hindsight_k": hindsight_k},
         }

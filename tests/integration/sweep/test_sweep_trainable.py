@@ -21,7 +21,7 @@ from ray.rllib.utils.metrics import LEARNER_RESULTS
 from ray.tune.trainable import trainable
 
 from music_rllib import names
-from music_rllib.config.run_settings import RunSettings, Variant, handed_over, preset
+from music_rllib.config.run_settings import RunSettings, Variant, handed_over, variant_music
 from music_rllib.config.schema import Resources
 from music_rllib.envs.tasks import BUILT_IN_TASKS, Task
 from music_rllib.experiment.plan import node_key
@@ -75,7 +75,7 @@ def settings(variant: Variant, **changes: Any) -> RunSettings:
         "num_envs": 2,
         "evaluation": {"interval": 200, "episodes": 2},
         "tac": {"random_steps": 100, "hidden_sizes": [16], "batch_size": 16, "replay_ratio": 0.2},
-        "music": preset(variant, POINT) | {"hidden_size": 16, "batch_trajectories": 4},
+        "music": variant_music(variant, POINT) | {"hidden_size": 16, "batch_trajectories": 4},
     }
     return RunSettings.model_validate(base | changes)
 

@@ -13,7 +13,7 @@ import yaml
 from music_rllib.config.load import load_sweep
 from music_rllib.config.problems import ConfigError
 from music_rllib.config.remarks import remarks
-from music_rllib.config.run_settings import VARIANTS, RunSettings, handed_over, preset
+from music_rllib.config.run_settings import VARIANTS, RunSettings, handed_over, variant_music
 from music_rllib.config.schema import SweepConfig
 from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.results.analysis_plan import analysis_plan
@@ -535,7 +535,7 @@ def checkpoint(folder: Path, task: str = "FetchPush", **changes: Any) -> str:
             "task": BUILT_IN_TASKS[task],
             "variant": "music-u",
             "seed": 0,
-            "music": preset("music-u", BUILT_IN_TASKS[task]) | changes,
+            "music": variant_music("music-u", BUILT_IN_TASKS[task]) | changes,
         }
     )
     arrays = {"mi_estimator": {"w": np.zeros((3, 2), np.float32)}}
@@ -605,7 +605,7 @@ def test_every_variant_can_be_built_from_its_preset() -> None:
     task = BUILT_IN_TASKS["FetchPush"]
     for variant, rules in VARIANTS.items():
         run = RunSettings.model_validate(
-            {"task": task, "variant": variant, "seed": 0, "music": preset(variant, task)}
+            {"task": task, "variant": variant, "seed": 0, "music": variant_music(variant, task)}
         )
         assert {field: getattr(run.music, field) for field in rules.fixed} == dict(rules.fixed)
         assert json.loads(run.model_dump_json())["variant"] == variant
@@ -633,5 +633,10 @@ def test_settings_from_elsewhere_cannot_contradict_their_variant() -> None:
     reach = BUILT_IN_TASKS["FetchReach"]
     with pytest.raises(ValueError, match="'FetchReach', which has none"):
         RunSettings.model_validate(
-            {"task": reach, "variant": "music-u", "seed": 0, "music": preset("music-u", reach)}
+            {
+                "task": reach,
+                "variant": "music-u",
+                "seed": 0,
+                "music": variant_music("music-u", reach),
+            }
         )

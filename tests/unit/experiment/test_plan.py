@@ -11,11 +11,11 @@ import yaml
 
 from music_rllib.config.load import load_sweep
 from music_rllib.config.problems import ConfigError
-from music_rllib.config.run_settings import RunSettings, preset
+from music_rllib.config.run_settings import RunSettings, variant_music
 from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.experiment import plan as plan_module
 from music_rllib.experiment.plan import Plan, make_plan, node_key, shared_runs
-from music_rllib.labels import is_meant
+from music_rllib.labels import label_matches
 
 Document = dict[str, Any]
 
@@ -92,7 +92,7 @@ def test_only_layers_are_written_with_an_x(
     stage = {"name": "train", "variant": "tac", "grid": {setting: [value]}}
     sweep = plan(tmp_path, stages=[stage])
     assert sweep.runs[0].label == f"train/FetchPush/{setting}={label}/seed0"
-    assert is_meant(f"{setting}={label}/seed0", sweep.runs[0].label)
+    assert label_matches(f"{setting}={label}/seed0", sweep.runs[0].label)
 
 
 def test_equal_computations_are_one_node(tmp_path: Path) -> None:
@@ -143,7 +143,7 @@ def test_keys_ignore_names_places_and_resources(tmp_path: Path) -> None:
 
 def settings(**changes: Any) -> RunSettings:
     task = BUILT_IN_TASKS["FetchPush"]
-    base = {"task": task, "variant": "music-u", "seed": 0, "music": preset("music-u", task)}
+    base = {"task": task, "variant": "music-u", "seed": 0, "music": variant_music("music-u", task)}
     return RunSettings.model_validate(base | changes)
 
 
@@ -157,7 +157,7 @@ def settings(**changes: Any) -> RunSettings:
         {"tac": {"lr": 0.0011}},
         {"tac": {"log_std_form": "tanh"}},
         {"replay": {"hindsight_k": 1.0}},
-        {"music": preset("music-u", BUILT_IN_TASKS["FetchPush"]) | {"lr": 0.0011}},
+        {"music": variant_music("music-u", BUILT_IN_TASKS["FetchPush"]) | {"lr": 0.0011}},
         {"task": BUILT_IN_TASKS["FetchPush"].model_copy(update={"horizon": 49})},
         {"task": BUILT_IN_TASKS["FetchPickAndPlace"]},
     ],

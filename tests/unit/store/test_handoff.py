@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays_of
 
-from music_rllib.config.run_settings import RunSettings, preset
+from music_rllib.config.run_settings import RunSettings, variant_music
 from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.store.handoff import (
     HandoffError,
@@ -24,7 +24,7 @@ from tests.hostile_files import SPACES
 
 PUSH, SLIDE = BUILT_IN_TASKS["FetchPush"], BUILT_IN_TASKS["FetchSlide"]
 RUN = RunSettings.model_validate(
-    {"task": PUSH, "variant": "music-u", "seed": 0, "music": preset("music-u", PUSH)}
+    {"task": PUSH, "variant": "music-u", "seed": 0, "music": variant_music("music-u", PUSH)}
 )
 INFO = RUN.handoff_info("0" * 20, 6000, SPACES)
 WEIGHTS: NetworkWeights = {

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
-from music_rllib.config.run_settings import RunSettings, preset
+from music_rllib.config.run_settings import RunSettings, variant_music
 from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.experiment.open_sweep import OpenSweep, open_sweep
 from music_rllib.program import main
@@ -295,7 +295,7 @@ def test_files_that_are_none(program: Program, tmp_path: Path) -> None:
 def handoff(folder: Path, task_name: str) -> Path:
     task = BUILT_IN_TASKS[task_name]
     run = RunSettings.model_validate(
-        {"task": task, "variant": "music-u", "seed": 0, "music": preset("music-u", task)}
+        {"task": task, "variant": "music-u", "seed": 0, "music": variant_music("music-u", task)}
     )
     weights = {"mi_estimator": {"w": np.zeros((4, 4), np.float32)}}
     write_handoff(folder, weights, run.handoff_info("0" * 20, 1, SPACES))

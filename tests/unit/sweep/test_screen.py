@@ -13,7 +13,7 @@ from rich.console import Console, RenderableType
 from music_rllib import names
 from music_rllib.config.load import load_sweep
 from music_rllib.config.schema import SweepConfig
-from music_rllib.config.tac_settings import LearnedAlpha, in_words
+from music_rllib.config.tac_settings import LearnedAlpha, setting_text
 from music_rllib.experiment.listener import Failure
 from music_rllib.experiment.plan import Plan, make_plan
 from music_rllib.experiment.scheduler import Scheduler
@@ -359,11 +359,11 @@ def test_clock(seconds: float | None, text: str) -> None:
 
 
 def test_words() -> None:
-    assert in_words(1.0) == "1"
-    assert in_words(1.25) == "1.25"
-    assert in_words(Linear(start=1, end=2)) == "1 to 2"
-    assert in_words(Piecewise(points=((0, 1.0), (5, 3.0), (9, 2.0)))) == "1 to 3 to 2"
-    assert in_words(LearnedAlpha(learned=True)) == "learned"
+    assert setting_text(1.0) == "1"
+    assert setting_text(1.25) == "1.25"
+    assert setting_text(Linear(start=1, end=2)) == "1 to 2"
+    assert setting_text(Piecewise(points=((0, 1.0), (5, 3.0), (9, 2.0)))) == "1 to 3 to 2"
+    assert setting_text(LearnedAlpha(learned=True)) == "learned"
     assert percent(None) == "-"
     assert percent(0.345) == "34 %"
 
