@@ -1,18 +1,19 @@
-"""What determines an environment beside its settings: source, model files, versions of packages.
+"""Fingerprint of an environment: the source, model files and package versions that determine it.
 
-A run's key is a hash of its settings, the same on every machine. What the environment computes also
-depends on its code, so a run keeps a *fingerprint* of that, from name to version or content hash:
+A run's key is a hash of its settings, the same on every machine. The environment's results also
+depend on its code, so a run keeps a *fingerprint*, from name to version or content hash:
 
     {"package gymnasium": "1.2.3", "source lab_env.py": "5b0c…", "file assets/arm.xml": "91d4…"}
 
 - **Sources**: the module in front of the id, the modules of its entry point, of its classes and of
-  the wrappers of its registration, and all that these modules import. A module counts unless it is
-  Python's own or installed (an editable installation counts as source).
-- **Files** in the folder of such a module, or of its package, and below: models (`MODELS`), and any
-  other file whose name stands in the sources or in a model; also files that `env_kwargs` name.
+  the wrappers of its registration, and all modules that these import. Modules that belong to Python
+  or are installed do not count (an editable installation counts as source).
+- **Files** in the folder of these modules, or of their package, and below: models (`MODELS`), and
+  every other file whose name appears in the sources or in a model; also files that `env_kwargs`
+  name.
 - **Packages**: versions of those that hold the environment's classes or that the modules import.
 
-The built-in tasks have the versions of Gymnasium-Robotics and MuJoCo alone.
+Built-in tasks have the versions of Gymnasium-Robotics and MuJoCo only.
 """
 
 from __future__ import annotations
@@ -46,20 +47,20 @@ MODELS = frozenset(
     {".xml", ".mjcf", ".mjb", ".urdf", ".sdf", ".xacro", ".stl", ".obj", ".msh", ".dae", ".ply"}
     | {".glb", ".gltf", ".usd", ".usda", ".usdc"}
 )
-"""Endings of files that describe bodies and scenes."""
+"""Suffixes of files that describe bodies and scenes."""
 MOST_ENTRIES = 5000
-"""Entries of folders that are looked at for the files of one module."""
+"""Maximum number of folder entries searched for the files of one module."""
 MOST_BYTES = 64 * 2**20
-"""Of a larger file its beginning and its size count."""
+"""A larger file is hashed by its beginning and its size."""
 _WITHOUT_EFFECT = frozenset(
     {"music_rllib", "numpy", "matplotlib", "pygame", "PIL", "cv2", "imageio"}
 )
-"""Packages whose versions do not count: they draw, or promise to compute the same."""
+"""Packages without an effect on results: they draw, or their versions compute the same."""
 _PACKAGE, _SOURCE, _FILE = "package ", "source ", "file "
 
 
 def fingerprint_of(env_id: str, env_kwargs: Mapping[str, Any]) -> Fingerprint:
-    """The fingerprint of an environment; imports its module and makes nothing.
+    """The fingerprint of an environment; imports its module, but does not make the environment.
 
     Raises:
         ImportError: A module is not found.
@@ -82,7 +83,7 @@ def digest_of(fingerprint: Fingerprint) -> str:
 
 
 def differences(before: Fingerprint, after: Fingerprint) -> list[str]:
-    """`lab_env.py changed`, `mujoco 3.8.0 -> 3.8.1`, one line for each difference."""
+    """One line per difference, such as `lab_env.py changed` or `mujoco 3.8.0 -> 3.8.1`."""
     lines = []
     for name in sorted({**before, **after}):
         old, new = before.get(name), after.get(name)
@@ -97,16 +98,15 @@ def differences(before: Fingerprint, after: Fingerprint) -> list[str]:
 
 
 def on_another_machine(driver: Fingerprint, worker: Fingerprint) -> list[str]:
-    """Differences of a worker from its driver; a file that only one of them has does not count.
+    """Differences between a worker and its driver, without files that only one of them has.
 
-    Environments may write models for themselves. A worker that lacks a file fails by itself.
+    Environments may generate models. A worker that lacks a file fails when it opens the file.
     """
     alone = {name for name in driver.keys() ^ worker.keys() if name.startswith(_FILE)}
-    first, second = (
-        {name: value for name, value in one.items() if name not in alone}
-        for one in (driver, worker)
+    return differences(
+        {name: driver[name] for name in driver.keys() - alone},
+        {name: worker[name] for name in worker.keys() - alone},
     )
-    return differences(first, second)
 
 
 def _modules_of(env_id: str) -> Iterator[str]:
@@ -116,7 +116,7 @@ def _modules_of(env_id: str) -> Iterator[str]:
         make_importable(module)
         importlib.import_module(module)
         yield module
-    with warnings.catch_warnings():  # `gymnasium.make` warns of an old version, too
+    with warnings.catch_warnings():  # `gymnasium.make` prints the warning about an old version
         warnings.simplefilter("ignore")
         spec = gym.envs.registration._find_spec(env_id)
     entries = [spec.entry_point, *(wrapper.entry_point for wrapper in spec.additional_wrappers)]
@@ -130,19 +130,19 @@ def _modules_of(env_id: str) -> Iterator[str]:
 
 
 class _Walk:
-    """The modules that an environment depends on, followed by what they import."""
+    """The modules that an environment depends on, found by following imports."""
 
     def __init__(self) -> None:
         self.packages: dict[str, str] = {}
         self.sources: dict[str, str] = {}
         self._seen: set[tuple[str, bool]] = set()
         self._folders: dict[Path, Path] = {}
-        """Folders of modules and packages, and those from which they are imported."""
+        """Folder of each module or package -> folder from which it is imported."""
         self._strings: set[str] = set()
-        """All texts in the sources that may be names of files."""
+        """All strings in the sources, which may name files."""
 
     def visit(self, name: str, *, is_root: bool = False) -> None:
-        """Add a module, if there is one of this name, and what it imports."""
+        """Add a module, if one has this name, and what it imports."""
         top = name.partition(".")[0]
         if (name, is_root) in self._seen or top in _WITHOUT_EFFECT:
             return
@@ -155,7 +155,7 @@ class _Walk:
         elif version := _version_of(top, file):
             self.packages |= version
             if is_root and file.suffix == ".py":
-                # What an installed class stands on, such as its simulator.
+                # The packages that an installed class imports, such as its simulator.
                 imports = _imports(_parsed(file.read_bytes()).body, _package(name, file))
                 for other in {one.partition(".")[0] for one in imports} - _WITHOUT_EFFECT - {top}:
                     if (theirs := _file_of(other)) is not None and is_installed(str(theirs)):
@@ -180,11 +180,11 @@ class _Walk:
             if isinstance(node, ast.Constant) and isinstance(node.value, str):
                 self._strings.add(node.value)
         above = name.rpartition(".")[0]
-        for other in (*filter(None, [above]), *_imports(ast.walk(tree), _package(name, file))):
+        for other in (*([above] if above else []), *_imports(ast.walk(tree), _package(name, file))):
             self.visit(other)
 
     def files(self) -> dict[str, str]:
-        """Models in the folders of the sources, and files that sources or models name."""
+        """Hashes of models in the folders of the sources, and of files that these name."""
         found = {
             path: path.relative_to(root).as_posix()
             for folder, root in self._folders.items()
@@ -196,14 +196,14 @@ class _Walk:
             named |= {Path(one).name for one in _FILE_ATTRIBUTE.findall(_text(path))}
         wanted = {path: found[path] for path in found if path in models or path.name in named}
         for text, root in itertools.product(self._strings, self._folders):
-            # `../assets/arm.xml`, or with the whole path.
+            # A relative path such as `../assets/arm.xml`, or an absolute one.
             if "/" in text and "." in text[-8:] and "\n" not in text and len(text) < 500:
                 path = Path(os.path.normpath(root / text))
                 if path not in found and path.is_file():
                     wanted[path] = text
         found_now = {}
         for path, name in wanted.items():
-            with contextlib.suppress(OSError):  # one that an environment has made for itself
+            with contextlib.suppress(OSError):  # deleted meanwhile, as a generated model may be
                 found_now[_FILE + name] = _hash_of(path)
         return found_now
 
@@ -212,7 +212,7 @@ _FILE_ATTRIBUTE = re.compile(r"""\b(?:file|filename)\s*=\s*["']([^"']+)["']""")
 
 
 def _imports(nodes: Iterable[ast.AST], package: str) -> Iterator[str]:
-    """Names that statements import: modules, and perhaps attributes of modules."""
+    """Names that statements import: modules, and possibly attributes of modules."""
     for node in nodes:
         if isinstance(node, ast.Try):
             yield from _imports(node.body, package)
@@ -233,7 +233,7 @@ def _imports(nodes: Iterable[ast.AST], package: str) -> Iterator[str]:
 
 
 def _parsed(data: bytes) -> ast.Module:
-    """The statements of a source; none of one that this Python can't read."""
+    """The syntax tree of a source; an empty one if this Python can't parse it."""
     try:
         return ast.parse(data)
     except (SyntaxError, ValueError):
@@ -245,16 +245,13 @@ def _package(name: str, file: Path) -> str:
 
 
 def _file_of(name: str) -> Path | None:
-    """The file of a module; None where there is none, as for one that is built in."""
-    if name in sys.modules:
-        file = getattr(sys.modules[name], "__file__", None)
-    else:
-        try:
-            spec = importlib.util.find_spec(name)
-        except (ImportError, ValueError, AttributeError):
-            return None
-        file = spec.origin if spec and spec.has_location else None
-    return Path(file) if file and Path(file).is_file() else None
+    """The file of a module; None for built-in and missing ones."""
+    try:
+        spec = importlib.util.find_spec(name)
+    except (ImportError, ValueError, AttributeError):
+        return None
+    file = Path(spec.origin) if spec and spec.has_location and spec.origin else None
+    return file if file and file.is_file() else None
 
 
 @cache
@@ -263,7 +260,7 @@ def _version(distribution: str) -> str:
 
 
 def _version_of(top: str, file: Path) -> dict[str, str]:
-    """The version of the distribution that has an installed module; {} for Python's own."""
+    """The version of the distribution of an installed module; {} for Python's own modules."""
     if not {"site-packages", "dist-packages"} & {*file.parts}:
         return {}
     try:
@@ -277,7 +274,7 @@ def _version_of(top: str, file: Path) -> dict[str, str]:
 
 
 def _entries(folder: Path) -> Iterator[Path]:
-    """Files below a folder that are not Python's, nearest first."""
+    """Files below a folder except Python's, breadth first."""
     left, folders = MOST_ENTRIES, [folder]
     while folders and left > 0:
         folder = folders.pop(0)
@@ -286,7 +283,7 @@ def _entries(folder: Path) -> Iterator[Path]:
         except OSError:
             continue
         names = {entry.name for entry in entries}
-        # The storage of a sweep, or an installation.
+        # The storage of a sweep, or a virtual environment.
         if {"nodes", "work"} <= names or "pyvenv.cfg" in names:
             continue
         left -= len(entries)
@@ -301,7 +298,7 @@ def _entries(folder: Path) -> Iterator[Path]:
 
 
 def _files_of_arguments(arguments: Any) -> dict[str, str]:
-    """Files that are named in the arguments of an environment."""
+    """Hashes of the files that an environment's arguments name."""
     if isinstance(arguments, Mapping):
         arguments = list(arguments.values())
     if isinstance(arguments, list | tuple):
