@@ -28,7 +28,6 @@ import itertools
 import json
 import os
 import re
-import sys
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache

@@ -1,9 +1,9 @@
-"""Plays the environments of a sweep before anything is trained, and names what is wrong with them.
+"""Play environments before anything is trained, and report their problems.
 
 This is the program of a child process, since an environment may abort, end or block its process.
-`music_rllib.sweep.preflight` starts it, sends a `Request` on its standard input, and reads JSON
-lines: `["call", task, name]` before a call of an environment and once a second during many, and
-`["done", task, problems, remarks]` at the end of a task.
+`music_rllib.sweep.preflight` starts it with a folder. It reads a `Request` from the file `request`
+and appends JSON lines to the file `answers`: `["call", task, name]` before a call of an environment
+(at most once a second for repeated calls) and `["done", task, problems, remarks]` for each task.
 """
 
 from __future__ import annotations
@@ -18,22 +18,17 @@ import traceback
 from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Protocol, TextIO
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 from pydantic import BaseModel
 
 from music_rllib.envs.episodes import Episode, Recording
-from music_rllib.envs.make import (
-    Env,
-    goal_reward_of,
-    make_env,
-    moved_distance_of,
-    reset_seed,
-)
+from music_rllib.envs.make import Env, goal_reward_of, make_env, moved_distance_of, reset_seed
 from music_rllib.envs.tasks import Task, beyond_observation, closest
 from music_rllib.envs.values import (
+    GOAL_KEYS,
     BadNumberError,
     check_action_space,
     flag_of,
@@ -45,56 +40,49 @@ from music_rllib.errors import first_line, one_line
 from music_rllib.replay.buffer import GoalReward
 from music_rllib.replay.trajectories import ReplayLayout
 
+REQUEST, ANSWERS = "request", "answers"
 EPISODE_SECONDS = 10.0
-"""Time after which an episode is cut short."""
+"""Time limit of an episode, which is cut there."""
 MOST_STEPS, MOST_SECONDS = 20_000, 2.0
-"""Limits of the further episodes that are played to see a success and a second reward."""
+"""Limits of the further episodes that are played until a success and a second reward are seen."""
 REPEATED_STEPS = 50
-"""Steps that are compared with those after an earlier reset with the same seed."""
-_USED = frozenset({"observation", "desired_goal", "achieved_goal"})
-"""Keys of an observation with goals that the networks and hindsight use."""
-_TYPING_ERROR = 0.85
-"""Similarity from which a key is taken for a misspelled one."""
+"""Number of steps that are compared after two resets with the same seed."""
+_SIMILAR = 0.85
+"""Similarity above which a key counts as misspelled."""
 
 
 class Question(BaseModel):
-    """A task, and the `replay.hindsight_episodes` of its runs; empty without hindsight."""
+    """A task, and the values of `replay.hindsight_episodes` of its runs that use hindsight."""
 
     task: Task
     hindsight: tuple[str, ...] = ()
 
 
 class Request(BaseModel):
-    """Tasks that are to be played; a call may take so many seconds, where it is limited."""
+    """The tasks to play, and the maximum duration of one call in seconds."""
 
     questions: list[Question]
     seconds: float | None
 
 
-class Watch(Protocol):
-    """Is told of each call of an environment, before it is made."""
-
-    def __call__(self, call: str) -> None: ...
-
-
 class RefusedError(Exception):
-    """The environment breaks a rule, and is not played any longer; the message is one line."""
+    """The environment breaks a rule and is not played any longer; the message is one line."""
 
 
 class Probe:
-    """Plays the environment of one task.
+    """Play the environment of one task, and collect problems and remarks.
 
     Args:
         question: the task.
-        watch: is told of each call.
+        watch: called with the name of each call of the environment, before it.
     """
 
-    def __init__(self, question: Question, watch: Watch) -> None:
+    def __init__(self, question: Question, watch: Callable[[str], None]) -> None:
         self._task, self._hindsight, self._watch = question.task, question.hindsight, watch
         self.problems: list[str] = []
         """Reasons to refuse the task."""
         self.remarks: list[str] = []
-        """Matters that a user should know."""
+        """Other findings that a user should know."""
         self._steps = 0
         self._keys: Counter[str] = Counter()
         self._rewards: set[float] = set()
@@ -103,7 +91,7 @@ class Probe:
         self._reward: GoalReward | None = None
 
     def run(self) -> None:
-        """Find the problems and remarks."""
+        """Make the environment, play it and close it."""
         task = self._task
         try:
             env: Env = self._call("make", make_env, task.env_id, **task.env_kwargs)
@@ -117,8 +105,7 @@ class Probe:
         except RefusedError as error:
             self.problems.append(str(error))
         try:
-            # That of `make_env` ignores exceptions.
-            self._call("close()", type(env).close, env)
+            self._call("close()", type(env).close, env)  # the one of `make_env` does not raise
         except RefusedError as error:
             self.remarks.append(f"{error}; the exception is ignored")
 
@@ -140,6 +127,7 @@ class Probe:
             size, goal = observation_sizes(env.observation_space)
         except ValueError as error:
             raise RefusedError(str(error).removeprefix("environment: ")) from None
+        self._layout = ReplayLayout(size, int(action.shape[0]), goal, task.horizon)
         self.problems += beyond_observation(task.agent_indices, task.surrounding_indices, size)
         limit = env.spec.max_episode_steps if env.spec is not None else None
         if limit is not None and task.horizon > limit:
@@ -151,59 +139,41 @@ class Probe:
             self.problems.append(
                 "must have goals for replay.hindsight_k > 0, its observations have none"
             )
-        self._layout = ReplayLayout(
-            observation=size, action=int(action.shape[0]), goal=goal, horizon=task.horizon
-        )
-        first = self._first_episode(env)
+        smallest, largest = task.seed_range
+        self._try_seeds(env, smallest, largest)
+        first = self._play(env, largest, actions=0)
         if self._hindsight and goal:
-            self._reward = self._goal_reward(env)
-        self._play(env, task.seed_range[0], actions=1, steps=REPEATED_STEPS)
-        self._repeat(env, first)
-        self._play_on(env)
-        self._name_keys()
+            self._reward = self._goal_reward(env, smallest)
+        self._play(env, smallest, actions=1, steps=REPEATED_STEPS)
+        self._repeat(env, first, largest)
+        self._play_more(env)
+        self._add_remarks()
 
-    def _first_episode(self, env: Env) -> Episode:
-        """An episode of the largest seed, which an environment may refuse."""
-        smallest, largest = self._task.seed_range
+    # -- calls of the environment ---------------------------------------------------------
+
+    def _try_seeds(self, env: Env, smallest: int, largest: int) -> None:
+        """Name `seed_range` if the environment refuses only some seeds."""
         try:
             self._reset(env, largest)
+            return
         except RefusedError as error:
-            if largest == smallest:
-                raise
-            self._reset_to_smallest(env, smallest)
-            raise RefusedError(
-                f"reset must accept all seeds of seed_range, {smallest} to {largest}: {error}; "
-                f"seed_range: [{smallest}, N] declares N as the largest"
-            ) from None
-        return self._play(env, largest, actions=0)
-
-    def _reset_to_smallest(self, env: Env, seed: int) -> None:
-        """Name `seed_range` if the environment refuses this seed but resets without one."""
+            refused = error
         try:
-            self._reset(env, seed)
+            if smallest < largest:
+                self._reset(env, smallest)
+                refused = RefusedError(
+                    f"reset must accept all seeds of seed_range, {smallest} to {largest}: "
+                    f"{refused}; seed_range: [{smallest}, N] declares N as the largest"
+                )
         except RefusedError as error:
-            try:
+            with contextlib.suppress(BaseException):  # raised if the seed is not the reason
                 env.reset()
-            except BaseException:  # the seed is not the reason
-                raise error from None
-            raise RefusedError(
-                f"{error}; reset() without a seed works: if only some seeds are allowed, declare "
-                "them with seed_range: [SMALLEST, LARGEST]"
-            ) from None
-
-    def _goal_reward(self, env: Env) -> GoalReward | None:
-        seed = self._task.seed_range[0]
-        self._watch("compute_reward()")
-        try:
-            reward = goal_reward_of(env, seed)
-            if "moved" in self._hindsight and self._task.moved_distance is None:
-                moved_distance_of(env, reward, seed)
-        except ValueError as error:
-            self.problems.append(first_line(error))
-            return None
-        except BaseException as error:
-            raise RefusedError(f"compute_reward() raised {one_line(error)}") from error
-        return reward
+                error = RefusedError(
+                    f"{error}; reset() without a seed works: if only some seeds are allowed, "
+                    "declare them with seed_range: [SMALLEST, LARGEST]"
+                )
+            refused = error
+        raise refused from None
 
     def _reset(self, env: Env, seed: int) -> Any:
         result = self._call(f"reset(seed={seed})", env.reset, seed=seed)
@@ -222,7 +192,7 @@ class Probe:
         except RefusedError as error:
             if not isinstance(error.__cause__, ValueError | TypeError):
                 raise
-            # Perhaps a wrapper of Gymnasium's that expects five values.
+            # A wrapper of Gymnasium may have expected five values.
             try:
                 result = env.unwrapped.step(action)
             except BaseException:
@@ -231,13 +201,27 @@ class Probe:
             raise
         return _check_step(result)
 
+    def _goal_reward(self, env: Env, seed: int) -> GoalReward | None:
+        self._watch("compute_reward()")
+        try:
+            reward = goal_reward_of(env, seed)
+            if "moved" in self._hindsight and self._task.moved_distance is None:
+                moved_distance_of(env, reward, seed)
+        except ValueError as error:
+            self.problems.append(first_line(error))
+            return None
+        except BaseException as error:
+            raise RefusedError(f"compute_reward() raised {one_line(error)}") from error
+        return reward
+
+    # -- episodes -------------------------------------------------------------------------
+
     def _play(self, env: Env, seed: int, *, actions: int, steps: int | None = None) -> Episode:
-        """Plays an episode of random actions; the same ones for equal `actions`."""
+        """Play an episode of random actions, which `actions` seeds."""
         observation = self._reset(env, seed)
-        name = f"after reset(seed={seed})"
         recording = Recording(
             self._layout,
-            name=name,
+            name=f"after reset(seed={seed})",
             success=(self._task.success_key, False),
             goal_reward=self._reward,
         )
@@ -261,39 +245,24 @@ class Probe:
         self._rewards.update(episode.rewards.tolist())
         return episode
 
-    def _compare_types(self, space: spaces.Space[Any], observation: Any) -> None:
-        """Note the parts of a valid observation that are integers for floats, or the opposite."""
-        parts = space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
-        values = observation if isinstance(space, spaces.Dict) else {"observation": observation}
-        for name in parts.keys() & _USED:
-            returned, declared = np.asarray(values[name]).dtype, np.dtype(parts[name].dtype)
-            if returned.kind != declared.kind:
-                self._types.add(f"{name} has type {returned}, its space declares {declared}")
-
-    def _repeat(self, env: Env, first: Episode) -> None:
-        """Compares an episode with the first one, of the same seed and actions."""
-        seed = self._task.seed_range[1]
+    def _repeat(self, env: Env, first: Episode, seed: int) -> None:
+        """Play an episode again, and add a remark if it differs."""
         again = self._play(env, seed, actions=0, steps=min(REPEATED_STEPS, len(first)))
         steps = min(len(again), len(first))
-        same = [
-            np.array_equal(again.frames[: steps + 1], first.frames[: steps + 1]),
-            np.array_equal(again.rewards[:steps], first.rewards[:steps]),
-        ]
-        if not all(same):
-            unlike = (again.frames[: steps + 1] != first.frames[: steps + 1]).any(axis=1)
-            at = int(np.argmax(unlike)) if unlike.any() else steps
+        differs = (again.frames[: steps + 1] != first.frames[: steps + 1]).any(axis=1)
+        if differs.any() or (again.rewards[:steps] != first.rewards[:steps]).any():
+            at = int(np.argmax(differs)) if differs.any() else steps
             self.remarks.append(
                 f"reset(seed={seed}) must determine the episode; the second time it differed from "
-                f"step {at} on. "
-                "A resumed run will differ from an uninterrupted one, and runs with the same seed "
-                "will differ from each other"
+                f"step {at} on. A resumed run will differ from an uninterrupted one, and runs with "
+                "the same seed will differ from each other"
             )
 
-    def _play_on(self, env: Env) -> None:
-        """Plays until a success key and, with hindsight, a second reward have been seen."""
+    def _play_more(self, env: Env) -> None:
+        """Play until the success key and, with hindsight, a second reward have been seen."""
         end, number = time.monotonic() + MOST_SECONDS, 2
+        key = self._task.success_key
         while self._steps < MOST_STEPS and time.monotonic() < end:
-            key = self._task.success_key
             rewards_differ = self._reward is None or len(self._rewards) > 1
             if rewards_differ and (key is None or key in self._keys or self._misspelled()):
                 break
@@ -301,13 +270,24 @@ class Probe:
             self._play(env, seed, actions=number)
             number += 1
 
-    def _misspelled(self) -> str:
-        """The key of all steps that the success key must mean, as `closest` names it."""
-        always = [name for name, count in self._keys.items() if count == self._steps]
-        return closest(self._task.success_key or "", always, _TYPING_ERROR)
+    # -- findings -------------------------------------------------------------------------
 
-    def _name_keys(self) -> None:
-        """Name a missing success key, and parts of observations of another type or without use."""
+    def _compare_types(self, space: spaces.Space[Any], observation: Any) -> None:
+        """Note parts of a valid observation that are integers instead of floats, or vice versa."""
+        parts = space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
+        values = observation if isinstance(space, spaces.Dict) else {"observation": observation}
+        for name in parts.keys() & {*GOAL_KEYS}:
+            returned, declared = np.asarray(values[name]).dtype, np.dtype(parts[name].dtype)
+            if returned.kind != declared.kind:
+                self._types.add(f"{name} has type {returned}, its space declares {declared}")
+
+    def _misspelled(self) -> str:
+        """`closest` among the keys of every step, if one is nearly the success key."""
+        always = [name for name, count in self._keys.items() if count == self._steps]
+        return closest(self._task.success_key or "", always, _SIMILAR)
+
+    def _add_remarks(self) -> None:
+        """Name a missing success key, other types than declared, and unused parts."""
         key = self._task.success_key
         if key is not None and key not in self._keys:
             known = ", ".join(sorted(self._keys)) or "none"
@@ -321,7 +301,7 @@ class Probe:
                     f"{known}){closest(key, self._keys)}; a step without it counts as not reached"
                 )
         self.remarks += (f"{line}; the networks get float32" for line in sorted(self._types))
-        if unused := self._unused - _USED:
+        if unused := self._unused - {*GOAL_KEYS}:
             self.remarks.append(
                 f"the observation's {', '.join(sorted(unused))} is not used: the networks get "
                 "observation and desired_goal"
@@ -346,41 +326,40 @@ def _check_step(result: Any) -> tuple[Any, Any, bool, bool, Mapping[str, Any]]:
 
 
 class _Reporter:
-    """Tells the parent of calls, and ends this process where one takes too long."""
+    """Report calls to the parent, and end this process if one takes too long."""
 
-    def __init__(self, answers: TextIO, seconds: float | None) -> None:
-        self._answers, self._seconds = answers, seconds
+    def __init__(self, answers: Path, seconds: float | None) -> None:
+        self._answers, self._seconds = answers.open("a"), seconds
         self.task = self._call = ""
-        self._told = 0.0
+        self._reported = 0.0
 
     def __call__(self, call: str) -> None:
         now = time.monotonic()
-        if call == self._call and now - self._told < 1.0:
+        if call == self._call and now - self._reported < 1.0:
             return
-        self._call, self._told = call, now
-        self.tell("call", self.task, call)
+        self._call, self._reported = call, now
+        self.write("call", self.task, call)
         if self._seconds is not None:
             faulthandler.dump_traceback_later(self._seconds, exit=True)
 
-    def tell(self, *line: Any) -> None:
+    def write(self, *line: Any) -> None:
         print(json.dumps(line), file=self._answers, flush=True)
 
 
 def main() -> None:
-    """Answer the request on standard input, on the file descriptor that the argument names."""
-    os.set_inheritable(answers := int(sys.argv[1]), False)
-    with contextlib.suppress(OSError):  # of all processes, the system ends this one for memory
+    """Answer the request in the folder that the argument names."""
+    folder = Path(sys.argv[1])
+    with contextlib.suppress(OSError):  # if memory runs out, the system ends this process first
         Path("/proc/self/oom_score_adj").write_text("1000")
     faulthandler.enable()
-    request = Request.model_validate_json(sys.stdin.read())
-    with os.fdopen(answers, "w", encoding="utf-8") as file:
-        reporter = _Reporter(file, request.seconds)
-        for question in request.questions:
-            reporter.task = question.task.name
-            probe = Probe(question, reporter)
-            probe.run()
-            reporter.tell("done", question.task.name, probe.problems, probe.remarks)
-    os._exit(0)  # whatever threads the environments have left
+    request = Request.model_validate_json((folder / REQUEST).read_text())
+    reporter = _Reporter(folder / ANSWERS, request.seconds)
+    for question in request.questions:
+        reporter.task = question.task.name
+        probe = Probe(question, reporter)
+        probe.run()
+        reporter.write("done", question.task.name, probe.problems, probe.remarks)
+    os._exit(0)  # without waiting for threads of the environments
 
 
 if __name__ == "__main__":

@@ -112,8 +112,8 @@ from point_env import Point
 
 class Loud(Point):
     def step(self, action):
-        os.write(1, b"x" * 3_000_000)
-        os.write(2, b"y" * 3_000_000)
+        os.write(1, b"x" * 200_000)
+        os.write(2, b"y" * 200_000)
         threading.Thread(target=time.sleep, args=(3600,)).start()
         return super().step(action)
 
