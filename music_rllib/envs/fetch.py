@@ -1,9 +1,8 @@
-"""A faster step for the Fetch tasks, which looks every name up once instead of at every step.
+"""A faster step for the Fetch tasks, with bit-identical observations, rewards and simulation.
 
-Gymnasium-Robotics looks joints, sites and bodies up by name, some fifty times a step, and computes
-Jacobians one by one: half of a step's time is not physics. Here addresses and views of the
-simulator's arrays are found once per episode. Observations, rewards and simulation
-equal the original's bit for bit (`test_fast_fetch_steps_equal_the_originals_bit_for_bit`).
+Gymnasium-Robotics looks up joints, sites and bodies by name about fifty times per step, and
+computes Jacobians one by one, which takes half of a step's time. This step finds the addresses and
+views of the simulator's arrays once per episode.
 """
 
 from __future__ import annotations
@@ -36,20 +35,20 @@ _HOOKS = frozenset(
         "_is_success",
     }
 )
-"""Methods that the faster step does not call; where one is not the original, it is not used."""
+"""Methods that the faster step replaces; it is not used if one differs from the original."""
 _PACKAGE = "gymnasium_robotics."
 
 _ROTATION = np.array([1.0, 0.0, 1.0, 0.0])
-"""Added to the gripper's orientation, as in the original (MuJoCo normalises the quaternion)."""
+"""Added to the gripper's orientation, as in the original (MuJoCo normalizes the quaternion)."""
 _ALMOST_ZERO = np.finfo(np.float64).eps * 4.0
 
 
 def speed_up(env: gym.Env[Any, Any]) -> None:
-    """Gives a Fetch environment the faster step, in place; does nothing to other environments.
+    """Give a Fetch environment the faster step, in place; leave other environments unchanged.
 
-    An environment that replaces a method of `_HOOKS`, in its class, in Gymnasium-Robotics' class or
-    on the object, keeps its own step, even if it does so later. A model that is replaced or edited
-    counts from the next reset or step on.
+    An environment that replaces a method of `_HOOKS` (in its class, in Gymnasium-Robotics' class or
+    on the object, at any time) keeps its own step. A model that is replaced or edited takes effect
+    at the next reset or step.
     """
     unwrapped = env.unwrapped
     if isinstance(unwrapped, MujocoFetchEnv) and not _HOOKS & vars(unwrapped).keys():
@@ -59,7 +58,7 @@ def speed_up(env: gym.Env[Any, Any]) -> None:
 
 
 def _has_original_hooks(kind: type) -> bool:
-    """Whether a class has the methods of Gymnasium-Robotics, none of them replaced."""
+    """Whether a class has the original methods of Gymnasium-Robotics."""
     functions = [fetch_env.goal_distance]
     for name in _HOOKS:
         method = getattr(kind, name)
@@ -76,13 +75,13 @@ class _FastFetch:
         self._env = env
 
     def bind(self) -> bool:
-        """Looks up all names in the environment's current model; False where it does not fit."""
+        """Look up all names in the current model; False if the faster step does not apply."""
         env = self._env
         if env.render_mode == "human" or not _has_original_hooks(type(env)):
             return False
         try:
             self._bind(env, env.model, env.data)
-        except (ValueError, LookupError):  # a robot of another kind
+        except (ValueError, LookupError):  # another robot
             return False
         return True
 
@@ -109,7 +108,7 @@ class _FastFetch:
         self._linear, self._angular = np.zeros((2, 3, model.nv))
 
     def _fits(self) -> bool:
-        """Whether the faster step still applies; binds again if the model is a new one."""
+        """Whether the faster step still applies; binds again to a new model."""
         env = self._env
         own = vars(env)
         if len(_HOOKS & own.keys()) > 2 or own.get("_get_obs") != self.first_observation:
@@ -117,8 +116,8 @@ class _FastFetch:
         same = env.model is self._model and env.data is self._data
         return (same and env.has_object == self._has_object) or self.bind()
 
-    def _give_back(self) -> None:
-        """Leaves the environment its own step from now on."""
+    def _remove(self) -> None:
+        """Restore the environment's own step."""
         for name, method in (("step", self.step), ("_get_obs", self.first_observation)):
             if vars(self._env).get(name) == method:
                 delattr(self._env, name)
@@ -127,21 +126,21 @@ class _FastFetch:
         """The observation of a reset, which may have built or edited a model."""
         if self._fits() and self.bind():
             return self.observe()
-        self._give_back()
+        self._remove()
         observation: Goals = self._env._get_obs()
         return observation
 
     def _actuator(self, index: int) -> tuple[int, int | None]:
-        """The index of its control, and the address of the position that its target adds to."""
+        """Index of an actuator's control, and address of the position added to its target."""
         if self._model.actuator_biastype[index] == 0:
             return index, None
         return index, int(self._model.jnt_qposadr[self._model.actuator_trnid[index, 0]])
 
     def step(self, action: Any) -> tuple[Goals, Any, bool, bool, dict[str, Any]]:
-        """Takes one step, as `BaseRobotEnv.step`: [4] -> observation, reward, ..., info."""
+        """Take one step like `BaseRobotEnv.step`; action [4]."""
         env = self._env
         if not self._fits():
-            self._give_back()
+            self._remove()
             result: tuple[Goals, Any, bool, bool, dict[str, Any]] = env.step(action)
             return result
         space = env.action_space
@@ -162,18 +161,18 @@ class _FastFetch:
         return observation, reward, False, False, {"is_success": success}
 
     def _control(self, action: NDArray[Any]) -> None:
-        """Moves the fingers, and the target that the hand is welded to."""
+        """Move the fingers, and the target to which the hand is welded."""
         if self._actuators:
             opening = 0.0 if self._env.block_gripper else float(action[3])
             for index, address in self._actuators:
                 start = 0.0 if address is None else float(self._qpos[address])
                 self._data.ctrl[index] = start + opening
-        # At most 5 cm a step.
+        # At most 5 cm per step.
         self._mocap_position[:] = self._hand_position + action[:3] * 0.05
         self._mocap_quaternion[:] = self._hand_quaternion + _ROTATION
 
     def observe(self) -> Goals:
-        """The goal dictionary of the current state, in fresh arrays."""
+        """Goal dictionary of the current state, in new arrays."""
         env, qvel = self._env, self._qvel
         dt = env.n_substeps * self._model.opt.timestep
         linear, angular = self._linear, self._angular

@@ -1,9 +1,8 @@
 """Tasks: an environment, its horizon, and its split into agent and surrounding state.
 
 MUSIC (paper III-A) needs to know which observation entries belong to the agent (x, for Fetch the
-gripper's position) and which to its surroundings (y, the object's position). That split is part
-of a task's definition. Users declare tasks beside the built-in ones in a sweep's YAML under
-``environments:``::
+gripper's position) and which to its surroundings (y, the object's position). Users declare further
+tasks in a sweep's YAML under `environments:`::
 
     environments:
       MyPush:
@@ -12,7 +11,7 @@ of a task's definition. Users declare tasks beside the built-in ones in a sweep'
         agent_indices: 0:3                  # or a list, [0, 1, 2]
         surrounding_indices: [3, 4, 5]
 
-Nothing here imports an environment: :mod:`music_rllib.envs.make` builds them.
+This module imports no environment; `music_rllib.envs.make` makes them.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ _RANGE = re.compile(r"(\d+):(\d+)")
 
 
 def _expand_range(value: Any) -> Any:
-    """Turns `"3:6"` into (3, 4, 5) and a list into a tuple; returns any other value unchanged."""
+    """Turn `"3:6"` into (3, 4, 5) and a list into a tuple; return other values unchanged."""
     if isinstance(value, list | tuple):
         if len(value) > MOST_INDICES:
             raise ValueError(f"must have at most {MOST_INDICES} entries, got {len(value)}")
@@ -72,7 +71,7 @@ Seed = Annotated[int, Field(ge=0, le=LAST_SEED)]
 def beyond_observation(
     agent_indices: Sequence[int], surrounding_indices: Sequence[int], size: int
 ) -> list[str]:
-    """Why a split does not fit an observation of this size: behind it lie goals and the action."""
+    """Explain why a split does not fit an observation of this size; empty if it does."""
     parts = (("agent_indices", agent_indices), ("surrounding_indices", surrounding_indices))
     return [
         f"{name} must be < {size}, the size of the observation, got {max(indices)}"
@@ -82,7 +81,7 @@ def beyond_observation(
 
 
 def check_split(agent_indices: Sequence[int], surrounding_indices: Sequence[int]) -> None:
-    """Checks agent and surrounding state: both or none, no index twice; raises ValueError."""
+    """Raise ValueError unless a split has both parts or neither, and repeats no index."""
     if bool(agent_indices) != bool(surrounding_indices):
         missing = "surrounding_indices" if agent_indices else "agent_indices"
         raise ValueError(f"{missing} must be given too: a split needs both parts")
@@ -101,7 +100,7 @@ class Task(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=80)
-    """What sweeps, labels and reports call it. Does not influence results."""
+    """Name in sweeps, labels and reports. Does not influence results."""
     env_id: str = Field(min_length=1)
     """Gymnasium id, with `module:` in front if that module registers it."""
     horizon: int = Field(gt=0)
@@ -110,25 +109,25 @@ class Task(BaseModel):
     """Entries of the observation (of `observation["observation"]` if it is a goal dict) that are
     the agent state x: a list of positions, or a range such as `0:3`."""
     surrounding_indices: Indices = ()
-    """Entries that are the surrounding state y. Both empty: the task has no split and can't be
-    used with MUSIC."""
+    """Entries that are the surrounding state y. If both are empty, the task can't be used with
+    MUSIC."""
     success_key: str | None = "is_success"
-    """Key of `info` that says whether the goal is reached now, which it is not where a step lacks
-    it; null if there is none."""
+    """Key of `info` that reports success; a step without the key is not a success. null: the
+    environment does not define success."""
     env_kwargs: dict[str, JsonValue] = Field(default_factory=dict)
-    """Further arguments of `gymnasium.make`, as YAML reads them: `1e2` is the float 100.0. Only
+    """Arguments of `gymnasium.make`, as YAML reads them: `1e2` is the float 100.0. Only
     `max_episode_steps: 1e2` becomes an integer."""
     reward_range: tuple[float, float] | None = None
-    """Smallest and largest reward of a step; null: not known. Changes no result: it tells where
-    `tac.target_bounds` cut off values that can be reached."""
+    """Smallest and largest reward of a step; null: not known. Changes no result; it serves to
+    detect `tac.target_bounds` that cut off reachable values."""
     seed_range: tuple[Seed, Seed] = (0, LAST_SEED)
     """Smallest and largest seed that the environment's `reset` accepts."""
     mi_reward_weight: float = Field(1.0, ge=0)
-    """MUSIC-r's weight of the intrinsic reward where a sweep doesn't set it."""
+    """Default weight of the intrinsic reward in MUSIC-r."""
     moved_distance: float | None = Field(None, gt=0)
-    """Distance, in the goal's units, from which on what is achieved has moved, for
-    `replay.hindsight_episodes: moved`. null: where the task's reward no longer takes it for the
-    same; with dense rewards a fifth of the environment's `distance_threshold`."""
+    """Distance in the goal's units from which the achieved goal has moved, for
+    `replay.hindsight_episodes: moved`. null: it has moved if a sparse reward changes; with dense
+    rewards a fifth of the environment's `distance_threshold`."""
 
     @field_validator("env_kwargs")
     @classmethod
@@ -152,18 +151,18 @@ class Task(BaseModel):
 
     @property
     def primary_metric(self) -> str:
-        """The metric that compares its runs: the success rate, or the return without success."""
+        """Metric by which runs are compared: success rate, or return without a success key."""
         return names.primary_metric(self.success_key)
 
     @property
     def has_split(self) -> bool:
-        """Whether MUSIC can be used on this task."""
+        """Whether the task has agent and surrounding state, which MUSIC needs."""
         return bool(self.surrounding_indices)
 
     def identity(self) -> dict[str, Any]:
-        """The settings that define the task, without its name and its training settings.
+        """Settings that define the task, without its name and its training settings.
 
-        The default `seed_range` is omitted, as runs are older than this setting.
+        The default `seed_range` is omitted: run keys are older than this setting.
         """
         excluded = {"name", "reward_range", "mi_reward_weight", "moved_distance"}
         if self.seed_range == (0, LAST_SEED):
@@ -188,8 +187,8 @@ def _fetch(name: str, *, split: bool = True, mi_reward_weight: float = 1.0) -> T
 
 
 def _hand(name: str) -> Task:
-    # observation: 24 joint angles, their 24 velocities, the object's 6 velocities and its pose. The
-    # split uses only the pose's position, so that distances of surrounding states are metres.
+    # Observation: 24 joint angles, their 24 velocities, the object's 6 velocities and its pose. The
+    # split uses only the position, so that distances of surrounding states are in meters.
     return Task(
         name=name,
         env_id=f"{name}-v1",
@@ -204,7 +203,7 @@ BUILT_IN_TASKS: Mapping[str, Task] = MappingProxyType(
     {
         task.name: task
         for task in (
-            # Reach has no object: observation[3:6] are fingers and velocity, not surroundings.
+            # Reach has no object; observation[3:6] are fingers and velocity.
             _fetch("FetchReach", split=False),
             _fetch("FetchPush"),
             _fetch("FetchPickAndPlace"),
@@ -214,15 +213,15 @@ BUILT_IN_TASKS: Mapping[str, Task] = MappingProxyType(
         )
     }
 )
-"""Tasks of Gymnasium-Robotics; tests compare each of them with its environment."""
+"""Tasks of Gymnasium-Robotics; tests compare each with its environment."""
 
 
 class UnknownTaskError(LookupError):
-    """A task name that is neither built in nor declared; the message suggests close ones."""
+    """A task name that is neither built in nor declared; the message suggests a similar one."""
 
 
 class TaskRegistry(dict[str, Task]):
-    """The built-in tasks and those of a user, whose names must be new, by name."""
+    """The built-in tasks and a user's tasks, by name."""
 
     def __init__(self, user_tasks: Iterable[Task] = ()) -> None:
         super().__init__(BUILT_IN_TASKS)
@@ -239,7 +238,7 @@ class TaskRegistry(dict[str, Task]):
 
 
 def closest(name: str, known: Iterable[str], cutoff: float = 0.6) -> str:
-    """`" (did you mean 'FetchPush'?)"`, or an empty text where no known name is close."""
+    """`" (did you mean 'FetchPush'?)"`, or an empty string if no known name is similar."""
     by_folded = {candidate.casefold(): candidate for candidate in known}
     matches = difflib.get_close_matches(name.casefold(), by_folded, n=1, cutoff=cutoff)
     return f" (did you mean {by_folded[matches[0]]!r}?)" if matches else ""
