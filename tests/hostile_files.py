@@ -163,8 +163,6 @@ def write_export(folder: Path, table_format: Format = "parquet") -> Path:
     sweep = Sweep(
         name="mine",
         status="FINISHED",
-        run_id="parent",
-        experiment_id="1",
         started=0,
         source="sqlite:///mlflow.db",
         tags={names.TAG_GIT_COMMIT: "c0ffee"},
@@ -580,7 +578,8 @@ CORPUS: dict[str, Hostile] = {
         "must be encoded as",
     ),
     "export: more rows than it says": Hostile(
-        _export("metrics.parquet", _fewer_rows_said), "as many rows as it says, 5, it has 2000000"
+        _export("metrics.parquet", _fewer_rows_said),
+        "must have 5 rows, as its footer states, got 2000000",
     ),
     "export: many columns": Hostile(
         _export("runs.csv", _columns, "csv"), "must have at most 10000 columns"
@@ -589,7 +588,7 @@ CORPUS: dict[str, Hostile] = {
         _export("runs.parquet", lambda file: file.write_bytes(b"PAR1" * 9)), "runs.parquet:"
     ),
     "export: a table of nulls": Hostile(
-        _export("metrics.parquet", _nulls(1000, 1000)), "run must be given in each row"
+        _export("metrics.parquet", _nulls(1000, 1000)), "run must have a value in each row"
     ),
 }
 SECONDS, MEGABYTES = 1.0, 300

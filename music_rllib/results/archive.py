@@ -1,18 +1,17 @@
-"""A sweep as a folder of plain tables, readable without this package.
+"""Exports: a sweep as a folder of plain tables, readable without this package.
 
 `sweep.json`
-    the sweep's own run: name, status, tags, configuration.
+    Name, status, tags and configuration of the sweep.
 `runs.csv` or `runs.parquet`
-    one row per run: its number, its key, and a column per tag (`tag.`) and param (`param.`).
+    One row per run: its number, its key, and a column per tag (`tag.`) and param (`param.`).
 `metrics.csv` or `metrics.parquet`
-    one row per value: the run's number, metric, environment steps, value, time in ms.
+    One row per value: number of the run, metric, environment steps, value, time in ms.
 `search.json`
-    of a sweep that searched: trials, importance of settings, ranking on fresh seeds.
+    For a search: trials, importance of settings, ranking on fresh seeds.
 `analysis_plan.json`
-    of a sweep with a plan: its versions, each with the time at which it was recorded.
+    For a sweep with a plan: its versions, each with the time at which it was recorded.
 
-
-Merging of exports: the runs of several sittings, machines and sweeps as one sweep.
+Exports of several machines, sittings and sweeps can be merged into one sweep.
 """
 
 from __future__ import annotations
@@ -50,14 +49,15 @@ from music_rllib.results.data import (
 
 Format = Literal["csv", "parquet"]
 _HEADER, _SEARCHES, _PLANS = "sweep.json", "search.json", "analysis_plan.json"
-_OWN_FIELDS = ("name", "status", "run_id", "experiment_id", "started", "source", "tags", "config")
-_RUN_FIELDS = ("run_id", "name", "status", "started", "ended")
+_OWN_FIELDS = ("name", "status", "started", "source", "tags", "config")
 _RUNS = {
     "run": pa.int64(),
     **dict.fromkeys(("run_id", "name", "status"), pa.string()),
     **dict.fromkeys(("started", "ended"), pa.int64()),
+    "trained_seconds": pa.float64(),
 }
-"""Columns of the table of runs; every other column is text."""
+"""Columns of the table of runs; other columns are text."""
+_RUN_FIELDS = tuple(name for name in _RUNS if name != "run")
 _METRICS = {
     "run": pa.int64(),
     "metric": pa.string(),
@@ -72,9 +72,9 @@ _LOCAL = re.compile(r"(sqlite(?:\+\w+)?:///)/(?:.*/)?([^/]+/[^/]+)|(?:file://)?/
 
 
 def _without_folders(place: str) -> str:
-    """`place` without the folders above it; servers, buckets and relative paths stay.
+    """`place` without the folders above it; servers, buckets and relative paths are kept.
 
-    A sqlite file keeps its folder, as it is with the default storage: `results/mlflow.db`.
+    A sqlite file keeps its own folder, as in `results/mlflow.db`.
     """
     local = _LOCAL.fullmatch(place)
     return local.expand(r"\1\2\3") if local else place
@@ -86,12 +86,12 @@ def is_archive(folder: Path) -> bool:
 
 
 def write_archive(sweep: Sweep, folder: Path, file_format: Format = "parquet") -> None:
-    """Write `sweep` into `folder`; a sweep that was exported there before is replaced.
+    """Write `sweep` into `folder`, replacing an earlier export.
 
-    An export may be published, so it does not tell in which folder of a machine the sweep was.
+    An export may be published, so it does not contain absolute paths of the machine.
 
     Raises:
-        ReportError: where the folder is not writable.
+        ReportError: The folder is not writable.
     """
     header: dict[str, Any] = {"version": 1, "format": file_format}
     header |= {name: getattr(sweep, name) for name in _OWN_FIELDS}
@@ -102,7 +102,7 @@ def write_archive(sweep: Sweep, folder: Path, file_format: Format = "parquet") -
         )
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        # Written beside it first: a full disk must not cost the runs of an earlier export.
+        # Written to a temporary folder first: a full disk must not destroy an earlier export.
         with TemporaryDirectory(dir=folder, prefix=".new-") as temporary:
             new = Path(temporary)
             write_table(_runs_table(sweep.runs), new / f"runs.{file_format}")
@@ -123,10 +123,10 @@ def write_archive(sweep: Sweep, folder: Path, file_format: Format = "parquet") -
 
 
 def read_archive(folder: Path) -> Sweep:
-    """Inverse of :func:`write_archive`.
+    """Read an exported sweep.
 
     Raises:
-        ReportError: where something is missing or is not what was written.
+        ReportError: A file is missing or malformed.
     """
     file = folder / _HEADER
     try:
@@ -158,8 +158,6 @@ class _Header(BaseModel):
     format: Format
     name: str
     status: str
-    run_id: str
-    experiment_id: str
     started: int | None = Field(ge=0, lt=2**47)  # until the year 6429
     source: str
     tags: dict[str, str]
@@ -171,7 +169,7 @@ def _read_json(file: Path) -> Any:
 
 
 def _reason(error: Exception) -> str:
-    """The reason in one line; of several findings the first."""
+    """The first finding, in one line."""
     if isinstance(error, ValidationError):
         finding = error.errors(include_url=False)[0]
         place = ".".join(str(part) for part in finding["loc"])
@@ -194,8 +192,7 @@ def _write_json(document: Any, file: Path) -> None:
 def _runs_table(runs: Sequence[RunRecord]) -> pa.Table:
     table: dict[str, Any] = {"run": pa.array(range(len(runs)), pa.int64())}
     for name in _RUN_FIELDS:
-        kind = pa.int64() if name in ("started", "ended") else pa.string()
-        table[name] = pa.array([getattr(run, name) for run in runs], kind)
+        table[name] = pa.array([getattr(run, name) for run in runs], _RUNS[name])
     table |= _wide("tag.", [run.tags for run in runs])
     table |= _wide("param.", [run.params for run in runs])
     return pa.table(table)
@@ -223,7 +220,7 @@ def _metrics_table(sweep: Sweep) -> pa.Table:
 def _records(table: pa.Table) -> list[RunRecord]:
     return [
         RunRecord(
-            **{name: row[name] for name in _RUN_FIELDS},
+            **{name: row[name] for name in _RUN_FIELDS if name in row},
             params=_narrow("param.", row),
             tags=_narrow("tag.", row),
         )
@@ -254,20 +251,23 @@ def _history(table: pa.Table, runs: int) -> dict[str, Column]:
     }
 
 
+# Merging ------------------------------------------------------------------------------------------
+
 _Place = tuple[Sweep, int]
-"""An export that has a run, and the run's position in it."""
+"""An export, and the position of a run in it."""
 
 
 def merged(earlier: Sweep, later: Sweep) -> Sweep:
-    """Every run of either export; of a run that both have, the finished one, or else the later one.
+    """All runs of two exports of a sweep.
 
-    Runs are the same where their node key is: the hash of everything that determines their numbers.
-    The sweep's own fields are those of `later`, searches those of the last export to have any.
+    Runs with the same node key are the same run: the key hashes everything that determines their
+    numbers. Of two records of a run, a finished one is kept, else the later one. The fields of the
+    sweep come from `later`, and the searches from the last export that has any.
     """
     places = list(_best([earlier, later]).values())
     return replace(
         later,
-        runs=[_run(place) for place in places],
+        runs=[sweep.runs[position] for sweep, position in places],
         history=_history_of(places),
         searches=later.searches or earlier.searches,
         plans=_plans([earlier, later]),
@@ -275,27 +275,27 @@ def merged(earlier: Sweep, later: Sweep) -> Sweep:
 
 
 def of_plan(plan: Plan, exports: Iterable[Sweep], *earlier: Plan) -> Sweep | None:
-    """The runs of a plan that any export has, whichever sweep has computed them.
+    """The runs of a plan that any export has, whichever sweep trained them.
 
-    A run is that of the plan's node with its key: the same settings, seed and source, under
-    whatever names. It gets the plan's name for it, and the plan's order. The sweep's own fields are
-    those of the last export that has a run.
+    A run belongs to the node of the plan that has its key: the same settings, seed and source. It
+    gets the plan's name for it, and the plan's order. The fields of the sweep come from the last
+    export that has a run.
 
     Args:
         plan: The plan.
-        exports: The exports that are searched.
+        exports: The exports to search.
         earlier: The same plan under earlier versions of the algorithm, for runs that have not been
-            made since. A run's source is of the version that the run started from.
+            trained since. The source of a run has the version that the run started from.
 
     Returns:
-        None where no export has any of its runs.
+        None if no export has any of the runs.
     """
     exports = list(exports)
     best = _best(exports)
     versions = (plan, *earlier)
     found: list[tuple[Plan, Node]] = []
     sources: set[str | None] = set()
-    # A run has the same position in each plan, and its source comes before it.
+    # A run has the same position in each plan, after its source.
     for nodes in reversed(list(zip(*(version.nodes for version in versions), strict=True))):
         known = [pair for pair in zip(versions, nodes, strict=True) if pair[1].key in best]
         if known:
@@ -303,8 +303,9 @@ def of_plan(plan: Plan, exports: Iterable[Sweep], *earlier: Plan) -> Sweep | Non
             sources.add(found[-1][1].source_key)
     runs, places = [], []
     for version, node in reversed(found):
-        places.append(best[node.key])
-        run = _run(best[node.key])
+        sweep, position = best[node.key]
+        places.append((sweep, position))
+        run = sweep.runs[position]
         own = {
             names.TAG_SWEEP: plan.name,
             names.TAG_STAGE: node.stage,
@@ -325,7 +326,7 @@ def of_plan(plan: Plan, exports: Iterable[Sweep], *earlier: Plan) -> Sweep | Non
 
 
 def _plans(sweeps: Iterable[Sweep]) -> tuple[PlanVersion, ...]:
-    """Every version of a plan once, as recorded first, without later ones for fewer seeds."""
+    """Each version of a plan once, without later ones for a subset of the seeds."""
     kept: list[PlanVersion] = []
     versions = (version for sweep in sweeps for version in sweep.plans)
     for version in sorted(versions, key=lambda version: version.recorded_ms):
@@ -334,24 +335,19 @@ def _plans(sweeps: Iterable[Sweep]) -> tuple[PlanVersion, ...]:
     return tuple(kept)
 
 
-def _run(place: _Place) -> RunRecord:
-    sweep, position = place
-    return sweep.runs[position]
-
-
 def _best(sweeps: Iterable[Sweep]) -> dict[str, _Place]:
-    """The last finished run of each node key, or else the last run, in the keys' first order."""
+    """The last finished run of each node key, else the last one, in order of first appearance."""
     best: dict[str, _Place] = {}
     for sweep in sweeps:
         for position, run in enumerate(sweep.runs):
-            before = best.get(run.node_key)
-            if before is None or run.is_finished or not _run(before).is_finished:
+            other, at = best.get(run.node_key, (sweep, position))
+            if run.is_finished or not other.runs[at].is_finished:
                 best[run.node_key] = (sweep, position)
     return best
 
 
 def _history_of(places: Sequence[_Place]) -> History:
-    """The metrics of the runs at `places`, numbered in that order."""
+    """Metrics of the runs at `places`, numbered in that order."""
     parts: defaultdict[str, list[Column]] = defaultdict(list)
     for number, (sweep, position) in enumerate(places):
         for metric in sweep.history:

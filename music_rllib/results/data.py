@@ -1,7 +1,4 @@
-"""The runs of one sweep with the values of their metrics, from whatever source they were read.
-
-Check of a sweep's `search.json`, which may come from anybody.
-"""
+"""The runs of one sweep with the values of their metrics, from a storage or an export."""
 
 from __future__ import annotations
 
@@ -23,7 +20,7 @@ Ints = NDArray[np.int64]
 
 
 class ReportError(BadInputError):
-    """There is nothing to report on; names the place and what to do."""
+    """A sweep or an export can't be read or written; names the place and what to do."""
 
 
 @dataclass(frozen=True)
@@ -66,9 +63,9 @@ class Points(NamedTuple):
 
 
 def columns(runs: Iterable[Points]) -> dict[str, Column]:
-    """Columns from one `Points` per run, in the order of the runs.
+    """Build columns from one `Points` per run, in the order of the runs.
 
-    Of several values of a metric at one step of a run, the one logged last counts.
+    If a run has several values of a metric at one step, the one logged last counts.
     """
     parts: defaultdict[str, list[Column]] = defaultdict(list)
     for position, points in enumerate(runs):
@@ -90,7 +87,7 @@ def columns(runs: Iterable[Points]) -> dict[str, Column]:
 
 
 def joined(parts: Sequence[Column]) -> Column:
-    """The values of all parts, one part after the other."""
+    """Concatenate columns."""
     parts = parts or [_NO_VALUES]
     return Column(
         run=np.concatenate([part.run for part in parts]),
@@ -105,14 +102,16 @@ class RunRecord:
     """One run of the sweep."""
 
     run_id: str
-    """Key of the run's node; in exports of earlier versions its id in MLflow."""
+    """Key of the run's node; in old exports its MLflow id."""
     name: str
     status: str
     """RUNNING, FINISHED, FAILED, KILLED or SCHEDULED."""
     started: int | None = None
     """Start in ms since the epoch."""
     ended: int | None = None
-    """End in ms since the epoch."""
+    """Last report in ms since the epoch."""
+    trained_seconds: float | None = None
+    """Training time up to the last report, without pauses; None in old exports."""
     params: Mapping[str, str] = field(default_factory=dict, repr=False)
     tags: Mapping[str, str] = field(default_factory=dict, repr=False)
 
@@ -151,35 +150,36 @@ class RunRecord:
 
     @property
     def budget(self) -> int | None:
-        """Environment steps that the run is to train for."""
+        """Number of environment steps of the run's plan."""
         text = self.params.get("env_steps", "")
         return int(text) if text.isdecimal() and len(text) < 19 else None
 
     @property
     def seconds(self) -> float | None:
-        """Time from start to last report, pauses included; None where it has not ended."""
-        over = self.status not in {"RUNNING", "SCHEDULED"}
-        if not over or self.started is None or self.ended is None:
+        """Training time of a run that has ended, else None.
+
+        In old exports this is the time from start to last report, pauses included.
+        """
+        if self.status in {"RUNNING", "SCHEDULED"} or self.started is None or self.ended is None:
             return None
+        if self.trained_seconds is not None:
+            return self.trained_seconds
         return (self.ended - self.started) / 1000
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sweep:
-    """Everything that a report needs of one sweep."""
+    """The runs of a sweep, their curves, and its searches and plans."""
 
     name: str
     status: str = ""
     """Status of the sweep, in the words of :class:`RunRecord`."""
-    run_id: str = ""
-    """As `experiment_id`, only in exports of earlier versions: those of MLflow."""
-    experiment_id: str = ""
     started: int | None = None
     source: str = ""
     """Storage that the sweep was read from, without a password."""
     tags: Mapping[str, str] = field(default_factory=dict, repr=False)
     config: str | None = field(default=None, repr=False)
-    """The configuration as YAML; None where it was not kept."""
+    """The configuration as YAML; None if it was not kept."""
     runs: Sequence[RunRecord] = field(repr=False)
     history: History = field(repr=False)
     searches: Sequence[Mapping[str, Any]] = field(default=(), repr=False)
@@ -190,22 +190,22 @@ class Sweep:
     """A sentence about the runs of earlier plans, which are not part of the sweep."""
 
     def column(self, run: int, metric: str) -> Column:
-        """The values of a metric of `runs[run]`; empty where it has none."""
+        """The values of a metric of `runs[run]`, possibly empty."""
         return self.history.get(metric, _NO_VALUES).of_run(run)
 
     def series(self, run: int, metric: str) -> tuple[Ints, Array]:
-        """Steps and values of a metric of `runs[run]`, `[points]` each; empty where it has none."""
+        """Steps and values of a metric of `runs[run]`, `[points]` each, possibly empty."""
         column = self.column(run, metric)
         return column.step, column.value
 
     def finite(self, run: int, metric: str) -> tuple[Array, Array]:
-        """`series` without NaN and infinities, with the steps as floats."""
+        """Finite part of `series`, with the steps as floats."""
         steps, values = self.series(run, metric)
         is_finite = np.isfinite(values)
         return steps[is_finite].astype(float), values[is_finite]
 
     def seconds_at(self, run: int) -> tuple[Array, Array]:
-        """Steps of a run's evaluations, and seconds since its start, pauses included."""
+        """Steps of a run's evaluations, and seconds since its start, with pauses."""
         record = self.runs[run]
         if record.started is None:
             return np.empty(0), np.empty(0)
@@ -213,7 +213,7 @@ class Sweep:
         return column.step.astype(float), (column.time - record.started) / 1000
 
     def until(self, steps: Mapping[str, float]) -> Sweep:
-        """The sweep with what its runs on a task had measured by a number of environment steps."""
+        """The sweep with the values of each task's runs up to a number of environment steps."""
         last = np.array([steps.get(run.task, np.inf) for run in self.runs])
         cut = {
             metric: column.select(column.step <= last[column.run])
@@ -227,7 +227,7 @@ class Sweep:
         return float(values[-1]) if len(values) and np.isfinite(values[-1]) else None
 
     def having(self, wanted: Callable[[RunRecord], bool]) -> Sweep:
-        """The sweep with the runs that are `wanted`."""
+        """The sweep with the runs for which `wanted` is true."""
         kept = np.array([wanted(run) for run in self.runs], dtype=bool)
         position = np.cumsum(kept) - 1
         history = {
@@ -243,38 +243,41 @@ class Sweep:
         return [position for position, run in enumerate(self.runs) if run.task == task]
 
     def primary_metric(self, task: str) -> str:
-        """The metric that the runs of a task are judged by."""
+        """The metric by which the runs of a task are scored."""
         keys = (run.params.get("task.success_key", "") for run in self.runs if run.task == task)
         return names.primary_metric(next(keys, ""))
 
     def episodes(self, runs: Iterable[int]) -> float:
-        """Mean number of episodes of the runs' last evaluations; infinite where none is known."""
+        """Mean number of episodes of the runs' last evaluations; infinite if unknown."""
         counts = [self.final(run, names.EVAL_EPISODES) for run in runs]
         known = [count for count in counts if count is not None]
         return float(np.mean(known)) if known else np.inf
 
     def last_step(self, run: int) -> int:
-        """Environment steps that `runs[run]` is known to have done."""
+        """Environment steps of the last value of `runs[run]`; 0 without one."""
         steps = (self.column(run, metric).step for metric in self.history)
         return max((int(of_metric[-1]) for of_metric in steps if len(of_metric)), default=0)
 
     def least_budget(self, task: str, runs: Iterable[int]) -> float:
-        """The smallest budget of these runs on a task in environment steps; infinite without one.
+        """The smallest budget of these runs on a task in environment steps; infinite without runs.
 
-        A run whose budget is not known counts with the steps that it has done.
+        A run of unknown budget counts with its last step.
         """
         own = [run for run in runs if self.runs[run].task == task]
         return min((float(self.runs[r].budget or self.last_step(r)) for r in own), default=np.inf)
 
     def least_end(self, task: str, runs: Iterable[int]) -> float:
-        """Environment steps at which the runs on a task with the smallest budget have ended.
+        """Last step of the runs on a task with the smallest budget.
 
-        A last round may end behind the budget, and so its evaluation.
+        The last round, and its evaluation, can end after the budget.
         """
         own = [run for run in runs if self.runs[run].task == task]
         least = self.least_budget(task, own)
         ends = (self.last_step(run) for run in own if self.runs[run].budget == least)
         return max([least, *ends])
+
+
+# Searches -----------------------------------------------------------------------------------------
 
 
 class _Trial(BaseModel):
@@ -309,7 +312,7 @@ class _Objective(BaseModel):
 
 
 class _Search(BaseModel):
-    """The fields of a search that are read; there are more."""
+    """The fields of a search that are read; others are allowed."""
 
     stage: str
     mode: str
@@ -320,10 +323,10 @@ class _Search(BaseModel):
 
 
 def checked_searches(document: Any) -> list[dict[str, Any]]:
-    """The searches of a `search.json`, which may come from anybody.
+    """Validate the content of a `search.json`, which may come from strangers.
 
     Raises:
-        ValueError: The document is something else.
+        ValueError: The document is not a list of searches.
     """
     TypeAdapter(list[_Search]).validate_python(document)
     searches: list[dict[str, Any]] = document
@@ -332,9 +335,7 @@ def checked_searches(document: Any) -> list[dict[str, Any]]:
         for row in [trial for arm in search["arms"] for trial in arm["trials"]] + ranking:
             for name in ("objective", "interval", "fresh"):
                 if row.get(name) and len(row[name]) != objectives:
-                    raise ValueError(
-                        f"{name} must have {objectives} entries, it has {len(row[name])}"
-                    )
+                    raise ValueError(f"{name} must have {objectives} entries, got {len(row[name])}")
         if any("failure" not in row and not row.get("scores") for row in ranking):
-            raise ValueError("ranking must have scores where it has no failure")
+            raise ValueError("ranking must have scores or a failure in each row")
     return searches

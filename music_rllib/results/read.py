@@ -1,9 +1,7 @@
-"""Runs of a plan as a `Sweep` has them: without a result, or with their last values alone.
+"""Read the runs, curves and searches of a sweep from its storage or from an export.
 
-The runs, curves and searches of a sweep, read from its storage or from an export.
-
-A sweep is its current plan: every command and every page reads it here, so that all of them show
-the same runs. Runs of earlier versions of the plan are named in a sentence and not read.
+A sweep is its current plan: every command and page reads it here and shows the same runs. Runs of
+earlier versions of the plan are not read; a sentence names them.
 """
 
 from __future__ import annotations
@@ -24,67 +22,21 @@ from music_rllib.errors import first_line
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.location import SweepLocation, find_sweep
 from music_rllib.experiment.open_sweep import OpenSweep
-from music_rllib.experiment.plan import Node, Plan
+from music_rllib.experiment.plan import Node
 from music_rllib.experiment.run_info import run_info
-from music_rllib.redaction import flat_params, redact
+from music_rllib.redaction import redact
 from music_rllib.results.analysis_plan import plans_in
 from music_rllib.results.archive import is_archive, read_archive
 from music_rllib.results.data import Points, RunRecord, Sweep, checked_searches, columns
-from music_rllib.store.history import RunResult
+from music_rllib.results.planned import planned_run
 from music_rllib.store.node_store import damage_in_words
 from music_rllib.store.object_folder import DamagedError, StorageError
 from music_rllib.store.paths import folder_at, sweep_folder
 
 
-def planned_run(node: Node, algorithm: str) -> RunRecord:
-    """A run that has not begun."""
-    info = run_info(node)
-    tags = {**info.tags, names.TAG_NODE_KEY: node.key, names.TAG_ALGORITHM: algorithm}
-    return RunRecord(
-        run_id=node.key,
-        name=node.label,
-        status="SCHEDULED",
-        params=flat_params(info.config),
-        tags={name: str(value) for name, value in tags.items() if value is not None},
-    )
-
-
-class LastValues:
-    """A planned sweep with nothing but the results of its runs, without their curves."""
-
-    def __init__(self, plan: Plan) -> None:
-        self._plan = plan
-        self._runs: dict[str, RunRecord] = {}
-        """Runs by node key, whose description takes most of the time."""
-
-    def sweep(self, results: Mapping[str, RunResult]) -> Sweep:
-        """The sweep with these results, by node key, as far as runs have been planned."""
-        nodes = self._plan.nodes
-        for node in nodes:
-            if node.key not in self._runs:
-                self._runs[node.key] = planned_run(node, self._plan.algorithm)
-        return Sweep(
-            name=self._plan.name,
-            runs=[
-                replace(run, status="FINISHED") if node.key in results else run
-                for node in nodes
-                for run in [self._runs[node.key]]
-            ],
-            history=columns(_last_points(results.get(node.key)) for node in nodes),
-        )
-
-
-def _last_points(result: RunResult | None) -> Points:
-    if result is None:
-        return Points((), (), (), ())
-    values = [result.metrics[name] for name in sorted(result.metrics)]
-    steps = [result.env_steps] * len(values)
-    return Points(sorted(result.metrics), steps, [0] * len(values), values)
-
-
 @dataclass(frozen=True, kw_only=True)
 class SweepRead:
-    """A sweep and the place that it was read from."""
+    """A sweep and the place it was read from."""
 
     sweep: Sweep
     folder: Path
@@ -162,12 +114,12 @@ def read_stored(
 
 
 def searches_of(location: SweepLocation, config: SweepConfig) -> list[dict[str, Any]]:
-    """The outcome of each search of the present configuration, as far as it is known.
+    """The known outcome of each search of the current configuration.
 
-    It is that of `search.json`, which has the ranking, unless the search has been extended since.
+    It comes from `search.json`, which has the ranking, unless the search was extended since.
 
     Raises:
-        StorageError: A file is not what the sweep's driver has written.
+        StorageError: A file does not have the content that the driver writes.
     """
     state = location.read(sweep_files.STATE) or _NOT_STARTED
     try:
@@ -201,13 +153,14 @@ def _status(state: Mapping[str, Any]) -> str:
 
 
 class _Run(NamedTuple):
-    """What the storage has of a run."""
+    """The stored part of a run."""
 
     points: Points = Points((), (), (), ())
     begun: bool = False
     finished: bool = False
     started: int | None = None
     ended: int | None = None
+    seconds: float | None = None
     provenance: Mapping[str, str] = {}
     damage: DamagedError | None = None
 
@@ -239,13 +192,13 @@ def _read_runs(opened: OpenSweep, metrics: Collection[str] | None, *, lenient: b
 
 
 def _run(lines: bytes, node: Node, metrics: Collection[str] | None) -> _Run:
-    """A run from its `history.jsonl`.
+    """Parse the `history.jsonl` of a run.
 
     Raises:
-        DamagedError: The lines are no reports.
+        DamagedError: The lines are not reports.
     """
     try:
-        # As one text, and without a model of its fields: each would take a multiple of the time.
+        # Parsing line by line, or with a model of the fields, would be several times slower.
         reports = from_json(b"[%s]" % b",".join(lines.splitlines()))
         steps = [report["env_steps"] for report in reports]
         times = [report["timestamp_ms"] for report in reports]
@@ -270,15 +223,17 @@ def _run(lines: bytes, node: Node, metrics: Collection[str] | None) -> _Run:
         )
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise DamagedError(f"the history of {node.label} must hold reports: {error}") from error
-    first, last = (began, max(times)) if times else (None, None)
-    return _Run(points, begun=True, started=first, ended=last)
+    if not times:
+        return _Run(points, begun=True)
+    seconds = float(reports[-1]["seconds"])
+    return _Run(points, begun=True, started=began, ended=max(times), seconds=seconds)
 
 
 def _causes(opened: OpenSweep, state: Mapping[str, Any]) -> dict[str, str]:
-    """Node key to cause, of runs that failed and of those whose source failed."""
+    """Node key to cause, for runs that failed and for runs whose source failed."""
     failed = {failure["run"]: failure["cause"] for failure in state["failures"]}
     causes: dict[str, str] = {}
-    for node in opened.plan.nodes:  # a source comes before the runs that start from it
+    for node in opened.plan.nodes:  # a source precedes the runs that start from it
         cause = failed.get(node.label) or causes.get(node.source_key or "")
         if cause is not None and node.key not in opened.finished:
             causes[node.key] = cause
@@ -298,7 +253,7 @@ def _record(
     if run.finished:
         status = "FINISHED"
     elif run.damage is not None:
-        # Not FAILED, which has the worst score: the run has a result that cannot be read.
+        # Not FAILED, which has the worst score: the run has a result that can't be read.
         status, tags[names.TAG_FAILURE] = "KILLED", str(run.damage)
     elif cause is not None:
         status, tags[names.TAG_FAILURE] = "FAILED", cause
@@ -307,4 +262,11 @@ def _record(
     else:
         stopped = node.key in state.get("pruned", ()) or not sweep_files.is_alive(state)
         status = "KILLED" if stopped else "RUNNING"
-    return replace(planned, status=status, started=run.started, ended=run.ended, tags=tags)
+    return replace(
+        planned,
+        status=status,
+        started=run.started,
+        ended=run.ended,
+        trained_seconds=run.seconds,
+        tags=tags,
+    )

@@ -23,7 +23,8 @@ from music_rllib.labels import in_runs
 from music_rllib.redaction import redact
 from music_rllib.results.conditions import Condition
 from music_rllib.results.data import RunRecord, Sweep
-from music_rllib.results.read import LastValues, searches_of
+from music_rllib.results.planned import LastValues
+from music_rllib.results.read import searches_of
 from music_rllib.results.statistics import with_interval
 from music_rllib.search.ranking import (
     Scored,

@@ -22,7 +22,7 @@ from music_rllib.experiment.listener import Failure, Listener
 from music_rllib.experiment.open_sweep import OpenSweep, plan_document
 from music_rllib.experiment.plan import Node
 from music_rllib.experiment.scheduler import Status
-from music_rllib.results.read import LastValues
+from music_rllib.results.planned import LastValues
 from music_rllib.search.ranking import best_in_words, best_so_far
 from music_rllib.store.history import Report, RunResult, last_values
 from music_rllib.store.lease import process_start, this_machine

@@ -97,8 +97,6 @@ def sweep_of(
     return Sweep(
         name="smoke",
         status=status,
-        run_id="parent",
-        experiment_id="1",
         started=0,
         source="sqlite:////results/mlflow.db",
         tags={names.TAG_GIT_COMMIT: "c0ffee"},
@@ -492,8 +490,6 @@ def hostile() -> Sweep:
     return replace(
         sweep_of([(run, climbing(0.5)) for run in runs], status=SCRIPT, config=SCRIPT),
         name=SCRIPT,
-        run_id=SCRIPT,
-        experiment_id=SCRIPT,
         source=f"http://{SCRIPT}",
         tags={names.TAG_GIT_COMMIT: SCRIPT, f"{names.TAG_VERSION_PREFIX}{SCRIPT}": SCRIPT},
         searches=[search],

@@ -29,7 +29,7 @@ def sweep(*runs: tuple[str, str, list[float]], run_id: str = "s") -> Sweep:
         Points(["m"] * len(values), list(range(len(values))), [0] * len(values), values)
         for _, _, values in runs
     ]
-    return Sweep(name="n", run_id=run_id, runs=records, history=columns(points))
+    return Sweep(name="n", source=run_id, runs=records, history=columns(points))
 
 
 def values_of(found: Sweep) -> dict[str, tuple[str, list[float]]]:
@@ -52,7 +52,7 @@ def test_runs_of_both_sittings_are_there_once_with_their_own_values() -> None:
         "c": ("s-c", [4]),
         "d": ("t-d", [5, 6]),
     }
-    assert found.run_id == "t"
+    assert found.source == "t"
 
 
 def test_an_unfinished_run_is_the_later_one_and_merging_again_changes_nothing() -> None:

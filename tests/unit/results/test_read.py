@@ -31,6 +31,8 @@ from music_rllib.store.object_folder import DamagedError
 from music_rllib.store.paths import sweep_folder
 from music_rllib.sweep.listeners.state_file import StateFile
 
+PAUSE = 3_600_000
+"""Milliseconds between two sittings."""
 CODE = {names.TAG_GIT_COMMIT: "c0ffee", f"{names.TAG_VERSION_PREFIX}torch": "2.0"}
 
 
@@ -45,7 +47,7 @@ def reports(q: float, seed: int, steps: int) -> list[Report]:
         Report(
             env_steps=at,
             seconds=at / 100,
-            timestamp_ms=1_700_000_000_000 + 10 * at,
+            timestamp_ms=1_700_000_000_000 + 10 * at + PAUSE * (at > 1000),
             metrics={
                 names.EVAL_SUCCESS: round(at / steps * (0.9 - 0.2 * q) + 0.01 * seed, 6),
                 names.EVAL_EPISODES: 20.0,
@@ -300,7 +302,7 @@ def test_a_run_is_read_as_it_was_reported_and_with_the_code_that_made_it(tmp_pat
     assert sweep.series(0, names.SETTING_ENTROPIC_INDEX)[0].tolist() == [0]
     run = sweep.runs[0]
     assert run.started == 1_700_000_000_000, "when it began, not when it first reported"
-    assert run.seconds == pytest.approx(20.0)
+    assert run.seconds == pytest.approx(20.0), "without the pause"
     assert sweep.column(0, names.EVAL_SUCCESS).time.tolist() == [
         report.timestamp_ms for report in reports(1.0, 0, 2000)
     ]
@@ -323,6 +325,7 @@ def test_an_export_has_the_current_plan_and_its_addition_drops_what_was_replaced
 
     play(tmp_path, seeds=2, qs=(1.0,))
     assert exported() == {"seed0": 2000, "seed1": 2000}
+    assert [run.seconds for run in read_sweep(str(export)).sweep.runs] == [20.0, 20.0]
     play(tmp_path, seeds=1, qs=(1.0,), steps=4000)
     assert exported("--add") == {"seed0": 4000, "seed1": 2000}
     assert exported() == {"seed0": 4000}
