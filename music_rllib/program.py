@@ -13,7 +13,6 @@ from music_rllib.report import cli as report
 from music_rllib.runtime.quiet import prepare_environment, quiet_third_parties
 from music_rllib.serve import command as serve
 from music_rllib.sweep.commands import best, clean, compare, evaluate, files, run, status, stop
-from music_rllib.tracking import cli as tracking
 
 COMMANDS: dict[str, tuple[Callable[..., int], str]] = {
     "run": (run.run, run.RUN_EXAMPLES),
@@ -53,7 +52,6 @@ SIGTERM.
 app = new_app(epilog=EPILOG, add_completion=True)
 for _name, (_function, _examples) in COMMANDS.items():
     add_command(app, _name, _function, _examples)
-app.add_typer(tracking.app, name="tracking")
 
 
 @app.callback(invoke_without_command=True)

@@ -31,7 +31,7 @@ class RunInfo:
     name: str
     """The name in MLflow's lists, for example ``q=1.5 seed 0 FetchPush finetune``."""
     config: Mapping[str, object]
-    """All settings of the run: MLflow's params, and the artefact ``config/run.yaml``."""
+    """All settings of the run, which become MLflow's params."""
     tags: Mapping[str, object] = field(default_factory=dict)
     """``names.TAG_*`` to values; None is left out."""
     settings: Mapping[str, float] = field(default_factory=dict)

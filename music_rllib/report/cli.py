@@ -286,7 +286,7 @@ def _attach(source: SweepRead, folder: Path, report: Report) -> None:
     from music_rllib.report.tables import note
     from music_rllib.results.answer import answer
     from music_rllib.results.data import ReportError
-    from music_rllib.tracking.attach import SweepRun
+    from music_rllib.tracking.store import SweepRun
 
     if source.opened is None:
         raise ReportError("--attach must be given with a sweep in its storage, got an exported one")

@@ -63,8 +63,8 @@ from music_rllib.tracking.store import VARIABLE, resolve_store
 
 if TYPE_CHECKING:
     from music_rllib.search.controller import SearchController
-    from music_rllib.sweep.listeners.mlflow import MlflowListener
     from music_rllib.sweep.listeners.screen import Display
+    from music_rllib.tracking.listener import MlflowListener
     from music_rllib.tracking.tracker import Tracker
 
 DEFAULT_CONFIG = Path(__file__).with_name("default.yaml")
@@ -260,7 +260,7 @@ def _drive(console: Console, opened: OpenSweep, again: Sequence[str]) -> int:
         keep_settings(opened)
         if versions := _record_analysis_plan(console, opened):
             plans = as_json(as_document(versions))
-            tracker.put_sweep_artefact(names.ARTEFACT_ANALYSIS_PLAN, plans)
+            tracker.put_sweep_artifact(names.ARTEFACT_ANALYSIS_PLAN, plans)
         return _compute_and_report(console, opened, tracker)
 
 
@@ -291,8 +291,8 @@ def _open_tracker(opened: OpenSweep) -> Tracker:
 
 def _compute_and_report(console: Console, opened: OpenSweep, tracker: Tracker) -> int:
     """Compute what is left and show the results; the exit code."""
-    from music_rllib.sweep.listeners.mlflow import MlflowListener
     from music_rllib.sweep.listeners.screen import Display
+    from music_rllib.tracking.listener import MlflowListener
 
     with (
         Display(console, opened.plan, opened.scheduler) as display,

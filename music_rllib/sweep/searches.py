@@ -11,9 +11,9 @@ from music_rllib.experiment.sweep_files import SEARCH, as_json, keep
 from music_rllib.search.controller import SearchController
 from music_rllib.search.opening import learnings, open_searches
 from music_rllib.search.summary import outcome
-from music_rllib.sweep.listeners.mlflow import MlflowListener
 from music_rllib.sweep.listeners.screen import Display
 from music_rllib.sweep.listeners.state_file import StateFile
+from music_rllib.tracking.listener import MlflowListener
 from music_rllib.tracking.tracker import Tracker
 
 
@@ -46,6 +46,6 @@ def end_searches(
     searches = outcome(controller)
     if searches:
         text = as_json(searches)
-        tracker.put_sweep_artefact(names.ARTEFACT_SEARCH, text)
+        tracker.put_sweep_artifact(names.ARTEFACT_SEARCH, text)
         keep(opened, SEARCH, text)
     return searches

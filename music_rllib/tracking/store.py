@@ -1,4 +1,7 @@
-"""MLflow's store: the tracking URI, the place of artefacts, a sweep's record. Loads no MLflow."""
+"""Where a sweep is logged: the tracking URI, the place of artifacts, the sweep's record and run.
+
+Loading this module does not load MLflow.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +10,14 @@ import shlex
 import shutil
 import socket
 import sys
+import tempfile
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 from urllib.parse import unquote, urlsplit
 
+from music_rllib import names
 from music_rllib.errors import TrackingError
 from music_rllib.experiment import sweep_files
 from music_rllib.redaction import redact
@@ -21,26 +27,28 @@ from music_rllib.store.paths import database_url, sqlite_url
 if TYPE_CHECKING:
     import requests
 
+    from music_rllib.experiment.open_sweep import OpenSweep
+
 CONNECT_SECONDS = 3.0
 ANSWER_SECONDS = 5.0
 _DATABASES = ("sqlite", "postgresql", "mysql", "mssql")
 _SERVERS = ("http", "https")
 SETTING, VARIABLE = "mlflow.tracking_uri", "MLFLOW_TRACKING_URI"
-"""The setting of a sweep, and MLflow's own variable, which stands in for an absent setting."""
+"""The setting of a sweep, and MLflow's own variable, which is used if the setting is absent."""
 _LOW_MEMORY = "MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false"
-"""Keeps a server of MLflow 3 from starting job consumers of 2.5 GB, which tracking never uses."""
+"""Keeps a server of MLflow 3 from starting job consumers (2.5 GB), which tracking never uses."""
 RECORD = "tracking/sweep.json"
 """File of a `SweepRecord` in the sweep's folder."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrackingStore:
-    """A tracking URI, and where artefacts are kept."""
+    """A tracking URI, and the place of artifacts."""
 
     uri: str
     """URI for MLflow; may hold a password, so messages show `public_uri`."""
-    artefact_root: str | None
-    """URI below which artefacts are kept; None if the server decides."""
+    artifact_root: str | None
+    """URI of the folder for artifacts; None if the server decides."""
     database: Path | None = None
     """The sqlite file in the storage; None for other stores."""
 
@@ -73,21 +81,19 @@ class TrackingStore:
 
 @dataclass(frozen=True, kw_only=True)
 class SweepRecord:
-    """What a later driver needs to continue the sweep's runs in MLflow."""
+    """The ids of a sweep in MLflow, by which a later driver continues its runs."""
 
     sweep_name: str
     sweep_id: str
     tracking_uri: str | None
-    """URI without its password; None for the sqlite file in the storage."""
+    """URI without its password; None for the SQLite file in the storage."""
     experiment_id: str = ""
     run_id: str = ""
-    """MLflow's id of the parent run of the current plan; empty until it is known."""
-    plan: str = ""
-    """`names.TAG_PLAN` of that run."""
+    """Id of the parent run of the current plan; empty until it is known."""
 
     @classmethod
     def read(cls, storage: str, sweep_name: str) -> Self | None:
-        """The record in the folder `sweep_name` of a storage; None if there is none.
+        """The record of a sweep in a storage; None if there is none.
 
         Raises:
             TrackingError: The record cannot be read.
@@ -116,13 +122,73 @@ class SweepRecord:
             raise TrackingError(str(error)) from error
 
 
+@dataclass(frozen=True, kw_only=True)
+class SweepRun:
+    """The parent run of a sweep's current plan in MLflow."""
+
+    store: TrackingStore
+    experiment_id: str
+    run_id: str
+
+    @classmethod
+    def of(cls, sweep: OpenSweep) -> SweepRun:
+        """The run that the sweep's record names.
+
+        Raises:
+            TrackingError: The sweep was not tracked.
+        """
+        record = SweepRecord.read(sweep.storage, sweep.config.name)
+        if record is None or not record.run_id:
+            raise TrackingError(
+                f"--attach must be given with a sweep that was tracked, {sweep.config.name} has no "
+                "run in MLflow: run the sweep again, which reuses finished runs"
+            )
+        # The record has no password; the driver of a sweep passes the whole URI to the report.
+        uri = os.environ.get(names.VARIABLE_TRACKING_URI) or record.tracking_uri
+        store = resolve_store(uri, sweep.storage)
+        return cls(store=store, experiment_id=record.experiment_id, run_id=record.run_id)
+
+    @property
+    def page(self) -> str:
+        """The address of the run's page, or its id if no server shows it."""
+        if not self.store.is_server:
+            return f"run {self.run_id}"
+        return f"{self.store.pages}/#/experiments/{self.experiment_id}/runs/{self.run_id}"
+
+    def attach(self, folder: Path, files: Iterable[str], name: str, note: str) -> None:
+        """Log `files` of `folder` as artifacts below `name`, and set the run's description.
+
+        Raises:
+            TrackingError: MLflow does not answer, or refuses the files.
+        """
+        check_reachable(self.store)
+        from music_rllib.tracking.client import mlflow_reason, open_client
+
+        try:
+            with tempfile.TemporaryDirectory() as copy:  # one upload of these files only
+                for file in files:
+                    target = Path(copy, file)
+                    target.parent.mkdir(exist_ok=True)
+                    shutil.copyfile(folder / file, target)
+                client = open_client(self.store)
+                client.log_artifacts(self.run_id, copy, name)
+                client.set_tag(self.run_id, names.TAG_NOTE, note)
+        except TrackingError:
+            raise
+        except Exception as error:
+            raise TrackingError(
+                f"MLflow at {self.store.public_uri} must take the report, it answered: "
+                f"{mlflow_reason(error)}"
+            ) from error
+
+
 def resolve_store(tracking_uri: str | None, storage: str) -> TrackingStore:
     """The store that `mlflow.tracking_uri` names.
 
     Args:
         tracking_uri: A server (`http(s)://`), a database (`sqlite:///FILE`, `postgresql://...`),
             or None for a sqlite file in `storage`.
-        storage: The sweep's storage, a folder or a bucket URI. Artefacts are kept there, unless a
+        storage: The sweep's storage, a folder or a bucket URI. Artifacts are kept there, unless a
             server keeps them.
 
     Raises:
@@ -130,9 +196,9 @@ def resolve_store(tracking_uri: str | None, storage: str) -> TrackingStore:
     """
     folder = local_folder(storage)
     if folder is None:
-        artefacts = f"{storage.partition('?')[0].rstrip('/')}/mlartifacts"
+        artifacts = f"{storage.partition('?')[0].rstrip('/')}/mlartifacts"
     else:
-        artefacts = (folder / "mlartifacts").as_uri()
+        artifacts = (folder / "mlartifacts").as_uri()
     if tracking_uri is None:
         if folder is None:
             raise TrackingError(
@@ -141,12 +207,12 @@ def resolve_store(tracking_uri: str | None, storage: str) -> TrackingStore:
                 "Name an MLflow server there."
             )
         database = folder / "mlflow.db"
-        return TrackingStore(uri=sqlite_url(database), artefact_root=artefacts, database=database)
+        return TrackingStore(uri=sqlite_url(database), artifact_root=artifacts, database=database)
     is_server = _checked_scheme(tracking_uri) in _SERVERS
     uri, known = database_url(tracking_uri), database_url(os.environ.get(VARIABLE, ""))
     if redact(known) == uri:  # a sweep keeps its URI without the password
         uri = known
-    return TrackingStore(uri=uri, artefact_root=None if is_server else artefacts)
+    return TrackingStore(uri=uri, artifact_root=None if is_server else artifacts)
 
 
 def local_folder(storage: str) -> Path | None:

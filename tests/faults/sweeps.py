@@ -106,18 +106,10 @@ def finish(program: Program, timeout: float = PATIENCE) -> str:
     return output
 
 
-def deliver(program: Program, code: int = 0) -> str:
-    """What the end of a sweep says to do where MLflow lacks something; what it says."""
+def resume(program: Program, code: int = 0) -> str:
+    """The command that a sweep names when MLflow lacks records; returns its output."""
     done = subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "music_rllib.tracking",
-            "deliver",
-            "results/points",
-            "--timeout",
-            "600",
-        ],
+        [sys.executable, "-m", "music_rllib.sweep", "resume", "results/points"],
         cwd=program.folder,
         env=program.environment,
         capture_output=True,

@@ -11,7 +11,7 @@ import pytest
 import requests
 
 from tests.faults import comparison, sweeps
-from tests.faults.sweeps import deliver
+from tests.faults.sweeps import resume
 from tests.integration.conftest import Program
 from tests.integration.mlflow_server import USER, MlflowServer
 from tests.integration.tracking.test_refusing_mlflow import TODO, refusing
@@ -53,7 +53,7 @@ def test_a_server_that_is_away_for_a_minute(
     output, _ = process.communicate(timeout=sweeps.PATIENCE)
     assert process.returncode == 0, output
     if "did not reach MLflow" in output:  # the sweep was over before the server was back
-        deliver(program)
+        resume(program)
     same(unbroken, program, server.uri)
 
 
@@ -64,11 +64,11 @@ def test_a_server_that_stays_away(program: Program, unbroken: Path, server: Mlfl
     output, _ = process.communicate(timeout=sweeps.PATIENCE)
     assert process.returncode == 0, output
     assert f"did not reach MLflow at {server.uri}" in output
-    assert "python -m music_rllib.tracking deliver" in output
+    assert "music-rllib resume" in output
     server.start()
     server.wait()
-    deliver(program)
-    deliver(program)  # twice changes nothing
+    resume(program)
+    resume(program)  # twice changes nothing
     same(unbroken, program, server.uri)
 
 
@@ -82,17 +82,17 @@ def test_a_server_that_answers_500(program: Program, unbroken: Path, server: Mlf
         assert process.returncode == 0, output + errors
         assert f"did not reach MLflow at {server.uri}" in output
         assert TODO[500] in output
-        assert TODO[500] in deliver(program, code=2)
+        assert TODO[500] in resume(program, code=2)
     server.start()
     server.wait()
-    deliver(program)
+    resume(program)
     same(unbroken, program, server.uri)
 
 
 def test_a_password_that_is_changed(
     program: Program, unbroken: Path, mlflow_server: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """While the sweep goes on with the old one, until somebody delivers with the new one."""
+    """The sweep continues with the old one; a later `resume` uses the new one."""
     monkeypatch.setenv("MLFLOW_TRACKING_USERNAME", USER)
     program.environment |= {
         "MLFLOW_TRACKING_USERNAME": USER,
@@ -111,9 +111,9 @@ def test_a_password_that_is_changed(
     assert process.returncode == 0, output + errors
     assert f"did not reach MLflow at {mlflow_server}" in output
     assert TODO[401] in output
-    assert TODO[401] in deliver(program, code=2)
+    assert TODO[401] in resume(program, code=2)
     program.environment["MLFLOW_TRACKING_PASSWORD"] = PASSWORD[::-1]
     monkeypatch.setenv("MLFLOW_TRACKING_PASSWORD", PASSWORD[::-1])
-    deliver(program)
+    resume(program)
     same(unbroken, program, mlflow_server)
     assert PASSWORD not in output

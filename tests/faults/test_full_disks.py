@@ -13,7 +13,7 @@ import pytest
 from music_rllib.store.node_store import NodeStore
 from music_rllib.store.object_folder import StorageError
 from tests.faults import comparison, sweeps
-from tests.faults.sweeps import deliver
+from tests.faults.sweeps import resume
 from tests.integration.conftest import Program
 
 KEY = "a" * 20
@@ -134,10 +134,10 @@ def test_a_full_disk_below_mlflow(program: Program, unbroken: Path, small_disk: 
     output, errors = process.communicate(timeout=sweeps.PATIENCE)
     assert process.returncode == 0, output + errors
     assert "did not reach MLflow" in output
-    assert "python -m music_rllib.tracking deliver" in output
+    assert "music-rllib resume" in output
     ballast.unlink()
     time.sleep(1.0)
-    deliver(program)
+    resume(program)
     results = program.folder / "results"
     assert comparison.nodes(results) == comparison.nodes(unbroken)
     assert comparison.logged(uri) == comparison.logged(f"sqlite:///{unbroken}/mlflow.db")

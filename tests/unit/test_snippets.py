@@ -27,7 +27,6 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 MODULES = {
     "music_rllib.sweep": "music_rllib.program",
     "music_rllib.report": "music_rllib.report.cli",
-    "music_rllib.tracking": "music_rllib.tracking.cli",
 }
 """What `python -m` starts, and where its application is."""
 OTHERS = {

@@ -34,7 +34,6 @@ _RUN_TAGS = ("sweep", "stage", "variant", "task", "q", "seed", "run")
 _SWEEP_GAUGES = {
     "music_runs": ("sweep", "state"),
     "music_undelivered_records": ("sweep",),
-    "music_undelivered_artefacts": ("sweep",),
 }
 """Gauges of a whole sweep to their tags; all others are of a run."""
 _METRICS = {
@@ -60,7 +59,6 @@ GAUGES = {
     "music_grad_updates_per_second": "Gradient updates per second of a run; 0 when it is over.",
     "music_runs": "Runs of a sweep by their state.",
     "music_undelivered_records": "Records that MLflow has not received yet.",
-    "music_undelivered_artefacts": "Artefacts that MLflow has not received yet.",
 }
 """Name, to which Ray adds `ray_` in front, to its description."""
 
@@ -168,7 +166,6 @@ class PrometheusListener(Listener):
             self._gauges["music_runs"].set(count, tags=tags | {"state": status.value})
         pending = self._pending()
         self._gauges["music_undelivered_records"].set(pending.records, tags=tags)
-        self._gauges["music_undelivered_artefacts"].set(pending.artefacts, tags=tags)
 
     def _create_gauges(self) -> None:
         """Create the gauges in Ray, and write the addresses where Prometheus looks for them."""

@@ -15,7 +15,6 @@ import yaml
 from typer.testing import CliRunner
 
 from music_rllib.program import main
-from music_rllib.tracking.cli import app as tracking
 from tests.integration.conftest import SWEEP
 from tests.kept_sweep import kept_sweep
 
@@ -93,12 +92,6 @@ def test_a_sweep_says_so_and_starts_nothing(
     assert not Path("results", "nodes").exists()
     kept = [path for path in Path("results").rglob("*") if path.is_file()]
     assert not any(b"planted" in path.read_bytes() for path in kept)
-
-
-def test_what_waits_stays_and_is_told(uri: str, status: int, tmp_path: Path) -> None:
-    folder = kept_sweep(tmp_path, uri)
-    done = CliRunner().invoke(tracking, ["deliver", str(folder), "--timeout", "1"])
-    check(done.exit_code, done.stderr, status)
 
 
 def test_a_report_that_is_to_be_attached_says_so(uri: str, status: int, tmp_path: Path) -> None:

@@ -59,7 +59,7 @@ def test_what_is_exported_does_not_grow_with_the_runs_that_ended(
     exported: dict[str, dict[str, float]], plan: Plan, tmp_path: Path
 ) -> None:
     def pending() -> Pending:
-        return Pending(records=0, artefacts=0, error=None)
+        return Pending(records=0, error=None)
 
     now = iter(range(0, 1000, 10))
     gauges = PrometheusListener(

@@ -17,7 +17,7 @@ from music_rllib.errors import TrackingError
 from music_rllib.search.storage import same_database
 from music_rllib.store.paths import database_url, sqlite_url
 from music_rllib.tracking import store as store_module
-from music_rllib.tracking.store import check_reachable, resolve_store
+from music_rllib.tracking.store import RECORD, SweepRecord, check_reachable, resolve_store
 from tests.ports import free_port
 
 
@@ -46,7 +46,7 @@ def server_that_answers(status: int, body: bytes) -> Iterator[str]:
 def test_null_is_a_sqlite_file_in_the_storage(tmp_path: Path) -> None:
     store = resolve_store(None, str(tmp_path / "results"))
     assert store.uri == f"sqlite:///{tmp_path}/results/mlflow.db"
-    assert store.artefact_root == f"file://{tmp_path}/results/mlartifacts"
+    assert store.artifact_root == f"file://{tmp_path}/results/mlartifacts"
     assert "ui --backend-store-uri" in store.ui_command()
 
 
@@ -84,19 +84,19 @@ def test_postgresql_is_reached_by_the_driver_that_is_installed() -> None:
 def test_a_file_uri_is_the_folder_that_it_names() -> None:
     store = resolve_store(None, "file:///data/a%20b")
     assert store.database == Path("/data/a b/mlflow.db")
-    assert store.artefact_root == "file:///data/a%20b/mlartifacts"
+    assert store.artifact_root == "file:///data/a%20b/mlartifacts"
 
 
 def test_a_server_keeps_its_artefacts_itself() -> None:
     store = resolve_store("http://u:secret@mlflow:5000", "s3://bucket/sweeps")
-    assert store.artefact_root is None
+    assert store.artifact_root is None
     assert store.ui_command() == "http://mlflow:5000"
     assert store.pages == "http://mlflow:5000"
 
 
 def test_a_database_keeps_artefacts_in_the_storage() -> None:
     store = resolve_store("postgresql+psycopg2://u:p@db/mlflow", "s3://bucket/sweeps/")
-    assert store.artefact_root == "s3://bucket/sweeps/mlartifacts"
+    assert store.artifact_root == "s3://bucket/sweeps/mlartifacts"
     assert "u:p" not in store.ui_command()
 
 
@@ -131,6 +131,15 @@ def test_what_the_environment_sets_is_named_and_completes_what_a_sweep_kept(
         monkeypatch.setenv("MLFLOW_TRACKING_URI", given)
         assert "u:hunter2@" in resolve_store(kept, "results").uri
         assert "hunter2" not in resolve_store(f"{kept}1", "results").uri
+
+
+@pytest.mark.parametrize("record", ["{", "[]", "3", '{"sweep_name": "s"}'])
+def test_a_damaged_record_is_named(tmp_path: Path, record: str) -> None:
+    assert SweepRecord.read(str(tmp_path), "s") is None
+    (tmp_path / "s" / RECORD).parent.mkdir(parents=True)
+    (tmp_path / "s" / RECORD).write_text(record)
+    with pytest.raises(TrackingError, match=r"sweep\.json must hold a sweep's record"):
+        SweepRecord.read(str(tmp_path), "s")
 
 
 def test_a_bucket_needs_a_server() -> None:

@@ -1,0 +1,378 @@
+"""Every request that tracking sends to MLflow, and which failures a retry can solve."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import re
+import shutil
+import sqlite3
+import warnings
+from collections.abc import Collection, Mapping
+from contextlib import closing
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Literal, NamedTuple
+from urllib.parse import quote
+
+from filelock import FileLock
+from mlflow import MlflowClient
+from mlflow.entities import (
+    LoggedModel,
+    LoggedModelOutput,
+    LoggedModelStatus,
+    Param,
+    RunTag,
+)
+from mlflow.exceptions import MlflowException
+from mlflow.tracking._tracking_service import utils
+from mlflow.version import VERSION
+
+from music_rllib import names
+from music_rllib.errors import TrackingError
+from music_rllib.redaction import redact
+from music_rllib.tracking.policy_model import MODEL_NAME, write_model
+from music_rllib.tracking.store import TrackingStore
+
+REQUEST_SECONDS = 30
+"""Timeout of one request, unless MLFLOW_HTTP_REQUEST_TIMEOUT sets another."""
+SCHEMA_SECONDS = 120.0
+"""Longest wait for another process that creates the tables of the same SQLite file."""
+_LASTING_ERRORS = frozenset(
+    {
+        "INVALID_PARAMETER_VALUE",
+        "BAD_REQUEST",
+        "INVALID_STATE",
+        "RESOURCE_DOES_NOT_EXIST",
+        "NOT_FOUND",
+        "ENDPOINT_NOT_FOUND",
+    }
+)
+Status = Literal["FINISHED", "FAILED", "KILLED"]
+
+_HINTS = {
+    r"error code 40[13]\b": "Set MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD in the "
+    "environment.",
+    r"\b5\d\d error responses|error code 5\d\d\b": "The server's own log says why.",
+}
+"""Pattern of a server's error message -> advice that is appended to it."""
+
+
+def is_lasting(error: Exception) -> bool:
+    """Whether a retry cannot succeed: MLflow refuses the value, or the run was deleted."""
+    return isinstance(error, MlflowException) and error.error_code in _LASTING_ERRORS
+
+
+def mlflow_reason(error: Exception) -> str:
+    """The first meaningful line of an error's message, redacted, with advice if there is any."""
+    lines = [
+        line
+        for line in str(error).strip().splitlines()
+        if line.strip() and not line.startswith("(raised as a result of Query-invoked autoflush")
+    ] or [type(error).__name__]
+    line = redact(lines[0])
+    hint = next((hint for sign, hint in _HINTS.items() if re.search(sign, line)), "")
+    return f"{line} {hint}".rstrip()
+
+
+class KnownRun(NamedTuple):
+    """A run that exists in MLflow."""
+
+    run_id: str
+    status: str
+    tags: dict[str, str]
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether it is finished and all of its data has arrived."""
+        return self.status == "FINISHED" and names.TAG_INCOMPLETE not in self.tags
+
+
+class Experiment:
+    """The MLflow experiment of a sweep: finds, creates and updates the sweep's runs.
+
+    The constructor creates the experiment if it does not exist, and raises TrackingError if the
+    store refuses that. Every method except `known_id` sends requests and raises MLflow's errors.
+    """
+
+    def __init__(self, store: TrackingStore, name: str, sweep_id: str, plan: str) -> None:
+        self._store = store
+        self._name = name
+        self._sweep_id = sweep_id
+        self._plan = plan
+        self._earlier: list[KnownRun] = []
+        """Parent runs of other plans of the sweep."""
+        self._known: dict[str, KnownRun] | None = None
+        """Runs by node key ("" for the parent run); None until the server has listed them."""
+        try:
+            self.client = open_client(store)
+            """Sends the requests about one run."""
+            self.id = self._find_or_create()
+        except TrackingError:
+            raise
+        except Exception as error:
+            raise TrackingError(
+                f"MLflow at {store.public_uri} must accept the experiment {name!r}, "
+                f"it answered: {mlflow_reason(error)}"
+            ) from error
+
+    # -- finding and creating runs -----------------------------------------------------------
+
+    def find(self, node_key: str, environment: str | None = None) -> KnownRun | None:
+        """The run of a node, or the parent run ("").
+
+        Lists all runs of the sweep on the first call. A run of another environment is deleted (as
+        MLflow deletes runs, so that it can be restored), because a new run replaces it.
+        """
+        if self._known is None:
+            self._known = self._list()
+        known = self._known.get(node_key)
+        if (
+            known
+            and environment
+            and known.tags.get(names.TAG_ENVIRONMENT, environment) != (environment)
+        ):
+            self.delete(node_key)
+            return None
+        return known
+
+    def delete(self, node_key: str) -> None:
+        """Delete a node's run, if there is one, so that it can still be restored."""
+        known = self.find(node_key)
+        if known is not None and self._known is not None:
+            self.client.delete_run(known.run_id)
+            del self._known[node_key]
+
+    def known_id(self, node_key: str) -> str | None:
+        """Run id of a node whose run was found or created before; sends no request."""
+        run = (self._known or {}).get(node_key)
+        return None if run is None else run.run_id
+
+    def create(self, node_key: str, name: str, time: int, tags: Mapping[str, str]) -> KnownRun:
+        """A new run that began at `time` (ms since the epoch), for a node or the sweep itself."""
+        own = (names.TAG_NODE_KEY, node_key) if node_key else (names.TAG_PLAN, self._plan)
+        all_tags = {
+            **tags,
+            names.TAG_KIND: names.KIND_RUN if node_key else names.KIND_SWEEP,
+            names.TAG_SWEEP_ID: self._sweep_id,
+            names.TAG_CURRENT: names.CURRENT,
+            own[0]: own[1],
+        }
+        known, self._known = self._known or {}, None  # listed again if the response gets lost
+        run = self.client.create_run(self.id, start_time=time, tags=all_tags, run_name=name)
+        new = KnownRun(str(run.info.run_id), run.info.status, all_tags)
+        self._known = known | {node_key: new}
+        return new
+
+    def _list(self) -> dict[str, KnownRun]:
+        """The sweep's runs by node key; the older run if two have the same key."""
+        wanted, token = f"tags.`{names.TAG_SWEEP_ID}` = '{self._sweep_id}'", None
+        known: dict[str, KnownRun] = {}
+        self._earlier = []
+        while True:
+            page = self.client.search_runs(
+                [self.id],
+                wanted,
+                max_results=1000,
+                order_by=["attributes.start_time ASC"],
+                page_token=token,
+            )
+            for run in page:
+                tags = dict(run.data.tags)
+                found = KnownRun(run.info.run_id, run.info.status, tags)
+                node_key = tags.get(names.TAG_NODE_KEY, "")
+                if node_key or tags.get(names.TAG_PLAN) == self._plan:
+                    known.setdefault(node_key, found)
+                else:
+                    self._earlier.append(found)
+            token = page.token
+            if not token:
+                return known
+
+    # -- the sweep ---------------------------------------------------------------------------
+
+    def keep_current(self, node_keys: Collection[str]) -> None:
+        """Mark the runs of these nodes, and the parent run, as current, and no other runs.
+
+        A run of an earlier plan that is current again becomes a child of the current parent run.
+        """
+        parent = self.find("")
+        current = {names.TAG_CURRENT: names.CURRENT}
+        superseded = {names.TAG_CURRENT: names.SUPERSEDED}
+        child = current if parent is None else {**current, names.TAG_PARENT_RUN: parent.run_id}
+        for node_key, run in list((self._known or {}).items()):
+            if node_key:
+                self._mark(run, child if node_key in node_keys else superseded)
+            else:
+                self._mark(run, current)
+        for run in self._earlier:
+            self._mark(run, superseded)
+
+    def _mark(self, run: KnownRun, tags: Mapping[str, str]) -> None:
+        """Set the tags of a run that it does not have."""
+        changed = dict(tags.items() - run.tags.items())
+        if not changed:
+            return
+        try:
+            self.set_tags(run.run_id, changed)
+        except MlflowException as error:
+            if not is_lasting(error):  # otherwise the run was deleted
+                raise
+        run.tags.update(changed)
+
+    def keep_view(self, key: str, content: str) -> None:
+        """Save a view of the experiment's pages under `key`."""
+        self.client.set_experiment_tag(self.id, names.TAG_VIEW_PREFIX + key, content)
+
+    # -- one run -----------------------------------------------------------------------------
+
+    def last_steps(self, run_id: str) -> dict[str, int]:
+        """Last step of each metric of the run."""
+        metrics = self.client.get_run(run_id).data.metrics
+        return {
+            name: max(point.step for point in self.client.get_metric_history(run_id, name))
+            for name in metrics
+        }
+
+    def begin_run(self, run_id: str, tags: Mapping[str, str], params: Mapping[str, str]) -> None:
+        """Mark the run as running, with these tags and params, without the tags of an earlier end.
+
+        MLflow's params are immutable: a param that the run already has keeps its value.
+        """
+        run = self.client.get_run(run_id)
+        fresh = [Param(*item) for item in params.items() if item[0] not in run.data.params]
+        self.set_tags(run_id, tags)
+        self.client.log_batch(run_id, params=fresh)
+        for tag in {names.TAG_FAILURE, names.TAG_PRUNED} & run.data.tags.keys() - tags.keys():
+            self.client.delete_tag(run_id, tag)
+        if run.info.status != "RUNNING":
+            self.client.update_run(run_id, status="RUNNING")
+
+    def set_tags(self, run_id: str, tags: Mapping[str, str]) -> None:
+        """Set tags; existing tags of the same names are overwritten."""
+        self.client.log_batch(run_id, tags=[RunTag(*item) for item in tags.items()])
+
+    def log_policy(self, run_id: str, content: bytes) -> None:
+        """Upload a policy as the run's logged model, unless it was uploaded before."""
+        model = self._policy_model(run_id)
+        if model.status == LoggedModelStatus.READY:
+            return
+        with TemporaryDirectory() as temporary:
+            file, folder = Path(temporary, "policy.safetensors"), Path(temporary, "model")
+            file.write_bytes(content)
+            policy = write_model(file, folder, run_id=run_id, model_id=model.model_id)
+            self.client.log_model_artifacts(model.model_id, str(folder))
+        # MLflow would cache an upload client, with its threads, for each of 1,024 models.
+        getattr(utils, "_artifact_repos_cache", {}).pop(model.model_id, None)
+        steps = int(policy.about.get("env_steps", 0))
+        outputs = self.client.get_run(run_id).outputs
+        if not outputs or model.model_id not in [o.model_id for o in outputs.model_outputs]:
+            self.client.log_outputs(run_id, [LoggedModelOutput(model.model_id, steps)])
+        self.client.finalize_logged_model(model.model_id, LoggedModelStatus.READY)
+
+    def _policy_model(self, run_id: str) -> LoggedModel:
+        """The run's logged model; created unless an earlier attempt has created it."""
+        found = self.client.search_logged_models(
+            [self.id], f"tags.`{names.TAG_SOURCE_RUN}` = '{run_id}'", max_results=1
+        )
+        if found:
+            return found[0]
+        tags = self.client.get_run(run_id).data.tags
+        shown = {key: tags[key] for key in names.TAGS_OF_A_MODEL if key in tags}
+        return self.client.create_logged_model(
+            self.id,
+            name=MODEL_NAME,
+            source_run_id=run_id,
+            tags={**shown, names.TAG_SOURCE_RUN: run_id},
+            params=shown,
+            model_type=MODEL_NAME,
+        )
+
+    def _find_or_create(self) -> str:
+        experiment = self.client.get_experiment_by_name(self._name)
+        if experiment is None:
+            root = self._store.artifact_root
+            location = None if root is None else f"{root}/{quote(self._name)}"
+            try:
+                return self.client.create_experiment(
+                    self._name, location, tags=names.EXPERIMENT_TAGS
+                )
+            except MlflowException as error:
+                if error.error_code != "RESOURCE_ALREADY_EXISTS":
+                    raise
+                experiment = self.client.get_experiment_by_name(self._name)
+        if experiment is None or experiment.lifecycle_stage != "active":
+            raise TrackingError(
+                f"the experiment {self._name!r} at {self._store.public_uri} must not be deleted. "
+                "Restore it (mlflow experiments restore) or give the sweep another name."
+            )
+        return str(experiment.experiment_id)
+
+
+def open_client(store: TrackingStore) -> MlflowClient:
+    """Connect to the store, without MLflow's own retries and notices.
+
+    MLflow's retries would block for minutes, and could create a run twice if a response gets
+    lost. The sender retries instead, and looks for the run first. Only one process at a time may
+    create the tables of a SQLite file: MLflow's migration crashes if several do.
+
+    Raises:
+        TrackingError: The SQLite file cannot be written.
+    """
+    os.environ["MLFLOW_HTTP_REQUEST_MAX_RETRIES"] = "0"
+    os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", str(REQUEST_SECONDS))
+    os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
+    os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
+    # Raised by MLflow's use of SQLAlchemy when its database code is imported.
+    warnings.filterwarnings("ignore", r"The ``noload`` loader strategy", DeprecationWarning)
+    # Raised by MLflow's own type hints when its model code is imported.
+    warnings.filterwarnings("ignore", r".*Any type hint is inferred as AnyType", UserWarning)
+    logging.getLogger("alembic").setLevel(logging.WARNING)
+    # It logs tracebacks of errors that it also raises, and that the sender logs in one line.
+    logging.getLogger("mlflow.store.db.utils").setLevel(logging.CRITICAL)
+    if store.database is None:
+        return MlflowClient(store.uri)
+    try:
+        store.database.parent.mkdir(parents=True, exist_ok=True)
+        with FileLock(f"{store.database}.lock", timeout=SCHEMA_SECONDS):
+            is_new = not store.database.exists()
+            if is_new:
+                with contextlib.suppress(OSError, RuntimeError):
+                    shutil.copyfile(_empty_database(), store.database)
+            client = MlflowClient(store.uri)
+            client.search_experiments(max_results=1)
+            if is_new:
+                _keep_empty_database(store.database)
+            return client
+    except (OSError, TimeoutError) as error:
+        raise TrackingError(
+            f"{store.database} must be writable for the local MLflow store: {error}. "
+            "Choose another storage folder or name a server in mlflow.tracking_uri."
+        ) from error
+
+
+def _empty_database() -> Path:
+    """File in the user's cache with this MLflow's tables, which take 2 s of CPU time to create."""
+    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(cache, "music_rllib", f"mlflow-{VERSION}.db")
+
+
+def _keep_empty_database(database: Path) -> None:
+    """Put an empty copy of a new database into the cache, if it is writable."""
+    with contextlib.suppress(OSError, RuntimeError, sqlite3.Error):
+        kept = _empty_database()
+        if kept.exists():
+            return
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(dir=kept.parent) as folder:
+            copy = Path(folder, "empty.db")
+            with (
+                closing(sqlite3.connect(database)) as source,
+                closing(sqlite3.connect(copy)) as target,
+            ):
+                source.backup(target)
+                # MLflow creates its default experiment again, with this store's artifact folder.
+                target.execute("DELETE FROM experiments")
+                target.commit()
+            copy.replace(kept)

@@ -1,0 +1,84 @@
+"""Passes the events of runs to the tracker."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from music_rllib import names
+from music_rllib.envs.fingerprint import Fingerprint
+from music_rllib.experiment.listener import Failure, Listener
+from music_rllib.experiment.plan import Node
+from music_rllib.experiment.run_info import run_info
+from music_rllib.policy.policy import policy_from_folder
+from music_rllib.store.history import Report, RunResult
+from music_rllib.store.node_store import NodeStore
+from music_rllib.store.object_folder import StorageError
+from music_rllib.tracking.client import Status
+from music_rllib.tracking.run_queue import StoredRun
+from music_rllib.tracking.tracker import Tracker
+
+logger = logging.getLogger(__name__)
+
+
+class MlflowListener(Listener):
+    """Logs the runs of a sweep: reports of running ones, and finished ones from the store."""
+
+    def __init__(
+        self, tracker: Tracker, store: NodeStore, environments: Mapping[str, Fingerprint]
+    ) -> None:
+        """Log by `tracker`; `environments` are those of the tasks of running runs."""
+        self.tracker = tracker
+        self._store = store
+        self._environments = environments
+        self._running: set[str] = set()
+        """Keys of nodes whose run has started and not ended."""
+
+    def started(self, node: Node) -> None:
+        """Start the node's MLflow run, or continue an earlier one."""
+        self.tracker.start(run_info(node, self._environments.get(node.run.task.name)))
+        self._running.add(node.key)
+
+    def reported(self, node: Node, reports: list[Report]) -> None:
+        """Log metrics with their original time, so that repeats are identical."""
+        self.tracker.log(node.key, reports)
+
+    def finished(self, node: Node, result: RunResult | None = None) -> None:
+        """Log a run that this sweep or an earlier one has finished, with its policy."""
+        info = run_info(node, self._store.environment(node.key))
+        self.tracker.mirror(info, partial(finished_run, self._store, node))
+        self._running.discard(node.key)
+
+    def failed(self, node: Node, failure: Failure) -> None:
+        """End the run with its cause."""
+        if node.key not in self._running:
+            self.started(node)
+        self._end(node, "FAILED", {names.TAG_FAILURE: failure.cause})
+
+    def pruned(self, node: Node, reason: str) -> None:
+        """End a run that was stopped early, with the reason."""
+        if node.key in self._running:
+            self._end(node, "KILLED", {names.TAG_PRUNED: reason})
+
+    def _end(self, node: Node, status: Status, tags: dict[str, str]) -> None:
+        self.tracker.end(node.key, status, tags)
+        self._running.discard(node.key)
+
+
+def finished_run(store: NodeStore, node: Node) -> StoredRun:
+    """A finished run with its policy, or without one if that cannot be read.
+
+    Raises:
+        DamagedError: The run's history cannot be read.
+    """
+    reports, policy = store.history(node.key), None
+    with TemporaryDirectory() as folder:
+        try:
+            store.fetch(node.key, Path(folder))
+            policy = policy_from_folder(Path(folder), [node.run.task]).to_bytes()
+        except (OSError, ValueError, StorageError) as error:
+            logger.warning("MLflow gets no policy of %s: %s", node.label, error)
+    return StoredRun(reports, policy)

@@ -1,0 +1,244 @@
+"""The queue of the records that one run still has to send to MLflow.
+
+The queue is in memory only. If the driver dies, nothing is lost: a resumed run reports the
+history of its checkpoint again, and a finished run has its whole history in the store.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from itertools import islice, takewhile
+from typing import NamedTuple
+
+from mlflow.entities import Metric
+
+from music_rllib import names
+from music_rllib.experiment.run_info import RunInfo
+from music_rllib.redaction import flat_params, redact
+from music_rllib.runtime.provenance import provenance_tags
+from music_rllib.store.history import Report
+from music_rllib.tracking.client import Experiment, KnownRun, Status
+
+MAX_METRICS = 1000
+"""MLflow's limit for the metrics of one request."""
+Record = Report | Callable[[], None]
+"""A report, or a function that sends something else."""
+
+
+class StoredRun(NamedTuple):
+    """The data of a finished run in the store."""
+
+    reports: Sequence[Report]
+    policy: bytes | None = None
+
+
+class _Cancelled(Exception):  # noqa: N818 - no error
+    """`RunQueue.cancel` was called."""
+
+
+class RunQueue:
+    """Queues the records of one run, and sends them to MLflow in order.
+
+    Any thread may add to the queue; only one thread sends. `start` or `mirror` must come first.
+    The sweep's own run has no node key and no parent. MLflow gets each step of a metric once:
+    values up to the last step that it has are skipped.
+    """
+
+    def __init__(
+        self, experiment: Experiment, node_key: str = "", sweep_tags: Mapping[str, str] = {}
+    ) -> None:
+        """Send to a run of `experiment`, which also gets the tags `sweep_tags`."""
+        self.node_key = node_key
+        self.refused: str | None = None
+        """Reason of a lasting failure, after which nothing more is sent."""
+        self._experiment = experiment
+        self._sweep_tags = sweep_tags
+        self._info: RunInfo
+        self._records: deque[Record] = deque()
+        self._lock = threading.Lock()
+        self._run: KnownRun | None = None
+        self._last_steps: dict[str, int] = {}
+        """Last step that MLflow has of each metric."""
+        self._ended = True
+        self._cancelled = False
+
+    # -- adding to the queue -----------------------------------------------------------------
+
+    def start(self, info: RunInfo) -> None:
+        """The run starts or is resumed; its reports follow, from the first one on."""
+        with self._lock:
+            self._info, self._ended = info, False
+            self._records.append(self._send_start)
+
+    def report(self, reports: Iterable[Report]) -> None:
+        """Add reports."""
+        with self._lock:
+            self._records.extend(reports)
+
+    def end(self, status: Status, tags: Mapping[str, str]) -> None:
+        """The run ends without a result in the store."""
+        with self._lock:
+            self._records.append(partial(self._send_end, status, _now(), tags))
+            self._ended = True
+
+    def mirror(self, info: RunInfo, read: Callable[[], StoredRun]) -> None:
+        """The run is in the store: what `read` returns replaces all records in the queue."""
+        with self._lock:
+            self._info, self._ended = info, True
+            self._records = deque([partial(self._send_stored, read)])
+
+    def keep_current(self, node_keys: Iterable[str]) -> None:
+        """The sweep, whose parent run this is, has the runs of these nodes and no others."""
+        with self._lock:
+            keys = frozenset(node_keys)
+            self._records.append(partial(self._experiment.keep_current, keys))
+
+    def put_text(self, name: str, text: str) -> None:
+        """Add or replace the artifact `name`."""
+        with self._lock:
+            self._records.append(
+                lambda: self._experiment.client.log_text(self.attach().run_id, text, name)
+            )
+
+    # -- state -------------------------------------------------------------------------------
+
+    @property
+    def is_running(self) -> bool:
+        """Whether the run has started and not ended."""
+        return not self._ended
+
+    @property
+    def run_id(self) -> str | None:
+        """The run's id in MLflow; None until it is known."""
+        return self._run.run_id if self._run else self._experiment.known_id(self.node_key)
+
+    @property
+    def records(self) -> int:
+        """Number of records in the queue."""
+        return len(self._records)
+
+    def cancel(self) -> None:
+        """Send nothing after the current request."""
+        self._cancelled = True
+
+    # -- sending -----------------------------------------------------------------------------
+
+    def send(self) -> None:
+        """Send the records in order. Raises MLflow's error at the first one that fails."""
+        with contextlib.suppress(_Cancelled):
+            while not self._cancelled and (records := self._next()):
+                if callable(first := records[0]):
+                    first()
+                else:
+                    self._log([record for record in records if isinstance(record, Report)])
+                self._remove(records)
+
+    def attach(self, started: int | None = None) -> KnownRun:
+        """The run in MLflow, which is found there or created.
+
+        Args:
+            started: Start time of a run that is created, in ms since the epoch; by default now.
+        """
+        if self._run is None:
+            run = self._experiment.find(self.node_key, self._environment)
+            if run is None:
+                name, time = self._info.name, started or _now()
+                run = self._experiment.create(self.node_key, name, time, self._tags())
+            else:
+                self._last_steps = self._experiment.last_steps(run.run_id)
+            self._run = run
+        return self._run
+
+    def _next(self) -> list[Record]:
+        """The first record, or all reports at the front of the queue, for one request."""
+        with self._lock:
+            reports = list(takewhile(lambda record: isinstance(record, Report), self._records))
+            return reports or list(islice(self._records, 1))
+
+    def _remove(self, records: Iterable[Record]) -> None:
+        """Remove sent records from the queue, unless `mirror` has replaced them meanwhile."""
+        with self._lock:
+            for record in records:
+                if self._records and self._records[0] is record:
+                    self._records.popleft()
+
+    def _send_start(self) -> None:
+        run_id = self.attach().run_id
+        self._experiment.begin_run(run_id, self._tags(), flat_params(self._info.config))
+
+    def _send_end(self, status: Status, time: int, tags: Mapping[str, str]) -> None:
+        run_id = self.attach().run_id
+        self._log([])
+        self._experiment.set_tags(run_id, {**self._tags(), **tags})
+        self._experiment.client.set_terminated(run_id, status, time)
+
+    def _send_stored(self, read: Callable[[], StoredRun]) -> None:
+        known = self._experiment.find(self.node_key, self._environment)
+        if self._run is None and known is not None and known.is_complete:
+            self._run = known
+            return
+        stored = read()
+        times = [report.timestamp_ms for report in stored.reports] or [_now()]
+        run_id = self.attach(times[0]).run_id
+        tags = {**self._tags(), names.TAG_INCOMPLETE: "its policy is not uploaded yet"}
+        self._experiment.begin_run(run_id, tags, flat_params(self._info.config))
+        self._log(stored.reports)
+        self._experiment.client.set_terminated(run_id, "FINISHED", times[-1])
+        self._check_cancelled()
+        if stored.policy is not None:
+            self._experiment.log_policy(run_id, stored.policy)
+        self._experiment.client.delete_tag(run_id, names.TAG_INCOMPLETE)
+
+    def _log(self, reports: Sequence[Report]) -> None:
+        """Log the settings and the values that MLflow lacks, as a resumed run repeats steps."""
+        run_id = self.attach().run_id
+        metrics = [
+            Metric(name, value, report.timestamp_ms, report.env_steps)
+            for report in reports
+            for name, value in report.metrics.items()
+        ]
+        # Settings follow the first report, as MLflow's page that compares runs plots the metric
+        # that was logged first: a plot of a setting, such as q against q, would be useless.
+        position = len(reports[0].metrics) if reports else 0
+        time = reports[0].timestamp_ms if reports else _now()
+        metrics[position:position] = [
+            Metric(name, value, time, 0) for name, value in self._info.settings.items()
+        ]
+        last, new = dict(self._last_steps), []
+        for metric in metrics:
+            if metric.step > last.get(metric.key, -1):
+                last[metric.key] = metric.step
+                new.append(metric)
+        for begin in range(0, len(new), MAX_METRICS):
+            self._check_cancelled()
+            chunk = new[begin : begin + MAX_METRICS]
+            self._experiment.client.log_batch(run_id, metrics=chunk)
+            self._last_steps.update((metric.key, metric.step) for metric in chunk)
+
+    def _check_cancelled(self) -> None:
+        if self._cancelled:
+            raise _Cancelled
+
+    @property
+    def _environment(self) -> str | None:
+        value = self._info.tags.get(names.TAG_ENVIRONMENT)
+        return None if value is None else str(value)
+
+    def _tags(self) -> dict[str, str]:
+        """The run's tags, with the MLflow run that it starts from as soon as that is known."""
+        own = {
+            key: redact(str(value)) for key, value in self._info.tags.items() if value is not None
+        }
+        source = self._experiment.known_id(self._info.source_node or "")
+        known = {names.TAG_SOURCE_RUN: source} if self._info.source_node and source else {}
+        return {**provenance_tags(), **own, **known, **self._sweep_tags}
+
+
+def _now() -> int:
+    """Now, in ms since the epoch, as MLflow counts."""
+    return round(time.time() * 1000)
