@@ -42,8 +42,9 @@ from music_rllib.results.archive import read_archive
 from music_rllib.results.conditions import find_stages
 from music_rllib.results.data import ReportError
 from music_rllib.store.handoff import HandoffError
-from music_rllib.store.object_folder import ObjectFolders, StorageError, open_storage
-from music_rllib.store.state_io import StateError, read_state, write_state
+from music_rllib.store.sealed import SealedFolders
+from music_rllib.store.serialization import StateError, read_state, write_state
+from music_rllib.store.storage import StorageError, open_storage
 from tests.hostile_files import PENDULUM, seal_policy, write_export, write_sweep
 
 OWN_ERRORS = (ConfigError, HandoffError, PolicyError, ReportError, StateError, StorageError)
@@ -252,7 +253,7 @@ def sealed_policy(rng: random.Random, sound: Path, folder: Path) -> Callable[[],
         _seal_again(folder)
 
     def read() -> None:
-        storage = ObjectFolders(*open_storage(str(folder)))
+        storage = SealedFolders(open_storage(str(folder)))
         for name in storage.names():
             storage.fetch(name, folder / "copy")
         policy = load_policy(folder / "node")
@@ -267,7 +268,7 @@ def _seal_again(folder: Path) -> None:
     node = folder / "node"
     handoff = node / "handoff" / "handoff.json"
     try:
-        from music_rllib.store.object_folder import _record
+        from music_rllib.store.sealed import _record
 
         content = json.loads(handoff.read_bytes())
         for module in content["modules"].values():

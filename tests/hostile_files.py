@@ -33,7 +33,8 @@ from music_rllib.policy import load_policy
 from music_rllib.results.archive import Format, write_archive
 from music_rllib.results.data import Points, RunRecord, Sweep, columns
 from music_rllib.store.handoff import Spaces, write_handoff
-from music_rllib.store.object_folder import ObjectFolders, open_storage
+from music_rllib.store.sealed import SealedFolders
+from music_rllib.store.storage import open_storage
 
 INPUTS = 3
 SPACES = Spaces(observation_size=INPUTS, goal_size=0, action_low=(-2.0,), action_high=(2.0,))
@@ -64,7 +65,7 @@ def write_policy(folder: Path, task: Task) -> Path:
 
 
 def seal_policy(storage: Path, task: Task) -> Path:
-    with ObjectFolders(*open_storage(str(storage))).sealing("node", {}) as folder:
+    with SealedFolders(open_storage(str(storage))).sealing("node", {}) as folder:
         write_policy(folder, task)
     return storage / "node"
 

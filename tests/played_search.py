@@ -22,7 +22,7 @@ from music_rllib.search.controller import SearchController
 from music_rllib.search.opening import open_searches
 from music_rllib.search.summary import outcome
 from music_rllib.store.history import HISTORY, Report, RunResult, last_values, to_json_lines
-from music_rllib.store.paths import sweep_folder
+from music_rllib.store.storage import sweep_folder
 from music_rllib.tune.runner import DagSearcher
 
 Document = dict[str, Any]

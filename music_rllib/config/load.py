@@ -54,7 +54,7 @@ from music_rllib.envs.tasks import (
     UnknownTaskError,
 )
 from music_rllib.limits import MOST_RUNS, MOST_SEEDS
-from music_rllib.store.paths import expanded
+from music_rllib.store.storage import expanded
 
 
 def load_sweep(

@@ -18,8 +18,7 @@ from music_rllib.experiment.sweep_files import CONFIG, PLAN, SETTINGS, keep, rea
 from music_rllib.labels import ShortLabels, in_runs
 from music_rllib.redaction import redact
 from music_rllib.store.node_store import NodeStore
-from music_rllib.store.object_folder import StorageError
-from music_rllib.store.paths import check_answers, resolve_storage
+from music_rllib.store.storage import StorageError, check_answers, resolve_storage
 from music_rllib.store.work_folder import steps_of
 from music_rllib.version import ALGORITHM_VERSION
 

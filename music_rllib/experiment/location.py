@@ -18,10 +18,11 @@ from music_rllib.experiment.plan import make_plan
 from music_rllib.experiment.sweep_files import IN_STORAGE
 from music_rllib.redaction import redact
 from music_rllib.store.node_store import NodeStore
-from music_rllib.store.paths import (
+from music_rllib.store.storage import (
     below,
     check_answers,
     folder_at,
+    open_storage,
     resolve_storage,
     storage_and_name,
     sweep_folder,
@@ -157,18 +158,7 @@ def _names(storage: str) -> str:
 
 
 def sweeps_in(storage: str) -> list[SweepLocation]:
-    """Every sweep in a storage that has been planned."""
-    import pyarrow.fs as pafs
-
-    from music_rllib.store.object_folder import open_storage
-
-    filesystem, root = open_storage(storage)
-    selector = pafs.FileSelector(root, allow_not_found=True)
-    names = [info.base_name for info in filesystem.get_file_info(selector) if not info.is_file]
-    plans = [f"{root}/{name}/{sweep_files.PLAN}" for name in names]
-    infos = filesystem.get_file_info(plans) if plans else []
-    return [
-        SweepLocation(storage=storage, name=name)
-        for name, plan in zip(names, infos, strict=True)
-        if plan.is_file
-    ]
+    """Every sweep in a storage that has a plan."""
+    root = open_storage(storage)
+    names = root.having(sweep_files.PLAN, root.folders())
+    return [SweepLocation(storage=storage, name=name) for name in names]

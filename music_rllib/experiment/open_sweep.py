@@ -21,8 +21,7 @@ from music_rllib.labels import ShortLabels
 from music_rllib.redaction import redact, redact_yaml, without_secrets
 from music_rllib.store.history import RunResult
 from music_rllib.store.node_store import NodeStore, damage_in_words
-from music_rllib.store.object_folder import DamagedError, StorageError
-from music_rllib.store.paths import database_url
+from music_rllib.store.storage import DamagedError, StorageError, database_url
 
 
 @dataclass(frozen=True, kw_only=True)

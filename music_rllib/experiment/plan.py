@@ -18,7 +18,7 @@ from music_rllib.config.schema import ImportedHandoff, Source, Stage, SweepConfi
 from music_rllib.config.search_check import of_stage, stages_in
 from music_rllib.envs.tasks import Task
 from music_rllib.labels import in_runs
-from music_rllib.store.files import content_key
+from music_rllib.store.serialization import content_key
 from music_rllib.version import ALGORITHM_VERSION
 
 

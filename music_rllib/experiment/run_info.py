@@ -18,7 +18,7 @@ from music_rllib.config.tac_settings import (
 from music_rllib.envs.fingerprint import Fingerprint, digest_of
 from music_rllib.experiment.plan import Node, short
 from music_rllib.schedules import Linear, Measured, Piecewise, value_at
-from music_rllib.store.files import content_key
+from music_rllib.store.serialization import content_key
 from music_rllib.version import ALGORITHM_VERSION
 
 

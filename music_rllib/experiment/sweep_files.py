@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 from music_rllib.config.problems import shown
 from music_rllib.redaction import redact
-from music_rllib.store.files import write_atomically
 from music_rllib.store.lease import runs_here, this_machine
-from music_rllib.store.object_folder import StorageError, open_storage
+from music_rllib.store.storage import StorageError, is_remote, open_storage, write_atomically
 
 if TYPE_CHECKING:
     from music_rllib.experiment.open_sweep import OpenSweep
@@ -69,11 +68,6 @@ def keep(sweep: OpenSweep, name: str, text: str) -> None:
         write(sweep.storage, f"{sweep.config.name}/{name}", text)
 
 
-def is_remote(storage: str) -> bool:
-    """Whether a storage is a bucket, so that the sweep's folder on this machine is not in it."""
-    return "://" in storage and not storage.startswith("file://")
-
-
 def write_locally(path: Path, text: str) -> None:
     """Write a file on this machine, whole or not at all.
 
@@ -94,17 +88,7 @@ def write(storage: str, path: str, text: str) -> None:
     Raises:
         StorageError: It can't be written.
     """
-    filesystem, root = open_storage(storage)
-    target = f"{root}/{path}"
-    if not is_remote(storage):
-        write_locally(Path(target), text)
-        return
-    try:
-        filesystem.create_dir(target.rpartition("/")[0], recursive=True)
-        with filesystem.open_output_stream(target) as sink:
-            sink.write(text.encode())
-    except OSError as error:
-        raise StorageError(f"{target} must be writable: {error}") from error
+    open_storage(storage).write(path, text.encode())
 
 
 _STATE_KEYS = {"sweep", "driver", "stages", "env_steps", "running", "best", "searches", "failures"}
@@ -139,13 +123,11 @@ def read(storage: str, path: str) -> Any:
     Raises:
         StorageError: It can't be read, or its content is not what its name says.
     """
-    filesystem, root = open_storage(storage)
-    target = f"{root}/{path}"
+    folder = open_storage(storage)
+    target = f"{folder.path}/{path}"
     try:
-        with filesystem.open_input_stream(target) as stream:
-            document = json.loads(stream.read())
-    except FileNotFoundError:
-        return None
+        data = folder.read(path)
+        document = None if data is None else json.loads(data)
     except (OSError, ValueError) as error:
         raise StorageError(f"{target} must be a readable JSON file: {error}") from error
     name = path.rpartition("/")[2]
@@ -163,10 +145,7 @@ def remove(storage: str, path: str) -> None:
     Raises:
         StorageError: It can't be deleted.
     """
-    filesystem, root = open_storage(storage)
     try:
-        filesystem.delete_file(f"{root}/{path}")
-    except FileNotFoundError:
-        pass
+        open_storage(storage).remove(path)
     except OSError as error:
         raise StorageError(f"{redact(storage)}/{path} must be deletable: {error}") from error

@@ -7,15 +7,13 @@ import os
 import warnings
 from collections.abc import Iterator
 
-import pyarrow.fs as pafs
-
 from music_rllib.config.load import declared_tasks
 from music_rllib.envs.tasks import Task
 from music_rllib.labels import label_matches
 from music_rllib.policy.policy import PolicyError
 from music_rllib.redaction import redact
-from music_rllib.store.object_folder import ObjectFolders, open_storage
-from music_rllib.store.paths import below, resolve_storage
+from music_rllib.store.sealed import SealedFolders
+from music_rllib.store.storage import StorageFolder, below, open_storage, resolve_storage
 
 _SHORTEST_KEY = 4
 """Characters of a key's beginning that are enough to name it."""
@@ -49,13 +47,13 @@ def find_policy(wanted: str, storage: str) -> str:
 
 
 def _find(wanted: str, storage: str) -> str:
-    filesystem, root = open_storage(storage)
+    root = open_storage(storage)
     labels: dict[str, list[str]] = {}
-    for key, label in _labels(filesystem, root):
+    for key, label in _labels(root):
         labels.setdefault(key, []).append(label)  # sweeps that share a run label it differently
-    nodes = ObjectFolders(filesystem, f"{root}/nodes")
+    nodes = SealedFolders(root / "nodes")
     finished = nodes.names()
-    unfinished = [key for key in _folders(filesystem, f"{root}/work") if key not in finished]
+    unfinished = [key for key in sorted((root / "work").folders()) if key not in finished]
     keys = _matching(wanted, [*finished, *unfinished], labels)
     if not keys:
         known = [labels.get(key, [key])[0] for key in finished][:_LISTED]
@@ -72,7 +70,7 @@ def _find(wanted: str, storage: str) -> str:
         )
     if keys[0] in finished:
         return below(storage, f"nodes/{keys[0]}")
-    checkpoints = ObjectFolders(filesystem, f"{root}/work/{keys[0]}").names()
+    checkpoints = SealedFolders(root / "work" / keys[0]).names()
     if not checkpoints:
         raise PolicyError(f"{wanted!r} must have a checkpoint, it has none in {storage} yet")
     return below(storage, f"work/{keys[0]}/{checkpoints[-1]}")
@@ -101,26 +99,14 @@ def _matching(wanted: str, keys: list[str], labels: dict[str, list[str]]) -> lis
     return [key for key in keys if any(label_matches(wanted, one) for one in labels.get(key, ()))]
 
 
-def _labels(filesystem: pafs.FileSystem, root: str) -> Iterator[tuple[str, str]]:
+def _labels(storage: StorageFolder) -> Iterator[tuple[str, str]]:
     """Key and label of every run in the plans of the storage's sweeps."""
-    for name in _folders(filesystem, root):
-        plan = f"{root}/{name}/plan.json"
-        if filesystem.get_file_info(plan).type != pafs.FileType.File:
-            continue
+    for name in sorted(storage.having("plan.json", storage.folders())):
         try:
-            with filesystem.open_input_stream(plan) as stream:
-                nodes = json.loads(stream.read())["nodes"]
+            nodes = json.loads((storage / name).read("plan.json") or b"")["nodes"]
             labels = [(str(node["key"]), str(node["label"])) for node in nodes]
         except (ValueError, TypeError, LookupError, RecursionError) as error:
+            plan = f"{storage.path}/{name}/plan.json"
             warnings.warn(f"{plan} is damaged, its labels are not known: {error!r}", stacklevel=2)
             continue
         yield from labels
-
-
-def _folders(filesystem: pafs.FileSystem, root: str) -> list[str]:
-    entries = filesystem.get_file_info(pafs.FileSelector(root, allow_not_found=True))
-    return sorted(
-        info.base_name
-        for info in entries
-        if info.type == pafs.FileType.Directory and not info.base_name.startswith(".")
-    )

@@ -5,13 +5,12 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-import pyarrow.fs as pafs
 from numpy.typing import NDArray
 
 from music_rllib.config.problems import shown
@@ -27,8 +26,8 @@ from music_rllib.store.handoff import (
     open_handoff,
     read_handoff,
 )
-from music_rllib.store.object_folder import MANIFEST, ObjectFolders, StorageError, open_storage
-from music_rllib.store.paths import database_url
+from music_rllib.store.sealed import MANIFEST, SealedFolders
+from music_rllib.store.storage import StorageError, database_url, open_storage
 
 MLFLOW_FILE = "policy.safetensors"
 """File with the policy in an MLflow model."""
@@ -244,12 +243,12 @@ def _from_mlflow(uri: str, env: str | Sequence[Task]) -> Policy:
 @contextlib.contextmanager
 def _local_copy(place: str) -> Iterator[Path]:
     """Yields a verified copy of an object folder, or any other local folder or file itself."""
-    filesystem, root = open_storage(place)
-    parent, _, name = root.rpartition("/")
-    folders = ObjectFolders(filesystem, parent)
+    storage = open_storage(place)
+    parent, _, name = storage.path.rpartition("/")
+    folders = SealedFolders(replace(storage, path=parent))
     if not folders.exists(name):
-        if isinstance(filesystem, pafs.LocalFileSystem):
-            yield Path(root)
+        if storage.is_local:
+            yield Path(storage.path)
             return
         raise PolicyError(f"{place} must be a finished node or a checkpoint: no {MANIFEST} there")
     with TemporaryDirectory() as folder:

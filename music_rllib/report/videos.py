@@ -14,7 +14,7 @@ from music_rllib.errors import first_line
 from music_rllib.report.figures.choice import slug
 from music_rllib.results.analysis import StageAnalysis
 from music_rllib.results.data import RunRecord, Sweep
-from music_rllib.store.paths import below
+from music_rllib.store.storage import below
 
 if TYPE_CHECKING:
     from music_rllib.policy.policy import Policy

@@ -29,8 +29,8 @@ from music_rllib.config.tac_settings import setting_text
 from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.sweep_files import ANALYSIS_PLAN, as_json, keep, read
 from music_rllib.redaction import redact
-from music_rllib.store.files import content_key
-from music_rllib.store.object_folder import StorageError
+from music_rllib.store.serialization import content_key
+from music_rllib.store.storage import StorageError
 
 MARGIN_OF_A_RATE = 0.05
 """Default margin of a success rate."""

@@ -30,8 +30,7 @@ from music_rllib.results.archive import is_archive, read_archive
 from music_rllib.results.data import Points, RunRecord, Sweep, checked_searches, columns
 from music_rllib.results.planned import planned_run
 from music_rllib.store.node_store import damage_in_words
-from music_rllib.store.object_folder import DamagedError, StorageError
-from music_rllib.store.paths import folder_at, sweep_folder
+from music_rllib.store.storage import DamagedError, StorageError, folder_at, sweep_folder
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,7 +22,7 @@ from music_rllib.search.storage import DATABASE_ERRORS
 from music_rllib.search.study_record import SCORES, VALUES
 from music_rllib.search.trials import Active, Arm, Array, Finalist, Search, ranked, up_to
 from music_rllib.store.history import Report
-from music_rllib.store.object_folder import DamagedError
+from music_rllib.store.storage import DamagedError
 
 POLL_SECONDS = 1.0
 """Time between two looks at the trials of other drivers."""

@@ -18,8 +18,7 @@ from sqlalchemy.exc import ArgumentError, IntegrityError, ProgrammingError, SQLA
 
 from music_rllib.errors import first_line
 from music_rllib.redaction import redact
-from music_rllib.store.object_folder import StorageError
-from music_rllib.store.paths import database_url, sqlite_url
+from music_rllib.store.storage import StorageError, database_url, sqlite_url
 
 DATABASE_ERRORS = (StorageInternalError, SQLAlchemyError)
 """Errors of a database that doesn't answer, or not now."""

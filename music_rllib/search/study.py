@@ -30,7 +30,7 @@ from music_rllib.search.sampler import Proposer, trial_at
 from music_rllib.search.storage import studies_of
 from music_rllib.search.study_record import Identity, fits
 from music_rllib.search.warm_start import warm_start
-from music_rllib.store.files import content_key
+from music_rllib.store.serialization import content_key
 
 LEASE_SECONDS = 120.0
 """A driver on another machine counts as dead when its last sign of life is older."""

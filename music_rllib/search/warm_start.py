@@ -14,7 +14,7 @@ from music_rllib.config.search import SearchSettings, WarmStart
 from music_rllib.redaction import redact
 from music_rllib.search.storage import open_studies, studies_of
 from music_rllib.search.study_record import ARM, SEARCH, VALUES, Identity, fits
-from music_rllib.store.object_folder import StorageError
+from music_rllib.store.storage import StorageError
 
 
 def no_study_error(warm: WarmStart, known: Sequence[str]) -> StorageError:

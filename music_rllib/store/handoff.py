@@ -1,45 +1,40 @@
-"""Handoffs: the weights that one run takes over from another, with a manifest.
+"""Handoffs: the network weights that one run takes over from another, with a manifest.
 
-A handoff is a folder with one safetensors file per module and `handoff.json`, which names the task,
-the source run, and the size, hash and shapes of each file. The manifest is written last and read
-first. A handoff cannot contain code: a pickle in place of weights has the wrong hash, and is no
-safetensors file if the manifest was forged too.
+A handoff is a folder with one safetensors file per network and `handoff.json`, which names the
+task, the source run, and the size, hash and shapes of each file. The manifest is written last and
+read first. A handoff cannot contain code: a pickle in place of weights has the wrong hash, and if
+the manifest was forged too, it is not a safetensors file.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-import safetensors
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
-from safetensors.numpy import load as load_safetensors
-from safetensors.numpy import save as save_safetensors
 
 from music_rllib.envs.tasks import Task
 from music_rllib.errors import BadInputError
 from music_rllib.limits import (
     MOST_JSON_BYTES,
     MOST_WEIGHTS_BYTES,
-    check_safetensors,
-    open_regular,
     read_json,
     read_regular,
 )
-from music_rllib.store.files import canonical_json, write_atomically
+from music_rllib.store.serialization import arrays_from_bytes, arrays_to_bytes, content_key
+from music_rllib.store.storage import write_atomically
 from music_rllib.version import ALGORITHM_VERSION
 
 if TYPE_CHECKING:
     import gymnasium as gym
 
 NetworkWeights = Mapping[str, Mapping[str, npt.NDArray[Any]]]
-"""Arrays by module name and array name."""
+"""Arrays by network and array name."""
 
 MANIFEST = "handoff.json"
 
@@ -53,7 +48,7 @@ class _Strict(BaseModel):
 
 
 class Architecture(_Strict):
-    """The settings that determine the shapes and the meaning of a handoff's arrays."""
+    """The settings that determine the shapes and the meaning of network weights."""
 
     hidden_sizes: tuple[int, ...]
     policy: str
@@ -66,7 +61,7 @@ class Architecture(_Strict):
     """Range to which the form `tanh` scales; other forms only clip to it."""
 
     def differences(self, other: Architecture, starts_from: str) -> list[str]:
-        """Names, as in a sweep's YAML, of the settings because of which a handoff does not fit."""
+        """Settings that prevent a run from starting from these weights, named as in YAML."""
         if starts_from == "estimator":
             fits = self.estimator_hidden_size == other.estimator_hidden_size
             return [] if fits else ["music.hidden_size"]
@@ -90,7 +85,7 @@ class Spaces(_Strict):
         """The sizes and bounds of these spaces.
 
         Raises:
-            ValueError: Training does not support such spaces.
+            ValueError: Training does not support these spaces.
         """
         from music_rllib.envs.values import check_action_space, observation_sizes
 
@@ -114,7 +109,7 @@ class HandoffInfo(_Strict):
     """Environment steps of the source run."""
     seed: int
     node_key: str
-    """Key of the source run, a hash of its settings and of its own source."""
+    """Key of the source run."""
     algorithm_version: str = ALGORITHM_VERSION
     spaces: Spaces
     """Spaces of the environment."""
@@ -131,7 +126,7 @@ class _Array(_Strict):
 
 class _ModuleFile(_Strict):
     file: Annotated[str, Field(pattern=r"^[a-z_]+\.safetensors$")]
-    """Name beside the manifest; the pattern keeps a forged manifest from naming another place."""
+    """Name in the manifest's folder; a forged manifest cannot name another place."""
     sha256: str
     bytes: int
     arrays: dict[str, _Array]
@@ -147,28 +142,25 @@ class HandoffManifest(_Strict):
     @property
     def content_hash(self) -> str:
         """Hash of everything in the handoff that affects a run that starts from it."""
-        content = {
-            "task": self.info.task.identity(),
-            "modules": {name: module.sha256 for name, module in self.modules.items()},
-        }
-        return hashlib.sha256(canonical_json(content).encode()).hexdigest()[:20]
+        weights = {name: module.sha256 for name, module in self.modules.items()}
+        return content_key({"task": self.info.task.identity(), "modules": weights})
 
 
-def write_handoff(folder: Path, modules: NetworkWeights, info: HandoffInfo) -> HandoffManifest:
+def write_handoff(folder: Path, weights: NetworkWeights, info: HandoffInfo) -> HandoffManifest:
     """Write network weights and their manifest into `folder`.
 
     Raises:
-        ValueError: An array contains NaN or infinity: the run diverged, and none may start from it.
+        ValueError: An array contains NaN or infinity: the run diverged, and no run may start from
+            it.
         OSError: The folder cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     files = {}
-    for name, arrays in modules.items():
+    for name, arrays in weights.items():
         for key, array in arrays.items():
             if not np.isfinite(array).all():
-                raise ValueError(f"{name}.{key} must be finite to be handed over, it is not")
-        # In C order, because safetensors ignores strides.
-        data = save_safetensors({key: np.asarray(a, order="C") for key, a in arrays.items()})
+                raise ValueError(f"{name}.{key} must be finite to start a run from it, it is not")
+        data = arrays_to_bytes(arrays)
         file = f"{name}.safetensors"
         write_atomically(folder / file, data)
         files[name] = _ModuleFile(
@@ -215,24 +207,24 @@ def _reason(error: ValueError | OSError) -> str:
 
 
 def read_handoff(
-    folder: Path, modules: Sequence[str], task: Task
+    folder: Path, networks: Sequence[str], task: Task
 ) -> dict[str, dict[str, npt.NDArray[Any]]]:
-    """Read and verify the weights of `modules`, which must have been trained on `task`.
+    """Read and verify the weights of `networks`, which must have been trained on `task`.
 
-    Another name of the task does not matter. `folder` is as for `open_handoff`.
+    The name of the task may differ. `folder` is as for `open_handoff`.
 
     Raises:
-        HandoffError: A module is missing, damaged, or was trained on another task.
+        HandoffError: A network is missing, damaged, or was trained on another task.
     """
     folder, manifest = open_handoff(folder)
     _check_task(folder, manifest.info.task, task)
-    absent = [name for name in modules if name not in manifest.modules]
+    absent = [name for name in networks if name not in manifest.modules]
     if absent:
         raise HandoffError(
-            f"{folder} must have {', '.join(modules)}; it lacks {', '.join(absent)} "
+            f"{folder} must have {', '.join(networks)}; it lacks {', '.join(absent)} "
             f"(made by {manifest.info.variant})"
         )
-    return {name: _read_module(folder, manifest.modules[name]) for name in modules}
+    return {name: _read_weights(folder, manifest.modules[name]) for name in networks}
 
 
 def _check_task(folder: Path, source: Task, task: Task) -> None:
@@ -249,26 +241,19 @@ def _check_task(folder: Path, source: Task, task: Task) -> None:
         )
 
 
-def _read_module(folder: Path, expected: _ModuleFile) -> dict[str, npt.NDArray[Any]]:
+def _read_weights(folder: Path, expected: _ModuleFile) -> dict[str, npt.NDArray[Any]]:
     path = folder / expected.file
-    if expected.bytes > MOST_WEIGHTS_BYTES:
-        raise HandoffError(
-            f"{path} must have at most {MOST_WEIGHTS_BYTES} bytes, {MANIFEST} says {expected.bytes}"
-        )
     try:
-        with open_regular(path) as file:
-            size = os.fstat(file.fileno()).st_size
-            data = file.read(size) if size == expected.bytes else b""
+        data = read_regular(path, min(expected.bytes, MOST_WEIGHTS_BYTES))
     except OSError as error:
         raise HandoffError(f"{path} must be readable: {error.strerror}") from None
-    if size != expected.bytes:
-        raise HandoffError(f"{path} must have {expected.bytes} bytes, it has {size}")
+    if len(data) != expected.bytes:
+        raise HandoffError(f"{path} must have {expected.bytes} bytes, it has {len(data)}")
     if hashlib.sha256(data).hexdigest() != expected.sha256:
         raise HandoffError(f"{path} must have the hash in {MANIFEST}, its content has changed")
     try:
-        check_safetensors(data)
-        arrays = load_safetensors(data)
-    except (safetensors.SafetensorError, ValueError, KeyError, TypeError) as error:
+        arrays = arrays_from_bytes(data)
+    except ValueError as error:
         raise HandoffError(f"{path} must be a safetensors file: {error}") from None
     found = _descriptions(arrays)
     keys = found.keys() | expected.arrays.keys()

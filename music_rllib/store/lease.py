@@ -1,11 +1,11 @@
 """Leases: only one process at a time may write a run.
 
-A worker can outlive the driver that started it, and a second sweep may need the same run, so
-whoever computes a run holds its lease. A lease expires unless it is renewed. The lease of a process
-of this machine that is known to be dead need not expire first. A process that was suspended (a
-laptop asleep) finds its lease lost when it resumes, and stops writing.
+A worker can outlive the driver that started it, and a second sweep may need the same run, so the
+process that computes a run holds its lease. A lease expires unless it is renewed. If the owner was
+a process of this machine and is dead, its lease is taken over at once. A process that was suspended
+(a sleeping laptop) finds its lease lost when it resumes, and stops writing.
 
-On a disk, a file lock protects taking and renewing a lease. An object store has no locks: the last
+On a disk, a file lock protects acquiring and renewing a lease. A bucket has no locks: the last
 writer has the lease, and every writer reads it again after a moment.
 """
 
@@ -18,32 +18,37 @@ import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import psutil
-import pyarrow.fs as pafs
 from filelock import FileLock
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from music_rllib.store.object_folder import StorageError, must_be_writable
+from music_rllib.store.storage import (
+    StorageError,
+    StorageFolder,
+    must_be_writable,
+    write_atomically,
+)
 
 EXPIRES_SECONDS = 60.0
-"""Time until a lease expires that is not renewed; machines' clocks must agree better than that."""
+"""Time until a lease expires; the clocks of machines must agree better than that."""
 RENEWALS = 4
 """Number of renewals in that time."""
 SETTLE_SECONDS = 2.0
-"""Wait between writing a lease into an object store and reading it again."""
-LOCK_SECONDS = 30.0
+"""Wait between writing a lease into a bucket and reading it again."""
+LOCK_SECONDS, LOCK_ATTEMPTS = 30.0, 100
 LOOK_SECONDS = 1.0
-"""Longest time in which a renewing thread does not see that the time of day was set."""
+"""Longest time until a renewing thread notices that the system time was changed."""
 
 
 class LeaseLostError(RuntimeError):
-    """Another process computes the run now, so this one must not write its results."""
+    """Another process has the lease, so this one must not write."""
 
 
 class Lease(BaseModel):
-    """The process that holds the lease, and until when."""
+    """The owner of a lease, and the time when it expires."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -83,7 +88,7 @@ class Lease(BaseModel):
         return max(0.0, self.expires - time.time())
 
     def holds(self) -> bool:
-        """Whether the owner may still be at work."""
+        """Whether the lease is valid: not expired, and its owner may be running."""
         if time.time() >= self.expires:
             return False
         return self.machine != this_machine() or runs_here(self.pid, self.process_started)
@@ -103,7 +108,7 @@ def this_machine() -> str:
 
 
 def process_start(pid: int) -> float:
-    """Start time of a process of this machine, in seconds of a clock that nobody can set.
+    """Start time of a process of this machine, in seconds of a clock that cannot be changed.
 
     Raises:
         psutil.NoSuchProcess: The process does not exist.
@@ -133,32 +138,30 @@ class LeaseFile:
     Methods raise StorageError if it cannot be written.
     """
 
-    def __init__(self, filesystem: pafs.FileSystem, path: str) -> None:
-        self._fs = filesystem
-        self.path = path
-        self._local = isinstance(filesystem, pafs.LocalFileSystem)
+    def __init__(self, folder: StorageFolder, name: str) -> None:
+        self._folder, self._name = folder, name
+        self.path = f"{folder.path}/{name}"
         self._seen: tuple[Lease | None, float] = (None, 0.0)
         """The lease of another owner, and the monotonic time when it was first seen."""
 
     def read(self) -> Lease | None:
-        """The lease in the file; None if the file does not exist or is not readable."""
+        """The lease in the file; None if the file does not exist or is incomplete."""
         try:
-            with self._fs.open_input_stream(self.path) as stream:
-                return Lease.model_validate_json(stream.read())
-        except (FileNotFoundError, ValidationError):
+            return Lease.model_validate_json(self._folder.read(self._name) or b"")
+        except ValidationError:
             return None
 
     def acquire(self, lease: Lease) -> Lease | None:
-        """Take the lease and return None, or return the lease of another owner that holds."""
+        """Acquire the lease and return None, or return the valid lease of another owner."""
         # A process that only waits must not write to a folder that the owner may be deleting.
         with contextlib.suppress(OSError):  # raised below, with the path
             if (holder := self._other_holder(lease)) is not None:
                 return holder
-        with self._exclusively(make_folder=True):
+        with self._locked(LOCK_ATTEMPTS):
             if (holder := self._other_holder(lease)) is not None:
                 return holder
             self._write(lease)
-        if self._local:
+        if self._folder.is_local:
             return None
         time.sleep(SETTLE_SECONDS)
         holder = self.read()
@@ -170,19 +173,13 @@ class LeaseFile:
             return None
         if holder != self._seen[0]:
             self._seen = (holder, time.monotonic())
-        # A lease that holds longer was dated by another clock, or before this one was set back.
+        # A lease that expires later was dated by another clock, or before this one was set back.
         stale = time.monotonic() - self._seen[1] >= EXPIRES_SECONDS
         return None if holder.seconds > EXPIRES_SECONDS and stale else holder
 
     def renew(self, lease: Lease) -> bool:
         """Write the lease again, unless another owner has it; returns whether it was written."""
-        if not self.is_owned_by(lease.owner):
-            return False
-        with self._exclusively():
-            if not self.is_owned_by(lease.owner):
-                return False
-            self._write(lease)
-        return True
+        return self._if_owned_by(lease.owner, partial(self._write, lease))
 
     def is_owned_by(self, owner: str) -> bool:
         """Whether the file has a lease of this owner."""
@@ -192,62 +189,58 @@ class LeaseFile:
     def release(self, owner: str) -> None:
         """Delete the lease if it is this owner's."""
         with contextlib.suppress(OSError, StorageError):
+            self._if_owned_by(owner, self._delete)
+
+    def _if_owned_by(self, owner: str, act: Callable[[], None]) -> bool:
+        """Call `act` under the lock if the lease is this owner's; returns whether it was called."""
+        # Also checked before locking, which creates a file: a new owner may delete the folder.
+        if not self.is_owned_by(owner):
+            return False
+        with self._locked():
             if not self.is_owned_by(owner):
-                return  # creates no lock file in a folder that the new owner may have deleted
-            with self._exclusively():
-                if self.is_owned_by(owner):
-                    self._fs.delete_file(self.path)
-                    if (
-                        self._local
-                    ):  # a process that waits for the lock notices, and creates another
-                        self._lock_path.unlink()
+                return False
+            act()
+        return True
 
     @contextlib.contextmanager
-    def _exclusively(self, *, make_folder: bool = False) -> Iterator[None]:
-        if not self._local:
+    def _locked(self, attempts: int = 1) -> Iterator[None]:
+        """Hold the lock file on a disk; several `attempts` create its folder if it is deleted."""
+        if not self._folder.is_local:
             yield
             return
+        lock = FileLock(self._lock_path, timeout=LOCK_SECONDS)
         with must_be_writable(self.path):
-            lock = self._lock(make_folder=make_folder)
+            for left in reversed(range(attempts)):
+                try:
+                    if attempts > 1:
+                        self._lock_path.parent.mkdir(parents=True, exist_ok=True)
+                    lock.acquire()
+                    break
+                except (FileNotFoundError, FileExistsError):  # the folder was deleted just now
+                    if not left:
+                        raise
         try:
             yield
         finally:
             lock.release()
 
-    def _lock(self, *, make_folder: bool, attempts: int = 100) -> FileLock:
-        lock = FileLock(self._lock_path, timeout=LOCK_SECONDS)
-        while True:
-            try:
-                if make_folder:
-                    self._lock_path.parent.mkdir(parents=True, exist_ok=True)
-                lock.acquire()
-            except (FileNotFoundError, FileExistsError):  # the folder was deleted just now
-                attempts -= 1
-                if not make_folder or not attempts:
-                    raise
-            else:
-                return lock
-
     @property
     def _lock_path(self) -> Path:
-        path = Path(self.path)
-        return path.with_name(f".{path.name}.lock")
+        return Path(self._folder.path, f".{self._name}.lock")
 
     def _write(self, lease: Lease) -> None:
         data = lease.model_dump_json().encode()
-        try:
-            if not self._local:
-                with self._fs.open_output_stream(self.path) as sink:
-                    sink.write(data)
-                return
-            # Renamed, so that nobody reads half of it; not flushed: no owner survives a power cut.
-            temporary = Path(f"{self.path}.{lease.owner}")
-            temporary.write_bytes(data)
-            temporary.replace(self.path)
-        except OSError as error:
-            raise StorageError(
-                f"{self.path} must be writable: {error.strerror or error}"
-            ) from error
+        if not self._folder.is_local:
+            self._folder.write(self._name, data)
+            return
+        # Not in a new folder, if the old one was deleted; no owner survives a power cut.
+        with must_be_writable(self.path):
+            write_atomically(Path(self.path), data, sync=False)
+
+    def _delete(self) -> None:
+        self._folder.remove(self._name)
+        if self._folder.is_local:  # a process that waits for the lock creates another file
+            self._lock_path.unlink()
 
 
 class HeldLease:
@@ -270,7 +263,7 @@ class HeldLease:
 
     def is_lost(self) -> bool:
         """Read the file again; returns whether another process has the lease."""
-        with contextlib.suppress(OSError):  # a store that does not answer proves nothing
+        with contextlib.suppress(OSError):  # a bucket that does not answer proves nothing
             self.lost = self.lost or not self._file.is_owned_by(self._lease.owner)
         return self.lost
 
@@ -283,8 +276,8 @@ class HeldLease:
         if self.is_lost():
             raise LeaseLostError(
                 f"{self._file.path} must name this process (owner {self._lease.owner}), it names "
-                f"{self._file.read() or 'nobody'}: this one was taken for dead, and writes nothing "
-                "any more"
+                f"{self._file.read() or 'nobody'}: the lease expired and another process took "
+                "over; stopping without writing"
             )
 
     def release(self) -> None:
@@ -301,7 +294,7 @@ class HeldLease:
     def _renew(self) -> None:
         while self._wait_until_due():
             later = self._lease.model_copy(update={"expires": time.time() + self._duration})
-            # A full disk, or a store that does not answer, may recover before the lease expires.
+            # A full disk, or a bucket that does not answer, may recover before the lease expires.
             with contextlib.suppress(OSError, StorageError):
                 if not self._file.renew(later):
                     self.lost = True
@@ -309,9 +302,9 @@ class HeldLease:
                     return
 
     def _wait_until_due(self) -> bool:
-        """Wait for the next renewal; False if there is none because of `end`.
+        """Wait for the next renewal; returns False after `end`.
 
-        A renewal is due at once after the machine slept or the time of day was set.
+        A renewal is due at once after the machine slept or its time was changed.
         """
         pause = self._duration / RENEWALS
         day, steady = time.time(), time.monotonic()

@@ -5,9 +5,9 @@ All sweeps in a storage folder or bucket share one store::
     nodes/<key>/      a finished run: handoff/, history.jsonl, run.json, manifest.json last
     work/<key>/<n>/   checkpoints of an unfinished run, each with its manifest
     work/<key>/parts/ data that checkpoints share, such as old trajectories
-    work/<key>/lease.json   the process that computes the run, and until when that holds
+    work/<key>/lease.json   the process that computes the run, and until when its lease is valid
     continuations/<key>/<n>/   the end of a finished run, for a run with a larger budget
-    verified.json     on a disk: fingerprints of finished runs that were verified
+    verified.json     on a disk: fingerprints of the files of verified runs
 
 The store, not Tune's snapshot, decides which runs are finished.
 """
@@ -16,29 +16,30 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import hashlib
+import json
 import shutil
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
 from pathlib import Path
-from tempfile import mkdtemp
+from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
-
-import pyarrow.fs as pafs
 
 from music_rllib.envs.fingerprint import Fingerprint
 from music_rllib.store.history import HISTORY, Report, RunResult, from_json_lines, last_values
-from music_rllib.store.object_folder import DamagedError, ObjectFolders, open_storage
-from music_rllib.store.verified import Verified, fingerprint_of
+from music_rllib.store.sealed import MANIFEST, Manifest, SealedFolders
+from music_rllib.store.storage import DamagedError, open_storage, write_atomically
 from music_rllib.store.work_folder import KEEP, WorkFolder, environment_of
 
 K = TypeVar("K")
 V = TypeVar("V")
-READERS = 16
-"""Largest number of requests to a bucket at a time."""
 SHOWN = 10
 """Number of damaged runs that a message names."""
-CONTINUATIONS = "continuations"
-TRAIN_AGAIN = "'run' and 'resume' train what is damaged again with --retrain-damaged"
+SETTLED_SECONDS = 2.0
+"""A file that is newer may be written again without a change of its time stamp."""
+CONTINUATIONS, VERIFIED = "continuations", "verified.json"
+TRAIN_AGAIN = "to retrain damaged runs, give 'run' or 'resume' --retrain-damaged"
 
 
 class NodeStore:
@@ -50,10 +51,8 @@ class NodeStore:
 
     def __init__(self, uri: str) -> None:
         self.uri = uri
-        self._fs, self._root = open_storage(uri)
-        self._nodes = ObjectFolders(self._fs, f"{self._root}/nodes")
-        self._local = isinstance(self._fs, pafs.LocalFileSystem)
-        self._verified = Verified(Path(self._root, "verified.json"))
+        self._root = open_storage(uri)
+        self._nodes = SealedFolders(self._root / "nodes")
 
     def path(self, key: str) -> str:
         """Path of a node, whether it exists or not."""
@@ -64,20 +63,20 @@ class NodeStore:
         return self._nodes.exists(key)
 
     def finished(self, keys: Iterable[str]) -> set[str]:
-        """The published nodes among `keys`, from one request for all of them."""
-        return self._nodes.existing(dict.fromkeys(keys))
+        """The published nodes among `keys`."""
+        present = set(keys).intersection(self._nodes.folder.folders())
+        return set(self._nodes.folder.having(MANIFEST, present))
 
     def result(self, key: str) -> RunResult | None:
         """The result of a finished run; None for an imported handoff."""
-        with self._advice():
-            return self._result(key)
+        return self._result(self._nodes.manifest(key))
 
-    def _result(self, key: str) -> RunResult | None:
-        result = self._nodes.manifest(key).meta.get("result")
+    def _result(self, manifest: Manifest) -> RunResult | None:
+        result = manifest.meta.get("result")
         try:
             return None if result is None else RunResult.model_validate(result)
         except ValueError as error:
-            place = f"{self.path(key)}/manifest.json"
+            place = f"{self.path(manifest.name)}/{MANIFEST}"
             raise DamagedError(f"{place} must hold a run's result: {error}") from error
 
     def history(self, key: str) -> list[Report]:
@@ -88,11 +87,11 @@ class NodeStore:
             raise DamagedError(f"{self.path(key)}/{HISTORY} must hold reports: {error}") from error
 
     def environment(self, key: str) -> Fingerprint | None:
-        """Fingerprint of the environment that a finished run used; None: it is not known."""
+        """Fingerprint of the environment that a finished run used; None if it is not recorded."""
         return environment_of(self._nodes.manifest(key))
 
     def lines(self, key: str) -> tuple[bytes, dict[str, str], Fingerprint | None]:
-        """The `HISTORY` of a finished run, and its code and environment as `publish` got them."""
+        """The `HISTORY` of a finished run, and its code and environment as passed to `publish`."""
         manifest = self._nodes.manifest(key)
         known = manifest.meta.get("provenance")
         provenance = known.items() if isinstance(known, dict) else ()
@@ -109,7 +108,7 @@ class NodeStore:
     ) -> None:
         """Copy the files of `folder` to the node `key`, unless it exists already.
 
-        `provenance` are tags that name the code that has made it.
+        `provenance` are tags that name the code that computed it.
         """
         if self.is_finished(key):
             return
@@ -126,26 +125,38 @@ class NodeStore:
                 shutil.copyfile(file, target)
 
     def tidy(self, key: str) -> None:
-        """Delete what killed attempts at publishing a node have left; needs the node's lease."""
+        """Delete the remains of killed attempts to publish a node; needs the node's lease."""
         self._nodes.tidy(key)
 
     def fetch(self, key: str, folder: Path) -> None:
         """Copy a finished node's files into `folder`, verified."""
         self._nodes.fetch(key, folder)
 
+    @contextlib.contextmanager
+    def files(self, key: str) -> Iterator[Path]:
+        """Yield a finished node's folder; of a bucket, a verified copy that is deleted at the end.
+
+        On a disk, the caller verifies what it reads: a handoff has hashes of its own.
+        """
+        if self._root.is_local:
+            yield Path(self.path(key))
+            return
+        with TemporaryDirectory(prefix="music-rllib-node-") as copy:
+            self.fetch(key, Path(copy))
+            yield Path(copy)
+
     def folder(self, key: str) -> Path:
-        """A finished node's folder on this machine; of a bucket, a copy until the program ends."""
-        if self._local:
-            return Path(self.path(key))
-        copy = Path(mkdtemp(prefix="music-rllib-node-"))
-        atexit.register(shutil.rmtree, copy, ignore_errors=True)
-        self.fetch(key, copy)
-        return copy
+        """As `files`, until the program ends."""
+        stack = contextlib.ExitStack()
+        atexit.register(stack.close)
+        return stack.enter_context(self.files(key))
 
     def verify(self, key: str) -> None:
         """Check that a finished node matches its manifest."""
-        with self._advice():
+        try:
             self._nodes.check(key)
+        except DamagedError as error:
+            raise DamagedError(f"{error}; {TRAIN_AGAIN}") from error
 
     def is_sound(self, key: str) -> bool:
         """Whether the node has been published and matches its manifest."""
@@ -154,29 +165,37 @@ class NodeStore:
     def damage(self, keys: Iterable[str]) -> dict[str, DamagedError]:
         """The finished nodes among `keys` that differ from their manifests, with the errors.
 
-        On a disk, a node that was sound before and whose files have the same inodes, sizes and
+        On a disk, a node that was verified earlier and whose files have the same inodes, sizes and
         times is not read again.
         """
-        keys = list(keys)
+        keys, before = list(keys), dict(self._verified)
         errors = zip(keys, self.map(self._damage_of, keys), strict=True)
         damaged = {key: error for key, error in errors if error is not None}
-        self._verified.save()
+        if self._verified != before:
+            with contextlib.suppress(OSError):  # without the file, nodes are verified again
+                data = json.dumps(self._verified, indent=0).encode()
+                write_atomically(Path(self._root.path, VERIFIED), data, sync=False)
         return damaged
 
     def map(self, read: Callable[[K], V], keys: Iterable[K]) -> Iterator[V]:
-        """`read` of each key, in order; several at once where each has to be fetched."""
-        if self._local:
-            yield from map(read, keys)
-            return
-        with ThreadPoolExecutor(READERS) as pool:
-            yield from pool.map(read, keys)
+        """Apply `read` to each key, in order; requests to a bucket run in parallel."""
+        return self._root.map(read, keys)
+
+    @cached_property
+    def _verified(self) -> dict[str, str]:
+        """Fingerprint of the files of each verified node."""
+        with contextlib.suppress(OSError, ValueError):
+            content = json.loads(self._root.read(VERIFIED) or b"") if self._root.is_local else {}
+            return {key: str(value) for key, value in dict(content).items()}
+        return {}
 
     def _damage_of(self, key: str) -> DamagedError | None:
         try:
-            fingerprint = self._fingerprint(key)
-            if not self._verified.has(key, fingerprint):
+            fingerprint = self._fingerprint(key) if self._root.is_local else None
+            if fingerprint is None or self._verified.get(key) != fingerprint:
                 self._check(key)
-                self._verified.add(key, fingerprint)
+                if fingerprint is not None:
+                    self._verified[key] = fingerprint
         except DamagedError as error:
             return error
         except OSError as error:
@@ -185,55 +204,52 @@ class NodeStore:
         return None
 
     def _fingerprint(self, key: str) -> str | None:
-        if not self._local:
-            return None
-        try:
-            return fingerprint_of(map(Path, self._nodes.files(key)))
-        except FileNotFoundError:
-            return None  # `_check` names the file
+        """A hash of the files' inodes, sizes and times; None if a file is new or missing."""
+        digest, newest = hashlib.sha256(), 0
+        for path in map(Path, self._nodes.files(key)):
+            try:
+                status = path.stat()
+            except FileNotFoundError:
+                return None  # `_check` names the file
+            digest.update(
+                f"{path.name} {status.st_dev} {status.st_ino} {status.st_size} "
+                f"{status.st_mtime_ns} {status.st_ctime_ns}\n".encode()
+            )
+            newest = max(newest, status.st_mtime_ns, status.st_ctime_ns)
+        return None if time.time() - newest / 1e9 < SETTLED_SECONDS else digest.hexdigest()[:20]
 
     def _check(self, key: str) -> None:
-        self._nodes.check(key)
-        result = self._result(key)
+        manifest = self._nodes.check(key)
+        result = self._result(manifest)
         # The manifest has no hash of its own, but the history has the values of its result too.
-        if self._local and result is not None and HISTORY in self._nodes.manifest(key).files:
+        if self._root.is_local and result is not None and HISTORY in manifest.files:
             last = last_values(self.history(key))
             # As text, because NaN equals nothing.
             if _as_text(result.metrics) != _as_text(last):
                 raise DamagedError(
-                    f"{self.path(key)}/manifest.json must have the last values of {HISTORY}, it "
-                    "has others"
+                    f"{self.path(key)}/{MANIFEST} must have the last values of {HISTORY}, it has "
+                    "others"
                 )
 
     def remove(self, key: str) -> None:
         """Delete a node, so that it is trained again."""
         self._nodes.remove(key)
 
-    @contextlib.contextmanager
-    def _advice(self) -> Iterator[None]:
-        """Append what to do to the message of a DamagedError."""
-        try:
-            yield
-        except DamagedError as error:
-            raise DamagedError(f"{error}. {TRAIN_AGAIN}") from error
-
     def begun(self) -> set[str]:
         """Keys of the runs that have a work folder."""
-        selector = pafs.FileSelector(f"{self._root}/work", allow_not_found=True)
-        return {info.base_name for info in self._fs.get_file_info(selector)}
+        return set((self._root / "work").folders())
 
     def work_folder(self, key: str, keep: int = KEEP) -> WorkFolder:
         """The folder of an unfinished run, with its newest `keep` checkpoints."""
-        return WorkFolder(self._fs, f"{self._root}/work/{key}", keep)
+        return WorkFolder(self._root / "work" / key, keep)
 
     def has_continuations(self) -> bool:
-        """Whether there is any folder of `continuation`."""
-        selector = pafs.FileSelector(f"{self._root}/{CONTINUATIONS}", allow_not_found=True)
-        return bool(self._fs.get_file_info(selector))
+        """Whether any folder of `continuation` exists."""
+        return bool((self._root / CONTINUATIONS).folders())
 
     def continuation(self, key: str) -> WorkFolder:
         """The folder with the last checkpoint of the longest of runs that differ only in budget."""
-        return WorkFolder(self._fs, f"{self._root}/{CONTINUATIONS}/{key}", keep=1)
+        return WorkFolder(self._root / CONTINUATIONS / key, keep=1)
 
 
 def _as_text(metrics: Mapping[str, float]) -> dict[str, str]:
@@ -241,7 +257,7 @@ def _as_text(metrics: Mapping[str, float]) -> dict[str, str]:
 
 
 def damage_in_words(damage: Mapping[str, DamagedError]) -> str:
-    """A message with the labels of damaged runs, their errors, and what to do."""
+    """A message with the labels of damaged runs, their errors, and the remedy."""
     lines = [f"  {label}: {error}" for label, error in list(damage.items())[:SHOWN]]
     if len(damage) > SHOWN:
         lines.append(f"  ... and {len(damage) - SHOWN} more")

@@ -15,8 +15,7 @@ from music_rllib.experiment import sweep_files
 from music_rllib.experiment.location import SweepLocation, sweeps_in
 from music_rllib.redaction import redact
 from music_rllib.store.node_store import CONTINUATIONS
-from music_rllib.store.object_folder import open_storage
-from music_rllib.store.paths import sweep_folder
+from music_rllib.store.storage import is_remote, open_storage, sweep_folder
 from music_rllib.sweep.driver_lock import has_driver
 
 Item = dict[str, str]
@@ -75,7 +74,8 @@ def what_can_go(location: SweepLocation, *, unfinished: bool, everything: bool) 
     users = _users(location, nodes)
     pruned = set((state or {}).get("pruned", ()))
     cleaning = Cleaning()
-    filesystem, root = open_storage(location.storage)
+    storage = open_storage(location.storage)
+    filesystem, root = storage.filesystem, storage.path
 
     def exists(path: str) -> bool:
         return bool(filesystem.get_file_info(path).type != pafs.FileType.NotFound)
@@ -105,13 +105,13 @@ def what_can_go(location: SweepLocation, *, unfinished: bool, everything: bool) 
     if everything:
         cleaning.add(filesystem, f"{root}/{location.name}", "the sweep's own files")
         here = sweep_folder(location.storage, location.name)
-        if sweep_files.is_remote(location.storage) and here.is_dir():
+        if is_remote(location.storage) and here.is_dir():
             # A study is in it: the next sweep of this name would take that for its own.
             what = "the sweep's own files on this machine"
             cleaning.add(pafs.LocalFileSystem(), str(here), what)
-        for storage, study in _studies(location):
+        for database, study in _studies(location):
             what = f"study {study!r}: delete it with Optuna's tools where nobody needs it any more"
-            cleaning.keep(redact(storage), what)
+            cleaning.keep(redact(database), what)
     return cleaning
 
 

@@ -44,7 +44,7 @@ from music_rllib.runtime.machine import (
     ray_parent,
 )
 from music_rllib.runtime.process import early, give_back_freed_memory, try_for
-from music_rllib.store.paths import check_storage, resolve_storage, sweep_folder
+from music_rllib.store.storage import check_storage, resolve_storage, sweep_folder
 from music_rllib.sweep.driver_lock import hold_driver_lock
 from music_rllib.sweep.listeners.state_file import StateFile
 from music_rllib.sweep.preflight import (

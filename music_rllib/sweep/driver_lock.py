@@ -9,15 +9,14 @@ from music_rllib.errors import FAILED
 from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.runtime.process import end_process
 from music_rllib.store.lease import HeldLease, Lease, LeaseFile
-from music_rllib.store.object_folder import StorageError, open_storage
+from music_rllib.store.storage import StorageError, open_storage
 
 FILE = "driver.json"
 
 
 def has_driver(storage: str, name: str) -> bool:
     """Whether a process drives the sweep, or is about to: its `state.json` comes later."""
-    filesystem, root = open_storage(storage)
-    lease = LeaseFile(filesystem, f"{root}/{name}/{FILE}").read()
+    lease = LeaseFile(open_storage(storage) / name, FILE).read()
     return lease is not None and lease.holds()
 
 
@@ -35,9 +34,8 @@ def hold_driver_lock(sweep: OpenSweep, say: Callable[[str], None] = print) -> It
     Raises:
         StorageError: Another process has the lease, or the storage can't be written.
     """
-    filesystem, root = open_storage(sweep.storage)
-    folder, owner = f"{root}/{sweep.plan.name}", f"sweep {sweep.plan.name!r}"
-    file = LeaseFile(filesystem, f"{folder}/{FILE}")
+    place, owner = open_storage(sweep.storage) / sweep.plan.name, f"sweep {sweep.plan.name!r}"
+    file, folder = LeaseFile(place, FILE), place.path
     lease = Lease.of_this_process(owner)
     holder = file.acquire(lease)
     if holder is not None:

@@ -34,8 +34,7 @@ from music_rllib.search.ranking import (
     measure_of,
     scored_conditions,
 )
-from music_rllib.store.files import write_atomically
-from music_rllib.store.object_folder import StorageError
+from music_rllib.store.storage import StorageError, is_remote, write_atomically
 
 CHOSEN = "chosen.json"
 
@@ -221,7 +220,7 @@ def _stage(sweep: OpenSweep, node: Node, folder: Path) -> dict[str, Any]:
         source = {"init_from": place | {"task": given.task.name}}
     elif given is not None:
         checkpoint = sweep.store.folder(given.key)
-        if sweep_files.is_remote(sweep.storage):  # the copy that this is does not stay
+        if is_remote(sweep.storage):  # the copy that this is does not stay
             checkpoint = shutil.copytree(checkpoint, folder / "source", dirs_exist_ok=True)
         place = {"checkpoint": str(checkpoint.absolute())}
         source = {"init_from": place | {"task": given.task.name}}

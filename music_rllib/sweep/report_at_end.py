@@ -8,9 +8,8 @@ import sys
 from pathlib import Path
 
 from music_rllib import names
-from music_rllib.experiment.sweep_files import is_remote
 from music_rllib.redaction import redact
-from music_rllib.store.paths import below, sweep_folder
+from music_rllib.store.storage import below, is_remote, sweep_folder
 
 TIMEOUT_SECONDS = 900.0
 """After this time the sweep ends without a report."""

@@ -16,7 +16,7 @@ from music_rllib.experiment.run_info import run_info
 from music_rllib.policy.policy import policy_from_folder
 from music_rllib.store.history import Report, RunResult
 from music_rllib.store.node_store import NodeStore
-from music_rllib.store.object_folder import StorageError
+from music_rllib.store.storage import StorageError
 from music_rllib.tracking.client import Status
 from music_rllib.tracking.run_queue import StoredRun
 from music_rllib.tracking.tracker import Tracker

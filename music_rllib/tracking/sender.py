@@ -7,7 +7,7 @@ import random
 import threading
 from dataclasses import dataclass
 
-from music_rllib.store.object_folder import DamagedError
+from music_rllib.store.storage import DamagedError
 from music_rllib.tracking.client import is_lasting, mlflow_reason
 from music_rllib.tracking.run_queue import RunQueue
 

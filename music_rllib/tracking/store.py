@@ -21,8 +21,7 @@ from music_rllib import names
 from music_rllib.errors import TrackingError
 from music_rllib.experiment import sweep_files
 from music_rllib.redaction import redact
-from music_rllib.store.object_folder import StorageError
-from music_rllib.store.paths import database_url, sqlite_url
+from music_rllib.store.storage import StorageError, database_url, sqlite_url
 
 if TYPE_CHECKING:
     import requests

@@ -24,9 +24,9 @@ from music_rllib.command_line import PROGRAM
 from music_rllib.errors import TrackingError
 from music_rllib.experiment.run_info import RunInfo
 from music_rllib.redaction import redact, without_secrets
-from music_rllib.store.files import content_key
 from music_rllib.store.history import Report
-from music_rllib.store.paths import below
+from music_rllib.store.serialization import content_key
+from music_rllib.store.storage import below
 from music_rllib.tracking.client import Experiment, Status, mlflow_reason
 from music_rllib.tracking.run_queue import RunQueue, StoredRun
 from music_rllib.tracking.sender import Pending, Sender

@@ -129,11 +129,10 @@ def main() -> None:
     finally:
         shutil.rmtree(Path(calls).parent, ignore_errors=True)
     # Only now, as they take tens of megabytes.
-    from music_rllib.experiment.sweep_files import write
-    from music_rllib.store.object_folder import StorageError
+    from music_rllib.store.storage import StorageError, open_storage
 
     with contextlib.suppress(OSError, StorageError):  # it must not go on in any case
-        write(storage, record, f"{attempt}\n{seconds}\n{text}")
+        open_storage(storage).write(record, f"{attempt}\n{seconds}\n{text}".encode())
     os.kill(int(pid), signal.SIGKILL)
 
 

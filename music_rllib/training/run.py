@@ -20,7 +20,7 @@ from music_rllib.experiment.continuation import REPORT_INTERVAL
 from music_rllib.intrinsic.music import HELD_OUT_STEPS
 from music_rllib.replay.segments import Segment, new_segments
 from music_rllib.store.handoff import Spaces
-from music_rllib.store.state_io import read_arrays, read_state, write_arrays, write_state
+from music_rllib.store.serialization import read_arrays, read_state, write_arrays, write_state
 from music_rllib.store.work_folder import NewCheckpoint, SavedCheckpoint
 from music_rllib.tac.algorithm import TAC
 from music_rllib.tac.config import TACConfig

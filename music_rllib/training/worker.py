@@ -30,7 +30,7 @@ from music_rllib.store.history import (
 )
 from music_rllib.store.lease import HeldLease, Lease, LeaseLostError
 from music_rllib.store.node_store import NodeStore
-from music_rllib.store.object_folder import StorageError
+from music_rllib.store.storage import StorageError
 from music_rllib.store.work_folder import NewCheckpoint, SavedCheckpoint, WorkFolder, steps_of
 from music_rllib.training.divergence import divergence
 from music_rllib.training.environment import RunEnvironment
@@ -279,9 +279,8 @@ class RunTrainable(Trainable):
         job = self._job
         if job.source_key is None or job.source_task is None:
             return None
-        with TemporaryDirectory() as folder:
-            self._store.fetch(job.source_key, Path(folder))
-            return read_handoff(Path(folder), handed_over(job.run), job.source_task)
+        with self._store.files(job.source_key) as folder:
+            return read_handoff(folder, handed_over(job.run), job.source_task)
 
     def _start_watch(self) -> None:
         """Have this process ended if the environment hangs.
@@ -290,8 +289,8 @@ class RunTrainable(Trainable):
             HangError: The worker before this one was ended for that.
         """
         attempt = self._job.stop_key or "alone"
-        record = self._work.read(RECORD)
-        self._work.remove_file(RECORD)
+        record = self._work.folder.read_text(RECORD)
+        self._work.folder.remove(RECORD)
         check_hung(record, attempt, self._job.run.task.env_id)
         if (minutes := self._job.hang_minutes) is None:
             return

@@ -18,7 +18,7 @@ from music_rllib.experiment.scheduler import Scheduler
 from music_rllib.redaction import redact
 from music_rllib.store.history import from_json_lines
 from music_rllib.store.node_store import NodeStore
-from music_rllib.store.object_folder import DamagedError
+from music_rllib.store.storage import DamagedError
 from music_rllib.training.failure_reason import cause_of
 from music_rllib.training.hang_watch import RECORD
 from music_rllib.training.job import NodeJob
@@ -115,7 +115,7 @@ class TuneEvents(Callback):
             f"({trial.run_metadata.num_failures} of {RESTARTS} times)."
         )
         node = self._node(trial)
-        if self._store.work_folder(node.key).read(RECORD) is not None:
+        if self._store.work_folder(node.key).folder.read(RECORD) is not None:
             text = "its environment hangs, so its worker was ended; another one will say where"
         for listener in self._listeners:
             listener.noted(node, text)

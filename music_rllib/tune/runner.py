@@ -21,8 +21,7 @@ from music_rllib.experiment.plan import Node
 from music_rllib.experiment.scheduler import Scheduler, Status
 from music_rllib.runtime.machine import cluster_address
 from music_rllib.runtime.ray_cluster import cluster
-from music_rllib.store.object_folder import encoded
-from music_rllib.store.paths import below
+from music_rllib.store.storage import below, encoded
 from music_rllib.training.job import NodeJob
 from music_rllib.training.worker import RunTrainable
 from music_rllib.tune.events import RESTARTS, TuneEvents

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import pyarrow.fs as pafs
 import pytest
 import yaml
 
@@ -23,7 +22,7 @@ from music_rllib.experiment.plan import make_plan
 from music_rllib.store import lease as lease_module
 from music_rllib.store.history import RunResult
 from music_rllib.store.lease import Lease, LeaseFile
-from music_rllib.store.object_folder import StorageError
+from music_rllib.store.storage import StorageError, open_storage
 from music_rllib.sweep.driver_lock import hold_driver_lock
 
 RESULT = RunResult(label="l", env_steps=1200, seconds=1.0, metrics={})
@@ -177,7 +176,7 @@ def test_a_second_driver_is_refused_and_a_dead_one_does_not_count(
     tmp_path: Path, sweep_document: dict[str, Any]
 ) -> None:
     sweep = opened(tmp_path, sweep_document)
-    file = LeaseFile(pafs.LocalFileSystem(), str(sweep.folder / "driver.json"))
+    file = LeaseFile(open_storage(str(sweep.folder)), "driver.json")
     theirs = Lease.of_this_process("sweep 'points'")
     assert file.acquire(theirs) is None
     match = rf"points must be used by one process at a time.*\(process {os.getpid()} on "
@@ -202,7 +201,7 @@ def test_a_driver_that_was_suspended_ends_where_another_one_has_its_sweep(
     """And goes on where that one has ended since."""
     monkeypatch.setattr(lease_module, "EXPIRES_SECONDS", 0.4)
     sweep = opened(tmp_path, sweep_document)
-    file = LeaseFile(pafs.LocalFileSystem(), str(sweep.folder / "driver.json"))
+    file = LeaseFile(open_storage(str(sweep.folder)), "driver.json")
     ended: list[int] = []
     said: list[str] = []
     monkeypatch.setattr("music_rllib.sweep.driver_lock.end_process", ended.append)

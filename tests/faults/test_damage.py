@@ -266,7 +266,7 @@ def test_a_worker_whose_lease_is_lost_to_nobody_goes_on(
     if theirs == "released":
         Path(work.lease.path).unlink()
     else:
-        shutil.rmtree(work.root)
+        shutil.rmtree(work.folder.path)
     result: dict[str, Any] = {"done": False}
     while not result["done"]:
         result = trial.train()

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from music_rllib.store.node_store import NodeStore
-from music_rllib.store.object_folder import StorageError
+from music_rllib.store.storage import StorageError
 from tests.faults import comparison, sweeps
 from tests.faults.sweeps import resume
 from tests.integration.conftest import Program

@@ -16,7 +16,7 @@ from music_rllib.errors import BadInputError, first_line
 from music_rllib.experiment import sweep_files
 from music_rllib.redaction import for_people
 from music_rllib.report.live.state import Progress
-from music_rllib.store.object_folder import StorageError
+from music_rllib.store.storage import StorageError
 
 HOST = "127.0.0.1"
 LEAST_PAUSE = 10.0

@@ -12,7 +12,7 @@ from music_rllib.experiment import sweep_files
 from music_rllib.experiment.location import SweepLocation
 from music_rllib.labels import ShortLabels
 from music_rllib.redaction import redact
-from music_rllib.store.object_folder import StorageError
+from music_rllib.store.storage import StorageError
 
 WINDOW = 120.0
 """Seconds over which the speed is measured."""

@@ -40,7 +40,7 @@ def best(
     is complete, it is the best trial.
     """
     from music_rllib.experiment.location import find_sweep
-    from music_rllib.store.paths import sweep_folder
+    from music_rllib.store.storage import sweep_folder
     from music_rllib.sweep.export import export_best
 
     found = find_sweep(sweep, storage)

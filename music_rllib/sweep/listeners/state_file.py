@@ -26,7 +26,7 @@ from music_rllib.results.planned import LastValues
 from music_rllib.search.ranking import best_in_words, best_so_far
 from music_rllib.store.history import Report, RunResult, last_values
 from music_rllib.store.lease import process_start, this_machine
-from music_rllib.store.object_folder import StorageError
+from music_rllib.store.storage import StorageError, is_remote
 from music_rllib.store.work_folder import steps_of
 from music_rllib.sweep.cost import searched
 
@@ -67,7 +67,7 @@ class StateFile(Listener):
         """Trials in the `plan.json` that was written last."""
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="state_file", daemon=True)
-        self._interval = REMOTE_SECONDS if sweep_files.is_remote(sweep.storage) else LOCAL_SECONDS
+        self._interval = REMOTE_SECONDS if is_remote(sweep.storage) else LOCAL_SECONDS
         self._stop_path = f"{sweep.config.name}/{sweep_files.STOP}"
 
     def __enter__(self) -> Self:

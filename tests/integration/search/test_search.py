@@ -20,7 +20,7 @@ from sqlalchemy import create_engine, inspect, text
 
 from music_rllib import names
 from music_rllib.search.storage import known_studies
-from music_rllib.store.paths import database_url
+from music_rllib.store.storage import database_url
 from music_rllib.tracking.store import resolve_store
 from tests.faults import comparison
 from tests.integration.mlflow_server import USER, server_script

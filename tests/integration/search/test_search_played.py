@@ -36,7 +36,7 @@ from music_rllib.experiment.scheduler import Status
 from music_rllib.program import main
 from music_rllib.search.opening import learnings
 from music_rllib.search.summary import outcome
-from music_rllib.store.object_folder import StorageError
+from music_rllib.store.storage import StorageError
 from music_rllib.sweep.listeners.state_file import StateFile
 from tests.played_search import SPACE, Document, Driver, document, points, searched, success
 

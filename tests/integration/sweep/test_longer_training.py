@@ -63,7 +63,7 @@ def test_a_damaged_or_missing_end_costs_time_and_no_number(tmp_path: Path) -> No
     compute(short)
     kept = NodeStore(str(tmp_path)).continuation(continuation_key(short.run, None))
     (name,) = kept.names()
-    (Path(kept.root) / name / "history.jsonl").write_bytes(b"")
+    (Path(kept.folder.path) / name / "history.jsonl").write_bytes(b"")
     notes = compute(long)[0][NOTES]
     assert len(notes) == 1
     assert "a damaged checkpoint is skipped" in notes[0]

@@ -16,7 +16,8 @@ from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.policy import PolicyError, PolicyNetwork, find_policy, load_policy, locate
 from music_rllib.policy.network import PolicyFileError
 from music_rllib.store.handoff import Spaces, write_handoff
-from music_rllib.store.object_folder import ObjectFolders, open_storage
+from music_rllib.store.sealed import SealedFolders
+from music_rllib.store.storage import open_storage
 from music_rllib.tac.networks import Perceptron
 from music_rllib.tac.normaliser import RunningNormaliser
 
@@ -62,7 +63,7 @@ class Trained:
         return folder
 
     def publish(self, storage: Path, key: str = KEY) -> None:
-        with ObjectFolders(*open_storage(f"{storage}/nodes")).sealing(key, {}) as folder:
+        with SealedFolders(open_storage(f"{storage}/nodes")).sealing(key, {}) as folder:
             self.write(folder)
 
 
@@ -208,7 +209,7 @@ def test_is_found_by_key_label_and_place(tmp_path: Path) -> None:
     trained, storage = Trained(_run()), str(tmp_path)
     for key in (KEY, OTHER):
         trained.publish(tmp_path, key)
-    with ObjectFolders(*open_storage(f"{storage}/work/77aa")).sealing("000000000400-x", {}) as new:
+    with SealedFolders(open_storage(f"{storage}/work/77aa")).sealing("000000000400-x", {}) as new:
         trained.write(new)
     (tmp_path / "first").mkdir()
     nodes = [{"key": key, "label": f"run/seed={i}"} for i, key in enumerate((KEY, OTHER))]

@@ -17,7 +17,7 @@ from music_rllib.replay import segments as module
 from music_rllib.replay.buffer import TrajectoryReplay
 from music_rllib.replay.segments import MOST, Segment, new_segments
 from music_rllib.replay.trajectories import ReplayLayout, Trajectory
-from music_rllib.store.state_io import read_arrays, read_state, write_arrays, write_state
+from music_rllib.store.serialization import read_arrays, read_state, write_arrays, write_state
 
 pytestmark = pytest.mark.faults
 

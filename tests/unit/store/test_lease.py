@@ -19,9 +19,13 @@ from fsspec.implementations.memory import MemoryFileSystem  # type: ignore[impor
 
 from music_rllib.store import lease as lease_module
 from music_rllib.store.lease import HeldLease, Lease, LeaseFile, LeaseLostError, runs_here
-from music_rllib.store.object_folder import StorageError
+from music_rllib.store.storage import StorageError, StorageFolder, open_storage
 
 pytestmark = pytest.mark.faults
+
+
+def lease_file(path: Path) -> LeaseFile:
+    return LeaseFile(open_storage(str(path.parent)), path.name)
 
 
 @pytest.fixture(params=["disk", "object store"])
@@ -29,13 +33,13 @@ def place(
     request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> LeaseFile:
     if request.param == "disk":
-        return LeaseFile(pafs.LocalFileSystem(), str(tmp_path / "work" / "lease.json"))
+        return lease_file(tmp_path / "work" / "lease.json")
     monkeypatch.setattr(lease_module, "SETTLE_SECONDS", 0.05)
     memory = MemoryFileSystem()
     memory.store.clear()
     memory.pseudo_dirs[:] = [""]
     filesystem = pafs.PyFileSystem(pafs.FSSpecHandler(memory))
-    return LeaseFile(filesystem, "bucket/work/lease.json")
+    return LeaseFile(StorageFolder(filesystem, "bucket/work"), "lease.json")
 
 
 def elsewhere(what: str = "another sweep", seconds: float = 60.0) -> Lease:
@@ -82,20 +86,22 @@ def test_a_lease_is_renewed_while_it_is_held(place: LeaseFile) -> None:
 
 def test_the_lease_of_a_process_that_was_killed_here_needs_no_waiting(tmp_path: Path) -> None:
     code = (
-        "import sys, time, pyarrow.fs as pafs\n"
+        "import sys, time\n"
         "from music_rllib.store.lease import Lease, LeaseFile\n"
-        "LeaseFile(pafs.LocalFileSystem(), sys.argv[1]).acquire(Lease.of_this_process('theirs'))\n"
+        "from music_rllib.store.storage import open_storage\n"
+        "file = LeaseFile(open_storage(sys.argv[1]), 'lease.json')\n"
+        "file.acquire(Lease.of_this_process('theirs'))\n"
         "print('held', flush=True)\n"
         "time.sleep(600)\n"
     )
     path = tmp_path / "lease.json"
     process = subprocess.Popen(
-        [sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE, text=True
     )
     with process:
         assert process.stdout is not None
         assert process.stdout.readline() == "held\n"
-        file, mine = LeaseFile(pafs.LocalFileSystem(), str(path)), Lease.of_this_process("mine")
+        file, mine = lease_file(path), Lease.of_this_process("mine")
         assert file.acquire(mine) is not None
         os.kill(process.pid, signal.SIGKILL)
         process.wait()
@@ -107,7 +113,7 @@ def test_of_many_at_once_one_gets_it(tmp_path: Path) -> None:
     won: list[str] = []
 
     def contend() -> None:
-        file, lease = LeaseFile(pafs.LocalFileSystem(), path), Lease.of_this_process("one of many")
+        file, lease = lease_file(Path(path)), Lease.of_this_process("one of many")
         if file.acquire(lease) is None:
             won.append(lease.owner)
 
@@ -122,14 +128,14 @@ def test_of_many_at_once_one_gets_it(tmp_path: Path) -> None:
 def test_half_a_lease_is_none(tmp_path: Path) -> None:
     path = tmp_path / "lease.json"
     path.write_text('{"owner": "x", "pi')
-    file = LeaseFile(pafs.LocalFileSystem(), str(path))
+    file = lease_file(path)
     assert file.read() is None
     assert file.acquire(Lease.of_this_process("mine")) is None
 
 
 def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "work").write_text("a file where the folder should be")
-    file = LeaseFile(pafs.LocalFileSystem(), str(tmp_path / "work" / "lease.json"))
+    file = lease_file(tmp_path / "work" / "lease.json")
     with pytest.raises(StorageError, match=r"work.* must be writable"):
         file.acquire(Lease.of_this_process("mine"))
 
@@ -176,7 +182,7 @@ def test_a_lease_from_a_time_that_is_yet_to_come_holds_while_it_is_renewed(
 def test_who_lost_a_lease_is_told_and_leaves_no_folder(tmp_path: Path) -> None:
     """Another sweep took the run over, finished it and deleted its folder."""
     path = tmp_path / "work" / "key" / "lease.json"
-    file, mine = LeaseFile(pafs.LocalFileSystem(), str(path)), Lease.of_this_process("m", 0.4)
+    file, mine = lease_file(path), Lease.of_this_process("m", 0.4)
     assert file.acquire(mine) is None
     told = threading.Event()
     held = HeldLease(file, mine, told.set)
@@ -207,7 +213,7 @@ def test_a_lease_is_acquired_while_its_folder_is_deleted_again_and_again(tmp_pat
 
     deleting = threading.Thread(target=delete)
     deleting.start()
-    file = LeaseFile(pafs.LocalFileSystem(), str(folder / "lease.json"))
+    file = lease_file(folder / "lease.json")
     try:
         for _ in range(50):
             mine = Lease.of_this_process("mine")

@@ -13,8 +13,7 @@ import pyarrow.fs as pafs
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem  # type: ignore[import-untyped]
 
-from music_rllib.store import object_folder, verified
-from music_rllib.store.files import canonical_json, write_atomically
+from music_rllib.store import node_store, sealed
 from music_rllib.store.history import (
     HISTORY,
     Report,
@@ -24,7 +23,15 @@ from music_rllib.store.history import (
     to_json_lines,
 )
 from music_rllib.store.node_store import NodeStore
-from music_rllib.store.object_folder import DamagedError, ObjectFolders, StorageError, open_storage
+from music_rllib.store.sealed import Manifest, SealedFolders
+from music_rllib.store.serialization import canonical_json
+from music_rllib.store.storage import (
+    DamagedError,
+    StorageError,
+    StorageFolder,
+    open_storage,
+    write_atomically,
+)
 from music_rllib.store.work_folder import steps_of
 
 KEY = "0123456789abcdef0123"
@@ -53,7 +60,8 @@ def object_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> NodeStore:
     memory.pseudo_dirs[:] = [""]
     filesystem = pafs.PyFileSystem(pafs.FSSpecHandler(memory))
     monkeypatch.setattr(
-        "music_rllib.store.node_store.open_storage", lambda _: (filesystem, "bucket/path")
+        "music_rllib.store.node_store.open_storage",
+        lambda _: StorageFolder(filesystem, "bucket/path"),
     )
     return NodeStore("s3://bucket/path")
 
@@ -108,7 +116,7 @@ def test_an_interrupted_publication_leaves_nothing(
         raise KeyboardInterrupt
 
     for step in ("_rename", "_upload"):
-        monkeypatch.setattr(ObjectFolders, step, interrupted)
+        monkeypatch.setattr(SealedFolders, step, interrupted)
     with pytest.raises(KeyboardInterrupt):
         store.publish(KEY, produced, RESULT)
     monkeypatch.undo()
@@ -152,7 +160,7 @@ def test_damage_is_found_and_named(
     tamper(tmp_path / "storage" / "nodes" / KEY / "handoff" / "w.bin")
     with pytest.raises(DamagedError, match=message) as error:
         store.verify(KEY)
-    assert "again with --retrain-damaged" in str(error.value)
+    assert "--retrain-damaged" in str(error.value)
     assert list(store.damage([KEY])) == [KEY]
     assert not store.is_sound(KEY)
     store.remove(KEY)
@@ -164,15 +172,15 @@ def test_what_was_sound_is_not_read_again_and_damage_since_is_found(
     tmp_path: Path, produced: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read: list[str] = []
-    check = ObjectFolders.check
+    check = SealedFolders.check
 
-    def counting(folders: ObjectFolders, name: str) -> None:
+    def counting(folders: SealedFolders, name: str) -> Manifest:
         read.append(name)
-        check(folders, name)
+        return check(folders, name)
 
-    monkeypatch.setattr(ObjectFolders, "check", counting)
+    monkeypatch.setattr(SealedFolders, "check", counting)
     # A file's ctime cannot be set to an older time, so new files must count as old here.
-    monkeypatch.setattr(verified, "SETTLED_SECONDS", 0.0)
+    monkeypatch.setattr(node_store, "SETTLED_SECONDS", 0.0)
     keys = [f"{number:020d}" for number in range(3)]
     for key in keys:
         local_store(tmp_path).publish(key, produced, RESULT)
@@ -225,12 +233,12 @@ def test_a_result_in_the_manifest_that_is_not_the_end_of_the_history(
 def test_a_manifest_without_a_sound_result_is_damage(store: NodeStore, produced: Path) -> None:
     store.publish(KEY, produced, RESULT)
     path = f"{store.path(KEY)}/manifest.json"
-    with store._fs.open_input_stream(path) as stream:
+    with store._root.filesystem.open_input_stream(path) as stream:
         text = stream.read().decode()
-    with store._fs.open_output_stream(path) as sink:
+    with store._root.filesystem.open_output_stream(path) as sink:
         sink.write(text.replace('"seconds"', '"secunds"').encode())
     assert "must hold a run's result" in str(store.damage([KEY])[KEY])
-    with pytest.raises(DamagedError, match="--retrain-damaged"):
+    with pytest.raises(DamagedError, match="must hold a run's result"):
         store.result(KEY)
 
 
@@ -238,11 +246,11 @@ def test_sizes_tell_without_reading(store: NodeStore, produced: Path) -> None:
     store.publish(KEY, produced, RESULT)
     assert store.damage([KEY]) == {}
     (weights,) = [file for file in store._nodes.files(KEY) if file.endswith("w.bin")]
-    with store._fs.open_output_stream(weights) as sink:
+    with store._root.filesystem.open_output_stream(weights) as sink:
         sink.write(b"weight")
     (error,) = store.damage([KEY]).values()
     assert "w.bin must have 7 bytes, it has 6" in str(error)
-    store._fs.delete_file(weights)
+    store._root.filesystem.delete_file(weights)
     (error,) = store.damage([KEY]).values()
     assert "w.bin must exist, its manifest lists it" in str(error)
 
@@ -299,8 +307,8 @@ def test_a_folder_that_was_copied_without_its_manifest_is_replaced(
 
 def test_a_killed_publisher_leaves_no_node(tmp_path: Path, produced: Path) -> None:
     code = (
-        "import os, sys; from music_rllib.store import node_store, object_folder\n"
-        "object_folder.write_atomically = lambda *_: os._exit(9)\n"
+        "import os, sys; from music_rllib.store import node_store, sealed\n"
+        "sealed.write_atomically = lambda *_: os._exit(9)\n"
         "from pathlib import Path\n"
         "node_store.NodeStore(sys.argv[1]).publish('k', Path(sys.argv[2]))\n"
     )
@@ -319,7 +327,7 @@ def test_a_full_disk_names_the_path(
     def full(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(object_folder, "write_atomically", full)
+    monkeypatch.setattr(sealed, "write_atomically", full)
     with pytest.raises(StorageError, match=f"nodes/{KEY} must be writable: No space left"):
         local_store(tmp_path).publish(KEY, produced, RESULT)
     assert list((tmp_path / "storage" / "nodes").iterdir()) == []
@@ -403,8 +411,7 @@ def test_what_is_saved_after_damage_stays_and_replaces_it(store: NodeStore, keep
     if keep == 2:
         save(9000)
     for name in work.names():
-        with store._fs.open_output_stream(f"{work.root}/{name}/manifest.json") as stream:
-            stream.write(b"damage")
+        work.folder.write(f"{name}/manifest.json", b"damage")
     parts.clear()
     warnings: list[str] = []
     for steps in (4000, 8000, 12000):
@@ -428,12 +435,12 @@ def test_storage_that_cannot_be(tmp_path: Path) -> None:
 def test_storage_paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", "/home/somebody")
-    assert open_storage("results/")[1] == f"{tmp_path}/results"
-    assert open_storage("~/results")[1] == "/home/somebody/results"
-    assert open_storage("file:///data/results")[1] == "/data/results"
-    assert open_storage("/data/q%201?#")[1] == "/data/q%201?#"
+    assert open_storage("results/").path == f"{tmp_path}/results"
+    assert open_storage("~/results").path == "/home/somebody/results"
+    assert open_storage("file:///data/results").path == "/data/results"
+    assert open_storage("/data/q%201?#").path == "/data/q%201?#"
     for key in ("q%201", "a b#c", "ü/50%", "x+y=1,z"):  # as other clients of a bucket take it
-        assert open_storage(f"s3://k:s%2F1@bucket/{key}?region=x")[1] == f"bucket/{key}"
+        assert open_storage(f"s3://k:s%2F1@bucket/{key}?region=x").path == f"bucket/{key}"
 
 
 def test_reports_survive_as_json_lines() -> None:

@@ -11,9 +11,9 @@ import pytest
 
 from music_rllib.config.load import load_sweep
 from music_rllib.config.problems import ConfigError
-from music_rllib.store import paths
-from music_rllib.store.object_folder import StorageError
-from music_rllib.store.paths import (
+from music_rllib.store import storage as storage_module
+from music_rllib.store.storage import (
+    StorageError,
     below,
     check_answers,
     check_storage,
@@ -40,17 +40,14 @@ def test_a_folder_that_can_be_made_is_not_made(tmp_path: Path, place: str) -> No
 @pytest.mark.parametrize(
     ("place", "message"),
     [
-        ("file", "is a file"),
-        ("file/below", "is a file"),
-        ("folder/../file/x", "is a file"),
-        ("fifo", "is a pipe"),
-        ("dangling", "is a link to nothing: nowhere"),
+        ("file", "file must be a writable folder, for .*: Not a directory"),
+        ("folder/../file/x", "file must be a writable folder, for .*/x/sweep: Not a directory"),
+        ("fifo", "fifo must be a writable folder, .* Not a directory"),
+        ("dangling", "dangling must be a writable folder, .* No such file"),
         ("loop/x", "Too many levels of symbolic links"),
-        ("taken", "taken/sweep is a file"),
-        ("broken", "broken/nodes is a link to nothing: gone"),
-        ("x" * 300, "names of at most 255 bytes in its path, got one of 300"),
-        ("ä" * 200, "names of at most 255 bytes in its path, got one of 400"),
-        ("free/" + "x" * 256, "names of at most 255 bytes in its path, got one of 256"),
+        ("taken", "taken/sweep must be a writable folder, .* Not a directory"),
+        ("broken", "broken/nodes must be a writable folder, .* No such file"),
+        ("x" * 300, "must be a writable folder, .* File name too long"),
         ("a/" * 2500, "File name too long"),
         ("a\nb", r"without control characters, got '.*a\\nb'"),
         ("a\x1b[31mb", r"without control characters, got '.*a\\x1b\[31mb'"),
@@ -77,9 +74,7 @@ def test_a_place_for_nothing_is_refused(tmp_path: Path, place: str, message: str
 
 @pytest.mark.parametrize("place", ["/dev/null", "/dev/full", "/proc/self", "/proc/x", "/sys/x"])
 def test_devices_and_what_only_looks_like_folders(place: str) -> None:
-    with pytest.raises(
-        StorageError, match=f"{place.rpartition('/')[0]}.* (is a device|must be wr)"
-    ):
+    with pytest.raises(StorageError, match=f"{place.rpartition('/')[0]}.* must be a writable"):
         check_storage(place, "sweep")
 
 
@@ -90,7 +85,7 @@ def test_a_folder_of_somebody_else(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         raise PermissionError(13, "Permission denied", str(dir))
 
     monkeypatch.setattr("tempfile.TemporaryFile", refuse)
-    with pytest.raises(StorageError, match=f"{tmp_path} must be writable, .* Permission denied"):
+    with pytest.raises(StorageError, match=f"{tmp_path} must be a writable folder, .* Permission"):
         check_storage(str(tmp_path), "sweep")
 
 
@@ -103,7 +98,7 @@ def test_nobodys_home_and_bytes_that_are_no_text() -> None:
 
 def test_a_bucket_that_does_not_answer_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     """The system accepts the connection, and nothing answers; the client would wait for minutes."""
-    monkeypatch.setattr(paths, "ANSWER_SECONDS", 1.0)
+    monkeypatch.setattr(storage_module, "ANSWER_SECONDS", 1.0)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         uri = f"s3://key:secret@b/x?endpoint_override=127.0.0.1:{silent.getsockname()[1]}"
         began = time.monotonic()

@@ -31,11 +31,11 @@ from music_rllib.results.analysis import analyse
 from music_rllib.results.answer import answer, claim_rows, mean_rows
 from music_rllib.results.read import read_sweep
 from music_rllib.results.study import study_of
-from music_rllib.store import node_store, object_folder, paths
+from music_rllib.store import node_store
+from music_rllib.store import storage as storage_module
 from music_rllib.store.handoff import write_handoff
 from music_rllib.store.history import HISTORY, Report, RunResult, to_json_lines
-from music_rllib.store.object_folder import DamagedError
-from music_rllib.store.paths import sweep_folder
+from music_rllib.store.storage import DamagedError, StorageFolder, sweep_folder
 from music_rllib.sweep import clean, driver, driver_lock
 from music_rllib.sweep.export import sweep_of_run
 from music_rllib.sweep.listeners.state_file import StateFile
@@ -80,11 +80,11 @@ def storage(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.
     memory = MemoryFileSystem()
     memory.store.clear()
     memory.pseudo_dirs[:] = [""]
-    bucket = (pafs.PyFileSystem(pafs.FSSpecHandler(memory)), "bucket/path")
+    bucket = StorageFolder(pafs.PyFileSystem(pafs.FSSpecHandler(memory)), "bucket/path")
     # All are loaded by now: one that was loaded later would keep this for good.
-    for module in (object_folder, node_store, sweep_files, clean, driver_lock):
+    for module in (storage_module, node_store, sweep_files, location, clean, driver_lock):
         monkeypatch.setattr(module, "open_storage", lambda _: bucket)
-    for module in (location, paths):
+    for module in (location, storage_module):
         monkeypatch.setattr(module, "check_answers", lambda _: None)
     return "s3://bucket/path"
 
@@ -739,7 +739,7 @@ def test_a_damaged_run_is_named_by_every_command_and_trained_again_when_asked(
     good, bad = sweep.plan.nodes[0], sweep.plan.nodes[4]
     label = ShortLabels.of(node.label for node in sweep.plan.nodes)
     history = next(file for file in sweep.store._nodes.files(bad.key) if file.endswith(HISTORY))
-    with sweep.store._fs.open_output_stream(history) as sink:
+    with sweep.store._root.filesystem.open_output_stream(history) as sink:
         sink.write(b"")
     place, file = f"{storage}/mine", str(tmp_path / "sweep.yaml")
     for arguments in (

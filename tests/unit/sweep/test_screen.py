@@ -20,7 +20,7 @@ from music_rllib.experiment.scheduler import Scheduler
 from music_rllib.report.figures.palette import colour_of
 from music_rllib.schedules import Linear, Piecewise
 from music_rllib.store.history import Report, RunResult
-from music_rllib.store.paths import resolve_storage, sweep_folder
+from music_rllib.store.storage import resolve_storage, sweep_folder
 from music_rllib.sweep.listeners.screen import Display
 from music_rllib.sweep.views.alpha import adaptive_rows, adaptive_text, alpha_rows, alpha_table
 from music_rllib.sweep.views.tables import plan_view, results_table

@@ -15,7 +15,7 @@ from sqlalchemy.engine import make_url
 
 from music_rllib.errors import TrackingError
 from music_rllib.search.storage import same_database
-from music_rllib.store.paths import database_url, sqlite_url
+from music_rllib.store.storage import database_url, sqlite_url
 from music_rllib.tracking import store as store_module
 from music_rllib.tracking.store import RECORD, SweepRecord, check_reachable, resolve_store
 from tests.ports import free_port
