@@ -12,13 +12,13 @@ from music_rllib.command_line import PROGRAM, add_command, new_app, run_app
 from music_rllib.report import cli as report
 from music_rllib.runtime.quiet import prepare_environment, quiet_third_parties
 from music_rllib.serve import command as serve
-from music_rllib.sweep.commands import best, clean, compare, evaluate, files, run, status, stop
+from music_rllib.sweep.commands import best, clean, compare, evaluate, files, run, status
 
 COMMANDS: dict[str, tuple[Callable[..., int], str]] = {
     "run": (run.run, run.RUN_EXAMPLES),
     "plan": (run.plan, run.PLAN_EXAMPLES),
-    "status": (status.status, status.EXAMPLES),
-    "stop": (stop.stop, stop.EXAMPLES),
+    "status": (status.status, status.STATUS_EXAMPLES),
+    "stop": (status.stop, status.STOP_EXAMPLES),
     "resume": (run.resume, run.RESUME_EXAMPLES),
     "compare": (compare.compare, compare.EXAMPLES),
     "best": (best.best, best.EXAMPLES),

@@ -9,16 +9,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from music_rllib.config.run_settings import RETIRED
-from music_rllib.config.schema import SweepConfig
 from music_rllib.experiment.continuation import budget_settings, continued_from
 from music_rllib.experiment.earlier import differences
 from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.plan import Node
-from music_rllib.experiment.sweep_files import CONFIG, PLAN, SETTINGS, keep, read
+from music_rllib.experiment.sweep_files import PLAN, SETTINGS, keep, read
 from music_rllib.labels import ShortLabels, in_runs
-from music_rllib.redaction import redact
 from music_rllib.store.node_store import NodeStore
-from music_rllib.store.storage import StorageError, check_answers, resolve_storage
 from music_rllib.store.work_folder import steps_of
 from music_rllib.version import ALGORITHM_VERSION
 
@@ -115,21 +112,6 @@ def _changed_searches(
         if lines or (stage.source and stage.source.stage in changed):
             changed.append(stage.name)
             yield stage.name, lines
-
-
-def check_begun(config: SweepConfig) -> None:
-    """Refuse to resume a sweep that was never run.
-
-    Raises:
-        StorageError: There is no sweep of this name in the storage.
-    """
-    storage = resolve_storage(config.storage)[0]
-    check_answers(storage)
-    if read(storage, f"{config.name}/{CONFIG}") is None:
-        raise StorageError(
-            f"--resume must find an earlier run of sweep {config.name!r}, there is none in "
-            f"{redact(storage)}"
-        )
 
 
 def changes_since(sweep: OpenSweep) -> Changes | None:

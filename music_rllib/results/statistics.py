@@ -13,6 +13,7 @@ coverage of the intervals here; docs/reports.md lists it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -313,13 +314,17 @@ def number(value: float | Array) -> str:
 
 
 def with_interval(value: float | None, ends: Sequence[float | None] | None) -> str:
-    """`0.45 [0.3, 0.6]`, or `0.45` without an interval."""
+    """`0.45 [0.3, 0.6]`, or `0.45` without an interval; digits beyond the width are rounded off."""
     if value is None:
         return "-"
     low, high = ends or (None, None)
     if low is None or high is None or low != low or high != high:
         return f"{value:.3g}"
-    return f"{value:.3g} [{low:.3g}, {high:.3g}]"
+    if not 0 < high - low < math.inf:
+        return f"{value:.3g} [{low:.3g}, {high:.3g}]"
+    digits = 1 - math.floor(math.log10(high - low))
+    value, low, high = (round(number, digits) + 0.0 for number in (value, low, high))
+    return f"{value:.10g} [{low:.10g}, {high:.10g}]"
 
 
 def interval_text(estimate: Estimate) -> str:

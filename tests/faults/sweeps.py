@@ -37,8 +37,8 @@ class OwnProgram(Program):
 
     started: list[subprocess.Popen[str]] = field(default_factory=list)
 
-    def start(self, *options: str) -> subprocess.Popen[str]:
-        self.started.append(super().start(*options))
+    def start(self, *options: str, command: str = "run") -> subprocess.Popen[str]:
+        self.started.append(super().start(*options, command=command))
         return self.started[-1]
 
     def end_all(self) -> None:

@@ -50,7 +50,7 @@ def test_a_driver_in_a_new_pod_goes_on(
     program.environment["HOME"] = str(tmp_path / "one")
     sweeps.kill(sweeps.start_until(program, "finetune/q=1/seed0: started"))
     program.environment |= {"HOME": str(tmp_path / "two"), names.VARIABLE_REPORT: "on"}
-    code, output, errors = program.run("--resume", "--dry-run", "tac.lr=0.01")
+    code, output, errors = program.run("tac.lr=0.01", command="plan")
     assert code == 0, errors
     assert "would be trained anew" in output
     output = sweeps.finish(program)

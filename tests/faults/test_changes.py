@@ -144,18 +144,9 @@ def test_the_program_starts_nothing_until_changes_are_accepted(
     assert code == 2
     assert "tac.lr: 0.001 -> 0.01 (1 run)" in errors
     assert "starting a local Ray" not in output
-    code, output, errors = sweep_program.run("--dry-run")
+    code, output, errors = sweep_program.run(command="plan")
     assert code == 0
     assert "tac.lr: 0.001 -> 0.01 (1 run)" in output
-
-
-def test_resume_needs_something_to_go_on_with(
-    sweep_program: Any, sweep_document: dict[str, Any]
-) -> None:
-    sweep_program.write(sweep_document)
-    code, output, errors = sweep_program.run("--resume")
-    assert (code, output) == (2, "")
-    assert "--resume must find an earlier run of sweep 'points', there is none in " in errors
 
 
 @pytest.mark.thorough

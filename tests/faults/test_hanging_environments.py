@@ -146,7 +146,7 @@ def test_one_that_hangs_while_it_is_checked_ends_the_program(program: Program) -
     }
     document["resources"] |= {"hang_minutes": 0.1}
     program.write(document)
-    code, _, errors = program.run("--dry-run", timeout=sweeps.PATIENCE)
+    code, _, errors = program.run(command="plan", timeout=sweeps.PATIENCE)
     assert code == 2
     assert "error: environments.Hanging: step() must return within resources.hang_minu" in errors
     assert 'point_env.py", line ' in errors

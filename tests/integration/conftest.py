@@ -68,10 +68,10 @@ class Program:
         """Put `document` where the program reads it."""
         (self.folder / "sweep.yaml").write_text(yaml.safe_dump(document, sort_keys=False))
 
-    def start(self, *options: str) -> subprocess.Popen[str]:
+    def start(self, *options: str, command: str = "run") -> subprocess.Popen[str]:
         """Start it, in a process group of its own."""
         return subprocess.Popen(
-            [sys.executable, "-m", "music_rllib.sweep", "sweep.yaml", *options],
+            [sys.executable, "-m", "music_rllib.sweep", command, "sweep.yaml", *options],
             cwd=self.folder,
             env=self.environment,
             stdout=subprocess.PIPE,
@@ -80,9 +80,11 @@ class Program:
             start_new_session=True,
         )
 
-    def run(self, *options: str, timeout: float = 240) -> tuple[int, str, str]:
+    def run(
+        self, *options: str, command: str = "run", timeout: float = 240
+    ) -> tuple[int, str, str]:
         """Run it to its end: exit code, standard output, standard error."""
-        process = self.start(*options)
+        process = self.start(*options, command=command)
         try:
             output, errors = process.communicate(timeout=timeout)
         finally:

@@ -151,7 +151,7 @@ def test_init_writes_a_sweep_that_runs_and_replaces_none(
     monkeypatch.chdir(tmp_path)
     assert main(["init", "my reach.yaml"]) == 0
     assert main(["plan", "my reach.yaml", "seeds=2"]) == 0
-    assert "6 runs, 60,000 env steps in all" in capsys.readouterr().out
+    assert "6 runs, 60,000 env steps in total" in capsys.readouterr().out
     assert load_sweep("my reach.yaml").name == "my_reach"
     # The other sweep that its comments show.
     text = Path("my reach.yaml").read_text()

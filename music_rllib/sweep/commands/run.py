@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from music_rllib.command_line import Json
 from music_rllib.sweep.commands.arguments import Place, Storage
+
+if TYPE_CHECKING:
+    from music_rllib.config.schema import SweepConfig
 
 RUN_EXAMPLES = """\
 Examples:
@@ -50,7 +53,7 @@ Config = Annotated[
     Path | None,
     typer.Argument(
         metavar="CONFIG",
-        help="Sweep file (YAML). Without one, a small packaged sweep runs.",
+        help="Sweep file (YAML). Default: a small packaged sweep.",
         show_default=False,
     ),
 ]
@@ -104,7 +107,7 @@ KeepRuns = Annotated[
     typer.Option(
         "--keep-runs",
         help="If an environment has changed since runs used it, use these runs as they are. The "
-        "answer is kept in the storage. Without an answer the command starts nothing.",
+        "storage records this choice. Without it the command starts nothing.",
     ),
 ]
 RetrainDamaged = Annotated[
@@ -123,39 +126,21 @@ def run(
     storage: SweepStorage = None,
     name: Name = None,
     seeds: Seeds = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Check everything, show the plan, run nothing.")
-    ] = False,
     accept_changes: AcceptChanges = False,
     retrain: Retrain = None,
     keep_runs: KeepRuns = False,
     retrain_damaged: RetrainDamaged = False,
-    resume: Annotated[
-        bool,
-        typer.Option(
-            "--resume",
-            help="Start only if this sweep has run before. A repeated command resumes the sweep "
-            "with and without this option.",
-        ),
-    ] = False,
     json: Json = False,
 ) -> int:
     """Train every run of a sweep and log them to MLflow."""
-    from music_rllib.sweep.driver import run_sweep
+    from music_rllib.sweep import driver
 
-    config, overrides = _file_and_overrides(config, overrides)
-    return run_sweep(
-        config,
-        dry_run=dry_run,
-        storage=storage,
-        name=name,
-        seeds=seeds,
-        overrides=overrides,
+    return driver.run(
+        _load(config, overrides, storage, name, seeds),
         accept_changes=accept_changes,
         retrain=retrain or (),
         keep_runs=keep_runs,
         retrain_damaged=retrain_damaged,
-        must_exist=resume,
         as_json=json,
     )
 
@@ -180,19 +165,10 @@ def plan(
 
     No run is started. The `analysis` section is recorded as the analysis plan of the sweep.
     """
-    from music_rllib.sweep.driver import run_sweep
+    from music_rllib.sweep import driver
 
-    config, overrides = _file_and_overrides(config, overrides)
-    return run_sweep(
-        config,
-        dry_run=True,
-        measure=measure,
-        storage=storage,
-        name=name,
-        seeds=seeds,
-        overrides=overrides,
-        as_json=json,
-    )
+    sweep = _load(config, overrides, storage, name, seeds)
+    return driver.plan(sweep, measure=measure, as_json=json)
 
 
 def resume(
@@ -207,11 +183,10 @@ def resume(
 ) -> int:
     """Resume a stopped or killed sweep, using the configuration kept in its storage."""
     from music_rllib.experiment.location import find_sweep
-    from music_rllib.sweep.driver import run_sweep
+    from music_rllib.sweep import driver
 
-    return run_sweep(
-        find_sweep(sweep, storage),
-        seeds=seeds,
+    return driver.run(
+        find_sweep(sweep, storage).config(seeds),
         accept_changes=accept_changes,
         retrain=retrain or (),
         keep_runs=keep_runs,
@@ -220,11 +195,17 @@ def resume(
     )
 
 
-def _file_and_overrides(
-    config: Path | None, overrides: list[str] | None
-) -> tuple[Path | None, list[str]]:
-    """The file and its overrides; a first argument with a `=` that is no file is an override."""
-    given = list(overrides or ())
+def _load(
+    config: Path | None,
+    overrides: list[str] | None,
+    storage: str | None,
+    name: str | None,
+    seeds: str | None,
+) -> SweepConfig:
+    """The sweep; a first argument with a `=` that is not a file is an override."""
+    from music_rllib.sweep import driver
+
+    overrides = overrides or []
     if config is not None and "=" in str(config) and not config.exists():
-        return None, [str(config), *given]
-    return config, given
+        config, overrides = None, [str(config), *overrides]
+    return driver.load(config, name=name, storage=storage, seeds=seeds, overrides=overrides)

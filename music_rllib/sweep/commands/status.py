@@ -1,4 +1,4 @@
-"""`status`: the state of a sweep."""
+"""`status` and `stop`: the state of a sweep, and a request to stop it."""
 
 from __future__ import annotations
 
@@ -14,12 +14,19 @@ from music_rllib.sweep.commands.arguments import Place, Storage
 if TYPE_CHECKING:
     from music_rllib.experiment.location import SweepLocation
 
-EXAMPLES = """\
+STATUS_EXAMPLES = """\
 Examples:
   music-rllib status results/smoke
   music-rllib status results/smoke --watch
       update the view until the sweep ends
   music-rllib status s3://bucket/sweeps/smoke --json
+"""
+STOP_EXAMPLES = """\
+Examples:
+  music-rllib stop results/smoke
+      runs save their state and the sweep ends, as with Ctrl-C
+  music-rllib stop s3://bucket/sweeps/smoke --wait 0
+      from any machine, without waiting for the end
 """
 
 
@@ -36,6 +43,8 @@ def status(
     json: Json = False,
 ) -> int:
     """Show the progress of a sweep: stages, trials, runs, budget and best result so far."""
+    from rich.live import Live
+
     from music_rllib.experiment.location import find_sweep
     from music_rllib.sweep.views.status import status_view
 
@@ -49,8 +58,6 @@ def status(
     elif not watch:
         console.print(status_view(state, _labels(location)))
     else:
-        from rich.live import Live
-
         with Live(console=console, auto_refresh=False) as live:
             live.update(status_view(state, _labels(location)), refresh=True)
             while state["state"] == "running":
@@ -72,14 +79,13 @@ def state_of(location: SweepLocation) -> dict[str, Any]:
     state = location.read(sweep_files.STATE)
     if state is None:
         return {"sweep": location.name, "place": location.place, "state": "not started"}
-    earlier = location.earlier()
     outcome = state["driver"]["outcome"]
     if not sweep_files.is_alive(state):
         outcome = "interrupted" if outcome == "running" else outcome
         _mark_interrupted(state)
-    store = NodeStore(location.storage)
-    finished = store.finished(node["key"] for node in location.nodes())
-    labels = {node["key"]: node["label"] for node in location.nodes() if node["key"] in finished}
+    store, nodes = NodeStore(location.storage), location.nodes()
+    finished = store.finished(node["key"] for node in nodes)
+    labels = {node["key"]: node["label"] for node in nodes if node["key"] in finished}
     damaged = [
         {"run": labels[key], "cause": str(error)} for key, error in store.damage(labels).items()
     ]
@@ -88,12 +94,12 @@ def state_of(location: SweepLocation) -> dict[str, Any]:
         "state": outcome,
         **state,
         "damaged": damaged,
-        "earlier": earlier,
+        "earlier": location.earlier(),
     }
 
 
 def _mark_interrupted(state: dict[str, Any]) -> None:
-    """Call the runs interrupted that a driver which has ended had under way when it last wrote."""
+    """Mark the runs as interrupted that were running when the driver last wrote its state."""
     state["interrupted"] = [*state.get("interrupted", ()), *state["running"]]
     state["running"] = []
     for stage in state["stages"]:
@@ -102,3 +108,45 @@ def _mark_interrupted(state: dict[str, Any]) -> None:
     for search in state["searches"]:
         for arm in search["arms"] if search["storage"] is None else ():
             arm["running"] = 0  # a study of the sweep's own has no other driver
+
+
+def stop(
+    sweep: Place,
+    storage: Storage = None,
+    wait: Annotated[
+        float,
+        typer.Option(
+            metavar="SECONDS",
+            help="Time to wait for the end; the exit code is 1 if the sweep still runs then.",
+        ),
+    ] = 120.0,
+    json: Json = False,
+) -> int:
+    """Ask a running sweep to save its state and stop.
+
+    The request goes through the storage, so the sweep can run on another machine.
+    """
+    from music_rllib.experiment import sweep_files
+    from music_rllib.experiment.location import find_sweep
+    from music_rllib.sweep.driver_lock import has_driver
+
+    location = find_sweep(sweep, storage)
+    name = location.name
+    console = console_for(as_json=json)
+    state = state_of(location)["state"]
+    deadline = time.monotonic() + wait
+    while state != "running" and has_driver(location.storage, name) and time.monotonic() < deadline:
+        time.sleep(0.5)  # the sweep is starting
+        state = state_of(location)["state"]
+    was_running = state == "running"
+    if was_running:
+        sweep_files.write(location.storage, f"{name}/{sweep_files.STOP}", '{"stop": true}')
+        while state == "running" and time.monotonic() < deadline:
+            time.sleep(0.5)
+            state = state_of(location)["state"]
+        console.print(f"{name}: {'was told to stop' if state == 'running' else 'has stopped'}")
+    else:
+        console.print(f"{name}: is not running ({state})")
+    if json:
+        print_json({"sweep": name, "was_running": was_running, "state": state})
+    return FAILED if state == "running" and wait > 0 else 0

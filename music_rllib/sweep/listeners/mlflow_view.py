@@ -1,7 +1,7 @@
 """The view of MLflow's chart page that the link at the end of a sweep opens.
 
-MLflow keeps what its *Save view* makes as a tag of the experiment, and opens it by the tag's key
-(`?viewStateShareKey=KEY`). That format is MLflow's own: it was read out of the pages of `VERSIONS`.
+MLflow keeps the result of *Save view* as a tag of the experiment, and opens it by the tag's key
+(`?viewStateShareKey=KEY`). The format is MLflow's own, as its pages of `VERSIONS` read it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ GROUPED = {
 """Setting to the tag that holds its value."""
 METRICS = (names.EVAL_RETURN, names.SHANNON_ENTROPY, names.ENTROPY, names.MI_BOUND)
 """Charts after those of the tasks' primary metrics."""
-OPEN_SECTION = "comparison"
+SECTION = "comparison"
 
 
 def comparison_view(plan: Plan, sweep_id: str, now: float) -> str:
@@ -99,7 +99,7 @@ def _card(kind: str, uuid: str) -> dict[str, Any]:
     return {
         "type": kind,
         "uuid": uuid,
-        "metricSectionId": OPEN_SECTION,
+        "metricSectionId": SECTION,
         "runsCountToCompare": 100,
         "deleted": False,
         "isGenerated": False,
@@ -107,8 +107,8 @@ def _card(kind: str, uuid: str) -> dict[str, Any]:
 
 
 def _sections() -> Iterator[dict[str, Any]]:
-    """The comparison, and folded what MLflow would unfold: a section for each group of metrics."""
-    section = {"uuid": OPEN_SECTION, "name": "Comparison", "display": True, "isReordered": True}
+    """The open section of the comparison, and a folded one for each group of metrics."""
+    section = {"uuid": SECTION, "name": "Comparison", "display": True, "isReordered": True}
     yield section | {"columns": 2}
     for group in (*names.GROUPS, "Model metrics", "System metrics"):
         section = {"uuid": f"folded-{group}", "name": group, "display": False}

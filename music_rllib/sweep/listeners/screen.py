@@ -16,8 +16,7 @@ from music_rllib.experiment.plan import Node, Plan
 from music_rllib.experiment.scheduler import Scheduler, Status
 from music_rllib.labels import ShortLabels
 from music_rllib.store.history import Report, RunResult
-from music_rllib.sweep.views.tables import new_table
-from music_rllib.sweep.views.text import clock, evaluated_in_words, measured, percent
+from music_rllib.sweep.views.text import clock, evaluation_text, measured, new_table, percent
 from music_rllib.training.throughput import Throughput
 
 REFRESH_SECONDS = 0.5
@@ -103,7 +102,7 @@ class Display(Listener):
 
     def finished(self, node: Node, result: RunResult) -> None:
         self._running.pop(node.key, None)
-        evaluated = evaluated_in_words(node.run.task, result.metrics)
+        evaluated = evaluation_text(node.run.task, result.metrics)
         cost = f"{result.env_steps:,} env steps in {clock(result.seconds)}"
         self._say_of(node, f"finished, {evaluated}, {cost}", "green")
 
@@ -196,5 +195,5 @@ class Display(Listener):
         if rate is not None:
             parts += [f"{rate:.0f} steps/s", f"{clock(left)} left"]
         if node.run.task.primary_metric in throughput.metrics:
-            parts.append(evaluated_in_words(node.run.task, throughput.metrics))
+            parts.append(evaluation_text(node.run.task, throughput.metrics))
         return ", ".join(parts)

@@ -28,7 +28,7 @@ from music_rllib.store.history import Report, RunResult, last_values
 from music_rllib.store.lease import process_start, this_machine
 from music_rllib.store.storage import StorageError, is_remote
 from music_rllib.store.work_folder import steps_of
-from music_rllib.sweep.cost import searched
+from music_rllib.sweep.views.budget import searched_runs
 
 LOCAL_SECONDS, REMOTE_SECONDS = 2.0, 15.0
 """Between two writes of `state.json`, in a folder and in a bucket."""
@@ -223,7 +223,7 @@ class StateFile(Listener):
             asked = [run for run in plan.runs if run.stage == stage.name]
             if stage.search is None or any(run.part.startswith("final") for run in asked):
                 continue  # the runs on fresh seeds are asked for last, and all at once
-            at_most = sum(kind.runs * kind.env_steps for kind in searched(config, stage))
+            at_most = sum(one.runs * one.env_steps for one in searched_runs(config, stage))
             known = sum(node.run.env_steps for node in plan.nodes if node.stage == stage.name)
             steps += max(0, at_most - known)
         return steps

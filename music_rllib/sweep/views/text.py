@@ -1,11 +1,34 @@
-"""Values in a few characters, for tables, lines and tags."""
+"""Tables, and values in a few characters."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
+from typing import Any
+
+from rich.table import Table
 
 from music_rllib import names
 from music_rllib.envs.tasks import Task
+from music_rllib.experiment.plan import short
+
+
+def new_table(title: str, heads: Iterable[str], left: Collection[str] = ()) -> Table:
+    """A table whose cells are folded and never cut.
+
+    Args:
+        title: Text above it.
+        heads: Heads of its columns, in order.
+        left: Heads of the left-aligned columns of text; numbers are right-aligned.
+    """
+    table = Table(title=title, title_justify="left", box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for head in heads:
+        table.add_column(head, justify="left" if head in left else "right", overflow="fold")
+    return table
+
+
+def setting_cells(settings: Iterable[str], values: Mapping[str, Any]) -> list[str]:
+    """A cell for each setting: its value, or `-` if it has none."""
+    return [short(values[name], name) if name in values else "-" for name in settings]
 
 
 def percent(value: float | None) -> str:
@@ -14,12 +37,12 @@ def percent(value: float | None) -> str:
 
 
 def measured(metric: str, value: float | None) -> str:
-    """`35 %` of a rate, `-5.2` of another metric, or `-` for None."""
+    """`35 %` for a rate, `-5.2` for another metric, or `-` for None."""
     return percent(value) if value is None or metric in names.EVAL_RATES else f"{value:.4g}"
 
 
-def evaluated_in_words(task: Task, metrics: Mapping[str, float]) -> str:
-    """A run's last evaluation by its task's own metric: `success 35 % (any step 40 %)`."""
+def evaluation_text(task: Task, metrics: Mapping[str, float]) -> str:
+    """A run's last evaluation by its task's primary metric: `success 35 % (any step 40 %)`."""
     metric = task.primary_metric
     text = f"{names.word_of(metric)} {measured(metric, metrics.get(metric))}"
     if metric != names.EVAL_SUCCESS:

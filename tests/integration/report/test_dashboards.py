@@ -141,7 +141,7 @@ def test_every_query_returns_data_of_a_running_sweep(
         output, errors = process.communicate(timeout=120)
     assert ended is None, f"the sweep must not end before it is seen:\n{output}{errors}"
     assert process.returncode == 128 + signal.SIGTERM
-    assert "continue with: python -m music_rllib.sweep sweep.yaml" in output
+    assert "continue with: python -m music_rllib.sweep run sweep.yaml" in output
     assert not waiting, f"no data for {list(waiting)}"
     assert labels == {"sweep", "task", "q"}
     (success,) = seen["Success rate by q and task A"]

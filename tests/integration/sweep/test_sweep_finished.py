@@ -93,7 +93,7 @@ def _run(folder: Path, report: str) -> str:
 
 def test_the_screen_shows_the_plan_the_runs_and_their_results(finished: Finished) -> None:
     output = finished.output
-    assert "3 runs, 3,600 env steps in all." in output
+    assert "3 runs, 3,600 env steps in total." in output
     assert output.index("Sweep points") < output.index(": started") < output.index("Results of")
     unexpected = [line for line in output.splitlines() if not EXPECTED.match(line)]
     assert unexpected == [], "the newcomer's screen"

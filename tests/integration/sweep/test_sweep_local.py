@@ -154,7 +154,7 @@ def test_beside_a_second_driver_stopped_killed_and_continued(
     process.send_signal(signal.SIGINT)
     output, errors = process.communicate(timeout=60)
     assert (process.returncode, errors) == (130, "")
-    assert "continue with: python -m music_rllib.sweep sweep.yaml" in output
+    assert "continue with: python -m music_rllib.sweep run sweep.yaml" in output
     assert [row[-1] for row in rows(output)] == ["interrupted"]
 
     process = sweep_program.start_until(": continues at ")

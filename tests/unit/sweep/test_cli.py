@@ -15,7 +15,7 @@ from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.experiment.open_sweep import OpenSweep, open_sweep
 from music_rllib.program import main
 from music_rllib.store.handoff import write_handoff
-from music_rllib.sweep import driver
+from music_rllib.sweep import execution
 from tests.hostile_files import SPACES
 
 Document = dict[str, Any]
@@ -45,15 +45,15 @@ def program(
     def begun(*_: object) -> int:
         raise AssertionError("the sweep began")
 
-    monkeypatch.setattr(driver, "_compute_and_report", begun)
+    monkeypatch.setattr(execution, "compute_and_report", begun)
 
-    def run(document: Document | None = None, *options: str) -> Result:
+    def run(document: Document | None = None, *options: str, command: str = "run") -> Result:
         arguments = list(options)
         if document is not None:
             (tmp_path / "sweep.yaml").write_text(yaml.safe_dump(document))
-            arguments = ["run", "sweep.yaml", *options]
+            arguments = [command, "sweep.yaml", *options]
         capsys.readouterr()
-        code = main(arguments or ["run"])
+        code = main(arguments)
         output, errors = capsys.readouterr()
         return Result(code, output + errors, errors)
 
@@ -75,23 +75,23 @@ def from_checkpoint(folder: Path) -> Document:
     return document(stages=[{"name": "f", "variant": "music-r", "init_from": source}])
 
 
-def test_a_dry_run_shows_the_plan_and_leaves_nothing(program: Program, tmp_path: Path) -> None:
-    result = program(document(), "--dry-run")
+def test_plan_shows_the_runs_and_leaves_nothing(program: Program, tmp_path: Path) -> None:
+    result = program(document(), command="plan")
     assert result.exit_code == 0
-    assert "1 run, 200,000 env steps in all." in result.output
+    assert "1 run, 200,000 env steps in total." in result.output
     assert f"Storage: {tmp_path}/results" in result.output
     assert [path.name for path in tmp_path.iterdir()] == ["sweep.yaml"]
 
 
 def test_without_a_file_the_packaged_sweep_runs(program: Program) -> None:
-    result = program(None, "run", "--dry-run")
+    result = program(None, "plan")
     assert result.exit_code == 0
     assert "No CONFIG given" in result.output
     assert "tac.entropic_index: 1, 1.5, 2" in result.output
 
 
 def test_options_replace_name_and_storage(program: Program, tmp_path: Path) -> None:
-    result = program(document(), "--dry-run", "--name", "other", "--storage", "elsewhere")
+    result = program(document(), "--name", "other", "--storage", "elsewhere", command="plan")
     assert "Sweep other" in result.output
     assert f"Storage: {tmp_path}/elsewhere" in result.output
 
@@ -100,18 +100,18 @@ def test_mlflows_own_variable_stands_in_for_an_absent_setting(
     program: Program, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://me:planted@127.0.0.1:9")
-    result = program(document(), "--dry-run")
+    result = program(document(), command="plan")
     line = "MLflow: http://127.0.0.1:9, from MLFLOW_TRACKING_URI (mlflow.tracking_uri=null keeps"
     assert line in result.output
     assert "planted" not in result.output
     result = program(document())
     assert result.exit_code == 2
     assert "(from the environment variable MLFLOW_TRACKING_URI) must name an MLf" in result.stderr
-    given = program(document(mlflow={"tracking_uri": "http://127.0.0.1:9"}), "--dry-run")
-    null = program(document(), "mlflow.tracking_uri=null", "--dry-run")
+    given = program(document(mlflow={"tracking_uri": "http://127.0.0.1:9"}), command="plan")
+    null = program(document(), "mlflow.tracking_uri=null", command="plan")
     assert "MLFLOW_TRACKING_URI" not in given.output + null.output
     monkeypatch.setenv("MLFLOW_TRACKING_URI", "./mlruns")
-    result = program(document(), "--dry-run")
+    result = program(document(), command="plan")
     assert result.exit_code == 2
     assert "MLFLOW_TRACKING_URI) must be null (a sqlite file" in result.stderr
 
@@ -191,10 +191,10 @@ BAD: list[tuple[Document, str]] = [
 def test_bad_input_is_refused_before_anything_starts(
     program: Program, tmp_path: Path, bad: Document, message: str
 ) -> None:
-    for options in ((), ("--dry-run",)):
-        if options and "server that answers" in message:
+    for command in ("run", "plan"):
+        if command == "plan" and "server that answers" in message:
             continue  # a plan needs no MLflow
-        result = program(bad, *options)
+        result = program(bad, command=command)
         assert result.exit_code == 2, result.output
         assert message in result.stderr
         assert result.stderr.startswith("error: ")
@@ -250,15 +250,13 @@ def test_a_refused_sweep_is_not_recorded(
     assert not list(tmp_path.rglob("*.db"))
 
 
-@pytest.mark.parametrize("command", [("plan",), ("run", "--dry-run")])
 @pytest.mark.parametrize(
     ("bad", "message"), REFUSED[:-2], ids=[message[:30] for _, message in REFUSED[:-2]]
 )
 def test_a_plan_is_refused_as_its_sweep_would_be(
-    program: Program, tmp_path: Path, command: tuple[str, ...], bad: Document, message: str
+    program: Program, tmp_path: Path, bad: Document, message: str
 ) -> None:
-    (tmp_path / "sweep.yaml").write_text(yaml.safe_dump(bad))
-    result = program(None, command[0], "sweep.yaml", *command[1:])
+    result = program(bad, command="plan")
     assert (result.exit_code, message in result.stderr) == (2, True), result.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["sweep.yaml"]
 
@@ -266,7 +264,7 @@ def test_a_plan_is_refused_as_its_sweep_would_be(
 def test_a_refused_configuration_does_not_replace_the_one_that_ran(
     program: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(driver, "_compute_and_report", lambda *_: 0)
+    monkeypatch.setattr(execution, "compute_and_report", lambda *_: 0)
     assert program(document()).exit_code == 0
     before = (tmp_path / "results/s/config.json").read_text()
     other = document(seeds=[7], mlflow={"tracking_uri": "http://127.0.0.1:9"})
@@ -278,7 +276,7 @@ def test_a_search_may_learn_from_a_stage_above_it(program: Program) -> None:
     """Its study is made with the sweep's own."""
     first = searched()["stages"][0]
     second = searched(warm_start={"study": "s/a"})["stages"][0] | {"name": "b"}
-    assert program(document(stages=[first, second]), "--dry-run").exit_code == 0
+    assert program(document(stages=[first, second]), command="plan").exit_code == 0
 
 
 def test_files_that_are_none(program: Program, tmp_path: Path) -> None:
@@ -355,7 +353,7 @@ def test_a_damaged_node_that_others_start_from(
         return opened[-1]
 
     monkeypatch.setattr("music_rllib.sweep.driver.open_sweep", remember)
-    program(document(stages=[PRETRAIN, finetune]), "--dry-run")
+    program(document(stages=[PRETRAIN, finetune]), command="plan")
     key = opened[-1].plan.nodes[0].key
     produced = tmp_path / "produced"
     handoff(produced / "handoff", "FetchPush")
@@ -368,7 +366,7 @@ def test_a_damaged_node_that_others_start_from(
     assert f"{node}/handoff/handoff.json must have " in result.stderr
     assert "--retrain-damaged" in result.stderr
     (node / "manifest.json").write_text("{}")
-    result = program(document(stages=[PRETRAIN, finetune]), "--dry-run")
+    result = program(document(stages=[PRETRAIN, finetune]), command="plan")
     assert result.exit_code == 2
     assert f"{node}/manifest.json must be a manifest" in result.stderr
     assert "--retrain-damaged" in result.stderr
@@ -387,7 +385,7 @@ def test_a_mistyped_option_is_bad_input(program: Program) -> None:
 def test_the_command_line_is_recorded_with_the_file(
     program: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(driver, "_compute_and_report", lambda *_: 0)
+    monkeypatch.setattr(execution, "compute_and_report", lambda *_: 0)
     assert program(document(), "seeds=2", "env_steps=7e3").exit_code == 0
     kept = json.loads((tmp_path / "results/s/config.json").read_text())
     assert (kept["seeds"], kept["defaults"]["env_steps"]) == ([0, 1], 7000)
@@ -448,6 +446,13 @@ def test_an_option_or_place_that_cannot_be_is_bad_input(
     assert (result.exit_code, result.stderr.startswith(f"error: {message}")) == (2, True), (
         result.stderr
     )
+
+
+def test_resume_needs_a_sweep(program: Program, tmp_path: Path) -> None:
+    (tmp_path / "results/s").mkdir(parents=True)
+    result = program(None, "resume", str(tmp_path / "results/s"))
+    assert result.exit_code == 2
+    assert "SWEEP must be a sweep that was started" in result.stderr
 
 
 def test_a_folder_that_is_not_there(program: Program, tmp_path: Path) -> None:

@@ -687,7 +687,7 @@ def test_an_analysis_plan_is_recorded_and_changes_no_run(
     plain.write_text(yaml.safe_dump(SWEEP))
     folder = tmp_path / "results/mine"
     keys = {node["key"] for node in program("plan", str(plain), "--json").document["nodes"]}
-    assert not folder.exists()  # a dry run leaves nothing where nothing was planned
+    assert not folder.exists()  # plan leaves nothing without an analysis plan
 
     def recorded(**analysis: Any) -> list[Any]:
         asked = {"hypotheses": ["q = 1.5 better than q = 1"], **analysis}
@@ -744,7 +744,6 @@ def test_a_damaged_run_is_named_by_every_command_and_trained_again_when_asked(
     place, file = f"{storage}/mine", str(tmp_path / "sweep.yaml")
     for arguments in (
         ("run", file, "--storage", storage),
-        ("run", file, "--storage", storage, "--dry-run"),
         ("plan", file, "--storage", storage),
         ("resume", place),
         ("best", place),

@@ -10,10 +10,11 @@ from music_rllib.config.load import load_sweep
 from music_rllib.experiment.plan import make_plan
 from music_rllib.runtime import machine
 from music_rllib.sweep import cost
+from music_rllib.sweep.views.budget import RunGroup, run_groups
 from music_rllib.training.sample_run import RunSample
 
 
-def kinds(folder: Path, finished: int = 0, **changes: Any) -> list[cost.Kind]:
+def kinds(folder: Path, finished: int = 0, **changes: Any) -> list[RunGroup]:
     document: dict[str, Any] = {
         "name": "s",
         "tasks": ["FetchPush", "FetchSlide"],
@@ -31,7 +32,7 @@ def kinds(folder: Path, finished: int = 0, **changes: Any) -> list[cost.Kind]:
     path.write_text(yaml.safe_dump(document | changes))
     config = load_sweep(path)
     plan = make_plan(config)
-    return cost.kinds(config, plan, {node.key for node in plan.nodes[:finished]})
+    return run_groups(config, plan, {node.key for node in plan.nodes[:finished]})
 
 
 def test_runs_of_one_task_differ_in_cost_by_their_networks_and_not_by_q(tmp_path: Path) -> None:
@@ -89,7 +90,7 @@ SAMPLE = RunSample(
 
 
 def costs(folder: Path) -> list[cost.Cost]:
-    return [cost.Cost(kind=kind, sample=SAMPLE) for kind in kinds(folder)]
+    return [cost.Cost(group=group, sample=SAMPLE) for group in kinds(folder)]
 
 
 def test_the_time_is_training_evaluations_and_start(tmp_path: Path) -> None:
@@ -105,8 +106,8 @@ def test_the_time_is_training_evaluations_and_start(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("here", "told"),
     [
-        (16, "Together they take up to 6.0 of this machine's 16.0 GiB of memory."),
-        (4, "this machine has 4.0: set resources.memory_per_run to 1.5."),
+        (16, "Together they need up to 6.0 of this machine's 16.0 GiB of memory."),
+        (4, "this machine has 4.0. Set resources.memory_per_run to 1.5."),
     ],
 )
 def test_runs_that_no_memory_holds_side_by_side_are_told_of(
@@ -114,5 +115,5 @@ def test_runs_that_no_memory_holds_side_by_side_are_told_of(
 ) -> None:
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     monkeypatch.setattr(machine, "memory", lambda: here * 2**30)
-    caption = cost.cost_table(costs(tmp_path), slots=4).caption
-    assert told in str(caption)
+    view = cost.cost_view(costs(tmp_path), slots=4)
+    assert any(told in str(line) for line in view.renderables)

@@ -1,0 +1,185 @@
+"""Computes what is left of an opened sweep and shows the results."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+
+from music_rllib import names
+from music_rllib.command_line import how_to_continue
+from music_rllib.errors import FAILED
+from music_rllib.experiment.open_sweep import OpenSweep
+from music_rllib.experiment.scheduler import Status
+from music_rllib.experiment.sweep_files import as_json
+from music_rllib.results.analysis_plan import PlanVersion, as_document
+from music_rllib.runtime.machine import cluster_address
+from music_rllib.runtime.process import give_back_freed_memory, try_for
+from music_rllib.sweep.listeners.mlflow_view import VERSIONS, comparison_view
+from music_rllib.sweep.listeners.prometheus import PrometheusListener
+from music_rllib.sweep.listeners.screen import Display
+from music_rllib.sweep.listeners.state_file import StateFile
+from music_rllib.sweep.report_at_end import report_at_end
+from music_rllib.sweep.views.results import results_table, search_views
+from music_rllib.tracking.listener import MlflowListener
+from music_rllib.tracking.tracker import Tracker
+
+if TYPE_CHECKING:
+    from music_rllib.search.controller import SearchController
+
+LAST_SECONDS = 20.0
+"""Time to write the last state and to close MLflow's runs after Ray has died."""
+CLOSE_SECONDS = 10.0
+"""The part of it in which MLflow receives what is left."""
+LISTED_REUSED_RUNS = 10
+
+
+def open_tracker(opened: OpenSweep) -> Tracker:
+    """The connection to MLflow, with the shared view of the sweep.
+
+    Raises:
+        BadInputError: MLflow can't be used.
+    """
+    give_back_freed_memory()
+    tracker = Tracker(
+        sweep_name=opened.config.name,
+        storage=opened.storage,
+        config=opened.config.document,
+        tracking_uri=opened.config.mlflow.tracking_uri,
+    )
+    tracker.keep_view(comparison_view(opened.plan, tracker.sweep_id, time.time()), VERSIONS)
+    return tracker
+
+
+def compute_and_report(
+    console: Console, opened: OpenSweep, tracker: Tracker, versions: Sequence[PlanVersion]
+) -> int:
+    """Compute what is left, show the results and write the report; the exit code.
+
+    Args:
+        console: Shows progress and results.
+        opened: The sweep, whose lock this process holds.
+        tracker: As `open_tracker` returns it.
+        versions: The recorded versions of its analysis plan.
+    """
+    if versions:
+        plans = as_json(as_document(versions))
+        tracker.put_sweep_artifact(names.ARTEFACT_ANALYSIS_PLAN, plans)
+    with (
+        Display(console, opened.plan, opened.scheduler) as display,
+        StateFile(opened) as state_file,
+    ):
+        mlflow_log = MlflowListener(tracker, opened.store, opened.environments.now)
+        display.headline = state_file.headline
+        _take_over_reused(opened, display, mlflow_log)
+        controller = None
+        if opened.plan.searched:
+            from music_rllib.sweep.searches import begin_searches, end_searches
+
+            controller = begin_searches(opened, display, mlflow_log, state_file)
+        tracker.keep_current(node.key for node in opened.plan.nodes)
+        stopped_by = _compute(opened, display, mlflow_log, state_file, controller)
+        searches = [] if controller is None else end_searches(opened, controller, tracker)
+        tracker.keep_current(node.key for node in opened.plan.nodes)  # with trials since then
+        lost = _lost_trials(searches)
+        failed = (
+            bool(opened.scheduler.having(Status.FAILED, Status.SKIPPED))
+            or lost > 0
+            or (stopped_by is None and not opened.scheduler.complete)
+        )
+        state_file.end("stopped" if stopped_by else "failed" if failed else "finished")
+    tracker.close("KILLED" if stopped_by else "FAILED" if failed else "FINISHED")
+    _show_results(console, opened, tracker, state_file, searches)
+    if lost:
+        console.print(
+            f"{lost} trials failed because a run of theirs failed. This study does not try them "
+            "again; with another search.study the next command does, and reuses finished runs.",
+            style="yellow",
+            soft_wrap=True,
+        )
+    if stopped_by is not None:
+        console.print(how_to_continue(), soft_wrap=True)
+        return 128 + stopped_by
+    config = opened.config
+    report = report_at_end(opened.storage, config.name, config.mlflow.tracking_uri, config.path)
+    if report is not None:
+        console.print(report, soft_wrap=True)
+    return FAILED if failed else 0
+
+
+def _lost_trials(searches: Sequence[Mapping[str, Any]]) -> int:
+    """Number of trials that failed because a run failed, under earlier drivers too."""
+    return sum(t["lost"] for one in searches for arm in one["arms"] for t in arm["trials"])
+
+
+def _take_over_reused(opened: OpenSweep, display: Display, mlflow_log: MlflowListener) -> None:
+    """List the reused runs, and log those that MLflow does not have."""
+    reused = opened.scheduler.having(Status.REUSED)
+    for node in reused[:LISTED_REUSED_RUNS]:
+        display.say(f"{display.short(node.label)}: finished earlier, reused")
+    if len(reused) > LISTED_REUSED_RUNS:
+        display.say(f"{len(reused) - LISTED_REUSED_RUNS} more: finished earlier, reused")
+    for node in reused:
+        mlflow_log.finished(node)
+
+
+def _compute(
+    opened: OpenSweep,
+    display: Display,
+    mlflow_log: MlflowListener,
+    state_file: StateFile,
+    controller: SearchController | None,
+) -> int | None:
+    """Compute what is left, if anything; the signal that stopped it, or None."""
+    if opened.scheduler.complete and (controller is None or controller.over):
+        return None
+    from music_rllib.tune.runner import compute  # Ray and RLlib take seconds to load
+
+    address = cluster_address()
+    display.say("starting a local Ray" if address is None else f"connecting to Ray at {address}")
+    tracker = mlflow_log.tracker
+    gauges = PrometheusListener(
+        opened.config.name, opened.scheduler, tracker.pending, opened.folder
+    )
+    searches = [] if controller is None else [controller]
+
+    def on_stop() -> None:
+        display.say("stopping, this takes a few seconds; Ctrl-C again stops at once", "yellow")
+
+    def on_ray_gone(cause: str | None) -> None:
+        stopped = "Ray was told to stop as well, so nothing more can be saved"
+        display.say(cause or stopped, "red" if cause else "yellow")
+        try_for(
+            LAST_SECONDS,
+            lambda: state_file.end("failed" if cause else "stopped"),
+            lambda: tracker.close("FAILED" if cause else "KILLED", timeout=CLOSE_SECONDS),
+        )
+        display.say(how_to_continue())
+
+    try:
+        listeners = [mlflow_log, display, state_file, gauges, *searches]
+        return compute(opened, listeners, on_stop, on_ray_gone, controller)
+    finally:
+        gauges.close()
+
+
+def _show_results(
+    console: Console,
+    opened: OpenSweep,
+    tracker: Tracker,
+    state_file: StateFile,
+    searches: Sequence[dict[str, Any]],
+) -> None:
+    """Print the results of runs and searches, and where MLflow shows them."""
+    reached = state_file.unfinished | opened.results()
+    results = results_table(opened.plan, state_file.status, reached)
+    if results.rows:  # a sweep may consist of searches only
+        console.print(results)
+    for view in search_views(searches):
+        console.print(view)
+    if undelivered := tracker.undelivered_message():
+        console.print(undelivered, style="yellow", soft_wrap=True)
+    console.print(f"Compare in MLflow: {tracker.comparison_url()}", soft_wrap=True)
+    console.print(f"Open MLflow's pages with: {tracker.store.ui_command()}", soft_wrap=True)

@@ -1,0 +1,260 @@
+"""The plan of a sweep, as text with tables and as plain data."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import closing
+from typing import Any
+
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from music_rllib import names
+from music_rllib.config.remarks import remarks
+from music_rllib.config.schema import Source, Stage, SweepConfig
+from music_rllib.config.search import SearchSettings
+from music_rllib.config.space import Choice, Dimension
+from music_rllib.config.tac_settings import MatchedAlpha, NormalisedAlpha, alpha_at, setting_text
+from music_rllib.envs.tasks import Task
+from music_rllib.experiment.open_sweep import OpenSweep, plan_document
+from music_rllib.experiment.plan import Node, Plan, shared_runs, short
+from music_rllib.labels import in_runs
+from music_rllib.redaction import redact
+from music_rllib.schedules import QUANTITIES, Linear, Measured, Piecewise, value_at
+from music_rllib.sweep.views.budget import search_budget
+from music_rllib.sweep.views.text import new_table
+
+
+def plan_view(config: SweepConfig, plan: Plan, finished: Collection[str]) -> RenderableType:
+    """Stages, trials, runs, environment steps, and finished runs."""
+    heads = ("stage", "trials", "runs", "env steps per run", "env steps", "finished")
+    table = new_table(f"Sweep {plan.name}", heads, left=["stage"])
+    seeds = len(config.seeds)
+    for stage in config.stages:
+        table.add_row(stage.name, *_stage_cells(stage, plan, finished, seeds))
+    lines = [*(_stage_text(stage, seeds) for stage in config.stages), _summary(plan, finished)]
+    searched = [stage for stage in config.stages if stage.search is not None]
+    if searched:
+        budgets = [search_budget(stage, seeds) for stage in searched]
+        runs = sum(budget.runs for budget in budgets)
+        steps = sum(budget.env_steps for budget in budgets)
+        lines[-1] += f" Searches: up to {runs} more runs and {steps:,} more env steps"
+        fresh = any(stage.search and stage.search.final and stage.source for stage in searched)
+        lines[-1] += ", without the source runs of fresh seeds." if fresh else "."
+    parts: list[RenderableType] = [table, *map(Text, lines)]
+    if rows := alpha_rows(plan):
+        parts.append(_alpha_table(rows))
+    return Group(*parts, *(Text(adaptive_text(row)) for row in adaptive_rows(plan)))
+
+
+def _stage_cells(stage: Stage, plan: Plan, finished: Collection[str], seeds: int) -> list[str]:
+    if stage.search is not None:
+        studies, budget = len(stage.search.compared()), search_budget(stage, seeds)
+        trials = stage.search.count
+        return [
+            f"{studies} x {trials}" if studies > 1 else str(trials),
+            f"≤ {budget.runs}",
+            f"≤ {max(budget.trial_env_steps, budget.fresh_env_steps):,}",
+            f"≤ {budget.env_steps:,}",
+            "-",
+        ]
+    runs = [run for run in plan.runs if run.stage == stage.name]
+    if not runs:  # a search varies its settings and asks for its runs
+        env_steps = next(iter(stage.points[0].runs.values())).env_steps
+        return ["as needed", "-", f"{env_steps:,}", "-", "-"]
+    budgets = sorted(plan.node(run.key).run.env_steps for run in runs)
+    return [
+        str(len({run.trial for run in runs})),
+        str(len(runs)),
+        " to ".join(f"{steps:,}" for steps in dict.fromkeys((budgets[0], budgets[-1]))),
+        f"{sum(budgets):,}",
+        str(sum(run.key in finished for run in runs)),
+    ]
+
+
+def _stage_text(stage: Stage, seeds: int) -> str:
+    """A stage's variant, tasks, source and seeds, and a line for each setting that it varies."""
+    search = stage.search
+    fresh = f" and {search.final.seeds} fresh" if search and search.final else ""
+    text = (
+        f"{stage.name}: {stage.variant} on {', '.join(map(_task_text, stage.tasks))} from "
+        f"{_source_text(stage.source)}, {seeds} seed{'s' * (seeds > 1)}{fresh}"
+    )
+    settings = _grid_settings(stage) if search is None else _searched_settings(search)
+    return "\n  ".join((text, *settings))
+
+
+def _task_text(task: Task) -> str:
+    """The task's name, with its primary metric unless that is success."""
+    metric = task.primary_metric
+    return task.name if metric == names.EVAL_SUCCESS else f"{task.name} ({names.word_of(metric)})"
+
+
+def _source_text(source: Source | None) -> str:
+    if source is None:
+        return "scratch"
+    origin = source.stage or str(source.checkpoint.folder if source.checkpoint else "")
+    return f"{origin} ({source.task.name})" if source.task else origin
+
+
+def _grid_settings(stage: Stage) -> list[str]:
+    values: dict[str, dict[str, None]] = {}
+    for point in stage.points:
+        for name, value in point.values.items():
+            values.setdefault(name, {})[short(value, name)] = None
+    if math.prod(map(len, values.values())) > len(stage.points):  # settings that vary together
+        points = [
+            ", ".join(short(value, name) for name, value in point.values.items())
+            for point in stage.points
+        ]
+        return [f"{', '.join(values)}: {'; '.join(points)}"]
+    return [f"{name}: {', '.join(choices)}" for name, choices in values.items()]
+
+
+def _searched_settings(search: SearchSettings) -> Iterator[str]:
+    yield f"searched by {search.sampler}:"
+    for name, dimension in search.space.items():
+        yield f"{name}: {_dimension_text(name, dimension)}"
+    for name, values in search.compare.items():
+        yield f"{name}: {', '.join(short(value, name) for value in values)} ({search.mode})"
+
+
+def _dimension_text(name: str, dimension: Dimension) -> str:
+    if isinstance(dimension, Choice):
+        return ", ".join(short(value, name) for value in dimension.choice)
+    low, high = dimension.bounds
+    step = "" if dimension.step in (None, 1) else f" by {dimension.step:g}"
+    return f"{low:g} to {high:g}{step}{' (log)' if dimension.log else ''}"
+
+
+def _summary(plan: Plan, finished: Collection[str]) -> str:
+    left = [node for node in plan.nodes if node.key not in finished]
+    parts = [in_runs(len(plan.runs))]
+    if len(plan.nodes) < len(plan.runs):
+        parts.append(f"{len(plan.nodes)} different ones")
+    parts.append(f"{plan.env_steps:,} env steps in total")
+    if reused := len(plan.nodes) - len(left):
+        parts.append(f"{reused} finished earlier and reused")
+        parts.append(f"{sum(node.run.env_steps for node in left):,} env steps left")
+    return ", ".join(parts) + "."
+
+
+def plan_answer(opened: OpenSweep, changes: str) -> dict[str, Any]:
+    """The plan as plain data, with the changes since the last run of the sweep."""
+    config, plan = opened.config, opened.plan
+    searches = [
+        {
+            "stage": stage.name,
+            "mode": stage.search.mode,
+            "sampler": stage.search.sampler,
+            "studies": len(stage.search.compared()),
+            "trials": stage.search.count,
+            "runs_at_most": search_budget(stage, len(config.seeds)).runs,
+            "space": stage.search.model_dump(mode="json", by_alias=True)["space"],
+        }
+        for stage in config.stages
+        if stage.search is not None
+    ]
+    finished = opened.finished
+    nodes = [
+        node | {"finished": node["key"] in finished} for node in plan_document(opened)["nodes"]
+    ]
+    return {
+        "sweep": config.name,
+        "storage": redact(opened.storage),
+        "seeds": list(config.seeds),
+        "runs": len(plan.runs),
+        "env_steps": plan.env_steps,
+        "env_steps_left": sum(node["env_steps"] for node in nodes if not node["finished"]),
+        "nodes": nodes,
+        "searches": searches,
+        "remarks": [*remarks(config), *shared_runs(plan)],
+        "alpha": alpha_rows(plan),
+        "adaptive": adaptive_rows(plan),
+        "changes": changes or None,
+    }
+
+
+# -- alpha and settings that follow a measurement -------------------------------------------------
+
+
+def alpha_rows(plan: Plan) -> list[dict[str, Any]]:
+    """Alpha at the start and at the end of a run, for each stage, scaled alpha and q.
+
+    A plain alpha has no row because it is as given, a learned one because it is not known yet.
+    """
+    scaled = [
+        node
+        for node in plan.nodes
+        if isinstance(node.run.tac.alpha, MatchedAlpha | NormalisedAlpha)
+    ]
+    # Only the joint entropy's scale depends on the number of dimensions of an action.
+    joint = {n.run.task.name: n.run.task for n in scaled if n.run.tac.entropy_form == "joint"}
+    dimensions = {name: _action_dimensions(task) for name, task in joint.items()}
+    rows = _unique(_alpha_row(node, dimensions.get(node.run.task.name, 1)) for node in scaled)
+    return sorted(rows, key=lambda row: (row["stage"], row["alpha"], row["q_at_start"]))
+
+
+def _alpha_row(node: Node, action_dimensions: int) -> dict[str, Any]:
+    tac, budget = node.run.tac, node.run.env_steps
+    q_at_start = value_at(tac.entropic_index, 0, budget)
+    q_at_end = _final_q(tac.entropic_index, budget)
+    return {
+        "stage": node.stage,
+        "alpha": setting_text(tac.alpha),
+        "q": setting_text(tac.entropic_index),
+        "q_at_start": q_at_start,
+        "at_start": alpha_at(tac, q_at_start, 0, budget, action_dimensions),
+        "at_end": alpha_at(tac, q_at_end, budget, budget, action_dimensions),
+    }
+
+
+def _final_q(q: float | Linear | Piecewise | Measured, budget: int) -> float:
+    """The q at the end of a run; one that follows a measurement ends at its last point."""
+    if isinstance(q, Measured):
+        return q.points[-1 if q.follows == "success_rate" else 0][1]
+    return value_at(q, budget, budget)
+
+
+def _action_dimensions(task: Task) -> int:
+    from music_rllib.envs.make import make_env  # few plans need an environment
+
+    with closing(make_env(task.env_id, **task.env_kwargs)) as env:
+        return int(env.action_space.shape[0])  # type: ignore[index]
+
+
+def _alpha_table(rows: Iterable[dict[str, Any]]) -> Table:
+    heads = ("stage", "alpha", "q", "α at the start", "at the end")
+    table = new_table("α for each q", heads, left=heads[:2])
+    for row in rows:
+        numbers = (f"{row['at_start']:.4g}", f"{row['at_end']:.4g}")
+        table.add_row(row["stage"], row["alpha"], row["q"], *numbers)
+    return table
+
+
+def adaptive_rows(plan: Plan) -> list[dict[str, Any]]:
+    """The settings of each stage that follow a measurement, with their points."""
+    return _unique(
+        {"stage": node.stage, "setting": name} | setting.model_dump(mode="json")
+        for node in plan.nodes
+        for name, setting in (
+            ("tac.entropic_index", node.run.tac.entropic_index),
+            ("music.mi_reward_weight", node.run.music.mi_reward_weight),
+        )
+        if isinstance(setting, Measured)
+    )
+
+
+def _unique(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    return list({repr(row): row for row in rows}.values())
+
+
+def adaptive_text(row: dict[str, Any]) -> str:
+    """`her: tac.entropic_index follows the success rate: 2 at 0.2, 1 at 0.9`."""
+    points = ", ".join(f"{value:g} at {measured:g}" for measured, value in row["points"])
+    text = f"{row['stage']}: {row['setting']} follows the {QUANTITIES[row['follows']]}: {points}"
+    if row["smoothing"]:
+        text += f"; averaged over {row['smoothing']:g} env steps"
+    return text + ("; never goes back" if row["monotone"] else "")
