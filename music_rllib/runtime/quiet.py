@@ -33,6 +33,7 @@ _EXPECTED_NOTICES: dict[str, tuple[str, ...]] = {
 
 # Loggers whose INFO messages repeat the program's output, or mean nothing to a user.
 _CHATTY_LOGGERS = (
+    "ray._private.worker",  # "Started a local Ray instance."
     "ray.tune.tune",  # "Wrote the latest version of all result files ..."
     "ray.tune.trainable.trainable",  # "Trainable.setup took ..."
     "ray.train._internal.storage",  # "Checkpoint successfully created at ..."

@@ -1,1 +1,1 @@
-"""One run being trained: built from its settings, advanced, checkpointed, watched."""
+"""One run: build it from its settings, train it, save checkpoints, watch for hangs."""

@@ -1,4 +1,4 @@
-"""The cause of a run's failure, in one or two lines."""
+"""Name the cause of a run's failure in one or two lines."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ def cause_of(error: BaseException | None, text: str, limit: int = 300) -> str:
     """One or two lines that name the cause of a failure.
 
     Args:
-        error: The exception that Ray raised in the driver; None where it could not be read.
-        text: Its traceback, whose last line names the cause then.
-        limit: Most characters per line.
+        error: The exception that Ray raised in the driver; None if it could not be read.
+        text: Its traceback, whose last line replaces a missing `error`.
+        limit: Maximum number of characters per line.
     """
     if isinstance(error, RayTaskError) and isinstance(error.cause, BaseException):
         error = error.cause
@@ -41,10 +41,10 @@ def cause_of(error: BaseException | None, text: str, limit: int = 300) -> str:
 
 
 def trace_of(error: BaseException) -> str:
-    """The traceback of an exception that a run has raised.
+    """The traceback of an exception of a run.
 
     Raises:
-        SystemExit: The error itself, by which Ray ends the process.
+        SystemExit: The exception itself, if Ray raised it to end the process.
     """
     if hasattr(error, "ray_terminate_msg"):
         raise error
@@ -61,12 +61,12 @@ def in_words_only() -> Iterator[None]:
 
 
 def _memory() -> str:
-    """Memory of the worker, which is the process that calls this, and of its machine."""
+    """Memory of this process and its machine."""
     memory, own = psutil.virtual_memory(), psutil.Process().memory_info().rss
     return (
         f"The process had {own / 2**30:.1f} GiB, {memory.available / 2**30:.1f} of the machine's "
-        f"{memory.total / 2**30:.1f} GiB are free. Fewer runs at once or a smaller replay.capacity "
-        "need less."
+        f"{memory.total / 2**30:.1f} GiB are free. Train fewer runs at once, or reduce "
+        "replay.capacity."
     )
 
 
@@ -75,7 +75,7 @@ def _non_empty(text: str) -> list[str]:
 
 
 def _cause_of_death(text: str) -> list[str]:
-    """The cause of a worker process that died, or whose first task raised."""
+    """The cause of death of a worker process, or the error of its first task."""
     if "creation task" in text:
         return _non_empty(text)[-1:]
     place = ", ".join(f"{name} {value}" for name, value in _PLACE.findall(text))

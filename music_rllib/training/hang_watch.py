@@ -1,9 +1,9 @@
 """A process that kills a worker whose environment hangs, and records the worker's stack.
 
-The watching process loads nothing but a bare Python. When one call of `step()` or `reset()` lasts
-too long, it makes the worker write its stack, which `faulthandler` does without Python's lock, puts
-that into the run's work folder, and kills the worker. The worker that is started in its place finds
-the record and fails the run.
+If a call of `step()` or `reset()` takes too long, the watching process makes the worker write its
+stack (`faulthandler` does not need Python's lock), copies the stack into the run's work folder and
+kills the worker. The next worker of the run finds the record and fails the run. Until then, the
+watching process imports only Python's own modules.
 """
 
 from __future__ import annotations
@@ -21,27 +21,27 @@ from pathlib import Path
 from tempfile import mkdtemp
 
 RECORD = "hung.txt"
-"""File in a run's work folder: the attempt that hung, the seconds it hung, and the stack."""
+"""File in a run's work folder: the attempt, the seconds that it hung, and the stack."""
 LOOKS = 20
-"""Looks of the watching process in the time that a call may take."""
+"""Number of looks of the watching process during the time limit of a call."""
 LONGEST_PAUSE, DUMP_SECONDS = 5.0, 5.0
 
 
 class HangError(RuntimeError):
-    """An environment that did not return; the message has the stack in which it hangs."""
+    """An environment did not return; the message has the stack in which it hangs."""
 
 
 class HangWatch:
-    """The worker's side: it is watched until `end`."""
+    """The worker's side; the worker is watched until `end`."""
 
     def __init__(self, seconds: float, storage: str, key: str, attempt: str) -> None:
         """Start the watching process.
 
         Args:
-            seconds: Longest duration of one call of the environment.
-            storage: The record is written into its folder `work/<key>`.
+            seconds: Maximum duration of one call of the environment.
+            storage: The record is written to `work/<key>` in this storage.
             key: The run's key.
-            attempt: Name that tells the record from those of earlier sweeps.
+            attempt: Name of this attempt, which earlier records do not have.
 
         Raises:
             OSError: The watching process can't be started.
@@ -58,7 +58,7 @@ class HangWatch:
         faulthandler.register(signal.SIGUSR2, self._stack, all_threads=True)
         names = (str(calls), str(stack), storage, f"work/{key}/{RECORD}", attempt)
         self._process = subprocess.Popen(  # noqa: S603
-            # -P: the folder of this file has names of its own.
+            # -P: no module of this file's folder may replace one of Python.
             [sys.executable, "-P", __file__, str(os.getpid()), str(seconds), *names],
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
@@ -71,7 +71,7 @@ class HangWatch:
         import faulthandler
 
         assert self._process.stdin is not None
-        self._process.stdin.close()  # it ends at that
+        self._process.stdin.close()  # which ends the process
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(timeout=5.0)
         self._calls.unshare()
@@ -83,8 +83,8 @@ def check_hung(record: str | None, attempt: str, what: str) -> None:
     """Fail if a worker hung in this attempt.
 
     Args:
-        record: The content of the record; None where there is none.
-        attempt: Records of other attempts do not count: the environment may be mended since.
+        record: The content of the record, if there is one.
+        attempt: Records of other attempts are ignored, as the environment may be fixed since.
         what: The environment, for the message.
 
     Raises:
@@ -102,12 +102,12 @@ def check_hung(record: str | None, attempt: str, what: str) -> None:
 
 
 def _innermost(stack: str) -> str:
-    """The innermost line of the thread that plays, as `faulthandler` writes it."""
+    """The innermost line of the playing thread, as `faulthandler` writes it."""
     threads = [thread for thread in stack.split("\n\n") if "env_runner.py" in thread]
     lines = [
         line.strip() for line in "".join(threads[:1]).splitlines() if line.startswith("  File ")
     ]
-    return lines[0] if lines else "a place that is not known"
+    return lines[0] if lines else "an unknown place"
 
 
 def _call_in(stack: str) -> str:
@@ -120,7 +120,7 @@ def _call_in(stack: str) -> str:
 
 
 def main() -> None:
-    """Watch the process that the arguments name until it ends, or hangs."""
+    """Watch the process that the arguments name until it ends or hangs."""
     pid, seconds, calls, stack, storage, record, attempt = sys.argv[1:]
     try:
         if not _hangs(int(pid), float(seconds), Path(calls)):
@@ -128,19 +128,19 @@ def main() -> None:
         text = _dump(int(pid), Path(stack))
     finally:
         shutil.rmtree(Path(calls).parent, ignore_errors=True)
-    # Only now, as they take tens of megabytes.
+    # Imported only now, because they take tens of megabytes.
     from music_rllib.store.storage import StorageError, open_storage
 
-    with contextlib.suppress(OSError, StorageError):  # it must not go on in any case
+    with contextlib.suppress(OSError, StorageError):  # kill the worker in any case
         open_storage(storage).write(record, f"{attempt}\n{seconds}\n{text}".encode())
     os.kill(int(pid), signal.SIGKILL)
 
 
 def _hangs(pid: int, seconds: float, calls: Path) -> bool:
-    """Wait until one call has lasted so long; False where the watched process ends before that.
+    """Wait until one call has taken too long; False if the watched process ends first.
 
-    The time is counted in looks that find it in the same call: while the machine slept, or the
-    worker was stopped, it has not hung.
+    The time is counted in looks that find the same call, so it does not include the time while the
+    machine slept or the worker was stopped.
     """
     pause = min(seconds / LOOKS, LONGEST_PAUSE)
     seen, stalled = 0, 0.0

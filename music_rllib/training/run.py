@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,11 +15,13 @@ from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, EPISODE_RETURN_MEAN, LEA
 
 from music_rllib import names
 from music_rllib.compiling import is_kept
+from music_rllib.config.returns import Range, have_diverged, reward_of_step
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.experiment.continuation import REPORT_INTERVAL
 from music_rllib.intrinsic.music import HELD_OUT_STEPS
 from music_rllib.replay.segments import Segment, new_segments
 from music_rllib.store.handoff import Spaces
+from music_rllib.store.history import Report
 from music_rllib.store.serialization import read_arrays, read_state, write_arrays, write_state
 from music_rllib.store.work_folder import NewCheckpoint, SavedCheckpoint
 from music_rllib.tac.algorithm import TAC
@@ -47,7 +49,7 @@ _EVALUATION = {
 
 
 def algorithm_config(run: RunSettings) -> TACConfig:
-    """The RLlib config of a run: every setting in it comes from `run`."""
+    """The RLlib config of a run; all its settings come from `run`."""
     config = TACConfig()
     config.environment(run.task.env_id, env_config=dict(run.task.env_kwargs))
     config.env_runners(num_env_runners=0, num_envs_per_env_runner=run.num_envs)
@@ -61,14 +63,14 @@ def algorithm_config(run: RunSettings) -> TACConfig:
     config.replay(moved_distance=run.task.moved_distance, **dict(run.replay))
     config.success_key, config.success_if_missing = run.task.success_key, False
     config.seed_range = run.task.seed_range
-    # `TrainingRun` evaluates, at given environment steps.
+    # `TrainingRun` evaluates at given environment steps.
     config.evaluation(
         evaluation_interval=_NEVER,
         evaluation_duration=run.evaluation.episodes,
         evaluation_duration_unit="episodes",
         evaluation_config=TACConfig.overrides(explore=False),
     )
-    # One iteration is one episode in every sub-environment; a report covers several.
+    # An iteration is one episode in every sub-environment; a report covers several iterations.
     config.reporting(min_sample_timesteps_per_iteration=1)
     config.debugging(seed=run.seed)
     return config
@@ -79,12 +81,12 @@ class Paused(Exception):  # noqa: N818  not an error
 
 
 class TrainingRun:
-    """Trains one run to its budget.
+    """Train one run to its budget.
 
     Args:
         run: The settings.
-        handoff: Weights to start from, by network (`TAC.set_network_weights`).
-        gpus: The networks train on a GPU where it is more than 0.
+        handoff: Network weights to start from (`TAC.set_network_weights`).
+        gpus: If above 0, the networks train on a GPU.
 
     Raises:
         ValueError: Settings or weights do not fit the environment.
@@ -100,7 +102,7 @@ class TrainingRun:
         config = algorithm_config(run)
         if gpus:
             config.learners(num_gpus_per_learner=gpus)
-        with warnings.catch_warnings():  # the sweep has warned of its settings, once
+        with warnings.catch_warnings():  # the sweep has printed this warning already
             warnings.filterwarnings("ignore", "target_bounds ")
             self.algorithm: TAC = config.build_algo()
         if handoff:
@@ -108,13 +110,13 @@ class TrainingRun:
                 handoff = {**handoff, "normaliser": for_another_run(handoff["normaliser"])}
             self.algorithm.set_network_weights(handoff)
         self._begun = False
-        """Whether the policy has been evaluated as it was before any training."""
+        """Whether the untrained policy has been evaluated."""
         self._rounds: defaultdict[str, list[float]] = defaultdict(list)
         """Metrics of the training iterations since the last report."""
         self._segments: list[Segment] = []
-        """Files of trajectories in this run's checkpoints."""
+        """Files with trajectories in this run's checkpoints."""
         self._process = psutil.Process()
-        self._process.cpu_percent()  # the first call only starts the measurement
+        self._process.cpu_percent()  # the first call starts the measurement
 
     @property
     def env_steps(self) -> int:
@@ -128,22 +130,22 @@ class TrainingRun:
 
     @property
     def will_compile(self) -> bool:
-        """Whether its first update compiles, as the first one on a machine does."""
+        """Whether the first update compiles code, which happens once per machine."""
         return not self._gpus and not is_kept(learn)
 
     def advance(self, pause: Callable[[], bool] = lambda: False) -> dict[str, float]:
-        """Train until the next report is due; the first one is an evaluation at step 0.
+        """Train until the next report is due; the first report is an evaluation at step 0.
 
         Args:
-            pause: Called often; training pauses at once where it returns True.
+            pause: Called before each iteration; training pauses if it returns True.
 
         Returns:
             Means since the last report, by the names of `music_rllib.names`, and evaluation metrics
-            where an evaluation is due. Metrics that do not exist yet are left out.
+            if an evaluation is due. Metrics that do not exist yet are left out.
 
         Raises:
-            Paused: `pause` returned True. `save` keeps what has been measured so far, so that the
-                report will be as if there had been no pause.
+            Paused: `pause` returned True. `save` keeps the metrics measured so far, so the pause
+                does not change the next report.
         """
         if not self._begun:
             self._begun = True
@@ -164,7 +166,7 @@ class TrainingRun:
         return metrics | self._status()
 
     def evaluate(self) -> dict[str, float]:
-        """Metrics of deterministic episodes with fresh goals, the same in every run of a seed."""
+        """Metrics of deterministic episodes, whose goals depend on the seed only."""
         results = self.algorithm.evaluate()[ENV_RUNNER_RESULTS]
         metrics = {name: float(results[key]) for key, name in _EVALUATION.items() if key in results}
         return metrics | {names.EVAL_EPISODES: float(self.run.evaluation.episodes)}
@@ -178,7 +180,7 @@ class TrainingRun:
         }
 
     def network_weights(self) -> dict[str, dict[str, NDArray[Any]]]:
-        """Weights of every network, by its name, as a handoff carries them."""
+        """Weights of every network, by its name."""
         return self.algorithm.get_network_weights()
 
     @property
@@ -187,10 +189,10 @@ class TrainingRun:
         return Spaces.of(*self.algorithm.env_runner.get_spaces()[DEFAULT_MODULE_ID])
 
     def save(self, draft: NewCheckpoint, *, alone: bool = False) -> None:
-        """Write everything that `restore` needs to continue exactly from here.
+        """Write everything that `restore` needs to resume bit-identically.
 
-        Of the replay, these are the trajectories that no earlier checkpoint of this run has, or all
-        of them for a checkpoint that stands `alone`.
+        Only trajectories that no earlier checkpoint of this run has are written, or all of them if
+        the checkpoint must be complete `alone`.
 
         Raises:
             StorageError: The storage cannot be written.
@@ -213,13 +215,13 @@ class TrainingRun:
         }
         write_state(draft.folder, state)
 
-    def restore(self, saved: SavedCheckpoint, *, foreign: bool = False) -> None:
-        """Continue from what `save` wrote. Only before the first `advance`.
+    def restore(self, saved: SavedCheckpoint, *, other_run: bool = False) -> None:
+        """Resume from a checkpoint that `save` wrote; only before the first `advance`.
 
-        After the checkpoint of another, `foreign` run, the next `save` writes all trajectories.
+        After a checkpoint of another run, the next `save` writes all trajectories.
 
         Raises:
-            StateError: It is no checkpoint.
+            StateError: It is not a checkpoint.
             ValueError: It has other settings.
         """
         state = read_state(saved.folder)
@@ -228,14 +230,34 @@ class TrainingRun:
         files = ((segment.first, saved.parts[segment.name] / _TRAJECTORIES) for segment in segments)
         parts = ((first, read_arrays(path)) for first, path in files)  # one in memory at a time
         self.algorithm.replay.load_packed(state["replay"], parts)
-        self._segments = [] if foreign else segments
+        self._segments = [] if other_run else segments
         self._rounds = defaultdict(list, state["rounds"])
         self._begun = state["begun"]
 
     @property
     def replay_mb(self) -> float:
-        """Megabytes that the trajectories in the replay take."""
+        """Size of the trajectories in the replay, in megabytes."""
         return self.algorithm.replay.used_nbytes / 2**20
+
+    def divergence(self, reports: Sequence[Report]) -> str | None:
+        """A message if the last of the run's reports is the first with diverged critics."""
+        run = self.run
+        task_reward = run.task.reward_range
+        if task_reward is None and run.music.task_reward:
+            return None  # the reachable returns are not known
+        reward = reward_of_step(Range(*(task_reward or (0.0, 0.0))), run.music)
+        metrics = [report.metrics for report in reports]
+        means = np.array([one.get(names.Q_MEAN, 0.0) for one in metrics])
+        bonuses = np.array(
+            [one.get(names.ALPHA, 0.0) * one.get(names.ENTROPY, 0.0) for one in metrics]
+        )
+        diverged = have_diverged(means, bonuses, reward, run.tac.gamma)
+        if not diverged[-1] or diverged[:-1].any():
+            return None
+        return (
+            f"its critics diverge: {means[-1]:.3g} on average, with rewards of {reward} a step "
+            f"at gamma {run.tac.gamma:g}"
+        )
 
     def close(self) -> None:
         """Release environments and networks."""
@@ -243,7 +265,7 @@ class TrainingRun:
 
 
 def _means(rounds: Mapping[str, list[float]]) -> dict[str, float]:
-    """Means over training iterations; the bound on fresh trajectories is weighted by steps."""
+    """Means over training iterations; the bound on new trajectories is weighted by steps."""
     metrics = {name: float(np.mean(values)) for name, values in rounds.items()}
     if (steps := metrics.pop(HELD_OUT_STEPS, None)) is not None:
         weights = np.array(rounds[HELD_OUT_STEPS]) / steps
@@ -256,9 +278,9 @@ def _next_multiple(steps: int, interval: int) -> int:
 
 
 def _training_metrics(result: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
-    """The metrics that a report takes from an RLlib result, by their public names.
+    """Public names and values of the metrics of an RLlib result.
 
-    RLlib's mean of nothing is NaN: of an iteration without an update there is no metric.
+    RLlib's mean of no values is NaN; such metrics of iterations without an update are left out.
     """
     episodes = result.get(ENV_RUNNER_RESULTS, {})
     for key, name in _TRAINING.items():

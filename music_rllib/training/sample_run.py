@@ -1,4 +1,4 @@
-"""The time and memory that a run takes, measured on some that train side by side for seconds."""
+"""Measure the time and memory of a run on copies that train side by side for some seconds."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from music_rllib.training.failure_reason import in_words_only
 from music_rllib.training.run import TrainingRun
 
 SECONDS = 4.0
-"""Shortest duration of the measured training, after one iteration that warms up."""
+"""Minimum duration of the measured training, after one iteration of warm-up."""
 PATIENCE = 60.0
-"""Longest wait for further processes after the first one, on a cluster that others use, too."""
+"""Maximum wait for further processes after the first, if others use the cluster."""
 
 
 class RunSample(NamedTuple):
-    """Means of runs of a kind that trained at the same time."""
+    """Means over runs that trained at the same time."""
 
     start_seconds: float
-    """Time from the request for processes to the first environment steps of all."""
+    """Time from the request for processes until all have made their first environment steps."""
     steps_per_second: float
     """Environment steps per second of training."""
     evaluation_seconds: float
     """Duration of one evaluation."""
     memory: int
-    """Bytes of the largest process at its run's end, without the libraries that all runs share."""
+    """Bytes of the largest process at the end of its run, without libraries that runs share."""
 
 
 def sample_run(run: RunSettings, resources: Resources, at_once: int) -> RunSample:
-    """Train so many copies of a run at once for some seconds, in workers of the connected Ray.
+    """Train `at_once` copies of a run for some seconds, in workers of the connected Ray.
 
-    They share caches, memory and clock speed of their machine, as the runs of a sweep do. Copies
-    for which there is no place are left out.
+    Like the runs of a sweep, they share the caches, memory and clock speed of their machine. Copies
+    that Ray cannot place are left out.
 
     Raises:
         BadInputError: A run fails.
@@ -67,18 +67,18 @@ def sample_run(run: RunSettings, resources: Resources, at_once: int) -> RunSampl
 
 
 class _Worker:
-    """Ray actor that trains the run."""
+    """Ray actor that trains a run."""
 
     def start(self, run: RunSettings, gpus: float) -> None:
         """Build the run and make its first environment steps."""
-        # Steps without updates are many times faster than the others, and soon over.
+        # Leave out the initial steps without updates, which are many times faster.
         tac = run.tac.model_copy(update={"random_steps": 0, "warmup_steps": None})
         with in_words_only():
             self._training = TrainingRun(run.model_copy(update={"tac": tac}), gpus=gpus)
             self._training.algorithm.env_runner.sample(num_episodes=1)
 
     def train(self) -> tuple[float, float, int]:
-        """The last three numbers of a `RunSample`."""
+        """Steps per second, seconds of an evaluation, and bytes of memory."""
         with in_words_only():
             return self._measure()
 

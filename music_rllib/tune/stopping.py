@@ -18,7 +18,7 @@ from music_rllib.command_line import say_stopped_at_once
 from music_rllib.errors import FAILED
 from music_rllib.runtime.process import SIGNALS, early, end_process
 from music_rllib.runtime.ray_cluster import RayWatch
-from music_rllib.training.stop import StopFlag
+from music_rllib.training.job import StopFlag
 from music_rllib.training.worker import STOPPED
 
 WATCH_SECONDS = 0.3

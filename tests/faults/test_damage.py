@@ -218,7 +218,7 @@ def test_a_dead_owner_whose_clock_was_ahead_is_not_waited_for_until_then(
     monkeypatch.setattr(lease_module, "EXPIRES_SECONDS", 1.0)
     trial = RunTrainable(config=node.to_tune())
     waiting, *_, last = (trial.train() for _ in range(4))
-    assert "waits, as it is being computed by sweep 'other'" in waiting[NOTES][0]
+    assert "waits, because sweep 'other'" in waiting[NOTES][0]
     assert last["reports"], "it computes"
     trial.stop()
 
@@ -238,8 +238,8 @@ def test_a_worker_whose_lease_is_taken_over_writes_nothing_more_and_reuses(
     Path(work.lease.path).write_text(theirs.model_dump_json())
     results = [trial.train(), trial.train()]
     notes = [note for result in results for note in result[NOTES]]
-    assert "was taken over while this process was suspended" in notes[0]
-    assert "waits, as it is being computed by sweep 'other'" in notes[1]
+    assert "another process took over while this one was suspended" in notes[0]
+    assert "waits, because sweep 'other'" in notes[1]
     assert not any(result["done"] for result in results)
     assert work.names() == before
     assert work.lease.is_owned_by(theirs.owner)

@@ -60,7 +60,7 @@ def test_a_suspended_sweep_waits_for_the_one_that_took_its_runs_over(
     signal_all(process, signal.SIGCONT)
     output, errors = process.communicate(timeout=sweeps.PATIENCE)
     assert process.returncode == 0, output + errors
-    assert "pretrain/seed0: was taken over while this process was suspended" in output
+    assert "pretrain/seed0: another process took over while this one was suspended" in output
     output, errors = second.communicate(timeout=sweeps.PATIENCE)
     assert second.returncode == 0, output + errors
     comparison.same(unbroken, tmp_path / "results")

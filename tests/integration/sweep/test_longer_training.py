@@ -105,7 +105,7 @@ def test_nothing_of_another_environment_is_continued_or_reused(tmp_path: Path) -
     answered = {"same_environments": frozenset(map(digest_of, (here, old["environment"])))}
     assert CAUSE not in compute(short.model_copy(update=answered))[-1]
     elsewhere = compute(cut.model_copy(update=old))
-    assert "it is not the driver's: point_env.py changed" in elsewhere[-1][CAUSE]
+    assert "it differs from the driver's: point_env.py changed" in elsewhere[-1][CAUSE]
 
 
 @pytest.mark.usefixtures("local_ray")
