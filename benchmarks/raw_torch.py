@@ -10,11 +10,9 @@ import torch
 from torch import Tensor
 
 from music_rllib.functional import actor_critic
-from music_rllib.functional.squashed_gaussian import sample_squashed
-from music_rllib.functional.tsallis import ln_q_of_policy
-from music_rllib.optim.adam import FusedAdam
-from music_rllib.tac.networks import Critics, Perceptron
-from music_rllib.tac.normaliser import RunningNormaliser
+from music_rllib.functional.distribution import ln_q_of_policy, sample_squashed
+from music_rllib.kernels.adam import FusedAdam
+from music_rllib.tac.networks import Critics, Perceptron, RunningNormaliser
 
 HIDDEN = (256, 256, 256)
 

@@ -14,9 +14,9 @@ from benchmarks.measure import Row, Taken, compared, interleaved, middle, on_one
 from benchmarks.raw_torch import RawUpdate
 from benchmarks.runs import fill
 from music_rllib import TACConfig
-from music_rllib.compiling import compiled
+from music_rllib.kernels.blas import multiply
+from music_rllib.kernels.compiling import compiled
 from music_rllib.tac.algorithm import TAC
-from music_rllib.tac.kernels.blas import multiply
 
 __all__ = ["rows"]
 
@@ -73,7 +73,7 @@ def algorithm(
     )
     algo: TAC = config.build_algo()
     if not direct:
-        algo.learner_group._learner._direct = None
+        algo.learner_group._learner._compiled = None
     while len(algo.replay) < 10_000:
         algo.training_step()
     fill(algo.replay, transitions)

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from music_rllib.results.frames import load_sweep
-    from music_rllib.tac.algorithm import TAC
-    from music_rllib.tac.config import TACConfig
+    from music_rllib.tac.algorithm import TAC, TACConfig
     from music_rllib.tac.learner import TACLearner
     from music_rllib.tac.rl_module import TACModule
 
@@ -22,7 +21,7 @@ __all__ = ["TAC", "TACConfig", "TACLearner", "TACModule", "__version__", "load_s
 
 _HOMES = {
     "TAC": "music_rllib.tac.algorithm",
-    "TACConfig": "music_rllib.tac.config",
+    "TACConfig": "music_rllib.tac.algorithm",
     "TACLearner": "music_rllib.tac.learner",
     "TACModule": "music_rllib.tac.rl_module",
     "load_sweep": "music_rllib.results.frames",

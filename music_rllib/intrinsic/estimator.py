@@ -14,9 +14,8 @@ import torch
 from torch import Tensor, nn
 
 from music_rllib.functional.mutual_information import donsker_varadhan, of_draw, shuffle_time
-from music_rllib.intrinsic.compiled import Data, Weights, bounds, learn
-from music_rllib.optim.adam import FusedAdam
-from music_rllib.optim.flat import FlatParameters
+from music_rllib.kernels.adam import FlatParameters, FusedAdam
+from music_rllib.kernels.mutual_information import Data, Weights, bounds, learn
 
 FAR = 10.0
 """Mean or standard deviation of an input above which a fresh network's tanh saturates: every
@@ -154,8 +153,8 @@ class MutualInformationEstimator(nn.Module):
             Weights(*(view.numpy() for view in self._flat.views(flat)))
             for flat in (self._flat.values, self._flat.gradients)
         )
-        descent = optimizer.descent(self._flat)
-        of_pairs, means = learn(pairs, trajectories, weights, gradients, descent, updates)
+        step = optimizer.step_of(self._flat)
+        of_pairs, means = learn(pairs, trajectories, weights, gradients, step, updates)
         return torch.from_numpy(of_pairs), torch.from_numpy(means)
 
     def data(self, observations: Tensor, permutations: Tensor, inside: Tensor | None) -> Data:

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from music_rllib.optim.adam import FusedAdam
+from music_rllib.kernels.adam import FusedAdam
 from music_rllib.replay.trajectories import Trajectory
 
 

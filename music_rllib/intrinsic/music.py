@@ -18,7 +18,7 @@ from music_rllib import names
 from music_rllib.functional.mutual_information import time_permutations
 from music_rllib.intrinsic.estimator import MutualInformationEstimator, intrinsic_reward, two_frames
 from music_rllib.intrinsic.settings import MusicSettings
-from music_rllib.optim.adam import FusedAdam
+from music_rllib.kernels.adam import FusedAdam
 from music_rllib.replay.trajectories import Trajectory, WholeTrajectories, long_enough
 
 HELD_OUT_STEPS = "held_out_steps"

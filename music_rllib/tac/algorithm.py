@@ -1,4 +1,4 @@
-"""The algorithm `TAC`: collects episodes, stores them, learns from the replay, syncs weights."""
+"""The algorithm `TAC` and its config: collect episodes, store them, learn from the replay."""
 
 from __future__ import annotations
 
@@ -15,14 +15,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from ray.rllib.algorithms.algorithm import Algorithm
-from ray.rllib.core import (
-    COMPONENT_EVAL_ENV_RUNNER,
-    COMPONENT_RL_MODULE,
-    DEFAULT_MODULE_ID,
-)
-from ray.rllib.core.columns import Columns
+from ray.rllib.core import COMPONENT_EVAL_ENV_RUNNER, COMPONENT_RL_MODULE
 from ray.rllib.env.env_runner_group import EnvRunnerGroup
-from ray.rllib.policy.sample_batch import MultiAgentBatch, SampleBatch
 from ray.rllib.utils.metrics import (
     ENV_RUNNER_RESULTS,
     ENV_RUNNER_SAMPLING_TIMER,
@@ -39,24 +33,24 @@ from music_rllib.envs.episodes import Episode
 from music_rllib.envs.make import goal_reward_of, moved_distance_of
 from music_rllib.envs.values import BadNumberError
 from music_rllib.replay.buffer import TrajectoryReplay
-from music_rllib.replay.trajectories import Transitions
+from music_rllib.replay.trajectories import WholeTrajectories
 from music_rllib.schedules import value_at
-from music_rllib.tac.config import TACConfig
+from music_rllib.tac.config import AlgorithmSettings, TACConfigBase
 from music_rllib.tac.env_runner import SUCCESS_LAST, TrajectoryEnvRunner, seed_or_entropy
-from music_rllib.tac.rl_module import ESTIMATOR_MODULE
-from music_rllib.tac.weights import NetworkWeights, by_module, by_network
+from music_rllib.tac.minibatches import batch_of
+from music_rllib.tac.rl_module import NetworkWeights, states_by_module, weights_by_network
 
 REVIVE_SECONDS = 300.0
-"""How long a remote environment runner that died may take to be restarted."""
+"""Longest wait for the restart of a remote environment runner that died."""
 UPDATES_PER_CALL = 100
-"""Updates whose minibatches are sampled and sent together: few enough for the CPU's cache."""
+"""Updates whose minibatches are sampled and sent together; they fit into the CPU's cache."""
 
 
 class TAC(Algorithm):
-    """Tsallis Actor-Critic (paper Fig. 3), with MUSIC's intrinsic reward where configured."""
+    """Tsallis Actor-Critic (paper Fig. 3), with MUSIC's intrinsic reward if configured."""
 
     REPLAY = "replay"
-    """Name of the trajectories' part of the state."""
+    """Key of the trajectories in the state."""
 
     @classmethod
     def get_default_config(cls) -> TACConfig:
@@ -65,19 +59,16 @@ class TAC(Algorithm):
     def setup(self, config: TACConfig) -> None:
         with _determinism_without_compiler():
             super().setup(config)
-        self._settings = self.config.tac_settings()
-        self._music = self.config.music_settings()
-        self._replay_settings = self.config.replay_settings()
+        self._settings: AlgorithmSettings = self.config.settings
         self.env_steps = 0
-        """Environment steps collected so far, by all runners."""
+        """Environment steps of all runners."""
         self.grad_updates = 0
-        """Gradient updates done so far."""
         self.replay = self._make_replay()
         self._runner_states: dict[int, StateDict] = dict(self._call_runners(_random_state))
         """Random states of the remote runners after their last episodes, by worker index."""
 
     def _make_replay(self) -> TrajectoryReplay:
-        settings = self._replay_settings
+        settings = self._settings.replay
         runner = self._runner_with_environment()
         seed = self.config.seed_range[0]
         goal_reward = goal_reward_of(runner.env, seed) if settings.hindsight_k > 0 else None
@@ -96,7 +87,7 @@ class TAC(Algorithm):
         )
 
     def _runner_with_environment(self) -> TrajectoryEnvRunner:
-        """The local runner; one without environments, as beside remote runners, gets one."""
+        """The local runner; beside remote runners it has no environment, and gets one here."""
         runner: TrajectoryEnvRunner = self.env_runner
         if not runner.envs:
             runner.config = runner.config.copy(copy_frozen=False).env_runners(
@@ -106,7 +97,7 @@ class TAC(Algorithm):
         return runner
 
     def _setup_logdir(self) -> None:
-        """Outside Tune, logs to a temporary folder instead of a new one in the user's home."""
+        """Outside Tune, log to a temporary folder instead of a new one in the user's home."""
         if self._storage is not None:
             super()._setup_logdir()
         else:
@@ -117,13 +108,13 @@ class TAC(Algorithm):
 
     def cleanup(self) -> None:
         super().cleanup()
-        if self._storage is None:  # not left to the interpreter's end, which workers of Ray skip
+        if self._storage is None:  # now, because workers of Ray skip the interpreter's finalizers
             self._remove_logdir()
 
     # -- one step of the algorithm --------------------------------------------------------
 
     def training_step(self) -> None:
-        explored = self.env_steps >= self._settings.random_steps
+        explored = self.env_steps >= self._settings.tac.random_steps
         with self.metrics.log_time((TIMERS, ENV_RUNNER_SAMPLING_TIMER)):
             episodes = self._collect(random_actions=not explored)
         self._observe_inputs(episodes)
@@ -132,8 +123,11 @@ class TAC(Algorithm):
         self.replay.extend(episodes, self._trajectory_priorities(episodes))
         for updates in self._updates_due():
             with self.metrics.log_time((TIMERS, REPLAY_BUFFER_SAMPLE_TIMER)):
-                drawn = self._draw(updates)
-                batch = self._batch_of(drawn, updates)
+                drawn = self.replay.sample_transitions(
+                    updates * self._settings.tac.batch_size,
+                    importance_exponent=self._importance_exponent,
+                )
+                batch = batch_of(drawn, self._sample_trajectories(updates))
             with self.metrics.log_time((TIMERS, LEARNER_UPDATE_TIMER)):
                 results = self.learner_group.update(
                     batch=batch, timesteps={NUM_ENV_STEPS_SAMPLED_LIFETIME: self.env_steps}
@@ -150,7 +144,7 @@ class TAC(Algorithm):
         group.sync_weights(from_worker_or_learner_group=self.learner_group, inference_only=True)
 
     def evaluate(self, *args: Any, **kwargs: Any) -> Any:
-        """Evaluates as RLlib does, and gives the success rate to settings that follow it."""
+        """Evaluate as RLlib does, and pass the success rate to settings that follow it."""
         results = super().evaluate(*args, **kwargs)
         success = results.get(ENV_RUNNER_RESULTS, {}).get(SUCCESS_LAST)
         if success is not None:
@@ -161,7 +155,7 @@ class TAC(Algorithm):
         return results
 
     def _collect(self, *, random_actions: bool) -> list[Episode]:
-        """Plays one episode in every sub-environment."""
+        """Play one episode in every sub-environment."""
 
         def play(runner: TrajectoryEnvRunner) -> tuple[list[Episode], Any]:
             return runner.sample(random_actions=random_actions), runner.get_metrics()
@@ -176,18 +170,18 @@ class TAC(Algorithm):
     # -- remote environment runners, which may die ----------------------------------------
 
     def _call_runners(self, function: Callable[[Any], Any], ids: Iterable[int] = ()) -> list[Any]:
-        """Results of the living remote runners among `ids`, or of all where none are given."""
+        """Results of the healthy remote runners among `ids`; without `ids`, of all of them."""
         results: list[Any] = self.env_runner_group.foreach_env_runner(
             function, local_env_runner=False, remote_worker_ids=sorted(ids) or None
         )
         return results
 
     def _collect_remotely(self, play: Callable[[Any], Any]) -> list[tuple[list[Episode], Any]]:
-        """Plays one round on every remote runner, again where a runner died; in runners' order.
+        """Play one round on every remote runner, in their order; repeat it if a runner died.
 
         Raises:
             RuntimeError: a runner could not be restarted.
-            BadNumberError: an environment returned a number that cannot be learned from.
+            BadNumberError: an environment returned an unusable number.
         """
 
         def play_with_state(runner: TrajectoryEnvRunner) -> tuple[Any, tuple[int, StateDict]]:
@@ -214,7 +208,7 @@ class TAC(Algorithm):
         return [samples[index] for index in sorted(samples)]
 
     def restore_env_runners(self, env_runner_group: EnvRunnerGroup) -> list[int]:
-        """Restarts dead runners in the random states from which they would have continued."""
+        """Restart dead runners with the random states from which they would have continued."""
         restored: list[int] = super().restore_env_runners(env_runner_group)
         if restored and env_runner_group is self.env_runner_group:
             self._restore_random_states(restored)
@@ -228,18 +222,18 @@ class TAC(Algorithm):
     # -- learning -------------------------------------------------------------------------
 
     def _observe_inputs(self, episodes: list[Episode]) -> None:
-        """Adds the new states to the normaliser, also with the goals that hindsight will use."""
+        """Add the new states to the normalizer, also with the goals that hindsight may use."""
         width, layout = self.replay.layout.network_input, self.replay.layout
         frames = np.concatenate([episode.frames for episode in episodes])
         inputs = frames[:, :width]
-        if self._replay_settings.hindsight_k > 0:
+        if self._settings.replay.hindsight_k > 0:
             achieved = np.concatenate([frames[:, : layout.observation], frames[:, width:]], axis=1)
             inputs = np.concatenate([inputs, achieved])
         self.learner_group.foreach_learner(lambda learner: learner.observe_inputs(inputs))
 
     def _trajectory_priorities(self, episodes: list[Episode]) -> NDArray[np.float64] | None:
-        """MUSIC-p: a priority for each episode by the frozen estimator."""
-        if not self._music.prioritise_replay:
+        """MUSIC-p: the frozen estimator's priority of each episode."""
+        if not self._settings.music.prioritise_replay:
             return None
         priorities: NDArray[np.float64] = self._call_learner(
             lambda learner: learner.trajectory_priorities(episodes)
@@ -250,59 +244,38 @@ class TAC(Algorithm):
         return next(iter(self.learner_group.foreach_learner(function))).get()
 
     def _updates_due(self) -> list[int]:
-        """The updates that the replay ratio asks for, in calls of at most `UPDATES_PER_CALL`."""
-        counted_steps = self.env_steps - self._settings.steps_before_updates
-        due = int(counted_steps * self._settings.replay_ratio) - self.grad_updates
+        """Numbers of updates per call, at most `UPDATES_PER_CALL`, to reach the replay ratio."""
+        counted_steps = self.env_steps - self._settings.tac.steps_before_updates
+        due = int(counted_steps * self._settings.tac.replay_ratio) - self.grad_updates
         full, rest = divmod(max(due, 0), UPDATES_PER_CALL)
         return [UPDATES_PER_CALL] * full + ([rest] if rest else [])
 
-    def sample_batch(self, updates: int) -> MultiAgentBatch:
-        """The minibatches of `updates` updates, concatenated as `TACLearner` takes them."""
-        return self._batch_of(self._draw(updates), updates)
+    @property
+    def _importance_exponent(self) -> float:
+        schedule, budget = self._settings.replay.importance_exponent, self.config.total_env_steps
+        return value_at(schedule, self.env_steps, budget or 0)
 
-    def _draw(self, updates: int) -> Transitions:
-        beta = value_at(
-            self._replay_settings.importance_exponent,
-            self.env_steps,
-            self.config.total_env_steps or 0,
-        )
-        rows = updates * self._settings.batch_size
-        return self.replay.sample_transitions(rows, importance_exponent=beta)
+    def _sample_trajectories(self, updates: int) -> WholeTrajectories | None:
+        """The estimator's part of the minibatches; None if it is not trained."""
+        _, music, _, split = self._settings
+        if music.estimator != "trained":
+            return None
+        last = max(*split.agent_indices, *split.surrounding_indices)
+        return self.replay.sample_trajectories(updates * music.batch_trajectories, width=last + 1)
 
-    def _batch_of(self, drawn: Transitions, updates: int) -> MultiAgentBatch:
-        columns = {
-            Columns.OBS: drawn.inputs,
-            Columns.ACTIONS: drawn.actions,
-            Columns.REWARDS: drawn.rewards,
-            "discounts": drawn.discounts,
-            Columns.NEXT_OBS: drawn.next_inputs,
-        }
-        if drawn.weights is not None:
-            columns["weights"] = drawn.weights
-        batches = {DEFAULT_MODULE_ID: SampleBatch(columns)}
-        if self._music.estimator == "trained":
-            last = max(*self.config.agent_indices, *self.config.surrounding_indices)
-            count = updates * self._music.batch_trajectories
-            whole = self.replay.sample_trajectories(count, width=last + 1)
-            trajectories: dict[str, NDArray[Any]] = {Columns.OBS: whole.observations}
-            if whole.inside is not None:
-                trajectories["inside"] = whole.inside
-            batches[ESTIMATOR_MODULE] = SampleBatch(trajectories)
-        return MultiAgentBatch(batches, env_steps=len(drawn.rewards))
-
-    # -- plain weights --------------------------------------------------------------------
+    # -- network weights ------------------------------------------------------------------
 
     def get_network_weights(self) -> NetworkWeights:
-        """The arrays of each network: policy, critics, value, value_target, normaliser, ..."""
+        """Weights by network (policy, critics, value, value_target, normaliser, ...) and array."""
         state = self.learner_group.get_state(components="learner/rl_module")["learner"]["rl_module"]
-        return by_network(state)
+        return weights_by_network(state)
 
     def set_network_weights(self, weights: Mapping[str, Mapping[str, NDArray[Any]]]) -> None:
-        """Loads the given networks, as `get_network_weights` returns them; keeps the others.
+        """Load the given networks, as `get_network_weights` returns them; keep the others.
 
         Raises ValueError for an unknown network, and for missing, unknown or misshapen tensors.
         """
-        modules = by_module(weights, self.get_network_weights())
+        modules = states_by_module(weights, self.get_network_weights())
         self.learner_group.foreach_learner(
             lambda learner: [learner.module[mid].set_state(state) for mid, state in modules.items()]
         )
@@ -325,7 +298,7 @@ class TAC(Algorithm):
     def set_state(self, state: StateDict) -> None:
         super().set_state(state)
         if COMPONENT_EVAL_ENV_RUNNER in state and self.eval_env_runner is not None:
-            # RLlib gives it the training runner's state.
+            # RLlib sets the training runner's state.
             self.eval_env_runner.set_state(state[COMPONENT_EVAL_ENV_RUNNER])
         if self.REPLAY in state:
             self.replay.load_state(state[self.REPLAY])
@@ -338,9 +311,29 @@ class TAC(Algorithm):
             self._restore_random_states(runner_states)
 
 
+class TACConfig(TACConfigBase):
+    """Configures TAC, with or without MUSIC, on any continuous-action Gymnasium environment.
+
+    Every field of `TACSettings` is an attribute and an argument of `training()`, every field of
+    `MusicSettings` (prefixed `music_`) of `music()`, every field of `ReplaySettings` (prefixed
+    `replay_`) of `replay()`. `validate()` checks all of them; RLlib calls it when it builds the
+    algorithm.
+
+        >>> config = (
+        ...     TACConfig()
+        ...     .environment("Pendulum-v1")
+        ...     .training(entropic_index=1.5, alpha=0.2)
+        ... )
+        >>> algo = config.build_algo()
+    """
+
+    def __init__(self, algo_class: type | None = None) -> None:
+        super().__init__(algo_class=algo_class or TAC)
+
+
 _COUNTERS, _RUNNERS = "tac_counters", "tac_runners"
 _REPLAY_STREAM = 101
-"""Separates the replay's random stream from those of the environment runners."""
+"""Separates the replay's random stream from the environment runners' streams."""
 
 
 def _random_state(runner: TrajectoryEnvRunner) -> tuple[int, StateDict]:
@@ -350,9 +343,9 @@ def _random_state(runner: TrajectoryEnvRunner) -> tuple[int, StateDict]:
 
 @contextlib.contextmanager
 def _determinism_without_compiler() -> Iterator[None]:
-    """Spare each run's process a second: RLlib seeds torch by a call that loads its compiler.
+    """Save a second per process: RLlib seeds torch by a call that loads torch's compiler.
 
-    That sets the compiler's own flag too, which matters only where it is loaded.
+    The call also sets the compiler's own flag, which matters only if the compiler is loaded.
     """
     if "torch._inductor" in sys.modules:
         yield

@@ -1,17 +1,16 @@
-"""`TACConfig`: an ordinary RLlib config whose own settings are those of TAC, MUSIC and replay."""
+"""The RLlib config of TAC, without the algorithm: `TACConfig` in `tac/algorithm.py` adds it."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Self, TypeVar
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, Self, TypeVar
 
-from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
+from pydantic import BaseModel, ValidationError, model_validator
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig, NotProvided
 from ray.rllib.core import DEFAULT_MODULE_ID
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
-from ray.tune.search.sample import Domain
 
 from music_rllib.config.returns import Range, cut_off
 from music_rllib.config.tac_settings import TACSettings
@@ -21,44 +20,52 @@ from music_rllib.intrinsic.music import Music
 from music_rllib.intrinsic.settings import MusicSettings
 from music_rllib.replay.settings import ReplaySettings
 from music_rllib.runtime.quiet import quiet_third_parties
-from music_rllib.schedules import Linear, Measured, check_measurable
+from music_rllib.schedules import Linear, Measured, StrictModel, check_measurable
+from music_rllib.tac.env_runner import TrajectoryEnvRunner
+from music_rllib.tac.learner import TACLearner
 from music_rllib.tac.rl_module import ESTIMATOR_MODULE, EstimatorModule, TACModule
-from music_rllib.tac.rllib.settings import without_effect
-from music_rllib.tac.scheduled import ScheduledSettings
+from music_rllib.tac.rllib_settings import ignored_settings
 
-_Settings = TypeVar("_Settings", TACSettings, MusicSettings, ReplaySettings)
+_Model = TypeVar("_Model", bound=BaseModel)
 
 
-class TACConfig(AlgorithmConfig):
-    """Configures TAC, with or without MUSIC, on any continuous-action Gymnasium environment.
+class Split(StrictModel):
+    """Positions of the agent's and the surrounding state in the observation."""
 
-    Every field of `TACSettings` is an attribute and an argument of `training()`, every field of
-    `MusicSettings` (prefixed `music_`) of `music()`, every field of `ReplaySettings` (prefixed
-    `replay_`) of `replay()`. They are plain attributes, so `tune.grid_search` works on them; they
-    are validated together by `validate()`.
+    agent_indices: Indices = ()
+    surrounding_indices: Indices = ()
 
-        >>> config = (
-        ...     TACConfig()
-        ...     .environment("Pendulum-v1")
-        ...     .training(entropic_index=1.5, alpha=0.2)
-        ... )
-        >>> algo = config.build_algo()
+    @model_validator(mode="after")
+    def _both_or_none(self) -> Self:
+        check_split(self.agent_indices, self.surrounding_indices)
+        return self
+
+
+class AlgorithmSettings(NamedTuple):
+    """The validated settings of an algorithm, as all of its parts read them."""
+
+    tac: TACSettings
+    music: MusicSettings
+    replay: ReplaySettings
+    split: Split
+
+
+class TACConfigBase(AlgorithmConfig):
+    """Everything of `TACConfig` except its algorithm.
+
+    Settings are plain attributes, so `tune.grid_search` works on them. `settings` is their one
+    validated form; `validate()` checks it together with RLlib's settings.
     """
 
     def __init__(self, algo_class: type | None = None) -> None:
-        from music_rllib.tac.algorithm import TAC
-        from music_rllib.tac.env_runner import TrajectoryEnvRunner
-
-        # A user of TAC can do nothing about RLlib's notices on its own API stack.
-        quiet_third_parties()
-        super().__init__(algo_class=algo_class or TAC)
-        for settings, prefix in _OWNED:
-            for name, field in settings.model_fields.items():
+        quiet_third_parties()  # users of TAC can't act on RLlib's notices about its own API stack
+        super().__init__(algo_class=algo_class)
+        self._settings: AlgorithmSettings | None = None
+        for model, prefix in _MODELS:
+            for name, field in model.model_fields.items():
                 setattr(self, prefix + name, field.default)
         self.total_env_steps: int | None = None
         self.torch_threads = 1
-        self.agent_indices: tuple[int, ...] = ()
-        self.surrounding_indices: tuple[int, ...] = ()
         self.reward_range: tuple[float, float] | None = None
         self.seed_range: tuple[int, int] = (0, LAST_SEED)
         self.success_key: str | None = "is_success"
@@ -76,10 +83,9 @@ class TACConfig(AlgorithmConfig):
         self._dont_auto_sync_env_runner_states = True
 
     def __setattr__(self, key: str, value: Any) -> None:
-        # Checked here, because RLlib later takes every -1 for "not set" and would use the default.
-        if key in _CHECKS and not _is_search_space(value):
-            _checked(key, lambda: _CHECKS[key].validate_python(value))
         super().__setattr__(key, value)
+        if key in _FIELDS:
+            self._settings = None
 
     # -- setting --------------------------------------------------------------------------
 
@@ -91,20 +97,21 @@ class TACConfig(AlgorithmConfig):
         reward_range: tuple[float, float] | None = NotProvided,
         **settings: Any,
     ) -> Self:
-        """Sets TAC's hyper-parameters.
+        """Set TAC's hyperparameters.
 
         Args:
             total_env_steps: budget of the run, of which `linear` schedules are fractions.
             reward_range: smallest and largest reward of the environment, if they are known:
-                `validate()` then warns of `target_bounds` that cut off values within reach.
+                `validate()` then warns if `target_bounds` cut off reachable values.
             torch_threads: threads of the Learner's process. More than one gains nothing on
                 networks of this size, and changes results in the last digits.
             **settings: fields of `TACSettings`, or arguments of `AlgorithmConfig.training`.
 
         Raises:
-            TypeError: an unknown setting.
+            TypeError: unknown setting.
         """
-        tac = {name: settings.pop(name) for name in list(settings) if name in _TAC_FIELDS}
+        fields = TACSettings.model_fields
+        tac = {name: settings.pop(name) for name in list(settings) if name in fields}
         super().training(**settings)
         return self._set(
             tac,
@@ -120,51 +127,50 @@ class TACConfig(AlgorithmConfig):
         surrounding_indices: Sequence[int] = NotProvided,
         **settings: Any,
     ) -> Self:
-        """Switches MUSIC's intrinsic reward on and sets it up.
+        """Switch on MUSIC's intrinsic reward and set its hyperparameters.
 
         Args:
-            agent_indices: where the agent's state lies in the observation.
-            surrounding_indices: where the surrounding state lies in the observation.
+            agent_indices: positions of the agent's state in the observation.
+            surrounding_indices: positions of the surrounding state in the observation.
             **settings: fields of `MusicSettings`.
 
         Raises:
-            TypeError: an unknown setting.
-            ValueError: the indices overlap, or repeat one.
+            TypeError: unknown setting.
         """
-        _reject_unknown("music", settings, MusicSettings)
-        self._set(_prefixed("music_", settings))
         if agent_indices is not NotProvided:
-            self.agent_indices = tuple(agent_indices)
+            agent_indices = tuple(agent_indices)
         if surrounding_indices is not NotProvided:
-            self.surrounding_indices = tuple(surrounding_indices)
-        if self.agent_indices and self.surrounding_indices:  # a later call may set the other one
-            check_split(self.agent_indices, self.surrounding_indices)
-        return self
+            surrounding_indices = tuple(surrounding_indices)
+        return self._set(
+            _prefixed("music", settings, MusicSettings),
+            agent_indices=agent_indices,
+            surrounding_indices=surrounding_indices,
+        )
 
     def replay(self, *, moved_distance: float | None = NotProvided, **settings: Any) -> Self:
-        """Sets the replay and hindsight up.
+        """Set the hyperparameters of replay and hindsight.
 
         Args:
             moved_distance: for `hindsight_episodes: moved`, the distance from the first achieved
-                goal that counts as moved. None: the task's reward decides, or where it is dense a
+                goal that counts as moved. None: the task's reward decides; with dense rewards, a
                 fifth of the environment's `distance_threshold`.
             **settings: fields of `ReplaySettings`.
 
         Raises:
-            TypeError: an unknown setting.
+            TypeError: unknown setting.
         """
-        _reject_unknown("replay", settings, ReplaySettings)
-        return self._set(_prefixed("replay_", settings), moved_distance=moved_distance)
+        fields = _prefixed("replay", settings, ReplaySettings)
+        return self._set(fields, moved_distance=moved_distance)
 
-    def _set(self, settings: Mapping[str, Any], **more: Any) -> Self:
-        """Sets attributes; those of `more` only where they are provided."""
-        given = {name: value for name, value in more.items() if value is not NotProvided}
+    def _set(self, settings: Mapping[str, Any], **optional: Any) -> Self:
+        """Set attributes; those of `optional` only if they are provided."""
+        given = {name: value for name, value in optional.items() if value is not NotProvided}
         for name, value in {**settings, **given}.items():
             setattr(self, name, value)
         return self
 
     def update_from_dict(self, config_dict: Any) -> Self:
-        """Updates the settings as RLlib does, but raises ValueError for unknown keys."""
+        """Update the settings as RLlib does, but raise ValueError for unknown keys."""
         # RLlib also reads keys of its own dictionaries that are no attributes, and Tune adds keys
         # with double underscores.
         known = {*self.to_dict(), "multiagent"}
@@ -177,29 +183,50 @@ class TACConfig(AlgorithmConfig):
             raise ValueError(f"unknown settings in the config: {', '.join(sorted(unknown))}")
         return super().update_from_dict(config_dict)  # type: ignore[no-any-return]
 
+    def to_dict(self) -> dict[str, Any]:
+        found: dict[str, Any] = super().to_dict()
+        del found["_settings"]
+        return found
+
+    def get_state(self) -> dict[str, Any]:
+        # RLlib drops values of -1, which would then pass validation as the default.
+        state: dict[str, Any] = super().get_state()
+        return state | {name: getattr(self, name) for name in _FIELDS}
+
     # -- reading --------------------------------------------------------------------------
 
-    def tac_settings(self) -> TACSettings:
-        """The validated settings of TAC; raises ValueError that names each problem."""
-        return self._collect(TACSettings, "")
+    @property
+    def settings(self) -> AlgorithmSettings:
+        """The validated settings; raises ValueError that names each problem."""
+        if self._settings is None:
+            found = AlgorithmSettings(
+                tac=self._validated(TACSettings, ""),
+                music=self._validated(MusicSettings, "music_"),
+                replay=self._validated(ReplaySettings, "replay_"),
+                split=self._validated(Split, ""),
+            )
+            self.__dict__["_settings"] = found  # also if the config is frozen
+            return found
+        return self._settings
 
-    def music_settings(self) -> MusicSettings:
-        """The validated settings of MUSIC; raises ValueError that names each problem."""
-        return self._collect(MusicSettings, "music_")
-
-    def replay_settings(self) -> ReplaySettings:
-        """The validated settings of the replay; raises ValueError that names each problem."""
-        return self._collect(ReplaySettings, "replay_")
-
-    def _collect(self, model: type[_Settings], prefix: str) -> _Settings:
+    def _validated(self, model: type[_Model], prefix: str) -> _Model:
         values = {name: getattr(self, prefix + name) for name in model.model_fields}
-        return _checked(prefix, lambda: model.model_validate(values))
+        try:
+            return model.model_validate(values)
+        except ValidationError as error:
+            problems = []
+            for problem in error.errors():
+                where = ".".join(str(part) for part in problem["loc"] if part not in _TAGS)
+                rule = problem["msg"].removeprefix("Value error, ")
+                value = "" if "got " in rule else f", got {problem['input']!r}"
+                problems.append(f"{prefix}{where}: {rule}{value}" if where else f"{rule}{value}")
+            raise ValueError("; ".join(problems)) from None
 
     def validate(self) -> None:
-        if not self.in_evaluation and (problems := list(without_effect(self))):
+        if not self.in_evaluation and (problems := list(ignored_settings(self))):
             self._value_error("\n".join(problems))
         super().validate()
-        tac, music, replay = self.tac_settings(), self.music_settings(), self.replay_settings()
+        tac, music, replay, split = self.settings
         if self.in_evaluation:
             return
         if self.num_learners > 1:
@@ -210,17 +237,17 @@ class TACConfig(AlgorithmConfig):
         if music.prioritise_replay and replay.priority != "uniform":
             self._value_error(
                 "replay_priority must be 'uniform' with music_prioritise_replay, "
-                f"got {replay.priority!r}: one of them decides what is replayed"
+                f"got {replay.priority!r}: only one of them can decide what is replayed"
             )
         if music.prioritise_replay and replay.hindsight_episodes == "moved":
             self._value_error(
                 "replay_hindsight_episodes must be 'all' with music_prioritise_replay, got "
-                "'moved': one of them decides what is replayed"
+                "'moved': only one of them can decide what is replayed"
             )
         if music.goals == "zero" and replay.hindsight_k > 0:
             self._value_error(
-                "replay_hindsight_k must be 0 with music_goals='zero' (hindsight would put "
-                f"achieved goals in place of the zeros), got {replay.hindsight_k:g}"
+                "replay_hindsight_k must be 0 with music_goals='zero' (hindsight would replace "
+                f"the zeros by achieved goals), got {replay.hindsight_k:g}"
             )
         schedules = (
             tac.entropic_index,
@@ -233,15 +260,14 @@ class TACConfig(AlgorithmConfig):
                 "a linear schedule needs the budget: set training(total_env_steps=...)"
             )
         self._check_adaptive(tac, music)
-        if music.estimator != "none" and not (self.agent_indices and self.surrounding_indices):
+        if music.estimator != "none" and not split.agent_indices:
             self._value_error(
                 "MUSIC needs to know the agent's and the surrounding state: set "
                 "music(agent_indices=[...], surrounding_indices=[...])"
             )
-        check_split(self.agent_indices, self.surrounding_indices)
-        task = self._rewards()
-        if task is not None and (remark := cut_off(tac, music, task)):
-            warnings.warn(str(remark), stacklevel=2)
+        task = self._reward_of_step()
+        if task is not None and (warning := cut_off(tac, music, task)):
+            warnings.warn(str(warning), stacklevel=2)
 
     def _check_adaptive(self, tac: TACSettings, music: MusicSettings) -> None:
         adaptive = {
@@ -258,40 +284,39 @@ class TACConfig(AlgorithmConfig):
                     "evaluation(evaluation_interval=...)"
                 )
 
-    def _rewards(self) -> Range | None:
-        """The range of a step's reward, as set or a built-in task's; None: unknown."""
+    def _reward_of_step(self) -> Range | None:
+        """The range of a step's reward, set or that of a built-in task; None: unknown."""
         reward_range = self.reward_range
         if reward_range is None and not self.env_config:
             built_in = (t.reward_range for t in BUILT_IN_TASKS.values() if t.env_id == self.env)
             reward_range = next(built_in, None)
         return None if reward_range is None else Range(*reward_range)
 
-    # -- what RLlib builds from it --------------------------------------------------------
+    # -- defaults for RLlib ---------------------------------------------------------------
 
     def get_default_rl_module_spec(self) -> RLModuleSpec:
         return RLModuleSpec(module_class=TACModule)
 
+    def get_default_learner_class(self) -> type:
+        return TACLearner
+
     @property
     def _model_config_auto_includes(self) -> dict[str, Any]:
-        """RLlib lays a spec's own `model_config` upon it, so that own modules get the settings."""
-        return {"tac": self.tac_settings().model_dump(mode="json")}
+        """RLlib merges a spec's own `model_config` into it, so own modules get the settings."""
+        return {"tac": self.settings.tac}
 
     def get_multi_rl_module_spec(
         self, *, inference_only: bool = False, **kwargs: Any
     ) -> MultiRLModuleSpec:
         spec = super().get_multi_rl_module_spec(inference_only=inference_only, **kwargs)
-        music = self.music_settings()
+        music = self.settings.music
         if music.estimator != "none" and not inference_only:
             policy = spec.rl_module_specs[DEFAULT_MODULE_ID]
             estimator = RLModuleSpec(
                 module_class=EstimatorModule,
                 observation_space=policy.observation_space,
                 action_space=policy.action_space,
-                model_config={
-                    "agent_indices": self.agent_indices,
-                    "surrounding_indices": self.surrounding_indices,
-                    "hidden_size": music.hidden_size,
-                },
+                model_config={**dict(self.settings.split), "hidden_size": music.hidden_size},
                 learner_only=True,
             )
             spec.add_modules({ESTIMATOR_MODULE: estimator})
@@ -300,70 +325,32 @@ class TACConfig(AlgorithmConfig):
     def intrinsic_reward(self, networks: Any) -> IntrinsicReward:
         """The reward that the Learner adds; a subclass may return another one.
 
-        `networks` is the module `ESTIMATOR_MODULE`; None where the settings have no estimator.
+        `networks` is the module `ESTIMATOR_MODULE`; None if the settings have no estimator.
         """
-        return Music(self.music_settings(), networks and networks.estimator)
-
-    def scheduled(self, actions: int) -> ScheduledSettings:
-        """The settings that change over the run; `actions` is the number of action dimensions."""
-        return ScheduledSettings(
-            self.tac_settings(), self.music_settings(), self.total_env_steps or 0, actions
-        )
-
-    def get_default_learner_class(self) -> type:
-        from music_rllib.tac.learner import TACLearner
-
-        return TACLearner
+        return Music(self.settings.music, networks and networks.estimator)
 
 
-_OWNED: tuple[tuple[type[BaseModel], str], ...] = (
+_MODELS: tuple[tuple[type[BaseModel], str], ...] = (
     (TACSettings, ""),
     (MusicSettings, "music_"),
     (ReplaySettings, "replay_"),
+    (Split, ""),
 )
-_TAC_FIELDS = frozenset(TACSettings.model_fields)
-_CHECKS: dict[str, TypeAdapter[Any]] = {
-    prefix + name: TypeAdapter(field.rebuild_annotation(), config=ConfigDict(allow_inf_nan=False))
-    for settings, prefix in _OWNED
-    for name, field in settings.model_fields.items()
-} | {name: TypeAdapter(Indices) for name in ("agent_indices", "surrounding_indices")}
-"""The rule of each single field; `validate()` checks rules between fields."""
-_KINDS = frozenset(
+"""Types of `AlgorithmSettings`, and the prefix of their fields as attributes of the config."""
+_FIELDS = frozenset(prefix + name for model, prefix in _MODELS for name in model.model_fields)
+_TAGS = frozenset(
     {
         *("constant", "linear", "piecewise", "measured", "scheduled", "learned"),
         *("policy", "gaussian_noise"),
     }
 )
-"""Members of unions, which pydantic adds to an error's location."""
-_T = TypeVar("_T")
+"""Tags of unions, which pydantic adds to an error's location."""
 
 
-def _checked(place: str, validation: Callable[[], _T]) -> _T:
-    """The result of `validation`; its errors become one ValueError with field, rule and value."""
-    try:
-        return validation()
-    except ValidationError as error:
-        problems = []
-        for problem in error.errors():
-            inside = [str(part) for part in problem["loc"] if part not in _KINDS]
-            where = place + ("." if place in _CHECKS and inside else "") + ".".join(inside)
-            rule = problem["msg"].removeprefix("Value error, ")
-            value = "" if "got " in rule else f", got {problem['input']!r}"
-            problems.append(f"{where}: {rule}{value}" if where else f"{rule}{value}")
-        raise ValueError("; ".join(problems)) from None
-
-
-def _prefixed(prefix: str, settings: Mapping[str, Any]) -> dict[str, Any]:
-    return {prefix + name: value for name, value in settings.items()}
-
-
-def _is_search_space(value: Any) -> bool:
-    """Whether Tune still has to choose the value."""
-    return isinstance(value, Domain) or (isinstance(value, dict) and "grid_search" in value)
-
-
-def _reject_unknown(method: str, settings: Mapping[str, Any], model: type[BaseModel]) -> None:
+def _prefixed(method: str, settings: Mapping[str, Any], model: type[BaseModel]) -> dict[str, Any]:
+    """Settings by the names of their attributes; raises TypeError for an unknown one."""
     unknown = sorted(set(settings) - set(model.model_fields))
     if unknown:
         known = ", ".join(model.model_fields)
         raise TypeError(f"{method}() has no setting {', '.join(unknown)}; it has: {known}")
+    return {f"{method}_{name}": value for name, value in settings.items()}

@@ -1,20 +1,34 @@
-"""Metrics of gradient updates. Formulas: docs/algorithms.md.
+"""Metrics of gradient updates and of fresh episodes. Formulas: docs/algorithms.md.
 
 All updates of a call are measured at once, which takes a tenth of the time of one by one.
 
-Shape legend: K updates, B batch, A action dimensions, C critics.
+Shape legend: K updates, B batch, A action dimensions, C critics, E fresh episodes, S steps of all
+of them, I network inputs.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from ray.rllib.core.columns import Columns
 from torch import Tensor
 
 from music_rllib import names
 from music_rllib.config.tac_settings import TACSettings
-from music_rllib.functional.tsallis import MAX_EXPONENT, bound_active, ln_q_of_log, ln_q_of_policy
+from music_rllib.functional.distribution import (
+    MAX_EXPONENT,
+    bound_active,
+    ln_q_of_log,
+    ln_q_of_policy,
+)
+from music_rllib.replay.trajectories import Trajectory
+from music_rllib.tac.objective import Objective
+from music_rllib.tac.rl_module import TACModule
 
 
 class NonFiniteLossError(RuntimeError):
@@ -22,7 +36,7 @@ class NonFiniteLossError(RuntimeError):
 
 
 def check_finite(keys: Sequence[str], table: Tensor, updates: int, q: float, alpha: float) -> None:
-    """Raises NonFiniteLossError where a metric of a call is not finite.
+    """Raise NonFiniteLossError if a metric of a call is not finite.
 
     `table` is [K, M] with the metrics named by `keys`, `updates` the number of the last update.
     """
@@ -71,7 +85,10 @@ def td_errors(observed: Mapping[str, Tensor]) -> Tensor:
 
 
 def _of_policy(log_density: Tensor, q: float, form: str) -> dict[str, Tensor]:
-    """Entropies of the policy, and how often the bound of ln_q acts, by log-densities [K, B, A]."""
+    """Entropies of the policy, and the share of densities beyond the bound of ln_q.
+
+    `log_density` is [K, B, A].
+    """
     # Bounded as in the losses: a metric that overflows would stop a run whose losses are finite.
     tsallis = -ln_q_of_log(log_density, q, max_exponent=MAX_EXPONENT).mean(1)
     shannon = -log_density.mean(1)
@@ -93,3 +110,72 @@ def _share_at_bounds(values: Tensor, bounds: tuple[float, float]) -> Tensor:
 def _share(holds: Tensor) -> Tensor:
     """[K, ...] booleans -> [K]."""
     return holds.flatten(1).float().mean(1)
+
+
+# -- fresh episodes, before they are trained on ----------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class FreshEpisodes:
+    """Concatenated episodes: states and next states [S, I], actions [S, A], task rewards [S]."""
+
+    states: Tensor
+    followers: Tensor
+    actions: Tensor
+    rewards: Tensor
+    lengths: list[int]
+    """[E] steps of each episode."""
+    terminated: NDArray[np.bool_]
+    """[E]"""
+
+    @classmethod
+    def of(cls, episodes: Sequence[Trajectory], inputs: int, device: torch.device) -> FreshEpisodes:
+        """The episodes on a device; the first `inputs` columns of a frame are a network's input."""
+
+        def concatenated(arrays: Sequence[NDArray[Any]]) -> Tensor:
+            return torch.as_tensor(np.concatenate(arrays), device=device)
+
+        return cls(
+            states=concatenated([episode.frames[:-1, :inputs] for episode in episodes]),
+            followers=concatenated([episode.frames[1:, :inputs] for episode in episodes]),
+            actions=concatenated([episode.actions for episode in episodes]),
+            rewards=concatenated([episode.rewards for episode in episodes]),
+            lengths=[len(episode) for episode in episodes],
+            terminated=np.array([episode.terminated for episode in episodes]),
+        )
+
+
+def critic_bias(
+    fresh: FreshEpisodes,
+    rewards: Tensor,
+    module: TACModule,
+    objective: Objective,
+    noise: Mapping[str, Tensor],
+) -> float:
+    """Mean over episodes of the critics' value of the first step minus the realized return.
+
+    Args:
+        fresh: the episodes.
+        rewards: [S] with the intrinsic reward.
+        module: TAC's networks.
+        objective: gives the entropy's part of the return, and the value after a truncation.
+        noise: standard normal noise [S, A] for the policy's actions, by name.
+    """
+    first = np.cumsum([0, *fresh.lengths[:-1]])
+    last = np.cumsum(fresh.lengths) - 1
+    normalised = module.normaliser(fresh.states)
+    _, log_density, _ = module.sample_with_density(normalised, noise.get("noise"))
+    entropy = -objective.ln_q(log_density).expand(len(rewards))
+    earned = (rewards + float(objective.alpha) * entropy).cpu().numpy().astype(float)
+    # A critic's value does not include the entropy of the action that it is given.
+    earned[first] = rewards.cpu().numpy()[first]
+    ends = {Columns.NEXT_OBS: fresh.followers[last]}
+    ends |= {name: values[last] for name, values in noise.items()}
+    tail = objective.soft_value(module.forward_target(ends)).cpu().numpy()
+    gamma = objective.gamma
+    episodes = np.split(earned, first[1:])
+    realized = np.array([episode @ gamma ** np.arange(len(episode)) for episode in episodes])
+    realized += ~fresh.terminated * gamma ** np.array(fresh.lengths) * tail
+    inputs = torch.cat([module.normaliser(fresh.states[first]), fresh.actions[first]], -1)
+    predicted = module.critics(inputs).amin(0).cpu().numpy()
+    return float((predicted - realized).mean())

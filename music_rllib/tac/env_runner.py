@@ -47,8 +47,8 @@ from music_rllib.envs.tasks import beyond_observation
 from music_rllib.envs.values import BadNumberError, check_action_space, observation_sizes, to_bounds
 from music_rllib.replay.trajectories import ReplayLayout
 from music_rllib.runtime.quiet import quiet_third_parties
+from music_rllib.tac.callbacks import EpisodeCallbacks
 from music_rllib.tac.rl_module import Actor, TACModule
-from music_rllib.tac.rllib.callbacks import EpisodeCallbacks
 
 SUCCESS_LAST, SUCCESS_ANY = "success_last_step", "success_any_step"
 DISPLACEMENT, MOVED = "object_displacement", "object_moved"
@@ -72,13 +72,12 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
         self.worker_index: int = self.worker_index or 0
         self._env_creator = kwargs.get("env_creator")
         self._spaces = kwargs.get("spaces")
-        self._settings: TACSettings = self.config.tac_settings()
-        music = self.config.music_settings()
-        self._zero_goals = music.goals == "zero" and not self.config.in_evaluation
+        tac, music, replay, self._split = self.config.settings
+        self._settings: TACSettings = tac
+        training = not self.config.in_evaluation
+        self._zero_goals = training and music.goals == "zero"
+        self._hindsight = training and replay.hindsight_k > 0
         self._success = (self.config.success_key, self.config.success_if_missing)
-        self._hindsight = (
-            self.config.replay_settings().hindsight_k > 0 and not self.config.in_evaluation
-        )
         # Training and evaluation have independent random streams, and so do the workers.
         self._entropy = (
             seed_or_entropy(self.config.seed),
@@ -108,7 +107,7 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
             goal=goal,
             horizon=episode_limit(self.env, self._settings.max_episode_steps),
         )
-        split = (self.config.agent_indices, self.config.surrounding_indices)
+        split = self._split.agent_indices, self._split.surrounding_indices
         if beyond := beyond_observation(*split, observation):
             raise ValueError("\n".join(beyond))
 
@@ -268,8 +267,8 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
         if episode.successes is not None:
             yield SUCCESS_LAST, float(episode.successes[-1])
             yield SUCCESS_ANY, float(episode.successes.any())
-        if self.config.surrounding_indices:
-            surrounding = episode.frames[:, list(self.config.surrounding_indices)]
+        if self._split.surrounding_indices:
+            surrounding = episode.frames[:, list(self._split.surrounding_indices)]
             moved = np.linalg.norm(surrounding - surrounding[0], axis=-1)
             yield DISPLACEMENT, float(moved[-1])
             yield MOVED, float(moved.max() > MOVED_THRESHOLD)

@@ -1,14 +1,7 @@
-"""The Learner: gradient updates of TAC and of an intrinsic reward, many in a call.
+"""The Learner: gradient updates of TAC and of an intrinsic reward, many in one call.
 
-A call of `update()` gets K concatenated minibatches (B transitions, N trajectories, T frames,
-I network inputs, D observation, A actions):
-
-- module `default_policy`: OBS [K*B, I], ACTIONS [K*B, A], REWARDS [K*B] (the task's),
-  "discounts" [K*B], NEXT_OBS [K*B, I], and "weights" [K*B] where the replay is prioritised
-- module `mi_estimator`, where it is trained: OBS [K*N, T, D] whole trajectories
-
-Each of the K updates relabels its transitions with the current intrinsic reward and takes one step
-of every network.
+A call of `update()` gets K concatenated minibatches (`minibatches.py`). Each of its K updates
+relabels its transitions with the current intrinsic reward and takes one step of every network.
 """
 
 from __future__ import annotations
@@ -33,36 +26,31 @@ from torch import Tensor
 from music_rllib import names
 from music_rllib.config.tac_settings import LearnedAlpha, TACSettings
 from music_rllib.intrinsic.interface import IntrinsicReward
-from music_rllib.optim.adam import FusedAdam
 from music_rllib.replay.trajectories import Trajectory
 from music_rllib.runtime.process import keep_freed_memory
 from music_rllib.runtime.quiet import quiet_third_parties
 from music_rllib.schedules import Quantity
 from music_rllib.tac import diagnostics
-from music_rllib.tac.fresh_episodes import FreshEpisodes, critic_bias
-from music_rllib.tac.kernels.blas import use_threads
-from music_rllib.tac.kernels.forward import TACForward
-from music_rllib.tac.kernels.minibatches import Minibatch, Minibatches
-from music_rllib.tac.kernels.update import DirectUpdate
-from music_rllib.tac.normaliser import RunningNormaliser
-from music_rllib.tac.objective import Losses, Objective
-from music_rllib.tac.rl_module import ESTIMATOR_MODULE, TACModule
-from music_rllib.tac.rllib.settings import HOOKS, has_own_loss, needs_gradients
-from music_rllib.tac.scheduled import ScheduledSettings
+from music_rllib.tac.compiled_update import CompiledUpdate, FusedAdam, needs_autograd, use_threads
+from music_rllib.tac.diagnostics import FreshEpisodes, critic_bias
+from music_rllib.tac.minibatches import Minibatch, Minibatches
+from music_rllib.tac.networks import RunningNormaliser
+from music_rllib.tac.objective import Losses, Objective, ScheduledSettings
+from music_rllib.tac.rl_module import ESTIMATOR_MODULE, TACForward, TACModule
 
 GRAD_UPDATES = "grad_updates"
 LOSSES = "losses"
 
 
 class TACLearner(TorchLearner):
-    """Tsallis actor-critic updates (paper III-B), with an intrinsic reward where configured."""
+    """Tsallis actor-critic updates (paper III-B), with an intrinsic reward if configured."""
 
     def build(self) -> None:
         quiet_third_parties()  # a remote Learner is a process of its own
         keep_freed_memory()
-        self._settings: TACSettings = self.config.tac_settings()
-        # An algorithm in the driver would otherwise use every core for 256-row products, and run
-        # twenty times slower beside another trial; sums would also change.
+        self._settings: TACSettings = self.config.settings.tac
+        # Otherwise an algorithm in the driver uses every core for 256-row products, runs twenty
+        # times slower beside another trial, and gets other sums.
         torch.set_num_threads(self.config.torch_threads)
         use_threads(self.config.torch_threads)
         self._adam: dict[str, FusedAdam] = {}
@@ -74,31 +62,31 @@ class TACLearner(TorchLearner):
         self._observed: dict[str, Tensor] = {}
         self._names_of_losses: list[str] = []
         self._td_errors: Tensor | None = None
-        self._now: ScheduledSettings = self.config.scheduled(self._policy_module.action_size)
+        music, budget = self.config.settings.music, self.config.total_env_steps or 0
+        actions = self._policy_module.action_size
+        self._now = ScheduledSettings(self._settings, music, budget, actions)
         self._objective = Objective(self._settings, self._policy_module, self._now)
         pairs = self._policy_module.get_target_network_pairs()
         self._online: list[Tensor] = [p for online, _ in pairs for p in online.parameters()]
         self._targets: list[Tensor] = [p for _, target in pairs for p in target.parameters()]
-        self._direct: DirectUpdate | None = None
-        on_cpu = self._device.type == "cpu"
-        if on_cpu and self._is_standard and not needs_gradients(self.config):
-            self._direct = DirectUpdate(self._policy_module)
+        self._compiled: CompiledUpdate | None = None
+        if self._device.type == "cpu" and not self._needs_autograd:
+            self._compiled = CompiledUpdate(self._policy_module)
 
     @cached_property
     def _intrinsic(self) -> IntrinsicReward:
-        has_estimator = ESTIMATOR_MODULE in self.module
-        networks = self.module[ESTIMATOR_MODULE].unwrapped() if has_estimator else None
-        return self.config.intrinsic_reward(networks)  # type: ignore[no-any-return]
+        return self.config.intrinsic_reward(self._estimator)  # type: ignore[no-any-return]
 
     @property
-    def _is_standard(self) -> bool:
-        """Whether `DirectUpdate` does all that an update by autograd would do."""
-        own_hooks = any(getattr(type(self), h) is not getattr(TACLearner, h) for h in HOOKS)
-        own_networks = type(self._policy_module) is not TACModule
-        own_loss = ESTIMATOR_MODULE in self.module and has_own_loss(
-            self.module[ESTIMATOR_MODULE].unwrapped()
-        )
-        return not (own_hooks or own_networks or own_loss)
+    def _estimator(self) -> Any:
+        """The module of the intrinsic reward's networks, if there is one."""
+        has_one = ESTIMATOR_MODULE in self.module
+        return self.module[ESTIMATOR_MODULE].unwrapped() if has_one else None
+
+    @property
+    def _needs_autograd(self) -> bool:
+        modules = self._policy_module, self._estimator
+        return needs_autograd(type(self), TACLearner, self.config, *modules)
 
     @property
     def _policy_module(self) -> TACModule:
@@ -135,7 +123,7 @@ class TACLearner(TorchLearner):
         self._objective.refresh()
 
     def observe_measured(self, quantity: Quantity, measured: float, env_steps: int) -> None:
-        """Records a measurement after `env_steps`; settings follow it from the next update on."""
+        """Record a measurement after `env_steps`; settings follow it from the next update on."""
         self._now.observe(quantity, measured, env_steps)
 
     def update(
@@ -146,9 +134,9 @@ class TACLearner(TorchLearner):
         timesteps: dict[str, Any] | None = None,
         **kwargs: Any,
     ) -> ResultDict:
-        """Does one update for each minibatch of the batch, and logs the means of their metrics.
+        """Do one update for each minibatch of the batch, and log the means of their metrics.
 
-        Raises `diagnostics.NonFiniteLossError` where a loss is not finite.
+        Raises `diagnostics.NonFiniteLossError` if a loss is not finite.
         """
         self._check_is_built()
         self.before_gradient_based_update(timesteps=timesteps or {})
@@ -157,11 +145,11 @@ class TACLearner(TorchLearner):
             batch = training_data.batch
         assert batch is not None
         self._weights_seq_no += 1
-        if self._direct is not None and not self._direct.is_in_use:
-            self._direct = DirectUpdate(self._policy_module)
+        if self._compiled is not None and not self._compiled.is_in_use:
+            self._compiled = CompiledUpdate(self._policy_module)
         minibatches = self._minibatches(self._convert_batch_type(batch))
         if minibatches.updates:
-            learn = self._learn_by_autograd if self._direct is None else self._learn_directly
+            learn = self._learn_by_autograd if self._compiled is None else self._learn_compiled
             self._log_updates(learn(minibatches))
         self.after_gradient_based_update(timesteps=timesteps or {})
         return self.metrics.reduce()
@@ -175,13 +163,13 @@ class TACLearner(TorchLearner):
                 self._update_targets()
         return {name: torch.stack([each[name] for each in history]) for name in history[0]}
 
-    def _learn_directly(self, minibatches: Minibatches) -> dict[str, Tensor]:
-        """Updates without autograd: all in one call, or one by one where alpha is learned."""
+    def _learn_compiled(self, minibatches: Minibatches) -> dict[str, Tensor]:
+        """Updates without autograd: all in one call, or one by one if alpha is learned."""
         history = []
         for part in minibatches.one_by_one() if "alpha" in self._adam else (minibatches,):
             self._losses, self._observed = {}, {}
             rewards = functools.partial(self._learn_intrinsic, part)
-            self._update_directly(self._relabelled(part.columns, rewards))
+            self._update_compiled(self._relabelled(part.columns, rewards))
             self._grad_updates += part.updates
             losses = torch.stack([loss.view(part.updates) for loss in self._losses.values()], 1)
             history.append({LOSSES: losses, **self._observed})
@@ -193,13 +181,13 @@ class TACLearner(TorchLearner):
         torch._foreach_lerp_(self._targets, self._online, self._settings.tau)
 
     def postprocess_gradients(self, gradients_dict: ParamDict) -> ParamDict:
-        """Skips RLlib's sorting of gradients where nothing is clipped or logged."""
+        """Skip RLlib's sorting of gradients if nothing is clipped or logged."""
         if self.config.grad_clip is None and not self.config.log_gradients:
             return gradients_dict
         return super().postprocess_gradients(gradients_dict)
 
     def _step(self, minibatch: Minibatches) -> dict[str, Tensor]:
-        """Updates every network but the targets by autograd, on one minibatch.
+        """Update every network except the targets by autograd, on one minibatch.
 
         Returns `LOSSES` [M], in the order of `_names_of_losses`, and tensors for the diagnostics.
         """
@@ -212,7 +200,7 @@ class TACLearner(TorchLearner):
         return {LOSSES: torch.stack(list(self._losses.values())), **self._observed}
 
     def _minibatches(self, batch: MultiAgentBatch) -> Minibatches:
-        """The minibatches of a batch, with the random numbers of all updates."""
+        """The minibatches of a batch, with random numbers for all updates."""
         columns: Minibatch = {mid: dict(b) for mid, b in batch.policy_batches.items()}
         policy = columns[DEFAULT_MODULE_ID]
         policy |= self._policy_noise(policy[Columns.ACTIONS])
@@ -223,7 +211,7 @@ class TACLearner(TorchLearner):
         return Minibatches(columns, drawn)
 
     def _policy_noise(self, actions: Tensor) -> dict[str, Tensor]:
-        """Standard normal noise for the policy's actions, and for the next ones where needed."""
+        """Standard normal noise for the policy's actions, and for the next ones if needed."""
         if self._settings.policy == "deterministic":
             return {}
         columns = ["noise"] if self._settings.bootstrap == "value" else ["noise", "next_noise"]
@@ -246,7 +234,7 @@ class TACLearner(TorchLearner):
         return self._losses_of(fwd_out["tac"], batch).total
 
     def _losses_of(self, forward: TACForward, batch: Mapping[str, Tensor]) -> Losses:
-        """The losses; keeps the tensors of the metrics, since reading them here would wait."""
+        """The losses; keeps the tensors of the metrics, because reading them here would wait."""
         losses = self._objective.losses(forward, batch)
         self._losses |= losses.named
         self._observed |= {"q_values": forward.q_values.detach(), "targets": losses.target}
@@ -261,12 +249,12 @@ class TACLearner(TorchLearner):
         self._losses |= metrics
         return loss
 
-    def _update_directly(self, minibatches: Minibatch) -> None:
-        """Updates TAC's networks without autograd, and a learned alpha by one step."""
-        assert self._direct is not None
+    def _update_compiled(self, minibatches: Minibatch) -> None:
+        """Update TAC's networks without autograd, and a learned alpha by one step."""
+        assert self._compiled is not None
         q, alpha = self._now.entropic_index, float(self._objective.alpha)
         policy = minibatches[DEFAULT_MODULE_ID]
-        learned = self._direct.learn(policy, self._adam["networks"], self._grad_updates, q, alpha)
+        learned = self._compiled.learn(policy, self._adam["networks"], self._grad_updates, q, alpha)
         self._losses |= learned.losses
         self._observed |= learned.observed
         if "alpha" in self._adam:
@@ -279,7 +267,7 @@ class TACLearner(TorchLearner):
             self._adam["alpha"].step()
 
     def _learn_intrinsic(self, minibatches: Minibatches) -> Tensor:
-        """[K, B] intrinsic rewards, each minibatch's before the update of their networks."""
+        """[K, B] intrinsic rewards, each minibatch's before the update of its networks."""
         if "estimator" not in self._adam:
             return minibatches.intrinsic_rewards(self._intrinsic)
         states, followers = minibatches.transitions
@@ -291,14 +279,14 @@ class TACLearner(TorchLearner):
         return rewards
 
     def _log_updates(self, outputs: Mapping[str, Tensor]) -> None:
-        """Logs the means of the updates' metrics; `outputs` are those of `_step`, stacked to K."""
+        """Log the means of the updates' metrics; `outputs` are those of `_step`, stacked to K."""
         losses_of_updates = dict(zip(self._names_of_losses, outputs[LOSSES].T, strict=True))
         q, alpha = self._now.entropic_index, float(self._objective.alpha)
         metrics = losses_of_updates | diagnostics.of_updates(outputs, self._settings, q)
-        if self.config.replay_priority == "td_error":
+        if self.config.settings.replay.priority == "td_error":
             self._td_errors = diagnostics.td_errors(outputs)
         keys, table = list(metrics), torch.stack([m.float() for m in metrics.values()], dim=1)
-        # A NaN never leaves the networks again, so looking once a call is enough.
+        # A NaN never leaves the networks again, so one check per call is enough.
         diagnostics.check_finite(keys, table, self._grad_updates, q, alpha)
         log = self.metrics.log_value
         means = dict(zip(keys, table.mean(0).tolist(), strict=True))
@@ -313,9 +301,9 @@ class TACLearner(TorchLearner):
 
     @torch.no_grad()
     def diagnose(self, episodes: Sequence[Trajectory]) -> None:
-        """Measures fresh episodes of the policy before they are trained on.
+        """Measure fresh episodes of the policy before they are trained on.
 
-        Logs the critics' bias at their first steps; the intrinsic reward keeps its own measures.
+        Log the critics' bias at their first steps; the intrinsic reward keeps its own measures.
         """
         fresh = FreshEpisodes.of(episodes, self._policy_module.input_size, self._device)
         rewards = fresh.rewards
@@ -343,10 +331,10 @@ class TACLearner(TorchLearner):
     # -- normaliser, state ----------------------------------------------------------------
 
     def observe_inputs(self, inputs: Any) -> None:
-        """Updates the running normaliser by [B, I] new network inputs (numpy)."""
+        """Update the running normalizer by [B, I] new network inputs (numpy)."""
         normaliser = self._policy_module.normaliser
         if isinstance(normaliser, RunningNormaliser):
-            # A remote Learner gets arrays that can't be written to, of which PyTorch warns.
+            # A remote Learner gets read-only arrays; PyTorch warns about those.
             normaliser.update(torch.tensor(inputs, device=self._device))
 
     def get_state(self, *args: Any, **kwargs: Any) -> StateDict:

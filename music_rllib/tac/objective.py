@@ -1,4 +1,4 @@
-"""TAC's losses on one minibatch, by the current settings.
+"""TAC's losses on one minibatch, and the current values of settings that change over a run.
 
 Shape legend: B batch, A action dimensions, C critics.
 """
@@ -7,19 +7,97 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from ray.rllib.core.columns import Columns
 from torch import Tensor
 
 from music_rllib import names
-from music_rllib.config.tac_settings import LearnedAlpha, TACSettings
+from music_rllib.config.tac_settings import LearnedAlpha, TACSettings, alpha_at
 from music_rllib.functional import actor_critic
-from music_rllib.functional.tsallis import ln_q_of_policy
-from music_rllib.tac.kernels.forward import Bootstrap, TACForward
-from music_rllib.tac.rl_module import TACModule
-from music_rllib.tac.scheduled import ScheduledSettings
+from music_rllib.functional.distribution import ln_q_of_policy
+from music_rllib.intrinsic.settings import MusicSettings
+from music_rllib.schedules import Follower, Measured, Quantity, value_at
+from music_rllib.tac.rl_module import Bootstrap, TACForward, TACModule
+
+
+class ScheduledSettings:
+    """q, alpha and the weight of the intrinsic reward at the time of the last `advance`.
+
+    Args:
+        tac: settings of TAC.
+        music: settings of MUSIC.
+        total_env_steps: the run's budget; 0 if it is unknown.
+        actions: number of action dimensions.
+    """
+
+    entropic_index: float
+    mi_reward_weight: float
+    alpha: float
+    """Alpha at the current q; unused if alpha is learned."""
+
+    def __init__(
+        self, tac: TACSettings, music: MusicSettings, total_env_steps: int, actions: int
+    ) -> None:
+        self._tac, self._music = tac, music
+        self._total, self._actions = total_env_steps, actions
+        adaptive = {
+            names.ENTROPIC_INDEX: tac.entropic_index,
+            names.MI_REWARD_WEIGHT: music.mi_reward_weight,
+        }
+        self._followers = {
+            name: Follower(value) for name, value in adaptive.items() if isinstance(value, Measured)
+        }
+        self._set(0, {})
+
+    def advance(self, env_steps: int) -> None:
+        """Set the values for `env_steps`, using the measurements so far."""
+        self._set(env_steps, {name: each.measured for name, each in self._followers.items()})
+
+    def _set(self, env_steps: int, followed: dict[str, float | None]) -> None:
+        self._env_steps, self._followed = env_steps, followed
+        tac, time = self._tac, (env_steps, self._total)
+        self.entropic_index = value_at(
+            tac.entropic_index, *time, followed.get(names.ENTROPIC_INDEX)
+        )
+        self.mi_reward_weight = value_at(
+            self._music.mi_reward_weight, *time, followed.get(names.MI_REWARD_WEIGHT)
+        )
+        self.alpha = alpha_at(tac, self.entropic_index, *time, self._actions)
+
+    def observe(self, quantity: Quantity, measured: float, env_steps: int | None = None) -> None:
+        """Record a measurement made after `env_steps`, or at the last `advance`."""
+        at = self._env_steps if env_steps is None else env_steps
+        for follower in self._followers.values():
+            follower.observe(quantity, measured, at)
+
+    def metrics(self) -> dict[str, float]:
+        """The values without alpha, and the measurements that they follow, by metric name."""
+        followed = {
+            names.FOLLOWED[name]: measured
+            for name, measured in self._followed.items()
+            if measured is not None
+        }
+        return {
+            names.ENTROPIC_INDEX: self.entropic_index,
+            names.MI_REWARD_WEIGHT: self.mi_reward_weight,
+            **followed,
+        }
+
+    def state(self) -> dict[str, Any]:
+        """The state for a checkpoint; fresh episodes are measured with the last update's values."""
+        return {
+            "env_steps": self._env_steps,
+            "followed": dict(self._followed),
+            "followers": {name: follower.state() for name, follower in self._followers.items()},
+        }
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """Continue from a result of `state`."""
+        self._set(state["env_steps"], dict(state["followed"]))
+        for name, follower in self._followers.items():
+            follower.load_state(state["followers"][name])
 
 
 class Losses(NamedTuple):
@@ -29,13 +107,13 @@ class Losses(NamedTuple):
     named: dict[str, Tensor]
     """[] each, by the metric's name."""
     target: Tensor
-    """[B] of the critics."""
+    """[B] the critics' targets."""
 
 
 class Objective:
     """TAC's losses (paper III-B) with the current networks, q and alpha.
 
-    `module` has TAC's networks, with log alpha where it is learned; `now` the scheduled settings.
+    `module` has TAC's networks, with log alpha if it is learned; `now` the scheduled settings.
     """
 
     def __init__(self, settings: TACSettings, module: TACModule, now: ScheduledSettings) -> None:
@@ -44,7 +122,7 @@ class Objective:
         self.refresh()
 
     def refresh(self) -> None:
-        """Adapts a learned alpha's target to the current q; called once for many updates."""
+        """Adapt a learned alpha's target to the current q; called once for many updates."""
         alpha = self._settings.alpha
         self._target_entropy = 0.0
         if isinstance(alpha, LearnedAlpha):
@@ -57,7 +135,7 @@ class Objective:
 
     @property
     def alpha(self) -> Tensor | float:
-        """The coefficient of the entropy, learned or by its schedule."""
+        """The coefficient of the entropy, learned or scheduled."""
         if isinstance(self._settings.alpha, LearnedAlpha):
             return self._module.log_alpha.detach().exp()
         return self._now.alpha
@@ -69,13 +147,13 @@ class Objective:
         return ln_q_of_policy(log_density, self._now.entropic_index, self._settings.entropy_form)
 
     def soft_value(self, bootstrap: Bootstrap) -> Tensor:
-        """[B] value of the states, with the entropy of the policy's action."""
+        """[B] value of the states, including the entropy of the policy's action."""
         if bootstrap.log_density is None:
             return bootstrap.value
         return bootstrap.value - self.alpha * self.ln_q(bootstrap.log_density)
 
     def losses(self, forward: TACForward, batch: Mapping[str, Tensor]) -> Losses:
-        """The losses of a minibatch; `batch` has the columns documented at `TACLearner`."""
+        """The losses of a minibatch; `batch` has the columns documented in `minibatches`."""
         settings, alpha = self._settings, self.alpha
         target = actor_critic.critic_target(
             batch[Columns.REWARDS],
@@ -106,7 +184,7 @@ class Objective:
         return Losses(total, named, target)
 
     def excess_entropy(self, log_density: Tensor, log_std: Tensor, ln_q_pi: Tensor) -> Tensor:
-        """The policy's entropy minus the target of a learned alpha, in the target's own measure.
+        """The policy's entropy minus a learned alpha's target, in the target's own measure.
 
         [] from log_density and log_std [B, A] and ln_q_pi [B]; the derivative of alpha's loss.
         """

@@ -1,12 +1,18 @@
-"""RLModules: TAC's networks, and MUSIC's estimator, which is on the Learner only."""
+"""RLModules: TAC's networks, MUSIC's estimator, and the weights of both as arrays.
+
+Shape legend: B batch, I network inputs, A action dimensions, C critics.
+"""
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from ray.rllib.core import DEFAULT_MODULE_ID
 from ray.rllib.core.columns import Columns
 from ray.rllib.core.rl_module.apis import InferenceOnlyAPI, SelfSupervisedLossAPI, TargetNetworkAPI
 from ray.rllib.core.rl_module.torch.torch_rl_module import TorchRLModule
@@ -15,44 +21,72 @@ from torch import Tensor, nn
 
 from music_rllib.config.tac_settings import LearnedAlpha, TACSettings
 from music_rllib.envs.values import observation_sizes
-from music_rllib.functional.squashed_gaussian import (
+from music_rllib.functional.distribution import (
     bounded_log_std,
-    deterministic_action,
     sample_squashed,
     squashed_action,
 )
 from music_rllib.intrinsic.estimator import MutualInformationEstimator
-from music_rllib.tac.kernels.forward import Bootstrap, TACForward
-from music_rllib.tac.networks import Critics, Floats, Perceptron
-from music_rllib.tac.normaliser import RunningNormaliser
+from music_rllib.tac.networks import Critics, Floats, Perceptron, RunningNormaliser
 
 Actor = Callable[[Floats, Floats | None], Floats]
 """Inputs [B, I] and noise [B, A], or None -> actions [B, A]."""
 ESTIMATOR_MODULE = "mi_estimator"
 """Module id of MUSIC's estimator in the Learner."""
+NetworkWeights = dict[str, dict[str, NDArray[Any]]]
+"""Arrays by network name (policy, critics, value, normaliser, mi_estimator, ...) and array name."""
+
+
+class Bootstrap(NamedTuple):
+    """Values of the next states by the target networks."""
+
+    value: Tensor
+    """[B] V of the averaged value network, or the smallest averaged critic at the next action."""
+    log_density: Tensor | None = None
+    """[B, A] of the next action, whose entropy is not in a critic's value; None if V includes it
+    or the policy is deterministic."""
+
+
+class TACForward(NamedTuple):
+    """Outputs of the networks for one minibatch, from which the losses are computed."""
+
+    action: Tensor
+    """[B, A] of the current policy at the batch's states."""
+    log_density: Tensor | None
+    """[B, A] of that action; None for a deterministic policy."""
+    log_std: Tensor | None
+    """[B, A]; None for a deterministic policy."""
+    q_values: Tensor
+    """[C, B] critics at the batch's actions."""
+    q_of_policy: Tensor
+    """[C, B] critics with frozen weights at the policy's actions."""
+    value: Tensor | None
+    """[B]; None without a value network."""
+    next: Bootstrap
 
 
 class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
-    """The networks of TAC behind one observation normaliser.
+    """The networks of TAC behind one observation normalizer.
 
-    The paper has a policy, a value network, its average, and twin critics. `bootstrap: critics`
-    replaces the value networks by averaged critics; a deterministic policy has one critic and an
-    averaged policy (DDPG).
+    The paper has a policy, a value network, its moving average, and twin critics. With
+    `bootstrap: critics`, averaged critics replace the value networks; a deterministic policy has
+    one critic and an averaged policy (DDPG).
 
     Observations are a one-dimensional Box, or a goal dictionary, whose observation and desired goal
-    are the networks' inputs. `model_config["tac"]` is a dumped `TACSettings`.
+    are the networks' inputs. `model_config["tac"]` is a `TACSettings`.
 
     All actions, of `act` and of RLlib's `forward_inference` and `forward_exploration`, are in
-    [-1, 1], whatever the environment's bounds: a caller scales them to its action space by
+    [-1, 1] for any bounds of the environment. The caller scales them to its action space by
     `low + (action + 1) / 2 * (high - low)`, as TAC's environment runner does.
 
     A subclass may have other networks. Its `setup` calls this one's, replaces `policy`, `critics`
     or `value` by modules with the same inputs and outputs, and then calls
-    `make_target_networks()`; it is given by `rl_module(rl_module_spec=RLModuleSpec(...))`.
+    `make_target_networks()`. Set it by `rl_module(rl_module_spec=RLModuleSpec(...))`.
     """
 
     def setup(self) -> None:
-        settings = self.settings = TACSettings.model_validate(self.model_config["tac"])
+        settings: TACSettings = self.model_config["tac"]
+        self.settings = settings
         observation, goal = observation_sizes(self.observation_space)
         inputs, actions = observation + goal, int(self.action_space.shape[0])
         sizes = settings.hidden_sizes
@@ -73,12 +107,13 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
             self.log_alpha = nn.Parameter(torch.tensor(settings.alpha.initial).log())
         self.make_target_networks()
 
+    # -- acting -------------------------------------------------------------------------------
+
     def policy_parameters(self, normalised: Tensor) -> tuple[Tensor, Tensor | None]:
         """[B, I] -> mean [B, A] before tanh, log standard deviation [B, A] within its bounds."""
-        return self.distribution(self.policy(normalised))
+        return self._parameters_of(self.policy(normalised))
 
-    def distribution(self, outputs: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Mean and log standard deviation from the outputs of the policy's network."""
+    def _parameters_of(self, outputs: Tensor) -> tuple[Tensor, Tensor | None]:
         if self.deterministic:
             return outputs, None
         mean, raw = outputs.chunk(2, dim=-1)
@@ -91,33 +126,26 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
         return self._action(self.policy(self.normaliser(inputs)), noise)
 
     def actor(self) -> Actor:
-        """`act` of arrays by the weights as they are now, on a CPU."""
+        """`act` on arrays with the current weights, on a CPU."""
         if type(self) is not TACModule:
-            return self._actor_in_torch
+            return lambda inputs, noise: self.act(torch.from_numpy(inputs), _tensor(noise)).numpy()
         policy, normaliser = self.policy.in_numpy(), self.normaliser
         normalise = normaliser.in_numpy() if isinstance(normaliser, RunningNormaliser) else None
 
         @torch.no_grad()
         def act(inputs: Floats, noise: Floats | None) -> Floats:
             outputs = policy(inputs if normalise is None else normalise(inputs))
-            drawn = None if noise is None else torch.from_numpy(noise)
-            return self._action(torch.from_numpy(outputs), drawn).numpy()
+            return self._action(torch.from_numpy(outputs), _tensor(noise)).numpy()
 
         return act
 
-    def _actor_in_torch(self, inputs: Floats, noise: Floats | None) -> Floats:
-        drawn = None if noise is None else torch.from_numpy(noise)
-        actions: Floats = self.act(torch.from_numpy(inputs), drawn).numpy()
-        return actions
-
     def _action(self, outputs: Tensor, noise: Tensor | None) -> Tensor:
-        mean, log_std = self.distribution(outputs)
+        mean, log_std = self._parameters_of(outputs)
         if noise is None or log_std is None:
-            return deterministic_action(mean)
+            return torch.tanh(mean)
         return squashed_action(mean, log_std, noise)
 
     def _forward_inference(self, batch: dict[str, Any], **kwargs: Any) -> dict[str, Any]:
-        """Actions in [-1, 1], which the caller scales."""
         return {Columns.ACTIONS: self.act(_network_inputs(batch[Columns.OBS]))}
 
     def _forward_exploration(self, batch: dict[str, Any], **kwargs: Any) -> dict[str, Any]:
@@ -125,11 +153,21 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
         noise = torch.randn(inputs.shape[0], self.action_size, device=inputs.device)
         return {Columns.ACTIONS: self.act(inputs, noise)}
 
+    # -- learning -----------------------------------------------------------------------------
+
+    def sample_with_density(
+        self, normalised: Tensor, noise: Tensor | None
+    ) -> tuple[Tensor, Tensor | None, Tensor | None]:
+        """[B, I] -> [B, A] actions, their log-densities, ln std; the last two None for DDPG."""
+        mean, log_std = self.policy_parameters(normalised)
+        if log_std is None or noise is None:
+            return torch.tanh(mean), None, None
+        return *sample_squashed(mean, log_std, noise), log_std
+
     def _forward_train(self, batch: dict[str, Any], **kwargs: Any) -> dict[str, Any]:
-        """All that the losses need; `batch` is documented at `TACLearner`."""
+        """The `TACForward` of a minibatch with the columns documented in `minibatches`."""
         inputs = self.normaliser(batch[Columns.OBS])
-        mean, log_std = self.policy_parameters(inputs)
-        action, log_density = choose_action(mean, log_std, batch.get("noise"))
+        action, log_density, log_std = self.sample_with_density(inputs, batch.get("noise"))
         return {
             "tac": TACForward(
                 action=action,
@@ -143,7 +181,7 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
         }
 
     def train(self, mode: bool = True) -> TACModule:
-        """Skips a mode that is already set: RLlib sets it for each update, which took 3 % of it."""
+        """Skip a mode that is already set: RLlib sets it for each update, 3% of an update."""
         return self if self.training == mode else super().train(mode)
 
     @property
@@ -159,9 +197,7 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
         if self.deterministic:
             action, log_density = torch.tanh(self.policy_target(inputs)), None
         else:
-            action, log_density = choose_action(
-                *self.policy_parameters(inputs), batch["next_noise"]
-            )
+            action, log_density, _ = self.sample_with_density(inputs, batch["next_noise"])
         return Bootstrap(self.critics_target(torch.cat([inputs, action], -1)).amin(0), log_density)
 
     def make_target_networks(self) -> None:
@@ -178,7 +214,7 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
     def get_target_network_pairs(self) -> list[tuple[nn.Module, nn.Module]]:
         return [(getattr(self, name), getattr(self, f"{name}_target")) for name in self._averaged]
 
-    # RLlib's own get_state and set_state round the normaliser's float64 moments to float32.
+    # -- state: RLlib's own methods round the normalizer's float64 moments to float32 ------------
 
     def get_state(
         self, components: Any = None, *, inference_only: bool = False, **kwargs: Any
@@ -192,7 +228,7 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
         }
 
     def set_state(self, state: StateDict) -> None:
-        """Loads the tensors of `state` that this module has."""
+        """Load the tensors of `state` that this module has."""
         own = self.state_dict()
         known = {name: torch.tensor(state[name]) for name in own if name in state}
         if self.inference_only and (missing := own.keys() - known.keys()):
@@ -224,18 +260,66 @@ class EstimatorModule(TorchRLModule, SelfSupervisedLossAPI):
         return loss
 
 
-def choose_action(
-    mean: Tensor, log_std: Tensor | None, noise: Tensor | None
-) -> tuple[Tensor, Tensor | None]:
-    """Action [B, A] and its log-density [B, A]; None for a deterministic policy."""
-    if log_std is None or noise is None:
-        return deterministic_action(mean), None
-    sample = sample_squashed(mean, log_std, noise)
-    return sample.action, sample.log_density
-
-
 def _network_inputs(observation: Any) -> Tensor:
     """The observation, or the observation and desired goal of a goal dictionary, as a tensor."""
     if isinstance(observation, dict):
         return torch.cat([observation["observation"], observation["desired_goal"]], dim=-1).float()
     return torch.as_tensor(observation).float()
+
+
+def _tensor(array: Floats | None) -> Tensor | None:
+    return None if array is None else torch.from_numpy(array)
+
+
+# -- network weights ------------------------------------------------------------------------------
+
+
+def weights_by_network(state: Mapping[str, Mapping[str, Any]]) -> NetworkWeights:
+    """The network weights in the states of the Learner's modules."""
+    weights: NetworkWeights = {}
+    for name, array in state[DEFAULT_MODULE_ID].items():
+        network, _, rest = name.partition(".")
+        weights.setdefault(network, {})[rest or network] = np.asarray(array)
+    if ESTIMATOR_MODULE in state:
+        weights[ESTIMATOR_MODULE] = {
+            name.removeprefix("estimator."): np.asarray(array)
+            for name, array in state[ESTIMATOR_MODULE].items()
+        }
+    return weights
+
+
+def states_by_module(
+    weights: Mapping[str, Mapping[str, NDArray[Any]]], own: NetworkWeights
+) -> dict[str, dict[str, NDArray[Any]]]:
+    """The states of the Learner's modules with the weights of some networks.
+
+    `own` has the current weights of all networks. Raises ValueError for an unknown network, and for
+    missing, unknown or misshapen tensors.
+    """
+    modules: dict[str, dict[str, NDArray[Any]]] = {}
+    for network, arrays in weights.items():
+        _check_same_tensors(network, own.get(network), arrays)
+        module = ESTIMATOR_MODULE if network == ESTIMATOR_MODULE else DEFAULT_MODULE_ID
+        prefix = "estimator" if network == ESTIMATOR_MODULE else network
+        for name, array in arrays.items():
+            modules.setdefault(module, {})[f"{prefix}.{name}"] = array
+    return modules
+
+
+def _check_same_tensors(
+    network: str,
+    own: Mapping[str, NDArray[Any]] | None,
+    given: Mapping[str, NDArray[Any]],
+) -> None:
+    if own is None:
+        raise ValueError(f"{network}: this algorithm has no such network")
+    if own.keys() != given.keys():
+        missing, unknown = sorted(own.keys() - given.keys()), sorted(given.keys() - own.keys())
+        raise ValueError(
+            f"{network}: tensors missing: {missing or 'none'}, unknown: {unknown or 'none'}"
+        )
+    for name, array in given.items():
+        if array.shape != own[name].shape:
+            raise ValueError(
+                f"{network}.{name}: shape must be {own[name].shape}, got {array.shape}"
+            )

@@ -10,9 +10,9 @@ import torch
 from ray.rllib.callbacks.callbacks import RLlibCallback
 
 from music_rllib.envs.values import BadNumberError
-from music_rllib.tac.config import TACConfig
+from music_rllib.tac.algorithm import TACConfig
 from music_rllib.tac.env_runner import TrajectoryEnvRunner
-from music_rllib.tac.normaliser import RunningNormaliser
+from music_rllib.tac.networks import RunningNormaliser
 
 
 class Countdown(gym.Env[Any, Any]):

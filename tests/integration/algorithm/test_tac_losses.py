@@ -12,7 +12,7 @@ from ray.rllib.core import DEFAULT_MODULE_ID
 from torch import Tensor
 
 from music_rllib import names
-from music_rllib.tac.config import TACConfig
+from music_rllib.tac.algorithm import TACConfig
 from music_rllib.tac.diagnostics import NonFiniteLossError, of_updates
 from music_rllib.tac.learner import TACLearner
 

@@ -103,7 +103,7 @@ def test_a_run_begins_without_torchs_compiler() -> None:
     code = (
         "import sys, torch\n"
         "from ray.rllib.utils.torch_utils import set_torch_seed\n"
-        "from music_rllib.optim.adam import FusedAdam\n"
+        "from music_rllib.kernels.adam import FusedAdam\n"
         "from music_rllib.tac.algorithm import _determinism_without_compiler\n"
         "with _determinism_without_compiler():\n"
         "    set_torch_seed(0)\n"

@@ -7,8 +7,15 @@ import math
 import torch
 from torch import Tensor
 
+from music_rllib.functional.distribution import ln_q_of_log
+
 _SHANNON = 1e-9
 """|q - 1| below which the limit at q = 1 is used."""
+
+
+def ln_q(x: Tensor, q: float) -> Tensor:
+    """The q-logarithm of x > 0 (paper eq. 4)."""
+    return ln_q_of_log(torch.log(x), q)
 
 
 def exp_q(y: Tensor, q: float) -> Tensor:

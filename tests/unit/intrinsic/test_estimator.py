@@ -13,9 +13,9 @@ from music_rllib.functional.mutual_information import (
     shuffle_time,
     time_permutations,
 )
-from music_rllib.intrinsic.compiled import Data
 from music_rllib.intrinsic.estimator import MutualInformationEstimator, intrinsic_reward
-from music_rllib.optim.adam import FusedAdam
+from music_rllib.kernels.adam import FusedAdam
+from music_rllib.kernels.mutual_information import Data
 
 
 def make_estimator(

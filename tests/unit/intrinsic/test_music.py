@@ -10,7 +10,7 @@ from torch import Tensor
 from music_rllib.intrinsic.estimator import MutualInformationEstimator
 from music_rllib.intrinsic.music import Music
 from music_rllib.intrinsic.settings import MusicSettings
-from music_rllib.optim.adam import FusedAdam
+from music_rllib.kernels.adam import FusedAdam
 from music_rllib.replay.trajectories import Trajectory
 
 

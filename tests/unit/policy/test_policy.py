@@ -18,8 +18,7 @@ from music_rllib.policy.network import PolicyFileError
 from music_rllib.store.handoff import Spaces, write_handoff
 from music_rllib.store.sealed import SealedFolders
 from music_rllib.store.storage import open_storage
-from music_rllib.tac.networks import Perceptron
-from music_rllib.tac.normaliser import RunningNormaliser
+from music_rllib.tac.networks import Perceptron, RunningNormaliser
 
 REACH = BUILT_IN_TASKS["FetchReach"]
 KEY, OTHER = "0123456789abcdef0123", "0123ffffffffffffffff"

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from music_rllib.tac.normaliser import RunningNormaliser, for_another_run
+from music_rllib.tac.networks import RunningNormaliser, for_another_run
 
 Numbers = NDArray[Any]
 

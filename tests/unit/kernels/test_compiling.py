@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from numba.core.caching import FunctionCache
 
-from music_rllib.compiling import compiled, is_kept, kept_on_disk
+from music_rllib.kernels.compiling import compiled, is_kept, kept_on_disk
 
 PROGRAM = """
-from music_rllib.compiling import is_kept, kept_on_disk
+from music_rllib.kernels.compiling import is_kept, kept_on_disk
 
 @kept_on_disk
 def twice(x):

@@ -15,9 +15,9 @@ from ray.rllib.core import DEFAULT_MODULE_ID
 from torch import Tensor
 
 from music_rllib import TACConfig, names
+from music_rllib.kernels import blas
 from music_rllib.tac.algorithm import TAC
-from music_rllib.tac.kernels import blas
-from music_rllib.tac.kernels.update import DirectUpdate
+from music_rllib.tac.compiled_update import CompiledUpdate
 from music_rllib.tac.learner import TACLearner
 from tests.integration.algorithm.test_tac_algorithm import (
     HER,
@@ -78,8 +78,8 @@ def both_gradients(
     trained = {n: p for n, p in module.named_parameters() if p.requires_grad and n != "log_alpha"}
     losses = built._losses_of(module.forward_train(batch)["tac"], batch)
     grads = torch.autograd.grad(losses.total, list(trained.values()))
-    direct = DirectUpdate(module)
-    learned = direct.gradients(batch, built._now.entropic_index, float(built._objective.alpha))
+    direct = CompiledUpdate(module)
+    learned = direct.learn(batch, None, 0, built._now.entropic_index, float(built._objective.alpha))
     for expected, found in ((losses.named, learned.losses), (built._observed, learned.observed)):
         assert expected.keys() == found.keys()
         for name, values in expected.items():
@@ -195,7 +195,7 @@ def test_updates_at_once_have_the_bits_of_one_by_one(backbone: str) -> None:
         built, _ = ready(**settings)
         module = built.module[DEFAULT_MODULE_ID].unwrapped().float()
         first = {name: p.detach().clone() for name, p in module.named_parameters()}
-        direct, done = DirectUpdate(module), 0
+        direct, done = CompiledUpdate(module), 0
         for updates in calls:
             rows = slice(done * BATCH, (done + updates) * BATCH)
             some = {name: values[rows] for name, values in together.items()}
@@ -246,8 +246,8 @@ def spoilt(
     built._losses, built._observed = {}, {}
     losses = built._losses_of(module.forward_train(batch)["tac"], batch)
     expected = {**built._losses, **built._observed}
-    direct = DirectUpdate(module)
-    learned = direct.gradients(batch, built._now.entropic_index, float(built._objective.alpha))
+    direct = CompiledUpdate(module)
+    learned = direct.learn(batch, None, 0, built._now.entropic_index, float(built._objective.alpha))
     found = {**learned.losses, **learned.observed}
     if gradients:
         grads = torch.autograd.grad(losses.total, list(trained.values()))
@@ -292,7 +292,7 @@ def test_a_training_has_autograds_numbers_to_rounding(
     # Few updates: what is counted jumps where rounding has grown. Short episodes need a round more.
     rounds = 3 if "task" in settings else 2
     found = fingerprint(build(**settings), rounds)
-    monkeypatch.setattr(TACLearner, "_is_standard", False)
+    monkeypatch.setattr(TACLearner, "_needs_autograd", True)
     expected = fingerprint(build(**settings), rounds)
     assert found != expected, "they round differently: else both took the same way"
     for row, same in zip(found, expected, strict=True):
@@ -328,16 +328,16 @@ def test_a_learners_own_methods_are_called(hook: str) -> None:
         algo.train()
     assert algo.grad_updates == 10
     assert len(calls) == (1 if hook.startswith("configure") else 10)
-    assert algo.learner_group._learner._direct is None
+    assert algo.learner_group._learner._compiled is None
 
 
 def test_updates_without_own_methods_are_compiled() -> None:
-    def direct_of(algo: TAC) -> DirectUpdate | None:
-        found: DirectUpdate | None = algo.learner_group._learner._direct
+    def compiled_of(algo: TAC) -> CompiledUpdate | None:
+        found: CompiledUpdate | None = algo.learner_group._learner._compiled
         return found
 
-    assert direct_of(build()) is not None
-    assert direct_of(build(grad_clip=1.0)) is None
+    assert compiled_of(build()) is not None
+    assert compiled_of(build(grad_clip=1.0)) is None
 
 
 def test_learning_rates_of_rllibs_schedulers_are_used() -> None:

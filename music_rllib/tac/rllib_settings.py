@@ -1,4 +1,4 @@
-"""RLlib's settings, callbacks and hooks: which TAC refuses, and which need updates by autograd."""
+"""Settings and callbacks of RLlib that TAC refuses, because they would have no effect."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from ray.rllib.callbacks.callbacks import RLlibCallback
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 from ray.rllib.utils import force_list
 
-from music_rllib.tac.rl_module import EstimatorModule, TACModule
+from music_rllib.tac.env_runner import TrajectoryEnvRunner
+from music_rllib.tac.learner import TACLearner
+from music_rllib.tac.rl_module import TACModule
 
 _UPDATES = "set training(batch_size=..., replay_ratio=...)"
 _EPISODES = (
@@ -57,7 +59,7 @@ _INSTEAD: dict[str, dict[str, str]] = {
         "episode_lookback_horizon": "TAC keeps whole episodes",
         "episodes_to_numpy": "TAC keeps whole episodes as arrays",
         "exploration_config": "set training(behaviour=...)",
-        "create_local_env_runner": "the local runner's environment says how the replay is laid out",
+        "create_local_env_runner": "the replay's layout comes from the local runner's environment",
     },
     "environment": {
         "clip_rewards": _ENVIRONMENT,
@@ -84,7 +86,7 @@ _INSTEAD: dict[str, dict[str, str]] = {
     },
     "experimental": {"_torch_grad_scaler_class": "losses and gradients are float32"},
 }
-"""Method and attribute of `AlgorithmConfig` to what a user does in place of it."""
+"""Method and attribute of `AlgorithmConfig` to the instruction for its user."""
 
 NEVER_CALLED = (
     "on_sub_environment_created", "on_postprocess_trajectory", "on_create_policy",
@@ -94,38 +96,8 @@ NEVER_CALLED = (
 """Callbacks of RLlib's old API stack and of offline evaluation."""
 
 
-HOOKS = (
-    "configure_optimizers", "configure_optimizers_for_module", "compute_losses",
-    "compute_loss_for_module", "loss_of_trajectories", "compute_gradients",
-    "postprocess_gradients", "postprocess_gradients_for_module", "apply_gradients",
-    "_update", "_uncompiled_update", "_step", "_losses_of", "_update_targets",
-)  # fmt: skip
-"""Methods that updates by autograd call; a Learner that overrides one is updated by autograd."""
-
-
-def needs_gradients(config: AlgorithmConfig) -> bool:
-    """Whether RLlib clips, logs, checks or exchanges gradients, or changes learning rates."""
-    return (
-        config.grad_clip is not None
-        or config.log_gradients
-        or not config.torch_skip_nan_gradients
-        or config._torch_lr_scheduler_classes is not None
-        or config.num_learners > 1
-    )
-
-
-def has_own_loss(module: Any) -> bool:
-    """Whether a subclass of `EstimatorModule` has another loss, which compiled code lacks."""
-    if not isinstance(module, EstimatorModule):  # of another intrinsic reward, with its own code
-        return False
-    return (
-        type(module).compute_self_supervised_loss
-        is not EstimatorModule.compute_self_supervised_loss
-    )
-
-
-def without_effect(config: AlgorithmConfig) -> Iterator[str]:
-    """A sentence for each setting of RLlib that would be ignored: its name, value and a remedy."""
+def ignored_settings(config: AlgorithmConfig) -> Iterator[str]:
+    """Yield a message for each setting of RLlib that would be ignored: name, value, remedy."""
     if config.framework_str != "torch":
         yield f"framework must be 'torch', got {config.framework_str!r}"
     if not (config.enable_rl_module_and_learner and config.enable_env_runner_and_connector_v2):
@@ -158,9 +130,6 @@ def _unusable_callbacks(config: AlgorithmConfig) -> Iterator[str]:
 
 
 def _unusable_classes(config: AlgorithmConfig) -> Iterator[str]:
-    from music_rllib.tac.env_runner import TrajectoryEnvRunner
-    from music_rllib.tac.learner import TACLearner
-
     for name, found, needed in (
         ("env_runners(env_runner_cls=...)", config.env_runner_cls, TrajectoryEnvRunner),
         ("learners(learner_class=...)", config.learner_class, TACLearner),

@@ -1,6 +1,15 @@
-"""The minibatches of the updates of a call, all of them or one by one.
+"""The minibatches of the updates of a call: made by the algorithm, read by the Learner.
 
-Shape legend: K updates, B transitions of a minibatch, N trajectories.
+A call of K updates has K concatenated minibatches:
+
+- module `default_policy`: OBS [K*B, I], ACTIONS [K*B, A], REWARDS [K*B] of the task, "discounts"
+  [K*B], NEXT_OBS [K*B, I], and "weights" [K*B] with prioritized replay. The Learner adds the
+  policy's "noise" [K*B, A], and "next_noise" with averaged critics.
+- module `mi_estimator`, if it is trained: OBS [K*N, T, D] whole trajectories, and "inside" [K*N, T]
+  if they have unequal lengths
+
+Shape legend: K updates, B transitions and N trajectories of one, T frames, I network inputs,
+D observation, A actions.
 """
 
 from __future__ import annotations
@@ -11,24 +20,45 @@ from typing import Any, NamedTuple
 import torch
 from ray.rllib.core import DEFAULT_MODULE_ID
 from ray.rllib.core.columns import Columns
+from ray.rllib.policy.sample_batch import MultiAgentBatch, SampleBatch
 from ray.rllib.utils.typing import ModuleID
 from torch import Tensor
 
 from music_rllib.intrinsic.interface import IntrinsicReward
-
-__all__ = ["Minibatch", "Minibatches"]
+from music_rllib.replay.trajectories import Transitions, WholeTrajectories
+from music_rllib.tac.rl_module import ESTIMATOR_MODULE
 
 Minibatch = dict[ModuleID, dict[str, Tensor]]
 """Columns by module."""
 
 
+def batch_of(drawn: Transitions, whole: WholeTrajectories | None) -> MultiAgentBatch:
+    """The argument of `Learner.update`; `whole` is the estimator's part, if it is trained."""
+    columns: dict[str, Any] = {
+        Columns.OBS: drawn.inputs,
+        Columns.ACTIONS: drawn.actions,
+        Columns.REWARDS: drawn.rewards,
+        "discounts": drawn.discounts,
+        Columns.NEXT_OBS: drawn.next_inputs,
+    }
+    if drawn.weights is not None:
+        columns["weights"] = drawn.weights
+    batches = {DEFAULT_MODULE_ID: SampleBatch(columns)}
+    if whole is not None:
+        trajectories: dict[str, Any] = {Columns.OBS: whole.observations}
+        if whole.inside is not None:
+            trajectories["inside"] = whole.inside
+        batches[ESTIMATOR_MODULE] = SampleBatch(trajectories)
+    return MultiAgentBatch(batches, env_steps=len(drawn.rewards))
+
+
 class Minibatches(NamedTuple):
-    """Those of K updates, behind each other."""
+    """Minibatches of K updates."""
 
     columns: Minibatch
     """[K*B, ...] transitions of the policy's module, [K*N, ...] of the estimator's."""
     drawn: Sequence[Hashable]
-    """[K] by the intrinsic reward."""
+    """[K] values drawn by the intrinsic reward."""
 
     @property
     def updates(self) -> int:
@@ -36,7 +66,7 @@ class Minibatches(NamedTuple):
         return len(self.drawn)
 
     def one_by_one(self) -> Iterator[Minibatches]:
-        """Those of each update."""
+        """The minibatches of each update."""
         for k, drawn in enumerate(self.drawn):
             columns = {
                 module: {name: self._of_update(k, values) for name, values in columns.items()}
@@ -50,7 +80,7 @@ class Minibatches(NamedTuple):
 
     @property
     def transitions(self) -> tuple[Tensor, Tensor]:
-        """States and the next ones, [K, B, I] each."""
+        """States and next states, [K, B, I] each."""
         policy = self.columns[DEFAULT_MODULE_ID]
         shape = (self.updates, -1)
         return (
@@ -58,12 +88,12 @@ class Minibatches(NamedTuple):
         )  # fmt: skip
 
     def intrinsic_rewards(self, reward: IntrinsicReward) -> Tensor:
-        """[K, B] of networks that stay as they are: those for which the same was drawn together."""
+        """[K, B] rewards of fixed networks; equal drawn values are computed at once."""
         states, followers = self.transitions
         rewards: Tensor = states.new_empty(states.shape[:2])
         kinds = dict.fromkeys(self.drawn)
         for drawn in kinds:
-            alike: Any = slice(None)  # which copies nothing
+            alike: Any = slice(None)  # copies nothing
             if len(kinds) > 1:
                 alike = torch.tensor([k for k, other in enumerate(self.drawn) if other == drawn])
             before, after = (values[alike].flatten(0, 1) for values in (states, followers))

@@ -8,9 +8,8 @@ import torch
 from scipy import integrate
 from torch import nn
 
-from music_rllib.functional.squashed_gaussian import (
+from music_rllib.functional.distribution import (
     bounded_log_std,
-    deterministic_action,
     sample_squashed,
 )
 from music_rllib.tac.networks import Critics, Perceptron
@@ -38,12 +37,6 @@ def test_log_density_keeps_its_digits_where_tanh_saturates() -> None:
     sample.log_density.sum().backward()
     assert mean.grad is not None
     assert float(mean.grad) == pytest.approx(2.0, rel=1e-5)
-
-
-def test_deterministic_action_is_the_sample_without_noise() -> None:
-    mean = torch.randn(5, 3)
-    sample = sample_squashed(mean, torch.zeros(5, 3), torch.zeros(5, 3))
-    torch.testing.assert_close(deterministic_action(mean), sample.action)
 
 
 def as_two_perceptrons(critics: Critics, sizes: list[int]) -> list[Perceptron]:

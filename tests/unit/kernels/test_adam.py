@@ -10,8 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from music_rllib.optim.adam import FusedAdam, descend
-from music_rllib.optim.flat import FlatParameters
+from music_rllib.kernels.adam import FlatParameters, FusedAdam, adam_step
 
 SHAPES = [(7, 5), (5,), (2, 3, 4), ()]
 STEPS = 6
@@ -138,7 +137,7 @@ def test_a_flat_step_has_the_numbers_and_the_state_of_adam(behind: int) -> None:
             a.grad = torch.randn(a.shape, generator=training.generator)
             flat.gradient(b).copy_(a.grad)
         training.adam.step()
-        descend(training.fused.descent(flat))
+        adam_step(training.fused.step_of(flat))
         theirs, ours = training.adam.state_dict()["state"], training.fused.state_dict()["state"]
         assert theirs.keys() == ours.keys()
         for i, (a, b) in enumerate(zip(training.theirs, training.ours, strict=True)):

@@ -17,12 +17,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from music_rllib import compiling
-from music_rllib.compiling import compiled, kept_on_disk, sources_of
-from music_rllib.optim import adam
-from music_rllib.optim.adam import Descent, descend
-
-__all__ = ["Data", "Weights", "bounds", "learn"]
+from music_rllib.kernels import adam, compiling
+from music_rllib.kernels.adam import AdamStep, adam_step
+from music_rllib.kernels.compiling import compiled, kept_on_disk, sources_of
 
 Array = NDArray[Any]
 
@@ -227,7 +224,7 @@ def _compiled_for(sources: str) -> Any:
 
     @kept_on_disk
     def learn(
-        transitions: Data, trajectories: Data, weights: Weights, by: Weights, descent: Descent,
+        transitions: Data, trajectories: Data, weights: Weights, by: Weights, step: AdamStep,
         updates: int,
     ) -> tuple[Array, Array]:  # fmt: skip
         """Updates one after the other, each of its part of the data.
@@ -235,9 +232,9 @@ def _compiled_for(sources: str) -> Any:
         Args:
             transitions: [K*B] pairs of frames, of which each update takes the bounds first.
             trajectories: [K*N] that it then learns from, the minibatches behind each other.
-            weights: in `descent.values`.
-            by: in `descent.gradients`.
-            descent: Adam's step.
+            weights: in `step.values`.
+            by: in `step.gradients`.
+            step: arguments of Adam.
             updates: K.
 
         Returns:
@@ -258,7 +255,7 @@ def _compiled_for(sources: str) -> Any:
                 trajectories.agent[some], trajectories.surrounding[some],
                 trajectories.others[some], trajectories.frames[some], weights, by,
             )  # fmt: skip
-            descend(descent)
+            adam_step(step)
         return found, means
 
     return learn

@@ -1,0 +1,157 @@
+"""Adam (Kingma and Ba 2015) of all parameters at once, for compiled updates and for autograd.
+
+Shape legend: S flat parameters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from inspect import unwrap
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from music_rllib.kernels.compiling import compiled
+from music_rllib.kernels.layers import Array
+
+_ALIGNMENT = 16
+"""Floats of a cache line: two parameters never share one."""
+
+
+class FlatParameters:
+    """Moves parameters of one type and device into one tensor, of which they become views.
+
+    The parameters keep their values; their `.data` is replaced.
+    """
+
+    def __init__(self, parameters: Sequence[Tensor]) -> None:
+        self.parameters = list(parameters)
+        self._starts: dict[int, int] = {}
+        size = 0
+        for parameter in parameters:
+            self._starts[id(parameter)] = size
+            size += -(-parameter.numel() // _ALIGNMENT) * _ALIGNMENT
+        self.values = parameters[0].new_zeros(size).detach()
+        """[S], with zeros between the parameters."""
+        self.gradients = torch.zeros_like(self.values)
+        """[S]"""
+        for parameter, view in zip(parameters, self.views(self.values), strict=True):
+            view.copy_(parameter.detach())
+            parameter.data = view
+
+    def views(self, flat: Tensor) -> list[Tensor]:
+        """Parts of a tensor [S], one for each parameter, in its shape."""
+        return [self._view(flat, parameter) for parameter in self.parameters]
+
+    def gradient(self, parameter: Tensor) -> Tensor:
+        """The part of `gradients` that belongs to a parameter."""
+        return self._view(self.gradients, parameter)
+
+    def _view(self, flat: Tensor, parameter: Tensor) -> Tensor:
+        start = self.start(parameter)
+        return flat[start : start + parameter.numel()].view(parameter.shape)
+
+    def start(self, parameter: Tensor) -> int:
+        """Position of a parameter's first number in `values`."""
+        return self._starts[id(parameter)]
+
+    def extent(self, parameters: Sequence[Tensor]) -> tuple[int, int]:
+        """First position of neighboring parameters, and the number of values to their end."""
+        first, last = self.start(parameters[0]), self.start(parameters[-1])
+        return first, last + parameters[-1].numel() - first
+
+    @property
+    def is_in_use(self) -> bool:
+        """Whether the parameters are still views; converting a module replaces them."""
+        return self.parameters[0].data_ptr() == self.values.data_ptr()
+
+
+class AdamStep(NamedTuple):
+    """Arguments of one step of Adam. All arrays are empty if no step is to be taken."""
+
+    values: Array
+    """[S]"""
+    gradients: Array
+    """[S]"""
+    means: Array
+    """[S] first moments."""
+    squares: Array
+    """[S] second moments."""
+    steps: Array
+    """[1] number of steps so far."""
+    lr: float
+    beta1: float
+    beta2: float
+    eps: float
+
+
+@compiled
+def adam_step(step: AdamStep) -> None:
+    """Take one step (algorithm 1), rounded as `torch.optim.Adam` does."""
+    if len(step.values) == 0:
+        return
+    values, gradients, means, squares = step.values, step.gradients, step.means, step.squares
+    number = values.dtype.type
+    step.steps[0] += 1.0
+    count = float(step.steps[0])
+    step_size = number(step.lr / (1.0 - step.beta1**count))
+    correction = number(1.0 / np.sqrt(1.0 - step.beta2**count))
+    kept, fresh = number(step.beta2), number(1.0 - step.beta2)
+    share, eps = number(1.0 - step.beta1), number(step.eps)
+    for i in range(len(values)):
+        gradient = gradients[i]
+        means[i] += share * (gradient - means[i])
+        squares[i] = kept * squares[i] + fresh * gradient * gradient
+        values[i] -= step_size * means[i] / (np.sqrt(squares[i]) * correction + eps)
+
+
+class FusedAdam(torch.optim.Adam):
+    """`torch.optim.Adam(fused=True)`, whose steps compiled code can take.
+
+    Torch's decorators are removed: they load its compiler, which costs each process a second.
+    """
+
+    add_param_group = unwrap(torch.optim.Adam.add_param_group)
+    load_state_dict = unwrap(torch.optim.Adam.load_state_dict)
+    state_dict = unwrap(torch.optim.Adam.state_dict)
+    zero_grad = unwrap(torch.optim.Adam.zero_grad)
+    step = torch.no_grad()(unwrap(torch.optim.Adam.step))
+
+    def __init__(self, parameters: Iterable[Tensor], lr: float) -> None:
+        super().__init__(list(parameters), lr=lr, fused=True)
+        self._flat_state: Any = None
+        """The `state` whose tensors are views of `_moments`; loading a state replaces it."""
+        self._moments: tuple[Tensor, Tensor, Tensor] | None = None
+        """Flat first and second moments [S], and the number of steps [1]."""
+
+    def step_of(self, flat: FlatParameters) -> AdamStep:
+        """The arguments of `adam_step` for a step of all parameters by the gradients of `flat`.
+
+        `flat` has this optimizer's parameters, in their order, on a CPU.
+        """
+        group = self.param_groups[0]
+        if self._moments is None or self._flat_state is not self.state:
+            self._moments, self._flat_state = self._flattened(flat), self.state
+        means, squares, steps = (moments.numpy() for moments in self._moments)
+        beta1, beta2 = group["betas"]
+        return AdamStep(
+            flat.values.numpy(), flat.gradients.numpy(), means, squares, steps,
+            float(group["lr"]), beta1, beta2, group["eps"],
+        )  # fmt: skip
+
+    @torch.no_grad()
+    def _flattened(self, flat: FlatParameters) -> tuple[Tensor, Tensor, Tensor]:
+        """Move the state into flat tensors; each parameter's state becomes views of them."""
+        means, squares = torch.zeros_like(flat.values), torch.zeros_like(flat.values)
+        steps = torch.zeros(1)
+        views = zip(flat.views(means), flat.views(squares), strict=True)
+        for parameter, (mean, square) in zip(flat.parameters, views, strict=True):
+            if old := self.state.get(parameter):
+                mean.copy_(old["exp_avg"])
+                square.copy_(old["exp_avg_sq"])
+                steps.copy_(old["step"])
+            new = {"step": steps[0], "exp_avg": mean, "exp_avg_sq": square}
+            self.state[parameter] = new
+        return means, squares, steps

@@ -1,1 +1,0 @@
-"""Adam, and a flat layout of parameters for it."""

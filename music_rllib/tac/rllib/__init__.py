@@ -1,1 +1,0 @@
-"""RLlib's settings, hooks and callbacks, as TAC takes them."""
