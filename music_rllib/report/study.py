@@ -32,7 +32,7 @@ def _kind(study: Study) -> str:
 
 
 def _claims_table(study: Study) -> TextTable:
-    claims = (*study.planned, *study.afterwards)
+    claims = (*study.planned, *study.unplanned)
     measures = " or ".join(dict.fromkeys(claim.measure.words for claim in claims))
     return TextTable(
         title=f"Comparisons by the {_kind(study)}",

@@ -1,7 +1,4 @@
-"""The first sentences of a report: question, answer with its interval, seeds and control.
-
-Rows with a study's numbers, for `compare --json`, the report and its CSV files.
-"""
+"""A study in sentences and as rows: for the report, `compare`, the results pages and CSV files."""
 
 from __future__ import annotations
 
@@ -31,24 +28,25 @@ from music_rllib.results.study import Mean, Study
 MOST_CLAIMS = 4
 """Number of claims with a sentence of their own; the others are in the table."""
 FEWEST_FOR_SPREAD = 3
-"""Least number of seeds whose spread counts; that of two may be ten times too small."""
+"""Smallest number of seeds whose spread counts; the spread of two can be ten times too small."""
 
 
 def answer(sweep: Sweep, study: Study) -> list[str]:
-    """At most ten sentences on a sweep, for its report and `compare`."""
+    """At most ten sentences: question, verdicts, metric, seeds and control."""
     planned = planned_in_words(study)
     sentences = [f"{planned[0].upper()}{planned[1:]}."]
     if study.question is not None:
-        sentences = [f"Asked: {study.question} ({planned})."]
+        sentences = [f"Question: {study.question} ({planned})."]
     if study.stage is None and any(run.status != "SCHEDULED" for run in sweep.runs):
-        return [*sentences, "No stage trains for the task, so nothing is compared."]
+        return [*sentences, "No stage trains for the task: no comparison."]
     if study.stage is None or not study.means:
         return [*sentences, "No run that may be compared has finished yet."]
     shown = [claim for claim in study.claims if claim.task == ALL_TASKS] or list(study.claims)
-    sentences += [f"{in_words(claim)}." for claim in shown[:MOST_CLAIMS]]
-    if not shown and study.afterwards:
-        text = "Nothing that was planned can be tested yet; what was not is in the table."
-        sentences.append(text)
+    sentences += [f"{claim_in_words(claim)}." for claim in shown[:MOST_CLAIMS]]
+    if not shown and study.unplanned:
+        sentences.append(
+            "No planned comparison can be tested yet; the table has the exploratory ones."
+        )
     elif not shown:
         only = study.means[0]
         sentences.append(
@@ -60,10 +58,10 @@ def answer(sweep: Sweep, study: Study) -> list[str]:
         verdicts = ", ".join(f"{n} {verdict}" for verdict, n in counts.items())
         more = f"{len(rest)} more comparisons: {verdicts}"
         sentences.append(f"{more}." if len(rest) > 1 else f"1 more comparison: {rest[0].verdict}.")
-    sentences += [_counted(study, shown), _seeds(sweep, study, shown)]
+    sentences += [_metric(study, shown), _seeds(sweep, study, shown)]
     sentences.append(f"Control: {_control(sweep, study, study.stage)}.")
     undecided = (Verdict.UNDECIDED, Verdict.NONE)
-    if any(claim.verdict in undecided and not claim.waiting for claim in study.claims):
+    if any(claim.verdict in undecided and not claim.unfinished for claim in study.claims):
         sentences += filter(None, [seeds_needed(shown, study.means, study.family)])
     return [*sentences, *(f"Not tested: {text}." for text in study.untested[:1])]
 
@@ -79,10 +77,7 @@ def planned_in_words(study: Study) -> str:
         changed = [] if latest is None else _changed(plan.plan, latest.plan)
         return f"{text}; changed afterwards: {', '.join(changed)}" if changed else text
     if latest is not None:
-        return (
-            f"planned {latest.recorded}, when runs had finished already: it counts as thought of "
-            "afterwards"
-        )
+        return f"recorded {latest.recorded}, after the first run had finished: not planned"
     return "no comparison was planned in advance: all comparisons are exploratory"
 
 
@@ -92,7 +87,7 @@ def _changed(before: AnalysisPlan, after: AnalysisPlan) -> list[str]:
     return [name.replace("_", " ") for name in known if known[name] != now[name]]
 
 
-def in_words(claim: Claim) -> str:
+def claim_in_words(claim: Claim) -> str:
     """`q = 1.5 against q = 1 on FetchPush: superior, +0.12 (95% CI 0.05 to 0.19; p = 0.002)`."""
     where = "over all tasks" if claim.task == ALL_TASKS else f"on {claim.task}"
     mean = f", averaged over {len(claim.pairs)} settings" if len(claim.pairs) > 1 else ""
@@ -104,31 +99,30 @@ def in_words(claim: Claim) -> str:
 
 
 def verdict_in_words(claim: Claim) -> str:
-    """`equivalent within 0.05`, or the reason why there is no verdict."""
+    """`equivalent within 0.05`, or the reason for having no verdict."""
     if claim.verdict is Verdict.EQUIVALENT:
         return f"equivalent within {claim.margin:g}"
     return claim.why if claim.verdict is Verdict.NONE else str(claim.verdict)
 
 
 def not_excluded(claim: Claim) -> str:
-    """Rare collapses that a verdict does not exclude; empty if there is nothing to say."""
+    """The rate of collapses that a verdict does not exclude; empty if it is small."""
     if claim.collapses is None:
         return ""
-    return f"; it does not exclude collapses in up to {100 * claim.collapses:.0f} % of seeds"
+    return f"; collapses in up to {100 * claim.collapses:.0f}% of seeds are not excluded"
 
 
 def interval_in_words(claim: Claim) -> str:
     """The interval that belongs to the verdict: `95% CI 0.05 to 0.19`."""
     if claim.verdict is Verdict.EQUIVALENT:
         return f"90% CI {interval_text(claim.contrast.within)}"
-    difference = claim.contrast.difference
-    return f"95% CI {interval_text(difference)}" if difference.has_interval else "no interval"
+    return mean_interval(claim.contrast.difference)
 
 
 def p_in_words(claim: Claim) -> str:
-    """The p-value of the verdict, then the one adjusted for the family; empty if it is not tested.
+    """The p-value of the verdict and the one adjusted for the family; empty without a test.
 
-    It is named where it is not of a difference: `TOST p = 0.01, adjusted 0.03`.
+    The p-value of an equivalence test is named: `TOST p = 0.01, adjusted 0.03`.
     """
     raw, adjusted, name = claim.contrast.p_value, claim.p_value, ""
     if claim.verdict is Verdict.EQUIVALENT and claim.contrast.p_equivalent is not None:
@@ -149,13 +143,13 @@ def numbers_in_words(claim: Claim) -> str:
     return f"{gap} ({'; '.join(filter(None, (interval_in_words(claim), p_in_words(claim))))})"
 
 
-def _counted(study: Study, shown: Sequence[Claim]) -> str:
+def _metric(study: Study, shown: Sequence[Claim]) -> str:
     measure = (shown[0] if shown else study.means[0]).measure
-    area = ", the area under the learning curve" if measure.kind == "auc" else ""
-    text = f"Counted: {measure.words}{area}"
+    area = " (area under the learning curve)" if measure.kind == "auc" else ""
+    text = f"Metric: {measure.words}{area}"
     margins = {one.margin for one in shown if one.margin is not None}
     if margins:
-        text += f"; a difference below {max(margins):g} does not matter"
+        text += f"; equivalence margin {max(margins):g}"
     if study.family > 1:
         text += f"; p-values adjusted for {study.family} comparisons (Holm)"
     return f"{text}."
@@ -171,11 +165,11 @@ def _seeds(sweep: Sweep, study: Study, shown: Sequence[Claim]) -> str:
     if counts[-1] < 2:
         text += ", too few for an interval or a test"
     elif shown:
-        paired = [one.contrast.paired for one in shown]
-        text += ", compared in pairs" if all(paired) else ", not all of them shared"
+        paired = all(one.contrast.paired for one in shown)
+        text += ", paired" if paired else ", not all shared between conditions"
     if study.stage is not None and study.stage.is_search:
-        text += ", fresh ones that no setting was chosen by"
-    text += f"; {finished} of {len(study.runs)} runs are finished."
+        text += ", not used for selection"
+    text += f"; {finished} of {len(study.runs)} runs finished."
     if failed:
         runs = "1 failed run counts" if failed == 1 else f"{failed} failed runs count"
         text += f" {runs} with the worst value of the metric."
@@ -183,7 +177,7 @@ def _seeds(sweep: Sweep, study: Study, shown: Sequence[Claim]) -> str:
 
 
 def _control(sweep: Sweep, study: Study, stage: StageRuns) -> str:
-    """What is done for different q to be compared fairly."""
+    """What is held equal so that different q can be compared."""
     version = study.plan or study.latest
     if version is not None:
         return version.plan.control
@@ -192,7 +186,7 @@ def _control(sweep: Sweep, study: Study, stage: StageRuns) -> str:
     if stage.is_search:
         return f"settings were searched on other seeds; α is {', '.join(words)}"
     if len(words) > 1:
-        return f"α varies beside q ({', '.join(words)})"
+        return f"α varies with q ({', '.join(words)})"
     same_q = len({condition.entropic_index for condition in stage.compared}) == 1
     if same_q or is_controlled(words[0]):
         return f"α {words[0]}"
@@ -200,24 +194,23 @@ def _control(sweep: Sweep, study: Study, stage: StageRuns) -> str:
 
 
 def seeds_needed(claims: Sequence[Claim], means: Sequence[Mean], family: int) -> str | None:
-    """A sentence about the seeds; None without a margin or where no spread is known.
+    """How many seeds would decide; None without a margin or a known spread.
 
-    Conditions within the margin of a ceiling or floor are left out: their seeds differ less than
-    those of others.
+    Conditions within the margin of a bound are left out: their seeds differ less than others.
 
     Args:
-        claims: claims whose spread counts.
-        means: primary metric of the conditions.
-        family: number of comparisons that are tested together; by Holm's method the first of them
-            has a level of 5 % / family.
+        claims: Claims whose spread counts.
+        means: Mean scores of the conditions.
+        family: Number of comparisons that are tested together; Holm's method tests the first of
+            them at 0.05 / family.
     """
     margin = max((claim.margin for claim in claims if claim.margin is not None), default=None)
     if margin is None:
         return None
     if means and all(_at_a_bound(mean, margin) for mean in means):
         return (
-            f"All conditions are within {margin:g} of the ceiling or the floor, where seeds differ "
-            "less than elsewhere: their spread does not show how many seeds are needed."
+            f"All conditions are within {margin:g} of a bound, where seeds differ less than "
+            "elsewhere: their spread does not show how many seeds are needed."
         )
     bounded = {(mean.condition, mean.task) for mean in means if _at_a_bound(mean, margin)}
     clear = [
@@ -236,12 +229,13 @@ def seeds_needed(claims: Sequence[Claim], means: Sequence[Mean], family: int) ->
     paired = all(contrast.paired for contrast in clear)
     spread = float(np.sqrt(np.mean([float(contrast.spread) ** 2 for contrast in clear])))
     level = SIGNIFICANCE / family
-    shown = _seeds_text(seeds_for_difference(margin, spread, paired=paired, level=level))
-    alike = _seeds_text(seeds_for_equivalence(margin, spread, paired=paired, level=level))
-    pairs = "paired seeds" if paired else "single seeds"
+    for_difference = seeds_for_difference(margin, spread, paired=paired, level=level)
+    for_equivalence = seeds_for_equivalence(margin, spread, paired=paired, level=level)
     return (
-        f"Differences of {pairs} have a standard deviation of {number(spread)}: for 80 % power, a "
-        f"difference of {margin:g} needs {shown}, and equivalence within it needs {alike}."
+        f"The standard deviation of {'paired' if paired else 'single-seed'} differences is "
+        f"{number(spread)}: for 80% power, a difference of {margin:g} needs "
+        f"{_seeds_text(for_difference)}, and equivalence within it needs "
+        f"{_seeds_text(for_equivalence)}."
     )
 
 
@@ -261,8 +255,11 @@ def _seeds_text(needed: int | None) -> str:
     return f"{max(needed, FEWEST_SEEDS)} seeds"
 
 
+# As rows ------------------------------------------------------------------------------------------
+
+
 def mean_rows(study: Study) -> list[dict[str, Any]]:
-    """The primary metric of each condition on each task, and of each of its seeds."""
+    """The mean score of each condition on each task, with the score of each seed."""
     return [
         {
             "stage": study.stage.name if study.stage else "",
@@ -315,7 +312,7 @@ def claim_rows(study: Study) -> list[dict[str, Any]]:
             "seeds": list(claim.contrast.seeds),
             "pairs_of_conditions": len(claim.pairs),
         }
-        for claim in (*study.planned, *study.afterwards)
+        for claim in (*study.planned, *study.unplanned)
     ]
 
 

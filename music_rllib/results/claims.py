@@ -1,17 +1,13 @@
-"""Contrasts of two conditions: their difference, its tests, and the verdicts.
+"""Claims: one condition against another, seed by seed, tested as one family.
 
-Shapes: `x` and `y` are `[seeds]`, or `[seeds, draws]` for many studies at once (simulations); the
-results have the shape of the draws. Conditions that share all their seeds share initial weights,
+Shapes: `x` and `y` are `[seeds]`, or `[seeds, draws]` for many simulated studies at once; results
+then have the shape of the draws. Conditions that share all their seeds share initial weights,
 evaluation goals and pretraining, so their differences are taken seed by seed.
 
-Tests: Student's t on the differences of paired seeds, Welch's otherwise; two one-sided tests
-(Schuirmann 1987, https://doi.org/10.1007/BF01068419) for equivalence within a margin. Intervals
-come from the same standard error, so the 95 % interval excludes 0 where p < 0.05, and the 90 %
-interval lies within the margin where the TOST p < 0.05. `benchmarks/decisions.py` simulates their
-error rates.
-
-
-Claims: one condition against another, seed by seed, tested with those it is a family with.
+Tests: Student's t on the differences of paired seeds, Welch's t otherwise; two one-sided tests
+(Schuirmann 1987, https://doi.org/10.1007/BF01068419) for equivalence within a margin. Intervals use
+the same standard error: the 95% CI excludes 0 if and only if p < 0.05, and the 90% CI lies within
+the margin if and only if the TOST p < 0.05. `benchmarks/decisions.py` simulates the error rates.
 """
 
 from __future__ import annotations
@@ -30,22 +26,17 @@ from music_rllib.results.analysis_plan import MARGIN_OF_A_RATE
 from music_rllib.results.conditions import ALL_TASKS, Condition
 from music_rllib.results.data import Sweep
 from music_rllib.results.scores import Measure, Scores, scores_of
-from music_rllib.results.statistics import (
-    POWER,
-    SIGNIFICANCE,
-    Array,
-    Estimate,
-)
+from music_rllib.results.statistics import POWER, SIGNIFICANCE, Array, Estimate
 
 FEWEST_SEEDS = 5
-"""Least number of seeds per condition for a verdict."""
+"""Smallest number of seeds per condition for a verdict."""
 COLLAPSES = 0.05
-"""Rate of collapses per seed from which a verdict states that it does not exclude it."""
+"""Rate of collapses per seed from which on a verdict states that it does not exclude it."""
 _COLLAPSED = 5
-"""Robust standard deviations from the median from which a seed counts as collapsed."""
+"""Robust standard deviations from the median from which on a seed counts as collapsed."""
 _SEEDS_FOR_SPREAD = 16
-"""Number of seeds from which collapsed ones are counted: the median absolute deviation of fewer is
-too noisy, and fewer do not exclude collapses of one in ten anyway."""
+"""Number of seeds from which on collapsed ones are counted. The median absolute deviation of fewer
+seeds is too noisy, and they do not exclude collapses of one in ten anyway."""
 _TIED = 1e-9
 """Standard errors below this share of the scores are rounding errors."""
 
@@ -56,10 +47,10 @@ class Verdict(StrEnum):
     SUPERIOR = "superior"
     WORSE = "worse"
     EQUIVALENT = "equivalent"
-    """The difference is within the margin, whether or not there is one."""
+    """The difference is within the margin; a smaller difference is possible."""
     UNDECIDED = "undecided"
     NONE = "no verdict"
-    """Too few seeds, unfinished runs, or a comparison made after the plan."""
+    """Too few seeds, unfinished runs, or a comparison that was not planned."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,9 +58,9 @@ class Contrast:
     """The difference `x - y` and its tests."""
 
     difference: Estimate
-    """Difference of the means, with its 95 % interval; without one the seeds tie or are single."""
+    """Difference of the means with its 95% CI; no CI if the seeds tie or are single."""
     within: Estimate
-    """The same with its 90 % interval, which belongs to the test of equivalence."""
+    """The same with its 90% CI, which belongs to the equivalence test."""
     p_value: Array
     """Two-sided p-value of no difference; 1 without an interval."""
     p_equivalent: Array | None
@@ -79,21 +70,20 @@ class Contrast:
     paired: bool
     seeds: tuple[int, int]
     """Number of seeds of `x` and of `y`."""
-
     collapsed: Array
-    """Number of seeds that are far from all others, of the side that has more of them."""
+    """Number of seeds far from all others, on the side that has more of them."""
 
     @property
     def p_values(self) -> tuple[float, float | None]:
-        """p-values of no difference and of no equivalence, of a single study."""
+        """p-values of no difference and of no equivalence of a single study."""
         return float(self.p_value), None if self.p_equivalent is None else float(self.p_equivalent)
 
     @property
     def collapses(self) -> Array:
-        """Upper end, with 80 % confidence, of the rate of collapses per seed.
+        """Upper end, with 80% confidence, of the rate of collapses per seed (Clopper-Pearson).
 
-        Where a side collapses in one seed of ten and none was drawn, no test of these seeds can
-        tell, so a verdict states this rate (Clopper and Pearson; 1 - 0.2^(1/n) without collapses).
+        Without a collapse among n seeds this is 1 - 0.2^(1/n). If one seed of ten collapses and
+        none was drawn, no test of these seeds can detect it.
         """
         seeds = min(self.seeds)
         return np.asarray(stats.beta.ppf(POWER, self.collapsed + 1, seeds - self.collapsed))
@@ -106,19 +96,12 @@ def contrast(
 
     Args:
         x: `[m]` or `[m, draws]`, a score for each seed.
-        y: `[n]` or `[n, draws]`; with `paired` of the same seeds in the same order.
-        paired: whether seeds are compared in pairs.
-        margin: > 0, below which a difference does not matter; None: equivalence is not tested.
-        noise: standard error of the difference from the evaluation episodes alone; the standard
-            error used is at least this large, so that seeds that tie are not taken for certain.
-
-    Raises:
-        ValueError: `margin` is not > 0, or pairs are incomplete.
+        y: `[n]` or `[n, draws]`; if `paired`, for the same seeds in the same order.
+        paired: Whether seeds are compared in pairs.
+        margin: Difference below which conditions count as equivalent, > 0; None: no such test.
+        noise: Standard error of the difference from the evaluation episodes alone. The standard
+            error of the tests is at least this large, so that tied seeds do not count as certain.
     """
-    if margin is not None and not margin > 0:
-        raise ValueError(f"margin must be > 0, got {margin}")
-    if paired and len(x) != len(y):
-        raise ValueError(f"pairs must be complete, got {len(x)} and {len(y)} seeds")
     x, y = np.asarray(x, float), np.asarray(y, float)
     value = np.asarray(x.mean(axis=0) - y.mean(axis=0))
     spread = error = freedom = np.full(value.shape, np.nan)
@@ -127,11 +110,11 @@ def contrast(
         error = np.maximum(error, noise)
         scale = np.maximum(np.abs(x).max(axis=0), np.abs(y).max(axis=0))
         error = np.where(error > _TIED * scale, error, np.nan)
-        # Welch's degrees of freedom are unknown where neither side has a spread.
+        # Welch's degrees of freedom are unknown if neither side has a spread.
         freedom = np.where(np.isnan(freedom), len(x) + len(y) - 2, freedom)
 
     def p_greater(difference: Array) -> Array:
-        """One-sided p-value of a mean difference as large as this one."""
+        """One-sided p-value of a mean difference of this size."""
         return np.asarray(np.nan_to_num(stats.t.sf(difference / error, freedom), nan=1.0))
 
     def with_interval(level: float) -> Estimate:
@@ -160,14 +143,14 @@ def _far_off(scores: Array, margin: float) -> Array:
     if len(scores) < _SEEDS_FOR_SPREAD:
         return np.zeros(scores.shape[1:])
     away = np.abs(scores - np.median(scores, axis=0))
-    spread = 1.4826 * np.median(away, axis=0)  # a standard deviation, of normal scores
+    spread = 1.4826 * np.median(away, axis=0)  # a standard deviation for normal scores
     return np.asarray(np.sum(away > np.maximum(_COLLAPSED * spread, margin), axis=0))
 
 
 def _student(x: Array, y: Array, paired: bool) -> tuple[Array, Array, Array]:
-    """Student's test of pairs, or Welch's, along the seeds.
+    """Student's test of pairs, or Welch's test, along the seeds.
 
-    As scipy's `ttest_rel` and `ttest_ind`, which warn where a condition has no spread.
+    Equal to scipy's `ttest_rel` and `ttest_ind`, which warn if a condition has no spread.
 
     Returns:
         Standard deviation of a difference, standard error of its mean, degrees of freedom.
@@ -183,11 +166,7 @@ def _student(x: Array, y: Array, paired: bool) -> tuple[Array, Array, Array]:
 
 
 def verdict_of(difference: float, p_value: float, p_equivalent: float | None) -> Verdict:
-    """The verdict from adjusted p-values.
-
-    A difference that is surely within the margin does not matter, so equivalence goes before a
-    difference that is surely there.
-    """
+    """The verdict from adjusted p-values; equivalence takes precedence over a small difference."""
     if p_equivalent is not None and p_equivalent < SIGNIFICANCE:
         return Verdict.EQUIVALENT
     if p_value < SIGNIFICANCE:
@@ -200,16 +179,16 @@ def adjusted(
 ) -> list[tuple[float, float | None]]:
     """Adjusted p-values of no difference and of no equivalence of each contrast, as one family.
 
-    Holm's method over both kinds of test with Shaffer's (1986,
-    https://doi.org/10.1080/01621459.1986.10478341) multiplier: no difference and a difference of
-    the margin exclude each other, so a pair has at most one true hypothesis, and counts once until
-    both are rejected. The chance of any wrong verdict in the family is at most 5 %.
+    Holm's method over both kinds of test with the multiplier of Shaffer (1986,
+    https://doi.org/10.1080/01621459.1986.10478341): no difference and a difference of the margin
+    exclude each other, so a contrast has at most one true hypothesis and counts once until both are
+    rejected. The probability of any wrong verdict in the family is at most 5%.
 
     Args:
-        p_values: those of no difference and of no equivalence, None without a margin, of each
-            contrast of the family: all that is shown together with a verdict.
-        without_test: number of further planned comparisons that can't be tested and count with
-            p = 1; otherwise a condition without results would make the other claims easier.
+        p_values: p-values of no difference and of no equivalence (None without a margin) of each
+            contrast that is shown with a verdict.
+        without_test: Number of further planned comparisons that can't be tested. They count with
+            p = 1; otherwise a condition without results would weaken the correction.
     """
     tests = [
         (p_value, position, kind)
@@ -228,13 +207,15 @@ def adjusted(
     return [(found[i, 0], found.get((i, 1))) for i in range(len(p_values))]
 
 
-Cells = Sequence[tuple[Condition, Condition]]
-"""Pairs of conditions that are alike in the rest."""
+# Claims -------------------------------------------------------------------------------------------
+
+Pairs = Sequence[tuple[Condition, Condition]]
+"""Pairs of conditions that agree in all other settings."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Claim:
-    """One condition against another on a task, tested."""
+    """One condition against another on a task, with its test and verdict."""
 
     first: str
     second: str
@@ -242,28 +223,26 @@ class Claim:
     """The task, or `ALL_TASKS` for their mean."""
     measure: Measure
     margin: float | None
-    """Difference below which it does not matter; None where none was stated."""
+    """Margin of equivalence; None without one."""
     contrast: Contrast
-    pairs: Cells = field(repr=False)
-    """Pairs of conditions, alike in the rest, over which it is the mean."""
-    waiting: int = 0
+    pairs: Pairs = field(repr=False)
+    """Pairs of conditions over which the difference is averaged."""
+    unfinished: int = 0
     """Number of planned runs of both sides that are neither finished nor failed."""
-    failed: int = 0
-    """Number of failed runs, which count with the worst value."""
     p_value: float | None = None
-    """Adjusted p-value of no difference, set by :func:`decided`; None outside of a family."""
+    """Adjusted p-value of no difference; None for a comparison that was not planned."""
     p_equivalent: float | None = None
-    """Adjusted p-value of no equivalence; None without a margin or outside of a family."""
+    """Adjusted p-value of no equivalence; None also without a margin."""
     verdict: Verdict = Verdict.NONE
     why: str = ""
-    """Reason why there is no verdict."""
+    """Reason for having no verdict."""
     planned: bool = False
-    """Whether it was stated before the first of its runs had finished."""
+    """Whether it was planned before the first of its runs had finished."""
     hypothesis: Hypothesis | None = None
 
     @property
     def subject(self) -> tuple[object, ...]:
-        """What it is about: two claims on the same subject differ in nothing but the plan."""
+        """What is compared. Claims with the same subject differ only in their plan."""
         pairs = frozenset(frozenset(pair) for pair in self.pairs)
         return pairs, self.task, self.measure.kind, self.measure.metric
 
@@ -276,7 +255,7 @@ class Claim:
 
     @property
     def confirmed(self) -> bool | None:
-        """Whether its hypothesis holds; None where that is undecided or nothing was expected."""
+        """Whether its hypothesis holds; None if it is undecided or nothing was expected."""
         expected = {
             "better than": Verdict.SUPERIOR,
             "worse than": Verdict.WORSE,
@@ -289,35 +268,36 @@ class Claim:
 
 def claims_of(
     sweep: Sweep,
-    comparisons: Sequence[tuple[str, str, Cells]],
+    comparisons: Sequence[tuple[str, str, Pairs]],
     measures: Mapping[str, Measure],
     margin: float | None,
     seeds: int = 0,
 ) -> Iterator[Claim]:
-    """Claims without a verdict, over all tasks and on each.
+    """Claims without a verdict, on each task and on all tasks if these have the same unit.
 
     Args:
-        sweep: the runs.
-        comparisons: two labels each, and the cells that they name.
-        measures: task to measure.
-        margin: difference below which it does not matter; None: the default for success rates.
-        seeds: number of seeds that were planned for each condition; 0 if unknown.
+        sweep: The runs.
+        comparisons: Two labels each, and the pairs of conditions that they name.
+        measures: Task to measure.
+        margin: Margin of equivalence; None: the default for success rates.
+        seeds: Number of planned seeds of each condition; 0 if unknown.
     """
-    for scope, own in _scopes(measures):
+    scopes = [(task, {task: one}) for task, one in measures.items()]
+    if len(measures) > 1 and all(one.is_rate for one in measures.values()):
+        scopes.insert(0, (ALL_TASKS, dict(measures)))
+    for scope, own in scopes:
         measure, *others = own.values()
         if any(other.horizon != measure.horizon for other in others):
             measure = replace(measure, horizon=np.nan)
-        is_success = measure.metric == names.EVAL_SUCCESS
-        # One of 1 or more can only be meant for returns.
-        not_for_rates = margin is None or margin >= 1
-        own_margin = MARGIN_OF_A_RATE if is_success and not_for_rates else margin
-        for first, second, cells in comparisons:
+        # A margin of 1 or more can only be meant for returns.
+        default = measure.metric == names.EVAL_SUCCESS and (margin is None or margin >= 1)
+        own_margin = MARGIN_OF_A_RATE if default else margin
+        for first, second, pairs in comparisons:
             sides = [
-                [scores_of(sweep, pair[side], task, m) for pair in cells for task, m in own.items()]
+                [scores_of(sweep, pair[side], task, m) for pair in pairs for task, m in own.items()]
                 for side in (0, 1)
             ]
             tested = _contrast(*sides, margin=own_margin)
-            every = [scores for side in sides for scores in side]
             if tested is not None:
                 yield Claim(
                     first=first,
@@ -326,29 +306,21 @@ def claims_of(
                     measure=measure,
                     margin=own_margin,
                     contrast=tested,
-                    pairs=cells,
-                    waiting=sum(max(one.waiting, seeds - len(one.by_seed)) for one in every),
-                    failed=sum(one.failed for one in every),
+                    pairs=pairs,
+                    unfinished=sum(
+                        max(one.unfinished, seeds - len(one.by_seed))
+                        for side in sides
+                        for one in side
+                    ),
                 )
-
-
-def _scopes(measures: Mapping[str, Measure]) -> Iterator[tuple[str, Mapping[str, Measure]]]:
-    """All tasks together, where they have a unit in common, and each by itself."""
-    if len(measures) > 1 and all(one.is_rate for one in measures.values()):
-        yield ALL_TASKS, measures
-    for task, one in measures.items():
-        yield task, {task: one}
 
 
 def _contrast(
     first: Sequence[Scores], second: Sequence[Scores], *, margin: float | None
 ) -> Contrast | None:
-    """The contrast of two sides; None where one has no seed with a score everywhere.
+    """The contrast of two sides, each with scores for each task and each of several settings.
 
-    Args:
-        first: scores on each task of each of several pairs that are alike in the rest.
-        second: scores of the other side.
-        margin: difference below which it does not matter.
+    The result is None if a side has no seed with all its scores.
     """
     sides = [_complete(first), _complete(second)]
     if not (sides[0] and sides[1]):
@@ -356,7 +328,7 @@ def _contrast(
     paired = sides[0].keys() == sides[1].keys()
     if paired:
         sides[1] = {seed: sides[1][seed] for seed in sides[0]}
-    x, y = (np.array([row.mean() for row in side.values()]) for side in sides)
+    x, y = (np.array(list(side.values())) for side in sides)
     variances = (
         sum(one.noise for one in columns) / len(columns) ** 2 / len(side)
         for columns, side in zip((first, second), sides, strict=True)
@@ -364,10 +336,10 @@ def _contrast(
     return contrast(x, y, paired=paired, margin=margin, noise=float(np.sqrt(sum(variances))))
 
 
-def _complete(columns: Sequence[Scores]) -> dict[str, Array]:
-    """The scores of each seed that has finished in every column."""
+def _complete(columns: Sequence[Scores]) -> dict[str, float]:
+    """The mean score of each seed that has a score in every column."""
     seeds = [seed for seed in columns[0].by_seed if all(seed in c.by_seed for c in columns)]
-    return {seed: np.array([c.by_seed[seed] for c in columns]) for seed in seeds}
+    return {seed: float(np.mean([c.by_seed[seed] for c in columns])) for seed in seeds}
 
 
 def decided(claims: Sequence[Claim], *, planned: bool, without_test: int = 0) -> tuple[Claim, ...]:
@@ -380,21 +352,21 @@ def decided(claims: Sequence[Claim], *, planned: bool, without_test: int = 0) ->
 
 
 def exploratory(claims: Sequence[Claim]) -> tuple[Claim, ...]:
-    """Claims that were not planned beside others that were: no verdict, no adjusted p-value."""
+    """Claims outside the plan: without a verdict and without an adjusted p-value."""
     return tuple(replace(claim, why="exploratory: not in the plan") for claim in claims)
 
 
 def _decided(claim: Claim) -> Claim:
-    """The claim with its verdict, or with the reason why it has none."""
+    """The claim with its verdict, or with the reason for having none."""
     seeds = min(claim.contrast.seeds)
-    if claim.waiting:
-        runs = "1 run is" if claim.waiting == 1 else f"{claim.waiting} runs are"
+    if claim.unfinished:
+        runs = "1 run is" if claim.unfinished == 1 else f"{claim.unfinished} runs are"
         return replace(claim, why=f"{runs} not finished")
     if seeds < FEWEST_SEEDS:
         count = "1 seed" if seeds == 1 else f"{seeds} seeds"
         return replace(claim, why=f"{count}: no verdict below {FEWEST_SEEDS}")
     if not claim.contrast.difference.has_interval:
-        return replace(claim, why="all seeds tie: no spread to go by")
+        return replace(claim, why="all seeds tie: their spread is unknown")
     assert claim.p_value is not None
     value = float(claim.contrast.difference.value)
     sign = 1 if claim.measure.maximised else -1

@@ -1,14 +1,14 @@
-"""A score for each seed: what the runs of a condition are compared by.
+"""The score of each seed, by which conditions are compared.
 
-A study's primary metric is the area under the learning curve: the mean of a metric over the budget.
-It counts how soon and how high alike. Steps to a threshold are biased early where an evaluation is
-noisy (an agent at 85 % passes "90 % of 50 episodes" in 22 % of its evaluations), and final values
-say nothing where all runs end at the ceiling.
+The default score is the area under the learning curve: the mean of a metric over the budget. It
+weighs speed and final performance equally. Steps to a threshold are biased early by noisy
+evaluations (an agent at 85% passes "90% of 50 episodes" in 22% of its evaluations), and final
+values do not differ once all runs are at the ceiling.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -22,19 +22,18 @@ from music_rllib.results.statistics import Array
 
 @dataclass(frozen=True, kw_only=True)
 class Measure:
-    """The number that a run is compared by."""
+    """The number by which a run is compared."""
 
     kind: str
-    """`auc`: the area under the curve of `metric` over the budget, its mean; `final`: its last
+    """`auc`: the mean of `metric` over the budget, the area under its curve. `final`: its last
     value."""
     metric: str
     horizon: float
-    """Environment steps of the area, the smallest budget of what is compared; NaN for several
-    tasks with a horizon each."""
+    """Environment steps of the area: the smallest budget of the compared runs. NaN for several
+    tasks with different horizons."""
     maximised: bool = True
-    worst: float = float("nan")
-    """Score of a failed run: 0 for a rate, the floor of a return where the reward's range is known,
-    else the worst score of the compared runs; NaN if unknown."""
+    worst: float = np.nan
+    """Score of a failed run; NaN if unknown."""
 
     @property
     def is_rate(self) -> bool:
@@ -61,15 +60,14 @@ class Scores:
     """Scores of one condition on one task."""
 
     by_seed: Mapping[str, float]
-    """Scores of the finished runs, and the worst score for each failed one."""
+    """Scores of the finished runs, and the worst score for each failed run."""
     episodes: float
-    """Evaluation episodes behind a score, mean of the runs; infinite where they are not known."""
-    noise: float = 0.0
-    """Variance of a rate's score from its evaluation episodes alone, mean of the runs; 0 where
-    episodes are unknown."""
-    failed: int = 0
+    """Mean number of evaluation episodes behind a score; infinite if unknown."""
+    noise: float
+    """Mean variance of a rate's score from its evaluation episodes alone; 0 if unknown."""
+    failed: int
     """Number of failed runs."""
-    waiting: int = 0
+    unfinished: int
     """Number of runs that are neither finished nor failed."""
 
     @property
@@ -81,23 +79,26 @@ class Scores:
 def measure_on(
     sweep: Sweep,
     task: str,
-    runs: Sequence[int],
+    runs: Iterable[int],
     kind: str,
     metric: str | None = None,
     *,
     maximised: bool = True,
     horizon: float = np.inf,
 ) -> Measure:
-    """The measure of the runs on a task, over a budget that each of them has.
+    """The measure by which runs on a task are compared.
+
+    A failed run has the worst score: 0 for a rate, the lowest possible return if the reward's range
+    is known, else the worst score of the compared runs.
 
     Args:
-        sweep: the runs.
-        task: the task.
-        runs: positions of all runs that are compared.
+        sweep: The runs.
+        task: The task.
+        runs: Positions of all runs that are compared.
         kind: `auc` or `final`.
-        metric: None for the task's primary one.
-        maximised: whether more of it is better.
-        horizon: largest number of environment steps.
+        metric: The metric; None: the task's primary one.
+        maximised: Whether higher values are better.
+        horizon: Largest number of environment steps.
     """
     own = [run for run in runs if sweep.runs[run].task == task]
     measure = Measure(
@@ -106,20 +107,19 @@ def measure_on(
         horizon=min(horizon, sweep.least_budget(task, own)),
         maximised=maximised,
     )
-    if not any(has_failed(sweep, run, measure.metric) for run in own):
+    if not any(_has_failed(sweep, run, measure.metric) for run in own):
         return measure
     return replace(measure, worst=_worst(sweep, own, measure))
 
 
-def has_failed(sweep: Sweep, run: int, metric: str) -> bool:
-    """Whether a run ended with an error, or diverged to a score that is no number."""
+def _has_failed(sweep: Sweep, run: int, metric: str) -> bool:
+    """Whether a run ended with an error, or diverged to a score that is not a number."""
     record, values = sweep.runs[run], sweep.column(run, metric).value
     diverged = record.is_finished and len(values) > 0 and not np.isfinite(values[-1])
     return record.status == "FAILED" or diverged
 
 
 def _worst(sweep: Sweep, runs: Sequence[int], measure: Measure) -> float:
-    """The worst value of a measure, for runs that failed."""
     if measure.is_rate:
         return 0.0 if measure.maximised else 1.0
     params = sweep.runs[runs[0]].params
@@ -130,37 +130,37 @@ def _worst(sweep: Sweep, runs: Sequence[int], measure: Measure) -> float:
     scores = [_score(sweep, run, measure) for run in runs]
     known = [score for score in scores if np.isfinite(score)]
     worst = min if measure.maximised else max
-    return worst(known, default=float("nan"))
+    return worst(known, default=np.nan)
 
 
 def _score(sweep: Sweep, run: int, measure: Measure) -> float:
-    """The score of a run; NaN for one that has not finished or was not evaluated to the end."""
-    if not sweep.runs[run].is_finished or has_failed(sweep, run, measure.metric):
-        return float("nan")
+    """The score of a run; NaN if it is unfinished or was not evaluated up to the horizon."""
+    if not sweep.runs[run].is_finished or _has_failed(sweep, run, measure.metric):
+        return np.nan
     steps, values = sweep.finite(run, measure.metric)
     if measure.kind == "auc" and measure.horizon > 0:
         return area_under_curve(steps, values, measure.horizon)
-    return float(values[-1]) if len(values) else float("nan")
+    return float(values[-1]) if len(values) else np.nan
 
 
 def scores_of(sweep: Sweep, condition: Condition, task: str, measure: Measure) -> Scores:
     """The scores of a condition's runs on a task.
 
-    A failed run has the measure's worst value: leaving it out would make a condition look better
-    the more of its runs crash. An unfinished run has no score: its result is not known.
+    A failed run has the worst score: without it, a condition would look better the more of its runs
+    fail. An unfinished run has no score.
     """
     by_seed: dict[str, float] = {}
-    episodes, noise, failed, waiting = [], [], 0, 0
+    episodes, noise, failed, unfinished = [], [], 0, 0
     for run in condition.runs:
         record = sweep.runs[run]
         if record.task != task:
             continue
-        if has_failed(sweep, run, measure.metric):
+        if _has_failed(sweep, run, measure.metric):
             if np.isfinite(measure.worst):
                 by_seed[record.seed] = measure.worst
                 failed += 1
             continue
-        waiting += not record.is_finished
+        unfinished += not record.is_finished
         score = _score(sweep, run, measure)
         if np.isnan(score):
             continue
@@ -173,7 +173,7 @@ def scores_of(sweep: Sweep, condition: Condition, task: str, measure: Measure) -
             episodes.append(np.inf)
         else:
             episodes.append(of_one * len(used))
-            # A rate of 0 or 1 in few episodes is not certain: half an episode is added to both.
+            # Half an episode is added to both outcomes: a rate of 0 or 1 is not certain.
             rates = (used * of_one + 0.5) / (of_one + 1)
             noise.append(float(np.mean(rates * (1 - rates))) / max(of_one * len(used), 1))
     return Scores(
@@ -181,37 +181,36 @@ def scores_of(sweep: Sweep, condition: Condition, task: str, measure: Measure) -
         episodes=float(np.mean(episodes)) if episodes else np.inf,
         noise=float(np.mean(noise)) if noise and measure.is_rate else 0.0,
         failed=failed,
-        waiting=waiting,
+        unfinished=unfinished,
     )
 
 
 def area_under_curve(steps: Array, values: Array, horizon: float) -> float:
     """Mean of a learning curve over environment steps 0 to `horizon`, by the trapezoid rule.
 
-    Before the first evaluation the curve has that one's value; a budget of 100 steps that ends
-    between two evaluations is cut there.
+    Before the first evaluation the curve has its value. A horizon between two evaluations cuts the
+    line between them.
 
     Args:
-        steps: `[points]` of the evaluations, rising.
+        steps: `[points]` of the evaluations, increasing.
         values: `[points]`, finite.
-        horizon: environment steps, > 0.
+        horizon: Environment steps, > 0.
 
     Returns:
-        The mean in the metric's unit; NaN for a run without an evaluation at `horizon` or later,
-        as the rest of its curve is not known.
+        The mean in the metric's unit; NaN without an evaluation at `horizon` or later.
     """
     if not len(steps) or steps[-1] < horizon:
-        return float("nan")
+        return np.nan
     inside = steps[(steps > 0) & (steps < horizon)]
     at = np.concatenate([[0.0], inside, [horizon]])
     return float(np.trapezoid(np.interp(at, steps, values), at) / horizon)
 
 
-def ended_first(sweep: Sweep, runs: Sequence[int]) -> float:
-    """Time of the earliest last evaluation among finished runs, in ms since the epoch.
+def first_result(sweep: Sweep, runs: Iterable[int]) -> float:
+    """Time of the earliest last evaluation of a finished run, in ms since the epoch.
 
-    The time is infinite before any run has finished. A run that was taken over from another sweep
-    counts when that sweep computed it.
+    It is infinite before any run has finished. A run that another sweep trained counts at the time
+    of its training.
     """
     ends = []
     for run in runs:

@@ -1,14 +1,8 @@
-"""Conditions of a sweep that a hypothesis is about.
+"""The study of a sweep: planned hypotheses with verdicts, and comparisons outside the plan.
 
-Claims of a study: tests of hypotheses that were planned before the runs, and of later ones.
-
-Each condition's runs give a score for each seed, which comparisons take seed by seed
-(:mod:`~music_rllib.results.claims`). The planned comparisons are one family, and only
-they have verdicts; without a plan all pairs of conditions are the family. Other comparisons are
-exploratory: they have a difference, an interval and an unadjusted p-value.
-
-
-The primary metric against α, a line for each q: what a comparison at one α would have found.
+The planned comparisons are one family, and only they have verdicts. Without a plan, all pairs of
+conditions are the family. Other comparisons are exploratory: they have a difference, an interval
+and an unadjusted p-value.
 """
 
 from __future__ import annotations
@@ -24,12 +18,11 @@ from music_rllib.config.analysis import Hypothesis, parsed
 from music_rllib.config.problems import same
 from music_rllib.results import statistics as st
 from music_rllib.results.analysis_plan import PlanVersion
-from music_rllib.results.claims import Claim, claims_of, decided, exploratory
+from music_rllib.results.claims import Claim, Pairs, claims_of, decided, exploratory
 from music_rllib.results.conditions import (
     ALPHA,
     ENTROPIC_INDEX,
     IN_WORDS,
-    SEEDS,
     Condition,
     StageRuns,
     Values,
@@ -37,91 +30,16 @@ from music_rllib.results.conditions import (
     whole_setting,
 )
 from music_rllib.results.data import RunRecord, Sweep
-from music_rllib.results.scores import (
-    Measure,
-    Scores,
-    ended_first,
-    measure_on,
-    scores_of,
-)
+from music_rllib.results.scores import Measure, Scores, first_result, measure_on, scores_of
 from music_rllib.results.statistics import Array, Estimate
 
-
-def in_words(side: Mapping[str, str]) -> str:
-    """One side of a hypothesis as labels have it: `q = 1.5, α = 0.1`."""
-    return ", ".join(f"{_label(name)} = {value}" for name, value in side.items())
-
-
-def _label(name: str) -> str:
-    """The label of a setting or of a part of it: `tac.alpha.value` is α."""
-    return IN_WORDS.get(whole_setting(name), (name, ""))[0]
-
-
-def matching(
-    sweep: Sweep, stages: Mapping[str, StageRuns], side: Mapping[str, str], stage: str
-) -> list[Condition]:
-    """Conditions that may be compared and have all settings of one side of a hypothesis."""
-    settings = dict(side)
-    chosen = stages.get(settings.pop("stage", stage))
-    return [
-        condition
-        for condition in (chosen.compared if chosen else ())
-        if all(_has(sweep.runs[condition.runs[0]], *setting) for setting in settings.items())
-    ]
-
-
-def _has(run: RunRecord, name: str, value: str) -> bool:
-    _, tag = IN_WORDS.get(name, ("", ""))
-    known = (run.params.get(name), run.tags.get(tag))
-    return any(_same(value, other) for other in known if other is not None)
-
-
-def _same(one: str, other: str) -> bool:
-    return one == other or same(parsed(one), parsed(other))
-
-
-def alike_in_the_rest(
-    first: Sequence[Condition], second: Sequence[Condition], hypothesis: Hypothesis
-) -> list[tuple[Condition, Condition]] | str:
-    """Pairs of conditions that differ only in what the hypothesis names.
-
-    One against one is a pair, whatever else they differ in: each value of q may have been given
-    its own α.
-
-    Returns:
-        The pairs, or in words why there are none.
-    """
-    for side, settings in ((first, hypothesis.first), (second, hypothesis.second)):
-        if not side:
-            return f"no run of {in_words(settings)} has begun that may be compared"
-    if len(first) == len(second) == 1:
-        return [(first[0], second[0])]
-    named = {_label(name) for name in (*hypothesis.first, *hypothesis.second)}
-    firsts, seconds = (
-        {_rest(condition, named): condition for condition in side} for side in (first, second)
-    )
-    pairs = [(one, seconds[rest]) for rest, one in firsts.items() if rest in seconds]
-    if not pairs or len(firsts) < len(first) or len(seconds) < len(second):
-        return (
-            f"{len(first)} and {len(second)} conditions have these settings, and no pairs of them "
-            "are alike in the rest: it must name more"
-        )
-    return pairs
-
-
-def _rest(condition: Condition, named: set[str]) -> Values:
-    """The condition's settings that the hypothesis does not name."""
-    settings = ((ENTROPIC_INDEX, condition.entropic_index), *condition.others)
-    return tuple(pair for pair in settings if pair[0] not in named)
-
-
 MOST_CONDITIONS = 6
-"""Number of conditions up to which each is compared with each; more, with a reference."""
+"""Number of conditions up to which all pairs are compared; otherwise each with a reference."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Mean:
-    """A condition's primary metric on a task."""
+    """Mean score of a condition on a task."""
 
     condition: Condition
     task: str
@@ -129,15 +47,15 @@ class Mean:
     estimate: Estimate
     scores: Scores = field(repr=False)
     runs: int
-    """Number of runs that are planned or begun; finished and failed ones have scores."""
+    """Number of planned runs."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Study:
-    """All claims of one stage and of the hypotheses."""
+    """Mean scores of the conditions of one stage, and all comparisons with their verdicts."""
 
     stage: StageRuns | None
-    """None before a run has begun, and without a stage that trains for the task."""
+    """None before a run has started, and without a stage that trains for the task."""
     plan: PlanVersion | None
     """The last version recorded before the first of its runs had finished; None without one."""
     latest: PlanVersion | None
@@ -145,18 +63,18 @@ class Study:
     means: tuple[Mean, ...]
     planned: tuple[Claim, ...]
     """Claims of the hypotheses of `plan`."""
-    afterwards: tuple[Claim, ...]
+    unplanned: tuple[Claim, ...]
     """Other claims: hypotheses that are only in `latest`, and other pairs of the stage."""
     untested: tuple[str, ...]
     """Hypotheses that can't be tested, with the reason."""
     runs: tuple[int, ...]
-    """Positions in `Sweep.runs` of what may be compared, of the stage and those of `plan`."""
+    """Positions in `Sweep.runs` of the runs that may be compared, in the stage and in `plan`."""
     family: int
-    """Number of comparisons that `claims` are corrected for, with those that can't be tested."""
+    """Number of comparisons for which p-values are adjusted, with those that can't be tested."""
 
     @property
     def question(self) -> str | None:
-        """The plan's question, or its hypotheses where it has none; None without a plan."""
+        """The question of the plan, or its hypotheses without one; None without a plan."""
         version = self.plan or self.latest
         if version is None:
             return None
@@ -164,11 +82,11 @@ class Study:
 
     @property
     def claims(self) -> tuple[Claim, ...]:
-        """Claims that answer the question: the planned ones, or without a plan all there are.
+        """The claims that answer the question: the planned ones, or all without a plan.
 
-        While no planned claim can be tested there are none: other claims are no substitute.
+        While no planned claim can be tested, there are none.
         """
-        return self.planned if self.plan is not None else self.afterwards
+        return self.planned if self.plan is not None else self.unplanned
 
 
 def study_of(
@@ -177,25 +95,25 @@ def study_of(
     """Test the planned hypotheses, and compare the other conditions of a stage.
 
     Args:
-        sweep: its runs, with the metrics that are read.
-        stage: of the comparisons that nobody planned; None: the plan's, or the last that trains
-            for the task.
-        metric: of those; None: each task's primary one, measured as the plan says.
-        maximised: whether more of `metric` is better.
+        sweep: The runs.
+        stage: Stage of the comparisons outside the plan; None: the plan's, or the last stage that
+            trains for the task.
+        metric: Metric of the comparisons outside the plan; None: each task's primary one.
+        maximised: Whether higher values of `metric` are better.
     """
     stages = {found.name: found for found in find_stages(sweep)}
     latest = sweep.plans[-1] if sweep.plans else None
-    plan = _planned(sweep, stages)
+    plan = _plan_before_results(sweep, stages)
     chosen = stages.get(stage or (latest.plan.stage if latest else ""))
     if chosen is None and stage is None:
         chosen = next((s for s in reversed(stages.values()) if s.has_task_reward), None)
     untested: list[str] = []
     planned = list(_of_plan(sweep, stages, plan, (), untested)) if plan else []
     without_test = len(untested)
-    afterwards: list[Claim] = []
+    unplanned: list[Claim] = []
     if latest is not None and latest != plan:
         known = plan.plan.hypotheses if plan and _same_test(plan, latest) else ()
-        afterwards += _of_plan(sweep, stages, latest, known, untested)
+        unplanned += _of_plan(sweep, stages, latest, known, untested)
     means: list[Mean] = []
     if chosen is not None:
         kind, margin = "auc", None
@@ -206,19 +124,22 @@ def study_of(
             for task in chosen.tasks
         }
         means += _means(sweep, chosen, measures)
-        afterwards += _of_stage(sweep, chosen, measures, margin, (*planned, *afterwards))
-    about = [stages[name] for name in (plan.plan.stages if plan else ()) if name in stages]
-    family = len(planned) + without_test if plan else len(afterwards)
+        pairs = [(x.short_label, y.short_label, [(x, y)]) for x, y in _pairs(chosen.compared)]
+        known_subjects = {claim.subject for claim in (*planned, *unplanned)}
+        of_stage = claims_of(sweep, pairs, measures, margin)
+        unplanned += [claim for claim in of_stage if claim.subject not in known_subjects]
+    of_plan = [stages[name] for name in (plan.plan.stages if plan else ()) if name in stages]
+    compared = [run for one in filter(None, [chosen, *of_plan]) for run in _runs(one)]
     return Study(
         stage=chosen,
         plan=plan,
         latest=latest,
         means=tuple(means),
         planned=decided(planned, planned=True, without_test=without_test),
-        afterwards=exploratory(afterwards) if plan else decided(afterwards, planned=False),
+        unplanned=exploratory(unplanned) if plan else decided(unplanned, planned=False),
         untested=tuple(dict.fromkeys(untested)),
-        family=family,
-        runs=tuple({run: None for stage in filter(None, [chosen, *about]) for run in _runs(stage)}),
+        family=len(planned) + without_test if plan else len(unplanned),
+        runs=tuple(dict.fromkeys(compared)),
     )
 
 
@@ -227,11 +148,11 @@ def _runs(stage: StageRuns) -> list[int]:
     return [run for condition in stage.compared for run in condition.runs]
 
 
-def _planned(sweep: Sweep, stages: Mapping[str, StageRuns]) -> PlanVersion | None:
-    """The last version of the plan that was recorded before any result."""
+def _plan_before_results(sweep: Sweep, stages: Mapping[str, StageRuns]) -> PlanVersion | None:
+    """The last version of the plan that was recorded before any result of its stages."""
     for version in reversed(sweep.plans):
         runs = [run for name in version.plan.stages & stages.keys() for run in stages[name].runs]
-        if version.recorded_ms < ended_first(sweep, runs):
+        if version.recorded_ms < first_result(sweep, runs):
             return version
     return None
 
@@ -253,12 +174,12 @@ def _of_plan(
             continue
         hypothesis = Hypothesis.of(text)
         sides = (hypothesis.first, hypothesis.second)
-        first, second = (matching(sweep, stages, side, version.plan.stage) for side in sides)
-        cells = alike_in_the_rest(first, second, hypothesis)
-        if isinstance(cells, str):
-            untested.append(f"{text}: {cells}")
+        first, second = (_matching(sweep, stages, side, version.plan.stage) for side in sides)
+        pairs = _equal_in_the_rest(first, second, hypothesis)
+        if isinstance(pairs, str):
+            untested.append(f"{text}: {pairs}")
             continue
-        runs = [run for pair in cells for condition in pair for run in condition.runs]
+        runs = [run for pair in pairs for condition in pair for run in condition.runs]
         measures = {
             task: measure_on(
                 sweep,
@@ -269,7 +190,7 @@ def _of_plan(
             )
             for task in dict.fromkeys(sweep.runs[run].task for run in runs)
         }
-        labelled = (in_words(hypothesis.first), in_words(hypothesis.second), cells)
+        labelled = (_in_words(hypothesis.first), _in_words(hypothesis.second), pairs)
         claims = list(
             claims_of(sweep, [labelled], measures, version.plan.margin, version.plan.seed_count)
         )
@@ -278,32 +199,11 @@ def _of_plan(
         yield from (replace(claim, hypothesis=hypothesis) for claim in claims)
 
 
-def _of_stage(
-    sweep: Sweep,
-    stage: StageRuns,
-    measures: Mapping[str, Measure],
-    margin: float | None,
-    others: Sequence[Claim],
-) -> Iterator[Claim]:
-    """The undecided claims of a stage's pairs of conditions, on what no other claim is about."""
-    known = {claim.subject for claim in others}
-    pairs = [(x.short_label, y.short_label, [(x, y)]) for x, y in _pairs(stage.compared)]
-    for claim in claims_of(sweep, pairs, measures, margin):
-        if claim.subject not in known:
-            yield claim
-
-
-def label_of(condition: Condition) -> str:
-    """The condition's label without the seeds of a search: only fresh ones are compared."""
-    others = tuple(pair for pair in condition.others if pair[0] != SEEDS)
-    return replace(condition, others=others).label
-
-
 def _pairs(conditions: Sequence[Condition]) -> list[tuple[Condition, Condition]]:
     """Pairs of a later condition and an earlier one; of many conditions, each and its reference.
 
-    The reference is the condition alike in the rest with q = 1, or with the smallest q; where no
-    two conditions are alike in the rest, the first of those with this q.
+    The reference has the same other settings and q = 1, or the smallest q. If no two conditions
+    have the same other settings, it is the first condition with this q.
     """
     if len(conditions) <= MOST_CONDITIONS:
         return [(second, first) for first, second in combinations(conditions, 2)]
@@ -333,48 +233,118 @@ def _means(sweep: Sweep, stage: StageRuns, measures: Mapping[str, Measure]) -> I
                 )
 
 
+# Conditions of a hypothesis -----------------------------------------------------------------------
+
+
+def _in_words(side: Mapping[str, str]) -> str:
+    """One side of a hypothesis: `q = 1.5, α = 0.1`."""
+    return ", ".join(f"{_label(name)} = {value}" for name, value in side.items())
+
+
+def _label(name: str) -> str:
+    """The label of a setting or of a part of it: `tac.alpha.value` is α."""
+    return IN_WORDS.get(whole_setting(name), (name, ""))[0]
+
+
+def _matching(
+    sweep: Sweep, stages: Mapping[str, StageRuns], side: Mapping[str, str], stage: str
+) -> list[Condition]:
+    """Conditions that may be compared and have all settings of one side of a hypothesis."""
+    settings = dict(side)
+    chosen = stages.get(settings.pop("stage", stage))
+    return [
+        condition
+        for condition in (chosen.compared if chosen else ())
+        if all(_has(sweep.runs[condition.runs[0]], *setting) for setting in settings.items())
+    ]
+
+
+def _has(run: RunRecord, name: str, value: str) -> bool:
+    _, tag = IN_WORDS.get(name, ("", ""))
+    known = [text for text in (run.params.get(name), run.tags.get(tag)) if text is not None]
+    return any(value == text or same(parsed(value), parsed(text)) for text in known)
+
+
+def _equal_in_the_rest(
+    first: Sequence[Condition], second: Sequence[Condition], hypothesis: Hypothesis
+) -> Pairs | str:
+    """Pairs of conditions that differ only in the settings of a hypothesis.
+
+    A single condition on each side is a pair even if other settings differ: each q can have its own
+    α.
+
+    Returns:
+        The pairs, or the reason why there are none.
+    """
+    for side, settings in ((first, hypothesis.first), (second, hypothesis.second)):
+        if not side:
+            return f"no run of {_in_words(settings)} that may be compared has started"
+    if len(first) == len(second) == 1:
+        return [(first[0], second[0])]
+    named = {_label(name) for name in (*hypothesis.first, *hypothesis.second)}
+    firsts, seconds = (
+        {_rest(condition, named): condition for condition in side} for side in (first, second)
+    )
+    pairs = [(one, seconds[rest]) for rest, one in firsts.items() if rest in seconds]
+    if not pairs or len(firsts) < len(first) or len(seconds) < len(second):
+        return (
+            f"{len(first)} and {len(second)} conditions have these settings, and their other "
+            "settings form no pairs: the hypothesis must name more settings"
+        )
+    return pairs
+
+
+def _rest(condition: Condition, named: set[str]) -> Values:
+    """The condition's settings that the hypothesis does not name."""
+    settings = ((ENTROPIC_INDEX, condition.entropic_index), *condition.others)
+    return tuple(pair for pair in settings if pair[0] not in named)
+
+
+# Sensitivity to α ---------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True, kw_only=True)
 class AlphaLine:
-    """Conditions on a task that differ in α only, by rising α."""
+    """Mean scores of conditions on a task that differ only in α, by increasing α."""
 
     task: str
     entropic_index: str
     others: Values
-    """Other settings that tell the line from the others."""
+    """The other settings."""
     means: tuple[Mean, ...]
     alphas: Array
     """`[points]`."""
     estimate: Estimate
-    """`[points]`, of the primary metric over the seeds."""
+    """`[points]`."""
 
 
 def alpha_sensitivity(means: Sequence[Mean]) -> list[AlphaLine]:
-    """Lines of at least two values of α; a condition whose α is no number is on none."""
+    """Lines with at least two values of α; conditions whose α is not a number are left out."""
     groups: defaultdict[tuple[str, str, Values], list[tuple[float, Mean]]] = defaultdict(list)
     for mean in means:
-        others = dict(mean.condition.others)
+        settings = dict(mean.condition.others)
         try:
-            alpha = float(others.pop(ALPHA, ""))
+            alpha = float(settings.pop(ALPHA, ""))
         except ValueError:
             continue
-        key = (mean.task, mean.condition.entropic_index, tuple(others.items()))
+        key = (mean.task, mean.condition.entropic_index, tuple(settings.items()))
         groups[key].append((alpha, mean))
-    return [_line(*key, points) for key, points in groups.items() if len(points) > 1]
-
-
-def _line(
-    task: str, entropic_index: str, others: Values, points: Sequence[tuple[float, Mean]]
-) -> AlphaLine:
-    alphas, means = zip(*sorted(points, key=lambda point: point[0]), strict=True)
-    value, lower, upper = (
-        np.array([float(getattr(mean.estimate, end)) for mean in means])
-        for end in ("value", "lower", "upper")
-    )
-    return AlphaLine(
-        task=task,
-        entropic_index=entropic_index,
-        others=others,
-        means=means,
-        alphas=np.array(alphas),
-        estimate=Estimate(value=value, lower=lower, upper=upper),
-    )
+    lines = []
+    for (task, entropic_index, others), points in groups.items():
+        if len(points) > 1:
+            alphas, ordered = zip(*sorted(points, key=lambda point: point[0]), strict=True)
+            ends = {
+                end: np.array([float(getattr(mean.estimate, end)) for mean in ordered])
+                for end in ("value", "lower", "upper")
+            }
+            lines.append(
+                AlphaLine(
+                    task=task,
+                    entropic_index=entropic_index,
+                    others=others,
+                    means=ordered,
+                    alphas=np.array(alphas),
+                    estimate=Estimate(**ends),
+                )
+            )
+    return lines

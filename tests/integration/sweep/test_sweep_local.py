@@ -117,7 +117,7 @@ def test_tasks_without_success_show_their_return_from_the_first_line_to_the_repo
     assert table.count(f"finetune,Point,{names.EVAL_RETURN},q = ") == 2
     for command, words in (
         ("status", "Best so far: finetune q = "),
-        ("compare", "Counted: mean return over 800 steps"),
+        ("compare", "Metric: mean return over 800 steps"),
     ):
         code, said, errors = call(main, folder, command, "points", "--storage", "results")
         assert (code, errors) == (0, "")
