@@ -125,7 +125,7 @@ BEGINS = TrajectoryEnvRunner._start_episode.__name__
             "reset",
             f'File "/x/tac/env_runner.py", line 9 in {BEGINS}',
         ),
-        ("a\n300.0\n", "step() or reset", "a place that is not known"),
+        ("a\n300.0\n", "step() or reset", "an unknown place"),
     ],
 )
 def test_the_message_names_the_call_and_the_place(record: str, call: str, place: str) -> None:

@@ -1,4 +1,4 @@
-"""A user's task is held against its environment before anything is trained."""
+"""A declared task is compared with its environment before training."""
 
 from pathlib import Path
 from typing import Any
@@ -77,7 +77,7 @@ MISFITS: list[tuple[dict[str, Any], str]] = [
 ]
 
 
-def test_what_does_not_fit_is_named(tmp_path: Path) -> None:
+def test_tasks_that_do_not_fit_are_named(tmp_path: Path) -> None:
     with pytest.raises(TaskError) as caught:
         check(tmp_path, *(task for task, _ in MISFITS), hindsight_k=4.0)
     lines = str(caught.value).splitlines()
@@ -95,7 +95,7 @@ def test_dense_rewards_need_a_distance_for_hindsight_from_moved_episodes(tmp_pat
     assert "or the task must have a moved_distance: PointMaze_UMaze" in line
 
 
-def test_all_that_does_not_fit_is_said_at_once(tmp_path: Path) -> None:
+def test_all_problems_are_reported_at_once(tmp_path: Path) -> None:
     task = {"env_id": "Pendulum-v1", "horizon": 300, "agent_indices": [0]}
     with pytest.raises(TaskError) as caught:
         check(tmp_path, task | {"surrounding_indices": [5]}, hindsight_k=4.0)
@@ -148,7 +148,7 @@ for kind in (Loud, Aborts, Ends, Stops, Raises):
 def test_an_environment_that_ends_its_process_is_named_and_the_others_are_played(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each would have ended the driver."""
+    """Each would end the driver."""
     (tmp_path / "fatal_env.py").write_text(FATAL)
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.syspath_prepend(str(ENVIRONMENTS))

@@ -1,10 +1,11 @@
-"""One node as a trial: every variant, from its source, and continued after a cut."""
+"""One run as a Tune trial: every variant, from its source, and resumed after an interruption."""
 
 from __future__ import annotations
 
 import math
 import os
 import re
+import shutil
 import subprocess
 import sys
 import time
@@ -94,7 +95,7 @@ def job(storage: Path, run: RunSettings, source: NodeJob | None = None) -> NodeJ
 
 
 def compute(node: NodeJob, steps: int | None = None) -> list[dict[str, Any]]:
-    """Results of a trial that makes so many steps, or goes to its end."""
+    """Results of a trial, of its first `steps` steps or to its end."""
     trial = RunTrainable(config=node.to_tune())
     results: list[dict[str, Any]] = []
     try:
@@ -106,36 +107,39 @@ def compute(node: NodeJob, steps: int | None = None) -> list[dict[str, Any]]:
 
 
 def numbers(storage: Path, node: NodeJob) -> list[dict[str, float]]:
-    """A finished node's metrics, report by report, without what depends on the machine's mood."""
+    """A finished run's metrics by report, without the metrics of the machine."""
     return [
         {name: value for name, value in report.metrics.items() if not name.startswith("system/")}
         for report in NodeStore(str(storage)).history(node.key)
     ]
 
 
+@pytest.fixture(scope="module")
+def pretrained(local_ray: None, tmp_path_factory: pytest.TempPathFactory) -> NodeJob:
+    """A finished run of MUSIC-u, from which others start."""
+    source = job(tmp_path_factory.mktemp("storage"), settings("music-u"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(trainable, "DEFAULT_STORAGE_PATH", source.storage)
+        compute(source)
+    return source
+
+
 @pytest.mark.usefixtures("local_ray")
-@pytest.mark.parametrize(("lowest", "times"), [(-1e-6, 1), (-100.0, 0)])
-def test_critics_beyond_what_can_be_earned_are_told_of_once(
-    lowest: float, times: int, tmp_path: Path
-) -> None:
-    """The first task says that its rewards are far smaller than they are."""
-    task = POINT.model_copy(update={"reward_range": (lowest, 0.0)})
+def test_diverged_critics_are_reported_once(tmp_path: Path) -> None:
+    """The task declares far smaller rewards than its environment returns."""
+    task = POINT.model_copy(update={"reward_range": (-1e-6, 0.0)})
     tac = settings("tac").tac.model_dump() | {"alpha": 0.0}
     results = compute(job(tmp_path, settings("tac", task=task, tac=tac)))
-    notes = [note for result in results for note in result[NOTES] if "critics" in note]
-    assert len(notes) == times
-    for note in notes:
-        assert re.match(r"its critics diverge: \S+ on average, with rewards of -1e-06 to 0 ", note)
+    (note,) = [note for result in results for note in result[NOTES] if "critics" in note]
+    assert re.match(r"its critics diverge: \S+ on average, with rewards of -1e-06 to 0 ", note)
 
 
-@pytest.mark.usefixtures("local_ray")
-def test_every_variant_trains_from_its_source(tmp_path: Path) -> None:
-    store = NodeStore(str(tmp_path))
-    source = job(tmp_path, settings("music-u"))
-    compute(source)
+def test_every_variant_trains_from_its_source(pretrained: NodeJob) -> None:
+    source, storage = pretrained, Path(pretrained.storage)
+    store = NodeStore(source.storage)
     variants: list[Variant] = ["tac", "music-r", "music-f", "music-p"]
     for variant in variants:
-        node = job(tmp_path, settings(variant), source if variant != "tac" else None)
+        node = job(storage, settings(variant), source if variant != "tac" else None)
         assert compute(node)[-1]["done"]
         result = store.result(node.key)
         assert result is not None
@@ -153,10 +157,9 @@ def estimator(store: NodeStore, key: str) -> dict[str, Any]:
     return read_handoff(Path(store.path(key)), ["mi_estimator"], POINT)["mi_estimator"]
 
 
-@pytest.mark.usefixtures("local_ray")
-def test_music_f_begins_with_the_agent_that_it_was_handed(tmp_path: Path) -> None:
-    source = job(tmp_path, settings("music-u"))
-    compute(source)
+def test_music_f_starts_with_the_agent_of_its_source(pretrained: NodeJob, tmp_path: Path) -> None:
+    shutil.copytree(pretrained.storage, tmp_path, dirs_exist_ok=True)
+    source = pretrained
     node = job(tmp_path, settings("music-f"), source)
     trial = RunTrainable(config=node.to_tune())
     begun = trial._begin()
@@ -164,7 +167,7 @@ def test_music_f_begins_with_the_agent_that_it_was_handed(tmp_path: Path) -> Non
     expected = read_handoff(folder, handed_over(node.run), POINT)
     assert set(expected) == {"policy", "critics", "value", "value_target", "normaliser"}
     found = begun.network_weights()
-    # MUSIC-u's goals were zeros: of these the moments are no start (observation 4, goal 2).
+    # MUSIC-u's goals were zeros, so their moments start again (observation 4, goal 2).
     for name in ("count", "centre", "squares"):
         expected["normaliser"][name][4:] = 0.0
     for module, arrays in expected.items():
@@ -181,22 +184,22 @@ def test_music_f_begins_with_the_agent_that_it_was_handed(tmp_path: Path) -> Non
 
 
 @pytest.mark.usefixtures("local_ray")
-def test_the_first_report_is_of_the_untrained_policy_and_changes_no_training() -> None:
-    def trained(*, looked_at: bool) -> tuple[list[dict[str, float]], Any]:
+def test_evaluating_the_untrained_policy_does_not_change_training() -> None:
+    def trained(*, evaluated: bool) -> tuple[list[dict[str, float]], Any]:
         run = TrainingRun(settings("music-r"))
-        run._begun = not looked_at
+        run._begun = not evaluated
         reports = []
         while not run.finished:
             reports.append(run.advance())
         run.close()
         return reports, run.network_weights()["policy"]
 
-    reports, policy = trained(looked_at=True)
+    reports, policy = trained(evaluated=True)
     first, *rest = reports
     assert first[names.ENV_STEPS] == first[names.GRAD_UPDATES] == 0
     assert first[names.EVAL_EPISODES] == settings("music-r").evaluation.episodes
     assert names.TRAIN_RETURN not in first
-    others, same_policy = trained(looked_at=False)
+    others, same_policy = trained(evaluated=False)
     learned = {key for key in rest[-1] if key.startswith(names.LEARNER_GROUPS)}
     assert learned
     for report, other in zip(rest, others, strict=True):
@@ -206,7 +209,7 @@ def test_the_first_report_is_of_the_untrained_policy_and_changes_no_training() -
 
 
 @pytest.mark.usefixtures("local_ray")
-def test_a_task_says_from_which_distance_on_something_has_moved() -> None:
+def test_a_task_sets_the_distance_that_counts_as_moved() -> None:
     def weights(far: float | None, episodes: str) -> Any:
         task = POINT.model_copy(update={"moved_distance": far})
         replay = {"hindsight_k": 4.0, "hindsight_episodes": episodes}
@@ -216,7 +219,7 @@ def test_a_task_says_from_which_distance_on_something_has_moved() -> None:
         run.close()
         return run.network_weights()["policy"]["0.weight"]
 
-    # Farther than anything gets there, and as far as the reward tells apart.
+    # 100 is beyond every movement; without a distance, the reward decides.
     np.testing.assert_array_equal(weights(100.0, "moved"), weights(None, "all"))
     assert (weights(None, "moved") != weights(None, "all")).any()
 
@@ -226,7 +229,7 @@ def test_a_task_says_from_which_distance_on_something_has_moved() -> None:
 def test_a_cut_run_ends_with_the_numbers_of_an_unbroken_one(
     tmp_path: Path, variant: Variant
 ) -> None:
-    """Also where q follows the entropy, and the weight of MUSIC's reward the success rate."""
+    """Also if q follows the entropy, and the weight of MUSIC's reward the success rate."""
     run = settings(variant, env_steps=800)
     q = {"follows": "shannon_entropy", "points": [[0.0, 1.0], [1.5, 2.0]], "smoothing": 100.0}
     follows = {"tac": {**run.tac.model_dump(), "entropic_index": q}}
@@ -239,11 +242,11 @@ def test_a_cut_run_ends_with_the_numbers_of_an_unbroken_one(
     cut = job(tmp_path / "b", run)
     assert cut.key == unbroken.key
     assert [result["done"] for result in compute(cut, steps=3)] == [False, False, False]
-    # What it did after its last checkpoint is lost, as after a kill.
+    # Steps after the last checkpoint are lost, as after a kill.
     results = compute(cut)
     assert results[0][NOTES] == ["continues at 400 env steps"]
     told = [report.env_steps for r in results for report in from_json_lines(r[REPORTS].encode())]
-    assert told == [0, 200, 400, 600, 800], "the driver may not have heard of the first ones"
+    assert told == [0, 200, 400, 600, 800], "the driver may not have received the first ones"
     assert numbers(tmp_path / "b", cut) == numbers(tmp_path / "a", unbroken)
     assert NodeStore(str(tmp_path / "b")).work_folder(cut.key).names() == []
     rows = [row for row in numbers(tmp_path / "a", unbroken) if names.ENTROPIC_INDEX_FOLLOWS in row]
@@ -254,13 +257,13 @@ def test_a_cut_run_ends_with_the_numbers_of_an_unbroken_one(
             assert row[names.MI_REWARD_WEIGHT] == 1.0 - before[names.EVAL_SUCCESS]
 
 
-def test_the_bound_on_fresh_episodes_is_averaged_by_their_steps_over_a_report() -> None:
+def test_a_report_weights_the_bound_on_new_episodes_by_their_steps() -> None:
     rounds = {"a": [1.0, 3.0], names.HELD_OUT_BOUND: [0.1, 0.4], HELD_OUT_STEPS: [30.0, 10.0]}
     assert _means(rounds) == pytest.approx({"a": 2.0, names.HELD_OUT_BOUND: 0.175})
     assert _means({"a": [1.0]}) == {"a": 1.0}
 
 
-def test_an_iteration_without_an_update_takes_no_metric_from_the_others() -> None:
+def test_an_iteration_without_an_update_has_no_metrics_of_updates() -> None:
     learned = {"loss/critic": math.nan, "critics/mean": np.float32(2.0), "fps": 3.0}
     assert dict(_training_metrics({LEARNER_RESULTS: {DEFAULT_MODULE_ID: learned}})) == {
         "critics/mean": 2.0
@@ -268,8 +271,8 @@ def test_an_iteration_without_an_update_takes_no_metric_from_the_others() -> Non
 
 
 @pytest.mark.usefixtures("local_ray")
-def test_few_updates_leave_no_gap_in_the_curves(tmp_path: Path) -> None:
-    """Every second iteration has no update: it plays an episode of 20 steps, an update takes 40."""
+def test_iterations_without_updates_leave_no_gap_in_the_curves(tmp_path: Path) -> None:
+    """An iteration plays 20 steps, and there is an update every 40 steps."""
     base = settings("tac").tac.model_dump()
     run = settings("tac", num_envs=1, tac=base | {"replay_ratio": 0.025})
     node = job(tmp_path, run)
@@ -286,7 +289,7 @@ def test_a_nan_from_the_environment_is_named_and_the_last_checkpoint_stays(tmp_p
     *_, last = compute(node)
     assert last["done"]
     first, second = last[CAUSE].splitlines()
-    # An evaluation of one episode each went before, of environments of their own.
+    # Evaluations have environments of their own.
     assert re.fullmatch(
         r"BadNumberError: Point-v0, sub-environment 0, training episode 15 \(reset with seed \d+\),"
         r" step 10: observation\[2\] is nan, every number must be finite and within \+-1e\+15",
@@ -305,20 +308,15 @@ def test_a_nan_from_the_environment_is_named_and_the_last_checkpoint_stays(tmp_p
 
 
 @pytest.mark.usefixtures("local_ray")
-@pytest.mark.parametrize(("kept", "notes"), [(True, 0), (False, 1)])
-def test_where_updates_are_compiled_first_that_is_said(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kept: bool, notes: int
-) -> None:
-    monkeypatch.setattr(run_module, "is_kept", lambda _: kept)
-    said = [note for result in compute(job(tmp_path, settings("tac"))) for note in result[NOTES]]
-    assert [note.startswith("compiles its updates first") for note in said] == [True] * notes
+def test_compiling_updates_is_announced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run_module, "is_kept", lambda _: False)
+    ((note,),) = [result[NOTES] for result in compute(job(tmp_path, settings("tac")), steps=1)]
+    assert note.startswith("compiles its updates first")
 
 
-@pytest.mark.usefixtures("local_ray")
-def test_a_finished_node_is_not_trained_again(tmp_path: Path) -> None:
-    node = job(tmp_path, settings("tac"))
-    compute(node)
-    manifest = Path(NodeStore(str(tmp_path)).path(node.key)) / "manifest.json"
+def test_a_finished_node_is_not_trained_again(pretrained: NodeJob) -> None:
+    node = pretrained
+    manifest = Path(NodeStore(node.storage).path(node.key)) / "manifest.json"
     before = manifest.stat().st_mtime_ns
     (result,) = compute(node)
     assert result["done"]
@@ -332,7 +330,7 @@ def test_a_finished_node_is_not_trained_again(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("local_ray")
-def test_a_damaged_checkpoint_is_skipped_and_said(tmp_path: Path) -> None:
+def test_a_damaged_checkpoint_is_skipped_with_a_note(tmp_path: Path) -> None:
     node = job(tmp_path, settings("tac"))
     compute(node, steps=3)
     newest = NodeStore(str(tmp_path)).work_folder(node.key).names()[-1]
@@ -344,7 +342,7 @@ def test_a_damaged_checkpoint_is_skipped_and_said(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("local_ray")
-def test_a_checkpoint_has_the_policy_that_it_would_go_on_with(tmp_path: Path) -> None:
+def test_a_checkpoint_contains_its_current_policy(tmp_path: Path) -> None:
     node = job(tmp_path, settings("tac"))
     trial = RunTrainable(config=node.to_tune())
     for _ in range(2):
@@ -360,7 +358,7 @@ def test_a_checkpoint_has_the_policy_that_it_would_go_on_with(tmp_path: Path) ->
 
 
 @pytest.mark.usefixtures("local_ray")
-def test_what_runs_take_side_by_side_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_runs_side_by_side_are_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sample_run, "SECONDS", 0.5)
     run = settings("tac", task=BUILT_IN_TASKS["FetchReach"])
     began = time.perf_counter()
@@ -386,8 +384,8 @@ while not trial.train()["done"]:
 
 
 @pytest.mark.usefixtures("local_ray")
-def test_a_run_in_a_process_that_has_trained_others_has_the_same_numbers(tmp_path: Path) -> None:
-    """The process has trained another run and failed once; a new process is the reference."""
+def test_a_run_in_a_reused_process_has_the_same_numbers(tmp_path: Path) -> None:
+    """The process has trained another run and failed once; the reference is a new process."""
     storage, reference = tmp_path / "reused", tmp_path / "new"
     first = job(
         storage, settings("music-u", seed=4, tac={"hidden_sizes": [8], "random_steps": 100})

@@ -1,4 +1,4 @@
-"""The faster Fetch step against Gymnasium-Robotics' own."""
+"""The faster Fetch step equals the step of Gymnasium-Robotics."""
 
 import itertools
 from collections.abc import Callable
@@ -67,12 +67,12 @@ Change = Callable[[Any, int], None]
 
 
 def cheerful(env: Any, episode: int) -> None:
-    """As a user's script does, on the object."""
+    """As a user's script may do."""
     env.compute_reward = lambda achieved, goal, info: 1.0
 
 
 def rebuilt(env: Any, episode: int) -> None:
-    """As a wrapper with domain randomisation does: a fresh model and data."""
+    """As a wrapper with domain randomization does: a new model and data."""
     initial = {"robot0:slide0": 0.4049, "robot0:slide1": 0.48, "robot0:slide2": 0.0}
     env.initial_qpos = initial | {"object0:joint": [1.25, 0.53, 0.4, 1.0, 0.0, 0.0, 0.0]}
     env._initialize_simulation()
@@ -80,7 +80,7 @@ def rebuilt(env: Any, episode: int) -> None:
 
 
 def edited(env: Any, episode: int) -> None:
-    """The model stays and its numbers change, the time step among them."""
+    """The model keeps its identity and changes its numbers, including the time step."""
     env.model.geom_size[env.model.geom("object0").id] = 0.02 + 0.005 * episode
     env.model.opt.timestep = 0.002 / (1 + episode)
 
@@ -105,8 +105,8 @@ def other_observation(env: Any, episode: int) -> None:
 
 @pytest.mark.parametrize("fast", [rebuilt, edited, heavier_actions])
 @pytest.mark.parametrize("kept", [cheerful, other_callback, other_observation])
-def test_what_is_changed_between_episodes_counts(fast: Change, kept: Change) -> None:
-    """Whether the faster step can follow a change, or has to give way to it."""
+def test_changes_between_episodes_take_effect(fast: Change, kept: Change) -> None:
+    """The faster step follows some changes; others restore the original step."""
     envs = [make_env("FetchPush-v4"), original("FetchPush-v4")]
     assert "step" in vars(envs[0].unwrapped)
     rng = np.random.default_rng(1)
@@ -124,7 +124,7 @@ def test_what_is_changed_between_episodes_counts(fast: Change, kept: Change) -> 
 
 
 @pytest.mark.parametrize("on_the_class", [True, False], ids=["their class", "a class of its own"])
-def test_an_environment_with_a_reward_of_its_own_keeps_its_step(
+def test_an_environment_with_its_own_reward_keeps_its_step(
     on_the_class: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     make_env("FetchReach-v4")  # registers the robotics tasks
@@ -147,7 +147,7 @@ def test_an_environment_with_a_reward_of_its_own_keeps_its_step(
     assert env.step(np.zeros(4, np.float32))[1] in (0.0, 1.0)
 
 
-def test_a_robot_of_another_kind_keeps_its_step(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_robot_keeps_its_step(monkeypatch: pytest.MonkeyPatch) -> None:
     env = original("FetchPush-v4")
     monkeypatch.setattr(env.unwrapped, "_model_names", SimpleNamespace(joint_names=["robot0:none"]))
     speed_up(env)
@@ -162,7 +162,7 @@ def test_an_action_of_another_size_is_refused() -> None:
 
 
 @pytest.mark.parametrize(("reward_type", "distance"), [("sparse", None), ("dense", 0.01)])
-def test_moved_is_what_a_sparse_reward_says_and_a_fifth_of_the_threshold_of_a_dense_one(
+def test_a_sparse_reward_decides_what_moved_and_a_dense_one_uses_the_threshold(
     reward_type: str, distance: float | None
 ) -> None:
     env = make_env("FetchPush-v4", reward_type=reward_type)

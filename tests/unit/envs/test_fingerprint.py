@@ -1,4 +1,4 @@
-"""What determines an environment is found, wherever it stands."""
+"""The fingerprint covers the sources, files and packages of an environment."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def now(folder: Path) -> Fingerprint:
     return fingerprint_of("lab.envs:Lab-v0", {"scene": str(folder / "scene.txt"), "size": 2})
 
 
-def test_sources_models_and_packages_that_count_are_found(folder: Path) -> None:
+def test_sources_models_and_packages_are_found(folder: Path) -> None:
     found = now(folder)
     packages = {name for name in found if name.startswith("package ")}
     assert packages == {"package gymnasium"}
@@ -126,7 +126,7 @@ def test_a_change_is_named(
     assert (digest_of(before) == digest_of(after)) == (line is None)
 
 
-def test_versions_of_packages_are_named_and_are_all_of_a_built_in_task(
+def test_a_built_in_task_has_versions_of_packages_only(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     before = fingerprint_of("FetchPush-v4", {})
@@ -140,7 +140,7 @@ def test_versions_of_packages_are_named_and_are_all_of_a_built_in_task(
     ]
 
 
-def test_a_model_that_a_worker_has_written_for_itself_is_no_difference() -> None:
+def test_a_model_that_a_worker_generated_is_not_a_difference() -> None:
     driver = {"source lab.py": "a", "file a.xml": "1"}
     assert not on_another_machine(driver, {"source lab.py": "a", "file tmp1.xml": "2"})
     assert on_another_machine(driver, {"source lab.py": "b", "file a.xml": "2"}) == [

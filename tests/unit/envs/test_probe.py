@@ -1,4 +1,4 @@
-"""What is said of an environment that is played before anything is trained."""
+"""Problems and remarks of environments that are played before training."""
 
 from collections.abc import Callable
 from typing import Any
@@ -55,7 +55,7 @@ def probed(
 
 
 def changed(step: Callable[..., Any]) -> type[Sound]:
-    """An environment whose step is changed afterwards."""
+    """An environment whose step returns something else."""
 
     class Changed(Sound):
         def step(self, action: Any) -> Any:
@@ -64,7 +64,7 @@ def changed(step: Callable[..., Any]) -> type[Sound]:
     return Changed
 
 
-def test_a_sound_environment_has_no_remarks(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sound_environment_has_no_problems_or_remarks(monkeypatch: pytest.MonkeyPatch) -> None:
     made = probed(monkeypatch, Sound, hindsight=True)
     assert (made.problems, made.remarks) == ([], [])
 
@@ -123,14 +123,14 @@ class OneNumber(Sound):
         (SmallSeeds, "reset(seed=0) must not raise, it raised IndexError: level 0 is not there"),
     ],
 )
-def test_what_training_would_stumble_over_is_a_problem(
+def test_an_environment_that_would_fail_in_training_is_refused(
     kind: type[Sound], problem: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (line,) = probed(monkeypatch, kind, hindsight=True).problems
     assert problem in line
 
 
-def test_seeds_are_tried_at_both_ends_of_their_range(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_both_ends_of_the_seed_range_are_tried(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not probed(monkeypatch, SmallSeeds, hindsight=True, seed_range=(5, 99)).problems
     (line,) = probed(monkeypatch, SmallSeeds, seed_range=(5, 100)).problems
     assert line.startswith("reset must accept all seeds of seed_range, 5 to 100: reset(seed=100)")
@@ -183,7 +183,7 @@ class Stubborn(Sound):
         (changed(lambda env, *step: (*step[:4], {"success": 1})), "(did you mean 'success'?)"),
     ],
 )
-def test_what_a_user_should_know_is_a_remark(
+def test_other_findings_are_remarks(
     kind: type[Sound], remark: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = probed(monkeypatch, kind)

@@ -1,4 +1,4 @@
-"""Tasks: the built-in ones, and what a user may declare."""
+"""Built-in tasks, and tasks that a user declares."""
 
 import pytest
 from pydantic import ValidationError
@@ -21,7 +21,7 @@ def test_built_in_fetch_tasks_have_the_split_of_the_paper() -> None:
     assert weights["FetchPush"] == 1.0
 
 
-def test_the_hand_splits_off_the_position_of_its_block() -> None:
+def test_the_hand_has_joint_angles_and_the_position_of_its_block() -> None:
     task = BUILT_IN_TASKS["HandManipulateBlock"]
     assert (task.env_id, task.horizon) == ("HandManipulateBlock-v1", 100)
     assert task.agent_indices == tuple(range(24))
@@ -68,7 +68,7 @@ def test_unsound_tasks_are_rejected(change: dict[str, object], rule: str) -> Non
         Task.model_validate(sound | change)
 
 
-def test_identity_ignores_what_does_not_change_the_environment() -> None:
+def test_identity_ignores_settings_that_do_not_change_the_environment() -> None:
     push = BUILT_IN_TASKS["FetchPush"]
     trained_otherwise = {"mi_reward_weight": 0.3, "moved_distance": 0.02}
     renamed = push.model_copy(update={"name": "Mine", **trained_otherwise})
@@ -97,14 +97,14 @@ def test_the_limit_of_steps_is_an_integer() -> None:
     assert repr(task.env_kwargs) == "{'max_episode_steps': 100, 'distance': 100.0}"
 
 
-def test_an_unknown_task_is_named_with_its_neighbour() -> None:
+def test_an_unknown_task_is_named_with_a_similar_one() -> None:
     with pytest.raises(UnknownTaskError, match=r"got 'fetchpush' \(did you mean 'FetchPush'\?\)"):
         TaskRegistry()["fetchpush"]
     with pytest.raises(UnknownTaskError, match=r"FetchReach.*got 'Walker2d'$"):
         TaskRegistry()["Walker2d"]
 
 
-def test_user_tasks_join_the_built_in_ones_and_replace_none() -> None:
+def test_user_tasks_cannot_replace_built_in_ones() -> None:
     mine = Task(name="Pendulum", env_id="Pendulum-v1", horizon=200, success_key=None)
     registry = TaskRegistry([mine])
     assert registry["Pendulum"] is mine
@@ -116,7 +116,7 @@ def test_user_tasks_join_the_built_in_ones_and_replace_none() -> None:
 
 
 @pytest.mark.parametrize(("name", "hint"), [("hiden", "'hidden'"), ("zzz", "")])
-def test_closest_only_suggests_what_is_close(name: str, hint: str) -> None:
+def test_closest_suggests_only_similar_names(name: str, hint: str) -> None:
     text = closest(name, ["hidden", "lr"])
     assert hint in text
     assert bool(hint) == bool(text)

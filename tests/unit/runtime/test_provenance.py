@@ -30,24 +30,24 @@ def test_the_commit_of_a_checkout(checkout: Path) -> None:
     assert git_commit(checkout / "module.py") == git(checkout, "rev-parse", "HEAD")
 
 
-def test_a_changed_checkout_is_called_dirty(checkout: Path) -> None:
+def test_a_changed_checkout_is_dirty(checkout: Path) -> None:
     (checkout / "module.py").write_text("a = 2\n")
     assert git_commit(checkout / "module.py") == git(checkout, "rev-parse", "HEAD") + "-dirty"
 
 
-def test_a_package_installed_inside_a_foreign_checkout_has_no_commit(checkout: Path) -> None:
+def test_a_package_installed_inside_another_checkout_has_no_commit(checkout: Path) -> None:
     installed = checkout / ".venv" / "module.py"
     installed.parent.mkdir()
     installed.write_text("a = 1\n")
     assert git_commit(installed) is None
 
 
-def test_no_git_at_all_is_no_error(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_git_there_is_no_commit(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "")
     assert git_commit(checkout / "module.py") is None
 
 
-def test_versions_of_what_a_result_depends_on() -> None:
+def test_the_versions_of_packages_are_recorded() -> None:
     tags = provenance_tags()
     for package in ("python", "ray", "torch", "mujoco", "mlflow"):
         assert tags[names.TAG_VERSION_PREFIX + package]

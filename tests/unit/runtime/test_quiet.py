@@ -1,4 +1,4 @@
-"""Known notices are hidden, and everything else is shown."""
+"""Known messages are hidden, and all others are shown."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LOGGER = "ray.rllib.algorithms.algorithm_config"
 
 @pytest.fixture
 def seen(caplog: pytest.LogCaptureFixture) -> Iterator[pytest.LogCaptureFixture]:
-    """Records that the logger lets through; once imported, Ray hides them from the root logger."""
+    """Records that pass the logger, from which Ray does not propagate to the root logger."""
     logger = logging.getLogger(LOGGER)
     logger.addHandler(caplog.handler)
     quiet.quiet_third_parties()
@@ -27,7 +27,7 @@ def seen(caplog: pytest.LogCaptureFixture) -> Iterator[pytest.LogCaptureFixture]
     logger.removeHandler(caplog.handler)
 
 
-def test_an_expected_notice_is_dropped_and_its_neighbours_are_not(
+def test_an_expected_message_is_hidden_and_others_are_shown(
     seen: pytest.LogCaptureFixture,
 ) -> None:
     logger = logging.getLogger(LOGGER)
@@ -48,14 +48,7 @@ def test_warnings_survive_in_chatty_loggers() -> None:
         assert logging.getLogger(name).isEnabledFor(logging.WARNING)
 
 
-def test_a_second_call_adds_nothing() -> None:
-    quiet.quiet_third_parties()
-    filters = list(logging.getLogger(LOGGER).filters)
-    quiet.quiet_third_parties()
-    assert logging.getLogger(LOGGER).filters == filters
-
-
-def test_only_rllibs_own_environment_may_be_overridden_silently() -> None:
+def test_only_the_warning_about_rllibs_own_environment_is_hidden() -> None:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         quiet.quiet_third_parties()
@@ -68,7 +61,7 @@ def test_only_rllibs_own_environment_may_be_overridden_silently() -> None:
     assert [("FetchPush" in str(warning.message)) for warning in caught] == [True]
 
 
-def test_importing_the_robotics_environments_says_nothing() -> None:
+def test_importing_the_robotics_environments_prints_nothing() -> None:
     code = (
         "from music_rllib.runtime.quiet import quiet_third_parties\n"
         "quiet_third_parties()\n"
@@ -89,16 +82,16 @@ LOOPBACK_ONLY = quiet.LOCAL_RAY_BEYOND_LOOPBACK
 
 @pytest.fixture
 def bare(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
-    """An environment without any variable of Ray or MLflow."""
+    """Remove all variables of Ray and MLflow from the environment."""
     for name in list(os.environ):
         if name.startswith(("RAY_", "MLFLOW_")):
             monkeypatch.delenv(name)
-    monkeypatch.setenv(LOOPBACK_ONLY, "")  # so that it is gone again after the test
+    monkeypatch.setenv(LOOPBACK_ONLY, "")  # so that it is removed after the test
     monkeypatch.delenv(LOOPBACK_ONLY)
     return monkeypatch
 
 
-def test_a_local_ray_gets_a_token_of_its_own(bare: pytest.MonkeyPatch) -> None:
+def test_each_local_ray_gets_a_new_token(bare: pytest.MonkeyPatch) -> None:
     tokens = set()
     for _ in range(2):
         bare.delenv("RAY_AUTH_MODE", raising=False)
@@ -114,7 +107,7 @@ def test_a_local_ray_gets_a_token_of_its_own(bare: pytest.MonkeyPatch) -> None:
     "chosen",
     [{"RAY_ADDRESS": "head:6379"}, {"RAY_AUTH_MODE": "disabled"}],
 )
-def test_a_chosen_cluster_or_mode_is_left_alone(
+def test_the_users_cluster_or_authentication_is_unchanged(
     bare: pytest.MonkeyPatch, chosen: dict[str, str]
 ) -> None:
     for name, value in chosen.items():
@@ -124,7 +117,7 @@ def test_a_chosen_cluster_or_mode_is_left_alone(
     assert os.environ.get("RAY_AUTH_MODE") == chosen.get("RAY_AUTH_MODE")
 
 
-def test_what_the_user_has_set_is_kept(bare: pytest.MonkeyPatch) -> None:
+def test_variables_of_the_user_are_kept(bare: pytest.MonkeyPatch) -> None:
     bare.setenv("RAY_USAGE_STATS_ENABLED", "1")
     bare.setenv("RAY_AUTH_TOKEN", "mine")
     quiet.prepare_environment()

@@ -1,4 +1,4 @@
-"""Why a run failed: the one line that a person needs."""
+"""The cause of a run's failure in one or two lines."""
 
 import re
 
@@ -34,12 +34,12 @@ def in_a_task(cause: Exception) -> RayTaskError:
     ],
     ids=["one line", "many lines", "memory", "never came up", "not readable"],
 )
-def test_the_cause_is_what_was_raised(error: BaseException | None, expected: str) -> None:
+def test_the_cause_is_the_original_exception(error: BaseException | None, expected: str) -> None:
     assert cause_of(error, "Traceback:\n  File\nKeyError: 'the last line'\n\n") == expected
 
 
 class WordlessError(Exception):
-    """Needs two arguments, and fails to give its message."""
+    """It needs two arguments, and its message cannot be read."""
 
     def __init__(self, first: int, second: int) -> None:
         super().__init__(first, second)
@@ -48,7 +48,7 @@ class WordlessError(Exception):
         raise LookupError
 
 
-def test_an_exception_that_has_no_readable_message_keeps_its_name() -> None:
+def test_an_exception_without_a_readable_message_keeps_its_name() -> None:
     assert (
         cause_of(WordlessError(1, 2), "")
         == "WordlessError: (its message can't be read: LookupError)"
@@ -58,7 +58,7 @@ def test_an_exception_that_has_no_readable_message_keeps_its_name() -> None:
         raise WordlessError(1, 2)
 
 
-def test_a_worker_that_died_says_where_and_what_to_do() -> None:
+def test_a_dead_worker_is_reported_with_its_place_and_advice() -> None:
     first, second = cause_of(RayActorError(error_msg=DEATH), DEATH).splitlines()
     assert first == (
         "The worker process died (pid 18609, ip 10.0.0.2): Worker unexpectedly exits with a "
@@ -68,7 +68,7 @@ def test_a_worker_that_died_says_where_and_what_to_do() -> None:
     assert "continues from the last checkpoint" in second
 
 
-def test_a_lack_of_memory_names_the_limits() -> None:
+def test_a_memory_error_reports_the_free_memory() -> None:
     first, second = cause_of(in_a_task(MemoryError()), "").splitlines()
     assert first == "MemoryError: no memory was left"
     assert re.match(r"The process had \d+\.\d GiB, \d+\.\d of the machine's \d+\.\d GiB", second)

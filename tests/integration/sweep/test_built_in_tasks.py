@@ -1,6 +1,6 @@
-"""Every built-in task against its live environment, and the second family trained for real.
+"""Every built-in task against its environment, and training in a task without Fetch's robot.
 
-What docs/add_an_environment.md tells a user to check, done for all that the registry offers.
+These are the checks that docs/add_an_environment.md describes.
 """
 
 from __future__ import annotations
@@ -27,17 +27,15 @@ from music_rllib.sweep.preflight import check_environments
 
 Floats = NDArray[np.float64]
 Env = gym.Env[Any, Any]
-
-
 SPLIT = [name for name, task in BUILT_IN_TASKS.items() if task.has_split]
 
 
-@pytest.fixture(params=list(BUILT_IN_TASKS))
+@pytest.fixture(scope="module", params=list(BUILT_IN_TASKS))
 def task(request: pytest.FixtureRequest) -> Task:
     return BUILT_IN_TASKS[request.param]
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def env(task: Task) -> Iterator[Env]:
     made = make_env(task.env_id, **task.env_kwargs)
     yield made
@@ -48,11 +46,11 @@ def env(task: Task) -> Iterator[Env]:
 
 
 class Anatomy(NamedTuple):
-    """Where a simulator keeps what the two halves of a split are."""
+    """Names of the joints that move the two parts of a split."""
 
     object_joint: str
     robot_joint: str
-    """One that moves the agent's state and is not driven by others."""
+    """A joint that moves the agent's state and is not driven by other joints."""
 
 
 ANATOMY = {
@@ -67,7 +65,7 @@ def anatomy(task: Task) -> Anatomy:
 
 
 def agent_state(task: Task, robot: Any) -> Floats:
-    """The agent's state by names in the simulator: Fetch's gripper, the hand's 24 joint angles."""
+    """The agent's state, read by name: Fetch's gripper, the hand's 24 joint angles."""
     if task.name.startswith("Fetch"):
         position: Floats = robot._utils.get_site_xpos(robot.model, robot.data, "robot0:grip")
         return position.copy()
@@ -78,7 +76,7 @@ def agent_state(task: Task, robot: Any) -> Floats:
 
 
 def moved(robot: Any, joint: str, by: float) -> Floats:
-    """The observation after `joint`'s first coordinates were moved, without time passing."""
+    """The observation after moving `joint`'s first coordinates without advancing time."""
     position = robot._utils.get_joint_qpos(robot.model, robot.data, joint)
     position[:3] += by
     robot._utils.set_joint_qpos(robot.model, robot.data, joint, position)
@@ -101,7 +99,7 @@ def test_split_entries_are_the_agent_and_the_object(task: Task, env: Env) -> Non
         observed = env.step(env.action_space.sample())[0]
         state = observed["observation"]
         np.testing.assert_array_equal(state[agent], agent_state(task, robot))
-        # Both families' goals begin with the object's position, in metres.
+        # All goals begin with the object's position, in meters.
         np.testing.assert_array_equal(state[surrounding], observed["achieved_goal"][:3])
     before = moved(robot, anatomy(task).object_joint, 0.0)
     after = moved(robot, anatomy(task).object_joint, 0.05)
@@ -116,10 +114,10 @@ def test_split_entries_are_the_agent_and_the_object(task: Task, env: Env) -> Non
 
 
 def play(env: Env, seed: int, goal: Floats | None = None) -> tuple[Trajectory, list[float]]:
-    """An episode towards the object with noise; its states and its steps' success.
+    """An episode towards the object with noise, and the success of its steps.
 
     Args:
-        goal: takes the place of the one that the environment drew.
+        goal: replaces the goal of the environment.
     """
     rng = np.random.default_rng(seed)
     seen = [env.reset(seed=seed)[0]]
@@ -129,7 +127,7 @@ def play(env: Env, seed: int, goal: Floats | None = None) -> tuple[Trajectory, l
     terminated = truncated = False
     while not (terminated or truncated):
         action = rng.uniform(-1.0, 1.0, env.action_space.shape)
-        if len(action) == 4:  # Fetch: a random hand would hardly ever meet the object
+        if len(action) == 4:  # Fetch: random actions would rarely touch the object
             towards = seen[-1]["achieved_goal"] - seen[-1]["observation"][:3]
             action[:3] = np.clip(10 * towards + 0.3 * action[:3], -1, 1)
         observation, reward, terminated, truncated, info = env.step(action.astype(np.float32))
@@ -153,16 +151,16 @@ def layout_of(env: Env, task: Task) -> ReplayLayout:
     return ReplayLayout(observation, action, goal, task.horizon)
 
 
-def test_episodes_last_the_horizon_and_say_whether_they_succeed(task: Task, env: Env) -> None:
+def test_episodes_last_the_horizon_and_report_success(task: Task, env: Env) -> None:
     trajectory, successes = play(env, seed=3)
     assert len(trajectory) == task.horizon
     assert task.success_key == "is_success"
-    # Sparse rewards, 0 where the goal is reached and -1 elsewhere, say the same as the key.
+    # Sparse rewards (0 if the goal is reached, otherwise -1) agree with the key.
     np.testing.assert_array_equal(trajectory.rewards, np.array(successes) - 1.0)
     assert task.reward_range == (-1.0, 0.0)
 
 
-def test_same_seed_same_episode_whatever_was_played_before(task: Task, env: Env) -> None:
+def test_a_seed_determines_the_episode(task: Task, env: Env) -> None:
     first, _ = play(env, seed=5)
     play(env, seed=6)
     again, _ = play(env, seed=5)
@@ -172,7 +170,7 @@ def test_same_seed_same_episode_whatever_was_played_before(task: Task, env: Env)
 # --- hindsight ---------------------------------------------------------------------------------
 
 
-def test_recomputed_rewards_are_those_that_the_environment_gave(task: Task, env: Env) -> None:
+def test_recomputed_rewards_equal_the_rewards_of_the_environment(task: Task, env: Env) -> None:
     layout, reward = layout_of(env, task), goal_reward_of(env)
     for seed in range(3):
         episode, _ = play(env, seed)
@@ -181,7 +179,7 @@ def test_recomputed_rewards_are_those_that_the_environment_gave(task: Task, env:
         np.testing.assert_array_equal(reward(achieved, desired), episode.rewards)
 
 
-def test_relabelled_rewards_are_those_of_an_episode_with_that_goal(task: Task, env: Env) -> None:
+def test_relabeled_rewards_equal_those_of_an_episode_with_that_goal(task: Task, env: Env) -> None:
     layout = layout_of(env, task)
     episode, _ = play(env, seed=0)
     replay = TrajectoryReplay(
@@ -198,7 +196,7 @@ def test_relabelled_rewards_are_those_of_an_episode_with_that_goal(task: Task, e
     for later in (1, task.horizon // 2, task.horizon):
         goal = episode.frames[later, layout.network_input :]
         rows = np.flatnonzero((goals == goal).all(1))
-        # The same episode once more, the environment itself having this goal from the start.
+        # Play the same episode again, with this goal in the environment from the start.
         repeated, _ = play(env, seed=0, goal=goal.astype(np.float64))
         np.testing.assert_array_equal(repeated.frames[:, :3], episode.frames[:, :3])
         for row in rows:
@@ -209,26 +207,18 @@ def test_relabelled_rewards_are_those_of_an_episode_with_that_goal(task: Task, e
     assert compared == {-1.0, 0.0}
 
 
-@pytest.mark.parametrize("env_id", ["HandManipulatePen-v1", "HandManipulatePenRotate-v1"])
-def test_a_reward_that_mixes_up_the_rows_of_a_batch_is_refused(env_id: str) -> None:
-    env = make_env(env_id)
-    with pytest.raises(ValueError, match=f"hindsight_k must be 0 where compute_reward.*{env_id}"):
-        goal_reward_of(env)
+def test_environments_whose_rewards_hindsight_cannot_use_are_refused() -> None:
+    scaled = gym.wrappers.TransformReward(make_env("FetchReach-v4"), lambda r: 2 * float(r))
+    for env, message in (
+        (make_env("HandManipulatePen-v1"), "must be 0 where compute_reward.*HandManipulatePen-v1"),
+        (scaled, "a step returned reward -2, compute_reward gives -1"),
+        (make_env("Pendulum-v1"), "must be 0 without a goal environment: Pendulum-v1"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            goal_reward_of(env)
 
 
-def test_a_reward_that_a_step_does_not_give_is_refused() -> None:
-    """Replayed steps would have one scale, relabelled ones another."""
-    env = gym.wrappers.TransformReward(make_env("FetchReach-v4"), lambda reward: 2 * float(reward))
-    with pytest.raises(ValueError, match=r"a step returned reward -2, compute_reward gives -1"):
-        goal_reward_of(env)
-
-
-def test_an_environment_without_goals_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"must be 0 without a goal environment: Pendulum-v1"):
-        goal_reward_of(make_env("Pendulum-v1"))
-
-
-# --- the page about it -------------------------------------------------------------------------
+# --- docs/add_an_environment.md ----------------------------------------------------------------
 
 PAGE = (Path(__file__).parents[3] / "docs" / "add_an_environment.md").read_text(encoding="utf-8")
 
@@ -274,7 +264,7 @@ def run_settings(variant: Variant, *, hindsight_k: float = 0.0) -> RunSettings:
 
 @pytest.mark.usefixtures("local_ray")
 @pytest.mark.parametrize("variant, hindsight_k", [("music-u", 0.0), ("tac", 4.0)])
-def test_the_hand_is_trained_to_the_end_of_its_budget(variant: Variant, hindsight_k: float) -> None:
+def test_the_hand_trains_to_the_end_of_its_budget(variant: Variant, hindsight_k: float) -> None:
     from music_rllib.training.run import TrainingRun
 
     training = TrainingRun(run_settings(variant, hindsight_k=hindsight_k))
@@ -288,7 +278,7 @@ def test_the_hand_is_trained_to_the_end_of_its_budget(variant: Variant, hindsigh
     assert metrics[names.EVAL_EPISODES] == 2
     assert 0.0 <= metrics[names.EVAL_SUCCESS] <= metrics[names.EVAL_SUCCESS_ANY] <= 1.0
     assert -100.0 <= metrics[names.EVAL_RETURN] <= 0.0
-    # The block lies in the palm: any movement of the fingers moves it, by centimetres.
+    # The block lies in the palm: every movement of the fingers moves it by centimeters.
     assert 0.001 < metrics[names.TRAIN_DISPLACEMENT] < 1.0
     assert np.isfinite(list(metrics.values())).all()
     assert ("mi_estimator" in modules) == (variant == "music-u")

@@ -1,4 +1,4 @@
-"""How many runs a cluster can hold at once, and which it can never hold."""
+"""The number of runs that a cluster can hold, and runs that it can never hold."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ SMALL = {"CPU": 4.0, "memory": 8 * GIB}
 BIG = {"CPU": 16.0, "memory": 60 * GIB, "GPU": 2.0}
 
 
-def test_a_local_ray_has_a_short_folder_of_its_own(
+def test_a_local_ray_has_a_short_private_folder(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Its sockets are writable by all in a folder that only we may enter, and it is removed."""
+    """Everybody may write to its sockets, so only this user may enter its parent folder."""
     long = tmp_path / "a-long-name-of-a-job's-folder" / ("x" * 60)
     long.mkdir(parents=True)
     monkeypatch.setattr(tempfile, "tempdir", str(long))
@@ -68,7 +68,7 @@ def test_a_local_ray_has_a_short_folder_of_its_own(
         ({"cpus_per_run": 2, "gpus_per_run": 0.5, "memory_per_run": 20}, [SMALL, BIG], 3),
     ],
 )
-def test_runs_are_packed_by_what_is_scarce(
+def test_the_scarcest_resource_limits_the_number_of_runs(
     settings: dict[str, Any], nodes: list[dict[str, float]], expected: int
 ) -> None:
     assert slots(Resources(**settings), nodes, local=False) == expected
@@ -82,18 +82,18 @@ def test_runs_are_packed_by_what_is_scarce(
         ({"memory_per_run": 61}, "memory_per_run must fit .* has 60 GiB of memory .*, got 61"),
     ],
 )
-def test_what_can_never_fit_is_refused(settings: dict[str, Any], message: str) -> None:
+def test_a_run_that_can_never_fit_is_refused(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ClusterError, match=message):
         slots(Resources(**settings), [SMALL, BIG], local=False)
 
 
-def test_cpus_here_and_memory_there_are_no_place_for_a_run() -> None:
+def test_one_node_must_have_all_resources_of_a_run() -> None:
     nodes = [{"CPU": 8.0, "memory": 1 * GIB}, {"CPU": 1.0, "memory": 32 * GIB}]
     with pytest.raises(ClusterError, match=r"but all together .* on none"):
         slots(Resources(cpus_per_run=4, memory_per_run=16), nodes, local=False)
 
 
-def test_a_machine_without_gpus() -> None:
+def test_a_machine_without_gpus_is_named() -> None:
     with pytest.raises(ClusterError, match="must fit into this machine, which has 0 GPUs, got 1"):
         slots(Resources(gpus_per_run=1), [SMALL], local=True)
 
@@ -104,7 +104,7 @@ HEAD = {"CPU": 1.0}
 def put_cluster(
     monkeypatch: pytest.MonkeyPatch, *nodes: dict[str, float], group: str | None = "workers"
 ) -> None:
-    """Replaces Ray's answers about a cluster whose nodes are of a group."""
+    """Replace Ray's list of nodes by these nodes of a group."""
     labels = {} if group is None else {"ray.io/node-group": group}
     alive = [{"Alive": True, "Resources": node, "Labels": labels} for node in nodes]
     dead = {"CPU": 1000.0, "GPU": 1000.0}
@@ -116,7 +116,7 @@ def put_cluster(
 def test_a_run_waits_for_a_node_on_a_cluster_that_grows(
     settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As on AWS: a head with one CPU, and workers that are started for waiting runs."""
+    """As on AWS: a head with one CPU, and workers that start for waiting runs."""
     put_cluster(monkeypatch, HEAD)
     capacity = _capacity(Resources(**settings))
     assert capacity == Capacity(now=0, grows=True)
@@ -126,7 +126,7 @@ def test_a_run_waits_for_a_node_on_a_cluster_that_grows(
 
 
 @pytest.mark.parametrize("group", [None, "local.cluster.node"])
-def test_it_is_refused_on_a_cluster_of_given_machines(
+def test_a_run_that_does_not_fit_is_refused_on_a_fixed_cluster(
     group: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     put_cluster(monkeypatch, HEAD, group=group)
@@ -134,27 +134,26 @@ def test_it_is_refused_on_a_cluster_of_given_machines(
         _capacity(Resources(gpus_per_run=1))
 
 
-def test_runs_wait_where_nodes_are_added_for_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One run fits. If only one more waited, the cluster would grow by one node at a time."""
+def test_many_runs_wait_if_nodes_are_added_for_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One run fits. If only one more waited, the cluster would add one node at a time."""
     put_cluster(monkeypatch, HEAD)
     capacity = _capacity(Resources())
     assert (capacity.now, capacity.waiting, capacity.remark) == (1, WAITING, None)
 
 
-def test_no_more_runs_wait_than_fit_where_nothing_is_added(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_as_many_runs_wait_as_fit_on_a_fixed_cluster(monkeypatch: pytest.MonkeyPatch) -> None:
     put_cluster(monkeypatch, SMALL, HEAD, group=None)
     capacity = _capacity(Resources())
     assert (capacity.now, capacity.at_once, capacity.waiting, capacity.remark) == (5, 5, 5, None)
 
 
 @pytest.mark.parametrize("settings", [{"gpus_per_run": -1}, {"memory_per_run": 0}])
-def test_impossible_amounts(settings: dict[str, Any]) -> None:
+def test_impossible_amounts_are_refused(settings: dict[str, Any]) -> None:
     with pytest.raises(ValidationError):
         Resources(**settings)
 
 
-def test_a_trial_asks_ray_for_all_of_it() -> None:
-    """A trial reserves the bundle that was checked."""
+def test_a_trial_reserves_the_bundle_that_was_checked() -> None:
     from music_rllib.config.load import load_sweep
     from music_rllib.experiment.plan import make_plan
     from music_rllib.sweep.driver import DEFAULT_CONFIG
@@ -171,7 +170,7 @@ def test_a_trial_asks_ray_for_all_of_it() -> None:
 
 
 @pytest.mark.parametrize("address", [None, "127.0.0.1:1"])
-def test_a_ray_that_does_not_start_is_said_in_a_line(
+def test_a_ray_that_does_not_start_is_reported_in_one_line(
     address: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def not_in_time(**options: Any) -> None:
