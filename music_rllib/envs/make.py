@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import mmap
-import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,7 +14,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from music_rllib.envs.episodes import Recording, lost_by_rounding, random_offsets
-from music_rllib.envs.modules import drop_farama_notice, make_importable
+from music_rllib.envs.modules import make_importable, register_robotics
 from music_rllib.envs.tasks import BUILT_IN_TASKS, LAST_SEED, Task
 from music_rllib.envs.values import (
     BadNumberError,
@@ -31,28 +29,6 @@ from music_rllib.replay.buffer import GoalReward
 from music_rllib.replay.trajectories import ReplayLayout
 
 Env = gym.Env[Any, Any]
-
-
-@functools.cache
-def register_robotics() -> None:
-    """Register the robotics tasks with Gymnasium, without printing their package's notice.
-
-    Raises:
-        gymnasium.error.DependencyNotInstalled: MuJoCo can't be imported.
-    """
-    drop_farama_notice()
-    try:
-        import gymnasium_robotics
-    except Exception as error:  # of any type, if the machine lacks the renderer of MUJOCO_GL
-        renderer = os.environ.get("MUJOCO_GL")
-        if renderer is None:
-            raise
-        raise gym.error.DependencyNotInstalled(
-            f"MuJoCo can't be loaded with MUJOCO_GL={renderer} ({error}): unset it, or install "
-            "what it needs (Debian: libosmesa6 for osmesa, libegl1 for egl)"
-        ) from error
-
-    gym.register_envs(gymnasium_robotics)
 
 
 def make_env(env_id: str, **kwargs: Any) -> Env:

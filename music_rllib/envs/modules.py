@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
+import os
 import site
 import sys
 import sysconfig
@@ -79,6 +80,30 @@ def _installed() -> tuple[Path, ...]:
     folders += [*site.getsitepackages(), site.getusersitepackages()]
     folders += [one for one in sys.path if Path(one).name in {"site-packages", "dist-packages"}]
     return tuple({Path(one).resolve() for one in folders})
+
+
+@cache
+def register_robotics() -> None:
+    """Register the robotics tasks with Gymnasium, without printing their package's notice.
+
+    Raises:
+        gymnasium.error.DependencyNotInstalled: MuJoCo can't be imported.
+    """
+    import gymnasium as gym
+
+    drop_farama_notice()
+    try:
+        import gymnasium_robotics
+    except Exception as error:  # of any type, if the machine lacks the renderer of MUJOCO_GL
+        renderer = os.environ.get("MUJOCO_GL")
+        if renderer is None:
+            raise
+        raise gym.error.DependencyNotInstalled(
+            f"MuJoCo can't be loaded with MUJOCO_GL={renderer} ({error}): unset it, or install "
+            "what it needs (Debian: libosmesa6 for osmesa, libegl1 for egl)"
+        ) from error
+
+    gym.register_envs(gymnasium_robotics)
 
 
 def drop_farama_notice() -> None:

@@ -36,12 +36,13 @@ from music_rllib.runtime.machine import (
     ray_parent,
 )
 from music_rllib.runtime.process import early
-from music_rllib.store.storage import check_storage, resolve_storage, sweep_folder
+from music_rllib.store.storage import check_storage, is_remote, resolve_storage, sweep_folder
 from music_rllib.sweep import preflight
 from music_rllib.sweep.views.plan import plan_answer, plan_view
-from music_rllib.tracking.store import VARIABLE, resolve_store
 
 DEFAULT_CONFIG = Path(__file__).with_name("default.yaml")
+VARIABLE = "MLFLOW_TRACKING_URI"
+"""MLflow's own variable, which is used if a sweep has no `mlflow.tracking_uri`."""
 
 
 def load(
@@ -185,7 +186,10 @@ def _open(console: Console, config: SweepConfig, *, lenient: bool = False) -> Op
     opened = open_sweep(
         config, planned, storage, folder, environments=environments, lenient=lenient
     )
-    resolve_store(config.mlflow.tracking_uri, storage)
+    if config.mlflow.tracking_uri is not None or is_remote(storage):
+        from music_rllib.tracking.store import resolve_store  # the default needs no check
+
+        resolve_store(config.mlflow.tracking_uri, storage)
     console.print(plan_view(config, planned, opened.finished))
     _say(console, f"Storage: {redact(storage)}")
     notes = (

@@ -12,12 +12,12 @@ import sys
 import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 
 from music_rllib.envs.fingerprint import Fingerprint, fingerprint_of
 from music_rllib.envs.modules import folders_for_workers
-from music_rllib.envs.probe import ANSWERS, REQUEST, Question, Request
 from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.errors import BadInputError
 from music_rllib.experiment import sweep_files
@@ -28,6 +28,9 @@ from music_rllib.runtime.machine import check_reachable, cluster_address
 from music_rllib.runtime.process import early
 from music_rllib.store.handoff import open_handoff, read_handoff
 from music_rllib.store.node_store import NodeStore
+
+if TYPE_CHECKING:
+    from music_rllib.envs.probe import Question
 
 _TIMEOUT = "Timeout ("
 """Beginning of the stack that `faulthandler` writes if a call takes too long."""
@@ -53,13 +56,17 @@ def check_environments(plan: Plan, hang_minutes: float | None = None) -> list[st
     Raises:
         TaskError: A task does not fit; with one line per problem, and the remarks.
     """
+    runs = [run for run in plan.settings if run.task.name not in BUILT_IN_TASKS]
+    if not runs:
+        return []
+    from music_rllib.envs.probe import Question
+
     left: dict[str, Question] = {}
-    for run in plan.settings:
-        if (name := run.task.name) not in BUILT_IN_TASKS:
-            question = left.setdefault(name, Question(task=run.task))
-            if run.replay.hindsight_k > 0:
-                episodes = {*question.hindsight, run.replay.hindsight_episodes}
-                question.hindsight = tuple(sorted(episodes))
+    for run in runs:
+        question = left.setdefault(run.task.name, Question(task=run.task))
+        if run.replay.hindsight_k > 0:
+            episodes = {*question.hindsight, run.replay.hindsight_episodes}
+            question.hindsight = tuple(sorted(episodes))
     problems, remarks = [], []
     while left:  # the child process ends early at an environment that ends it
         for name, wrong, noteworthy in _play([*left.values()], hang_minutes):
@@ -92,6 +99,8 @@ def _play(
     questions: list[Question], hang_minutes: float | None
 ) -> list[tuple[str, list[str], list[str]]]:
     """Name, problems and remarks of the tasks that a child process played until it ended."""
+    from music_rllib.envs.probe import ANSWERS, REQUEST, Request
+
     seconds = None if hang_minutes is None else 60 * hang_minutes
     # The child searches for modules where this process does. -P: not in the current folder first.
     entries = (*sys.path, *folders_for_workers())
