@@ -23,9 +23,9 @@ from pydantic.json_schema import GenerateJsonSchema
 from pydantic_core import core_schema
 
 from music_rllib.config.analysis import Analysis
-from music_rllib.config.layers import LAYER_KEYS, all_settings
+from music_rllib.config.layers import all_settings
 from music_rllib.config.presets import SCHEMA, shipped_presets
-from music_rllib.config.run_settings import VARIANTS, Evaluation, RunSettings
+from music_rllib.config.run_settings import LAYER_KEYS, VARIANTS, Evaluation, RunSettings
 from music_rllib.config.schema import (
     Checkpoints,
     Header,
@@ -108,11 +108,6 @@ file's top replaces that. What a `grid` or `search` varies can only be replaced 
 folder keeps the configuration with it (`config.json`), so that `resume` needs no repetition.
 """
 
-PRESET_MEANING = (
-    "Settings that lie below `defaults`, by name: a file of `presets/` beside the sweep's, or one "
-    "of the package's (`music-rllib presets`). Or any YAML file by its path from the sweep's."
-)
-
 SEARCH_TEXT = """\
 ### Search
 
@@ -161,10 +156,6 @@ def document() -> str:
                 *rows(Resources, "resources."),
                 *rows(Checkpoints, "checkpoints."),
                 *rows(Analysis, "analysis."),
-                ("preset", "text", "none", PRESET_MEANING),
-                ("environments", "mapping", "`{}`", "Tasks of your own, [below](#environments)."),
-                ("defaults", "mapping", "`{}`", "[Settings](#settings) of every stage."),
-                ("stages", "list", "required", "What is trained, in order; [below](#stages)."),
             ]
         ),
         "## Stages",
@@ -444,10 +435,6 @@ def _add_suggestions(document: dict[str, Any]) -> None:
             if kind.get("type") == "array":
                 kind["items"] = {"type": "string", "examples": list(BUILT_IN_TASKS)}
     properties["preset"]["examples"] = list(shipped_presets())
-    properties["preset"]["description"] = "Settings below `defaults`, by name or by path."
-    properties["environments"]["description"] = "Tasks of your own."
-    properties["defaults"]["description"] = "Settings of every stage."
-    properties["stages"]["description"] = "What is trained, in order."
     grid = parts["Stage"]["properties"]["grid"]
     grid["properties"] = {name: {"type": "array"} for name in all_settings() if "." in name}
 

@@ -1,7 +1,7 @@
 """Merges the layers of run settings: variant < defaults < stage < its task < grid point.
 
 Each value keeps the place where it was written, so that an error in the merged settings is reported
-at the line that has to change.
+at the line to change.
 """
 
 from __future__ import annotations
@@ -10,8 +10,20 @@ import copy
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-from music_rllib.config.problems import KeyPath, Problem, known_fields, lookup, shown, unknown
+from pydantic import create_model
+
+from music_rllib.config.problems import (
+    Findings,
+    KeyPath,
+    Problem,
+    known_fields,
+    lookup,
+    shown,
+    unknown,
+)
 from music_rllib.config.run_settings import (
+    LAYER_KEYS,
+    SECTIONS,
     VARIANTS,
     RunSettings,
     Variant,
@@ -20,18 +32,48 @@ from music_rllib.config.run_settings import (
     without_retired,
 )
 from music_rllib.envs.tasks import Task
+from music_rllib.schedules import StrictModel
 
-SECTIONS = ("evaluation", "tac", "music", "replay")
-"""Groups of settings, whose fields layers replace one by one."""
-LAYER_KEYS = ("env_steps", "num_envs", *SECTIONS)
-"""Keys that `defaults`, a stage, its `per_task` and a grid point may set."""
 PlacedPoint = Mapping[str, tuple[KeyPath, Any]]
 """Dotted setting to (place below the stage, value) at one point of a grid or search."""
 
+_FIELDS: dict[str, Any] = {
+    name: (field.rebuild_annotation(), field.default)
+    for name, field in RunSettings.model_fields.items()
+    if name in LAYER_KEYS
+}
+Layer = create_model("Settings", __base__=StrictModel, **_FIELDS)
+"""The settings that `defaults`, a stage, its `per_task` and a grid point may have."""
 
-def known_settings(path: KeyPath) -> Iterable[str]:
-    """Names of a run's settings below `path`, for suggestions."""
-    return known_fields(RunSettings, path) if path else LAYER_KEYS
+
+def all_settings() -> list[str]:
+    """Names of all settings of a run, dotted for those in groups."""
+    return [
+        *LAYER_KEYS,
+        *(f"{section}.{name}" for section in SECTIONS for name in known_fields(Layer, (section,))),
+    ]
+
+
+def is_in(setting: str, group: str) -> bool:
+    """Whether a dotted setting is `group`, or below it."""
+    return f"{setting}.".startswith(f"{group}.")
+
+
+def check_defaults(defaults: Mapping[str, Any], findings: Findings) -> None:
+    """Check `defaults` as far as possible before they are merged with a stage."""
+    for key in defaults.keys() - set(LAYER_KEYS):
+        findings.add((key,), unknown(key, all_settings()))
+    given = {
+        key: value
+        for key, value in without_retired(defaults).items()
+        if key in LAYER_KEYS and (key not in SECTIONS or value is not None)
+    }
+    own = Findings()
+    own.validate(Layer, given)
+    for path, rule in own.problems:
+        # A rule between fields of a group depends on the variant, too.
+        if len(path) > 1 or not isinstance(given[str(path[0])], dict):
+            findings.add(path, for_a_grid(rule, path, given))
 
 
 def for_a_grid(rule: str, path: KeyPath, settings: Any) -> str:
@@ -91,12 +133,6 @@ class Layers:
         return otherwise + path
 
 
-def all_settings() -> list[str]:
-    """Names of all settings of a run, dotted for those in groups."""
-    fields = [f"{section}.{name}" for section in SECTIONS for name in known_settings((section,))]
-    return [*LAYER_KEYS, *fields]
-
-
 def varied_by(name: str, values: Iterable[Any]) -> list[str]:
     """Dotted settings that `values` of a grid or search have: `name`, or the fields of a group."""
     values = list(values)
@@ -109,12 +145,12 @@ def varied_by(name: str, values: Iterable[Any]) -> list[str]:
 def field_by_field(point: PlacedPoint) -> PlacedPoint:
     """A point whose groups, `tac: {entropic_index: 1, alpha: 0.05}`, are settings of their own.
 
-    A group stays if one of its fields is also in the point by itself: `merge` refuses it.
+    A group stays if one of its fields is also in the point by itself: `merge` rejects it.
     """
     settings: dict[str, tuple[KeyPath, Any]] = {}
     for dotted, (place, value) in point.items():
         fields = varied_by(dotted, [value])
-        if any(field in point for field in fields):  # also if it is no group
+        if any(field in point for field in fields):  # also if it is not a group
             settings[dotted] = (place, value)
         else:
             settings |= {f"{dotted}.{name}": ((*place, name), value[name]) for name in value}
@@ -129,18 +165,22 @@ def merge(
     stage_path: KeyPath,
     point: PlacedPoint,
 ) -> tuple[Layers, list[Problem]]:
-    """Merge preset, defaults, stage, its `per_task` and one point of its grid or search.
+    """Merge variant, defaults, stage, its `per_task` and one point of its grid or search.
 
     Args:
+        variant: The stage's variant.
+        task: The run's task.
+        defaults: The sweep's `defaults`, with those of its preset.
         stage: The stage's own settings, keys of `LAYER_KEYS` and `per_task` only.
         stage_path: The stage's place in the document.
+        point: The point.
 
     Returns:
         The merged settings, and the problems of their layers.
     """
     layers, problems = Layers(), []
     rules = VARIANTS[variant]
-    idle = Problem((), f"has no effect with variant {variant}")
+    idle = f"has no effect with variant {variant}"
     for field, value in variant_music(variant, task).items():
         layers.put(("music", field), value, ("music", field))
     task_path = (*stage_path, "per_task", task.name)
@@ -150,12 +190,12 @@ def merge(
             if ".".join(path) not in rules.without_effect:
                 layers.put(path, value, (*place, *path))
             elif settings is not defaults:  # in `defaults` it may have an effect in other stages
-                problems.append(idle._replace(path=(*place, *path)))
+                problems.append(Problem((*place, *path), idle))
     for dotted, (below, value) in point.items():
         place = (*stage_path, *below)
         once = place[: place.index(dotted) + 1] if dotted in place else place
         if dotted in rules.without_effect:
-            problems.append(idle._replace(path=once))
+            problems.append(Problem(once, idle))
         elif dotted in SECTIONS and isinstance(value, Mapping):
             twice = ", ".join(name for name in value if f"{dotted}.{name}" in point)
             rule = f"must not hold a field that varies by itself too, got {twice}"

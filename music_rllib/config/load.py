@@ -14,45 +14,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
+from music_rllib.config.document import Document, Place
 from music_rllib.config.hypotheses import check_analysis
-from music_rllib.config.layers import (
-    LAYER_KEYS,
-    SECTIONS,
-    all_settings,
-    for_a_grid,
-    known_settings,
-)
-from music_rllib.config.overrides import lay_overrides, parse_overrides
-from music_rllib.config.presets import with_preset
-from music_rllib.config.problems import (
-    ConfigError,
-    Findings,
-    Problem,
-    from_json,
-    problem_lines,
-    problems_of,
-    shown,
-    unknown,
-)
-from music_rllib.config.resolve import resolve_stage
-from music_rllib.config.run_settings import RunSettings, without_retired
-from music_rllib.config.schema import (
-    RESERVED_NAMES,
-    Header,
-    Stage,
-    SweepConfig,
-)
+from music_rllib.config.layers import all_settings, check_defaults
+from music_rllib.config.overrides import lay_overrides, parse_overrides, preset_path
+from music_rllib.config.presets import read_preset
+from music_rllib.config.problems import ConfigError, Findings, shown, unknown
+from music_rllib.config.schema import Header, Stage, SweepConfig
 from music_rllib.config.search import FINAL_SEED
-from music_rllib.config.yaml_file import YamlFile, read_yaml
+from music_rllib.config.stages import resolve_stage
 from music_rllib.envs.modules import search_in
-from music_rllib.envs.tasks import (
-    BUILT_IN_TASKS,
-    Task,
-    TaskRegistry,
-    UnknownTaskError,
-)
+from music_rllib.envs.tasks import BUILT_IN_TASKS, Task, TaskRegistry, UnknownTaskError
 from music_rllib.limits import MOST_RUNS, MOST_SEEDS
 from music_rllib.store.storage import expanded
 
@@ -78,58 +50,66 @@ def load_sweep(
     Raises:
         ConfigError: With one line per problem.
     """
-    texts = {"name": name, "storage": storage}
-    options: dict[str, Any] = {key: text for key, text in texts.items() if text is not None}
-    for key, text in options.items():
-        try:
-            text.encode()
-        except UnicodeEncodeError:  # bytes of the command line that are not UTF-8
-            raise ConfigError([f"--{key} must be UTF-8 text, got {text!a}"]) from None
-    file = read_yaml(Path(path))
+    document, findings = Document(Path(path)), Findings()
     given = parse_overrides(overrides)
-    if (preset := given.pop("preset", None)) is not None:
-        file = file._replace(data=file.data | {"preset": preset.value})
-    document, origins = lay_overrides(with_preset(file, _preset_problems), given.values())
-    if preset is not None:
-        origins["preset",] = preset.key
-    if "seeds" in document:
-        document["seeds"] = _listed_seeds(document["seeds"])
-    if seeds is not None:
-        options["seeds"] = _parsed_seeds(seeds, document.get("seeds"))
-    document |= options
-    findings = Findings()
-    if storage is None and isinstance(document.get("storage"), str):  # a shell expands --storage
+    if "preset" in given:
+        document.put(("preset",), preset_path(given.pop("preset")))
+    if "preset" in document.data:
+        place = document.place(("preset",))
+        document.lay_over(read_preset(document.data.pop("preset"), Path(path).parent, place))
+    lay_overrides(document, given)
+    _list_seeds(document, findings)
+    if isinstance(document.data.get("storage"), str):
         try:
-            document["storage"] = expanded(document["storage"])
+            document.data["storage"] = expanded(document.data["storage"])
         except ValueError as error:
-            findings.add(("storage",), str(error))
-    config = _resolve(file, document, findings)
+            if storage is None:
+                findings.add(("storage",), str(error))
+    if seeds is not None:
+        document.put(("seeds",), _parsed_seeds(seeds, document.data["seeds"]), Place("--seeds"))
+    for key, text in (("name", name), ("storage", storage)):
+        if text is not None:
+            document.put((key,), _checked_text(key, text), Place(f"--{key}"))
+    config = _resolve(document, findings)
     if config is None:
-        raise ConfigError(problem_lines(findings.problems, file, document, options, origins))
+        raise ConfigError(document.lines(findings.problems))
     return replace(config, arguments=tuple(overrides))
 
 
-def _listed_seeds(seeds: Any) -> Any:
-    """The list of seeds for a valid number of them: `5` means the seeds 0 to 4."""
-    if isinstance(seeds, bool) or not isinstance(seeds, int | float):
-        return seeds
-    return list(range(int(seeds))) if 1 <= seeds <= MOST_SEEDS and seeds == int(seeds) else seeds
+def _checked_text(key: str, text: str) -> str:
+    try:
+        text.encode()
+    except UnicodeEncodeError:  # bytes of the command line that are not UTF-8
+        raise ConfigError([f"--{key} must be UTF-8 text, got {text!a}"]) from None
+    return text
 
 
 def declared_tasks(path: str | Path) -> tuple[Task, ...]:
     """The tasks that a sweep's YAML file declares under `environments`.
 
-    From then on the modules of environments are looked for beside the file, too.
+    From then on, modules of environments are also searched beside the file.
 
     Raises:
         ConfigError: The file can't be read, or a task is invalid.
     """
-    file, findings = read_yaml(Path(path)), Findings()
-    registry = _registry(file.data, findings)
+    document, findings = Document(Path(path)), Findings()
+    registry = _registry(document.data, findings)
     if findings.problems:
-        raise ConfigError(problem_lines(findings.problems, file, file.data, {}))
+        raise ConfigError(document.lines(findings.problems))
     search_in(Path(path).parent)
     return tuple(task for name, task in registry.items() if name not in BUILT_IN_TASKS)
+
+
+def _list_seeds(document: Document, findings: Findings) -> None:
+    """Replace a number of seeds by their list: `5` means the seeds 0 to 4."""
+    seeds = document.data.setdefault("seeds", [0])
+    if isinstance(seeds, bool) or not isinstance(seeds, int | float):
+        return
+    valid = 1 <= seeds <= MOST_SEEDS and seeds == int(seeds)
+    if not valid:
+        rule = f"must be a list like [0, 1], or how many (1 to {MOST_SEEDS:,}), got {shown(seeds)}"
+        findings.add(("seeds",), rule)
+    document.data["seeds"] = list(range(int(seeds))) if valid else [0]
 
 
 def _parsed_seeds(text: str, given: Any) -> list[float]:
@@ -137,7 +117,7 @@ def _parsed_seeds(text: str, given: Any) -> list[float]:
     digits = re.fullmatch(r"\d{1,9}(,\d{1,9})*,?", text)
     if digits and "," not in text and int(text) > MOST_SEEDS:
         raise ConfigError([f"--seeds must be at most {MOST_SEEDS:,} seeds, got {text}"])
-    if not digits or text in {"0", ""}:
+    if not digits or text == "0":
         raise ConfigError(
             [f"--seeds must be a number of seeds or a list like 0,1,7, got {shown(text)}"]
         )
@@ -149,21 +129,13 @@ def _parsed_seeds(text: str, given: Any) -> list[float]:
     return [*known, *itertools.islice(others, max(int(text) - len(known), 0))][: int(text)]
 
 
-def _preset_problems(preset: YamlFile) -> list[str]:
-    """The problems of a preset's own settings, as lines."""
-    findings = Findings()
-    _defaults({"defaults": preset.data}, findings)
-    problems = [Problem(problem.path[1:], problem.rule) for problem in findings.problems]
-    return problem_lines(problems, preset, preset.data, {})
-
-
-def _resolve(file: YamlFile, document: dict[str, Any], findings: Findings) -> SweepConfig | None:
+def _resolve(document: Document, findings: Findings) -> SweepConfig | None:
     """The sweep; None if there are problems, which are added to `findings`."""
-    registry = _registry(document, findings)
-    header = _header(document, findings)
-    defaults = _defaults(document, findings)
-    names, declared = document.get("tasks"), document.get("environments")
-    names = [name for name in names if isinstance(name, str)] if isinstance(names, list) else []
+    data = document.data
+    registry = _registry(data, findings)
+    header = _header(data, findings)
+    defaults = _mapping(data.get("defaults"))
+    check_defaults(defaults, findings.below("defaults"))
 
     def find_tasks(names: Iterable[str], findings: Findings) -> tuple[Task, ...]:
         tasks = []
@@ -171,21 +143,16 @@ def _resolve(file: YamlFile, document: dict[str, Any], findings: Findings) -> Sw
             try:
                 tasks.append(registry[name])
             except UnknownTaskError as error:
-                # An invalid declaration is a problem already, and its name is not unknown.
-                if not isinstance(declared, dict) or name not in declared:
+                # An invalid declaration is a problem already, and its name is known.
+                if name not in _mapping(data.get("environments")):
                     findings.add((position,), str(error))
         return tuple(tasks)
 
+    names = [name for name in _list(data.get("tasks")) if isinstance(name, str)]
     sweep_tasks = find_tasks(names, findings.below("tasks"))
-    raw_stages = document.get("stages")
-    if not isinstance(raw_stages, list) or not raw_stages:
-        rule = f"must be a list of at least one stage, got {shown(raw_stages)}"
-        findings.add(("stages",), rule)
-        raw_stages = []
     stages: dict[str, Stage | None] = {}
-    for index, raw in enumerate(raw_stages):
+    for index, raw in enumerate(_list(data.get("stages"))):
         if not isinstance(raw, dict):
-            findings.add(("stages", index), f"must be a mapping, got {shown(raw)}")
             continue
         stage = resolve_stage(
             raw,
@@ -197,21 +164,22 @@ def _resolve(file: YamlFile, document: dict[str, Any], findings: Findings) -> Sw
             earlier=stages,
         )
         stages[stage.name if stage else str(raw.get("name"))] = stage
-    if header:
-        _count_runs(stages, len(header.seeds), findings)
-    if header and any(stage and stage.search for stage in stages.values()):
+    if header is None:
+        return None
+    _count_runs(stages, len(header.seeds), findings)
+    if any(stage and stage.search for stage in stages.values()):
         for position, seed in enumerate(header.seeds):
             if seed >= FINAL_SEED:
                 rule = f"must be < {FINAL_SEED}, where a search's fresh seeds begin, got {seed}"
                 findings.add(("seeds", position), rule)
-    if header and header.analysis:
+    if header.analysis:
         check_analysis(header.analysis, stages, findings)
-    if findings.problems or header is None:
+    if findings.problems:
         return None
     return SweepConfig(
-        path=file.path,
-        text=file.text,
-        document=document,
+        path=document.file.path,
+        text=document.file.text,
+        document=data,
         name=header.name,
         seeds=header.seeds,
         storage=header.storage,
@@ -223,8 +191,42 @@ def _resolve(file: YamlFile, document: dict[str, Any], findings: Findings) -> Sw
     )
 
 
+def _mapping(value: Any) -> dict[str, Any]:
+    """`value` if it is a mapping; the problem of another value is reported with the header."""
+    return value if isinstance(value, dict) else {}
+
+
+def _list(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else []
+
+
+def _header(data: dict[str, Any], findings: Findings) -> Header | None:
+    known = (*Header.model_fields, *sorted(f"defaults.{name}" for name in all_settings()))
+    for key in data.keys() - Header.model_fields:
+        findings.add((key,), unknown(key, known))
+    values = {key: value for key, value in data.items() if key in Header.model_fields}
+    for key in ("tasks", "seeds"):
+        findings.forbid_repeats(values.get(key), (key,))
+    return findings.validate(Header, values)
+
+
+def _registry(data: dict[str, Any], findings: Findings) -> TaskRegistry:
+    tasks = []
+    for name, raw in _mapping(data.get("environments")).items():
+        path = ("environments", name)
+        if name in BUILT_IN_TASKS:
+            findings.add(path, "is a built-in task; choose another name")
+        elif "name" in _mapping(raw):
+            findings.add((*path, "name"), f"must not be given, got {shown(raw['name'])}")
+        elif isinstance(raw, dict) and (
+            task := findings.below(*path).validate(Task, raw | {"name": name})
+        ):
+            tasks.append(task)
+    return TaskRegistry(tasks)
+
+
 def _count_runs(stages: Mapping[str, Stage | None], seeds: int, findings: Findings) -> None:
-    """Refuse more runs than can be planned; they multiply from stage to stage."""
+    """Reject more runs than can be planned; they multiply from stage to stage."""
     trials: dict[str, int] = {}
     total = 0
     for index, (name, stage) in enumerate(stages.items()):
@@ -237,66 +239,3 @@ def _count_runs(stages: Mapping[str, Stage | None], seeds: int, findings: Findin
             rule = f"must not make the sweep larger than {MOST_RUNS:,} runs, got {total:,}"
             findings.add(("stages", index), rule)
             return
-
-
-def _registry(document: dict[str, Any], findings: Findings) -> TaskRegistry:
-    tasks = []
-    environments = document.get("environments") or {}
-    if not isinstance(environments, dict):
-        findings.add(("environments",), f"must be a mapping, got {shown(environments)}")
-        environments = {}
-    for name, raw in environments.items():
-        path = ("environments", name)
-        if name in BUILT_IN_TASKS:
-            findings.add(path, "is a built-in task; choose another name")
-        elif not isinstance(raw, dict) or "name" in raw:
-            findings.add(path, f"must be a mapping without a name of its own, got {shown(raw)}")
-        elif task := findings.below(*path).validate(Task, raw | {"name": name}):
-            tasks.append(task)
-    return TaskRegistry(tasks)
-
-
-def _header(document: dict[str, Any], findings: Findings) -> Header | None:
-    known = {*Header.model_fields, "preset", "environments", "defaults", "stages"}
-    below = {f"defaults.{name}" for name in all_settings()}
-    for key in document.keys() - known:
-        findings.add((key,), unknown(key, (*known, *sorted(below))))
-    values = {key: value for key, value in document.items() if key in Header.model_fields}
-    if isinstance(values.get("seeds"), int | float):  # an invalid number: others are lists now
-        rule = f"must be a list like [0, 1], or how many (1 to {MOST_SEEDS:,})"
-        findings.add(("seeds",), f"{rule}, got {shown(values.pop('seeds'))}")
-    header = findings.validate(Header, values)
-    if header and header.name in RESERVED_NAMES:
-        findings.add(("name",), f"must not be {header.name!r}, which the storage uses itself")
-    for key in ("tasks", "seeds"):
-        findings.forbid_repeats(values.get(key), (key,))
-    if header and len(header.seeds) > MOST_SEEDS:
-        rule = f"must have at most {MOST_SEEDS:,} entries, got {len(header.seeds):,}"
-        findings.add(("seeds",), rule)
-    return header
-
-
-def _defaults(document: dict[str, Any], findings: Findings) -> dict[str, Any]:
-    """`defaults`, checked as far as they can be before they are merged with a stage."""
-    defaults = document.get("defaults") or {}
-    if not isinstance(defaults, dict):
-        findings.add(("defaults",), f"must be a mapping, got {shown(defaults)}")
-        return {}
-    for key, value in defaults.items():
-        if key not in LAYER_KEYS:
-            findings.add(("defaults", key), unknown(key, all_settings()))
-        elif not (key in SECTIONS and value is None):
-            _check_fields(key, value, findings)
-    return defaults
-
-
-def _check_fields(key: str, value: Any, findings: Findings) -> None:
-    """Validate a group's fields alone: rules between groups depend on the variant."""
-    field, value = RunSettings.model_fields[key], without_retired({key: value})[key]
-    try:
-        from_json(field.rebuild_annotation(), value)
-    except ValidationError as error:
-        for path, rule in problems_of(error, value, lambda at: known_settings((key, *at))):
-            if path or not isinstance(value, dict):
-                rule = for_a_grid(rule, (key, *path), {key: value})
-                findings.add(("defaults", key, *path), rule)

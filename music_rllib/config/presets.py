@@ -7,21 +7,20 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import music_rllib
-from music_rllib.config.layers import SECTIONS
+from music_rllib.config.document import Place
 from music_rllib.config.problems import ConfigError, shown
 from music_rllib.config.schema import RESERVED_NAMES
 from music_rllib.config.yaml_file import YamlFile, read_yaml
 from music_rllib.envs.tasks import closest
 
 FOLDER = "presets"
-"""Folder beside the sweep's file, whose presets come before the package's of the same name."""
+"""Folder beside the sweep's file; its presets replace the package's presets of the same name."""
 SHIPPED = Path(music_rllib.__file__).with_name(FOLDER)
-"""The package's own presets, one file each."""
+"""Folder of the package's presets."""
 SCHEMA = Path(__file__).with_name("sweep.schema.json")
 """JSON Schema of a sweep's file, for editors; docs/generate_configuration.py writes it."""
 
@@ -39,7 +38,7 @@ def starter(file: Path) -> str:
 
 
 def shipped_presets() -> dict[str, str]:
-    """Name of each of the package's presets to the description in its first line."""
+    """Map the names of the package's presets to the description in their first line."""
     descriptions = {}
     for path in sorted(SHIPPED.glob("*.yaml")):
         line = path.read_text(encoding="utf-8").partition("\n")[0]
@@ -47,49 +46,25 @@ def shipped_presets() -> dict[str, str]:
     return descriptions
 
 
-def with_preset(file: YamlFile, check: Callable[[YamlFile], Iterable[str]]) -> dict[str, Any]:
-    """The sweep's document with its preset's settings below its `defaults`.
+def read_preset(name: Any, folder: Path, place: Place) -> YamlFile:
+    """Read a preset by its name, or by its path if `name` ends in `.yaml`.
 
     Args:
-        check: Gives the problems of a preset's own settings, as lines.
+        name: The value of `preset`.
+        folder: The folder of the sweep's file.
+        place: The place of `name`, for messages.
 
     Raises:
-        ConfigError: There is no such preset, or it has problems.
+        ConfigError: There is no such preset, or it can't be read.
     """
-    document = dict(file.data)
-    if "preset" not in document:
-        return document
-    preset = _read(file, document.pop("preset"))
-    if problems := list(check(preset)):
-        raise ConfigError(problems)
-    defaults = document.get("defaults") or {}
-    if isinstance(defaults, Mapping):  # anything else becomes a problem later
-        document["defaults"] = _merged(preset.data, defaults)
-    return document
-
-
-def _read(file: YamlFile, name: Any) -> YamlFile:
-    place, folder = file.place(("preset",)), file.path.parent
     if not isinstance(name, str) or not name:
         raise ConfigError([f"{place}: preset must be a preset's name or a file, got {shown(name)}"])
     if name.endswith((".yaml", ".yml")):
         return read_yaml(folder / name)
-    known = {
-        path.stem: path for place in (SHIPPED, folder / FOLDER) for path in place.glob("*.yaml")
-    }
+    known = {path.stem: path for one in (SHIPPED, folder / FOLDER) for path in one.glob("*.yaml")}
     if name not in known:
         choice = ", ".join(sorted(known))
         raise ConfigError(
             [f"{place}: preset must be one of {choice}, got {shown(name)}{closest(name, known)}"]
         )
     return read_yaml(known[name])
-
-
-def _merged(preset: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
-    """`defaults` over `preset`, the fields of groups one by one."""
-    merged = dict(preset) | dict(defaults)
-    for section in SECTIONS:
-        lower, upper = preset.get(section), defaults.get(section)
-        if isinstance(lower, Mapping) and (upper is None or isinstance(upper, Mapping)):
-            merged[section] = dict(lower) | dict(upper or {})
-    return merged

@@ -1,16 +1,13 @@
-"""Problems of a configuration, in words for the person who wrote it.
+"""Problems of a configuration: the broken rule, its place in the document, and the value.
 
-Every problem names its place (file, line, dotted key), the rule and the value. Validation does not
-stop at the first problem, so that a file is corrected in one round.
+Validation does not stop at the first problem, so that a file can be corrected in one round.
 """
 
 from __future__ import annotations
 
-import contextlib
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
@@ -18,9 +15,6 @@ from pydantic_core import ErrorDetails
 from music_rllib.envs.tasks import closest
 from music_rllib.errors import BadInputError
 from music_rllib.labels import SYMBOLS
-
-if TYPE_CHECKING:
-    from music_rllib.config.yaml_file import YamlFile
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -33,14 +27,14 @@ class Problem(NamedTuple):
 
     path: KeyPath
     rule: str
-    """What must hold, and the value that breaks it: `must be > 0, got -1`."""
+    """The rule and the value that breaks it: `must be > 0, got -1`."""
 
 
 class ConfigError(BadInputError, ValueError):
-    """A configuration that can't be used; the message has one line per problem."""
+    """An invalid configuration; the message has one line per problem."""
 
     def __init__(self, lines: Sequence[str]) -> None:
-        """Hold `lines`, each of which names place, rule and value."""
+        """Take `lines` that name place, rule and value."""
         super().__init__("\n".join(lines))
         self.lines = tuple(lines)
 
@@ -70,7 +64,7 @@ def lookup(document: Any, path: Iterable[str | int]) -> Any:
     """The value at `path`.
 
     Raises:
-        LookupError: The document has none there.
+        LookupError: The document has no value there.
     """
     for part in path:
         if isinstance(document, Mapping) or (
@@ -93,7 +87,7 @@ def unknown(key: str, known: Iterable[str]) -> str:
 
 
 def known_fields(model: type[BaseModel], path: KeyPath) -> Iterable[str]:
-    """Names of the fields of the model at `path` below `model`; none where it is a union."""
+    """Names of the fields at `path` below `model`; empty where the type is a union."""
     for part in path:
         field = model.model_fields.get(str(part))
         kind = field.annotation if field else None
@@ -103,45 +97,106 @@ def known_fields(model: type[BaseModel], path: KeyPath) -> Iterable[str]:
     return model.model_fields
 
 
-def problems_of(
-    error: ValidationError, document: Any, known: Callable[[KeyPath], Iterable[str]]
-) -> list[Problem]:
-    """Translate pydantic's error about `document` into problems, with paths relative to it.
+class Findings:
+    """The problems of a document so far; paths are relative to one place in it."""
 
-    Args:
-        known: Gives the known keys at a path, for suggestions.
+    def __init__(self, path: KeyPath = (), problems: list[Problem] | None = None) -> None:
+        self.path = path
+        self.problems = [] if problems is None else problems
+        """Problems of the whole document, with paths from its top."""
+
+    def below(self, *keys: str | int) -> Findings:
+        """The same problems, for paths relative to the value at `keys`."""
+        return Findings((*self.path, *keys), self.problems)
+
+    def add(self, path: KeyPath, rule: str) -> None:
+        """Add a problem."""
+        self.problems.append(Problem(self.path + path, rule))
+
+    def validate(self, kind: type[Model], value: Any) -> Model | None:
+        """Validate `value` as a `kind`; add the problems and return None if it is invalid."""
+        try:
+            return from_json(kind, value)
+        except ValidationError as error:
+            for problem in problems_of(error, value, kind):
+                self.add(problem.path, problem.rule)
+            return None
+
+    def forbid_repeats(self, values: Any, path: KeyPath) -> None:
+        """Add a problem for each repeated entry of the list `values`; 1 and 1.0 are the same."""
+        seen: set[tuple[bool, Any]] = set()
+        others: list[Any] = []
+        for position, value in enumerate(values if isinstance(values, list | tuple) else ()):
+            if isinstance(value, str | int | float | None):
+                # Equal numbers have equal hashes, whatever their type; so have 1 and true.
+                again = (isinstance(value, bool), value) in seen
+                seen.add((isinstance(value, bool), value))
+            else:
+                again = any(same(value, other) for other in others)
+                others.append(value)
+            if again:
+                self.add((*path, position), f"must not repeat, got {shown(value)} again")
+
+
+def from_json(kind: type[Model], value: Any) -> Model:
+    """Validate `value` strictly: text is not a number, and a truth value is not an integer.
+
+    Raises:
+        pydantic.ValidationError: It is invalid.
     """
-    problems = []
+    # Through JSON, because only there strict mode accepts lists for tuples.
+    adapter = TypeAdapter(kind)
+    try:
+        return adapter.validate_json(json.dumps(value), strict=True)
+    except ValidationError as error:
+        whole_numbers = [
+            _without_tags(details["loc"], value)
+            for details in error.errors(include_url=False)
+            if details["type"] in {"int_type", "int_from_float"}
+            and isinstance(details["input"], float)
+            and details["input"].is_integer()
+        ]
+        if not whole_numbers:
+            raise
+    # `1e6` is a float in YAML, and valid where an integer is needed.
+    document = json.loads(json.dumps(value))
+    for path in whole_numbers:
+        parent = lookup(document, path[:-1])
+        parent[path[-1]] = int(parent[path[-1]])
+    return adapter.validate_json(json.dumps(document), strict=True)
+
+
+def problems_of(error: ValidationError, document: Any, kind: type[BaseModel]) -> Iterator[Problem]:
+    """Translate pydantic's error about `document` as a `kind` into problems.
+
+    Yields:
+        Problems, with paths relative to `document`.
+    """
     for details in error.errors(include_url=False):
         if details["type"] == "too_short" and len(details["input"]) >= details["ctx"]["min_length"]:
             continue  # pydantic counts valid entries only; the invalid ones are reported
-        path = _without_tags(details["loc"], document, missing=details["type"] == "missing")
-        rule = _rule(details, path, known)
-        if details["type"] == "value_error":
+        path, rule = _without_tags(details["loc"], document), _rule(details)
+        if details["type"] == "extra_forbidden":
+            rule = unknown(str(path[-1]), known_fields(kind, path[:-1]))
+        elif details["type"] == "missing":
+            path = (*path, details["loc"][-1])
+        elif details["type"] == "value_error":
             path, rule = _more_precise(path, rule, document)
-        problems.append(Problem(path, rule))
-    return problems
+        yield Problem(path, rule)
 
 
-def _without_tags(loc: KeyPath, document: Any, *, missing: bool) -> KeyPath:
-    """The keys in pydantic's `loc`, which also names members of unions (tags)."""
+def _without_tags(loc: KeyPath, document: Any) -> KeyPath:
+    """The keys in pydantic's `loc` that exist in `document`, without the tags of unions.
 
-    def readings(rest: KeyPath, here: Any) -> Iterator[tuple[KeyPath, list[str | int]]]:
-        """Every way to split `rest` into keys of `here` and dropped tags."""
-        if not rest:
-            yield (), []
-            return
-        part = rest[0]
-        with contextlib.suppress(LookupError):
-            for path, dropped in readings(rest[1:], lookup(here, [part])):
-                yield (part, *path), dropped
-        if missing and len(rest) == 1 and isinstance(here, Mapping):
-            yield (part,), []
-        for path, dropped in readings(rest[1:], here):
-            yield path, [part, *dropped]
-
-    # A tag may equal a key: the right split drops the fewest parts, and preferably not the last.
-    path, _ = min(readings(loc, document), key=lambda r: (len(r[1]), loc[-1:] != r[0][-1:]))
+    No tag of a settings model may equal a key of the mapping that it is the tag of.
+    """
+    path: KeyPath = ()
+    for part in loc:
+        try:
+            document = lookup(document, [part])
+        except LookupError:
+            continue
+        path = (*path, part)
     return path
 
 
@@ -167,6 +222,11 @@ _FIXED_RULES = {
     "dict_type": "must be a mapping of keys to values",
     "model_type": "must be a mapping of keys to values",
     "model_attributes_type": "must be a mapping of keys to values",
+    "string_pattern_mismatch": (
+        "must be letters, digits, '.', '_' or '-', and begin with a letter or digit"
+    ),
+    "string_too_short": "must not be empty",
+    "missing": "must be given",
 }
 _COMPARISONS = {
     "greater_than": (">", "gt"),
@@ -176,14 +236,10 @@ _COMPARISONS = {
 }
 
 
-def _rule(details: ErrorDetails, path: KeyPath, known: Callable[[KeyPath], Iterable[str]]) -> str:
-    """The rule that a finding of pydantic is about."""
+def _rule(details: ErrorDetails) -> str:
+    """The rule and the value of one of pydantic's errors."""
     kind, context, value = details["type"], details.get("ctx", {}), details["input"]
     hint = ""
-    if kind == "extra_forbidden":
-        return unknown(str(path[-1]), known(path[:-1]))
-    if kind == "missing":
-        return "must be given"
     if kind in _FIXED_RULES:
         rule = _FIXED_RULES[kind]
     elif kind in _COMPARISONS:
@@ -196,151 +252,10 @@ def _rule(details: ErrorDetails, path: KeyPath, known: Callable[[KeyPath], Itera
             hint = closest(value, [option.strip("' ") for option in options])
     elif kind == "too_short":
         rule = f"must have at least {context['min_length']} entries"
-    elif kind == "string_too_short" and context["min_length"] == 1:
-        rule = "must not be empty"
-    elif kind == "string_pattern_mismatch":
-        rule = "must be letters, digits, '.', '_' or '-', and begin with a letter or digit"
+    elif kind == "too_long":
+        rule = f"must have at most {context['max_length']:,} entries"
     elif kind == "value_error":
         rule = str(context["error"])
     else:
         rule = details["msg"].replace("Input should", "must", 1)
-    if " got " in rule:
-        return rule
-    return f"{rule}, got {shown(value)}{hint}"
-
-
-def from_json(kind: Any, value: Any) -> Any:
-    """`value` as a `kind`, strictly: no text for numbers, no truth values for integers.
-
-    Raises:
-        pydantic.ValidationError: It isn't one.
-    """
-    # Through JSON, because strict mode takes lists for tuples only from there.
-    adapter = TypeAdapter(kind)
-    try:
-        return adapter.validate_json(json.dumps(value), strict=True)
-    except ValidationError as error:
-        whole_numbers = [
-            _without_tags(details["loc"], value, missing=False)
-            for details in error.errors(include_url=False)
-            if details["type"] in {"int_type", "int_from_float"}
-            and isinstance(details["input"], float)
-            and details["input"].is_integer()
-        ]
-        if not whole_numbers:
-            raise
-    # `1e6` is a float in YAML, and valid where an integer is asked for.
-    document = json.loads(json.dumps([value]))
-    for path in whole_numbers:
-        *above, last = (0, *path)
-        parent = lookup(document, above)
-        parent[last] = int(parent[last])
-    return adapter.validate_json(json.dumps(document[0]), strict=True)
-
-
-class Findings:
-    """The problems of a document so far; paths are relative to one place in it."""
-
-    def __init__(self, path: KeyPath = (), problems: list[Problem] | None = None) -> None:
-        self.path = path
-        self.problems = [] if problems is None else problems
-        """Problems of the whole document, with paths from its top."""
-
-    def below(self, *keys: str | int) -> Findings:
-        """The same problems, for paths relative to the value at `keys`."""
-        return Findings((*self.path, *keys), self.problems)
-
-    def add(self, path: KeyPath, rule: str) -> None:
-        """Add a problem."""
-        self.problems.append(Problem(self.path + path, rule))
-
-    def validate(self, kind: type[Model], value: Any) -> Model | None:
-        """`value` as a `kind`; None, with the problems added, if it isn't one."""
-        try:
-            return cast("Model", from_json(kind, value))
-        except ValidationError as error:
-            for problem in problems_of(error, value, lambda at: known_fields(kind, at)):
-                self.add(problem.path, problem.rule)
-            return None
-
-    def forbid_repeats(self, values: Any, path: KeyPath) -> None:
-        """Add a problem for each repeated entry of the list `values`; 1 and 1.0 are the same."""
-        seen: set[tuple[bool, Any]] = set()
-        others: list[Any] = []
-        for position, value in enumerate(values if isinstance(values, list | tuple) else ()):
-            if isinstance(value, str | int | float | None):
-                # Equal numbers have equal hashes, whatever their type; 1 and true too.
-                again = (isinstance(value, bool), value) in seen
-                seen.add((isinstance(value, bool), value))
-            else:
-                again = any(same(value, other) for other in others)
-                others.append(value)
-            if again:
-                self.add((*path, position), f"must not repeat, got {shown(value)} again")
-
-
-def problem_lines(
-    problems: Iterable[Problem],
-    file: YamlFile,
-    document: Any,
-    options: Mapping[str, Any],
-    origins: Mapping[KeyPath, str] = MappingProxyType({}),
-) -> list[str]:
-    """One line for each different problem, those of the command line first, then by line.
-
-    Args:
-        document: The content of `file` with the values of the command line.
-        options: Values of options like `--name`, by key.
-        origins: Place of a value to the `KEY` of the command line that it comes from.
-    """
-
-    def line(problem: Problem) -> str:
-        path, rule = problem
-        if path and path[0] in options:
-            return f"--{path[0]} {rule}"
-        place, key = file.place(path), _dotted(path, document)
-        above = next((path[:end] for end in range(len(path), 0, -1) if path[:end] in origins), None)
-        if above is not None:
-            rest = (f"[{k}]" if isinstance(k, int) else f".{k}" for k in path[len(above) :])
-            place, key = "command line", origins[above] + "".join(rest)
-        elif path not in file.lines and any(path == origin[: len(path)] for origin in origins):
-            place = "command line"
-        separator = " " if rule.startswith(("must ", "is ", "has ", "needs ")) else ": "
-        return f"{place}: {key}{separator if key else ''}{rule}"
-
-    in_order = sorted(_merged(problems), key=lambda problem: file.line(problem.path) or 0)
-    return list(dict.fromkeys(line(problem) for problem in in_order))
-
-
-def _merged(problems: Iterable[Problem]) -> list[Problem]:
-    """The problems, where those of values in one list of a grid that break one rule are one."""
-    groups: dict[tuple[KeyPath, str], list[Problem]] = {}
-    for problem in dict.fromkeys(problems):
-        path, rule = problem.path, problem.rule
-        if len(path) > 3 and path[2] == "grid" and isinstance(path[-1], int):
-            path, rule = path[:-1], rule.partition(", got ")[0]
-        groups.setdefault((path, rule), []).append(problem)
-    return [
-        group[0] if len(group) == 1 else Problem(path, rule + _got(group))
-        for (path, rule), group in groups.items()
-    ]
-
-
-def _got(group: Iterable[Problem]) -> str:
-    values = ", ".join(problem.rule.partition(", got ")[2] for problem in group)
-    return f", got {values}" if values.strip(", ") else ""
-
-
-def _dotted(path: KeyPath, document: Any) -> str:
-    """`stages.finetune.tac.lr`: a stage by its name, positions in other lists in brackets."""
-    text = ""
-    for position, part in enumerate(path):
-        name: Any = part
-        if path[0] == "stages" and position == 1:
-            with contextlib.suppress(LookupError):
-                name = lookup(document, (*path[:2], "name"))
-        if isinstance(name, str):
-            text += f".{name}" if text else name
-        else:
-            text += f"[{part}]"
-    return text
+    return rule if " got " in rule or kind == "missing" else f"{rule}, got {shown(value)}{hint}"

@@ -100,6 +100,11 @@ def contradiction(variant: Variant, fixed: Any, got: Any) -> str:
     return f"must be {json.dumps(fixed)} for {variant}, got {json.dumps(got)}"
 
 
+SECTIONS = ("evaluation", "tac", "music", "replay")
+"""Groups of settings, whose fields layers replace one by one."""
+LAYER_KEYS = ("env_steps", "num_envs", *SECTIONS)
+"""Keys that `defaults`, a stage, its `per_task` and a grid point may set."""
+
 YOUNGER: tuple[tuple[str, str], ...] = (("tac", "log_std_form"), ("tac", "warmup_steps"))
 """Group and name of settings that are newer than the node keys of finished runs."""
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from music_rllib import names
 from music_rllib.config.analysis import Analysis
@@ -17,6 +17,7 @@ from music_rllib.config.run_settings import RunSettings, Variant
 from music_rllib.config.search import SearchSettings
 from music_rllib.envs.tasks import Task
 from music_rllib.errors import BadInputError
+from music_rllib.limits import MOST_SEEDS
 from music_rllib.schedules import StrictModel
 from music_rllib.store.handoff import HandoffManifest
 
@@ -88,14 +89,20 @@ Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
 
 
-class Header(StrictModel):
-    """Top-level keys of the document, except `stages`, `environments`, `defaults` and `preset`."""
+def _not_reserved(name: str) -> str:
+    if name in RESERVED_NAMES:
+        raise ValueError(f"must not be {name!r}, which the storage uses itself")
+    return name
 
-    name: Name
+
+class Header(StrictModel):
+    """The keys of the file; what is below `environments`, `defaults` and `stages` is any value."""
+
+    name: Annotated[Name, AfterValidator(_not_reserved)]
     """The sweep's name: its folder in the storage and its experiment in MLflow."""
     tasks: tuple[str, ...] = Field(min_length=1)
     """Built-in tasks or those of `environments`; every trial has runs on each."""
-    seeds: tuple[Seed, ...] = Field((0,), min_length=1)
+    seeds: tuple[Seed, ...] = Field((0,), min_length=1, max_length=MOST_SEEDS)
     """Every trial has runs with each. `5` is short for `[0, 1, 2, 3, 4]`."""
     storage: str = Field("results", min_length=1)
     """Folder or bucket (`s3://`, `gs://`); the sweep's own folder is `<storage>/<name>`. `$NAME` is
@@ -105,6 +112,15 @@ class Header(StrictModel):
     checkpoints: Checkpoints = Checkpoints()
     analysis: Analysis | None = None
     """Hypotheses for an analysis plan before the runs (docs/comparing_q.md); null: none."""
+    preset: str | None = None
+    """Settings below `defaults`: the name of a file in `presets/` beside the sweep's file, the name
+    of one of the package's presets (`music-rllib presets`), or the path of a YAML file."""
+    environments: dict[str, dict[str, Any]] | None = None
+    """Name of a task of your own to its definition."""
+    defaults: dict[str, Any] | None = None
+    """Settings of every stage."""
+    stages: list[dict[str, Any]] = Field(min_length=1)
+    """The stages, in order."""
 
 
 class InitFrom(StrictModel):

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
-    BaseModel,
     Discriminator,
     Field,
     Tag,
@@ -106,27 +105,20 @@ class GaussianNoise(StrictModel):
     """Share of actions that are drawn uniformly instead."""
 
 
-_KINDS_OF_ALPHA: dict[str, type[BaseModel]] = {
-    "learned": LearnedAlpha,
-    "matched_width": MatchedAlpha,
-    "normalised": NormalisedAlpha,
-}
-"""Key that only one kind of alpha has to that kind."""
-
-
 def _alpha_kind(value: object) -> str:
-    """Tag of the member of `Alpha` that a value is meant to be."""
-    for key, kind in _KINDS_OF_ALPHA.items():
-        if (isinstance(value, dict) and key in value) or type(value) is kind:
-            return key
-    return "scheduled"
+    """Tag of the member of `Alpha` that `value` should be, by the key that only it has."""
+    kinds = {"learned": LearnedAlpha, "matched_width": MatchedAlpha, "normalised": NormalisedAlpha}
+    for key, kind in kinds.items():
+        if (isinstance(value, dict) and key in value) or isinstance(value, kind):
+            return kind.__name__
+    return "Schedule"
 
 
 Alpha = Annotated[
-    Annotated[PositiveSchedule, Tag("scheduled")]
-    | Annotated[LearnedAlpha, Tag("learned")]
-    | Annotated[MatchedAlpha, Tag("matched_width")]
-    | Annotated[NormalisedAlpha, Tag("normalised")],
+    Annotated[PositiveSchedule, Tag("Schedule")]
+    | Annotated[LearnedAlpha, Tag("LearnedAlpha")]
+    | Annotated[MatchedAlpha, Tag("MatchedAlpha")]
+    | Annotated[NormalisedAlpha, Tag("NormalisedAlpha")],
     Discriminator(_alpha_kind),
 ]
 """Entropy coefficient: a constant or a schedule, as it is or scaled for each q, or learned."""

@@ -1,7 +1,8 @@
-"""Strict reading of a YAML file, without the surprises of PyYAML.
+"""Reads a YAML file strictly, with the line of each value.
 
-Scalars follow the core schema of YAML 1.2, not PyYAML's 1.1, where ``1e-3`` is text, ``3:6`` is
-the number 186 and ``010`` is eight. Keys must be text and may not repeat; PyYAML keeps the last.
+Scalars follow the core schema of YAML 1.2. PyYAML follows YAML 1.1, where ``1e-3`` is text,
+``3:6`` is the number 186 and ``010`` is eight. Keys must be text and may not repeat; PyYAML keeps
+the last one.
 """
 
 from __future__ import annotations
@@ -26,23 +27,12 @@ from music_rllib.limits import (
 
 
 class YamlFile(NamedTuple):
-    """A YAML file's document, and the line on which each of its values begins."""
+    """A YAML file's content, and the line on which each of its values begins."""
 
     path: Path
     text: str
     data: dict[str, Any]
     lines: Mapping[KeyPath, int]
-
-    def line(self, path: KeyPath) -> int | None:
-        """The line of the value at `path`, or of the nearest existing value above it."""
-        while path and path not in self.lines:
-            path = path[:-1]
-        return self.lines.get(path)
-
-    def place(self, path: KeyPath) -> str:
-        """The place of a value for messages: `smoke.yaml:14`."""
-        line = self.line(path)
-        return f"{self.path.name}:{line}" if line else self.path.name
 
 
 def read_yaml(path: Path) -> YamlFile:
@@ -70,10 +60,10 @@ def read_yaml(path: Path) -> YamlFile:
 
 
 def read_value(text: str) -> Any:
-    """Read one YAML value, as it stands behind a key.
+    """Read one YAML value.
 
     Raises:
-        ValueError: It is invalid; names the rule.
+        ValueError: It is invalid; the message names the rule.
     """
     try:
         return _parse(text[:MOST_YAML_BYTES])[0]
@@ -82,8 +72,9 @@ def read_value(text: str) -> Any:
 
 
 def _parse(text: str) -> tuple[Any, dict[KeyPath, int]]:
-    """The document of a text, and the lines of its values."""
-    loader = _StrictLoader(text)
+    """The content of a text, and the lines of its values."""
+    _check_white_space(text)
+    loader = _StrictLoader(text.replace("\t", " "))  # in YAML 1.2 tabs may separate tokens
     root = loader.get_single_node()
     if root is None:
         return None, {}
@@ -96,7 +87,26 @@ def _rule(error: yaml.YAMLError) -> str:
     return f"must be valid YAML: {getattr(error, 'problem', None) or error}"
 
 
+_QUOTED = re.compile(r"'[^']*'|\"[^\"]*\"|#.*")
 _LIKE_A_SPACE = re.compile(r"[^\S \t\r\n]|[\u200b\u2060\ufeff]")
+_TAB_INDENTS = re.compile(r" *\t[ \t]*[^\s#]")
+
+
+def _check_white_space(text: str) -> None:
+    """Reject tabs that indent lines, and characters that only look like a space."""
+    as_json = text.lstrip().startswith(("{", "["))
+    for number, line in enumerate(text.split("\n")):
+        rule = ""
+        bare = _QUOTED.sub(lambda quoted: "." * len(quoted[0]), line)
+        if found := _LIKE_A_SPACE.search(bare):
+            name = f"U+{ord(found[0]):04X} ({unicodedata.name(found[0], 'a control character')})"
+            place = f"column {found.start() + 1} has {name}"
+            rule = f"{place}: replace it by a space, or quote the text"
+        elif _TAB_INDENTS.match(line) and not as_json:
+            rule = "a tab must not indent a line, use spaces"
+        if rule:
+            mark = yaml.Mark("", 0, number, 0, None, 0)
+            raise yaml.scanner.ScannerError(None, None, rule, mark)
 
 
 class _StrictLoader(yaml.SafeLoader):
@@ -107,7 +117,7 @@ class _StrictLoader(yaml.SafeLoader):
     _depth = _composed = 0
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        """Refuse too deep nesting before Python's own limit, and too many values early."""
+        """Reject deep nesting before Python's own limit, and too many values early."""
         self._depth += 1
         self._composed += 1
         rule = f"must be nested at most {MOST_NESTED} levels deep"
@@ -121,46 +131,8 @@ class _StrictLoader(yaml.SafeLoader):
         finally:
             self._depth -= 1
 
-    def scan_to_next_token(self) -> None:
-        """Skip tabs too, as YAML 1.2 has it: they separate tokens, and never indent a line."""
-        super().scan_to_next_token()
-        while self.peek() == "\t":
-            mark, ahead = self.get_mark(), 0
-            while self.peek(ahead) in {" ", "\t"}:
-                ahead += 1
-            indents = not self.buffer[self.pointer - self.column : self.pointer].strip()
-            if not self.flow_level:
-                if indents and self.peek(ahead) not in "#\r\n\0":
-                    rule = "a tab must not indent a line, use spaces"
-                    raise yaml.scanner.ScannerError(None, None, rule, mark)
-                self.allow_simple_key &= indents
-            self.forward(ahead)
-            super().scan_to_next_token()
-
-    def scan_plain_spaces(self, indent: int, start_mark: Any) -> Any:
-        """Let tabs separate the words of unquoted text, and end its lines."""
-        start = self.pointer
-        while self.peek() in {" ", "\t"}:
-            self.forward()
-        if self.peek() in "\r\n":
-            return super().scan_plain_spaces(indent, start_mark)
-        return [self.buffer[start : self.pointer]]
-
-    def scan_plain(self) -> yaml.ScalarToken:
-        """Refuse characters in unquoted text that look like a space, and are none to YAML."""
-        start, mark = self.pointer, self.get_mark()
-        token: yaml.ScalarToken = super().scan_plain()
-        if found := _LIKE_A_SPACE.search(self.buffer, start, self.pointer):
-            lines = self.buffer[start : found.start()].split("\n")
-            column = len(lines[-1]) + (mark.column if len(lines) == 1 else 0) + 1
-            mark.line += len(lines) - 1
-            what = f"U+{ord(found[0]):04X} ({unicodedata.name(found[0])})"
-            rule = f"column {column} has {what}: replace it by a space, or quote the text"
-            raise yaml.scanner.ScannerError(None, None, rule, mark)
-        return token
-
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
-        """Construct a value; text that does not fit its tag (`!!int x`) is an error of the file."""
+        """Construct a value; report text that does not fit its tag (`!!int x`) with its line."""
         try:
             return super().construct_object(node, deep=deep)
         except (ValueError, TypeError, LookupError, AttributeError) as error:
@@ -168,7 +140,7 @@ class _StrictLoader(yaml.SafeLoader):
             raise _refusal(f"must be of its type, {tag}: {error}", node) from None
 
     def reject(self, node: yaml.Node) -> Any:
-        """Refuse a value that is neither text, number, truth value, null, list nor mapping."""
+        """Reject a value that is not text, a number, a truth value, null, a list or a mapping."""
         raise _refusal(f"the tag {node.tag!r} is not allowed here", node)
 
 
@@ -204,14 +176,14 @@ def _check_keys(node: yaml.MappingNode) -> None:
 
 
 def _check_values(node: yaml.Node, counts: dict[int, int | None]) -> int:
-    """Number of values in `node`, with those of an alias at each of its uses.
+    """Count the values in `node`; the values of an alias count at each of its uses.
 
-    Before construction, which writes the keys of a `<<` into the mapping that has it.
+    Call it before construction, which copies the keys of a `<<` into its mapping.
 
     Args:
         node: The node; too many values in it are an error.
-        counts: Numbers of the nodes that are counted, by id, None during the count. Each node is
-            visited once: nine nested aliases can stand for a thousand million values.
+        counts: Id of a node to its count; None while it is being counted. Each node is visited
+            once, because nine nested aliases can stand for a thousand million values.
     """
     if id(node) in counts:
         count = counts[id(node)]
@@ -239,7 +211,7 @@ def _refusal(rule: str, node: yaml.Node) -> yaml.YAMLError:
 
 
 def _lines(node: yaml.Node, path: KeyPath) -> Iterator[tuple[KeyPath, int]]:
-    """Paths and lines of all values below `node`."""
+    """Yield paths and lines of all values below `node`."""
     inner: list[tuple[str | int, yaml.Node, yaml.Node]] = []
     if isinstance(node, yaml.MappingNode):
         inner = [(str(key.value), key, value) for key, value in node.value]

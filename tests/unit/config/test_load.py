@@ -209,7 +209,7 @@ def test_a_tasks_own_settings_lie_between_the_stage_and_its_grid(
 def test_options_replace_what_the_file_says(load: Callable[..., SweepConfig]) -> None:
     config = load(SOUND, name="other", storage="elsewhere")
     assert (config.name, config.storage) == ("other", "elsewhere")
-    with pytest.raises(ConfigError, match=r"^--name must be letters, .*got \"a b\"$"):
+    with pytest.raises(ConfigError, match=r"^--name: name must be letters, .*got \"a b\"$"):
         load(SOUND, name="a b")
 
 
@@ -304,7 +304,10 @@ BAD: list[tuple[Document, str]] = [
     (changed(tasks=["FetchPsh"]), "got 'FetchPsh' (did you mean 'FetchPush'?)"),
     (changed(tasks=[]), "tasks must have at least 1 entries, got []"),
     (changed(tasks=["FetchPush", "FetchPush"]), 'tasks[1] must not repeat, got "FetchPush" again'),
-    (changed(tasks=["FetchReach"]), "to be used with MUSIC, got FetchReach, which has none"),
+    (
+        changed(tasks=["FetchReach"], stages=[{"name": "pretrain", "variant": "music-u"}]),
+        "must have agent_indices and surrounding_indices for mus",
+    ),
     (changed(seeds=[0, 0]), "seeds[1] must not repeat, got 0 again"),
     (changed(seeds=[-1]), "seeds[0] must be >= 0, got -1"),
     (changed(seeds=[True]), "seeds[0] must be a whole number, got true"),
@@ -326,8 +329,8 @@ BAD: list[tuple[Document, str]] = [
         "defaults.env_steps must be > tac.random_steps (1000), or",
     ),
     (changed(defaults={"replay": {"capacity": 100}}), "replay.capacity must hold one episode"),
-    (changed(stages=[]), "stages must be a list of at least one stage, got []"),
-    (changed(stages=[1]), "stages[0] must be a mapping, got 1"),
+    (changed(stages=[]), "stages must have at least 1 entries, got []"),
+    (changed(stages=[1]), "stages[0] must be a mapping of keys to values, got 1"),
     (with_stage(0, variant="music-x"), "stages.pretrain.variant must be 'tac', 'music-u'"),
     (with_stage(0, lr=1), "stages.pretrain.lr is not a known setting"),
     (with_stage(0, tac={"entropic_index": 0}), "entropic_index must be > 0, got 0"),

@@ -12,12 +12,10 @@ from typing import Any
 from pydantic import ValidationError
 
 from music_rllib.config.layers import (
-    LAYER_KEYS,
     PlacedPoint,
     all_settings,
     field_by_field,
     for_a_grid,
-    known_settings,
     merge,
 )
 from music_rllib.config.problems import (
@@ -30,7 +28,13 @@ from music_rllib.config.problems import (
     shown,
     unknown,
 )
-from music_rllib.config.run_settings import VARIANTS, RunSettings, Variant, handed_over
+from music_rllib.config.run_settings import (
+    LAYER_KEYS,
+    VARIANTS,
+    RunSettings,
+    Variant,
+    handed_over,
+)
 from music_rllib.config.schema import ImportedHandoff, Point, Source, Stage, StageHeader
 from music_rllib.config.search_check import check_search, of_stage
 from music_rllib.envs.tasks import BUILT_IN_TASKS, Task, closest
@@ -76,7 +80,6 @@ def resolve_stage(
     if header.tasks is not None:
         findings.forbid_repeats(header.tasks, ("tasks",))
         tasks = find_tasks(header.tasks, findings.below("tasks"))
-    tasks = _with_split(tasks, header, findings)
     _check_per_task(header, tasks, findings)
     settings = _StageSettings(
         variant=header.variant,
@@ -137,7 +140,7 @@ class _StageSettings:
             try:
                 runs[task.name] = from_json(RunSettings, data)
             except ValidationError as error:
-                for path, rule in problems_of(error, data, known_settings):
+                for path, rule in problems_of(error, data, RunSettings):
                     # Settings that contradict their variant can't be consistent among themselves.
                     if not (problems and path == ("music",)):
                         origin = layers.origin(path, self.path)
@@ -159,9 +162,9 @@ class _StageSettings:
 
 
 def _header(raw: dict[str, Any], findings: Findings) -> StageHeader | None:
-    known = {*StageHeader.model_fields, *LAYER_KEYS}
-    for key in raw.keys() - known:
-        findings.add((key,), unknown(key, (*known, *all_settings())))
+    known = (*StageHeader.model_fields, *all_settings())
+    for key in raw.keys() - set(known):
+        findings.add((key,), unknown(key, known))
     values = {key: value for key, value in raw.items() if key in StageHeader.model_fields}
     if isinstance(values.get("init_from"), str):
         values["init_from"] = {"stage": values["init_from"]}
@@ -170,23 +173,6 @@ def _header(raw: dict[str, Any], findings: Findings) -> StageHeader | None:
     for dotted, choices in grid.items() if isinstance(grid, dict) else ():
         findings.forbid_repeats(choices, ("grid", dotted))
     return header
-
-
-def _with_split(
-    tasks: tuple[Task, ...], header: StageHeader, findings: Findings
-) -> tuple[Task, ...]:
-    """The tasks that the variant can be used on; the others are problems."""
-    if not VARIANTS[header.variant].uses_mi:
-        return tasks
-    above = () if header.tasks is None else findings.path
-    for task in tasks:
-        if not task.has_split:
-            rule = (
-                "must have agent_indices and surrounding_indices to be used with MUSIC, "
-                f"got {task.name}, which has none"
-            )
-            findings.problems.append(Problem((*above, "tasks"), rule))
-    return tuple(task for task in tasks if task.has_split)
 
 
 def _check_per_task(header: StageHeader, tasks: tuple[Task, ...], findings: Findings) -> None:
