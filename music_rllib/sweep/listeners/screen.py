@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterable
 from typing import Self
 
 from rich.console import Console, Group
@@ -15,15 +16,61 @@ from music_rllib.experiment.listener import Failure, Listener
 from music_rllib.experiment.plan import Node, Plan
 from music_rllib.experiment.scheduler import Scheduler, Status
 from music_rllib.labels import ShortLabels
-from music_rllib.store.history import Report, RunResult
+from music_rllib.store.history import Report, RunResult, last_values
 from music_rllib.sweep.views.text import clock, evaluation_text, measured, new_table, percent
-from music_rllib.training.throughput import Throughput
 
 REFRESH_SECONDS = 0.5
 QUIET_SECONDS = 30.0
 """Without a terminal, a run that has something new has a line at least this often."""
 WIDE = 76
 """Columns of a screen from which on the live table shows all that it can."""
+
+
+class Throughput:
+    """Speed and remaining time of one run, from its reports.
+
+    Args:
+        budget: Environment steps of the run.
+        warm_up: Number of initial steps without learning, which are many times faster than the
+            others and do not count.
+        now: Seconds on any clock.
+    """
+
+    def __init__(self, budget: int, warm_up: int, now: float) -> None:
+        self.budget, self._warm_up, self._updated = budget, warm_up, now
+        self.env_steps = 0
+        self.metrics: dict[str, float] = {}
+        """The last value of each metric."""
+        self._recent: deque[Report] = deque(maxlen=6)
+
+    def add(self, reports: Iterable[Report], now: float) -> None:
+        """Add new reports."""
+        reports = list(reports)
+        for report in reports:
+            if report.env_steps <= self._warm_up:
+                self._recent.clear()
+            self._recent.append(report)
+            self.env_steps = report.env_steps
+        self.metrics |= last_values(reports)
+        self._updated = now
+
+    @property
+    def steps_per_second(self) -> float | None:
+        """Speed over the last few reports; None before the first one after the warm-up."""
+        if self.env_steps <= self._warm_up:
+            return None
+        first, last = self._recent[0], self._recent[-1]
+        steps, seconds = last.env_steps - first.env_steps, last.seconds - first.seconds
+        if len(self._recent) == 1:  # since the start
+            steps, seconds = last.env_steps, last.seconds
+        return steps / seconds if seconds > 0 else None
+
+    def seconds_left(self, now: float) -> float | None:
+        """Estimated remaining time; None if the speed is not known yet."""
+        rate = self.steps_per_second
+        if rate is None:
+            return None
+        return max((self.budget - self.env_steps) / rate - (now - self._updated), 0.0)
 
 
 class Display(Listener):
@@ -85,7 +132,7 @@ class Display(Listener):
 
     def reported(self, node: Node, reports: list[Report]) -> None:
         _, throughput = self._running.setdefault(node.key, (node, self._new_throughput(node)))
-        throughput.hear(reports, self._now())
+        throughput.add(reports, self._now())
         if self._console.is_terminal or throughput.env_steps >= node.run.env_steps:
             return  # the table shows it, or the line of `finished` will
         evaluated = any(names.EVAL_EPISODES in report.metrics for report in reports)

@@ -21,11 +21,10 @@ from music_rllib.report.figures.palette import colour_of
 from music_rllib.schedules import Linear, Piecewise
 from music_rllib.store.history import Report, RunResult
 from music_rllib.store.storage import resolve_storage, sweep_folder
-from music_rllib.sweep.listeners.screen import Display
+from music_rllib.sweep.listeners.screen import Display, Throughput
 from music_rllib.sweep.views.plan import adaptive_rows, adaptive_text, alpha_rows, plan_view
 from music_rllib.sweep.views.results import results_table
 from music_rllib.sweep.views.text import clock, percent
-from music_rllib.training.throughput import Throughput
 
 DOCUMENT: dict[str, Any] = {
     "name": "s",
@@ -325,9 +324,9 @@ def test_pace_is_that_of_the_last_reports() -> None:
     throughput = Throughput(10_000, warm_up=0, now=0.0)
     assert throughput.steps_per_second is None
     assert throughput.seconds_left(5.0) is None
-    throughput.hear([report(1000, 20.0)], now=20.0)
+    throughput.add([report(1000, 20.0)], now=20.0)
     assert throughput.steps_per_second == pytest.approx(50)
-    throughput.hear([report(1000 + 1000 * i, 20.0 + 10 * i) for i in range(1, 7)], now=80.0)
+    throughput.add([report(1000 + 1000 * i, 20.0 + 10 * i) for i in range(1, 7)], now=80.0)
     assert throughput.steps_per_second == pytest.approx(100)
     assert throughput.env_steps == 7000
     assert throughput.seconds_left(80.0) == pytest.approx(30)
@@ -337,9 +336,9 @@ def test_pace_is_that_of_the_last_reports() -> None:
 
 def test_random_steps_say_nothing_about_the_pace_of_learning() -> None:
     throughput = Throughput(3000, warm_up=1000, now=0.0)
-    throughput.hear([report(500, 0.5), report(1000, 1.0)], now=1.0)
+    throughput.add([report(500, 0.5), report(1000, 1.0)], now=1.0)
     assert throughput.steps_per_second is None
-    throughput.hear([report(1500, 11.0)], now=11.0)
+    throughput.add([report(1500, 11.0)], now=11.0)
     assert throughput.steps_per_second == pytest.approx(50)
     assert throughput.seconds_left(11.0) == pytest.approx(30)
 
