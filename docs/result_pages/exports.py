@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+from music_rllib import names
 from music_rllib.config.load import load_sweep
 from music_rllib.config.schema import SweepConfig
-from music_rllib.experiment.plan import make_plan
-from music_rllib.results.archive import is_archive, of_plan, read_archive
+from music_rllib.experiment.plan import Node, Plan, make_plan
+from music_rllib.results.archive import (
+    best_records,
+    history_of,
+    is_archive,
+    plan_versions,
+    read_archive,
+)
 from music_rllib.results.data import Sweep
 from music_rllib.version import ALGORITHM_VERSION
 
@@ -69,3 +78,54 @@ def hours_text(name: str) -> str:
     """Wall time of a sweep's runs, summed, in hours."""
     sweep = sweep_called(name)
     return f"{sum(run.seconds or 0.0 for run in sweep.runs) / 3600:.1f}" if sweep else "0"
+
+
+def of_plan(plan: Plan, exports: Iterable[Sweep], *earlier: Plan) -> Sweep | None:
+    """The runs of a plan that any export has, whichever sweep trained them.
+
+    A run belongs to the node of the plan that has its key: the same settings, seed and source. It
+    gets the plan's name for it, and the plan's order. The fields of the sweep come from the last
+    export that has a run.
+
+    Args:
+        plan: The plan.
+        exports: The exports to search.
+        earlier: The same plan under earlier versions of the algorithm, for runs that have not been
+            trained since. The source of a run has the version that the run started from.
+
+    Returns:
+        None if no export has any of the runs.
+    """
+    exports = list(exports)
+    best = best_records(exports)
+    versions = (plan, *earlier)
+    found: list[tuple[Plan, Node]] = []
+    sources: set[str | None] = set()
+    # A run has the same position in each plan, after its source.
+    for nodes in reversed(list(zip(*(version.nodes for version in versions), strict=True))):
+        known = [pair for pair in zip(versions, nodes, strict=True) if pair[1].key in best]
+        if known:
+            found.append(min(known, key=lambda pair: pair[1].key not in sources))
+            sources.add(found[-1][1].source_key)
+    runs, places = [], []
+    for version, node in reversed(found):
+        sweep, position = best[node.key]
+        places.append((sweep, position))
+        run = sweep.runs[position]
+        own = {
+            names.TAG_SWEEP: plan.name,
+            names.TAG_STAGE: node.stage,
+            names.TAG_ALGORITHM: version.algorithm,
+            names.TAG_TRIAL: str(node.trial),
+        }
+        runs.append(replace(run, name=node.label, tags={**run.tags, **own}))
+    if not runs:
+        return None
+    return replace(
+        places[-1][0],
+        name=plan.name,
+        runs=runs,
+        history=history_of(places),
+        searches=(),
+        plans=plan_versions(sweep for sweep in exports if sweep.name == plan.name),
+    )

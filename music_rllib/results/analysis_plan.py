@@ -1,14 +1,12 @@
 """Analysis plans: a question and how it will be decided, recorded before the runs.
 
-Every version is kept with the time at which it was recorded, so that a report can tell planned
-comparisons from later ones: a plan that was recorded after the first of its runs had finished does
-not count. The hash is that of the plan alone: the same section of a sweep's file has the same hash
-on every machine, and can be cited, or committed, before anything runs.
+Every version is kept in `analysis_plan.json` with the time at which it was recorded, so that a
+report can tell planned comparisons from others: a plan that was recorded after the first of its
+runs had finished does not count. `analysis_plan.md` has the same content for readers. The hash is
+that of the plan alone: the same `analysis` section has the same hash on every machine, and can be
+cited or committed before anything runs.
 
-
-Record of a sweep's analysis plan in its folder: made before any run, each change a version.
-
-`analysis_plan.json` holds the versions, `analysis_plan.md` is the same for readers.
+Texts of a plan are part of its hash, so existing ones must not change.
 """
 
 from __future__ import annotations
@@ -47,7 +45,7 @@ _TEST = (
 MOST_VERSIONS = 1000
 
 Line = Annotated[str, Field(max_length=100_000, pattern=r"^[^\x00-\x1f\x7f]*$")]
-"""A plan may come from strangers: without control characters, which a terminal would obey."""
+"""Plans may come from strangers: text without control characters, which a terminal would obey."""
 
 
 class _Strict(BaseModel):
@@ -55,19 +53,19 @@ class _Strict(BaseModel):
 
 
 class AnalysisPlan(_Strict):
-    """A question, and everything that decides it."""
+    """A question, and everything needed to decide it."""
 
     question: Line | None
     hypotheses: tuple[Line, ...] = Field(min_length=1, max_length=50, strict=False)
     stage: Line
-    """Stage of the conditions, where a hypothesis names no other."""
+    """Stage of the conditions, unless a hypothesis names another one."""
     metric: Literal["auc", "final"]
     primary_metric: Line
     """`metric` in words."""
     margin: float | None = Field(gt=0)
     seeds: Line
     control: Line
-    """What is done for different q to be compared fairly."""
+    """What is held equal so that different q can be compared."""
     budget: dict[Line, int]
     """Environment steps over which runs are compared, by task."""
     test: Line
@@ -85,7 +83,7 @@ class AnalysisPlan(_Strict):
 
     @property
     def seed_count(self) -> int:
-        """Number of seeds of each condition; 0 where stages differ in theirs."""
+        """Number of seeds of each condition; 0 if stages have different seeds."""
         fresh = re.match(r"(\d+) fresh ones; [^;:]*$", self.seeds)
         if fresh is not None:
             return int(fresh[1])
@@ -97,7 +95,7 @@ class AnalysisPlan(_Strict):
         return content_key(self.model_dump(mode="json"))
 
     def is_part_of(self, other: AnalysisPlan) -> bool:
-        """Whether this is `other`, or the same for some of its seeds, as of one sitting."""
+        """Whether this is `other`, possibly for a subset of its seeds."""
         own, others = (set(plan.seeds.split(", ")) for plan in (self, other))
         return own <= others and self == other.model_copy(update={"seeds": self.seeds})
 
@@ -108,7 +106,7 @@ def _stages_of(hypotheses: Sequence[str], default: str) -> frozenset[str]:
 
 
 class PlanVersion(_Strict):
-    """A plan as it was recorded at one time."""
+    """A recorded version of a plan."""
 
     version: int = Field(ge=1)
     recorded_ms: int = Field(ge=0, lt=2**47)
@@ -132,10 +130,10 @@ _VERSIONS = TypeAdapter(tuple[PlanVersion, ...])
 
 
 def checked_plans(document: Any) -> tuple[PlanVersion, ...]:
-    """Versions from plain data that may come from strangers, in the order of their times.
+    """Validate versions from plain data that may come from strangers, and sort them by time.
 
     Raises:
-        ValueError: the data are something else, or a plan is not what was recorded.
+        ValueError: The data are malformed, or a plan does not have its recorded hash.
     """
     if not isinstance(document, list) or len(document) > MOST_VERSIONS:
         raise ValueError(f"must be a list of at most {MOST_VERSIONS} versions of a plan")
@@ -151,7 +149,7 @@ def as_document(versions: Sequence[PlanVersion]) -> list[dict[str, Any]]:
 def with_plan(
     versions: Sequence[PlanVersion], plan: AnalysisPlan, now_ms: int
 ) -> tuple[PlanVersion, ...]:
-    """`versions`, and `plan` as a new version unless the last version has it."""
+    """Append `plan` to `versions` as a new version, unless the last version has it."""
     if versions and versions[-1].hash == plan.hash:
         return tuple(versions)
     new = PlanVersion(version=len(versions) + 1, recorded_ms=now_ms, hash=plan.hash, plan=plan)
@@ -159,7 +157,7 @@ def with_plan(
 
 
 def as_markdown(name: str, versions: Sequence[PlanVersion]) -> str:
-    """The versions for readers, the newest first."""
+    """The versions as Markdown, the newest first."""
     parts = [f"# Analysis plan of {name}\n"]
     for one in reversed(versions):
         content = one.plan.model_dump(mode="json", exclude_none=True)
@@ -171,11 +169,11 @@ def as_markdown(name: str, versions: Sequence[PlanVersion]) -> str:
     return "\n".join(parts)
 
 
-# From a sweep's file ------------------------------------------------------------------------------
+# From the configuration ---------------------------------------------------------------------------
 
 
 def analysis_plan(config: SweepConfig) -> AnalysisPlan | None:
-    """The plan of a sweep's `analysis`; None where it has none."""
+    """The plan of a sweep's `analysis` section; None without one."""
     analysis = config.analysis
     if analysis is None:
         return None
@@ -201,7 +199,7 @@ def analysis_plan(config: SweepConfig) -> AnalysisPlan | None:
 
 
 def _of_each(texts: Mapping[str, str]) -> str:
-    """The text of each stage, or one text where all stages have the same."""
+    """The text of each stage, or one text if all stages have the same."""
     if len(set(texts.values())) == 1:
         return next(iter(texts.values()))
     return "; ".join(f"{name}: {text}" for name, text in texts.items())
@@ -232,12 +230,12 @@ def _control(stage: Stage) -> str:
 
 
 def is_controlled(alpha: str) -> bool:
-    """Whether α, in words, adapts so that policies of different q may be compared."""
+    """Whether α, in words, adapts so that policies of different q can be compared."""
     return any(word in alpha for word in ("matched", "learned", "normalised"))
 
 
 def _budget(stages: Sequence[Stage]) -> dict[str, int]:
-    """Least budget of a task in any stage; of a search that of its runs on fresh seeds."""
+    """Smallest budget of each task in any stage; in a search, of its runs on fresh seeds."""
     budget: dict[str, int] = {}
     for stage in stages:
         final = stage.search.final if stage.search else None
@@ -252,10 +250,10 @@ PLANS_TO_READ = "analysis_plan.md"
 
 
 def plans_in(storage: str, name: str) -> tuple[PlanVersion, ...]:
-    """Versions of a sweep's plan, the oldest first; empty where none was recorded.
+    """Versions of a sweep's plan, the oldest first; empty if none was recorded.
 
     Raises:
-        StorageError: The versions can't be read, or are not what was recorded.
+        StorageError: The versions can't be read or are malformed.
     """
     document = read(storage, f"{name}/{ANALYSIS_PLAN}")
     try:
@@ -269,10 +267,13 @@ def plans_in(storage: str, name: str) -> tuple[PlanVersion, ...]:
 
 
 def record_plan(sweep: OpenSweep) -> Sequence[PlanVersion]:
-    """Keep the plan of the sweep's file, as a new version where it changed; return all versions.
+    """Record the plan of a sweep's configuration as a new version if it changed.
+
+    Returns:
+        All versions.
 
     Raises:
-        StorageError: The plan can't be kept, or earlier versions can't be read.
+        StorageError: The plan can't be written, or earlier versions can't be read.
     """
     before = plans_in(sweep.storage, sweep.config.name)
     plan = analysis_plan(sweep.config)

@@ -30,10 +30,8 @@ import numpy as np
 import pyarrow as pa
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from music_rllib import names
 from music_rllib.config.problems import shown
 from music_rllib.errors import first_line
-from music_rllib.experiment.plan import Node, Plan
 from music_rllib.limits import MOST_JSON_BYTES, MOST_YAML_BYTES, read_json, read_regular
 from music_rllib.results.analysis_plan import PlanVersion, as_document, checked_plans
 from music_rllib.results.archive_tables import read_table, write_table
@@ -253,7 +251,7 @@ def _history(table: pa.Table, runs: int) -> dict[str, Column]:
 
 # Merging ------------------------------------------------------------------------------------------
 
-_Place = tuple[Sweep, int]
+Place = tuple[Sweep, int]
 """An export, and the position of a run in it."""
 
 
@@ -264,68 +262,17 @@ def merged(earlier: Sweep, later: Sweep) -> Sweep:
     numbers. Of two records of a run, a finished one is kept, else the later one. The fields of the
     sweep come from `later`, and the searches from the last export that has any.
     """
-    places = list(_best([earlier, later]).values())
+    places = list(best_records([earlier, later]).values())
     return replace(
         later,
         runs=[sweep.runs[position] for sweep, position in places],
-        history=_history_of(places),
+        history=history_of(places),
         searches=later.searches or earlier.searches,
-        plans=_plans([earlier, later]),
+        plans=plan_versions([earlier, later]),
     )
 
 
-def of_plan(plan: Plan, exports: Iterable[Sweep], *earlier: Plan) -> Sweep | None:
-    """The runs of a plan that any export has, whichever sweep trained them.
-
-    A run belongs to the node of the plan that has its key: the same settings, seed and source. It
-    gets the plan's name for it, and the plan's order. The fields of the sweep come from the last
-    export that has a run.
-
-    Args:
-        plan: The plan.
-        exports: The exports to search.
-        earlier: The same plan under earlier versions of the algorithm, for runs that have not been
-            trained since. The source of a run has the version that the run started from.
-
-    Returns:
-        None if no export has any of the runs.
-    """
-    exports = list(exports)
-    best = _best(exports)
-    versions = (plan, *earlier)
-    found: list[tuple[Plan, Node]] = []
-    sources: set[str | None] = set()
-    # A run has the same position in each plan, after its source.
-    for nodes in reversed(list(zip(*(version.nodes for version in versions), strict=True))):
-        known = [pair for pair in zip(versions, nodes, strict=True) if pair[1].key in best]
-        if known:
-            found.append(min(known, key=lambda pair: pair[1].key not in sources))
-            sources.add(found[-1][1].source_key)
-    runs, places = [], []
-    for version, node in reversed(found):
-        sweep, position = best[node.key]
-        places.append((sweep, position))
-        run = sweep.runs[position]
-        own = {
-            names.TAG_SWEEP: plan.name,
-            names.TAG_STAGE: node.stage,
-            names.TAG_ALGORITHM: version.algorithm,
-            names.TAG_TRIAL: str(node.trial),
-        }
-        runs.append(replace(run, name=node.label, tags={**run.tags, **own}))
-    if not runs:
-        return None
-    return replace(
-        places[-1][0],
-        name=plan.name,
-        runs=runs,
-        history=_history_of(places),
-        searches=(),
-        plans=_plans(sweep for sweep in exports if sweep.name == plan.name),
-    )
-
-
-def _plans(sweeps: Iterable[Sweep]) -> tuple[PlanVersion, ...]:
+def plan_versions(sweeps: Iterable[Sweep]) -> tuple[PlanVersion, ...]:
     """Each version of a plan once, without later ones for a subset of the seeds."""
     kept: list[PlanVersion] = []
     versions = (version for sweep in sweeps for version in sweep.plans)
@@ -335,9 +282,9 @@ def _plans(sweeps: Iterable[Sweep]) -> tuple[PlanVersion, ...]:
     return tuple(kept)
 
 
-def _best(sweeps: Iterable[Sweep]) -> dict[str, _Place]:
+def best_records(sweeps: Iterable[Sweep]) -> dict[str, Place]:
     """The last finished run of each node key, else the last one, in order of first appearance."""
-    best: dict[str, _Place] = {}
+    best: dict[str, Place] = {}
     for sweep in sweeps:
         for position, run in enumerate(sweep.runs):
             other, at = best.get(run.node_key, (sweep, position))
@@ -346,7 +293,7 @@ def _best(sweeps: Iterable[Sweep]) -> dict[str, _Place]:
     return best
 
 
-def _history_of(places: Sequence[_Place]) -> History:
+def history_of(places: Sequence[Place]) -> History:
     """Metrics of the runs at `places`, numbered in that order."""
     parts: defaultdict[str, list[Column]] = defaultdict(list)
     for number, (sweep, position) in enumerate(places):

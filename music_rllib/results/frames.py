@@ -1,4 +1,4 @@
-"""A sweep as pandas frames, with the same columns from a storage or an export."""
+"""Load a sweep as pandas frames, with the same columns from a storage and from an export."""
 
 from __future__ import annotations
 
@@ -55,36 +55,36 @@ _CONDITION_COLUMNS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Frames:
-    """The frames of one sweep; docs/reports.md describes the columns."""
+    """Frames of one sweep; docs/reports.md describes the columns."""
 
     name: str
     runs: pd.DataFrame = field(repr=False)
-    """A row for each run, by its `key`: its names, its settings, its last values."""
+    """One row per run, indexed by `key`: names, settings, last values."""
     curves: pd.DataFrame = field(repr=False)
-    """A row for each value of a metric: `key`, `metric`, `env_steps`, `value`, `time`."""
+    """One row per value of a metric: `key`, `metric`, `env_steps`, `value`, `time`."""
     conditions: pd.DataFrame = field(repr=False)
-    """A row for each condition on each task: the mean of its seeds with its 95 % interval."""
+    """One row per condition and task: the mean over the seeds with its 95% CI."""
     earlier: str | None = None
-    """A sentence about runs of earlier versions of the sweep, which the frames do not have."""
+    """A sentence about runs of earlier versions of the sweep, which are not in the frames."""
 
 
 def load_sweep(place: str | Path, *, storage: str | None = None) -> Frames:
-    """Runs, curves and conditions of a sweep, as pandas frames.
+    """Load the runs, curves and conditions of a sweep as pandas frames.
 
     Args:
-        place: a sweep's folder in a storage (`results/my_sweep`, `s3://bucket/sweeps/my_sweep`), a
+        place: A sweep's folder in a storage (`results/my_sweep`, `s3://bucket/sweeps/my_sweep`), a
             folder that `report --export` wrote, or a sweep's name.
-        storage: storage of a sweep that is given by its name; None for `results`.
+        storage: Storage of a sweep that is given by its name; None: `results`.
 
     Raises:
-        BadInputError: there is no such sweep, or the folder holds something else.
-        StorageError: the storage can't be read, or finished runs in it are damaged.
+        BadInputError: There is no such sweep, or the folder holds something else.
+        StorageError: The storage can't be read, or finished runs in it are damaged.
     """
     return frames_of(read_sweep(str(place), storage).sweep)
 
 
 def frames_of(sweep: Sweep) -> Frames:
-    """The frames of a sweep that has been read with all its metrics."""
+    """Frames of a sweep that was read with all its metrics."""
     keys = [run.node_key or run.run_id for run in sweep.runs]
     return Frames(
         name=sweep.name,
@@ -125,7 +125,7 @@ def _runs(sweep: Sweep, keys: list[str]) -> pd.DataFrame:
             }
         )
     frame = _frame(rows, _RUN_COLUMNS)
-    # Some params have a column of their own already.
+    # These params already have a column.
     params = {name for run in sweep.runs for name in run.params} - {"env_steps", "seed", "variant"}
     settings = {
         name: _typed([run.params.get(name) for run in sweep.runs]) for name in sorted(params)
@@ -135,7 +135,7 @@ def _runs(sweep: Sweep, keys: list[str]) -> pd.DataFrame:
 
 
 def _typed(texts: list[str | None]) -> Any:
-    """A column of numbers where all texts are numbers, else of texts."""
+    """A column of numbers if all texts are numbers, else of texts."""
     try:
         return pd.to_numeric(pd.Series(texts))
     except ValueError:
@@ -179,7 +179,7 @@ def _conditions(sweep: Sweep) -> Iterator[dict[str, Any]]:
 
 
 def _frame(rows: Any, columns: dict[str, str]) -> pd.DataFrame:
-    """A frame with these columns and types, whatever the rows hold, even without rows."""
+    """A frame with these columns and types, even without rows."""
     frame = pd.DataFrame(rows, columns=list(columns))
     for name, kind in columns.items():
         column = frame[name]

@@ -5,11 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
+from docs.result_pages.exports import of_plan
 from music_rllib import names
 from music_rllib.config.load import load_sweep
 from music_rllib.experiment.plan import make_plan
 from music_rllib.results.analysis_plan import AnalysisPlan, with_plan
-from music_rllib.results.archive import merged, of_plan
+from music_rllib.results.archive import merged
 from music_rllib.results.data import Points, RunRecord, Sweep, columns
 from music_rllib.version import ALGORITHM_VERSION
 
