@@ -1,1 +1,1 @@
-"""Pure maths: Tsallis entropies, the policy's density, TAC's losses, MUSIC's bound."""
+"""Pure mathematics: the policy's density and Tsallis entropy, TAC's losses, MUSIC's bound."""

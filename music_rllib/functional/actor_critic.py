@@ -21,9 +21,9 @@ def critic_target(
 
     Args:
         reward: [B]
-        discount: [B] 0 where the episode terminated, else 1 (truncation is not termination).
+        discount: [B] 0 if the episode terminated, 1 otherwise (truncation is not termination).
         next_value: [B] the target network's value of the next state.
-        bounds: the range that returns can have; targets are clipped to it.
+        bounds: range of possible returns, to which targets are clipped.
     """
     target = (reward + gamma * discount * next_value).detach()
     return target if bounds is None else target.clamp(*bounds)
@@ -59,15 +59,15 @@ def value_loss(value: Tensor, target: Tensor) -> Tensor:
 
 
 def policy_value(q_of_policy: Tensor, policy_critic: str) -> Tensor:
-    """[C, B] -> [B]: the critic that the policy improves on, `first` or `min`."""
+    """[C, B] -> [B]: the critic that the policy improves on: the `first` one, or their `min`."""
     return q_of_policy[0] if policy_critic == "first" else q_of_policy.amin(0)
 
 
 def policy_loss(value_of_policy: Tensor, ln_q_pi: Tensor, alpha: Tensor | float) -> Tensor:
-    """Paper eq. 10: E[alpha ln_q pi(a|s) - Q(s, a)], a reparameterised. Both inputs [B]."""
+    """Paper eq. 10: E[alpha ln_q pi(a|s) - Q(s, a)], a reparameterized. Both inputs [B]."""
     return (alpha * ln_q_pi - value_of_policy).mean()
 
 
 def alpha_loss(log_alpha: Tensor, excess_entropy: Tensor) -> Tensor:
-    """Drives S_q to its target by the excess entropy [] (Haarnoja et al. 2018b, eq. 18)."""
+    """Moves S_q to its target by the excess entropy [] (Haarnoja et al. 2018b, eq. 18)."""
     return log_alpha * excess_entropy

@@ -1,4 +1,4 @@
-"""Donsker-Varadhan bound on mutual information, and the time shuffles that MUSIC feeds it.
+"""Donsker-Varadhan bound on mutual information, and MUSIC's time shuffles.
 
 Shape legend: N trajectories, T frames in time, D features of one half of the state.
 Source: paper III-A; Zhao et al. 2021, "Mutual Information State Intrinsic Control".
@@ -19,11 +19,11 @@ def donsker_varadhan(joint: Tensor, marginals: Tensor, inside: Tensor | None = N
     Args:
         joint: [N, T] statistics of pairs that occurred together.
         marginals: [N, T] statistics of pairs from the product of marginals.
-        inside: [N, T] False for padding behind a trajectory that ends early; None: no padding.
+        inside: [N, T] False for padding after the end of a trajectory; None: no padding.
 
     Returns:
-        [N] bounds; unchanged when a constant is added to the statistic. The mean over few
-        frames of exp T makes a single bound noisy and, in expectation, slightly too high.
+        [N] bounds; adding a constant to the statistic does not change them. With few frames, a
+        single bound is noisy and on average slightly too high.
     """
     if inside is None:
         log_mean_exp = torch.logsumexp(marginals, dim=-1) - math.log(marginals.shape[-1])
@@ -45,9 +45,9 @@ def time_permutations(
     """Random permutations of time, [N, T] integers.
 
     Args:
-        generator: source of randomness; its device is the result's.
-        draws: number of permutations, each of which an equal share of neighbouring trajectories
-            has (`of_draw`). None: one for each trajectory.
+        generator: source of randomness, on the device of the result.
+        draws: number of permutations, each for an equal share of neighboring trajectories
+            (`of_draw`). None: one for each trajectory.
         inside: [N, T] False for padding, which keeps its place: only a trajectory's own frames are
             permuted. None: no padding.
     """
@@ -67,7 +67,7 @@ def of_draw(drawn: Tensor, rows: int) -> Tensor:
 
 
 def _order(keys: Tensor) -> Tensor:
-    """Positions of each row's keys in rising order; NumPy takes a quarter of PyTorch's time."""
+    """Positions of each row's keys in rising order; NumPy needs a quarter of PyTorch's time."""
     if keys.device.type == "cpu":
         return torch.from_numpy(np.argsort(keys.numpy(), axis=-1))
     return keys.argsort(dim=-1)

@@ -1,1 +1,1 @@
-"""MUSIC's mutual-information estimator: network, loss and intrinsic reward (pure torch)."""
+"""Intrinsic rewards: their interface, and MUSIC's with its mutual-information estimator."""

@@ -1,7 +1,7 @@
 """MUSIC's statistics network and the bounds computed from it (paper III-A, Fig. 1-2).
 
 Shape legend: N trajectories, T frames, B transitions, D observation, X / Y features of the agent's
-and the surrounding state. States are raw observations, as in the original, unless they lie far
+and the surrounding state. States are raw observations, as in the original, unless they are far
 from 0.
 """
 
@@ -18,19 +18,19 @@ from music_rllib.kernels.adam import FlatParameters, FusedAdam
 from music_rllib.kernels.mutual_information import Data, Weights, bounds, learn
 
 FAR = 10.0
-"""Mean or standard deviation of an input above which a fresh network's tanh saturates: every
-statistic is then 1 or every one -1, and the bound stays 0. Fetch's are below 2."""
+"""Mean or standard deviation of an input above which a new network's tanh saturates: all statistics
+are then 1 or all are -1, and the bound stays 0. Fetch's inputs are below 2."""
 
 
 class MutualInformationEstimator(nn.Module):
     """T(x, y) = tanh(w . relu(Wx x + Wy y + b) + c).
 
-    tanh keeps T in [-1, 1] and thereby the bound below 2 nats. Inputs that lie far from 0 are
-    shifted and scaled first (`adapt_to`), which leaves the information between them as it is.
+    tanh keeps T in [-1, 1] and thus the bound below 2 nats. Inputs that are far from 0 are shifted
+    and scaled first (`adapt_to`), which does not change the information between them.
 
     Args:
-        agent_indices: the X entries of an observation that are the agent's state.
-        surrounding_indices: the Y entries that are the surrounding state.
+        agent_indices: X positions of the agent's state in an observation.
+        surrounding_indices: Y positions of the surrounding state.
         hidden_size: hidden units.
     """
 
@@ -41,7 +41,7 @@ class MutualInformationEstimator(nn.Module):
     scale: Tensor
     """[X + Y] factor on the shifted inputs; 1 for raw inputs."""
     compiled = True
-    """Whether compiled code computes bounds on a CPU that need no gradient."""
+    """Whether compiled code computes bounds without gradient on a CPU."""
 
     def __init__(
         self,
@@ -67,7 +67,7 @@ class MutualInformationEstimator(nn.Module):
         self.register_load_state_dict_post_hook(hook)  # type: ignore[no-untyped-call]
 
     def _update_raw(self, *_: object) -> None:
-        """Caches whether inputs are raw: each update asks, and reading it waits for the device."""
+        """Cache whether inputs are raw: each update asks, and reading waits for the device."""
         self._raw = not bool(self.offset.any() or (self.scale != 1.0).any())
 
     def _halves(self, observations: Tensor) -> tuple[Tensor, Tensor]:
@@ -79,7 +79,7 @@ class MutualInformationEstimator(nn.Module):
 
     @torch.no_grad()
     def adapt_to(self, observations: Tensor) -> None:
-        """Sets offset and scale by [..., D] observations like those of the first training."""
+        """Set offset and scale by [..., D] observations, those of the first updates."""
         inputs = torch.cat(self._halves(observations), -1).flatten(0, -2).double()
         mean, std = inputs.mean(0), inputs.std(0, correction=0)
         self.offset.copy_(torch.where(mean.abs() > FAR, mean, 0.0))
@@ -109,7 +109,7 @@ class MutualInformationEstimator(nn.Module):
         Args:
             observations: [N, T, D]
             permutations: [N, T] of time, for the product of the marginals.
-            inside: [N, T] False for padding behind shorter trajectories; None: no padding.
+            inside: [N, T] False for padding after the end of trajectories; None: no padding.
         """
         if self.compiled and observations.device.type == "cpu" and not torch.is_grad_enabled():
             data = self.data(observations, permutations, inside)
@@ -124,24 +124,24 @@ class MutualInformationEstimator(nn.Module):
     ) -> Tensor:
         """Bounds on transitions from states [B, D] to `followers` [B, D]: [B] nats.
 
-        Each is of the two-frame trajectory, shuffled in time as in `two_frames`.
+        Each transition is a trajectory of two frames, shuffled in time by `two_frames`.
         """
         frames = self.pairs(states, followers)
         return self.bound(frames, two_frames(len(frames), tuple(swapped), frames.device))
 
     def pairs(self, states: Tensor, followers: Tensor) -> Tensor:
-        """[..., B, D] states and followers -> [..., B, 2, d] what is read of them, side by side."""
+        """[..., B, D] states and next states -> [..., B, 2, d] the columns that are used."""
         return torch.stack([each[..., : self._width] for each in (states, followers)], dim=-2)
 
     def learn(
         self, pairs: Data, trajectories: Data, optimizer: FusedAdam, updates: int
     ) -> tuple[Tensor, Tensor]:
-        """Trains on a CPU by compiled code; each of the K updates ascends the mean bound.
+        """Train on a CPU by compiled code; each of the K updates increases the mean bound.
 
         Args:
-            pairs: [K*B] pairs of frames, whose bounds are taken before their update.
-            trajectories: [K*N] the training data.
-            optimizer: of this module's parameters.
+            pairs: [K*B] pairs of frames, whose bounds are computed before their update.
+            trajectories: [K*N] training data.
+            optimizer: Adam of this module's parameters.
             updates: K.
 
         Returns:
@@ -158,7 +158,7 @@ class MutualInformationEstimator(nn.Module):
         return torch.from_numpy(of_pairs), torch.from_numpy(means)
 
     def data(self, observations: Tensor, permutations: Tensor, inside: Tensor | None) -> Data:
-        """The arguments of `bound` in the form that compiled code takes."""
+        """The arguments of `bound` as compiled code takes them."""
         agent, surrounding = self._scaled(*self._halves(observations))
         frames = np.full(*agent.shape[:2]) if inside is None else inside.sum(-1).numpy()
         tensors = (agent, surrounding, permutations)
@@ -166,12 +166,11 @@ class MutualInformationEstimator(nn.Module):
 
 
 def two_frames(rows: int, swapped: tuple[bool, ...], device: torch.device) -> Tensor:
-    """[B, 2] permutations of two frames, by draws that hold for equal shares of the rows.
+    """[B, 2] permutations of two frames; each draw is for an equal share of the rows.
 
     True pairs each frame with the surroundings of the other one; False is the identity, whose bound
     is <= 0.
     """
-    # Not copied from the CPU, which a captured update may not do.
     times = torch.arange(2, device=device)
     kinds = times.flip(0), times
     if len(swapped) == 1:

@@ -20,8 +20,8 @@ from music_rllib.replay.trajectories import Trajectory
 class IntrinsicReward(Protocol):
     """Relabels minibatches, learns from trajectories, and measures fresh episodes.
 
-    Its networks belong to a module of the Learner. Every random number comes from the generator
-    that is passed in, so that a resumed run draws the same ones.
+    Its networks belong to a module of the Learner. All random numbers come from the generator that
+    is passed in, so that a resumed run draws the same ones.
     """
 
     @property
@@ -30,59 +30,52 @@ class IntrinsicReward(Protocol):
 
     @property
     def learning_rate(self) -> float | None:
-        """Learning rate of its networks; None where they are not trained."""
+        """Learning rate of its networks; None if they are not trained."""
 
     def draw(
-        self,
-        updates: int,
-        transitions: int,
-        trajectories: dict[str, Tensor] | None,
-        generator: torch.Generator,
-        *,
-        first: bool,
-    ) -> Sequence[Hashable]:
-        """Draws the random numbers of K updates, one value each, for `reward`.
+        self, updates: int, transitions: int, trajectories: dict[str, Tensor] | None,
+        generator: torch.Generator, *, first: bool,
+    ) -> Sequence[Hashable]:  # fmt: skip
+        """Draw the random numbers of K updates, one value each, for `reward`.
 
-        Updates with the same value are relabeled together, so there should be few values.
+        Updates with equal values are relabeled together, so there should be few values.
 
         Args:
             updates: K.
             transitions: K*B.
-            trajectories: [K*N, T, D] the training data, to which columns may be added; None where
-                nothing is trained.
+            trajectories: [K*N, T, D] training data, to which columns may be added; None if nothing
+                is trained.
             generator: the Learner's.
             first: whether these are the run's first updates.
         """
 
     def reward(self, states: Tensor, followers: Tensor, drawn: Hashable) -> Tensor:
-        """[B, D] states and the next ones -> [B]."""
+        """[B, D] states and next states -> [B]."""
 
     def total(self, task: Tensor, intrinsic: Tensor, weight: float) -> Tensor:
-        """[B] the task's reward and the intrinsic one -> [B] the reward of the critics' targets."""
+        """[B] task reward and intrinsic reward -> [B] reward in the critics' targets."""
 
     def loss(self, trajectories: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
-        """[N, T, D] -> [] the loss of its networks, and metrics by name."""
+        """[N, T, D] -> [] loss of its networks, and metrics by name."""
 
     def learn(
         self, states: Tensor, followers: Tensor, drawn: Sequence[Hashable],
         trajectories: Mapping[str, Tensor], optimizer: FusedAdam,
     ) -> tuple[Tensor, dict[str, Tensor]]:  # fmt: skip
-        """Updates its networks K times on a CPU, without autograd where it can.
+        """Update its networks K times on a CPU, without autograd if possible.
 
-        Takes states and followers [K, B, D], the K values of `draw`, and trajectories [K*N, T, D].
-        Returns [K, B] rewards, each minibatch's before its update, and metrics by name, [K] each.
+        Takes states and next states [K, B, D], the K values of `draw`, and trajectories
+        [K*N, T, D]. Returns [K, B] rewards, each minibatch's before its update, and metrics by
+        name, [K] each.
         """
 
     def observe(
-        self,
-        episodes: Sequence[Trajectory],
-        states: Tensor,
-        followers: Tensor,
+        self, episodes: Sequence[Trajectory], states: Tensor, followers: Tensor,
         generator: torch.Generator,
-    ) -> Tensor:
-        """[steps] reward of fresh episodes, none of which has been trained on.
+    ) -> Tensor:  # fmt: skip
+        """[steps] reward of fresh episodes, before they are trained on.
 
-        Where `reward` depends on what is drawn, this is its mean over the draws.
+        If `reward` depends on the drawn values, this is its mean over them.
         """
 
     def priorities(
@@ -97,4 +90,4 @@ class IntrinsicReward(Protocol):
         """The state for a checkpoint, without the networks."""
 
     def load_state(self, state: Any) -> None:
-        """Continues from a result of `state`."""
+        """Continue from a result of `state`."""

@@ -1,4 +1,4 @@
-"""MUSIC: the information between the agent's own state and its surroundings (paper III-A).
+"""MUSIC: the information between the agent's state and the surrounding state (paper III-A).
 
 Shape legend: K updates of a call, B transitions and N trajectories of one, T frames, D observation.
 """
@@ -22,16 +22,16 @@ from music_rllib.kernels.adam import FusedAdam
 from music_rllib.replay.trajectories import Trajectory, WholeTrajectories, long_enough
 
 HELD_OUT_STEPS = "held_out_steps"
-"""Metric: the number of steps that the bound on fresh trajectories is averaged over."""
+"""Metric: number of steps over which the bound on fresh trajectories is averaged."""
 PRIORITY_CLIP = 2e-4
-"""MUSIC-p: largest bound (nats) of one step that counts for its trajectory's priority."""
+"""MUSIC-p: per-step bounds (nats) are clipped to this in a trajectory's priority."""
 WORKER_ROWS = 256
-"""Rows of a minibatch that share a time shuffle with `shuffle: random`: those of one of the
-original's workers, each of which draws its own."""
+"""Rows of a minibatch that share a time shuffle with `shuffle: random`: the rows of one worker of
+the original, each of which draws its own."""
 
 
 class Music:
-    """MUSIC's reward, an `IntrinsicReward`; `estimator` is None where the settings have none."""
+    """MUSIC's reward, an `IntrinsicReward`; `estimator` is None if the settings have none."""
 
     def __init__(
         self, settings: MusicSettings, estimator: MutualInformationEstimator | None
@@ -53,18 +53,13 @@ class Music:
         return self._estimator
 
     def draw(
-        self,
-        updates: int,
-        transitions: int,
-        trajectories: dict[str, Tensor] | None,
-        generator: torch.Generator,
-        *,
-        first: bool,
-    ) -> Sequence[tuple[bool, ...]]:
-        """Whether each update pairs frames with the other's surroundings, and the time shuffles.
+        self, updates: int, transitions: int, trajectories: dict[str, Tensor] | None,
+        generator: torch.Generator, *, first: bool,
+    ) -> Sequence[tuple[bool, ...]]:  # fmt: skip
+        """Whether each update swaps the two frames of transitions; also draws the time shuffles.
 
         With `shuffle: random` a minibatch of B rows has ceil(B / `WORKER_ROWS`) draws, each for an
-        equal share of its rows, and a draw leaves two frames as they are half of the time.
+        equal share of its rows, and half of the draws do not swap.
         """
         swapped: list[tuple[bool, ...]] = [(True,)] * updates
         if self._is_random and updates:
@@ -122,15 +117,12 @@ class Music:
         return rewards.view(updates, rows), {names.MI_BOUND: means}
 
     def observe(
-        self,
-        episodes: Sequence[Trajectory],
-        states: Tensor,
-        followers: Tensor,
+        self, episodes: Sequence[Trajectory], states: Tensor, followers: Tensor,
         generator: torch.Generator,
-    ) -> Tensor:
-        """With `shuffle: random`, the mean of the rewards of both shuffles.
+    ) -> Tensor:  # fmt: skip
+        """With `shuffle: random`, the mean of the rewards with and without swap.
 
-        The critics learn this mean, since each shuffle is drawn for half of what they learn from.
+        The critics learn this mean, because half of the draws swap.
         """
         rewards = [self.reward(states, followers, (True,))]
         if self._is_random:
@@ -140,7 +132,7 @@ class Music:
 
     @torch.no_grad()
     def _measure_held_out(self, episodes: Sequence[Trajectory], generator: torch.Generator) -> None:
-        """Adds the bounds of fresh episodes, weighted by their steps, for `metrics`."""
+        """Add the bounds of fresh episodes, weighted by their steps, to the sums for `metrics`."""
         lengths = np.array([len(episode) for episode in episodes])
         chosen = np.flatnonzero(long_enough(lengths)).tolist()
         whole = WholeTrajectories.of([episodes[i].frames for i in chosen])
@@ -182,10 +174,10 @@ class Music:
 
 
 def _draws(rows: int) -> int:
-    """Draws of a minibatch of B rows with `shuffle: random`."""
+    """Number of draws for B rows with `shuffle: random`."""
     return math.ceil(rows / WORKER_ROWS)
 
 
 def _coins(count: int, generator: torch.Generator) -> Tensor:
-    """[count] booleans, each as likely."""
+    """[count] booleans, each with probability 1/2."""
     return torch.rand(count, generator=generator, device=generator.device) < 0.5

@@ -4,42 +4,43 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-from music_rllib.schedules import AdaptiveSchedule, bounded
+from music_rllib.schedules import AdaptiveSchedule, StrictModel, bounded
 
 
-class MusicSettings(BaseModel):
-    """The intrinsic reward, its estimator, and what the agent sees of goals and task reward."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+class MusicSettings(StrictModel):
+    """The intrinsic reward, its estimator, and whether goals and task reward are visible."""
 
     estimator: Literal["none", "trained", "frozen"] = "none"
-    """No mutual information; an estimator trained along; or one that was handed over, unchanged."""
+    """`none`: no mutual information; `trained`: an estimator trained with the policy; `frozen`: an
+    estimator of another run, unchanged."""
     mi_reward_weight: Annotated[AdaptiveSchedule, bounded(">= 0", lambda w: w >= 0)] = 0.0
-    """Weight of the intrinsic reward in the reward of a minibatch. Higher moves things sooner and
-    leaves them at the goal later: at 1, moving them for ever is worth as much as rest there."""
+    """Weight of the intrinsic reward in the reward of a minibatch. With a higher weight, objects
+    are moved sooner and rest at the goal later: at 1, endless movement is worth as much as rest at
+    the goal."""
     task_reward: bool = True
     """Whether the environment's reward counts."""
     goals: Literal["environment", "zero"] = "environment"
-    """Desired goals in training: the environment's, or zeros (MUSIC-u). Evaluation: always real."""
+    """Desired goals in training: the environment's, or zeros (MUSIC-u). Evaluation always uses the
+    environment's."""
     reward_scale: float = Field(5000.0, gt=0)
-    """Factor on the bound before it is clipped to [0, 1] and shifted by -1. Higher: the slightest
-    influence earns the whole reward; lower: only much of it earns anything."""
+    """Factor of the bound before it is clipped to [0, 1] and shifted by -1. Higher: the smallest
+    influence earns the whole reward; lower: only a large influence earns any."""
     shuffle: Literal["independent", "random"] = "independent"
-    """Time shuffle: every trajectory its own permutation and two frames always swapped; or, as in
-    the original, one permutation for 256 rows of a minibatch, the share of one of its workers. On
-    two frames it is the identity half of the time."""
+    """Time shuffle. `independent`: each trajectory has its own permutation, and two frames are
+    always swapped. `random`: as in the original, one permutation for 256 rows of a minibatch, the
+    share of one of its workers. For two frames it is the identity half of the time."""
     hidden_size: int = Field(128, gt=0)
-    """Hidden units of the estimator. More find subtler dependences, on more data."""
+    """Hidden units of the estimator. More units find subtler dependencies, with more data."""
     lr: float = Field(1e-3, gt=0)
-    """Adam's step size for the estimator. Larger follows the policy's new behaviour sooner, and its
-    reward is noisier."""
+    """Adam's step size for the estimator. A larger one follows new behavior of the policy sooner,
+    and makes the reward noisier."""
     prioritise_replay: bool = False
     """MUSIC-p: draw trajectories by the rank of their summed, clipped bounds."""
     batch_trajectories: int = Field(32, gt=0)
-    """Trajectories per estimator update; one estimator update follows each policy update. More: a
-    steadier bound, and longer updates."""
+    """Trajectories per estimator update; each policy update is followed by one. More trajectories
+    make the bound less noisy and updates slower."""
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:

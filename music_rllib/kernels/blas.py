@@ -1,12 +1,12 @@
 """Matrix products for compiled code, by the library that is faster on this CPU.
 
 MKL, which is part of PyTorch, uses AVX-512 on Intel's CPUs only; SciPy's OpenBLAS uses it on
-others too (docs/performance.md has a table). The choice follows from the machine's description and
-not from a measurement: a seed has to give the same numbers.
+others too (docs/performance.md has a table). The choice depends on the machine's description, not
+on a measurement: a seed must always give the same numbers.
 
 OpenBLAS copies both matrices before it multiplies them, except in small products on a CPU with
-AVX-512. Larger products are therefore cut into small ones, which takes a seventh to a quarter less
-time. It has no such path where the right matrix is transposed.
+AVX-512. Larger products are therefore cut into small ones, which saves a seventh to a quarter of
+the time. OpenBLAS has no such path if the right matrix is transposed.
 """
 
 from __future__ import annotations
@@ -24,38 +24,36 @@ from numba import types
 from numba.extending import get_cython_function_address, overload
 from threadpoolctl import threadpool_info, threadpool_limits
 
-__all__ = ["cuts_products", "library", "multiply", "use_threads"]
-
 _PREFIX = "music_rllib_"
 _ROUTINES = {types.float32: "sgemm", types.float64: "dgemm"}
 _NO, _YES = ord("N"), ord("T")
 _WITHOUT_COPIES = ("SkylakeX", "Cooperlake", "SapphireRapids")
-"""OpenBLAS's names of the CPUs for which it multiplies small matrices in place."""
+"""OpenBLAS's names of CPUs on which it multiplies small matrices without copies."""
 _SMALL = 100**3
-"""The most multiplications of a product that it does so."""
+"""Largest number of multiplications of such a product."""
 _TILE = 12
-"""Rows that its kernel computes together: a product of a multiple of them is fastest."""
+"""Rows that its kernel computes together; products of a multiple of them are fastest."""
 
 
 def library() -> str:
-    """`MKL` or `OpenBLAS`, whichever multiplies on this machine."""
+    """Name of the library used on this machine: `MKL` or `OpenBLAS`."""
     return "MKL" if _cpu_vendor() == "GenuineIntel" and _in_mkl("sgemm") else "OpenBLAS"
 
 
 def cuts_products() -> bool:
-    """Whether products are cut into small ones, which OpenBLAS multiplies without copies."""
+    """Whether products are cut into small ones."""
     kernels = (info["architecture"] for info in threadpool_info() if "scipy" in info["filepath"])
     return library() == "OpenBLAS" and next(kernels, "") in _WITHOUT_COPIES
 
 
 def use_threads(count: int) -> None:
-    """Lets OpenBLAS have so many threads; MKL has those of PyTorch."""
+    """Set the number of OpenBLAS's threads; MKL uses PyTorch's."""
     threadpool_limits(count, user_api="blas")
 
 
 @functools.cache
 def _cpu_vendor() -> str:
-    """`GenuineIntel` or `AuthenticAMD`, as /proc/cpuinfo has it; empty without that file."""
+    """`GenuineIntel` or `AuthenticAMD`, from /proc/cpuinfo; empty without that file."""
     try:
         description = Path("/proc/cpuinfo").read_text()
     except OSError:
@@ -65,7 +63,7 @@ def _cpu_vendor() -> str:
 
 
 def _in_mkl(routine: str) -> int | None:
-    """The address of a routine in PyTorch's own library, where it has MKL."""
+    """The address of a routine in PyTorch's library; None if it has no MKL."""
     path = Path(torch.__file__).parent / "lib" / "libtorch_cpu.so"
     try:
         return ctypes.cast(getattr(ctypes.CDLL(str(path)), f"{routine}_"), ctypes.c_void_p).value
@@ -78,7 +76,7 @@ def _address(routine: str) -> int:
     return found or get_cython_function_address("scipy.linalg.cython_blas", routine)
 
 
-# Compiled code is kept on disk, where it has these names and not the addresses.
+# Compiled code on disk refers to these names; addresses differ between processes.
 for _routine in _ROUTINES.values():
     llvmlite.binding.add_symbol(_PREFIX + _routine, _address(_routine))
 
@@ -95,9 +93,9 @@ def _external(dtype: Any) -> Any:
 def multiply(
     left: Any, left_transposed: bool, right: Any, right_transposed: bool, out: Any
 ) -> None:
-    """Writes left @ right, either transposed, to out; their rows lie behind each other.
+    """Write left @ right, each optionally transposed, to out. All matrices are contiguous.
 
-    Compiled code calls BLAS in place of this.
+    Compiled code calls BLAS instead of this function.
     """
     np.matmul(left.T if left_transposed else left, right.T if right_transposed else right, out)
 
@@ -107,8 +105,7 @@ def _multiply(left: Any, left_transposed: Any, right: Any, right_transposed: Any
     gemm = _external(left.dtype)
     cut = _ROUTINES[left.dtype] == "sgemm" and cuts_products()
 
-    # To BLAS, which has columns behind each other, these are the transposed matrices:
-    # out' = right' @ left'.
+    # BLAS stores columns contiguously, so it sees the transposed matrices: out' = right' @ left'.
     def multiply_by_blas(
         left: Any, left_transposed: Any, right: Any, right_transposed: Any, out: Any
     ) -> None:

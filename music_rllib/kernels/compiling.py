@@ -1,4 +1,4 @@
-"""Functions compiled by numba, for loops in which Python's or PyTorch's overhead dominates."""
+"""Compilation by numba, for loops in which Python's or PyTorch's overhead dominates."""
 
 from __future__ import annotations
 
@@ -20,40 +20,40 @@ logger = logging.getLogger(__name__)
 Function = Callable[..., Any]
 
 PATIENCE = 120.0
-"""Seconds that a process waits for another one's machine code; making it takes some 20."""
+"""Longest wait in seconds for another process's machine code, which takes about 20 s."""
 
 
 def compiled(function: Function, *, any_order: bool = False) -> Any:
-    """Let compiled functions call a function; Python calls it as it stands, uncompiled.
+    """Make a function callable from compiled functions. Python calls it uncompiled.
 
     Args:
-        any_order: allows the compiler to reorder sums, which vectorises them. The order is the
-            same in every run, and NaN stays NaN.
+        any_order: let the compiler reorder sums, which vectorizes them. The order is the same in
+            every run, and NaN stays NaN.
     """
     fastmath = {"reassoc", "contract", "nsz"} if any_order else False
-    # `register_jitable` leaves out the wrappers for calls from elsewhere: a third of the time.
+    # Without wrappers for calls from C: a third of the compilation time.
     options = {"error_model": "numpy", "fastmath": fastmath, "no_cfunc_wrapper": True}
     return register_jitable(**options)(function)
 
 
 def kept_on_disk(function: Function) -> Any:
-    """Compile a function that Python calls, without the GIL, and keep the machine code on disk.
+    """Compile a function that Python calls, without the GIL, and cache the machine code on disk.
 
-    The code lies beside the source, in the user's cache or in `NUMBA_CACHE_DIR` until the source
-    changes. Where none of them is writable, each process compiles the function anew.
+    The cache is beside the source, in the user's cache folder or in `NUMBA_CACHE_DIR`, and is valid
+    until the source changes. If none of them is writable, each process compiles the function.
     """
     dispatcher: Any = njit(function, nogil=True, error_model="numpy")
     try:
         dispatcher._cache = _Cache(function)
     except (RuntimeError, OSError) as error:
         logger.warning(
-            "compiled code is not kept, so that each run takes longer to start: %s", error
+            "compiled code cannot be cached, so each run takes longer to start: %s", error
         )
     return dispatcher
 
 
 def is_kept(function: Any) -> bool:
-    """Whether an earlier process has left the machine code of a `kept_on_disk` function."""
+    """Whether the machine code of a `kept_on_disk` function is cached."""
     cache = function._cache
     if not isinstance(cache, _Cache):
         return False
@@ -61,16 +61,16 @@ def is_kept(function: Any) -> bool:
 
 
 def sources_of(*modules: ModuleType) -> str:
-    """A hash of the modules' files.
+    """Hash of the modules' files.
 
-    A function that encloses it is compiled anew when one of them changes, not only its own file.
+    A function that encloses it is compiled again if one of them changes, not only its own file.
     """
     files = (Path(inspect.getfile(module)).read_bytes() for module in modules)
     return hashlib.sha256(b"".join(files)).hexdigest()
 
 
 class _Cache(FunctionCache):
-    """Numba's cache, for which one process compiles as others wait; write errors are warnings."""
+    """Numba's cache: one process compiles while others wait; write errors become warnings."""
 
     def __init__(self, function: Function) -> None:
         super().__init__(function)  # type: ignore[no-untyped-call]
@@ -78,7 +78,7 @@ class _Cache(FunctionCache):
         self._lock = FileLock(Path(self.cache_path, name), timeout=PATIENCE)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """What is kept; where that is None, the caller compiles, holds the lock, and saves."""
+        """The cached code. None: the caller holds the lock, compiles and saves."""
         found = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
         if found is None and self._acquire():
             found = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
@@ -90,12 +90,12 @@ class _Cache(FunctionCache):
         try:
             super().save_overload(sig, data)  # type: ignore[no-untyped-call]
         except OSError as error:
-            logger.warning("compiled code could not be kept: %s", error)
+            logger.warning("compiled code could not be cached: %s", error)
         finally:
             self._lock.release()
 
     def _acquire(self) -> bool:
-        """Acquire the lock; False where that can't be or takes too long, which only costs time."""
+        """Acquire the lock; False if that fails or takes too long, which only costs time."""
         try:
             self._lock.acquire()
         except (OSError, NotImplementedError, Timeout):

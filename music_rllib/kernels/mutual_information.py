@@ -1,8 +1,9 @@
-"""The bound of MUSIC's estimator and its training, compiled, for a CPU.
+"""The bound of MUSIC's estimator, its derivatives, and its training.
 
-Of a frame's agent and surrounding state each half's part of the hidden units is computed once,
-whichever halves are then paired, and no matrix of hidden units is kept. Sums are in float64: the
-bound of two frames is small, and the intrinsic reward 5,000 times it.
+Formulas: `functional.mutual_information`. The agent's and the surrounding state of a frame each
+contribute to the hidden units; each contribution is computed once, for all pairs. No matrix of
+hidden units is stored. Sums are in float64: the bound of two frames is small, and the intrinsic
+reward is 5,000 times as large.
 
 Shape legend: K updates, N trajectories and B transitions of one, T frames, X / Y features of the
 agent's and the surrounding state, I both together, H hidden units.
@@ -15,30 +16,28 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from music_rllib.kernels import adam, compiling
 from music_rllib.kernels.adam import AdamStep, adam_step
 from music_rllib.kernels.compiling import compiled, kept_on_disk, sources_of
-
-Array = NDArray[Any]
+from music_rllib.kernels.layers import Array
 
 
 class Data(NamedTuple):
-    """Trajectories."""
+    """Trajectories, with a time permutation of each."""
 
     agent: Array
     """[N, T, X]"""
     surrounding: Array
     """[N, T, Y]"""
     others: Array
-    """[N, T] of which frame the surroundings are, in pairs from the marginals."""
+    """[N, T] frame of the surrounding state, in pairs from the product of the marginals."""
     frames: Array
-    """[N] of each trajectory; what is behind them is padding."""
+    """[N] number of frames of each trajectory; later ones are padding."""
 
 
 class Weights(NamedTuple):
-    """The estimator's parameters, or what belongs to them, in their order."""
+    """The estimator's parameters or their gradients, in their order."""
 
     agent: Array
     """[H, X]"""
@@ -68,9 +67,9 @@ def _transposed(weight: Array) -> Array:
 
 @_inner
 def _half(states: Array, n: int, frames: int, columns: Array, bias: Array, out: Array) -> None:
-    """A half's part of the hidden units in a trajectory: [N, T, I], [I, H], [H] -> [T, H].
+    """A half's contribution to the hidden units of a trajectory: [N, T, I], [I, H], [H] -> [T, H].
 
-    Three features in a pass, as many as a position has: `out` is read and written once for them.
+    A pass handles three features, as many as a position has, and reads and writes `out` once.
     """
     features = len(columns)
     threes = features - features % 3
@@ -91,7 +90,7 @@ def _half(states: Array, n: int, frames: int, columns: Array, bias: Array, out: 
 def _statistics(
     first: Array, second: Array, t: int, other: int, output: Array, offset: float
 ) -> tuple[float, float]:
-    """tanh(w . relu(agent + surrounding) + c) of a frame, and with another's surroundings."""
+    """tanh(w . relu(agent + surrounding) + c) of a frame, and with another frame's surroundings."""
     zero = first.dtype.type(0)
     together, apart = zero, zero
     for h in range(output.shape[1]):
@@ -111,7 +110,7 @@ def _add_pairs(
     first: Array, second: Array, t: int, other: int, together: float, apart: float,
     of_first: Array, of_second: Array, of_output: Array,
 ) -> None:  # fmt: skip
-    """Adds the slopes of both statistics to the gradients by the units that are on."""
+    """Add the derivatives of both statistics to the gradients, through units that are on."""
     zero = first.dtype.type(0)
     slope, other_slope = first.dtype.type(together), first.dtype.type(apart)
     for h in range(of_output.shape[1]):
@@ -126,7 +125,7 @@ def _add_pairs(
 
 @_inner
 def _add_products(states: Array, n: int, frames: int, of_units: Array, columns: Array) -> None:
-    """Adds [T, I]' @ [T, H] of a trajectory to [I, H]."""
+    """Add [T, I]' @ [T, H] of a trajectory to [I, H]."""
     for t in range(frames):
         for i in range(states.shape[2]):
             value = states[n, t, i]
@@ -161,10 +160,10 @@ def _bounds(
 def _differentiate(
     agent: Array, surrounding: Array, others: Array, frames: Array, weights: Weights, by: Weights
 ) -> float:
-    """The mean of `bounds`; the derivatives of its negative, `by` each parameter, are written.
+    """The mean of `bounds`; write the derivatives of its negative by each parameter to `by`.
 
-    A bound's derivative by a joint statistic is 1/T, by one of the marginals -exp(s) / sum exp(s);
-    a statistic's by its argument 1 - s^2.
+    A bound's derivative by a joint statistic is 1/T, and by one of the marginals
+    -exp(s) / sum exp(s); the derivative of a statistic s by its argument is 1 - s^2.
     """
     count, length = others.shape
     first = np.empty((length, len(weights.bias)), agent.dtype)
@@ -213,27 +212,27 @@ def _differentiate(
 
 @kept_on_disk
 def bounds(data: Data, weights: Weights) -> Array:
-    """[N] Donsker-Varadhan bounds in nats, as `functional.mutual_information` has them."""
+    """[N] Donsker-Varadhan bounds in nats."""
     found = np.empty(len(data.others), data.agent.dtype)
     _bounds(data.agent, data.surrounding, data.others, data.frames, weights, found)
     return found
 
 
 def _compiled_for(sources: str) -> Any:
-    """`learn`, kept on disk until one of the files changes that it is compiled of."""
+    """`learn`, cached on disk until a file that it is compiled from changes."""
 
     @kept_on_disk
     def learn(
         transitions: Data, trajectories: Data, weights: Weights, by: Weights, step: AdamStep,
         updates: int,
     ) -> tuple[Array, Array]:  # fmt: skip
-        """Updates one after the other, each of its part of the data.
+        """Do K updates in order, each on its part of the data.
 
         Args:
-            transitions: [K*B] pairs of frames, of which each update takes the bounds first.
-            trajectories: [K*N] that it then learns from, the minibatches behind each other.
-            weights: in `step.values`.
-            by: in `step.gradients`.
+            transitions: [K*B] pairs of frames, whose bounds are computed before their update.
+            trajectories: [K*N] training data, concatenated minibatches.
+            weights: views of `step.values`.
+            by: views of `step.gradients`.
             step: arguments of Adam.
             updates: K.
 

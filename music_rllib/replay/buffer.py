@@ -1,6 +1,6 @@
 """Replay of whole trajectories, sampled as transitions or as trajectories.
 
-Its memory is that of the ring (`music_rllib.replay.ring`); prioritised replay by TD error adds
+It needs the memory of the ring (`music_rllib.replay.ring`). Prioritized replay by TD error adds
 8 bytes a row and a tree of 16 to 32 bytes a row.
 
 Shape legend: B transitions, N trajectories, T frames, D observation, G goal, A action.
@@ -14,9 +14,15 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from music_rllib.replay.priorities import TDPriorities, WeightedDraws, ranges, rank_weights
 from music_rllib.replay.ring import TrajectoryRing
-from music_rllib.replay.sampling import Places
+from music_rllib.replay.sampling import (
+    Places,
+    TDPriorities,
+    Weights,
+    draw_weighted,
+    ranges,
+    rank_weights,
+)
 from music_rllib.replay.trajectories import (
     Floats,
     ReplayLayout,
@@ -36,18 +42,18 @@ class TrajectoryReplay(TrajectoryRing):
 
     Args:
         layout: sizes of a frame and an action, and the longest episode.
-        capacity: transitions of full episodes held at most, rounded down to whole episodes.
+        capacity: largest number of transitions of full episodes, rounded down to whole episodes.
         rng: source of all random numbers of sampling.
-        goal_reward: recomputes rewards of relabelled transitions; needed for hindsight.
+        goal_reward: recomputes rewards of relabeled transitions; needed for hindsight.
         hindsight_k: HER `future` (Andrychowicz et al. 2017): a share k/(1+k) of transitions gets
-            a goal that their trajectory achieved later on.
+            a goal that their trajectory achieved later.
         hindsight_episodes: `all`; or `moved`: transitions with such a goal come only from
             trajectories that have moved (Manela & Biess 2021 filter hindsight goals by the same
-            idea), at most the share `MOST_OF_ONE_EPISODE` from one of them: where too few have
-            moved for that, the rest comes from all.
-        moved_distance: a trajectory has moved where it achieves a goal farther than this from
-            its first achieved goal. None: where it achieves a goal that its first state does
-            not reach by `goal_reward`, which must be sparse then.
+            idea), at most the share `LARGEST_SHARE` from one of them. If too few have moved, the
+            rest comes from all.
+        moved_distance: a trajectory has moved if it achieves a goal farther than this from its
+            first achieved goal. None: if it achieves a goal that its first state does not reach by
+            `goal_reward`, which must be sparse.
         td_exponent: PER (Schaul et al. 2016): draw transitions with probability proportional to
             their absolute TD error to this power. None: uniformly.
 
@@ -79,18 +85,18 @@ class TrajectoryReplay(TrajectoryRing):
         self._moved_distance = moved_distance
         self._moved = np.zeros(0, np.bool_)
         self._priorities = np.zeros(0, np.float64)
-        self._by_rank: WeightedDraws | None = None
+        self._cumulative_ranks: Weights | None = None
         self._td = None if td_exponent is None else TDPriorities(len(self._steps), td_exponent)
         self._refresh()
 
     def __len__(self) -> int:
-        """Transitions held."""
+        """Number of transitions held."""
         return self._all_places.total
 
     def extend(
         self, trajectories: Sequence[Trajectory], priorities: NDArray[np.float64] | None = None
     ) -> None:
-        """Stores finished episodes in place of the oldest ones.
+        """Store finished episodes in place of the oldest ones.
 
         MUSIC-p gives `priorities` [N] with every call: episodes are drawn by their rank.
         """
@@ -105,9 +111,9 @@ class TrajectoryReplay(TrajectoryRing):
         self._refresh()
 
     def _refresh(self) -> None:
-        """Prepares sampling from the trajectories that are held now."""
+        """Prepare sampling from the trajectories that are held now."""
         if len(self._priorities):
-            self._by_rank = WeightedDraws(rank_weights(self._priorities))
+            self._cumulative_ranks = np.cumsum(rank_weights(self._priorities))
         starts, lengths = self._starts, self._lengths
         moved = self._moved if self._only_moved else slice(0)
         whole = long_enough(lengths)
@@ -136,9 +142,9 @@ class TrajectoryReplay(TrajectoryRing):
         )
 
     def sample_transitions(self, count: int, *, importance_exponent: float = 0.0) -> Transitions:
-        """Draws `count` transitions with replacement, uniformly or by priority.
+        """Draw `count` transitions with replacement, uniformly or by priority.
 
-        `importance_exponent` is PER's beta. Raises ValueError where the replay is empty.
+        `importance_exponent` is PER's beta. Raises ValueError if the replay is empty.
         """
         start, step, length = self._draw(count)
         relabelled = self._hindsight_share > 0
@@ -146,7 +152,7 @@ class TrajectoryReplay(TrajectoryRing):
             chosen = np.flatnonzero(self.rng.random(count) < self._hindsight_share)
             moved = self._moved_places
             if moved.total:
-                part = chosen[moved.few_of_one(self.rng, len(chosen), self._hindsight_share)]
+                part = chosen[moved.replaced(self.rng, len(chosen), self._hindsight_share)]
                 start[part], step[part], length[part] = moved.draw(self.rng, len(part))
         row = start + step
         width, frame = self.layout.network_input, self.layout.frame
@@ -155,7 +161,7 @@ class TrajectoryReplay(TrajectoryRing):
         inputs, next_inputs = both[:, :width].copy(), both[:, after : after + width].copy()
         actions, rewards = both[:, frame : after - 2].copy(), both[:, after - 2].copy()
         if relabelled:
-            # Uniform over the states that follow: step + 1 to the episode's last one.
+            # Uniform over the later states: step + 1 to the episode's last one.
             left = length[chosen] - step[chosen]
             later = step[chosen] + 1 + (self.rng.random(len(chosen)) * left).astype(np.int64)
             goals = self._read(start[chosen] + later, width, self.layout.goal)
@@ -170,7 +176,7 @@ class TrajectoryReplay(TrajectoryRing):
         return Transitions(inputs, actions, rewards, discounts, next_inputs, weights, row)
 
     def update_priorities(self, rows: Rows, errors: Floats) -> None:
-        """PER: sets the priorities of `rows` [B] by their absolute TD errors [B]."""
+        """PER: set the priorities of `rows` [B] by their absolute TD errors [B]."""
         assert self._td is not None
         self._td.update(rows, errors)
 
@@ -179,8 +185,8 @@ class TrajectoryReplay(TrajectoryRing):
         self._check_filled()
         if self._td is not None:
             return self._td.draw(self.rng.random(count))
-        if self._by_rank is not None:
-            which = self._by_rank.draw(self.rng.random(count))
+        if self._cumulative_ranks is not None:
+            which = draw_weighted(self._cumulative_ranks, self.rng.random(count))
             length = self._lengths[which]
             return self._starts[which], (self.rng.random(count) * length).astype(np.int64), length
         return self._all_places.draw(self.rng, count)
@@ -190,12 +196,11 @@ class TrajectoryReplay(TrajectoryRing):
             raise ValueError("cannot sample from an empty replay: collect an episode first")
 
     def sample_trajectories(self, count: int, width: int | None = None) -> WholeTrajectories:
-        """Draws `count` whole trajectories with replacement.
+        """Draw `count` whole trajectories with replacement; the first `width` numbers of frames.
 
-        Of each observation the first `width` numbers, by default all of them. Each trajectory is
-        drawn in proportion to its steps, so that every state counts the same, as for the policy.
-        Trajectories of a single step are drawn only where there are no others. T is the length of
-        the longest one held. Raises ValueError where the replay is empty.
+        Each trajectory is drawn in proportion to its steps, so that every state counts the same, as
+        for the policy. Trajectories of a single step are drawn only if there are no others. T is
+        the length of the longest one held. Raises ValueError if the replay is empty.
         """
         self._check_filled()
         places = self._whole_places
@@ -207,7 +212,7 @@ class TrajectoryReplay(TrajectoryRing):
         return WholeTrajectories(self._read(rows, 0, width), time <= length[:, None])
 
     def index(self) -> dict[str, Any]:
-        """The rest of the state beside `packed`: rows of trajectories, priorities, generator.
+        """The state except `packed`: rows of trajectories, priorities, generator.
 
         24 bytes a trajectory, and with priorities by TD error 8 bytes a transition.
         """
@@ -225,15 +230,15 @@ class TrajectoryReplay(TrajectoryRing):
     def load_packed(
         self, index: dict[str, Any], parts: Iterable[tuple[int, Mapping[str, NDArray[Any]]]]
     ) -> None:
-        """Continues exactly where `index` was taken.
+        """Continue exactly from a result of `index`.
 
         Args:
             index: the result of `index()`.
-            parts: number of the first trajectory, and arrays as `packed` gives them. Trajectories
+            parts: number of the first trajectory, and arrays as returned by `packed`. Trajectories
                 that are not in the index are ignored.
 
         Raises:
-            ValueError: they come from a replay of other sizes, or trajectories are missing.
+            ValueError: the replay had other sizes, or trajectories are missing.
         """
         self._terminal[: self._used] = 0.0
         self._starts = np.array(index["starts"], np.int64)
@@ -251,7 +256,7 @@ class TrajectoryReplay(TrajectoryRing):
             wanted = max(wanted, self._place(first, arrays))
         if wanted < self.trajectories_added:
             raise ValueError(
-                f"trajectory {wanted} must be in the checkpoint's files, as those before it"
+                f"trajectory {wanted} must be in the checkpoint's files, but is missing"
             )
         self._priorities = np.array(index["priorities"], np.float64)
         if self._only_moved:
@@ -265,10 +270,10 @@ class TrajectoryReplay(TrajectoryRing):
         self.rng.bit_generator.state = index["rng"]
 
     def state(self) -> dict[str, Any]:
-        """Everything that sampling and storing depend on, as arrays and plain values."""
+        """The whole state, as arrays and plain values."""
         first = self.oldest
         return {"index": self.index(), "first": first, "trajectories": self.packed(first)}
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Continues exactly where `state()` was taken; ValueError for a replay of other sizes."""
+        """Continue exactly from a result of `state`; ValueError for a replay of other sizes."""
         self.load_packed(state["index"], [(state["first"], state["trajectories"])])

@@ -1,26 +1,32 @@
-"""A ring buffer of trajectories in one float32 array.
+"""A ring buffer of trajectories in one float32 array, and its trajectories in files.
 
 A row is a frame (observation, desired goal, achieved goal), the action taken there, its reward, and
-whether it was terminal; a transition is two neighbouring rows, one stretch of memory. A trajectory
+whether it was terminal; a transition is two neighboring rows, one stretch of memory. A trajectory
 of n steps takes n + 1 rows and is never split by the ring's end, so a ring of capacity C holds
-exactly C transitions of full episodes, fewer where episodes end early.
+exactly C transitions of full episodes, fewer if episodes end early.
 
-Memory, h being the longest episode: ``4 (D + 2G + A + 2) bytes * C (h + 1)/h`` plus 16 bytes a
-trajectory, claimed from the system as it fills. A million FetchPush transitions: 151 MB.
+Memory, with h steps of the longest episode: ``4 (D + 2G + A + 2) bytes * C (h + 1)/h`` plus 16
+bytes a trajectory, claimed from the system as it fills. A million FetchPush transitions: 151 MB.
 
 Shape legend: N trajectories, n steps of one, D observation, G goal, A action.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from music_rllib.replay.priorities import ranges
+from music_rllib.replay.sampling import ranges
 from music_rllib.replay.trajectories import Floats, ReplayLayout, Rows, Trajectory
+
+TRAJECTORIES_PER_SEGMENT = 2_000
+"""Most trajectories in a segment: its file is built in memory, 15 MB for Fetch."""
+
+Arrays = Mapping[str, NDArray[Any]]
 
 
 class TrajectoryRing:
@@ -51,7 +57,7 @@ class TrajectoryRing:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the ring when full."""
+        """Bytes of the full ring."""
         return self._steps.nbytes
 
     @property
@@ -60,7 +66,7 @@ class TrajectoryRing:
         return self._used * self._steps.shape[1] * self._steps.itemsize
 
     def _store(self, trajectory: Trajectory) -> int:
-        """Writes a trajectory in place of the oldest ones and returns its first row."""
+        """Write a trajectory in place of the oldest ones, and return its first row."""
         steps = len(trajectory)
         if not 0 < steps <= self.layout.horizon:
             raise ValueError(f"an episode must have 1 to {self.layout.horizon} steps, got {steps}")
@@ -79,7 +85,7 @@ class TrajectoryRing:
         return start
 
     def _make_room(self, frames: int) -> int:
-        """Drops the oldest trajectories where `frames` rows are needed; returns the first row."""
+        """Drop the oldest trajectories in the way of `frames` rows, and return the first row."""
         stale, held = 0, len(self._starts)
         if self._write + frames > len(self._frames):
             # The trajectories between here and the ring's end are the oldest: the ring wraps.
@@ -93,11 +99,11 @@ class TrajectoryRing:
         return self._write
 
     def _drop(self, count: int) -> None:
-        """Drops the `count` oldest trajectories."""
+        """Drop the `count` oldest trajectories."""
         self._starts, self._lengths = self._starts[count:], self._lengths[count:]
 
     def _read(self, rows: Rows, first: int, count: int) -> Floats:
-        """Copies `count` numbers of `rows` [...] from column `first`, reaching into the next row.
+        """Copy `count` numbers of `rows` [...] from column `first`, reaching into the next row.
 
         Returns [..., count]. Each stretch is copied as a whole, not number by number.
         """
@@ -112,11 +118,11 @@ class TrajectoryRing:
         return self.trajectories_added - self.trajectories
 
     def packed(self, first: int, end: int | None = None) -> dict[str, NDArray[Any]]:
-        """Copies the trajectories number `first` (>= `oldest`) to `end` - 1, concatenated.
+        """Copy the trajectories number `first` (>= `oldest`) to `end` - 1, concatenated.
 
         Returns:
             lengths [N], terminated [N], frames [sum of n+1, D + 2G], actions [sum of n, A],
-            rewards [sum of n]; with `index()` the whole state.
+            rewards [sum of n]; together with `index()` the whole state.
         """
         held = slice(first - self.oldest, None if end is None else end - self.oldest)
         starts, lengths = self._starts[held], self._lengths[held]
@@ -130,7 +136,7 @@ class TrajectoryRing:
         }
 
     def _place(self, first: int, arrays: Mapping[str, NDArray[Any]]) -> int:
-        """Writes those of the trajectories `first`, ... that are in the index to their rows.
+        """Write those of the trajectories `first`, ... that are in the index to their rows.
 
         Returns the number after the last one written.
         """
@@ -156,3 +162,36 @@ class TrajectoryRing:
         self._rewards[rows] = arrays["rewards"][source]
         self._terminal[starts + own - 1] = arrays["terminated"][given]
         return end
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A file with the trajectories number `first` to `end` - 1, written once."""
+
+    name: str
+    first: int
+    end: int
+
+
+def new_segments(
+    replay: TrajectoryRing, stored: Sequence[Segment], write: Callable[[str, Arrays], str]
+) -> list[Segment]:
+    """Write the trajectories that are in none of the `stored` segments (oldest first).
+
+    A stored trajectory never changes, so a checkpoint writes only those added since the last one.
+
+    Args:
+        replay: holds the trajectories.
+        stored: segments of earlier checkpoints.
+        write: takes a label and arrays, and returns the name of the segment.
+
+    Returns:
+        The segments that hold all of the replay, oldest first.
+    """
+    needed = [segment for segment in stored if segment.end > replay.oldest]
+    first = max([replay.oldest, *(segment.end for segment in needed)])
+    for begin in range(first, replay.trajectories_added, TRAJECTORIES_PER_SEGMENT):
+        end = min(begin + TRAJECTORIES_PER_SEGMENT, replay.trajectories_added)
+        name = write(f"{begin:09d}-{end:09d}", replay.packed(begin, end))
+        needed.append(Segment(name, begin, end))
+    return needed

@@ -4,40 +4,40 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-from music_rllib.schedules import Schedule, bounded
+from music_rllib.schedules import Schedule, StrictModel, bounded
 
 
-class ReplaySettings(BaseModel):
-    """Size of the replay, and hindsight relabelling (Andrychowicz et al. 2017)."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+class ReplaySettings(StrictModel):
+    """Size of the replay, and hindsight relabeling (Andrychowicz et al. 2017)."""
 
     capacity: int = Field(1_000_000, gt=0)
-    """Transitions kept; the oldest trajectories go first. More remembers what the policy no longer
-    does, and takes memory: FetchPush 151 bytes each."""
+    """Number of transitions kept; the oldest trajectories are dropped first. A larger replay keeps
+    behavior that the policy no longer shows, and needs memory: 151 bytes per FetchPush
+    transition."""
     hindsight_k: float = Field(0.0, ge=0)
-    """HER, `future` strategy: k relabelled transitions for each one kept as it was. 0: off. Rewards
-    that come only at a goal are hardly ever found without it."""
+    """HER, `future` strategy: k relabeled transitions for each unchanged one. 0: off. Without it, a
+    policy rarely finds rewards that are given only at a goal."""
     hindsight_episodes: Literal["all", "moved"] = "all"
-    """HER: relabelled transitions come from all episodes, or only from those that achieve something
-    that their first state does not (`environments.<name>.moved_distance`). Where an object rests,
-    hindsight has nothing to tell. None of them makes up more than two fifths of a minibatch
-    on average."""
+    """HER: `all`: relabeled transitions come from all episodes. `moved`: only from episodes that
+    achieve something that their first state does not (`environments.<name>.moved_distance`);
+    hindsight teaches nothing about an object at rest. No episode fills more than two fifths of a
+    minibatch on average."""
     priority: Literal["uniform", "td_error"] = "uniform"
-    """Transitions drawn uniformly, or by their TD error (PER, Schaul et al. 2016, proportional)."""
+    """Transitions are drawn uniformly, or by their TD error (PER, Schaul et al. 2016,
+    proportional)."""
     priority_exponent: float = Field(0.6, gt=0)
-    """PER: how strongly TD errors count (alpha in the paper; 0 would be uniform). Higher repeats
-    surprises more often, and noise with them."""
+    """PER: weight of the TD errors (alpha in the paper; 0 would be uniform). Higher values repeat
+    surprising transitions more often, including noise."""
     importance_exponent: Annotated[Schedule, bounded("in [0, 1]", lambda b: 0 <= b <= 1)] = 0.4
-    """PER: strength of the importance weights that undo its bias (beta; 1 undoes it fully)."""
+    """PER: strength of the importance weights that correct its bias (beta; 1 corrects it fully)."""
 
     @model_validator(mode="after")
     def _one_choice(self) -> Self:
         if self.hindsight_episodes == "moved" and self.priority != "uniform":
             raise ValueError(
-                "hindsight_episodes must be all with priority: td_error, got moved: one of them "
-                "decides what is replayed"
+                "hindsight_episodes must be all with priority: td_error, got moved: only one of "
+                "them can decide what is replayed"
             )
         return self

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 SHORTEST = 2
-"""Fewest steps of a trajectory that the estimator learns from: of two frames, half of all
+"""Fewest steps of a trajectory that the estimator learns from: with two frames, half of all
 permutations of time are the identity."""
 
 Floats = NDArray[np.float32]
@@ -51,7 +51,7 @@ class Trajectory:
     rewards: Floats
     """[n] the environment's."""
     terminated: bool
-    """Whether it ended in a terminal state (a truncated one keeps its bootstrap)."""
+    """Whether it ended in a terminal state; a truncated trajectory keeps its bootstrap."""
 
     def __len__(self) -> int:
         return len(self.actions)
@@ -66,19 +66,19 @@ class Transitions:
     actions: Floats
     """[B, A]"""
     rewards: Floats
-    """[B] task reward, recomputed where the goal was relabelled."""
+    """[B] task reward, recomputed if the goal was relabeled."""
     discounts: Floats
-    """[B] 0 where the episode terminated, else 1."""
+    """[B] 0 if the episode terminated, 1 otherwise."""
     next_inputs: Floats
     """[B, D + G]"""
     weights: Floats | None
-    """[B] importance weights in (0, 1]; None where transitions are not drawn by TD error."""
+    """[B] importance weights in (0, 1]; None if transitions are not drawn by TD error."""
     rows: Rows
     """[B] rows of the ring, for `update_priorities`."""
 
 
 def long_enough(lengths: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """[N] steps -> [N] whether the estimator learns from it; all where all are too short."""
+    """[N] steps -> [N] whether the estimator learns from it; all True if all are too short."""
     return lengths >= min(SHORTEST, int(lengths.max(initial=0)))
 
 
@@ -89,7 +89,7 @@ class WholeTrajectories:
     observations: Floats
     """[N, T, D]; a shorter one is padded with its last frame."""
     inside: NDArray[np.bool_] | None
-    """[N, T] False for padding; None where all have the same length."""
+    """[N, T] False for padding; None if all have the same length."""
 
     @classmethod
     def of(cls, frames: Sequence[Floats]) -> WholeTrajectories:

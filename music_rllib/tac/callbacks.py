@@ -18,11 +18,11 @@ _CALLED = (
 
 
 class EpisodeCallbacks:
-    """Keeps RLlib's episodes beside the runner's own where a config has callbacks, else nothing.
+    """Builds RLlib's episodes for callbacks; does nothing if a config has no callbacks.
 
-    They hold what the environment returned and the actions in [-1, 1], like those of RLlib's own
-    runner; what a callback changes in them is not learned from. The scaled action is in their
-    `extra_model_outputs` as "actions_for_env". `env` is the sub-environment, since there is no
+    As in RLlib's own runner, episodes have what the environment returned and actions in [-1, 1].
+    Changes that a callback makes to them are not learned from. The scaled action is in their
+    `extra_model_outputs` as "actions_for_env". `env` is the sub-environment, because there is no
     vector environment.
     """
 
@@ -31,11 +31,10 @@ class EpisodeCallbacks:
         classes = [c for c in force_list(config.callbacks_class) if c is not RLlibCallback]
         self._objects = [made() for made in classes]
         self._functions = {name: getattr(config, f"callbacks_{name}") for name in _CALLED}
-        self.is_on = bool(self._objects) or any(self._functions.values())
-        """Whether anything is called."""
+        self._is_on = bool(self._objects) or any(self._functions.values())
         self._runner = runner
         self._episodes: dict[int, SingleAgentEpisode] = {}
-        self._watched: dict[int, _Watched] = {}
+        self._recorders: dict[int, _Recorder] = {}
         self._finished: list[SingleAgentEpisode] = []
 
     def _call(self, name: str, **arguments: Any) -> None:
@@ -54,36 +53,35 @@ class EpisodeCallbacks:
             rl_module=self._runner.module, env_index=index, **arguments,
         )  # fmt: skip
 
-    def made(self, env: Any, context: EnvContext) -> None:
-        """A sub-environment was made."""
-        if self.is_on:
+    def environment_created(self, env: Any, context: EnvContext) -> None:
+        if self._is_on:
             self._call("on_environment_created", env=env, env_context=context)
 
-    def created(self, index: int) -> None:
-        """Sub-environment `index` is about to be reset."""
-        if self.is_on:
+    def episode_created(self, index: int) -> None:
+        """Call before sub-environment `index` is reset."""
+        if self._is_on:
             env = self._runner.envs[index]
-            self._watched[index] = _Watched(env)
+            self._recorders[index] = _Recorder(env)
             self._episodes[index] = SingleAgentEpisode(
                 observation_space=env.observation_space, action_space=env.action_space
             )
             self._call_of_episode("on_episode_created", index)
 
-    def started(self, index: int, observation: Any, info: dict[str, Any]) -> None:
-        """It was reset."""
-        if self.is_on:
+    def episode_started(self, index: int, observation: Any, info: dict[str, Any]) -> None:
+        """Call after sub-environment `index` was reset."""
+        if self._is_on:
             self._episodes[index].add_env_reset(copy.deepcopy(observation), copy.copy(info))
             self._call_of_episode("on_episode_start", index)
 
-    def watched(self, index: int) -> Any:
-        """The sub-environment; where anything is called, one that keeps its last step."""
-        return self._watched[index] if self.is_on else self._runner.envs[index]
+    def env(self, index: int) -> Any:
+        """Sub-environment `index`, wrapped to record its last step if there are callbacks."""
+        return self._recorders[index] if self._is_on else self._runner.envs[index]
 
-    def stepped(self, index: int, action: Any, scaled: Any, ended: bool | None) -> None:
-        """It made a step; `ended` is whether it terminated, None where the episode continues."""
-        if not self.is_on:
+    def episode_stepped(self, index: int, action: Any, scaled: Any, ended: bool | None) -> None:
+        """Call after a step; `ended` is whether it terminated, None if the episode continues."""
+        if not self._is_on:
             return
-        observation, reward, _, _, info = self._watched[index].last
+        observation, reward, _, _, info = self._recorders[index].last
         self._episodes[index].add_env_step(
             copy.deepcopy(observation), action, reward, copy.copy(info),
             terminated=ended is True, truncated=ended is False,
@@ -94,15 +92,15 @@ class EpisodeCallbacks:
             self._call_of_episode("on_episode_end", index, prev_episode_chunks=[])
             self._finished.append(self._episodes[index].to_numpy())
 
-    def sampled(self) -> None:
-        """A call of `sample` ends."""
-        if self.is_on:
+    def sample_ended(self) -> None:
+        """Call at the end of `sample`."""
+        if self._is_on:
             self._call("on_sample_end", samples=self._finished)
             self._finished = []
 
 
-class _Watched:
-    """An environment whose last step is kept."""
+class _Recorder:
+    """An environment that keeps the result of its last step."""
 
     def __init__(self, env: Any) -> None:
         self._env = env

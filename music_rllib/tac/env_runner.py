@@ -1,9 +1,9 @@
-"""Plays whole episodes in a few sub-environments, stepped together.
+"""The environment runner: plays whole episodes in a few sub-environments, stepped together.
 
 RLlib's SingleAgentEnvRunner spends more than half of its time in connectors and episode objects,
-resets to the same goal again and again under a seed, and never seeds random actions. This runner
-plays one episode per sub-environment and call, seeds every reset by (seed, worker, episode), and
-holds no simulator state between calls: a checkpoint of a few integers resumes it exactly.
+resets to the same goal in every call with a seed, and never seeds random actions. This runner plays
+one episode per sub-environment and call, seeds every reset by (seed, worker, episode), and keeps no
+simulator state between calls: a checkpoint of a few integers resumes it exactly.
 """
 
 from __future__ import annotations
@@ -55,15 +55,16 @@ DISPLACEMENT, MOVED = "object_displacement", "object_moved"
 """Metrics of an episode in addition to RLlib's own."""
 
 MOVED_THRESHOLD = 0.01
-"""Distance from its start (metres in the Fetch tasks) above which the object counts as moved."""
+"""Distance from its start (meters in the Fetch tasks) above which the object counts as moved."""
 
 Floats = NDArray[np.float32]
 
 
 class TrajectoryEnvRunner(EnvRunner, Checkpointable):
-    """EnvRunner whose `sample()` returns finished `Episode`s. Connectors are not run.
+    """EnvRunner whose `sample()` returns finished `Episode`s.
 
-    RLlib's callbacks of environments and episodes are called (`EpisodeCallbacks`).
+    It runs no connectors. It calls RLlib's callbacks of environments and episodes
+    (`EpisodeCallbacks`).
     """
 
     def __init__(self, *, config: Any, **kwargs: Any) -> None:
@@ -123,7 +124,7 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
         else:
             assert self._env_creator is not None
             env = self._env_creator(context)
-        self._callbacks.made(env, context)
+        self._callbacks.environment_created(env, context)
         return env
 
     def make_module(self) -> None:
@@ -149,14 +150,14 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
         force_reset: bool = False,
         **kwargs: Any,
     ) -> list[Episode]:
-        """Plays whole episodes.
+        """Play whole episodes.
 
         Args:
             num_timesteps: play at least this many steps.
             num_episodes: play exactly this many episodes. Neither: one per sub-environment.
-            explore: act by the training behaviour; False: deterministically.
-            random_actions: act uniformly.
-            force_reset: ignored, since every call begins with fresh episodes.
+            explore: act by the training behavior; False: deterministically.
+            random_actions: act uniformly at random.
+            force_reset: ignored, because every call begins with new episodes.
         """
         if explore is None:
             explore = bool(self.config.explore)
@@ -171,11 +172,11 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
             if len(episodes) >= (num_episodes or 0) and steps >= (num_timesteps or 0):
                 break
         self._log(episodes, steps)
-        self._callbacks.sampled()
+        self._callbacks.sample_ended()
         return episodes
 
     def _play(self, count: int, *, explore: bool, random_actions: bool) -> list[Episode]:
-        """Plays one episode in each of the first `count` sub-environments."""
+        """Play one episode in each of the first `count` sub-environments."""
         recordings = [self._start_episode(i) for i in range(count)]
         finished: dict[int, Episode] = {}
         actor = self.module.actor()
@@ -186,18 +187,18 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
             if not actions.ravel().dot(actions.ravel()) <= actions.size:
                 raise _bad_action(actions, inputs, [recordings[i].place for i in playing])
             for i, action, scaled in zip(playing, actions, self._to_env(actions), strict=True):
-                ended = self._step(self._callbacks.watched(i), recordings[i], action, scaled)
-                self._callbacks.stepped(i, action, scaled, ended)
+                ended = self._step(self._callbacks.env(i), recordings[i], action, scaled)
+                self._callbacks.episode_stepped(i, action, scaled, ended)
                 if ended is not None:
                     finished[i] = recordings[i].finish(terminated=ended)
         return [finished[i] for i in range(count)]
 
     def _start_episode(self, index: int) -> Recording:
-        """Resets sub-environment `index`."""
+        """Reset sub-environment `index`."""
         entropy = np.random.SeedSequence((*self._entropy, self._episodes_started))
         self._episodes_started += 1
         seed = reset_seed(entropy, self.config.seed_range)
-        self._callbacks.created(index)
+        self._callbacks.episode_created(index)
         with in_environment:
             observation, info = self.envs[index].reset(seed=seed)
         worker = f" of worker {self.worker_index}" if self.worker_index else ""
@@ -214,11 +215,11 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
             goal_reward=compute_reward_of(self.envs[index]) if self._hindsight else None,
         )
         recording.see(observation)
-        self._callbacks.started(index, observation, info)
+        self._callbacks.episode_started(index, observation, info)
         return recording
 
     def _step(self, env: Env, recording: Recording, action: Floats, scaled: Floats) -> bool | None:
-        """Takes one step; returns whether the episode terminated at its end, None before it."""
+        """Take one step; return whether the episode terminated, or None if it continues."""
         with in_environment:
             observation, reward, terminated, truncated, info = env.step(scaled)
         recording.step(action, reward, info, observation)
@@ -227,7 +228,7 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
         return None
 
     def _to_env(self, actions: Floats) -> Floats:
-        """Scales actions [B, A] from [-1, 1] to the environment's bounds."""
+        """Scale actions [B, A] from [-1, 1] to the environment's bounds."""
         return to_bounds(actions, self._action_space)
 
     def _act(self, actor: Actor, inputs: Floats, *, explore: bool, random_actions: bool) -> Floats:
@@ -297,8 +298,8 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
             self._episodes_started = int(state["episodes_started"])
             self._rng.bit_generator.state = state["rng"]
         if COMPONENT_RL_MODULE in state:
-            # Not by sequence number: RLlib's runner skips older weights, which leaves it stale when
-            # an earlier checkpoint is restored in the same process.
+            # RLlib's runner skips weights with an older sequence number, so it would keep newer
+            # weights if an earlier checkpoint is restored in the same process.
             module_state = state[COMPONENT_RL_MODULE]
             if isinstance(module_state, ray.ObjectRef):
                 module_state = ray.get(module_state)
@@ -324,9 +325,9 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
 
 
 def _bad_action(actions: Floats, inputs: Floats, places: list[str]) -> BadNumberError:
-    """The error for actions [B, A] outside +-1, in episodes that stand at `places` [B].
+    """The error for actions [B, A] beyond +-1; `places` [B] name the episodes and steps.
 
-    The observations are finite, so the networks' weights are not, or are too large for the inputs.
+    Observations are finite, so the weights are not finite, or the inputs are too large for them.
     """
     row, dimension = np.argwhere(~(np.abs(actions) <= 1.0))[0]
     return BadNumberError(
@@ -338,7 +339,7 @@ def _bad_action(actions: Floats, inputs: Floats, places: list[str]) -> BadNumber
 
 
 def seed_or_entropy(seed: int | None) -> int:
-    """The seed, or fresh entropy from the system for None."""
+    """The seed; for None, entropy from the system."""
     if seed is not None:
         return seed
     entropy = np.random.SeedSequence().entropy

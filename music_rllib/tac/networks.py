@@ -19,12 +19,12 @@ from torch import Tensor, nn
 Floats = NDArray[np.float32]
 
 _ROUNDING = float(np.finfo(np.float32).eps) / 2
-"""Standard deviation, as a share of the mean, up to which a feature counts as constant: it only
-alternates between two neighbouring numbers of float32."""
+"""Standard deviation relative to the mean up to which a feature counts as constant: it only
+alternates between two adjacent float32 numbers."""
 
 
 class Perceptron(nn.Sequential):
-    """ReLU between its layers, a linear output; [..., I] -> [..., O] in float32."""
+    """Linear layers with ReLU between them; [..., I] -> [..., O] in float32."""
 
     def __init__(self, inputs: int, hidden_sizes: Sequence[int], outputs: int) -> None:
         layers: list[nn.Module] = []
@@ -37,15 +37,15 @@ class Perceptron(nn.Sequential):
     def forward(self, inputs: Tensor) -> Tensor:
         *hidden_layers, last = self._linear
         hidden = inputs
-        # Not as modules: for acting's few rows, calls take half of the products' time.
+        # Not as modules: with few rows, calls of modules take half of the products' time.
         for layer in hidden_layers:
             hidden = torch.relu_(F.linear(hidden, layer.weight, layer.bias))
         return F.linear(hidden, last.weight, last.bias)
 
     def in_numpy(self) -> Callable[[Floats], Floats]:
-        """`forward` of the weights as they are now, in float32 on a CPU.
+        """`forward` on arrays with the current weights, in float32 on a CPU.
 
-        With an acting policy's few rows PyTorch's calls take longer than the products.
+        With few rows, as in acting, PyTorch's calls take longer than the products.
         """
         *hidden_layers, (last, last_bias) = [
             (layer.weight.detach().numpy().T, layer.bias.detach().numpy()) for layer in self._linear
@@ -63,9 +63,9 @@ class Perceptron(nn.Sequential):
 
 
 class Critics(nn.Module):
-    """C critics of equal shape, evaluated together: one batched matrix product a layer.
+    """C critics of equal shape, evaluated together: one batched matrix product per layer.
 
-    C is 2, or 1 for DDPG. The first layer of both reads the same input, so it is a single product.
+    C is 2, or 1 for DDPG. All first layers read the same input, so they are a single product.
     """
 
     def __init__(self, inputs: int, hidden_sizes: Sequence[int], count: int = 2) -> None:
@@ -75,7 +75,7 @@ class Critics(nn.Module):
         self.weights = nn.ParameterList()
         self.biases = nn.ParameterList()
         for fan_in, fan_out in pairwise(sizes):
-            reach = 1.0 / math.sqrt(fan_in)  # nn.Linear's own initialisation, once per critic
+            reach = 1.0 / math.sqrt(fan_in)  # the initialization of nn.Linear, for each critic
             self.weights.append(
                 nn.Parameter(torch.empty(count, fan_in, fan_out).uniform_(-reach, reach))
             )
@@ -84,7 +84,7 @@ class Critics(nn.Module):
     def forward(self, inputs: Tensor, *, frozen: bool = False) -> Tensor:
         """[B, I] -> [C, B].
 
-        With `frozen`, gradients reach the inputs only: enough for the policy's step, and a third
+        With `frozen`, gradients reach only the inputs: enough for the policy's step, with a third
         less work.
         """
         *hidden_layers, (weight, bias) = self._layers(frozen)
@@ -109,11 +109,11 @@ class Critics(nn.Module):
 
 
 class RunningNormaliser(nn.Module):
-    """Running mean and standard deviation per feature; its outputs are clipped.
+    """Normalizes by running mean and standard deviation per feature, and clips the result.
 
-    The moments are float64 buffers and so part of the module's state: environment runners,
-    checkpoints and handoffs get them with the weights. Each feature has its own count, since a run
-    that starts from another one resets the counts of some (`for_another_run`).
+    The moments are float64 buffers and thus part of the module's state: environment runners,
+    checkpoints and handoffs get them with the weights. Each feature has its own count, because a
+    run that starts from another one resets the counts of some (`for_another_run`).
     """
 
     count: Tensor
@@ -136,12 +136,12 @@ class RunningNormaliser(nn.Module):
     def forward(self, values: Tensor) -> Tensor:
         """[..., I] -> [..., I]: (x - mean) / max(std, epsilon), clipped to plus/minus `clip`.
 
-        0 for a feature that was the same in all observations.
+        0 for a feature that had the same value in all observations.
         """
         return ((values - self.mean) * self.inverse_std).clamp(-self.clip, self.clip)
 
     def in_numpy(self) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
-        """`forward` by the moments as they are now."""
+        """`forward` on arrays with the current moments."""
         mean, inverse_std = self.mean.numpy(), self.inverse_std.numpy()
 
         def forward(values: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -153,13 +153,13 @@ class RunningNormaliser(nn.Module):
 
     @torch.no_grad()
     def update(self, values: Tensor) -> None:
-        """Adds [B, I] observations, B > 0, to the moments.
+        """Add [B, I] observations, B > 0, to the moments.
 
-        The batch's moments are merged with the previous ones (Chan et al. 1983, "Algorithms for
+        Merges the batch's moments with the previous ones (Chan et al. 1983, "Algorithms for
         computing the sample variance", (2.1)), each computed from numbers near 0.
         """
         values = values.to(self.centre)
-        # Relative to the first row: the mean of equal numbers is then exactly that number.
+        # Relative to the first row, so that the mean of equal numbers is exactly that number.
         shifted = values - values[0]
         shifted_mean = shifted.mean(0)
         added = values.shape[0]
@@ -170,20 +170,19 @@ class RunningNormaliser(nn.Module):
         self.centre += distance * (added / total)
         self.count.copy_(total)
         std = (self.squares / self.count).sqrt()
-        # The networks have learned nothing about a constant feature, so it stays 0 even when its
-        # value changes. MUSIC-u is trained on goals of 0 and evaluated with real ones, which would
-        # otherwise enter as -5 or 5, through untrained weights.
+        # Networks have learned nothing about a constant feature, so it stays 0 even if its value
+        # changes. MUSIC-u is trained on goals of 0 and evaluated with real ones, which would
+        # otherwise enter untrained weights as -5 or 5.
         constant = std <= _ROUNDING * self.centre.abs()
         self.mean.copy_(self.centre)
         self.inverse_std.copy_(torch.where(constant, 0.0, 1.0 / std.clamp(min=self.epsilon)))
 
 
 def for_another_run(moments: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """The initial moments of a run that starts from the networks of another run.
+    """Initial moments of a run that starts from the networks of another run.
 
-    Features that were constant are reset: their count would keep the standard deviation small for
-    as long as the source run was. MUSIC-u's goals are zeros; in MUSIC-f they vary. Until they do,
-    they stay 0.
+    Features that were constant are reset: otherwise their count would keep the standard deviation
+    small for as long as the source run lasted. MUSIC-u's goals are zeros; in MUSIC-f they vary.
     """
     varied = moments["inverse_std"] > 0
     fresh = {name: np.where(varied, moments[name], 0.0) for name in ("count", "centre", "squares")}

@@ -20,7 +20,7 @@ from music_rllib.experiment.continuation import REPORT_INTERVAL
 from music_rllib.intrinsic.music import HELD_OUT_STEPS
 from music_rllib.kernels.compiling import is_kept
 from music_rllib.kernels.update import learn
-from music_rllib.replay.segments import Segment, new_segments
+from music_rllib.replay.ring import Segment, new_segments
 from music_rllib.store.handoff import Spaces
 from music_rllib.store.history import Report
 from music_rllib.store.serialization import read_arrays, read_state, write_arrays, write_state

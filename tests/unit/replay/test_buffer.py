@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from music_rllib.replay.buffer import TrajectoryReplay
-from music_rllib.replay.priorities import SumTree, WeightedDraws, rank_weights
+from music_rllib.replay.sampling import SumTree, draw_weighted, rank_weights
 from music_rllib.replay.trajectories import ReplayLayout, Trajectory, WholeTrajectories
 
 LAYOUT = ReplayLayout(observation=3, action=2, goal=1, horizon=5)
@@ -324,18 +324,10 @@ def test_dense_ranks_leave_the_least_out_and_share_ties() -> None:
     np.testing.assert_array_equal(rank_weights(np.array([0.2, 0.2])), [1, 1])
 
 
-@given(
-    weights=st.lists(st.sampled_from([0.0, 1e-9, 1.0, 2.0, 500.0]), min_size=1, max_size=60),
-    drawn=st.lists(st.floats(0, 1, exclude_max=True), max_size=20),
-)
-@settings(deadline=None)
-def test_weighted_draws_invert_the_running_sums(weights: list[float], drawn: list[float]) -> None:
-    assume(any(weights))
-    sums = np.cumsum(weights)
-    uniform = np.array([*drawn, 0.0, np.nextafter(1.0, 0.0), *(sums[:-1] / sums[-1])])
-    uniform = uniform[uniform < 1.0]
-    expected = np.searchsorted(sums, uniform * sums[-1], side="right")
-    np.testing.assert_array_equal(WeightedDraws(np.array(weights)).draw(uniform), expected)
+def test_an_index_without_weight_is_never_drawn_not_even_by_rounding() -> None:
+    cumulative = np.cumsum([0.0, 1.0, 0.0, 0.7, 0.0])
+    uniform = np.array([0.0, 0.3, 1.0 / 1.7, np.nextafter(1.0, 0.0), 1.0])
+    assert draw_weighted(cumulative, uniform).tolist() == [1, 1, 3, 3, 3]
 
 
 def test_music_p_draws_episodes_by_the_rank_of_their_priority() -> None:

@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from music_rllib.replay import segments as module
+from music_rllib.replay import ring as module
 from music_rllib.replay.buffer import TrajectoryReplay
-from music_rllib.replay.segments import MOST, Segment, new_segments
+from music_rllib.replay.ring import TRAJECTORIES_PER_SEGMENT, Segment, new_segments
 from music_rllib.replay.trajectories import ReplayLayout, Trajectory
 from music_rllib.store.serialization import read_arrays, read_state, write_arrays, write_state
 
@@ -97,7 +97,7 @@ def test_saved_loaded_and_saved_again_it_is_the_same_bytes(
                 assert drawn.rows is not None
                 original.update_priorities(drawn.rows, rng.random(3).astype(np.float32))
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(module, "MOST", most)
+            patch.setattr(module, "TRAJECTORIES_PER_SEGMENT", most)
             segments = new_segments(original, segments, disk.write)
     loaded = make(12, seed=seed + 1, td=td)
     loaded.load_packed(original.index(), disk.parts(segments))
@@ -118,24 +118,23 @@ def test_saved_loaded_and_saved_again_it_is_the_same_bytes(
 
 
 def test_a_checkpoint_writes_only_what_is_new(disk: Disk) -> None:
-    """A full replay of a million transitions costs what has come since the last checkpoint."""
     layout = ReplayLayout(observation=25, action=4, goal=3, horizon=50)
-    replay = TrajectoryReplay(layout, 1_000_000, np.random.default_rng(0))
+    replay = TrajectoryReplay(layout, 225_000, np.random.default_rng(0))
     whole = Trajectory(
         np.ones((51, layout.frame), np.float32),
         np.ones((50, 4), np.float32),
         np.ones(50, np.float32),
         terminated=False,
     )
-    replay.extend([whole] * 20_000)
-    assert len(replay) == 1_000_000
+    replay.extend([whole] * 4_500)
+    assert len(replay) == 225_000
     segments = new_segments(replay, [], disk.write)
-    assert disk.written == pytest.approx(148e6, rel=0.03)
+    assert disk.written == pytest.approx(33.3e6, rel=0.03)
     disk.written = 0
     replay.extend([whole] * 40)
     segments = new_segments(replay, segments, disk.write)
-    assert disk.written == pytest.approx(148e6 * 40 / 20_000, rel=0.03)
-    ends = [*range(0, 20_001, MOST), 20_040]  # a file is not larger than a process can spare
+    assert disk.written == pytest.approx(33.3e6 * 40 / 4_500, rel=0.03)
+    ends = [*range(0, 4_500, TRAJECTORIES_PER_SEGMENT), 4_500, 4_540]
     assert [(segment.first, segment.end) for segment in segments] == list(pairwise(ends))
     disk.written = 0
     assert new_segments(replay, segments, disk.write) == segments
