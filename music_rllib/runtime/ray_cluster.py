@@ -148,23 +148,6 @@ def cluster(resources: Resources) -> Iterator[Capacity]:
 # -- capacity ---------------------------------------------------------------------------------
 
 
-def check_fits(resources: Resources) -> str | None:
-    """Check that Ray can hold a run, unless that is certain without asking Ray.
-
-    Returns:
-        `Capacity.remark`.
-
-    Raises:
-        ClusterError: Ray cannot be reached, or cannot hold a run.
-    """
-    if resources.bundle.keys() != {"CPU"} or (
-        cluster_address() is not None and resources.cpus_per_run > 1
-    ):
-        with cluster(resources) as capacity:
-            return capacity.remark
-    return None
-
-
 def _capacity(resources: Resources) -> Capacity:
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
     kinds = ("memory", "object_store_memory")

@@ -28,6 +28,7 @@ from music_rllib.runtime.machine import check_reachable, cluster_address
 from music_rllib.runtime.process import early
 from music_rllib.store.handoff import open_handoff, read_handoff
 from music_rllib.store.node_store import NodeStore
+from music_rllib.training.hang_watch import place_in
 
 if TYPE_CHECKING:
     from music_rllib.envs.probe import Question
@@ -154,9 +155,8 @@ def _ends(process: subprocess.Popen[bytes], answers: Path, seconds: float | None
 def _why_it_ended(code: int, call: str, errors: str) -> str:
     """The rule that an environment broke whose process ended during a call."""
     before = errors.partition("(most recent call first):\n")[0]
-    threads = [thread for thread in errors.split("\n\n") if "envs/probe.py" in thread]
-    places = [line.strip() for line in "".join(threads[:1]).splitlines() if "  File " in line]
-    at = f" at {places[0]}" if places else ""
+    place = place_in(errors, "envs/probe.py")
+    at = f" at {place}" if place else ""
     if _TIMEOUT in errors:
         return f"{call} must return within resources.hang_minutes, it hangs{at}"
     skipped = ("Fatal Python error", "Thread", "Current thread", " ")
@@ -211,15 +211,22 @@ def check_searches(opened: OpenSweep) -> None:
 
 
 def check_ray(console: Console, opened: OpenSweep) -> None:
-    """Check that Ray answers and can hold a run, unless everything is computed."""
-    begun = (opened.folder / sweep_files.CONFIG).is_file()
-    if opened.scheduler.complete and (begun or not opened.plan.searched):
-        return
-    if (address := cluster_address()) is not None:
-        check_reachable(address)
-    from music_rllib.runtime.ray_cluster import check_fits
+    """Check that a cluster answers and can hold a run, unless everything is computed.
 
-    if remark := check_fits(opened.config.resources):
-        console.print(remark, style="yellow", soft_wrap=True)
+    Raises:
+        ClusterError: It does not.
+    """
+    begun = (opened.folder / sweep_files.CONFIG).is_file()
+    address, resources = cluster_address(), opened.config.resources
+    if address is None or (opened.scheduler.complete and (begun or not opened.plan.searched)):
+        return
+    check_reachable(address)
+    if resources.bundle == {"CPU": 1}:  # every node can hold that
+        return
+    from music_rllib.runtime.ray_cluster import cluster
+
+    with cluster(resources) as capacity:
+        if capacity.remark is not None:
+            console.print(capacity.remark, style="yellow", soft_wrap=True)
     early.install()  # Ray has set a handler of its own
     early.check()

@@ -95,19 +95,19 @@ def check_hung(record: str | None, attempt: str, what: str) -> None:
     recorded_attempt, seconds, stack = (*record.split("\n", 2), "", "")[:3]
     if recorded_attempt != attempt:
         return
+    place = place_in(stack, "env_runner.py") or "an unknown place"
     raise HangError(
         f"environment {what} has not returned from {_call_in(stack)} for {float(seconds):g} s "
-        f"(resources.hang_minutes)\nit hangs at {_innermost(stack)}\n{stack}"
+        f"(resources.hang_minutes)\nit hangs at {place}\n{stack}"
     )
 
 
-def _innermost(stack: str) -> str:
-    """The innermost line of the playing thread, as `faulthandler` writes it."""
-    threads = [thread for thread in stack.split("\n\n") if "env_runner.py" in thread]
-    lines = [
-        line.strip() for line in "".join(threads[:1]).splitlines() if line.startswith("  File ")
-    ]
-    return lines[0] if lines else "an unknown place"
+def place_in(stack: str, file: str) -> str | None:
+    """The innermost line of the thread that runs `file`, in a stack that `faulthandler` wrote."""
+    for thread in stack.split("\n\n"):
+        if file in thread:
+            return next(line.strip() for line in thread.splitlines() if line.startswith("  File "))
+    return None
 
 
 def _call_in(stack: str) -> str:

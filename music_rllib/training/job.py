@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict
 from ray.experimental import internal_kv
 
 from music_rllib.config.run_settings import RunSettings
-from music_rllib.config.schema import Checkpoints
+from music_rllib.config.schema import Checkpoints, Resources
 from music_rllib.envs.tasks import Task
 from music_rllib.experiment.plan import Node
 
@@ -30,10 +30,7 @@ class NodeJob(BaseModel):
     source_task: Task | None
     storage: str
     """Absolute folder, or URI."""
-    cpus: int
-    gpus: float = 0.0
-    memory: int = 0
-    """Reserved bytes; 0: memory is not counted."""
+    resources: Resources = Resources(hang_minutes=None)
     until: int | None = None
     """The run pauses at the first evaluation at or after this environment step; None: never."""
     checkpoints: Checkpoints = Checkpoints()
@@ -45,11 +42,9 @@ class NodeJob(BaseModel):
     """Fingerprint of the task's environment in the driver; None: not computed."""
     same_environments: frozenset[str] = frozenset()
     """Digests of environments that count as the same."""
-    hang_minutes: float | None = None
-    """Maximum duration of one call of the environment; None: no limit."""
 
     @classmethod
-    def of(cls, node: Node, storage: str, cpus: int, **options: Any) -> NodeJob:
+    def of(cls, node: Node, storage: str, **options: Any) -> NodeJob:
         """The job that computes `node` in this storage; `options` are the fields with defaults."""
         return cls(
             key=node.key,
@@ -58,7 +53,6 @@ class NodeJob(BaseModel):
             source_key=node.source_key,
             source_task=node.input.task if node.input else None,
             storage=storage,
-            cpus=cpus,
             **options,
         )
 

@@ -44,10 +44,7 @@ class RunTrainable(Trainable):
 
     @classmethod
     def default_resource_request(cls, config: dict[str, Any]) -> PlacementGroupFactory:
-        """One bundle with a run's resources."""
-        job = NodeJob.from_tune(config)
-        bundle: dict[str, float] = {"CPU": job.cpus, "GPU": job.gpus, "memory": job.memory}
-        return PlacementGroupFactory([{name: amount for name, amount in bundle.items() if amount}])
+        return PlacementGroupFactory([NodeJob.from_tune(config).resources.bundle])
 
     def setup(self, config: dict[str, Any]) -> None:
         """Prepare only what can't fail; `step` reports errors with their cause."""
@@ -159,7 +156,7 @@ class RunTrainable(Trainable):
         self._start_watch()
         self._run_storage.check_environment()
         weights = self._run_storage.source_weights()
-        training = TrainingRun(self._job.run, weights, self._job.gpus)
+        training = TrainingRun(self._job.run, weights, self._job.resources.gpus_per_run)
         self._history, self._seconds_before = self._run_storage.restore(training)
         self._began = self._saved_at = time.monotonic()
         return training
@@ -174,7 +171,7 @@ class RunTrainable(Trainable):
         record = self._run_storage.work.folder.read_text(RECORD)
         self._run_storage.work.folder.remove(RECORD)
         check_hung(record, attempt, self._job.run.task.env_id)
-        if (minutes := self._job.hang_minutes) is None:
+        if (minutes := self._job.resources.hang_minutes) is None:
             return
         try:
             uri = self._run_storage.store.uri

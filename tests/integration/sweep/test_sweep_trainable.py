@@ -90,7 +90,6 @@ def job(storage: Path, run: RunSettings, source: NodeJob | None = None) -> NodeJ
         source_key=source_key,
         source_task=POINT if source else None,
         storage=str(storage),
-        cpus=1,
     )
 
 

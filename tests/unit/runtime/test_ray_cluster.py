@@ -162,10 +162,9 @@ def test_a_trial_reserves_the_bundle_that_was_checked() -> None:
 
     node = make_plan(load_sweep(DEFAULT_CONFIG)).nodes[0]
     wanted = Resources(cpus_per_run=2, gpus_per_run=0.5, memory_per_run=1.5)
-    memory = int(wanted.bundle["memory"])
-    job = NodeJob.of(node, "results", wanted.cpus_per_run, gpus=0.5, memory=memory)
+    job = NodeJob.of(node, "results", resources=wanted)
     assert RunTrainable.default_resource_request(job.to_tune()).bundles == [wanted.bundle]
-    plain = NodeJob.of(node, "results", 1)
+    plain = NodeJob.of(node, "results")
     assert RunTrainable.default_resource_request(plain.to_tune()).bundles == [{"CPU": 1}]
 
 
