@@ -37,6 +37,11 @@ class Hypothesis(NamedTuple):
     relation: str
     """`better than`, `worse than`, `equivalent to`, or `against` if nothing is expected."""
 
+    @property
+    def sides(self) -> tuple[Mapping[str, str], Mapping[str, str]]:
+        """Both conditions."""
+        return self.first, self.second
+
     @classmethod
     def of(cls, text: str) -> Self:
         """Parse a hypothesis.
@@ -80,6 +85,11 @@ def parsed(text: str) -> Any:
     with contextlib.suppress(ValueError, RecursionError):
         return json.loads(_JSON_FOR_PYTHON.get(text, text))
     return text
+
+
+def same_value(one: str, other: str) -> bool:
+    """Whether two texts are the same value: `1` and `1.0`, `true` and `True`."""
+    return one == other or same(parsed(one), parsed(other))
 
 
 class Analysis(StrictModel):

@@ -15,11 +15,13 @@ from pathlib import Path
 from typing import Any
 
 from music_rllib.config.document import Document, Place
-from music_rllib.config.hypotheses import check_analysis
+from music_rllib.config.hypotheses import check_analysis, unnamed_differences
 from music_rllib.config.layers import all_settings, check_defaults
 from music_rllib.config.overrides import lay_overrides, parse_overrides, preset_path
 from music_rllib.config.presets import read_preset
 from music_rllib.config.problems import ConfigError, Findings, shown, unknown
+from music_rllib.config.returns import Range, cut_off
+from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.schema import Header, Stage, SweepConfig
 from music_rllib.config.search import FINAL_SEED
 from music_rllib.config.stages import resolve_stage
@@ -239,3 +241,41 @@ def _count_runs(stages: Mapping[str, Stage | None], seeds: int, findings: Findin
             rule = f"must not make the sweep larger than {MOST_RUNS:,} runs, got {total:,}"
             findings.add(("stages", index), rule)
             return
+
+
+def warnings_of(config: SweepConfig) -> list[str]:
+    """One line for each property of a valid sweep that may be unintended."""
+    places: dict[str, list[str]] = {}
+    for stage in config.stages:
+        for task in stage.tasks:
+            runs = (point.runs[task.name] for _, point in stage.examples())
+            if text := next(filter(None, map(_cut_off_returns, runs)), None):
+                places.setdefault(text, []).append(f"{stage.name}/{task.name}")
+    lines = [f"{', '.join(where)}: {text}" for text, where in places.items()]
+    lines += [
+        f"{stage.name}: search.trials is {search.trials:,}, and the space has {search.count:,} "
+        f"points: the search ends after {search.count:,} trials"
+        for stage in config.stages
+        if (search := stage.search) is not None and (search.trials or 0) > search.count
+    ]
+    if config.analysis is not None:
+        stages = {stage.name: stage for stage in config.stages}
+        lines += [
+            f"analysis: {hypothesis!r} compares runs that also differ in {', '.join(settings)}"
+            for hypothesis, settings in unnamed_differences(config.analysis, stages)
+        ]
+    return lines
+
+
+def _cut_off_returns(run: RunSettings) -> str | None:
+    """The warning about a run's `target_bounds`; None if there is none."""
+    known = run.task.reward_range or (None if run.music.task_reward else (0.0, 0.0))
+    if known is not None:
+        text = cut_off(run.tac, run.music, Range(*known))
+        return text and f"tac.{text}"
+    if run.tac.target_bounds is None:
+        return None
+    return (
+        "tac.target_bounds may cut off reachable values: the rewards of "
+        f"{run.task.name} are not known (environments.{run.task.name}.reward_range)"
+    )

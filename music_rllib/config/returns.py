@@ -1,4 +1,4 @@
-"""Discounted returns that a configuration can reach, and what cuts them off or is beyond them."""
+"""Discounted returns that a configuration can reach, bounds that cut them off, and divergence."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from music_rllib.config.tac_settings import (
-    Alpha,
     LearnedAlpha,
     MatchedAlpha,
     NormalisedAlpha,
@@ -35,29 +34,19 @@ class Range(NamedTuple):
 
 
 def reward_of_step(task: Range, music: MusicSettings) -> Range:
-    """Range of a step's reward: the task's, plus an intrinsic one in weight times [-1, 0]."""
+    """Range of a step's reward: the task's, plus an intrinsic reward in weight times [-1, 0]."""
     low, high = task if music.task_reward else Range(0.0, 0.0)
     weight = extremes(music.mi_reward_weight)[1] if music.estimator != "none" else 0.0
     return Range(low - weight, high)
 
 
-class CutOff(NamedTuple):
-    """Reachable targets that are clipped, and the warning about them."""
-
-    reached: Range
-    warning: str
-
-    def __str__(self) -> str:
-        return self.warning
-
-
-def cut_off(tac: TACSettings, music: MusicSettings, task: Range) -> CutOff | None:
-    """The reachable targets, if `target_bounds` cut off some of them.
+def cut_off(tac: TACSettings, music: MusicSettings, task: Range) -> str | None:
+    """A warning if `target_bounds` cut off reachable targets.
 
     The return of an endless episode is a step's reward times 1/(1 - gamma); that of a terminated
     one is nearer to 0. The target value network also holds the entropies of later steps. These have
-    no lower bound (a policy may be arbitrarily narrow), so that they count at the upper end only.
-    They count for one action dimension, because the environment decides on the number.
+    no lower bound (a policy may be arbitrarily narrow), so they count at the upper end only. They
+    count for one action dimension, because the environment decides on the number.
     """
     if tac.target_bounds is None:
         return None
@@ -71,11 +60,10 @@ def cut_off(tac: TACSettings, music: MusicSettings, task: Range) -> CutOff | Non
     if bounds.low <= reached.low + slack and bounds.high >= reached.high - slack:
         return None
     entropy = " and the entropy of one action dimension" if bonus > 0 else ""
-    warning = (
-        f"target_bounds {bounds} cut off values that can be reached, {reached}: "
+    return (
+        f"target_bounds {bounds} cut off reachable values, {reached}: "
         f"rewards of {reward} a step at gamma {tac.gamma:g}{entropy}"
     )
-    return CutOff(reached, warning)
 
 
 def _entropy_bonus(tac: TACSettings) -> float:
@@ -84,32 +72,34 @@ def _entropy_bonus(tac: TACSettings) -> float:
         return 0.0
     from music_rllib.functional.entropy_scale import largest_entropy  # loads PyTorch
 
-    qs = extremes(tac.entropic_index)
-    return max(0.0, *(_largest_alpha(tac.alpha, q) * largest_entropy(q) for q in qs))
-
-
-def _largest_alpha(alpha: Alpha, q: float) -> float:
-    if isinstance(alpha, LearnedAlpha):
-        return alpha.initial  # where it goes from there is not known
-    if isinstance(alpha, MatchedAlpha | NormalisedAlpha):
-        return alpha.scaled(extremes(alpha.value)[1], q, 1, "per_dimension")
-    return extremes(alpha)[1]
+    alpha = tac.alpha
+    bonuses = [0.0]
+    for q in extremes(tac.entropic_index):
+        match alpha:
+            case LearnedAlpha():
+                largest = alpha.initial  # later values are unknown
+            case MatchedAlpha() | NormalisedAlpha():
+                largest = alpha.scaled(extremes(alpha.value)[1], q, 1, "per_dimension")
+            case _:
+                largest = extremes(alpha)[1]
+        bonuses.append(largest * largest_entropy(q))
+    return max(bonuses)
 
 
 def have_diverged(
     means: NDArray[np.float64], bonuses: NDArray[np.float64], reward: Range, gamma: float
 ) -> NDArray[np.bool_]:
-    """Where critics are so far from all returns that they can't have learned them from rewards.
+    """Whether critics are above `_DIVERGED` times every reachable return.
 
     Args:
         means: [N] means of the critics, in the order of time.
-        bonuses: [N] α S_q of the policy at the same times. Its largest size so far counts, as
-            it has no bound and critics follow it late.
-        reward: That of a step.
-        gamma: The discount.
+        bonuses: [N] α S_q of the policy at the same times. Its largest absolute value so far
+            counts, because it has no bound and critics follow it late.
+        reward: Range of a step's reward.
+        gamma: Discount.
 
     Returns:
-        [N]; False where a mean is NaN, and before the first bonus that is not.
+        [N]; False where a mean is NaN, and before the first bonus that is not NaN.
     """
     step = max(abs(reward.low), abs(reward.high))
     reached = (step + np.fmax.accumulate(np.abs(bonuses))) / (1.0 - gamma)

@@ -14,8 +14,7 @@ from itertools import combinations
 
 import numpy as np
 
-from music_rllib.config.analysis import Hypothesis, parsed
-from music_rllib.config.problems import same
+from music_rllib.config.analysis import Hypothesis, same_value
 from music_rllib.results import statistics as st
 from music_rllib.results.analysis_plan import PlanVersion
 from music_rllib.results.claims import Claim, Pairs, claims_of, decided, exploratory
@@ -262,7 +261,7 @@ def _matching(
 def _has(run: RunRecord, name: str, value: str) -> bool:
     _, tag = IN_WORDS.get(name, ("", ""))
     known = [text for text in (run.params.get(name), run.tags.get(tag)) if text is not None]
-    return any(value == text or same(parsed(value), parsed(text)) for text in known)
+    return any(same_value(value, text) for text in known)
 
 
 def _equal_in_the_rest(

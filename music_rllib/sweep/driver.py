@@ -16,8 +16,7 @@ from typing import Any
 from rich.console import Console
 
 from music_rllib.command_line import console_for, how_to_continue, print_json
-from music_rllib.config.load import load_sweep
-from music_rllib.config.remarks import remarks
+from music_rllib.config.load import load_sweep, warnings_of
 from music_rllib.config.schema import MlflowSettings, SweepConfig
 from music_rllib.envs.modules import search_in
 from music_rllib.errors import BadInputError
@@ -195,7 +194,7 @@ def _open(console: Console, config: SweepConfig, *, lenient: bool = False) -> Op
     notes = (
         remark,
         *played,
-        *remarks(config),
+        *warnings_of(config),
         *shared_runs(planned),
         *check_demand(opened),
         *longer(opened),

@@ -267,7 +267,7 @@ class TACConfigBase(AlgorithmConfig):
             )
         task = self._reward_of_step()
         if task is not None and (warning := cut_off(tac, music, task)):
-            warnings.warn(str(warning), stacklevel=2)
+            warnings.warn(warning, stacklevel=2)
 
     def _check_adaptive(self, tac: TACSettings, music: MusicSettings) -> None:
         adaptive = {

@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from music_rllib import names
-from music_rllib.config.remarks import remarks
+from music_rllib.config.load import warnings_of
 from music_rllib.config.schema import Source, Stage, SweepConfig
 from music_rllib.config.search import SearchSettings
 from music_rllib.config.space import Choice, Dimension
@@ -170,7 +170,7 @@ def plan_answer(opened: OpenSweep, changes: str) -> dict[str, Any]:
         "env_steps_left": sum(node["env_steps"] for node in nodes if not node["finished"]),
         "nodes": nodes,
         "searches": searches,
-        "remarks": [*remarks(config), *shared_runs(plan)],
+        "remarks": [*warnings_of(config), *shared_runs(plan)],
         "alpha": alpha_rows(plan),
         "adaptive": adaptive_rows(plan),
         "changes": changes or None,

@@ -6,10 +6,9 @@ from typing import Any
 import pytest
 import torch
 
-from music_rllib.config.load import load_sweep
+from music_rllib.config.load import load_sweep, warnings_of
 from music_rllib.config.presets import SHIPPED, shipped_presets
 from music_rllib.config.problems import ConfigError
-from music_rllib.config.remarks import remarks
 from music_rllib.config.yaml_file import read_yaml
 from music_rllib.functional.actor_critic import critic_target
 from tests.unit.functional.entropies import gaussian_entropy, joint_entropy
@@ -116,9 +115,9 @@ def test_music_2021_learns_from_the_intrinsic_reward_of_music_r(tmp_path: Path) 
 def test_no_shipped_bounds_cut_off_what_can_be_reached(tmp_path: Path) -> None:
     for preset in sorted(path.stem for path in SHIPPED.glob("*.yaml")):
         config = load_sweep(sweep(tmp_path, preset))
-        assert remarks(config) == []
+        assert warnings_of(config) == []
     for path in SWEEPS:
-        assert remarks(load_sweep(path)) == []
+        assert warnings_of(load_sweep(path)) == []
 
 
 CLAIMED: dict[str, dict[str, Any]] = {

@@ -15,9 +15,8 @@ import yaml
 from pydantic import ValidationError
 
 from music_rllib import names
-from music_rllib.config.load import load_sweep
+from music_rllib.config.load import load_sweep, warnings_of
 from music_rllib.config.problems import ConfigError
-from music_rllib.config.remarks import remarks
 from music_rllib.config.search import Objective, Pruning, Rung, SearchSettings
 from music_rllib.search.objective import aggregate, prune, score
 from music_rllib.search.sampler import Proposer, trial_at
@@ -477,7 +476,7 @@ def test_no_point_is_tried_twice(sampler: str, space: Document, trials: int) -> 
 def test_a_search_ends_with_its_last_point_and_says_so(tmp_path: Path) -> None:
     path = tmp_path / "sweep.yaml"
     path.write_text(yaml.safe_dump(document({"space": CHOICES, "trials": 20})))
-    (line,) = remarks(load_sweep(path))
+    (line,) = warnings_of(load_sweep(path))
     assert line == (
         "finetune: search.trials is 20, and the space has 9 points: the search ends after 9 trials"
     )

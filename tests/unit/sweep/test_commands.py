@@ -726,7 +726,7 @@ def test_plan_as_json_with_more_seeds(
     Path("narrow.yaml").write_text(yaml.safe_dump(narrow))
     answer = program("plan", "narrow.yaml", "--json")
     (remark,) = answer.document["remarks"]
-    assert "target_bounds -9 to 200 cut off values that can be reached, -100 to" in remark
+    assert "target_bounds -9 to 200 cut off reachable values, -100 to" in remark
     assert remark in answer.errors
     bad = program("plan", "sweep.yaml", "--seeds", "many")
     assert (bad.code, "--seeds must be a number of seeds" in bad.errors) == (2, True)
