@@ -522,9 +522,7 @@ def test_bounds_that_cut_off_values_within_reach_are_warned_of(make: Any, said: 
     if said is None:
         config.validate()
     else:
-        with pytest.warns(
-            UserWarning, match=rf"target_bounds .* reachable values, {said}"
-        ):
+        with pytest.warns(UserWarning, match=rf"target_bounds .* reachable values, {said}"):
             config.validate()
 
 
