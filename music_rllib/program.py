@@ -12,7 +12,7 @@ from music_rllib.command_line import PROGRAM, add_command, new_app, run_app
 from music_rllib.report import cli as report
 from music_rllib.runtime.quiet import prepare_environment, quiet_third_parties
 from music_rllib.serve import command as serve
-from music_rllib.sweep.commands import best, clean, compare, evaluate, files, run, status
+from music_rllib.sweep.commands import compare, evaluate, files, run, status
 
 COMMANDS: dict[str, tuple[Callable[..., int], str]] = {
     "run": (run.run, run.RUN_EXAMPLES),
@@ -21,9 +21,9 @@ COMMANDS: dict[str, tuple[Callable[..., int], str]] = {
     "stop": (status.stop, status.STOP_EXAMPLES),
     "resume": (run.resume, run.RESUME_EXAMPLES),
     "compare": (compare.compare, compare.EXAMPLES),
-    "best": (best.best, best.EXAMPLES),
+    "best": (files.best, files.BEST_EXAMPLES),
     "evaluate": (evaluate.evaluate, evaluate.EXAMPLES),
-    "clean": (clean.clean, clean.EXAMPLES),
+    "clean": (files.clean, files.CLEAN_EXAMPLES),
     "init": (files.init, files.INIT_EXAMPLES),
     "presets": (files.presets, files.PRESETS_EXAMPLES),
     "schema": (files.schema, files.SCHEMA_EXAMPLES),

@@ -33,7 +33,7 @@ Floats = npt.NDArray[np.float32]
 
 
 class PolicyFileError(ValueError):
-    """A file is no policy; the message names the file and the reason."""
+    """A file is not a policy; the message names the file and the reason."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,10 +57,10 @@ class PolicyNetwork:
     goal_size: int
     """G, 0 for an environment without goals."""
     about: Mapping[str, Any] = field(default_factory=dict)
-    """The run it comes from, as JSON values; no influence on actions."""
+    """The run that it comes from, as JSON values; they do not influence actions."""
 
     def __post_init__(self) -> None:
-        """Checks that the arrays fit together; raises ValueError where they don't."""
+        """Raise ValueError if the arrays do not fit together."""
         sizes = [self.input_size, *(len(bias) for bias in self.biases)]
         shapes = [(out, into) for into, out in pairwise(sizes)]
         if not self.weights or [weight.shape for weight in self.weights] != shapes:
@@ -110,11 +110,11 @@ class PolicyNetwork:
         """The deterministic action: [A], or [B, A] for a batch, within the environment's bounds.
 
         Args:
-            observation: a dictionary with `observation` [O] and `desired_goal` [G] (more is
+            observation: A dictionary with `observation` [O] and `desired_goal` [G] (more is
                 ignored), or an array [I] of both side by side; or batches of them, [B, ...].
 
         Raises:
-            ValueError: a part is missing, of another size, or not finite.
+            ValueError: A part is missing, of another size, or not finite.
         """
         inputs = self._inputs(observation)
         hidden = np.clip((inputs - self.mean) * self.inverse_std, -self.clip, self.clip)
@@ -169,7 +169,7 @@ class PolicyNetwork:
 
     @classmethod
     def from_file(cls, path: Path) -> PolicyNetwork:
-        """Reads a file of `to_bytes`; raises PolicyFileError where it is none."""
+        """Read a file of `to_bytes`; raise PolicyFileError for any other file."""
         try:
             _check_file(path)
             with safetensors.safe_open(path, framework="numpy") as file:
@@ -209,9 +209,9 @@ _UNREADABLE = (
 
 
 def _check_file(path: Path) -> None:
-    """Raises ValueError, before anything is parsed, for no regular file or a large header."""
+    """Raise ValueError, before anything is parsed, for a large header or not a regular file."""
     if not path.is_file():
-        raise ValueError("it is no regular file")
+        raise ValueError("it is not a regular file")
     with path.open("rb") as file:
         size = int.from_bytes(file.read(8), "little")
     if size > MOST_HEADER_BYTES:

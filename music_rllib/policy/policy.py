@@ -1,9 +1,11 @@
-"""Loads a run's policy from any place that holds it, without Ray and without unpickling."""
+"""Find a run's policy by its key, label or place, and load it without Ray or unpickling."""
 
 from __future__ import annotations
 
 import contextlib
+import json
 import os
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,12 +15,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from music_rllib.config.load import declared_tasks
 from music_rllib.config.problems import shown
 from music_rllib.envs.make import Known, known_environment
 from music_rllib.envs.tasks import Task
 from music_rllib.errors import BadInputError
+from music_rllib.labels import label_matches
 from music_rllib.limits import MOST_WEIGHTS_BYTES
 from music_rllib.policy.network import Floats, PolicyFileError, PolicyNetwork
+from music_rllib.redaction import redact
 from music_rllib.store.handoff import MANIFEST as HANDOFF_FILE
 from music_rllib.store.handoff import (
     HandoffError,
@@ -27,12 +32,23 @@ from music_rllib.store.handoff import (
     read_handoff,
 )
 from music_rllib.store.sealed import MANIFEST, SealedFolders
-from music_rllib.store.storage import StorageError, database_url, open_storage
+from music_rllib.store.storage import (
+    StorageError,
+    StorageFolder,
+    below,
+    database_url,
+    open_storage,
+    resolve_storage,
+)
 
 MLFLOW_FILE = "policy.safetensors"
 """File with the policy in an MLflow model."""
+_WEIGHTS = {HANDOFF_FILE, MLFLOW_FILE, f"artifacts/{MLFLOW_FILE}"}
+"""Files that a policy needs, besides those of a handoff."""
+_SHORTEST_KEY = 4
+"""Shortest beginning of a key that identifies a run."""
 _LISTED = 8
-"""Sub-folders that a message lists."""
+"""Number of runs that a message lists."""
 
 
 class PolicyError(BadInputError, ValueError):
@@ -41,7 +57,7 @@ class PolicyError(BadInputError, ValueError):
 
 @dataclass(frozen=True, kw_only=True)
 class Policy:
-    """The deterministic policy of a run, and the task and settings it was trained with."""
+    """The deterministic policy of a run, with the task and settings of its training."""
 
     network: PolicyNetwork
     task: Task
@@ -49,12 +65,12 @@ class Policy:
     seed: int
     node_key: str
     env_steps: int
-    """Environment steps of its training."""
+    """Environment steps of the training."""
     max_episode_steps: int
-    """Steps after which its episodes are truncated."""
+    """Steps after which episodes are truncated."""
     environment: Known | None
-    """The environment of its episodes. None where only the policy's file names it, and neither
-    this package nor the user does: the policy acts, but no environment is imported."""
+    """The environment of its episodes. None if only the policy's file names it, because a file
+    must not choose the code to import."""
 
     @property
     def observation_size(self) -> int:
@@ -63,7 +79,7 @@ class Policy:
 
     @property
     def goal_size(self) -> int:
-        """Features of a goal; 0 where the task has none."""
+        """Features of a goal; 0 if the task has none."""
         return self.network.goal_size
 
     @property
@@ -77,7 +93,7 @@ class Policy:
         return self.network.action_size
 
     def act(self, observation: Any) -> Floats:
-        """The action in the environment's own units, float32 (see `PolicyNetwork.act`)."""
+        """The action in the environment's units, float32 (see `PolicyNetwork.act`)."""
         return self.network.act(observation)
 
     def to_bytes(self) -> bytes:
@@ -86,20 +102,20 @@ class Policy:
 
 
 def load_policy(place: str | Path, env: str | Sequence[Task] = ()) -> Policy:
-    """Loads the policy of a finished or unfinished run.
+    """Load the policy of a finished or unfinished run.
 
     Nothing that its files name is imported or executed.
 
     Args:
-        place: a folder, or an `s3://` or `gs://` URI, of a finished node (`nodes/KEY`), of a
-            checkpoint (`work/KEY/NUMBER`) or of a handoff; a policy's own file; or an MLflow URI
-            (`models:/...`, `runs:/...`).
-        env: the environment of its episodes, where it isn't one of the built-in tasks or of
-            Gymnasium: its id (`module:` in front is imported), or tasks that declare it, as
-            `config.load.declared_tasks` reads them from a sweep's YAML file.
+        place: Folder or `s3://` or `gs://` URI of a finished run (`nodes/KEY`), of a checkpoint
+            (`work/KEY/NUMBER`) or of a handoff; a policy's file; or an MLflow URI (`models:/...`,
+            `runs:/...`).
+        env: The environment of its episodes, if it is neither built in nor part of Gymnasium: its
+            id (`module:` in front is imported), or tasks that declare it, as `named_environment`
+            reads them from a sweep's YAML file.
 
     Raises:
-        PolicyError: there is no policy, or it is damaged; the message names the place.
+        PolicyError: There is no policy, or it is damaged; the message names the place.
     """
     text = str(place)
     try:
@@ -115,9 +131,9 @@ def policy_from_folder(folder: Path, env: str | Sequence[Task] = ()) -> Policy:
     """The policy in a local node, checkpoint, handoff or MLflow model; `env` as for `load_policy`.
 
     Raises:
-        PolicyError: the weights don't fit their task or settings, or sub-folders hold several
+        PolicyError: The weights don't fit their task or settings, or sub-folders hold several
             policies.
-        HandoffError: there are no weights.
+        HandoffError: There are no weights.
     """
     for inside in (MLFLOW_FILE, f"artifacts/{MLFLOW_FILE}"):
         # A handoff's own file of weights has the same name.
@@ -140,23 +156,11 @@ def policy_from_folder(folder: Path, env: str | Sequence[Task] = ()) -> Policy:
 
 
 def _several_policies(folder: Path) -> PolicyError | None:
-    """The error for a folder that has policies in its sub-folders only; None for any other.
-
-    `best` writes such a folder where a sweep has several tasks.
-    """
-    if (folder / "handoff").exists() or (folder / HANDOFF_FILE).exists():
-        return None  # the error of this handoff is the one to report
-    policies = []
-    for child in sorted(folder.glob("*/")):
-        with contextlib.suppress(HandoffError):
-            policies.append(f"{child} ({open_handoff(child)[1].info.task.name})")
-    if not policies:
+    """The error for a folder of `best` with a sub-folder for each task; None for any other."""
+    policies = [str(child.parent) for child in sorted(folder.glob("*/handoff"))]
+    if not policies or (folder / "handoff").exists() or (folder / HANDOFF_FILE).exists():
         return None
-    more = f" and {len(policies) - _LISTED} more" if len(policies) > _LISTED else ""
-    return PolicyError(
-        f"{folder} must hold one policy, its sub-folders hold one each: give "
-        f"{' or '.join(policies[:_LISTED])}{more}"
-    )
+    return PolicyError(f"{folder} must hold one policy: use {' or '.join(policies[:_LISTED])}")
 
 
 def _network(parts: Mapping[str, Mapping[str, NDArray[Any]]], info: HandoffInfo) -> PolicyNetwork:
@@ -242,7 +246,7 @@ def _from_mlflow(uri: str, env: str | Sequence[Task]) -> Policy:
 
 @contextlib.contextmanager
 def _local_copy(place: str) -> Iterator[Path]:
-    """Yields a verified copy of an object folder, or any other local folder or file itself."""
+    """Yield a verified copy of a sealed folder; any other local folder or file as it is."""
     storage = open_storage(place)
     parent, _, name = storage.path.rpartition("/")
     folders = SealedFolders(replace(storage, path=parent))
@@ -250,10 +254,10 @@ def _local_copy(place: str) -> Iterator[Path]:
         if storage.is_local:
             yield Path(storage.path)
             return
-        raise PolicyError(f"{place} must be a finished node or a checkpoint: no {MANIFEST} there")
+        raise PolicyError(f"{place} must be a finished run or a checkpoint: no {MANIFEST} there")
     with TemporaryDirectory() as folder:
         sizes = {file: entry.bytes for file, entry in folders.manifest(name).files.items()}
-        needed = {file for file in sizes if file in _FILES or file.startswith("handoff/")}
+        needed = {file for file in sizes if file in _WEIGHTS or file.startswith("handoff/")}
         total = sum(sizes[file] for file in needed)
         if total > MOST_WEIGHTS_BYTES:
             raise PolicyError(
@@ -263,11 +267,8 @@ def _local_copy(place: str) -> Iterator[Path]:
         yield Path(folder)
 
 
-_FILES = {HANDOFF_FILE, MLFLOW_FILE, f"artifacts/{MLFLOW_FILE}"}
-
-
 def unknown_environment(task: Task) -> str:
-    """The message that a task's environment is not made, and how to have it made."""
+    """The message for an environment that is not made, with the options that allow it."""
     arguments = f" with {shown(task.env_kwargs)}" if task.env_kwargs else ""
     return (
         f"the environment of {task.name} must be a built-in task's, one of Gymnasium's, or named "
@@ -279,3 +280,97 @@ def unknown_environment(task: Task) -> str:
 
 def _floats(array: NDArray[Any]) -> Floats:
     return np.ascontiguousarray(array, np.float32)
+
+
+# -- finding a policy ------------------------------------------------------------------------------
+
+
+def find_policy(wanted: str, storage: str) -> str:
+    """The place from which `load_policy` loads a run's policy.
+
+    Args:
+        wanted: A place (folder, file, URI), which is returned as it is; the key of a run or its
+            beginning; or a run's label or enough parts of it (`q=1.5/seed0`).
+        storage: Folder or URI in which keys and labels are looked up.
+
+    Returns:
+        The folder of a finished run, or the newest checkpoint of an unfinished one.
+
+    Raises:
+        PolicyError: No run matches, or several do; the message lists them.
+    """
+    if "://" in wanted or wanted.startswith(("models:/", "runs:/")) or os.path.lexists(wanted):
+        return wanted
+    storage = resolve_storage(storage)[0]
+    try:
+        return _find(wanted, storage)
+    except OSError as error:
+        raise PolicyError(
+            f"--storage must be a place that can be read, got {redact(storage)}: {error}"
+        ) from error
+
+
+def _find(wanted: str, storage: str) -> str:
+    root = open_storage(storage)
+    labels: dict[str, list[str]] = {}
+    for key, label in _labels(root):
+        labels.setdefault(key, []).append(label)  # sweeps that share a run label it differently
+    nodes = SealedFolders(root / "nodes")
+    finished = nodes.names()
+    unfinished = [key for key in sorted((root / "work").folders()) if key not in finished]
+    keys = _matching(wanted, [*finished, *unfinished], labels)
+    if not keys:
+        known = [labels.get(key, [key])[0] for key in finished][:_LISTED]
+        there = f"finished there: {', '.join(known)}" if known else "no run is finished there"
+        raise PolicyError(
+            f"{wanted!r} must be a folder, or the key or label of a run in {storage}; {there}"
+        )
+    if len(keys) > 1:
+        fits = [f"{labels[key][0]} ({key[:8]})" if key in labels else key for key in keys[:_LISTED]]
+        more = f" and {len(keys) - _LISTED} more" if len(keys) > _LISTED else ""
+        raise PolicyError(
+            f"{wanted!r} must match one run, it matches {', '.join(fits)}{more}; give more of the "
+            "label, or the key"
+        )
+    if keys[0] in finished:
+        return below(storage, f"nodes/{keys[0]}")
+    checkpoints = SealedFolders(root / "work" / keys[0]).names()
+    if not checkpoints:
+        raise PolicyError(f"{wanted!r} must have a checkpoint, it has none in {storage} yet")
+    return below(storage, f"work/{keys[0]}/{checkpoints[-1]}")
+
+
+def named_environment(env: str | None) -> str | tuple[Task, ...]:
+    """The environment of `--env` for `load_policy`: an id, or the tasks of a sweep's YAML file.
+
+    Raises:
+        ConfigError: The file can't be read, or is wrong.
+    """
+    if env is None:
+        return ()
+    return declared_tasks(env) if env.endswith((".yaml", ".yml")) else env
+
+
+def _matching(wanted: str, keys: list[str], labels: dict[str, list[str]]) -> list[str]:
+    by_label = [key for key in keys if wanted in labels.get(key, ())]
+    if by_label:
+        return by_label
+    if wanted in keys:
+        return [wanted]
+    by_prefix = [key for key in keys if key.startswith(wanted)]
+    if len(wanted) >= _SHORTEST_KEY and by_prefix:
+        return by_prefix
+    return [key for key in keys if any(label_matches(wanted, one) for one in labels.get(key, ()))]
+
+
+def _labels(storage: StorageFolder) -> Iterator[tuple[str, str]]:
+    """Key and label of every run in the plans of the storage's sweeps."""
+    for name in sorted(storage.having("plan.json", storage.folders())):
+        try:
+            nodes = json.loads((storage / name).read("plan.json") or b"")["nodes"]
+            labels = [(str(node["key"]), str(node["label"])) for node in nodes]
+        except (ValueError, TypeError, LookupError, RecursionError) as error:
+            plan = f"{storage.path}/{name}/plan.json"
+            warnings.warn(f"{plan} is damaged, its labels are unknown: {error!r}", stacklevel=2)
+            continue
+        yield from labels

@@ -1,4 +1,4 @@
-"""Plays episodes of a policy in its task."""
+"""Episodes of a policy in its task."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from music_rllib.policy.policy import Policy, PolicyError, unknown_environment
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeResult:
-    """The result of one episode; None where the task doesn't define a value."""
+    """The result of one episode; None if the task does not define a value."""
 
     seed: int
     """Seed of the environment's reset."""
@@ -32,21 +32,22 @@ class EpisodeResult:
     """Distance between the surroundings' first and last state (metres in the Fetch tasks)."""
 
 
-class Moment(NamedTuple):
-    """The state of an episode after the reset or a step, for a film."""
+class EpisodeStep(NamedTuple):
+    """The state of an episode after its reset or a step, for a video."""
 
     env: Env
     step: int
     success: bool | None
-    """None before the first step, and where the task doesn't define it."""
+    """None before the first step, and if the task does not define it."""
     distance: float | None
     """Distance between achieved and desired goal."""
 
 
 def open_task(policy: Policy, **options: Any) -> Env:
-    """Makes the policy's environment; `options` override the task's arguments of `gymnasium.make`.
+    """Make the policy's environment; `options` override the task's arguments of `gymnasium.make`.
 
-    Raises PolicyError where only the policy's file names it, it can't be made, or it doesn't fit.
+    Raises:
+        PolicyError: Only the policy's file names it, it can't be made, or it does not fit.
     """
     known = policy.environment
     if known is None:
@@ -64,7 +65,7 @@ def open_task(policy: Policy, **options: Any) -> Env:
 
 
 def _check_fit(policy: Policy, env: Env) -> None:
-    """Raises ValueError for an environment with other observations, goals or actions."""
+    """Raise ValueError for an environment with other observations, goals or actions."""
     actions = check_action_space(env.action_space).shape
     theirs = (*observation_sizes(env.observation_space), *actions)
     ours = (policy.observation_size, policy.goal_size, policy.action_size)
@@ -76,24 +77,28 @@ def _check_fit(policy: Policy, env: Env) -> None:
 
 
 def play(
-    policy: Policy, env: Env, episodes: int, seed: int, see: Callable[[Moment], None] | None = None
+    policy: Policy,
+    env: Env,
+    episodes: int,
+    seed: int,
+    on_step: Callable[[EpisodeStep], None] | None = None,
 ) -> Iterator[EpisodeResult]:
-    """Plays `episodes` deterministic episodes in an environment of `open_task`.
+    """Play `episodes` deterministic episodes in an environment of `open_task`.
 
-    Equal seeds give equal starts and goals. `see` is called with each moment of each episode.
+    Equal seeds give equal starts and goals. `on_step` is called after each reset and step.
     """
     for number in range(episodes):
         entropy = np.random.SeedSequence((seed, number))
-        yield _episode(policy, env, reset_seed(entropy, policy.task.seed_range), see)
+        yield _episode(policy, env, reset_seed(entropy, policy.task.seed_range), on_step)
 
 
 def _episode(
-    policy: Policy, env: Env, seed: int, see: Callable[[Moment], None] | None
+    policy: Policy, env: Env, seed: int, on_step: Callable[[EpisodeStep], None] | None
 ) -> EpisodeResult:
     observation, _ = env.reset(seed=seed)
     first, total, successes = _surroundings(policy, observation), 0.0, []
-    if see:
-        see(Moment(env, 0, None, _distance(observation)))
+    if on_step:
+        on_step(EpisodeStep(env, 0, None, _distance(observation)))
     steps = 0
     for steps in range(1, policy.max_episode_steps + 1):
         # A bound may lie between two numbers of the policy's precision.
@@ -108,8 +113,8 @@ def _episode(
             raise PolicyError(f"{place}: {error}") from error
         if success is not None:
             successes.append(success)
-        if see:
-            see(Moment(env, steps, success, _distance(observation)))
+        if on_step:
+            on_step(EpisodeStep(env, steps, success, _distance(observation)))
         if terminated or truncated:
             break
     last = _surroundings(policy, observation)

@@ -1,7 +1,7 @@
-"""Films of a policy's episodes, rendered without a screen, as MP4 or GIF.
+"""Videos of a policy's episodes, rendered without a screen, as MP4 or GIF.
 
 MuJoCo renders off-screen through EGL or OSMesa. Which of them works depends on the machine's
-drivers, and a wrong choice can end the process: each is tried in a process of its own.
+drivers, and a wrong choice can end the process, so each is tried in a process of its own.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from PIL import Image, ImageDraw, ImageFont
 from music_rllib.envs.make import Env
 from music_rllib.errors import BadInputError
 from music_rllib.policy.policy import Policy
-from music_rllib.policy.rollout import EpisodeResult, Moment, open_task, play
+from music_rllib.policy.rollout import EpisodeResult, EpisodeStep, open_task, play
 
 FORMATS = (".mp4", ".gif")
 FRAMES_PER_SECOND = 20
@@ -31,30 +31,30 @@ SIZE = 320
 LINE = 26
 """Height of a line of text in pixels."""
 HOLD = 12
-"""Frames for which an episode's last picture stays."""
+"""Number of frames that repeat an episode's last picture."""
 
 SUCCESS, NOT_YET, UNKNOWN = "#009E73", "#D55E00", "#666666"
-"""Okabe and Ito's green and vermilion, and grey; a text repeats what they mean."""
+"""Okabe and Ito's green and vermilion, and gray; a text repeats their meaning."""
 DARK, LIGHT = "#1b1b1b", "#ffffff"
 
 Frame = NDArray[np.uint8]
 
 
 class VideoError(BadInputError, RuntimeError):
-    """No video can be made; the message has the reason and what to do."""
+    """No video can be made; the message has the reason and a remedy."""
 
 
 def film(
     policy: Policy, episodes: int, seed: int, title: str
 ) -> tuple[list[Frame], list[EpisodeResult]]:
-    """Plays and draws episodes; `seed` gives those of `rollout.play`, `title` is written above.
+    """Play and draw the episodes of `rollout.play` with this seed; `title` is written above.
 
     Returns:
         Pictures [height, width, 3], and the results of the episodes.
 
     Raises:
-        VideoError: this machine or this environment can't draw.
-        PolicyError: the environment can't be made.
+        VideoError: This machine or this environment can't draw.
+        PolicyError: The environment can't be made.
     """
     frames: list[Frame] = []
     results: list[EpisodeResult] = []
@@ -67,12 +67,11 @@ def film(
         if why_not is not None and hasattr(env.unwrapped, "mujoco_renderer"):
             raise VideoError(why_not)
 
-        def see(moment: Moment) -> None:
+        def draw(step: EpisodeStep) -> None:
             heading = title if episodes == 1 else f"{title}  ·  episode {len(results) + 1}"
-            limit = policy.max_episode_steps
-            frames.append(_draw(_picture(moment.env), heading, moment, limit))
+            frames.append(_draw(_picture(step.env), heading, step, policy.max_episode_steps))
 
-        for result in play(policy, env, episodes, seed, see):
+        for result in play(policy, env, episodes, seed, draw):
             results.append(result)
             frames.extend([frames[-1]] * HOLD)
     finally:
@@ -84,7 +83,7 @@ def _sizes(policy: Policy) -> dict[str, int]:
     """Size options of environments that MuJoCo draws; others choose their own size.
 
     Raises:
-        VideoError: the environment can't be drawn.
+        VideoError: The environment can't be drawn.
     """
     env = open_task(policy)
     modes = env.metadata.get("render_modes") or []
@@ -106,8 +105,8 @@ def _picture(env: Env) -> Image.Image:
     return Image.fromarray(np.asarray(picture, np.uint8)).convert("RGB")
 
 
-def _draw(picture: Image.Image, title: str, moment: Moment, limit: int) -> Frame:
-    # Even sizes, because MP4 stores colours for two by two pixels.
+def _draw(picture: Image.Image, title: str, step: EpisodeStep, limit: int) -> Frame:
+    # MP4 stores colors for two by two pixels, so sizes must be even.
     width = (max(picture.width, SIZE) + 1) // 2 * 2
     height = (picture.height + 1) // 2 * 2
     sheet = Image.new("RGB", (width, height + 2 * LINE), DARK)
@@ -118,13 +117,13 @@ def _draw(picture: Image.Image, title: str, moment: Moment, limit: int) -> Frame
         True: ("goal reached", SUCCESS),
         False: ("goal not reached", NOT_YET),
         None: ("", UNKNOWN),
-    }[moment.success]
-    if moment.step == 0 and moment.distance is not None:
+    }[step.success]
+    if step.step == 0 and step.distance is not None:
         words = "start"
     pen.rectangle((0, LINE + height, width, height + 2 * LINE), fill=colour)
-    left = f"step {moment.step} of {limit}"
-    if moment.distance is not None:
-        left += f"  ·  goal {moment.distance:.2f} away"
+    left = f"step {step.step} of {limit}"
+    if step.distance is not None:
+        left += f"  ·  goal {step.distance:.2f} away"
     pen.text((8, LINE + height + 5), left, fill=LIGHT, font=font)
     room = width - 8 - pen.textlength(words, font=font)
     pen.text((room, LINE + height + 5), words, fill=LIGHT, font=font)
@@ -133,9 +132,9 @@ def _draw(picture: Image.Image, title: str, moment: Moment, limit: int) -> Frame
 
 @functools.cache
 def find_renderer(chosen: str | None = None) -> tuple[str | None, str | None]:
-    """Tries to render without a screen by `egl`, `osmesa`, or the user's own `MUJOCO_GL`.
+    """Try to render without a screen with `egl`, `osmesa`, or the user's own `MUJOCO_GL`.
 
-    Returns the first name that works and None, or None and the message why none does.
+    Returns the first name that works and None, or None and the reason why none works.
     """
     reasons = []
     for name in [chosen] if chosen else ["egl", "osmesa"]:
@@ -157,7 +156,7 @@ def find_renderer(chosen: str | None = None) -> tuple[str | None, str | None]:
         lines = done.stderr.strip().splitlines() or [f"ended with {done.returncode}"]
         reasons.append(f"{name}: {lines[-1]}")
     return None, (
-        f"no way to draw without a screen works here ({'; '.join(reasons)}). Install EGL "
+        f"drawing without a screen does not work here ({'; '.join(reasons)}). Install EGL "
         "(Debian: apt-get install libegl1 libgl1-mesa-dri) or OSMesa (libosmesa6), or set MUJOCO_GL"
     )
 
@@ -172,10 +171,23 @@ context.free()
 """
 
 
-def write_video(path: Path, frames: Sequence[Frame]) -> None:
-    """Writes `frames` in the format that the path's ending names.
+def check_video_file(path: Path) -> None:
+    """Reject a file that can't be written, before minutes of episodes are played.
 
-    Raises VideoError where it is none of `FORMATS`, there is no encoder, or the encoder fails.
+    Raises:
+        BadInputError: The ending is not one of `FORMATS`, or the folder does not exist.
+    """
+    if path.suffix.lower() not in FORMATS:
+        raise BadInputError(f"--video must end in {' or '.join(FORMATS)}, got {str(path)!r}")
+    if not path.absolute().parent.is_dir():
+        raise BadInputError(f"--video must be in a folder that exists, got {str(path)!r}")
+
+
+def write_video(path: Path, frames: Sequence[Frame]) -> None:
+    """Write `frames` in the format of the path's ending.
+
+    Raises:
+        VideoError: The ending is not one of `FORMATS`, there is no encoder, or the encoder fails.
     """
     if path.suffix.lower() == ".gif":
         _write_gif(path, frames)
@@ -186,8 +198,8 @@ def write_video(path: Path, frames: Sequence[Frame]) -> None:
 
 
 def _write_gif(path: Path, frames: Sequence[Frame]) -> None:
-    # One palette for all frames: nothing flickers, and unchanged pixels take no space. Several
-    # frames make it, so that it has the colours of success and failure.
+    # One palette for all frames avoids flicker, and unchanged pixels take no space. It comes from
+    # several frames, so that it has the colors of success and failure.
     samples = [frames[i] for i in np.linspace(0, len(frames) - 1, 6).astype(int)]
     palette = Image.fromarray(np.concatenate(samples)).quantize(160)
     pictures = [

@@ -1,8 +1,7 @@
-"""Deletion of what a sweep has left in its storage."""
+"""Deletion of a sweep's files and runs in its storage."""
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,44 +14,42 @@ from music_rllib.experiment import sweep_files
 from music_rllib.experiment.location import SweepLocation, sweeps_in
 from music_rllib.redaction import redact
 from music_rllib.store.node_store import CONTINUATIONS
-from music_rllib.store.storage import is_remote, open_storage, sweep_folder
+from music_rllib.store.sealed import MANIFEST
+from music_rllib.store.storage import StorageFolder, is_remote, open_storage, sweep_folder
 from music_rllib.sweep.driver_lock import has_driver
 
 Item = dict[str, str]
+"""`{"path": ..., "what": ...}`."""
 
 
 @dataclass(kw_only=True)
 class Cleaning:
-    """What a clean would do, each item as `{"path": ..., "what": ...}`."""
+    """The folders that `clean` deletes, and those that it keeps."""
 
-    going: list[tuple[pafs.FileSystem, Item]] = field(default_factory=list)
+    folders: list[StorageFolder] = field(default_factory=list)
     """Folders to delete, in the storage or on this machine."""
+    items: list[Item] = field(default_factory=list)
+    """A description of each of them."""
     kept: list[Item] = field(default_factory=list)
-    """What one might expect to be deleted, and why it is kept."""
+    """Folders that one might expect to be deleted, and why they are kept."""
 
-    @property
-    def items(self) -> list[Item]:
-        """All that is deleted."""
-        return [item for _, item in self.going]
-
-    def add(self, filesystem: pafs.FileSystem, path: str, what: str) -> None:
+    def add(self, folder: StorageFolder, what: str) -> None:
         """Mark a folder to be deleted."""
-        self.going.append((filesystem, {"path": path, "what": what}))
+        self.folders.append(folder)
+        self.items.append({"path": folder.path, "what": what})
 
     def keep(self, path: str, what: str) -> None:
-        """Note what is kept, and why."""
+        """Note a folder that is kept, and why."""
         self.kept.append({"path": path, "what": what})
 
     def delete(self) -> None:
-        """Delete the folders, a node's manifest first: half a node is none."""
-        for filesystem, item in self.going:
-            with contextlib.suppress(FileNotFoundError):
-                filesystem.delete_file(f"{item['path']}/manifest.json")
-            with contextlib.suppress(FileNotFoundError):
-                filesystem.delete_dir(item["path"])
+        """Delete the folders, each run's manifest first: without it, the run is not finished."""
+        for folder in self.folders:
+            folder.remove(MANIFEST)
+            folder.delete()
 
 
-def what_can_go(location: SweepLocation, *, unfinished: bool, everything: bool) -> Cleaning:
+def find_deletable(location: SweepLocation, *, unfinished: bool, everything: bool) -> Cleaning:
     """Folders that can be deleted, with the reason.
 
     Args:
@@ -61,9 +58,9 @@ def what_can_go(location: SweepLocation, *, unfinished: bool, everything: bool) 
         everything: Include results and the sweep's own files.
 
     Raises:
-        BadInputError: The sweep is running, or another one is that shares runs with it.
+        BadInputError: The sweep is running, or another running sweep shares runs with it.
         StorageError: A record of this sweep or of another one in the storage is damaged, so that
-            what the sweep needs is not known.
+            the runs they need are not known.
     """
     state = location.read(sweep_files.STATE)
     if _is_driven(location, state):
@@ -73,46 +70,48 @@ def what_can_go(location: SweepLocation, *, unfinished: bool, everything: bool) 
     nodes = _nodes(location)
     users = _users(location, nodes)
     pruned = set((state or {}).get("pruned", ()))
-    cleaning = Cleaning()
     storage = open_storage(location.storage)
-    filesystem, root = storage.filesystem, storage.path
-
-    def exists(path: str) -> bool:
-        return bool(filesystem.get_file_info(path).type != pafs.FileType.NotFound)
-
+    finished = set((storage / "nodes").having(MANIFEST, [node["key"] for node in nodes]))
+    begun = {*(storage / "work").folders()}
+    continued = {*(storage / CONTINUATIONS).folders()}
+    cleaning = Cleaning()
     for node in nodes:
         key, label = node["key"], node["label"]
-        result, checkpoints = f"{root}/nodes/{key}", f"{root}/work/{key}"
-        finished = exists(f"{result}/manifest.json")
+        result = storage / "nodes" / key
         if key in users:
-            if everything and finished:
-                cleaning.keep(result, f"result of {label}: {', '.join(users[key])} has it too")
+            if everything and key in finished:
+                also = ", ".join(users[key])
+                cleaning.keep(result.path, f"result of {label}: {also} has it too")
             continue
-        if exists(checkpoints):
-            why = "finished" if finished else "stopped early" if key in pruned else "interrupted"
+        if key in begun:
+            why = "finished" if key in finished else "stopped early"
+            if key not in finished and key not in pruned:
+                why = "interrupted"
             if why != "interrupted" or unfinished:
-                cleaning.add(filesystem, checkpoints, f"checkpoints of {label}: {why}")
-        if finished and "continuation" in node:
-            last = f"{root}/{CONTINUATIONS}/{node['continuation']}"
-            what = f"last checkpoint of {label}"
-            if exists(last) and node["continuation"] in users:
-                others = ", ".join(users[node["continuation"]])
-                cleaning.keep(last, f"{what}: {others} has it too")
-            elif exists(last):
-                cleaning.add(filesystem, last, f"{what}: kept for a run with more env_steps")
-        if everything and finished:
-            cleaning.add(filesystem, result, f"result of {label}")
+                cleaning.add(storage / "work" / key, f"checkpoints of {label}: {why}")
+        if key in finished and (last := node.get("continuation")) in continued:
+            folder, what = storage / CONTINUATIONS / last, f"last checkpoint of {label}"
+            if last in users:
+                cleaning.keep(folder.path, f"{what}: {', '.join(users[last])} has it too")
+            else:
+                cleaning.add(folder, f"{what}: kept for a run with more env_steps")
+        if everything and key in finished:
+            cleaning.add(result, f"result of {label}")
     if everything:
-        cleaning.add(filesystem, f"{root}/{location.name}", "the sweep's own files")
-        here = sweep_folder(location.storage, location.name)
-        if is_remote(location.storage) and here.is_dir():
-            # A study is in it: the next sweep of this name would take that for its own.
-            what = "the sweep's own files on this machine"
-            cleaning.add(pafs.LocalFileSystem(), str(here), what)
-        for database, study in _studies(location):
-            what = f"study {study!r}: delete it with Optuna's tools where nobody needs it any more"
-            cleaning.keep(redact(database), what)
+        _add_own_files(location, storage, cleaning)
     return cleaning
+
+
+def _add_own_files(location: SweepLocation, storage: StorageFolder, cleaning: Cleaning) -> None:
+    cleaning.add(storage / location.name, "the sweep's own files")
+    here = sweep_folder(location.storage, location.name)
+    if is_remote(location.storage) and here.is_dir():
+        # They include a study, which the next sweep of this name would use as its own.
+        folder = StorageFolder(pafs.LocalFileSystem(), str(here))
+        cleaning.add(folder, "the sweep's own files on this machine")
+    for database, study in _studies(location):
+        what = f"study {study!r}: delete it with Optuna's tools if it is not needed"
+        cleaning.keep(redact(database), what)
 
 
 def _is_driven(location: SweepLocation, state: Mapping[str, Any] | None) -> bool:
@@ -120,7 +119,7 @@ def _is_driven(location: SweepLocation, state: Mapping[str, Any] | None) -> bool
 
 
 def _nodes(location: SweepLocation) -> list[dict[str, Any]]:
-    """The nodes of a sweep's plan, and the handoffs from outside that they start from."""
+    """The nodes of a sweep's plan, and the imported handoffs that they start from."""
     nodes = location.nodes()
     imported = {node["input"]: None for node in nodes if str(node["input"]).startswith(IMPORTED)}
     return [
@@ -130,12 +129,12 @@ def _nodes(location: SweepLocation) -> list[dict[str, Any]]:
 
 
 def _users(location: SweepLocation, nodes: Iterable[Mapping[str, Any]]) -> dict[str, list[str]]:
-    """Key to the names of other sweeps that have the node, or whose searches count on it.
+    """Key of each node to the names of other sweeps that have it, or whose searches need it.
 
-    Likewise for the key of a last checkpoint, which runs share that differ in their budget alone.
+    Likewise for the key of a last checkpoint, which runs share that differ only in their budget.
 
     Raises:
-        BadInputError: One of them is running.
+        BadInputError: One of these sweeps is running.
     """
     mine = {node["key"]: node for node in nodes}
     studies = _studies(location)
@@ -171,7 +170,7 @@ def _studies(location: SweepLocation) -> dict[tuple[str, str], str]:
 
 
 def _keys_of_stage(stage: str, nodes: Mapping[str, Mapping[str, Any]]) -> set[str]:
-    """Keys of a stage's nodes and of all that they start from."""
+    """Keys of a stage's nodes and of all nodes that they start from."""
     keys: set[str] = set()
     wanted = [key for key, node in nodes.items() if node["label"].startswith(f"{stage}/")]
     while wanted:

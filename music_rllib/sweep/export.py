@@ -42,11 +42,11 @@ CHOSEN = "chosen.json"
 def export_best(location: SweepLocation, stage_name: str | None, output: Path) -> dict[str, Any]:
     """Export the policy of the best condition for each of its tasks.
 
-    Of the condition's runs on a task, the middle one by the same measure is taken: it stands for
-    what the settings give, where the best one would stand for luck.
+    Of the condition's runs on a task, the run with the median score is exported: it represents the
+    settings, where the best run would represent luck.
 
     Returns:
-        What was chosen and why, as it is written beside the policy too.
+        The choice and its reasons, as they are also written beside the policy.
 
     Raises:
         BadInputError: Nothing is finished, or there is no such stage.
@@ -60,17 +60,47 @@ def export_best(location: SweepLocation, stage_name: str | None, output: Path) -
     best = _best(opened, stage, sweep, metric, searches)
     others = best.pop("other_tasks", None)
     if not others:
-        return _export_chosen(opened, stage, sweep, best, metric, output)
+        return _export_condition(opened, stage, sweep, best, metric, output)
     rows = [best, *others]
     exported = [
-        _export_chosen(opened, stage, sweep, row, metric, output / row["task"]) for row in rows
+        _export_condition(opened, stage, sweep, row, metric, output / row["task"]) for row in rows
     ]
     why = (f"{row['task']}: {one['why']}" for row, one in zip(rows, exported, strict=True))
     policies = [policy for one in exported for policy in one["policies"]]
     return exported[0] | {"why": "\n".join(why), "policies": policies}
 
 
-def _export_chosen(
+def entropies_text(entropies: Mapping[str, Mapping[str, Any]]) -> str | None:
+    """The entropies of an exported condition in a line; None if they are unknown."""
+    words = {names.SHANNON_ENTROPY: "Shannon entropy (nats)", names.ENTROPY: "S_q"}
+    texts = [
+        f"{words[metric]} {with_interval(entropy['value'], entropy['interval'])}"
+        for metric, entropy in entropies.items()
+    ]
+    return f"its policies at the end: {', '.join(texts)}" if texts else None
+
+
+def _best(
+    opened: OpenSweep,
+    stage: Stage,
+    sweep: Sweep,
+    metric: str,
+    searches: Sequence[Mapping[str, Any]],
+) -> dict[str, Any]:
+    """The best condition of a stage as plain data, with its trial if the stage is searched."""
+    best = best_so_far([stage], opened.plan, sweep, searches)
+    if best is None:
+        needed = f"a finished run of stage {stage.name} that reported {metric}"
+        if stage.search is not None:
+            needed = f"a scored trial of stage {stage.name}"
+        raise BadInputError(f"SWEEP must have {needed}, {opened.config.name} has none")
+    search = next((one for one in searches if one["stage"] == stage.name), None)
+    if stage.search is not None and search is not None and (first := leader(search)) is not None:
+        best |= {"metric": stage.search.objectives[0].label, "trial": first.trial}
+    return best
+
+
+def _export_condition(
     opened: OpenSweep,
     stage: Stage,
     sweep: Sweep,
@@ -78,7 +108,7 @@ def _export_chosen(
     metric: str,
     output: Path,
 ) -> dict[str, Any]:
-    """Export the policies of one condition, on all its tasks or on the one of `best`."""
+    """Export the policies of one condition, on all its tasks or on the task of `best`."""
     scored = _scored(opened, stage, sweep, best, metric)
     if scored is None:
         raise BadInputError(
@@ -86,12 +116,6 @@ def _export_chosen(
             f"{redact(opened.storage)} has none of them"
         )
     success = _scored(opened, stage, sweep, best, names.EVAL_SUCCESS)
-    by, rest, condition = best["by"], "", scored.condition
-    if not scored.complete:
-        rest = f", of {len(condition.runs)} planned: no condition has all of its runs"
-    fresh = best["on_fresh_seeds"]
-    level = best.get("level", 0)
-    rank = f"ties for first with {level} more" if level else "is first"
     chosen: dict[str, Any] = {
         "sweep": opened.config.name,
         "stage": stage.name,
@@ -103,16 +127,13 @@ def _export_chosen(
         "interval": best["interval"],
         "success_rate": None if success is None else float(success.estimate.value),
         "entropies": best.get("entropies", {}),
-        "on_fresh_seeds": fresh,
-        "why": f"{stage.name}: {condition.short_label} {rank} by {by} on "
-        f"{'fresh seeds' if fresh else 'the seeds that it was chosen by'}; {by} "
-        f"({'' if stage.search else 'mean, '}95 %): "
-        f"{with_interval(best['value'], best['interval'])} over {in_runs(scored.runs)}{rest}",
+        "on_fresh_seeds": best["on_fresh_seeds"],
+        "why": _reason(stage, best, scored),
     }
     policies = []
-    tasks = list(dict.fromkeys(sweep.runs[run].task for run in condition.runs))
+    tasks = list(dict.fromkeys(sweep.runs[run].task for run in scored.condition.runs))
     for task in tasks:
-        run = _middle_run(sweep, condition, task, metric)
+        run = _median_run(sweep, scored.condition, task, metric)
         if run is None:
             continue
         folder = output if len(tasks) == 1 else output / task
@@ -128,24 +149,19 @@ def _export_chosen(
     return chosen | {"policies": policies}
 
 
-def _best(
-    opened: OpenSweep,
-    stage: Stage,
-    sweep: Sweep,
-    metric: str,
-    searches: Sequence[Mapping[str, Any]],
-) -> dict[str, Any]:
-    """The best condition of a stage as plain data, with its trial if the stage is searched."""
-    best = best_so_far([stage], opened.plan, sweep, searches)
-    if best is None:
-        needed = f"a finished run of stage {stage.name} that reported {metric}"
-        if stage.search is not None:
-            needed = f"a judged trial of stage {stage.name}"
-        raise BadInputError(f"SWEEP must have {needed}, {opened.config.name} has none")
-    search = next((one for one in searches if one["stage"] == stage.name), None)
-    if stage.search is not None and search is not None and (first := leader(search)) is not None:
-        best |= {"metric": stage.search.objectives[0].label, "trial": first.trial}
-    return best
+def _reason(stage: Stage, best: Mapping[str, Any], scored: Scored) -> str:
+    by, condition = best["by"], scored.condition
+    level = best.get("level", 0)
+    rank = f"ties for first with {level} more" if level else "is first"
+    seeds = "fresh seeds" if best["on_fresh_seeds"] else "the seeds that selected it"
+    text = (
+        f"{stage.name}: {condition.short_label} {rank} by {by} on {seeds}; {by} "
+        f"({'' if stage.search else 'mean, '}95% CI): "
+        f"{with_interval(best['value'], best['interval'])} over {in_runs(scored.runs)}"
+    )
+    if scored.complete:
+        return text
+    return f"{text}, of {len(condition.runs)} planned: no condition has all of its runs"
 
 
 def _scored(
@@ -156,8 +172,8 @@ def _scored(
     return next((one for one in candidates if is_of(one, stage, best)), None)
 
 
-def _middle_run(sweep: Sweep, condition: Condition, task: str, metric: str) -> RunRecord | None:
-    """The run with the median score on a task; None where none is finished."""
+def _median_run(sweep: Sweep, condition: Condition, task: str, metric: str) -> RunRecord | None:
+    """The run with the median score on a task; None if none is finished."""
     scores = [
         (score, int(sweep.runs[run].seed), run)
         for run in condition.runs

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from contextlib import closing
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,19 +14,17 @@ from music_rllib.command_line import Json, console_for, print_json
 from music_rllib.errors import BadInputError
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
-    from music_rllib.policy.policy import Policy
+    from music_rllib.policy import Policy
     from music_rllib.policy.rollout import EpisodeResult
 
 EXAMPLES = """\
 Examples:
   music-rllib evaluate finetune/q=1.5/seed0
-      20 episodes of a run, by its label or the parts of it that tell which
+      20 episodes of a run, by its label or enough parts of it
   music-rllib evaluate 4f2a09c1 --episodes 100 --json
-      by its key or the key's beginning
+      by its key or the beginning of its key
   music-rllib evaluate results/smoke/best --video push.gif
-      a policy's folder; and a film of the first three episodes
+      the folder of a policy; record the first three episodes
   music-rllib evaluate q=2/seed1 --storage s3://bucket/sweeps
   music-rllib evaluate policy --env my.yaml
       a policy for an environment of your own, as my.yaml declares it
@@ -68,66 +67,40 @@ def evaluate(
     ] = 3,
     json: Json = False,
 ) -> int:
-    """Play episodes with the policy of a run, measure success, record video.
+    """Play deterministic episodes with the policy of a run, without starting Ray.
 
-    Deterministic ones; the run may be finished or not. Starts no Ray.
+    The run may be finished or not. Prints the success rate with its 95% CI; records video if asked.
     """
     from music_rllib.policy import find_policy, load_policy, named_environment
+    from music_rllib.policy.rollout import open_task, play
+    from music_rllib.policy.video import check_video_file, film, write_video
 
     if not storage:
         raise BadInputError("--storage must not be empty, got ''")
-    _check_video(video)
+    if video is not None:
+        check_video_file(video)
     place = find_policy(run, storage)
     try:
         policy = load_policy(place, named_environment(env))
-        results = _play(policy, episodes, seed)
-        if video:
-            _film(policy, video, min(video_episodes, episodes), seed)
+        with closing(open_task(policy)) as task:
+            results = list(play(policy, task, episodes, seed))
+        if video is not None:
+            title = f"{policy.task.name}  ·  {policy.variant}  ·  {policy.env_steps:,} env steps"
+            frames, _ = film(policy, min(video_episodes, episodes), seed, title)
+            write_video(video, frames)
     except OSError as error:
         raise BadInputError(str(error)) from error
     document = _document(place, policy, results, seed) | {"video": str(video) if video else None}
     if json:
         print_json(document)
-        return 0
-    console = console_for()
-    console.print(_table(document))
-    if video:
-        console.print(f"Video: {video}", soft_wrap=True)
+    else:
+        _show(document)
     return 0
-
-
-def _check_video(path: Path | None) -> None:
-    """Refuse a file that can't be written, before minutes of episodes are played."""
-    from music_rllib.policy.video import FORMATS
-
-    if path is None:
-        return
-    if path.suffix.lower() not in FORMATS:
-        raise BadInputError(f"--video must end in {' or '.join(FORMATS)}, got {str(path)!r}")
-    if not path.absolute().parent.is_dir():
-        raise BadInputError(f"--video must be in a folder that exists, got {str(path)!r}")
-
-
-def _play(policy: Policy, episodes: int, seed: int) -> list[EpisodeResult]:
-    from music_rllib.policy.rollout import open_task, play
-
-    with closing(open_task(policy)) as env:
-        return list(play(policy, env, episodes, seed))
-
-
-def _film(policy: Policy, path: Path, episodes: int, seed: int) -> None:
-    from music_rllib.policy.video import film, write_video
-
-    title = f"{policy.task.name}  ·  {policy.variant}  ·  {policy.env_steps:,} env steps"
-    frames, _ = film(policy, episodes, seed, title)
-    write_video(path, frames)
 
 
 def _document(
     place: str, policy: Policy, results: list[EpisodeResult], seed: int
 ) -> dict[str, Any]:
-    from dataclasses import asdict
-
     from music_rllib.redaction import redact
 
     successes = [result.success for result in results if result.success is not None]
@@ -151,13 +124,13 @@ def _document(
 
 
 def _mean(values: Iterable[float | None]) -> float | None:
-    """The mean of those values that are there; None where there are none."""
+    """The mean of the values that are not None; None if there are none."""
     numbers = [value for value in values if value is not None]
     return sum(numbers) / len(numbers) if numbers else None
 
 
 def _interval(successes: list[bool]) -> list[float] | None:
-    """Clopper and Pearson's 95 % interval of the policy's success rate over starts and goals."""
+    """The Clopper-Pearson 95% CI of the policy's success rate over starts and goals."""
     from music_rllib.results.statistics import clopper_pearson
 
     if not successes:
@@ -166,30 +139,24 @@ def _interval(successes: list[bool]) -> list[float] | None:
     return [float(lower), float(upper)]
 
 
-def _table(document: dict[str, Any]) -> Table:
-    from rich.table import Table
+def _show(document: dict[str, Any]) -> None:
+    from music_rllib.sweep.views.text import new_table, percent
 
-    table = Table(
-        title=f"{document['task']}, {document['variant']}, training seed "
-        f"{document['training_seed']}, after {document['env_steps']:,} env steps",
-        title_justify="left",
-        caption=f"{document['episodes']} episodes, seed {document['seed']}: {document['run']}",
-        caption_justify="left",
+    title = (
+        f"{document['task']}, {document['variant']}, training seed {document['training_seed']}, "
+        f"after {document['env_steps']:,} env steps"
     )
-    for name in ("", "mean", "95 % interval"):
-        table.add_column(name, justify="left" if not name else "right")
-    interval = document["success_rate_interval"]
-    table.add_row(
-        "success at the last step",
-        _percent(document["success_rate"]),
-        "-" if interval is None else f"{interval[0]:.0%} to {interval[1]:.0%}",
-    )
-    table.add_row("success at any step", _percent(document["success_rate_any_step"]), "")
+    table = new_table(title, ("", "mean", "95% CI"), left=[""])
+    low, high = document["success_rate_interval"] or (None, None)
+    interval = "-" if low is None else f"{percent(low)} to {percent(high)}"
+    table.add_row("success at the last step", percent(document["success_rate"]), interval)
+    table.add_row("success at any step", percent(document["success_rate_any_step"]), "")
     table.add_row("return of an episode", f"{document['episode_return']:.2f}", "")
     if document["object_displacement"] is not None:
-        table.add_row("object's displacement", f"{document['object_displacement']:.3f}", "")
-    return table
-
-
-def _percent(rate: float | None) -> str:
-    return "-" if rate is None else f"{rate:.0%}"
+        table.add_row("displacement of the object", f"{document['object_displacement']:.3f}", "")
+    console = console_for()
+    console.print(table)
+    episodes = f"{document['episodes']} episodes, seed {document['seed']}: {document['run']}"
+    console.print(episodes, soft_wrap=True)
+    if document["video"]:
+        console.print(f"Video: {document['video']}", soft_wrap=True)

@@ -1,4 +1,4 @@
-"""`init`, `presets` and `schema`: help to write a sweep file."""
+"""`best`, `clean`, `init`, `presets` and `schema`: write and delete files."""
 
 from __future__ import annotations
 
@@ -8,9 +8,29 @@ from typing import Annotated
 
 import typer
 
-from music_rllib.command_line import Json, print_json
+from music_rllib.command_line import Json, console_for, print_json
 from music_rllib.errors import BadInputError
+from music_rllib.sweep.commands.arguments import Place, StageName, Storage
 
+BEST_EXAMPLES = """\
+Examples:
+  music-rllib best results/smoke
+      export to results/smoke/best
+  music-rllib best s3://bucket/sweeps/search --output policy
+      export from a bucket to a local folder
+  music-rllib evaluate policy --episodes 100
+"""
+CLEAN_EXAMPLES = """\
+Examples:
+  music-rllib clean results/smoke
+      list checkpoints of runs that were stopped early, and the checkpoints
+      from which finished runs could be trained longer
+  music-rllib clean results/smoke --yes
+      delete them
+  music-rllib clean results/smoke --all --yes
+      delete the sweep's files and every run that no other sweep in the
+      storage uses; runs in MLflow and studies in a database are kept
+"""
 INIT_EXAMPLES = """\
 Examples:
   music-rllib init
@@ -26,9 +46,97 @@ SCHEMA_EXAMPLES = """\
 Examples:
   music-rllib schema > sweep.schema.json
 
-Editors with the YAML language server read it where a file begins with
+Editors with the YAML language server read it if a file begins with
 # yaml-language-server: $schema=sweep.schema.json
 """
+
+
+def best(
+    sweep: Place,
+    storage: Storage = None,
+    stage: StageName = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Target folder; by default 'best' in the folder of the sweep. With several "
+            "tasks, each has its own folder inside.",
+        ),
+    ] = None,
+    json: Json = False,
+) -> int:
+    """Export the best policy with its configuration, and print how it was chosen.
+
+    After a search, the best policy is the first of the ranking on fresh seeds; before the ranking
+    is complete, it is the best trial.
+    """
+    from music_rllib.experiment.location import find_sweep
+    from music_rllib.store.storage import sweep_folder
+    from music_rllib.sweep.export import entropies_text, export_best
+
+    found = find_sweep(sweep, storage)
+    folder = output or sweep_folder(found.storage, found.name) / "best"
+    chosen = export_best(found, stage, folder)
+    if json:
+        print_json(chosen)
+        return 0
+    console = console_for()
+    lines = [chosen["why"], entropies_text(chosen["entropies"]), found.earlier()]
+    lines += [f"{policy['task']}: {policy['folder']}" for policy in chosen["policies"]]
+    for line in filter(None, lines):
+        console.print(line, soft_wrap=True)
+    return 0
+
+
+def clean(
+    sweep: Place,
+    storage: Storage = None,
+    unfinished: Annotated[
+        bool,
+        typer.Option(
+            "--unfinished",
+            help="Also delete checkpoints of interrupted runs, which then start from scratch.",
+        ),
+    ] = False,
+    everything: Annotated[
+        bool,
+        typer.Option(
+            "--all",
+            help="Delete the sweep: its files, checkpoints, and results that no other sweep uses.",
+        ),
+    ] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Delete instead of listing.")] = False,
+    json: Json = False,
+) -> int:
+    """List files that are no longer needed, or delete them with --yes.
+
+    By default these are the checkpoints of runs that a search stopped early, and the checkpoints
+    that finished runs keep for longer training. Interrupted runs keep theirs.
+    """
+    from music_rllib.experiment.location import find_sweep
+    from music_rllib.sweep.clean import find_deletable
+
+    location = find_sweep(sweep, storage)
+    cleaning = find_deletable(location, unfinished=unfinished or everything, everything=everything)
+    items = cleaning.items
+    if yes:
+        cleaning.delete()
+    if json:
+        answer = {"sweep": location.name, "deleted": yes, "items": items, "kept": cleaning.kept}
+        print_json(answer)
+        return 0
+    console = console_for()
+    for item in items:
+        console.print(f"{item['path']}  ({item['what']})", soft_wrap=True)
+    for item in cleaning.kept:
+        console.print(f"kept: {item['path']}  ({item['what']})", soft_wrap=True)
+    if not items:
+        console.print("Nothing to delete.")
+    elif yes:
+        console.print(f"{len(items)} deleted.")
+    else:
+        console.print(f"{len(items)} to delete: use --yes to delete them.")
+    return 0
 
 
 def init(
@@ -56,10 +164,7 @@ def init(
 
 
 def presets(json: Json = False) -> int:
-    """List the presets: sets of settings that a sweep file can use.
-
-    By 'preset: NAME' in it.
-    """
+    """List the presets: sets of settings for 'preset: NAME' in a sweep file."""
     from music_rllib.config.presets import SHIPPED, shipped_presets
 
     shipped = shipped_presets()
@@ -69,7 +174,7 @@ def presets(json: Json = False) -> int:
     width = max(map(len, shipped))
     for name, about in shipped.items():
         typer.echo(f"{name:{width}}  {about}")
-    typer.echo(f"\nEach file says where its numbers come from: {SHIPPED}")
+    typer.echo(f"\nEach file names the source of its numbers: {SHIPPED}")
     return 0
 
 

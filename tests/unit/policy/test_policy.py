@@ -13,7 +13,7 @@ import torch
 
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.envs.tasks import BUILT_IN_TASKS
-from music_rllib.policy import PolicyError, PolicyNetwork, find_policy, load_policy, locate
+from music_rllib.policy import PolicyError, PolicyNetwork, find_policy, load_policy, policy
 from music_rllib.policy.network import PolicyFileError
 from music_rllib.store.handoff import Spaces, write_handoff
 from music_rllib.store.sealed import SealedFolders
@@ -218,7 +218,7 @@ def test_is_found_by_key_label_and_place(tmp_path: Path) -> None:
     assert find_policy("run/seed=0", storage) == find_policy(place, storage) == place
     assert find_policy("77aa", storage) == f"{storage}/work/77aa/000000000400-x"
     assert load_policy(find_policy("77aa", storage)).env_steps == 500
-    with pytest.raises(PolicyError, match=r"it fits run/seed=0 .*, run/seed=1 "):
+    with pytest.raises(PolicyError, match=r"it matches run/seed=0 .*, run/seed=1 "):
         find_policy("0123", storage)
     with pytest.raises(PolicyError, match="finished there: run/seed=0, run/seed=1"):
         find_policy("run/seed=2", storage)
@@ -238,7 +238,7 @@ def test_is_found_by_a_label_that_is_too_long_for_a_file(tmp_path: Path) -> None
 
 def test_a_storage_keeps_its_options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     Trained(_run()).publish(tmp_path)
-    monkeypatch.setattr(locate, "open_storage", lambda _: open_storage(str(tmp_path)))
+    monkeypatch.setattr(policy, "open_storage", lambda _: open_storage(str(tmp_path)))
     found = find_policy(KEY, "s3://bucket/x/?endpoint_override=127.0.0.1:9")
     assert found == f"s3://bucket/x/nodes/{KEY}?endpoint_override=127.0.0.1:9"
 
@@ -266,10 +266,7 @@ def test_a_folder_of_several_tasks_names_its_sub_folders(tmp_path: Path) -> None
     with pytest.raises(PolicyError) as error:
         load_policy(tmp_path)
     first, second = tmp_path / "FetchReach", tmp_path / "Other"
-    assert str(error.value) == (
-        f"{tmp_path} must hold one policy, its sub-folders hold one each: "
-        f"give {first} (FetchReach) or {second} (FetchReach)"
-    )
+    assert str(error.value) == f"{tmp_path} must hold one policy: use {first} or {second}"
     assert load_policy(first).task == REACH
 
 
