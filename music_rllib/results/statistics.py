@@ -18,11 +18,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-
-from music_rllib.imports import imported_on_use
-
-stats = imported_on_use("scipy.stats")
 
 Array = NDArray[np.float64]
 
@@ -113,13 +110,13 @@ def interval_of_mean(
     value, variance, freedom = (
         np.asarray(part, dtype=float) for part in np.broadcast_arrays(value, variance, freedom)
     )
-    t = stats.t.ppf(1 - _TAIL, np.where(freedom > 0, freedom, np.nan))
+    t = scipy.stats.t.ppf(1 - _TAIL, np.where(freedom > 0, freedom, np.nan))
     tied = variance < _NO_SPREAD
     if episodes is None:
         half = np.where(tied, np.nan, t * np.sqrt(variance))
         return Estimate(value=value, lower=value - half, upper=value + half)
     alike = _ratio(value * (1 - value), np.where(tied, np.nan, variance))
-    lessened = np.minimum(alike, episodes) * (stats.norm.ppf(1 - _TAIL) / t) ** 2
+    lessened = np.minimum(alike, episodes) * (scipy.stats.norm.ppf(1 - _TAIL) / t) ** 2
     trials = np.where(tied & ~np.isnan(t), episodes, lessened)
     lower, upper = clopper_pearson(value, trials)
     return Estimate(value=value, lower=lower, upper=upper)
@@ -135,8 +132,8 @@ def clopper_pearson(share: ArrayLike, trials: ArrayLike) -> tuple[Array, Array]:
     share, trials = (np.asarray(part, float) for part in np.broadcast_arrays(share, trials))
     trials = np.where(np.isfinite(trials), trials, np.nan)
     won, lost = share * trials, (1 - share) * trials
-    lower = np.where(won > 0, stats.beta.ppf(_TAIL, won, lost + 1), 0 * trials)
-    upper = np.where(lost > 0, stats.beta.ppf(1 - _TAIL, won + 1, lost), 1 + 0 * trials)
+    lower = np.where(won > 0, scipy.stats.beta.ppf(_TAIL, won, lost + 1), 0 * trials)
+    upper = np.where(lost > 0, scipy.stats.beta.ppf(1 - _TAIL, won + 1, lost), 1 + 0 * trials)
     return lower, upper
 
 
@@ -229,7 +226,7 @@ def censored_median(steps: Array, reached: NDArray[np.bool_]) -> Estimate:
         if below <= 0.5 + 1e-12:
             median = step
             break
-    outside = 2 * stats.binom.cdf(np.arange(runs), runs, 0.5)
+    outside = 2 * scipy.stats.binom.cdf(np.arange(runs), runs, 0.5)
     cut = int(np.sum(outside <= 1 - _COVERAGE)) - 1
     lower = upper = np.nan
     if cut >= 0:
@@ -259,7 +256,7 @@ def seeds_for_difference(
     def power(seeds: Array) -> Array:
         freedom = (1 if paired else 2) * (seeds - 1)
         shift = difference / spread * np.sqrt(seeds)
-        critical = stats.t.ppf(1 - level / 2, freedom)
+        critical = scipy.stats.t.ppf(1 - level / 2, freedom)
         return np.asarray(
             1 - _t_below(critical, freedom, shift) + _t_below(-critical, freedom, shift)
         )
@@ -278,7 +275,7 @@ def seeds_for_equivalence(
 
     def power(seeds: Array) -> Array:
         freedom = (1 if paired else 2) * (seeds - 1)
-        critical = stats.t.ppf(1 - level, freedom)
+        critical = scipy.stats.t.ppf(1 - level, freedom)
         # Both tests must reject. Either one misses with the same probability.
         return 1 - 2 * _t_below(critical, freedom, margin / spread * np.sqrt(seeds))
 
@@ -287,7 +284,7 @@ def seeds_for_equivalence(
 
 def _t_below(end: Array, freedom: Array, shift: Array) -> Array:
     """Cumulative distribution of the noncentral t; scipy's NaN far from the center means 0."""
-    return np.asarray(np.nan_to_num(stats.nct.cdf(end, freedom, shift), nan=0.0))
+    return np.asarray(np.nan_to_num(scipy.stats.nct.cdf(end, freedom, shift), nan=0.0))
 
 
 def _fewest_seeds(power: Callable[[Array], Array]) -> int | None:

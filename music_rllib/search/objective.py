@@ -10,15 +10,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 
 from music_rllib import names
 from music_rllib.config.search import Objective, Pruning
-from music_rllib.imports import imported_on_use
 from music_rllib.results import statistics as st
 from music_rllib.results.statistics import Array, Estimate
 from music_rllib.store.history import Report
-
-stats = imported_on_use("scipy.stats")
 
 
 def score(objective: Objective, history: Sequence[Report], budget: int) -> float:
@@ -62,7 +60,7 @@ def aggregate(objective: Objective, scores: Array) -> float:
     """The value of a trial with the scores `[seeds, tasks]`."""
     match objective.aggregate:
         case "iqm":
-            return float(stats.trim_mean(scores, 0.25, axis=None))
+            return float(scipy.stats.trim_mean(scores, 0.25, axis=None))
         case "mean":
             return float(np.mean(scores))
         case "median":
@@ -174,7 +172,7 @@ def _half_width(
     if freedom == 0:
         return math.inf
     spread = math.sqrt(squares / freedom)
-    quantile = float(stats.t.ppf((1 + confidence) / 2, freedom))
+    quantile = float(scipy.stats.t.ppf((1 + confidence) / 2, freedom))
     return quantile * spread / math.sqrt(_runs_behind(objective, scores))
 
 
