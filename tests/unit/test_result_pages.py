@@ -1,4 +1,4 @@
-"""The results page: pretraining counts, and its first sentence follows the verdicts."""
+"""The results page: totals with pretraining, and the first sentence."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ BUDGETS = {"pretrain": 100, "music-r": 300, "her": 300}
 
 
 def sweep() -> Sweep:
-    """Success is constant in each stage but for MUSIC-r's step 0; seeds differ a little."""
+    """Runs with a constant success rate in each stage; MUSIC-r starts at 0."""
     records, points = [], []
     for stage, level in LEVELS.items():
         for seed in SEEDS:

@@ -1,4 +1,4 @@
-"""Frames of a sweep: their content, and that an export gives the same."""
+"""Frames of a sweep, and exports."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DOCS = Path(__file__).parents[3] / "docs"
 EXPORT = DOCS / "results" / "data" / "v3-fetch-push-music-f"
 
 
-def test_frames_join_to_what_the_export_holds() -> None:
+def test_joined_frames_equal_the_export() -> None:
     sweep, frames = read_archive(EXPORT), load_sweep(EXPORT)
     assert frames.name == sweep.name
     assert list(frames.runs.index) == [run.node_key for run in sweep.runs]
@@ -43,7 +43,7 @@ def test_frames_join_to_what_the_export_holds() -> None:
     pd.testing.assert_series_equal(again.sort_index(), said.sort_index(), check_names=False)
 
 
-def test_an_export_as_csv_gives_the_same_frames(tmp_path: Path) -> None:
+def test_a_csv_export_gives_the_same_frames(tmp_path: Path) -> None:
     write_archive(read_archive(EXPORT), tmp_path / "csv", "csv")
     first, second = load_sweep(EXPORT), load_sweep(tmp_path / "csv")
     for name in ("runs", "curves", "conditions"):
@@ -51,15 +51,13 @@ def test_an_export_as_csv_gives_the_same_frames(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("file_format", get_args(Format))
-def test_an_export_of_a_sweep_without_runs_is_read_again(
-    tmp_path: Path, file_format: Format
-) -> None:
+def test_an_export_without_runs_can_be_read(tmp_path: Path, file_format: Format) -> None:
     write_archive(replace(read_archive(EXPORT), runs=[], history={}), tmp_path, file_format)
     again = read_archive(tmp_path)
     assert (list(again.runs), dict(again.history)) == ([], {})
 
 
-def test_a_sweep_without_runs_has_empty_frames_of_the_same_types() -> None:
+def test_frames_without_runs_have_the_same_types() -> None:
     whole = load_sweep(EXPORT)
     empty = frames_of(replace(read_archive(EXPORT), runs=[], history={}))
     for name in ("runs", "curves", "conditions"):
@@ -68,8 +66,8 @@ def test_a_sweep_without_runs_has_empty_frames_of_the_same_types() -> None:
         assert dict(frame.dtypes) == dict(getattr(whole, name).dtypes[frame.columns])
 
 
-def test_the_notebook_still_says_what_it_shows(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every code cell is run, and its result compared as text."""
+def test_the_notebook_reproduces_its_outputs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run every code cell and compare its output as text."""
     monkeypatch.chdir(DOCS)
     mpl.use("Agg")
     notebook = json.loads((DOCS / "first_results.ipynb").read_text(encoding="utf-8"))
@@ -86,8 +84,7 @@ def test_the_notebook_still_says_what_it_shows(monkeypatch: pytest.MonkeyPatch) 
         assert shown in ([repr(value)], ["<Figure>"])
 
 
-def test_of_several_values_at_a_step_the_one_logged_last_counts() -> None:
-    """The order of rows in a database is arbitrary."""
+def test_the_last_of_several_values_at_a_step_counts() -> None:
     points = Points(
         ("loss", "loss", "loss", "success"), (10, 20, 20, 20), (1, 9, 5, 3), (0.1, 0.2, 0.3, 0.4)
     )
@@ -96,14 +93,14 @@ def test_of_several_values_at_a_step_the_one_logged_last_counts() -> None:
     assert columns([points])["success"].value.tolist() == [0.4]
 
 
-def test_an_export_names_no_folder_of_the_machine(tmp_path: Path) -> None:
+def test_an_export_has_no_absolute_paths(tmp_path: Path) -> None:
     config = "storage: /home/anna/r\nstages:\n- search:\n    storage: sqlite:////home/anna/x/s.db\n"
     config += "mlflow:\n  tracking_uri: sqlite:////home/anna/y/mlflow.db\n"
     write_archive(replace(read_archive(EXPORT), config=config), tmp_path)
     assert "anna" not in (tmp_path / "sweep.json").read_text()
 
 
-def test_an_export_that_finds_no_room_leaves_the_earlier_one(
+def test_an_export_on_a_full_disk_keeps_the_earlier_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_archive(read_archive(EXPORT), tmp_path)

@@ -1,4 +1,4 @@
-"""Merged exports: no run twice, none lost, and each with its own numbers."""
+"""Merged exports have each run once, with its own values."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -41,7 +41,7 @@ def values_of(found: Sweep) -> dict[str, tuple[str, list[float]]]:
     }
 
 
-def test_runs_of_both_sittings_are_there_once_with_their_own_values() -> None:
+def test_merging_keeps_each_run_once_with_its_values() -> None:
     first = sweep(("a", "FINISHED", [1, 2]), ("b", "KILLED", [3]), ("c", "FINISHED", [4]))
     second = sweep(
         ("d", "FINISHED", [5, 6]), ("b", "FINISHED", [3, 7]), ("c", "FAILED", [0]), run_id="t"
@@ -56,7 +56,7 @@ def test_runs_of_both_sittings_are_there_once_with_their_own_values() -> None:
     assert found.source == "t"
 
 
-def test_an_unfinished_run_is_the_later_one_and_merging_again_changes_nothing() -> None:
+def test_of_unfinished_runs_the_later_one_is_kept() -> None:
     first, second = sweep(("a", "FAILED", [1])), sweep(("a", "RUNNING", []), run_id="t")
     assert values_of(merged(first, second)) == {"a": ("t-a", [])}
     whole = sweep(("a", "FINISHED", [1]), ("b", "FINISHED", [2]))
@@ -66,8 +66,8 @@ def test_an_unfinished_run_is_the_later_one_and_merging_again_changes_nothing() 
     assert np.all(np.diff(merged(whole, whole).history["m"].run) >= 0)
 
 
-def test_a_later_sitting_with_some_of_the_seeds_is_no_other_plan() -> None:
-    """Its runs would be told to have been made when the plan had changed."""
+def test_a_later_plan_for_fewer_seeds_is_not_another_version() -> None:
+    """Otherwise its runs would count as trained after a change of the plan."""
 
     def recorded(at: int, seeds: str) -> Sweep:
         plan = AnalysisPlan(
@@ -87,12 +87,12 @@ def test_a_later_sitting_with_some_of_the_seeds_is_no_other_plan() -> None:
     whole, part, more = recorded(1, "0, 1, 12"), recorded(2, "12, 1"), recorded(3, "0, 1, 2")
     assert merged(whole, part).plans == merged(part, whole).plans == whole.plans
     assert merged(whole, more).plans == (*whole.plans, *more.plans)
-    # Seeds that came later are a change, though their plan has the earlier ones, too.
+    # Additional seeds are a new version.
     early, late = recorded(1, "0, 1"), recorded(2, "0, 1, 2")
     assert merged(early, late).plans == (*early.plans, *late.plans)
 
 
-def test_a_plans_runs_are_found_in_other_sweeps_exports(tmp_path: Path) -> None:
+def test_runs_of_a_plan_are_found_in_exports_of_other_sweeps(tmp_path: Path) -> None:
     file = tmp_path / "sweep.yaml"
     file.write_text(
         "{name: mine, tasks: [FetchPush], seeds: [0, 1, 2], "
@@ -114,10 +114,10 @@ def test_a_plans_runs_are_found_in_other_sweeps_exports(tmp_path: Path) -> None:
     assert of_plan(plan, [sweep(("other", "FINISHED", [9]))]) is None
 
 
-def test_runs_of_an_earlier_version_are_found_where_there_are_none_of_a_later_one(
+def test_runs_of_an_earlier_algorithm_replace_missing_ones(
     tmp_path: Path,
 ) -> None:
-    """Runs and runs that start from them have the version of the algorithm as a tag."""
+    """A run and the runs that start from it have the same version of the algorithm."""
     file = tmp_path / "sweep.yaml"
     file.write_text(
         "{name: mine, tasks: [FetchPush], seeds: [0, 1], stages: [{name: u, variant: music-u},"
@@ -132,7 +132,7 @@ def test_runs_of_an_earlier_version_are_found_where_there_are_none_of_a_later_on
     ]
     found = of_plan(plan, exports, earlier)
     assert found is not None
-    # The run that starts from it is of the earlier version, and did not start from this one.
+    # The run that starts from it has the earlier version and did not start from this one.
     assert [run.node_key for run in found.runs] == before
     found = of_plan(plan, [*exports, sweep((now[3], "FINISHED", [4]))], earlier)
     assert found is not None

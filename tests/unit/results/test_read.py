@@ -41,7 +41,7 @@ def no_waiting_for_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def reports(q: float, seed: int, steps: int) -> list[Report]:
-    """Two reports a thousand steps, at a success rate that rises to its end."""
+    """A report every 500 steps, with a rising success rate."""
     return [
         Report(
             env_steps=at,
@@ -61,7 +61,7 @@ def reports(q: float, seed: int, steps: int) -> list[Report]:
 def opened_sweep(
     folder: Path, stage: dict[str, Any], steps: int = 2000, seeds: int = 3, name: str = "s"
 ) -> OpenSweep:
-    """A sweep that a driver has begun, with one stage."""
+    """A sweep with one stage that a driver has started."""
     content = {
         "name": name,
         "tasks": ["FetchPush"],
@@ -80,7 +80,7 @@ def opened_sweep(
 
 
 def publish(sweep: OpenSweep, node: Node, history: list[Report]) -> None:
-    """As if the run had been trained."""
+    """Store a run as finished."""
     with TemporaryDirectory() as folder:
         (Path(folder) / HISTORY).write_bytes(to_json_lines(history))
         last = history[-1]
@@ -102,7 +102,7 @@ def play(
     name: str = "s",
     stops_after: int | None = None,
 ) -> OpenSweep:
-    """A driver's whole run of a sweep, or its first runs; the next one has a checkpoint."""
+    """Run a sweep without training, or only its first runs; the next run has a checkpoint."""
     opened = opened_sweep(folder, {"grid": {"tac.entropic_index": list(qs)}}, steps, seeds, name)
     left = [node for node in opened.plan.nodes if not opened.store.is_finished(node.key)]
     with StateFile(opened) as state_file:
@@ -119,7 +119,7 @@ def play(
 
 
 class Shown:
-    """What the commands, the report and the frames show of a sweep."""
+    """The output of commands, report and frames for a sweep."""
 
     def __init__(self, folder: Path, capsys: pytest.CaptureFixture[str], name: str = "s") -> None:
         self.place = str(folder / "results" / name)
@@ -137,7 +137,7 @@ class Shown:
         return json.loads(capsys.readouterr().out)
 
     def agreed(self) -> dict[str, tuple[int, float]]:
-        """Seeds and mean of each condition, which are the same everywhere."""
+        """Number of runs and mean of each condition, after checking that all outputs agree."""
         (group,) = self.compared["groups"]
         found = {row["label"]: (row["runs"], row["value"]) for row in group["conditions"]}
         (analysis,) = analyse(self.read)
@@ -151,7 +151,7 @@ class Shown:
         return found
 
     def earlier(self) -> str | None:
-        """The sentence about runs of earlier plans, which is the same everywhere."""
+        """The sentence about runs of earlier plans, after checking that all outputs agree."""
         sentence: str | None = self.read.earlier
         assert self.compared["earlier"] == self.status["earlier"] == sentence
         assert self.frames.earlier == sentence
@@ -180,7 +180,7 @@ NOT_SHOWN = "of an earlier version of this sweep are not shown:"
     ],
     ids=["twice", "more seeds", "steps", "fewer seeds", "values", "steps and values", "back"],
 )
-def test_commands_and_report_show_the_current_plan_of_a_changed_sweep(
+def test_commands_and_report_agree_on_a_changed_sweep(
     changes: list[dict[str, Any]],
     earlier: str | None,
     tmp_path: Path,
@@ -197,7 +197,7 @@ def test_commands_and_report_show_the_current_plan_of_a_changed_sweep(
     assert shown.earlier() == earlier
 
 
-def test_a_sweep_under_another_name_has_its_own_plan(
+def test_a_renamed_sweep_has_its_own_plan(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     play(tmp_path)
@@ -209,7 +209,7 @@ def test_a_sweep_under_another_name_has_its_own_plan(
     assert (short.earlier(), longer.earlier()) == (None, None)
 
 
-def test_an_interrupted_sweep_shows_what_its_checkpoints_have(
+def test_an_interrupted_sweep_shows_runs_up_to_their_checkpoints(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     play(tmp_path)
@@ -229,7 +229,7 @@ def test_an_interrupted_sweep_shows_what_its_checkpoints_have(
     assert {runs for runs, _ in Shown(tmp_path, capsys).agreed().values()} == {3}
 
 
-def test_a_running_sweep_shows_its_runs_as_running(tmp_path: Path) -> None:
+def test_a_running_sweep_has_running_runs(tmp_path: Path) -> None:
     opened = play(tmp_path, stops_after=1)
     with StateFile(opened) as state_file:
         assert [run.status for run in read_sweep(str(opened.folder)).sweep.runs][:3] == [
@@ -244,8 +244,8 @@ def test_a_running_sweep_shows_its_runs_as_running(tmp_path: Path) -> None:
     assert failed.runs[1].failure == "no <luck>"
 
 
-def test_a_search_that_is_changed_shows_the_trials_of_its_plan(tmp_path: Path) -> None:
-    """As its driver records it; and a driver that only begins loses no trial of the record."""
+def test_a_changed_search_shows_the_trials_of_its_plan(tmp_path: Path) -> None:
+    """A driver that only starts keeps the recorded trials."""
 
     def begun(low: float) -> OpenSweep:
         search = {"space": {"tac.alpha": {"float": [low, 0.5]}}, "trials": 3}
@@ -256,7 +256,7 @@ def test_a_search_that_is_changed_shows_the_trials_of_its_plan(tmp_path: Path) -
         sweep.plan.add_trial("train", number, {"tac.alpha": alpha}, [0, 1, 2], f"trial{number}")
     for node in sweep.plan.nodes:
         publish(sweep, node, reports(1.0, node.run.seed, 2000))
-    keep_record(sweep)  # as the driver does whenever it has a new trial
+    keep_record(sweep)  # as a driver does for each new trial
     before = read_sweep(str(sweep.folder)).sweep
     assert [run.status for run in before.runs] == ["FINISHED"] * 9
     begun(0.1)
@@ -271,7 +271,7 @@ def test_a_search_that_is_changed_shows_the_trials_of_its_plan(tmp_path: Path) -
     assert changed.earlier == f"9 runs {NOT_SHOWN} other trials of train."
 
 
-def test_damaged_runs_are_refused_or_count_as_unfinished(tmp_path: Path) -> None:
+def test_damaged_runs_raise_or_count_as_unfinished(tmp_path: Path) -> None:
     opened = play(tmp_path)
     bad = opened.plan.nodes[2]
     (Path(opened.store.path(bad.key)) / HISTORY).write_text("no reports")
@@ -290,7 +290,7 @@ def test_damaged_runs_are_refused_or_count_as_unfinished(tmp_path: Path) -> None
     assert missing(read.sweep, ()) == []
 
 
-def test_a_run_is_read_as_it_was_reported_and_with_the_code_that_made_it(tmp_path: Path) -> None:
+def test_a_run_is_read_with_its_reports_and_code_versions(tmp_path: Path) -> None:
     opened = play(tmp_path, seeds=1, qs=(1.0,))
     sweep = read_sweep(str(opened.folder)).sweep
     for name in (names.EVAL_SUCCESS, names.ENTROPY):
@@ -311,10 +311,10 @@ def test_a_run_is_read_as_it_was_reported_and_with_the_code_that_made_it(tmp_pat
     assert set(only.history) == {names.EVAL_SUCCESS}
 
 
-def test_an_export_has_the_current_plan_and_its_addition_drops_what_was_replaced(
+def test_adding_to_an_export_replaces_changed_runs(
     tmp_path: Path,
 ) -> None:
-    """Seeds of another sitting stay: only runs with other settings under the same name go."""
+    """Other seeds are kept; runs with changed settings under the same name are replaced."""
     export = tmp_path / "published"
 
     def exported(*options: str) -> dict[str, int | None]:
@@ -330,7 +330,7 @@ def test_an_export_has_the_current_plan_and_its_addition_drops_what_was_replaced
     assert exported() == {"seed0": 4000}
 
 
-def test_a_run_of_an_earlier_version_of_the_algorithm_is_still_read(
+def test_runs_of_an_earlier_algorithm_are_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     opened = play(tmp_path, seeds=1)

@@ -1,4 +1,4 @@
-"""Numbers of published tables, of other libraries, and computed by hand."""
+"""Statistics against published numbers, other libraries and hand computation."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ def ends(found: s.Estimate) -> tuple[float, float, float]:
     return float(found.value), float(found.lower), float(found.upper)
 
 
-def test_rliable_s_published_numbers() -> None:
+def test_probability_of_improvement_equals_rliables() -> None:
     assert s.improvement(X, Y) == pytest.approx(1 / 3)
     assert s.improvement(Y, X) == pytest.approx(2 / 3)
 
 
 @given(matrices, st.integers(0, 5))
-def test_a_run_that_does_not_exist_counts_for_nothing(scores: np.ndarray, missing: int) -> None:
+def test_missing_runs_do_not_count(scores: np.ndarray, missing: int) -> None:
     padded = np.concatenate([scores, np.full((missing, scores.shape[1]), NAN)])
     ours, bare = s.estimate(padded), s.estimate(scores)
     for one, other in zip(ends(ours), ends(bare), strict=True):
@@ -38,7 +38,7 @@ def test_a_run_that_does_not_exist_counts_for_nothing(scores: np.ndarray, missin
 
 
 @given(st_numpy.arrays(float, st.integers(2, 9), elements=finite, unique=True))
-def test_a_metric_without_bounds_has_student_s_interval(values: np.ndarray) -> None:
+def test_an_unbounded_metric_has_students_interval(values: np.ndarray) -> None:
     expected = stats.ttest_1samp(values, 0).confidence_interval()
     assume(np.var(values) > 1e-6)
     found = s.estimate(values[:, np.newaxis])
@@ -46,20 +46,20 @@ def test_a_metric_without_bounds_has_student_s_interval(values: np.ndarray) -> N
 
 
 def test_tasks_are_strata() -> None:
-    """The spread of each task's runs counts, and not the distance between tasks."""
+    """The spread within each task counts, not the distance between tasks."""
     near, far = np.array([[0.0, 0.0], [1.0, 1.0]]), np.array([[0.0, 100.0], [1.0, 101.0]])
     a, b = s.estimate(near), s.estimate(far)
     assert b.value - a.value == 50
     # Two variances of 1/2 over two runs each: 1/8 of their mean, with two degrees of freedom.
     assert b.upper - b.value == pytest.approx(stats.t.ppf(0.975, 2) * np.sqrt(1 / 8))
     assert a.upper - a.value == pytest.approx(b.upper - b.value)
-    # As many degrees as the only task has whose runs differ.
+    # Only the task whose runs differ counts for the degrees of freedom.
     one = s.estimate(np.array([[0.0, 7.0], [1.0, 7.0]]))
     assert one.upper - one.value == pytest.approx(stats.t.ppf(0.975, 1) * np.sqrt(1 / 16))
 
 
 @pytest.mark.parametrize("wins", [0, 75, 150])
-def test_where_all_seeds_tie_the_interval_is_the_exact_one_over_their_episodes(wins: int) -> None:
+def test_tied_seeds_have_the_exact_interval_over_their_episodes(wins: int) -> None:
     found = s.estimate(np.full((3, 1), wins / 150), episodes=50)
     exact = stats.binomtest(wins, 150).proportion_ci(0.95, method="exact")
     assert ends(found)[1:] == pytest.approx((exact.low, exact.high))
@@ -67,15 +67,15 @@ def test_where_all_seeds_tie_the_interval_is_the_exact_one_over_their_episodes(w
     assert not s.estimate(np.full((3, 1), wins / 150)).has_interval
 
 
-def test_a_rate_s_interval_by_korn_and_graubard_s_formula() -> None:
-    """Three seeds at .9, 1, .8: variance of the mean 1/300, so 27 episodes' worth, and those
-    count (1.96 / 4.303)^2 times."""
+def test_the_interval_of_a_rate_follows_korn_and_graubard() -> None:
+    """Seeds at 0.9, 1 and 0.8 have a variance of the mean of 1/300, that of 27 episodes, reduced
+    by (1.96 / 4.303)^2."""
     trials = 27 * (stats.norm.ppf(0.975) / stats.t.ppf(0.975, 2)) ** 2
     found = s.estimate(np.array([[0.9], [1.0], [0.8]]), episodes=50)
     low = stats.beta.ppf(0.025, 0.9 * trials, 0.1 * trials + 1)
     high = stats.beta.ppf(0.975, 0.9 * trials + 1, 0.1 * trials)
     assert ends(found) == pytest.approx((0.9, low, high))
-    # More episodes than there were are never claimed.
+    # The number of episodes is an upper limit.
     tight = s.estimate(np.array([[0.5], [0.5], [0.52]]), episodes=50)
     few = 150 * (stats.norm.ppf(0.975) / stats.t.ppf(0.975, 2)) ** 2
     assert float(tight.lower) == pytest.approx(float(s.clopper_pearson(tight.value, few)[0]))
@@ -87,7 +87,7 @@ rates = st_numpy.arrays(
 
 
 @given(rates)
-def test_a_rate_s_interval_holds_it_and_stays_in_bounds(counts: np.ndarray) -> None:
+def test_the_interval_of_a_rate_contains_it_and_stays_in_bounds(counts: np.ndarray) -> None:
     found = s.estimate(counts / 20, episodes=20)
     assert 0 <= found.lower <= found.value + 1e-9
     assert found.value - 1e-9 <= found.upper <= 1
@@ -98,11 +98,11 @@ def test_one_run_has_no_interval() -> None:
     assert single.value == pytest.approx(0.75)
     assert not single.has_interval
     some = s.estimate(np.array([[0.7, 0.8], [0.9, NAN]]))
-    assert not some.has_interval  # the second task's spread is not known
+    assert not some.has_interval  # the spread of the second task is unknown
     assert np.isnan(s.estimate(np.empty((0, 1))).value)
 
 
-def test_a_curve_is_estimated_point_by_point_with_the_runs_that_are_there() -> None:
+def test_a_curve_is_estimated_at_each_point_from_the_runs_present() -> None:
     curves = np.array([[0.0, 1.0, 2.0], [0.0, 3.0, NAN], [0.0, NAN, NAN]])[:, np.newaxis]
     found = s.estimate(curves)
     np.testing.assert_allclose(found.value, [0, 2, 2])
@@ -111,8 +111,8 @@ def test_a_curve_is_estimated_point_by_point_with_the_runs_that_are_there() -> N
     np.testing.assert_allclose(found.upper, [NAN, 2 + half, NAN])
 
 
-def test_a_difference_has_both_intervals_in_it() -> None:
-    """Equal spreads: sqrt(2) times the half width; at a ceiling the far side counts alone."""
+def test_the_interval_of_a_difference_combines_both() -> None:
+    """Equal spreads: sqrt(2) times the half width; at a ceiling only the other side counts."""
     one, other = s.estimate(np.array([[1.0], [2], [3]])), s.estimate(np.array([[5.0], [6], [7]]))
     gap, half = s.difference(other, one), float(one.upper - one.value)
     assert ends(gap) == pytest.approx((4, 4 - np.sqrt(2) * half, 4 + np.sqrt(2) * half))
@@ -121,7 +121,7 @@ def test_a_difference_has_both_intervals_in_it() -> None:
     assert gap.upper == pytest.approx(float(gap.value + below.value - below.lower))
 
 
-def test_profile() -> None:
+def test_performance_profile() -> None:
     scores = np.array([[0.1, 0.5], [0.4, NAN], [0.5, 0.9]])
     found = s.performance_profile(scores, np.array([0.0, 0.4, 0.5, 0.9]))
     np.testing.assert_allclose(found.value, [1, 3 / 5, 1 / 5, 0])
@@ -154,7 +154,7 @@ def test_kaplan_meier_median_by_hand() -> None:
 def test_censored_runs_increase_the_median() -> None:
     assert median([10, 20, 30], [True] * 3)[0] == 20
     assert median([10, 20, 30, 100, 100], [True] * 3 + [False] * 2) == (30, 10, np.inf)
-    # The run that was stopped at 5 may have been the last one: 10 is no end of the interval.
+    # The run that was stopped at 5 may arrive last, so 10 is not the lower end.
     assert median([5, 10, 20, 30, 40], [False] + [True] * 4)[1:] == (5, np.inf)
 
 
