@@ -19,8 +19,9 @@ from benchmarks.measure import Row, Taken, middle, taken_by
 from music_rllib import names
 from music_rllib.config.load import load_sweep
 from music_rllib.config.schema import SweepConfig
-from music_rllib.experiment.open_sweep import keep_record, open_sweep
+from music_rllib.experiment.open_sweep import open_sweep
 from music_rllib.experiment.plan import make_plan
+from music_rllib.experiment.record import keep_record
 from music_rllib.report.build import PAGE
 from music_rllib.store.history import HISTORY, Report, RunResult, last_values, to_json_lines
 
@@ -102,7 +103,7 @@ def config(storage: Path) -> SweepConfig:
 def make_sweep(storage: Path) -> Path:
     """The folder of a sweep whose curves climb, with noise."""
     sweep, folder = config(storage), storage / "large"
-    opened = open_sweep(sweep, make_plan(sweep), str(storage), folder)
+    opened = open_sweep(sweep, make_plan(sweep), str(storage))
     keep_record(opened)
     rng, now = np.random.default_rng(0), int(time.time() * 1000)
     for node in opened.plan.nodes:

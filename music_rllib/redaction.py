@@ -6,11 +6,9 @@ file, the terminal or MLflow, and also `printable` on its way to the terminal.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import re
 from collections.abc import Iterator, Mapping
-from typing import Any
 
 MAX_PARAM_LENGTH = 6000
 """Longest value of a param that MLflow takes, in characters."""
@@ -67,35 +65,6 @@ def _hidden(match: re.Match[str]) -> str:
         return f"{match['name']}{match['equals']}***"
     quote = match["quote"] or '"'
     return f"{match['name']}{match['colon']}{quote}***{quote}"
-
-
-def redact_yaml(text: str) -> str:
-    """YAML without passwords and without the values of keys that name a secret; else as it was."""
-    import yaml
-
-    with contextlib.suppress(yaml.YAMLError, RecursionError):
-        spans = _secret_spans(yaml.compose(text, yaml.SafeLoader), set())
-        for start, end in sorted(set(spans), reverse=True):
-            length = len(text[start:end].rstrip())
-            text = text[:start] + ('"***"' if length else "") + text[start + length :]
-    return redact(text)
-
-
-def _secret_spans(
-    node: Any, seen: set[int], *, of_tasks: bool = False
-) -> Iterator[tuple[int, int]]:
-    """Where in its text a YAML node has the values of keys that name a secret."""
-    if id(node) in seen or not isinstance(node.value if node else None, list):
-        return
-    seen.add(id(node))
-    for item in node.value:
-        key, value = item if isinstance(item, tuple) else (None, item)
-        name = str(key.value) if key is not None else ""
-        number = 0 if value.tag.endswith((":int", ":float")) else None
-        if not of_tasks and _is_secret(name, number):
-            yield value.start_mark.index, value.end_mark.index
-        else:
-            yield from _secret_spans(value, seen, of_tasks=name in _KEYED_BY_TASK)
 
 
 def printable(text: str) -> str:

@@ -8,8 +8,9 @@ from pathlib import Path
 import yaml
 
 from music_rllib.config.load import load_sweep
-from music_rllib.experiment.open_sweep import keep_record, open_sweep
+from music_rllib.experiment.open_sweep import open_sweep
 from music_rllib.experiment.plan import make_plan
+from music_rllib.experiment.record import keep_record
 
 __all__ = ["kept_sweep"]
 
@@ -28,7 +29,7 @@ def kept_sweep(storage: Path, tracking_uri: str | None = None) -> Path:
     file.write_text(yaml.safe_dump(document))
     config = load_sweep(file)
     folder = storage / "s"
-    keep_record(open_sweep(config, make_plan(config), str(storage), folder))
+    keep_record(open_sweep(config, make_plan(config), str(storage)))
     record = {"sweep_name": "s", "sweep_id": "0", "tracking_uri": tracking_uri, "run_id": "1"}
     (folder / "tracking").mkdir()
     (folder / "tracking" / "sweep.json").write_text(json.dumps(record))

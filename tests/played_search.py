@@ -22,7 +22,6 @@ from music_rllib.search.controller import SearchController
 from music_rllib.search.opening import open_searches
 from music_rllib.search.summary import outcome
 from music_rllib.store.history import HISTORY, Report, RunResult, last_values, to_json_lines
-from music_rllib.store.storage import sweep_folder
 from music_rllib.tune.runner import DagSearcher
 
 Document = dict[str, Any]
@@ -72,9 +71,7 @@ class Driver:
         path.write_text(yaml.safe_dump(content, sort_keys=False))
         config = load_sweep(path, storage=str(folder / "results"))
         plan = make_plan(config)
-        self.sweep: OpenSweep = open_sweep(
-            config, plan, config.storage, sweep_folder(config.storage, config.name)
-        )
+        self.sweep: OpenSweep = open_sweep(config, plan, config.storage)
         self._time = time.time()  # as another driver's clock, which judges whether this one lives
         self.computed: list[str] = []
         self.pruned: dict[str, str] = {}

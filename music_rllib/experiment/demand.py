@@ -1,22 +1,22 @@
-"""The memory and time that runs need at least, by their settings alone.
+"""Lower bounds of the memory and time that runs need, computed from their settings.
 
-The bound of memory leaves out what is there whatever the settings are: the interpreter, its
-libraries, an environment's own data. An observation counts as far as the task's split of it into
-agent and surroundings reaches.
+The bound of memory omits what does not depend on the settings: the interpreter, its libraries, an
+environment's own data. An observation counts up to the largest index of the task's split into agent
+and surroundings.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from itertools import pairwise
+from operator import attrgetter
 from typing import TYPE_CHECKING
 
 from music_rllib.config.problems import shown
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.envs.tasks import Task
 from music_rllib.errors import BadInputError
-from music_rllib.runtime import machine as local
+from music_rllib.runtime import machine
 
 if TYPE_CHECKING:
     from music_rllib.experiment.open_sweep import OpenSweep
@@ -24,34 +24,19 @@ if TYPE_CHECKING:
 FLOAT = 4
 """Bytes of a number."""
 STEPS_PER_SECOND = 50_000
-"""Environment steps of a process that simulates as fast as any does."""
+"""Environment steps per second of the fastest simulations."""
 UPDATES_PER_SECOND = 10_000
-"""Gradient updates of small networks on the fastest hardware."""
+"""Gradient updates per second of small networks on the fastest hardware."""
 LONG_DAYS = 60
 """A run that takes longer at these rates is probably a mistake."""
 ENVIRONMENT_BYTES = 10_000
-"""Memory of one sub-environment; MuJoCo's take a hundred times that."""
-
+"""Memory of one sub-environment; MuJoCo's take a hundred times as much."""
 CERTAIN_BYTES = 2 * 2**30
 """Memory that every node of a cluster is assumed to have."""
 
-Demand = tuple[str, object, int]
-"""A dotted setting, its value, and the bytes or seconds that it causes."""
-
 
 class DemandError(BadInputError, ValueError):
-    """A run that no available machine can hold."""
-
-
-@dataclass(frozen=True)
-class Machine:
-    """Where runs are to run."""
-
-    name: str
-    memory: int
-    """Its memory in bytes."""
-    claimable: int
-    """Bytes that its system grants one process at once, used or not."""
+    """A run does not fit on any available machine."""
 
 
 def check_demand(sweep: OpenSweep) -> list[str]:
@@ -62,114 +47,72 @@ def check_demand(sweep: OpenSweep) -> list[str]:
 
     Raises:
         DemandError: A run does not fit.
-        ClusterError: The cluster whose memory counts can't be reached.
+        ClusterError: The cluster can't be reached.
     """
     runs = [(node.stage, node.run) for node in sweep.plan.nodes if node.key not in sweep.finished]
     for stage in sweep.config.stages:
         if stage.search is not None:
             runs += [(stage.name, run) for run in stage.points[0].runs.values()]
-    machine = Machine("this machine", local.memory(), local.claimable())
-    if (address := local.cluster_address()) is not None:
-        machine = _cluster_machine(address, sweep, runs)
-    check_memory(runs, machine)
+    place, memory = "this machine", float(machine.memory())
+    if (address := machine.cluster_address()) is not None:
+        place, memory = "the cluster's largest node", _cluster_memory(address, sweep, runs)
+    check_memory(runs, place, memory)
     return list(long_runs(runs))
 
 
-def _cluster_machine(
-    address: str, sweep: OpenSweep, runs: list[tuple[str, RunSettings]]
-) -> Machine:
-    """The cluster's largest node; it is only asked for its memory where the runs need much."""
-    name = "the cluster's largest node"
-    address_space = 2**47  # bytes: no limit
-    most = max((least_memory(run) for _, run in runs), default=0)
-    if most <= CERTAIN_BYTES:
-        return Machine(name, CERTAIN_BYTES, address_space)
+def _cluster_memory(
+    address: str, sweep: OpenSweep, runs: Iterable[tuple[str, RunSettings]]
+) -> float:
+    """Memory of the cluster's largest node, which is only looked up if the runs need much."""
+    if max((least_memory(run) for _, run in runs), default=0) <= CERTAIN_BYTES:
+        return CERTAIN_BYTES
     from music_rllib.runtime.ray_cluster import cluster
 
-    local.check_reachable(address)
-    with cluster(sweep.config.resources) as room:
-        return Machine(name, address_space if room.grows else room.memory, address_space)
+    machine.check_reachable(address)
+    with cluster(sweep.config.resources) as capacity:
+        return float("inf") if capacity.grows else capacity.memory
+
+
+def check_memory(runs: Iterable[tuple[str, RunSettings]], place: str, memory: float) -> None:
+    """Check that each of `runs`, given with the names of their stages, fits into `memory` bytes.
+
+    Raises:
+        DemandError: A run does not fit; the message names the settings that need most.
+    """
+    for stage, run in runs:
+        if least_memory(run) > memory:
+            settings, amount = max(_memory(run).items(), key=lambda item: item[1])
+            values = " and ".join(shown(attrgetter(setting)(run)) for setting in settings)
+            raise DemandError(
+                f"stage {stage}: {' and '.join(settings)} must fit into the memory of {place}, "
+                f"{_gib(memory)}, got {values}, for which a run on {run.task.name} needs at least "
+                f"{_gib(amount)}"
+            )
 
 
 def least_memory(run: RunSettings) -> int:
     """Bytes that a run needs at least."""
-    return sum(amount for _, _, amount in _memory(run))
+    return sum(_memory(run).values())
 
 
-def check_memory(runs: Iterable[tuple[str, RunSettings]], machine: Machine) -> None:
-    """Check that each of `runs`, given with the names of their stages, fits on `machine` alone.
-
-    Raises:
-        DemandError: A run does not fit; the message names the setting that needs most.
-    """
-    for stage, run in runs:
-        setting, value, amount = max(_memory(run), key=lambda demand: demand[2])
-        has, limit = "the memory of", machine.memory
-        if least_memory(run) <= limit:
-            # The replay's array is claimed whole, and costs memory as it fills.
-            setting, value = "replay.capacity", run.replay.capacity
-            amount = value * _row_bytes(run.task)
-            has, limit = "what a process may claim on", machine.claimable
-            if amount <= limit:
-                continue
-        raise DemandError(
-            f"stage {stage}: {setting} must fit into {has} {machine.name}, {_gib(limit)}, got "
-            f"{shown(value)}, for which a run on {run.task.name} needs {_gib(amount)} at least"
-        )
-
-
-def long_runs(runs: Iterable[tuple[str, RunSettings]]) -> Iterator[str]:
-    """One line per stage and task whose runs would take months or years on any hardware."""
-    seen = set()
-    for stage, run in runs:
-        setting, value, seconds = max(_seconds(run), key=lambda demand: demand[2])
-        days = seconds // 86_400
-        if days >= LONG_DAYS and (stage, run.task.name) not in seen:
-            seen.add((stage, run.task.name))
-            years = days // 365
-            time = f"{_number(years)} years" if years > 1 else f"{days} days"
-            yield (
-                f"stage {stage}: a run on {run.task.name} takes {time} on the fastest hardware, "
-                f"with {setting} {shown(value)}"
-            )
-
-
-def _seconds(run: RunSettings) -> Iterator[Demand]:
-    """Seconds that a run takes at least, by setting."""
-    evaluation = run.evaluation
-    evaluations = 1 - (-run.env_steps // evaluation.interval)
-    yield "env_steps", run.env_steps, run.env_steps // STEPS_PER_SECOND
-    played = evaluations * evaluation.episodes * run.task.horizon
-    yield "evaluation.episodes", evaluation.episodes, played // STEPS_PER_SECOND
-    ratio = run.tac.replay_ratio
-    updates = (run.env_steps - run.tac.steps_before_updates) * int(ratio)
-    yield "tac.replay_ratio", ratio, updates // UPDATES_PER_SECOND if ratio > 1 else 0
-
-
-def _memory(run: RunSettings) -> Iterator[Demand]:
-    """Bytes that a run needs at least, by setting."""
+def _memory(run: RunSettings) -> dict[tuple[str, ...], int]:
+    """Bytes that a run needs at least, by the settings that cause them."""
     tac, replay, music, horizon = run.tac, run.replay, run.music, run.task.horizon
-    row, observation = _row_bytes(run.task), _observation(run.task)
-    yield "tac.hidden_sizes", tac.hidden_sizes, FLOAT * _network_numbers(run, observation)
-    wide = sum(tac.hidden_sizes) > tac.batch_size
-    setting = ("tac.hidden_sizes", tac.hidden_sizes) if wide else ("tac.batch_size", tac.batch_size)
-    yield *setting, tac.batch_size * (row + FLOAT * sum(tac.hidden_sizes))
-    yield "replay.capacity", replay.capacity, min(replay.capacity, run.env_steps) * row
-    # The trajectories of an evaluation are counted when all are there.
-    episodes = run.evaluation.episodes
-    yield "evaluation.episodes", episodes, episodes * horizon * row
-    yield "num_envs", run.num_envs, run.num_envs * (ENVIRONMENT_BYTES + horizon * row)
-    if music.estimator != "none":
-        units, batch = music.hidden_size, music.batch_trajectories
-        yield "music.hidden_size", units, 4 * FLOAT * units * (observation + 2)
-        wide = units > batch * horizon
-        asked = ("music.hidden_size", units) if wide else ("music.batch_trajectories", batch)
-        yield *asked, FLOAT * batch * horizon * (observation + units)
-
-
-def _row_bytes(task: Task) -> int:
-    """Bytes of a transition: observation, action, reward, and whether it was the last."""
-    return FLOAT * (_observation(task) + 3)
+    observation, units = _observation(run.task), music.hidden_size
+    row = FLOAT * (observation + 3)  # with action, reward, and whether the episode ended
+    has_estimator = music.estimator != "none"
+    return {
+        ("tac.hidden_sizes",): FLOAT * _network_numbers(run, observation),
+        ("tac.batch_size", "tac.hidden_sizes"): tac.batch_size
+        * (row + FLOAT * sum(tac.hidden_sizes)),
+        ("replay.capacity",): replay.capacity * row,
+        # An evaluation keeps all of its trajectories until it ends.
+        ("evaluation.episodes",): run.evaluation.episodes * horizon * row,
+        ("num_envs",): run.num_envs * (ENVIRONMENT_BYTES + horizon * row),
+        ("music.hidden_size",): has_estimator * 4 * FLOAT * units * (observation + 2),
+        ("music.batch_trajectories", "music.hidden_size"): has_estimator
+        * (FLOAT * music.batch_trajectories * horizon * (observation + units)),
+    }
 
 
 def _network_numbers(run: RunSettings, observation: int) -> int:
@@ -179,11 +122,8 @@ def _network_numbers(run: RunSettings, observation: int) -> int:
     critics = _weights(observation + 1, tac.hidden_sizes)
     if tac.policy == "stochastic":
         critics *= 2
-    if tac.bootstrap == "value":
-        value = target = _weights(observation, tac.hidden_sizes)
-    else:
-        value, target = 0, critics
-    return 4 * (policy + critics + value) + target
+    value = policy if tac.bootstrap == "value" else 0
+    return 4 * (policy + critics + value) + (value or critics)
 
 
 def _weights(inputs: int, hidden_sizes: tuple[int, ...]) -> int:
@@ -197,8 +137,29 @@ def _observation(task: Task) -> int:
     return 1 + max((*task.agent_indices, *task.surrounding_indices), default=0)
 
 
-def _gib(amount: int) -> str:
-    return f"{_number(amount / 2**30 if amount < 10**30 else amount // 2**30)} GiB"
+def long_runs(runs: Iterable[tuple[str, RunSettings]]) -> Iterator[str]:
+    """One line per stage and task whose runs would take months or years on any hardware."""
+    seen = set()
+    for stage, run in runs:
+        days = _least_seconds(run) // 86_400
+        if days >= LONG_DAYS and (stage, run.task.name) not in seen:
+            seen.add((stage, run.task.name))
+            yield (
+                f"stage {stage}: a run on {run.task.name} takes at least {_number(days)} days on "
+                "the fastest hardware; see env_steps, tac.replay_ratio and evaluation"
+            )
+
+
+def _least_seconds(run: RunSettings) -> int:
+    """Seconds that a run takes at least."""
+    evaluations = 1 - (-run.env_steps // run.evaluation.interval)
+    played = evaluations * run.evaluation.episodes * run.task.horizon
+    updates = (run.env_steps - run.tac.steps_before_updates) * int(run.tac.replay_ratio)
+    return (run.env_steps + played) // STEPS_PER_SECOND + max(updates, 0) // UPDATES_PER_SECOND
+
+
+def _gib(amount: float) -> str:
+    return f"{_number(amount / 2**30 if amount < 10**30 else int(amount) // 2**30)} GiB"
 
 
 def _number(value: float) -> str:

@@ -1,77 +1,151 @@
-"""A planned sweep with its storage open: its finished runs, and the record of its plan."""
+"""A planned sweep with its storage open, its finished runs, and the environments of its tasks."""
 
 from __future__ import annotations
 
-import contextlib
-import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from music_rllib.config.schema import SweepConfig
-from music_rllib.envs.fingerprint import Fingerprint
-from music_rllib.experiment.continuation import continuation_key
-from music_rllib.experiment.earlier import earlier_runs
-from music_rllib.experiment.environments import Environments
-from music_rllib.experiment.plan import Plan
+from music_rllib.envs.fingerprint import Fingerprint, differences, digest_of
+from music_rllib.experiment.plan import Node, Plan, budget_settings, continuation_key, make_plan
 from music_rllib.experiment.scheduler import DONE, Scheduler
-from music_rllib.experiment.sweep_files import CONFIG, IN_STORAGE, PLAN, as_json, keep, read
+from music_rllib.experiment.sweep_files import PLAN, SETTINGS, SweepLocation, read_json
 from music_rllib.labels import ShortLabels
-from music_rllib.redaction import redact, redact_yaml, without_secrets
 from music_rllib.store.history import RunResult
 from music_rllib.store.node_store import NodeStore, damage_in_words
-from music_rllib.store.storage import DamagedError, StorageError, database_url
+from music_rllib.store.storage import DamagedError, StorageError, open_storage
+from music_rllib.store.work_folder import steps_of
+
+FINISHED = "is finished"
+SAME_ENVIRONMENTS = "environments.json"
+"""File of a storage: the environments that the user declared equivalent."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Environments:
+    """The present environments of a sweep's tasks."""
+
+    now: Mapping[str, Fingerprint] = field(default_factory=dict)
+    """Fingerprints by task; empty if they were not computed."""
+    kept: Sequence[tuple[str, str]] = ()
+    """Digests of an earlier and a later environment whose runs are used together."""
+
+    @classmethod
+    def of(cls, now: Mapping[str, Fingerprint], storage: str) -> Environments:
+        """Environments with the user's earlier decisions in this storage."""
+        kept = (read_json(open_storage(storage), SAME_ENVIRONMENTS) or {}).get("kept", ())
+        return cls(now=now, kept=tuple((one["earlier"], one["later"]) for one in kept))
+
+    def same(self, task: str) -> frozenset[str]:
+        """Digests of all environments that count as the task's."""
+        found = {digest_of(self.now[task])} if task in self.now else set()
+        before: set[str] = set()
+        while found != before:
+            before = set(found)
+            found |= {one for pair in self.kept for one in pair if found & {*pair}}
+        return frozenset(found)
+
+    def earliest(self, task: str) -> str:
+        """Digest of the first of the environments that count as the task's."""
+        same, later = self.same(task), {one for _, one in self.kept}
+        first = (one for one, _ in self.kept if one in same and one not in later)
+        return next(first, digest_of(self.now[task]))
+
+    def differences(self, task: str, run: Fingerprint | None) -> list[str]:
+        """Differences from the environment of a run; none if that was not recorded."""
+        if run is None or task not in self.now or digest_of(run) in self.same(task):
+            return []
+        return differences(run, self.now[task])
 
 
 @dataclass(frozen=True, kw_only=True)
 class OpenSweep:
-    """A planned sweep, its storage open."""
+    """A planned sweep with its storage open."""
 
     config: SweepConfig
     plan: Plan
     storage: str
     """Absolute folder, or URI."""
     store: NodeStore
-    folder: Path
-    """Folder of the sweep's own files, on this machine."""
     scheduler: Scheduler
     environments: Environments = field(default_factory=Environments)
-    """Environments of its tasks as they are now, if the sweep is to be run."""
     damaged: Mapping[str, str] = field(default_factory=dict)
-    """Finished nodes to be trained again, by key, and what is wrong with them."""
+    """Key of each finished node that is damaged and to be trained again, with a message."""
+    recorded: Mapping[str, Any] = field(default_factory=dict)
+    """Content of `plan.json` when the sweep was opened; empty if there was none."""
     earlier: list[dict[str, Any]] = field(default_factory=list)
-    """Runs of earlier versions of the plan, as `plan.json` has them."""
+    """Runs of earlier versions of the plan, as in `plan.json`."""
+
+    @cached_property
+    def location(self) -> SweepLocation:
+        """The place of the sweep's own files."""
+        return SweepLocation(storage=self.storage, name=self.config.name)
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the sweep's own files on this machine."""
+        return self.location.folder
 
     @property
     def finished(self) -> set[str]:
         """Keys of the nodes that have a result."""
         return {node.key for node in self.scheduler.having(*DONE)}
 
+    @property
+    def short(self) -> ShortLabels:
+        """Shortens the labels of the planned runs."""
+        return ShortLabels.of(node.label for node in self.plan.nodes)
+
     def results(self) -> dict[str, RunResult]:
         """Results of the finished nodes, by key."""
         results = zip(self.finished, self.store.map(self.store.result, self.finished), strict=True)
         return {key: result for key, result in results if result is not None}
+
+    def continued_from(self, node: Node) -> int | None:
+        """Environment steps of the finished shorter run that `node` would continue, if any."""
+        if budget_settings(node.run):
+            return None
+        key = continuation_key(node.run, node.source_key)
+        steps = [steps_of(name) for name in self.store.continuation(key).names()]
+        return max((count for count in steps if count < node.run.env_steps), default=None)
+
+    def progress(self, key: str) -> str | None:
+        """The progress of a run as text; None if it has neither a result nor a checkpoint."""
+        if self.store.is_finished(key):
+            return FINISHED
+        checkpoints = self.store.work_folder(key).names()
+        return f"is at {steps_of(checkpoints[-1]):,} env steps" if checkpoints else None
 
 
 def open_sweep(
     config: SweepConfig,
     plan: Plan,
     storage: str,
-    folder: Path,
     *,
     environments: Mapping[str, Fingerprint] | None = None,
     lenient: bool = False,
 ) -> OpenSweep:
     """Open the storage, and find the runs in it that are finished and undamaged.
 
-    Damaged ones are refused, or where `lenient` they wait for `remove_damaged`.
+    Args:
+        config: The sweep.
+        plan: Its plan.
+        storage: Absolute folder, or URI.
+        environments: Fingerprints of its tasks' environments, if the sweep is to be run.
+        lenient: Accept damaged runs, which wait for `remove_damaged`.
 
     Raises:
         StorageError: The storage can't be reached, or finished runs in it are damaged.
     """
     store = NodeStore(storage)
-    labels = _labels(config, plan, storage)
+    try:
+        recorded = SweepLocation(storage=storage, name=config.name).read(PLAN) or {}
+    except StorageError:  # the record is damaged, and the next run replaces it
+        recorded = {}
+    labels = _labels(plan, recorded)
     published = store.finished(labels)
     damaged = store.damage(key for key in labels if key in published)
     if damaged and not lenient:
@@ -82,104 +156,48 @@ def open_sweep(
         plan=plan,
         storage=storage,
         store=store,
-        folder=folder,
         scheduler=Scheduler(plan, finished - damaged.keys()),
         environments=Environments.of(environments, storage) if environments else Environments(),
         damaged={
-            key: f"{labels[key]}: damaged, is trained again: {damaged[key]}" for key in damaged
+            key: f"{labels[key]}: damaged, is trained again: {why}" for key, why in damaged.items()
         },
+        recorded=recorded,
     )
 
 
+def open_started(location: SweepLocation, *, lenient: bool = False) -> OpenSweep:
+    """Open a sweep with its plan as of its last run, and its finished runs.
+
+    The plan includes the searched trials. Its keys are of the version of the algorithm that the
+    sweep was run with.
+
+    Args:
+        location: The sweep.
+        lenient: Accept damaged runs, which then count as not finished.
+    """
+    recorded = location.read(PLAN) or {}
+    settings = {} if "algorithm" in recorded else location.read(SETTINGS) or {}
+    config = location.config()
+    plan = make_plan(config, algorithm=(recorded | settings).get("algorithm"))
+    for trial in recorded.get("trials", ()):
+        plan.add_trial(**trial)
+    return open_sweep(config, plan, location.storage, lenient=lenient)
+
+
 def remove_damaged(sweep: OpenSweep, say: Callable[[str], None]) -> None:
-    """Delete the damaged nodes, and say which; the caller must hold the sweep's lock."""
+    """Delete the damaged nodes, and print each; the caller must hold the sweep's lease."""
     for key, text in sweep.damaged.items():
         sweep.store.remove(key)
         say(text)
 
 
-def _labels(config: SweepConfig, plan: Plan, storage: str) -> dict[str, str]:
-    """Labels of all nodes that the sweep may reuse, by key; also those of earlier trials."""
-    labels = {
-        source.key: f"handoff {source.checkpoint.folder}"
-        for source in plan.imports
-        if source.checkpoint
-    }
-    short = ShortLabels.of(node.label for node in plan.nodes)
-    labels |= {node.key: short(node.label) for node in plan.nodes}
+def _labels(plan: Plan, recorded: Mapping[str, Any]) -> dict[str, str]:
+    """Labels of all nodes that the sweep may reuse, by key; with those of earlier trials."""
+    labels = {}
     if plan.searched:
-        with contextlib.suppress(StorageError):  # the sweep writes it anew
-            earlier = read(storage, f"{config.name}/{PLAN}") or {"nodes": []}
-            labels = {node["key"]: node["label"] for node in earlier["nodes"]} | labels
-    return labels
-
-
-def plan_document(sweep: OpenSweep) -> dict[str, Any]:
-    """The content of `plan.json`: all nodes, those of searches as far as they are chosen.
-
-    And the nodes of earlier plans that this one does not have.
-    """
-    keys = {node.key for node in sweep.plan.nodes}
-    nodes = [
-        {
-            "key": node.key,
-            "label": node.label,
-            "input": node.source_key,
-            "env_steps": node.run.env_steps,
-            "continuation": continuation_key(node.run, node.source_key),
-        }
-        for node in sweep.plan.nodes
-    ]
-    return {
-        "storage": redact(sweep.storage),
-        "algorithm": sweep.plan.algorithm,
-        "nodes": nodes,
-        "trials": sweep.plan.trials,
-        "environments": {task: dict(found) for task, found in sweep.environments.now.items()},
-        "earlier": [one for one in sweep.earlier if one["key"] not in keys],
-    }
-
-
-def keep_record(sweep: OpenSweep) -> None:
-    """Write the configuration and the plan into the sweep's folder.
-
-    Raises:
-        StorageError: The folder can't be written.
-    """
-    # A sweep that is continued from its storage has no file: the one that it began with stays.
-    if sweep.config.path.is_file() or not (sweep.folder / "sweep.yaml").is_file():
-        # As YAML of their own, whose values end where their lines do.
-        given = [redact_yaml(one.replace("=", ": ", 1)) for one in sweep.config.arguments]
-        arguments = [f"# {one.replace(': ', '=', 1)}  (command line)\n" for one in given]
-        keep(sweep, "sweep.yaml", "".join(arguments) + redact_yaml(sweep.config.text))
-    configuration = as_json(_configuration(sweep.config))
-    recorded = _recorded_plan(sweep, configuration)
-    with contextlib.suppress(StorageError):  # a damaged record is replaced
-        sweep.earlier[:] = (
-            recorded["earlier"] if recorded else earlier_runs(sweep.plan, sweep.storage)
-        )
-    keep(sweep, CONFIG, configuration)
-    keeps_trials = recorded is not None and sweep.plan.searched and not sweep.plan.trials
-    if not keeps_trials:  # else the record has more runs than the plan has yet
-        keep(sweep, PLAN, as_json(plan_document(sweep)))
-
-
-def _recorded_plan(sweep: OpenSweep, configuration: str) -> dict[str, Any] | None:
-    """The content of `plan.json` if the plan has not changed since; else None."""
-    with contextlib.suppress(StorageError):
-        plan: dict[str, Any] | None = read(sweep.storage, f"{sweep.config.name}/{PLAN}")
-        same = read(sweep.storage, f"{sweep.config.name}/{CONFIG}") == json.loads(configuration)
-        if same and plan and plan.get("algorithm") == sweep.plan.algorithm and "earlier" in plan:
-            return plan
-    return None
-
-
-def _configuration(config: SweepConfig) -> dict[str, Any]:
-    """The whole configuration without secrets, in words that mean the same elsewhere."""
-    document: dict[str, Any] = json.loads(as_json(without_secrets(config.document)))
-    if uri := (document.get("mlflow") or {}).get("tracking_uri"):
-        document["mlflow"]["tracking_uri"] = database_url(uri)
-    for stage, resolved in zip(document["stages"], config.stages, strict=True):
-        if resolved.source and resolved.source.checkpoint:
-            stage["init_from"]["checkpoint"] = f"{IN_STORAGE}{resolved.source.checkpoint.key}"
-    return document
+        labels = {node["key"]: node["label"] for node in recorded.get("nodes", ())}
+    for source in plan.imports:
+        if source.checkpoint:
+            labels[source.key] = f"handoff {source.checkpoint.folder}"
+    short = ShortLabels.of(node.label for node in plan.nodes)
+    return labels | {node.key: short(node.label) for node in plan.nodes}

@@ -9,17 +9,23 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
+
+from pydantic import BaseModel
 
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.schema import ImportedHandoff, Source, Stage, SweepConfig
 from music_rllib.config.search_check import of_stage, stages_in
 from music_rllib.envs.tasks import Task
 from music_rllib.labels import in_runs
+from music_rllib.schedules import Linear
 from music_rllib.store.serialization import content_key
 from music_rllib.version import ALGORITHM_VERSION
+
+REPORT_INTERVAL = 1_000
+"""Environment steps between two reports, unless evaluations are more frequent."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -308,6 +314,39 @@ def node_key(run: RunSettings, source: str | None, algorithm: str | None = None)
     """
     content = {"run": run.identity(), "source": source, "algorithm": algorithm or ALGORITHM_VERSION}
     return content_key(content)
+
+
+def continuation_key(run: RunSettings, source: str | None) -> str:
+    """Key that all runs share which differ only in their budget."""
+    return node_key(run.model_copy(update={"env_steps": 0}), source)
+
+
+def budget_settings(run: RunSettings) -> list[str]:
+    """Dotted settings whose value at a step depends on the budget: linear schedules."""
+    return [
+        f"{section}.{name}"
+        for section in ("tac", "music", "replay")
+        for name, value in getattr(run, section)
+        if any(isinstance(inner, Linear) for inner in _values(value))
+    ]
+
+
+def _values(value: object) -> Iterator[object]:
+    yield value
+    if isinstance(value, BaseModel):
+        for _, inner in value:
+            yield from _values(inner)
+
+
+def is_continuable(run: RunSettings) -> bool:
+    """Whether a longer run passes through the state in which this one ends.
+
+    It does not if a schedule spans the budget, or if the last evaluation or report is due only
+    because the budget ends.
+    """
+    interval = run.evaluation.interval
+    even = not run.env_steps % interval and not run.env_steps % min(interval, REPORT_INTERVAL)
+    return even and not budget_settings(run)
 
 
 def make_plan(config: SweepConfig, *, algorithm: str | None = None) -> Plan:

@@ -1,40 +1,188 @@
-"""A sweep's small files below `<storage>/<name>`, in a bucket too, where other machines read them.
+"""A started sweep: how commands find it, and its small files below `<storage>/<name>`.
 
 `config.json` is the whole configuration, `plan.json` its runs and those of earlier plans,
 `settings.json` their settings, `search.json` the results of its searches, `state.json` its
-progress, `analysis_plan.json` the versions of its analysis plan.
+progress, `analysis_plan.json` the versions of its analysis plan. In a bucket, other machines read
+them there; this machine has a copy.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
+import tempfile
 import time
 from collections.abc import Callable, Mapping, Set
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from music_rllib.config.load import load_sweep
 from music_rllib.config.problems import shown
+from music_rllib.config.schema import SweepConfig
+from music_rllib.errors import BadInputError
 from music_rllib.redaction import redact
 from music_rllib.store.lease import runs_here, this_machine
-from music_rllib.store.storage import StorageError, is_remote, open_storage, write_atomically
-
-if TYPE_CHECKING:
-    from music_rllib.experiment.open_sweep import OpenSweep
+from music_rllib.store.node_store import NodeStore
+from music_rllib.store.storage import (
+    StorageError,
+    StorageFolder,
+    below,
+    check_answers,
+    folder_at,
+    is_remote,
+    open_storage,
+    resolve_storage,
+    storage_and_name,
+    sweep_folder,
+)
 
 CONFIG, PLAN, SEARCH, STATE = "config.json", "plan.json", "search.json", "state.json"
 ANALYSIS_PLAN, SETTINGS = "analysis_plan.json", "settings.json"
 IN_STORAGE = "storage:"
-"""In `config.json`, in front of the key of a handoff: its first folder may be on another machine,
-or hold another one by now."""
+"""Prefix of a handoff's key in `config.json`: the folder that the user gave may have changed."""
 STOP = "stop.json"
 """Its presence asks the driver to stop."""
 SILENCE_SECONDS = 90.0
-"""A driver on another machine counts as dead when its last heartbeat is older."""
+"""A driver on another machine counts as dead if its last heartbeat is older."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepLocation:
+    """The place of a sweep, and its files there.
+
+    Methods raise StorageError for a file that is damaged or cannot be written.
+    """
+
+    storage: str
+    """Absolute folder, or URI."""
+    name: str
+
+    @property
+    def place(self) -> str:
+        """Its folder or URI, for messages."""
+        return redact(below(self.storage, self.name))
+
+    @property
+    def folder(self) -> Path:
+        """The folder of its files on this machine."""
+        return sweep_folder(self.storage, self.name)
+
+    @cached_property
+    def _files(self) -> StorageFolder:
+        return open_storage(self.storage) / self.name
+
+    def read(self, file: str) -> Any:
+        """The content of a JSON file; None if it does not exist."""
+        return read_json(self._files, file)
+
+    def write(self, file: str, text: str) -> None:
+        """Write a file atomically into the storage."""
+        self._files.write(file, text.encode())
+
+    def keep(self, file: str, text: str) -> None:
+        """Write a file into the storage, and if that is a bucket, to this machine too."""
+        if is_remote(self.storage):
+            open_storage(str(self.folder)).write(file, text.encode())
+        self.write(file, text)
+
+    def remove(self, file: str) -> None:
+        """Delete a file from the storage if it exists."""
+        try:
+            self._files.remove(file)
+        except OSError as error:
+            raise StorageError(f"{self.place}/{file} must be deletable: {error}") from error
+
+    def nodes(self) -> list[dict[str, Any]]:
+        """The runs in its `plan.json`; empty if it has none."""
+        nodes: list[dict[str, Any]] = (self.read(PLAN) or {"nodes": []})["nodes"]
+        return nodes
+
+    def document(self) -> Any:
+        """Its configuration as plain data, with handoffs as folders on this machine."""
+        document = self.read(CONFIG)
+        store = NodeStore(self.storage)
+        for stage in document["stages"]:
+            match stage.get("init_from"):
+                case {"checkpoint": str(place)} as source if place.startswith(IN_STORAGE):
+                    source["checkpoint"] = str(store.folder(place.removeprefix(IN_STORAGE)))
+        return document
+
+    def config(self, seeds: str | None = None) -> SweepConfig:
+        """Its configuration as of its last run, with other `seeds` if they are given.
+
+        Raises:
+            ConfigError: The configuration is not valid in this version.
+        """
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, f"{self.name}.json")
+            path.write_text(as_json(self.document()), encoding="utf-8")
+            return load_sweep(path, storage=self.storage, seeds=seeds)
+
+
+# Finding sweeps -----------------------------------------------------------------------------------
+
+
+def find_sweep(place: str, storage: str | None) -> SweepLocation:
+    """The started sweep that `place` names: by a folder, a URI, a name, or a YAML file.
+
+    Raises:
+        BadInputError: It does not exist.
+    """
+    location = _locate(place, storage)
+    check_answers(location.storage)
+    if location.read(CONFIG) is None:
+        raise BadInputError(
+            f"SWEEP must be a sweep that was started, got {redact(place)}: there is no "
+            f"{location.place}/{CONFIG} (sweeps there: {_names(location.storage)})"
+        )
+    return location
+
+
+def _locate(place: str, storage: str | None) -> SweepLocation:
+    """The place of the sweep, whether it exists or not."""
+    if not place or storage == "":
+        raise BadInputError(f"{'--storage' if place else 'SWEEP'} must not be empty, got ''")
+    folder = folder_at(place) if storage is None else None
+    if folder is not None:
+        return SweepLocation(storage=str(folder.parent), name=folder.name)
+    if place.endswith((".yaml", ".yml")):
+        config = load_sweep(place, storage=storage)
+        return SweepLocation(storage=resolve_storage(config.storage)[0], name=config.name)
+    place = place.rstrip("/")
+    if storage is None and "://" in place:
+        above, name = storage_and_name(place)
+        return SweepLocation(storage=above, name=name)
+    if storage is None and "/" in place:
+        folder = Path(resolve_storage(place)[0])
+        raise BadInputError(
+            f"SWEEP must be the folder of a sweep, a sweep's name or its YAML file, got {place}: "
+            f"there is no folder {folder} (sweeps beside it: {_names(str(folder.parent))})"
+        )
+    return SweepLocation(storage=resolve_storage(storage or "results")[0], name=place)
+
+
+def _names(storage: str) -> str:
+    """Names of the sweeps in a storage, for messages."""
+    with contextlib.suppress(OSError):  # the path cannot exist: a name in it is too long
+        return ", ".join(sorted(sweep.name for sweep in sweeps_in(storage))) or "none"
+    return "none"
+
+
+def sweeps_in(storage: str) -> list[SweepLocation]:
+    """Every sweep in a storage that has a plan."""
+    root = open_storage(storage)
+    names = root.having(PLAN, root.folders())
+    return [SweepLocation(storage=storage, name=name) for name in names]
+
+
+# JSON files ---------------------------------------------------------------------------------------
 
 
 def is_alive(state: Mapping[str, Any] | None) -> bool:
-    """Whether a sweep's driver is at work, by its `state.json`."""
+    """Whether a sweep's driver is running, by its `state.json`."""
     if state is None or state["driver"]["ended"] is not None:
         return False
     driver = state["driver"]
@@ -44,7 +192,7 @@ def is_alive(state: Mapping[str, Any] | None) -> bool:
 
 
 def plain(value: Any) -> Any:
-    """`value` as JSON can hold it: null in place of NaN and infinity."""
+    """`value` as JSON can represent it: null instead of NaN and infinity."""
     if isinstance(value, dict):
         return {str(key): plain(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):
@@ -57,43 +205,24 @@ def as_json(document: Any) -> str:
     return json.dumps(plain(document), indent=1, ensure_ascii=False, default=str)
 
 
-def keep(sweep: OpenSweep, name: str, text: str) -> None:
-    """Write a file of the sweep, on this machine and, where that is a bucket, in its storage.
+def read_json(folder: StorageFolder, file: str) -> Any:
+    """The content of a JSON file; None if it does not exist.
 
     Raises:
-        StorageError: It can't be written.
+        StorageError: It cannot be read, or lacks what a file of this name has.
     """
-    write_locally(sweep.folder / name, text)
-    if is_remote(sweep.storage):
-        write(sweep.storage, f"{sweep.config.name}/{name}", text)
-
-
-def write_locally(path: Path, text: str) -> None:
-    """Write a file on this machine, whole or not at all.
-
-    Raises:
-        StorageError: It can't be written.
-    """
+    place = f"{folder.path}/{file}"
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, text.encode())
-    except OSError as error:
-        place = error.filename or path.parent
-        raise StorageError(f"{place} must be writable: {error.strerror}") from error
-
-
-def write(storage: str, path: str, text: str) -> None:
-    """Write a file below a storage, whole or not at all.
-
-    Raises:
-        StorageError: It can't be written.
-    """
-    open_storage(storage).write(path, text.encode())
-
-
-_STATE_KEYS = {"sweep", "driver", "stages", "env_steps", "running", "best", "searches", "failures"}
-_PROCESS_KEYS = {"pid", "host", "machine", "process_started"}
-_DRIVER_KEYS = _PROCESS_KEYS | {"started", "heartbeat", "ended", "outcome"}
+        data = folder.read(file)
+        document = None if data is None else json.loads(data)
+    except (OSError, ValueError) as error:
+        raise StorageError(f"{place} must be a readable JSON file: {error}") from error
+    if document is not None and file in _SOUND and not _SOUND[file](document):
+        raise StorageError(
+            f"{place} must be a sweep's {file.removesuffix('.json')} as its driver writes it, got "
+            f"{shown(document)}; running the sweep again replaces it"
+        )
+    return document
 
 
 def _has(document: Any, keys: Set[str]) -> bool:
@@ -104,6 +233,13 @@ def _is_list_with(document: Any, keys: Set[str] = frozenset()) -> bool:
     return isinstance(document, list) and all(_has(item, keys) for item in document)
 
 
+_STATE_KEYS = {"sweep", "driver", "stages", "env_steps", "running", "best", "searches", "failures"}
+_DRIVER_KEYS = {"pid", "host", "machine", "process_started"} | {
+    "started",
+    "heartbeat",
+    "ended",
+    "outcome",
+}
 _SOUND: dict[str, Callable[[Any], bool]] = {
     CONFIG: lambda document: _has(document, {"stages"}) and _is_list_with(document["stages"]),
     PLAN: lambda document: (
@@ -114,38 +250,4 @@ _SOUND: dict[str, Callable[[Any], bool]] = {
     STATE: lambda document: _has(document, _STATE_KEYS) and _has(document["driver"], _DRIVER_KEYS),
     SEARCH: _is_list_with,
 }
-"""File name to a check that its content has what its readers rely on."""
-
-
-def read(storage: str, path: str) -> Any:
-    """The content of a JSON file below a storage; None where there is no such file.
-
-    Raises:
-        StorageError: It can't be read, or its content is not what its name says.
-    """
-    folder = open_storage(storage)
-    target = f"{folder.path}/{path}"
-    try:
-        data = folder.read(path)
-        document = None if data is None else json.loads(data)
-    except (OSError, ValueError) as error:
-        raise StorageError(f"{target} must be a readable JSON file: {error}") from error
-    name = path.rpartition("/")[2]
-    if document is not None and name in _SOUND and not _SOUND[name](document):
-        raise StorageError(
-            f"{target} must be a sweep's {name.removesuffix('.json')} as its driver writes it, got "
-            f"{shown(document)}: running the sweep again writes it anew"
-        )
-    return document
-
-
-def remove(storage: str, path: str) -> None:
-    """Delete a file below a storage, if it is there.
-
-    Raises:
-        StorageError: It can't be deleted.
-    """
-    try:
-        open_storage(storage).remove(path)
-    except OSError as error:
-        raise StorageError(f"{redact(storage)}/{path} must be deletable: {error}") from error
+"""File name to a check that its content has the keys that are read from it."""

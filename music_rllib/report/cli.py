@@ -256,7 +256,7 @@ def _beside(
 
 
 def _serve(place: str, storage: str | None, port: int) -> None:
-    from music_rllib.experiment.location import find_sweep
+    from music_rllib.experiment.sweep_files import find_sweep
     from music_rllib.report.build import WANTED, build_report
     from music_rllib.report.live.server import LivePage, make_server, serve
     from music_rllib.report.live.state import Progress

@@ -25,8 +25,7 @@ from music_rllib.config.analysis import Hypothesis
 from music_rllib.config.schema import Stage, SweepConfig
 from music_rllib.config.tac_settings import setting_text
 from music_rllib.experiment.open_sweep import OpenSweep
-from music_rllib.experiment.sweep_files import ANALYSIS_PLAN, as_json, keep, read
-from music_rllib.redaction import redact
+from music_rllib.experiment.sweep_files import ANALYSIS_PLAN, SweepLocation, as_json
 from music_rllib.store.serialization import content_key
 from music_rllib.store.storage import StorageError
 
@@ -255,13 +254,14 @@ def plans_in(storage: str, name: str) -> tuple[PlanVersion, ...]:
     Raises:
         StorageError: The versions can't be read or are malformed.
     """
-    document = read(storage, f"{name}/{ANALYSIS_PLAN}")
+    location = SweepLocation(storage=storage, name=name)
+    document = location.read(ANALYSIS_PLAN)
     try:
         return () if document is None else checked_plans(document)
     except ValueError as error:
         reason = str(error).splitlines()[-1].strip()
         raise StorageError(
-            f"{redact(storage)}/{name}/{ANALYSIS_PLAN} must hold the versions of an analysis plan "
+            f"{location.place}/{ANALYSIS_PLAN} must hold the versions of an analysis plan "
             f"as they were recorded: {reason}"
         ) from error
 
@@ -281,6 +281,6 @@ def record_plan(sweep: OpenSweep) -> Sequence[PlanVersion]:
         return before
     versions = with_plan(before, plan, int(time.time() * 1000))
     if len(versions) > len(before):
-        keep(sweep, ANALYSIS_PLAN, as_json(as_document(versions)))
-        keep(sweep, PLANS_TO_READ, as_markdown(sweep.config.name, versions))
+        sweep.location.keep(ANALYSIS_PLAN, as_json(as_document(versions)))
+        sweep.location.keep(PLANS_TO_READ, as_markdown(sweep.config.name, versions))
     return versions

@@ -20,10 +20,11 @@ from music_rllib.config.schema import SweepConfig
 from music_rllib.envs.fingerprint import digest_of
 from music_rllib.errors import first_line
 from music_rllib.experiment import sweep_files
-from music_rllib.experiment.location import SweepLocation, find_sweep
-from music_rllib.experiment.open_sweep import OpenSweep
+from music_rllib.experiment.open_sweep import OpenSweep, open_started
 from music_rllib.experiment.plan import Node
+from music_rllib.experiment.record import earlier_text
 from music_rllib.experiment.run_info import run_info
+from music_rllib.experiment.sweep_files import SweepLocation, find_sweep
 from music_rllib.redaction import redact
 from music_rllib.results.analysis_plan import plans_in
 from music_rllib.results.archive import is_archive, read_archive
@@ -83,7 +84,7 @@ def read_stored(
     location: SweepLocation, *, metrics: Collection[str] | None = None, lenient: bool = False
 ) -> StoredSweep:
     """Read a sweep from its storage; see :func:`read_sweep`."""
-    opened = location.open(lenient=lenient)
+    opened = open_started(location, lenient=lenient)
     state = location.read(sweep_files.STATE) or _NOT_STARTED
     runs = _read_runs(opened, metrics, lenient=lenient)
     pairs = list(zip(opened.plan.nodes, runs, strict=True))
@@ -102,7 +103,7 @@ def read_stored(
         history=columns(run.points for run in runs),
         searches=searches_of(location, opened.config),
         plans=plans_in(location.storage, location.name),
-        earlier=location.earlier(),
+        earlier=earlier_text(location),
     )
     return StoredSweep(
         sweep=sweep,

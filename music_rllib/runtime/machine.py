@@ -135,11 +135,6 @@ def memory() -> int:
     return min(limits)
 
 
-def claimable() -> int:
-    """Bytes that Linux lets a process allocate at once by default: memory and swap."""
-    return int(psutil.virtual_memory().total + psutil.swap_memory().total)
-
-
 def _gpu_count() -> int:
     import torch  # slow to load, and needed only if a sweep asks for GPUs
 

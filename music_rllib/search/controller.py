@@ -12,10 +12,9 @@ from optuna.trial import FrozenTrial, TrialState
 from music_rllib.config.problems import ConfigError
 from music_rllib.config.search import FINAL_SEED, SearchSettings
 from music_rllib.errors import first_line
-from music_rllib.experiment.listener import Listener
 from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.plan import Node, Run
-from music_rllib.experiment.scheduler import DONE, LOST, Status
+from music_rllib.experiment.scheduler import DONE, LOST, Listener, Status
 from music_rllib.redaction import redact
 from music_rllib.search.objective import aggregates, prune, score
 from music_rllib.search.storage import DATABASE_ERRORS

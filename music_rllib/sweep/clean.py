@@ -11,7 +11,7 @@ import pyarrow.fs as pafs
 from music_rllib.config.schema import IMPORTED
 from music_rllib.errors import BadInputError
 from music_rllib.experiment import sweep_files
-from music_rllib.experiment.location import SweepLocation, sweeps_in
+from music_rllib.experiment.sweep_files import SweepLocation, sweeps_in
 from music_rllib.redaction import redact
 from music_rllib.store.node_store import CONTINUATIONS
 from music_rllib.store.sealed import MANIFEST

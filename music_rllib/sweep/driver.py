@@ -20,12 +20,12 @@ from music_rllib.config.load import load_sweep, warnings_of
 from music_rllib.config.schema import MlflowSettings, SweepConfig
 from music_rllib.envs.modules import search_in
 from music_rllib.errors import BadInputError
-from music_rllib.experiment.changes import changes_since, keep_settings, longer
 from music_rllib.experiment.demand import check_demand
-from music_rllib.experiment.environments import Answer, changed_text, old_runs
-from music_rllib.experiment.open_sweep import OpenSweep, keep_record, open_sweep, remove_damaged
+from music_rllib.experiment.environments import Answer, changed_text, found_runs
+from music_rllib.experiment.open_sweep import OpenSweep, open_sweep, remove_damaged
 from music_rllib.experiment.plan import make_plan, shared_runs
-from music_rllib.experiment.sweep_files import STATE, read
+from music_rllib.experiment.record import changes_since, continued_runs_text, keep_record
+from music_rllib.experiment.sweep_files import STATE
 from music_rllib.redaction import redact
 from music_rllib.results.analysis_plan import PLANS_TO_READ, PlanVersion, as_document, record_plan
 from music_rllib.runtime.machine import (
@@ -35,7 +35,7 @@ from music_rllib.runtime.machine import (
     ray_parent,
 )
 from music_rllib.runtime.process import early
-from music_rllib.store.storage import check_storage, is_remote, resolve_storage, sweep_folder
+from music_rllib.store.storage import check_storage, is_remote, resolve_storage
 from music_rllib.sweep import preflight
 from music_rllib.sweep.views.plan import plan_answer, plan_view
 
@@ -87,7 +87,7 @@ def plan(config: SweepConfig, *, measure: bool = False, as_json: bool = False) -
     try:
         opened = _open(console, config)
         preflight.check_searches(opened)
-        texts = filter(None, (changes_since(opened), changed_text(opened, old_runs(opened))))
+        texts = filter(None, (changes_since(opened), changed_text(opened, found_runs(opened))))
         changes = "\n".join(map(str, texts))
         if changes:
             _say(console, changes, "yellow")
@@ -141,7 +141,7 @@ def run(
         if changes is not None and not accept_changes:
             raise BadInputError(str(changes))
         answer = Answer.to(
-            opened, old_runs(opened), retrain, all_changed=accept_changes, keep=keep_runs
+            opened, found_runs(opened), retrain, all_changed=accept_changes, keep=keep_runs
         )
         with hold_driver_lock(opened, partial(_say, console)), early:
             remove_damaged(opened, warn)
@@ -151,11 +151,10 @@ def run(
                 for retrained in answer.again:
                     tracker.forget(retrained.key)
                 keep_record(opened)
-                keep_settings(opened)
                 versions = _record_analysis_plan(console, opened)
                 code = compute_and_report(console, opened, tracker, versions)
         if as_json:
-            print_json(read(opened.storage, f"{opened.config.name}/{STATE}") or {})
+            print_json(opened.location.read(STATE) or {})
     except (KeyboardInterrupt, SystemExit) as stopped:
         return _stopped_early(console, stopped)
     return code
@@ -181,10 +180,7 @@ def _open(console: Console, config: SweepConfig, *, lenient: bool = False) -> Op
     check_memory_and_gpus(config.resources)
     storage, remark = resolve_storage(config.storage)
     check_storage(storage, config.name)
-    folder = sweep_folder(storage, config.name)
-    opened = open_sweep(
-        config, planned, storage, folder, environments=environments, lenient=lenient
-    )
+    opened = open_sweep(config, planned, storage, environments=environments, lenient=lenient)
     if config.mlflow.tracking_uri is not None or is_remote(storage):
         from music_rllib.tracking.store import resolve_store  # the default needs no check
 
@@ -197,7 +193,7 @@ def _open(console: Console, config: SweepConfig, *, lenient: bool = False) -> Op
         *warnings_of(config),
         *shared_runs(planned),
         *check_demand(opened),
-        *longer(opened),
+        *continued_runs_text(opened),
     )
     for line in filter(None, notes):
         _say(console, line, "yellow")

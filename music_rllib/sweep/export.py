@@ -16,9 +16,9 @@ from music_rllib.config.schema import Stage
 from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.errors import BadInputError
 from music_rllib.experiment import sweep_files
-from music_rllib.experiment.location import SweepLocation
-from music_rllib.experiment.open_sweep import OpenSweep
+from music_rllib.experiment.open_sweep import OpenSweep, open_started
 from music_rllib.experiment.plan import Node
+from music_rllib.experiment.sweep_files import SweepLocation
 from music_rllib.labels import in_runs
 from music_rllib.redaction import redact
 from music_rllib.results.conditions import Condition
@@ -52,7 +52,7 @@ def export_best(location: SweepLocation, stage_name: str | None, output: Path) -
         BadInputError: Nothing is finished, or there is no such stage.
         StorageError: The folder can't be written.
     """
-    opened = location.open()
+    opened = open_started(location)
     stage = opened.config.stage(stage_name)
     sweep = LastValues(opened.plan).sweep(opened.results())
     searches = searches_of(location, opened.config)

@@ -7,7 +7,7 @@ from typing import Any
 from music_rllib import names
 from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.plan import Node
-from music_rllib.experiment.sweep_files import SEARCH, as_json, keep
+from music_rllib.experiment.sweep_files import SEARCH, as_json
 from music_rllib.search.controller import SearchController
 from music_rllib.search.opening import learnings, open_searches
 from music_rllib.search.summary import outcome
@@ -47,5 +47,5 @@ def end_searches(
     if searches:
         text = as_json(searches)
         tracker.put_sweep_artifact(names.ARTEFACT_SEARCH, text)
-        keep(opened, SEARCH, text)
+        opened.location.keep(SEARCH, text)
     return searches

@@ -10,9 +10,9 @@ from tempfile import TemporaryDirectory
 
 from music_rllib import names
 from music_rllib.envs.fingerprint import Fingerprint
-from music_rllib.experiment.listener import Failure, Listener
 from music_rllib.experiment.plan import Node
 from music_rllib.experiment.run_info import run_info
+from music_rllib.experiment.scheduler import Failure, Listener
 from music_rllib.policy.policy import policy_from_folder
 from music_rllib.store.history import Report, RunResult
 from music_rllib.store.node_store import NodeStore

@@ -19,7 +19,7 @@ from urllib.parse import unquote, urlsplit
 
 from music_rllib import names
 from music_rllib.errors import TrackingError
-from music_rllib.experiment import sweep_files
+from music_rllib.experiment.sweep_files import SweepLocation, as_json
 from music_rllib.redaction import redact
 from music_rllib.store.storage import StorageError, database_url, sqlite_url
 
@@ -97,15 +97,15 @@ class SweepRecord:
         Raises:
             TrackingError: The record cannot be read.
         """
-        place = f"{sweep_name}/{RECORD}"
+        location = SweepLocation(storage=storage, name=sweep_name)
         try:
-            record = sweep_files.read(storage, place)
+            record = location.read(RECORD)
             if record is None:
                 return None
             return cls(**{key: record[key] for key in cls.__dataclass_fields__ if key in record})
         except (StorageError, TypeError, KeyError) as error:
             raise TrackingError(
-                f"{redact(storage)}/{place} must hold a sweep's record, got: {error}"
+                f"{location.place}/{RECORD} must hold a sweep's record, got: {error}"
             ) from error
 
     def write(self, storage: str) -> None:
@@ -115,8 +115,8 @@ class SweepRecord:
             TrackingError: The storage cannot be written.
         """
         try:
-            text = sweep_files.as_json(asdict(self))
-            sweep_files.write(storage, f"{self.sweep_name}/{RECORD}", text)
+            location = SweepLocation(storage=storage, name=self.sweep_name)
+            location.write(RECORD, as_json(asdict(self)))
         except StorageError as error:
             raise TrackingError(str(error)) from error
 

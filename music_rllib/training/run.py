@@ -16,7 +16,7 @@ from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, EPISODE_RETURN_MEAN, LEA
 from music_rllib import names
 from music_rllib.config.returns import Range, have_diverged, reward_of_step
 from music_rllib.config.run_settings import RunSettings
-from music_rllib.experiment.continuation import REPORT_INTERVAL
+from music_rllib.experiment.plan import REPORT_INTERVAL
 from music_rllib.intrinsic.music import HELD_OUT_STEPS
 from music_rllib.kernels.compiling import is_kept
 from music_rllib.kernels.update import learn

@@ -19,8 +19,8 @@ from music_rllib.envs.fingerprint import (
     fingerprint_of,
     on_another_machine,
 )
-from music_rllib.experiment.continuation import budget_settings, continuation_key, is_continuable
 from music_rllib.experiment.environments import ADVICE, EnvironmentChangedError
+from music_rllib.experiment.plan import budget_settings, continuation_key, is_continuable
 from music_rllib.runtime.provenance import provenance_tags
 from music_rllib.store.handoff import NetworkWeights, read_handoff, write_handoff
 from music_rllib.store.history import (

@@ -12,9 +12,8 @@ from ray import cloudpickle
 from ray.tune import Callback
 from ray.tune.experiment import Trial
 
-from music_rllib.experiment.listener import Failure, Listener
 from music_rllib.experiment.plan import Node
-from music_rllib.experiment.scheduler import Scheduler
+from music_rllib.experiment.scheduler import Failure, Listener, Scheduler
 from music_rllib.redaction import redact
 from music_rllib.store.history import from_json_lines
 from music_rllib.store.node_store import NodeStore

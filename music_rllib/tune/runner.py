@@ -15,10 +15,9 @@ from ray import tune
 from ray.tune.experiment import Trial
 from ray.tune.search import Searcher
 
-from music_rllib.experiment.listener import Listener
 from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.plan import Node
-from music_rllib.experiment.scheduler import Scheduler, Status
+from music_rllib.experiment.scheduler import Listener, Scheduler, Status
 from music_rllib.runtime.machine import cluster_address
 from music_rllib.runtime.ray_cluster import cluster
 from music_rllib.store.storage import below, encoded

@@ -14,11 +14,9 @@ import yaml
 
 from music_rllib.config.load import load_sweep
 from music_rllib.config.schema import SweepConfig
-from music_rllib.experiment import changes as changes_module
-from music_rllib.experiment.changes import changes_since, keep_settings, longer
-from music_rllib.experiment.continuation import continuation_key
 from music_rllib.experiment.open_sweep import OpenSweep, open_sweep
-from music_rllib.experiment.plan import make_plan
+from music_rllib.experiment.plan import continuation_key, make_plan
+from music_rllib.experiment.record import changes_since, continued_runs_text, keep_record
 from music_rllib.store import lease as lease_module
 from music_rllib.store.history import RunResult
 from music_rllib.store.lease import Lease, LeaseFile
@@ -33,7 +31,7 @@ def opened(folder: Path, document: dict[str, Any]) -> OpenSweep:
     path.write_text(yaml.safe_dump(document, sort_keys=False))
     config: SweepConfig = load_sweep(path)
     storage = folder / "results"
-    return open_sweep(config, make_plan(config), str(storage), storage / config.name)
+    return open_sweep(config, make_plan(config), str(storage))
 
 
 def finish(sweep: OpenSweep, folder: Path, *labels: str) -> None:
@@ -48,7 +46,7 @@ def test_what_changed_and_what_it_leaves_behind(
 ) -> None:
     first = opened(tmp_path, sweep_document)
     assert changes_since(first) is None, "the first time"
-    keep_settings(first)
+    keep_record(first)
     finish(first, tmp_path, "pretrain/Point/seed0")
     begun = next(node for node in first.plan.nodes if node.label.startswith("finetune"))
     begun_values = begun.label.split("/")[2].replace("tac.entropic_index", "q")
@@ -79,16 +77,16 @@ def test_more_env_steps_are_no_change_where_finished_runs_can_be_gone_on_from(
 ) -> None:
     sweep_document["stages"] = sweep_document["stages"][:1]
     first = opened(tmp_path, sweep_document)
-    keep_settings(first)
+    keep_record(first)
     finish(first, tmp_path, "pretrain/Point/seed0")
-    assert longer(first) == []
+    assert continued_runs_text(first) == []
     sweep_document["defaults"]["env_steps"] = 2000
     changes = changes_since(opened(tmp_path, sweep_document))
     assert changes is not None
     assert changes.differences == ("env_steps: 1200 -> 2000 (1 run)",)
     assert changes.lost == (
-        "seed0: is finished; it has kept no checkpoint of its end (checkpoints.finished_mb; or its "
-        "env_steps were no multiple of evaluation.interval and of 1,000)",
+        "seed0: is finished; it has kept no checkpoint of its end (checkpoints.finished_mb, or its "
+        "env_steps are not a multiple of evaluation.interval and of 1,000)",
     )
 
     (node,) = first.plan.nodes
@@ -96,9 +94,8 @@ def test_more_env_steps_are_no_change_where_finished_runs_can_be_gone_on_from(
         pass
     sweep = opened(tmp_path, sweep_document)
     assert changes_since(sweep) is None
-    assert longer(sweep) == [
-        "1 run goes on from the end of a finished one with fewer env_steps: 1,200 env steps less "
-        "to train."
+    assert continued_runs_text(sweep) == [
+        "1 run continues a finished run with fewer env_steps: 1,200 env steps less to train."
     ]
 
     # With a schedule over the budget it can't: everything before would have been otherwise.
@@ -106,7 +103,7 @@ def test_more_env_steps_are_no_change_where_finished_runs_can_be_gone_on_from(
     sweep_document["defaults"] |= {"env_steps": 1200}
     sweep_document["defaults"]["tac"]["entropic_index"] = q
     linear = opened(tmp_path, sweep_document)
-    keep_settings(linear)
+    keep_record(linear)
     finish(linear, tmp_path, "pretrain/Point/seed0")
     sweep_document["defaults"]["env_steps"] = 2000
     changes = changes_since(opened(tmp_path, sweep_document))
@@ -120,10 +117,9 @@ def test_a_new_version_of_the_algorithm_is_named(
     tmp_path: Path, sweep_document: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = opened(tmp_path, sweep_document)
-    keep_settings(first)
+    keep_record(first)
     finish(first, tmp_path, "pretrain/Point/seed0")
     monkeypatch.setattr("music_rllib.experiment.plan.ALGORITHM_VERSION", "next")
-    monkeypatch.setattr(changes_module, "ALGORITHM_VERSION", "next")
     changes = changes_since(opened(tmp_path, sweep_document))
     assert changes is not None
     (line,) = changes.differences
@@ -136,7 +132,7 @@ def test_the_program_starts_nothing_until_changes_are_accepted(
 ) -> None:
     sweep_document["stages"] = sweep_document["stages"][:1]
     first = opened(sweep_program.folder, sweep_document)
-    keep_settings(first)
+    keep_record(first)
     finish(first, sweep_program.folder, "pretrain/Point/seed0")
     sweep_document["defaults"]["tac"]["lr"] = 0.01
     sweep_program.write(sweep_document)
@@ -153,7 +149,7 @@ def test_the_program_starts_nothing_until_changes_are_accepted(
 def test_accepted_changes_are_trained(sweep_program: Any, sweep_document: dict[str, Any]) -> None:
     sweep_document["stages"] = sweep_document["stages"][:1]
     first = opened(sweep_program.folder, sweep_document)
-    keep_settings(first)
+    keep_record(first)
     finish(first, sweep_program.folder, "pretrain/Point/seed0")
     sweep_document["defaults"]["tac"]["lr"] = 0.01
     sweep_program.write(sweep_document)

@@ -9,7 +9,7 @@ from typing import Any
 
 from music_rllib import names
 from music_rllib.experiment import sweep_files
-from music_rllib.experiment.location import SweepLocation
+from music_rllib.experiment.sweep_files import SweepLocation
 from music_rllib.labels import ShortLabels
 from music_rllib.redaction import redact
 from music_rllib.store.storage import StorageError

@@ -47,7 +47,7 @@ def compare(
     json: Json = False,
 ) -> int:
     """Compare values of q, or of other settings, with 95% confidence intervals."""
-    from music_rllib.experiment.location import find_sweep
+    from music_rllib.experiment.sweep_files import find_sweep
     from music_rllib.sweep.views.compare import compare_document, compare_view
 
     document = compare_document(find_sweep(sweep, storage), stage, metric, minimize=minimize)

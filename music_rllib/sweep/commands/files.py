@@ -70,7 +70,7 @@ def best(
     After a search, the best policy is the first of the ranking on fresh seeds; before the ranking
     is complete, it is the best trial.
     """
-    from music_rllib.experiment.location import find_sweep
+    from music_rllib.experiment.sweep_files import find_sweep
     from music_rllib.store.storage import sweep_folder
     from music_rllib.sweep.export import entropies_text, export_best
 
@@ -113,7 +113,7 @@ def clean(
     By default these are the checkpoints of runs that a search stopped early, and the checkpoints
     that finished runs keep for longer training. Interrupted runs keep theirs.
     """
-    from music_rllib.experiment.location import find_sweep
+    from music_rllib.experiment.sweep_files import find_sweep
     from music_rllib.sweep.clean import find_deletable
 
     location = find_sweep(sweep, storage)

@@ -182,7 +182,7 @@ def resume(
     json: Json = False,
 ) -> int:
     """Resume a stopped or killed sweep, using the configuration kept in its storage."""
-    from music_rllib.experiment.location import find_sweep
+    from music_rllib.experiment.sweep_files import find_sweep
     from music_rllib.sweep import driver
 
     return driver.run(

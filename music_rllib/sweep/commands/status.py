@@ -12,7 +12,7 @@ from music_rllib.errors import FAILED, BadInputError
 from music_rllib.sweep.commands.arguments import Place, Storage
 
 if TYPE_CHECKING:
-    from music_rllib.experiment.location import SweepLocation
+    from music_rllib.experiment.sweep_files import SweepLocation
 
 STATUS_EXAMPLES = """\
 Examples:
@@ -45,7 +45,7 @@ def status(
     """Show the progress of a sweep: stages, trials, runs, budget and best result so far."""
     from rich.live import Live
 
-    from music_rllib.experiment.location import find_sweep
+    from music_rllib.experiment.sweep_files import find_sweep
     from music_rllib.sweep.views.status import status_view
 
     location = find_sweep(sweep, storage)
@@ -74,6 +74,7 @@ def _labels(location: SweepLocation) -> list[str]:
 def state_of(location: SweepLocation) -> dict[str, Any]:
     """The sweep's `state.json`, with its present state and its damaged runs."""
     from music_rllib.experiment import sweep_files
+    from music_rllib.experiment.record import earlier_text
     from music_rllib.store.node_store import NodeStore
 
     state = location.read(sweep_files.STATE)
@@ -94,7 +95,7 @@ def state_of(location: SweepLocation) -> dict[str, Any]:
         "state": outcome,
         **state,
         "damaged": damaged,
-        "earlier": location.earlier(),
+        "earlier": earlier_text(location),
     }
 
 
@@ -127,7 +128,7 @@ def stop(
     The request goes through the storage, so the sweep can run on another machine.
     """
     from music_rllib.experiment import sweep_files
-    from music_rllib.experiment.location import find_sweep
+    from music_rllib.experiment.sweep_files import find_sweep
     from music_rllib.sweep.driver_lock import has_driver
 
     location = find_sweep(sweep, storage)
@@ -140,7 +141,7 @@ def stop(
         state = state_of(location)["state"]
     was_running = state == "running"
     if was_running:
-        sweep_files.write(location.storage, f"{name}/{sweep_files.STOP}", '{"stop": true}')
+        location.write(sweep_files.STOP, '{"stop": true}')
         while state == "running" and time.monotonic() < deadline:
             time.sleep(0.5)
             state = state_of(location)["state"]

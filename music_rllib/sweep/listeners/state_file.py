@@ -18,10 +18,10 @@ from typing import Any, Self
 
 from music_rllib.config.run_settings import VARIANTS
 from music_rllib.experiment import sweep_files
-from music_rllib.experiment.listener import Failure, Listener
-from music_rllib.experiment.open_sweep import OpenSweep, plan_document
+from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.plan import Node
-from music_rllib.experiment.scheduler import Status
+from music_rllib.experiment.record import plan_document
+from music_rllib.experiment.scheduler import Failure, Listener, Status
 from music_rllib.results.planned import LastValues
 from music_rllib.search.ranking import best_in_words, best_so_far
 from music_rllib.store.history import Report, RunResult, last_values
@@ -68,10 +68,9 @@ class StateFile(Listener):
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="state_file", daemon=True)
         self._interval = REMOTE_SECONDS if is_remote(sweep.storage) else LOCAL_SECONDS
-        self._stop_path = f"{sweep.config.name}/{sweep_files.STOP}"
 
     def __enter__(self) -> Self:
-        sweep_files.remove(self._sweep.storage, self._stop_path)
+        self._sweep.location.remove(sweep_files.STOP)
         for node in self._sweep.scheduler.having(Status.REUSED):
             self.reused(node)
         self._update()
@@ -245,21 +244,21 @@ class StateFile(Listener):
 
     def _is_told_to_stop(self) -> bool:
         try:
-            if sweep_files.read(self._sweep.storage, self._stop_path) is None:
+            if self._sweep.location.read(sweep_files.STOP) is None:
                 return False
         except StorageError:
             return False
         with contextlib.suppress(StorageError):  # whoever begins next deletes it
-            sweep_files.remove(self._sweep.storage, self._stop_path)
+            self._sweep.location.remove(sweep_files.STOP)
         return True
 
     def _write(self) -> None:
         state = self._state | {"driver": self._driver | {"heartbeat": time.time()}}
-        sweep_files.keep(self._sweep, sweep_files.STATE, sweep_files.as_json(state))
+        self._sweep.location.keep(sweep_files.STATE, sweep_files.as_json(state))
         if (trials := len(self._sweep.plan.trials)) != self._written_trials:
             self._written_trials = trials
             plan = sweep_files.as_json(plan_document(self._sweep))
-            sweep_files.keep(self._sweep, sweep_files.PLAN, plan)
+            self._sweep.location.keep(sweep_files.PLAN, plan)
 
 
 def _checkpointed_steps(sweep: OpenSweep) -> dict[str, int]:

@@ -12,7 +12,7 @@ from rich.text import Text
 from music_rllib import names
 from music_rllib.errors import BadInputError
 from music_rllib.experiment.environments import mixed
-from music_rllib.experiment.location import SweepLocation
+from music_rllib.experiment.sweep_files import SweepLocation
 from music_rllib.labels import ShortLabels, symbol
 from music_rllib.results.analysis import FinalScores, Scope, stage_scopes
 from music_rllib.results.answer import answer, study_data

@@ -18,8 +18,9 @@ from music_rllib.config.search import SearchSettings
 from music_rllib.config.space import Choice, Dimension
 from music_rllib.config.tac_settings import MatchedAlpha, NormalisedAlpha, alpha_at, setting_text
 from music_rllib.envs.tasks import Task
-from music_rllib.experiment.open_sweep import OpenSweep, plan_document
+from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.plan import Node, Plan, shared_runs, short
+from music_rllib.experiment.record import plan_document
 from music_rllib.labels import in_runs
 from music_rllib.redaction import redact
 from music_rllib.schedules import QUANTITIES, Linear, Measured, Piecewise, value_at

@@ -18,9 +18,10 @@ from typer.testing import CliRunner, Result
 
 from music_rllib import names
 from music_rllib.config.load import load_sweep
-from music_rllib.experiment.listener import Failure
-from music_rllib.experiment.open_sweep import keep_record, open_sweep
+from music_rllib.experiment.open_sweep import open_sweep
 from music_rllib.experiment.plan import Node, make_plan
+from music_rllib.experiment.record import keep_record
+from music_rllib.experiment.scheduler import Failure
 from music_rllib.report.build import PAGE
 from music_rllib.report.cli import app
 from music_rllib.results.archive import Format, read_archive, write_archive
@@ -133,7 +134,7 @@ def sweep_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     file = storage / "tiny.yaml"
     file.write_text(CONFIG)
     config = load_sweep(file, storage=str(storage))
-    sweep = open_sweep(config, make_plan(config), str(storage), storage / "tiny")
+    sweep = open_sweep(config, make_plan(config), str(storage))
     keep_record(sweep)
     with StateFile(sweep) as state_file:
         for number, node in enumerate(sweep.plan.nodes[:-1]):

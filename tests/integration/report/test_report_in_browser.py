@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from music_rllib import names
-from music_rllib.experiment.location import SweepLocation
+from music_rllib.experiment.sweep_files import SweepLocation
 from music_rllib.report.build import build_report
 from music_rllib.report.live import server
 from music_rllib.report.live.state import Progress

@@ -30,8 +30,7 @@ from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.search import FINAL_SEED
 from music_rllib.config.tac_settings import LearnedAlpha
 from music_rllib.experiment import sweep_files
-from music_rllib.experiment.changes import changes_since, keep_settings
-from music_rllib.experiment.open_sweep import keep_record
+from music_rllib.experiment.record import changes_since, keep_record
 from music_rllib.experiment.scheduler import Status
 from music_rllib.program import main
 from music_rllib.search.opening import learnings
@@ -137,7 +136,7 @@ def test_a_trial_that_another_driver_has_ended_is_left_to_it(tmp_path: Path) -> 
 def test_other_settings_of_a_searched_stage_are_said_with_what_they_cost(tmp_path: Path) -> None:
     content = document({"trials": 2}, seeds=[0])
     first = Driver(tmp_path, content)
-    keep_settings(first.sweep)
+    keep_record(first.sweep)
     first.play()
     keep_record(first.sweep)
     content["stages"][1]["search"]["trials"] = 3
@@ -385,8 +384,8 @@ def recorded(folder: Path, content: Document) -> Driver:
         state_file.searches = lambda: outcome(driver.controller, thorough=False)
         state_file.end("stopped")
     if driver.controller.over:
-        sweep_files.keep(
-            driver.sweep, sweep_files.SEARCH, sweep_files.as_json(outcome(driver.controller))
+        driver.sweep.location.keep(
+            sweep_files.SEARCH, sweep_files.as_json(outcome(driver.controller))
         )
     return driver
 

@@ -15,8 +15,9 @@ from typer.testing import CliRunner
 
 from music_rllib import names
 from music_rllib.config.load import load_sweep
-from music_rllib.experiment.open_sweep import keep_record, open_sweep
+from music_rllib.experiment.open_sweep import open_sweep
 from music_rllib.experiment.plan import make_plan
+from music_rllib.experiment.record import keep_record
 from music_rllib.experiment.run_info import run_info
 from music_rllib.report.cli import app
 from music_rllib.results.archive import read_archive
@@ -41,7 +42,7 @@ def log_published_sweep(folder: Path) -> str:
     config = load_sweep(file)
     plan = make_plan(config)
     of_seed = {(run.entropic_index, run.seed): number for number, run in enumerate(sweep.runs)}
-    opened = open_sweep(config, plan, str(folder), folder / NAME)
+    opened = open_sweep(config, plan, str(folder))
     keep_record(opened)
     with Tracker(sweep_name=NAME, storage=str(folder), config=config.document) as tracker:
         for node in plan.nodes:

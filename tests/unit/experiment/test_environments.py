@@ -11,17 +11,16 @@ import yaml
 from music_rllib.config.load import load_sweep
 from music_rllib.envs.fingerprint import Fingerprint
 from music_rllib.errors import BadInputError
-from music_rllib.experiment.continuation import continuation_key
 from music_rllib.experiment.environments import (
     changed_text,
-    keep_old,
+    found_runs,
+    keep_runs,
     mixed,
-    old_runs,
-    remove_old,
+    remove_runs,
     to_retrain,
 )
 from music_rllib.experiment.open_sweep import OpenSweep, open_sweep
-from music_rllib.experiment.plan import Node, make_plan
+from music_rllib.experiment.plan import Node, continuation_key, make_plan
 from music_rllib.experiment.scheduler import Status
 from music_rllib.store.history import RunResult
 from music_rllib.store.lease import Lease
@@ -58,7 +57,7 @@ def opened(folder: Path, environment: Fingerprint, name: str = "s", **defaults: 
     path.write_text(yaml.safe_dump(document))
     config, storage = load_sweep(path), str(folder / "results")
     environments = {"Lab": environment, "Field": {"source field.py": "f"}}
-    return open_sweep(config, make_plan(config), storage, folder, environments=environments)
+    return open_sweep(config, make_plan(config), storage, environments=environments)
 
 
 def finish(sweep: OpenSweep, node: Node, environment: Fingerprint | None, folder: Path) -> None:
@@ -75,7 +74,7 @@ def finished(folder: Path, environment: Fingerprint | None = OLD) -> OpenSweep:
 
 
 def text_of(sweep: OpenSweep) -> str | None:
-    return changed_text(sweep, old_runs(sweep))
+    return changed_text(sweep, found_runs(sweep))
 
 
 @pytest.mark.parametrize("name", ["s", "another"])
@@ -106,8 +105,8 @@ def test_checkpoints_and_ends_of_shorter_runs_count_too(tmp_path: Path) -> None:
         pass
     assert "is at 200 env steps" in str(text_of(longer))
     assert text_of(opened(tmp_path, OLD, env_steps=800)) is None
-    remove_old(longer, to_retrain(longer, old_runs(longer), ["Lab"], all_changed=False))
-    assert not old_runs(longer)
+    remove_runs(longer, to_retrain(longer, found_runs(longer), ["Lab"], all_changed=False))
+    assert not found_runs(longer)
     assert not place.names()
 
 
@@ -115,7 +114,7 @@ def test_what_is_trained_again_takes_with_it_what_starts_from_it(tmp_path: Path)
     finished(tmp_path)
     sweep = opened(tmp_path, NEW)
     pretrain, finetune = sweep.plan.nodes
-    runs = old_runs(sweep)
+    runs = found_runs(sweep)
     assert not to_retrain(sweep, runs, [], all_changed=False)
     again = to_retrain(sweep, runs, [], all_changed=True)
     assert [run.label for run in again] == [pretrain.label, finetune.label]
@@ -128,11 +127,11 @@ def test_what_is_trained_again_takes_with_it_what_starts_from_it(tmp_path: Path)
     lease = Lease.of_this_process("sweep 'other'")
     work = sweep.store.work_folder(finetune.key).lease
     assert work.acquire(lease) is None
-    with pytest.raises(BadInputError, match=r"must not be computed meanwhile, it is by sweep 'oth"):
-        remove_old(sweep, again)
+    with pytest.raises(BadInputError, match=r"must not be running to be retrained, .* sweep 'oth"):
+        remove_runs(sweep, again)
     assert sweep.store.is_finished(pretrain.key), "nothing was deleted"
     work.release(lease.owner)
-    sweep = remove_old(sweep, again)
+    sweep = remove_runs(sweep, again)
     assert [sweep.scheduler[node.key] for node in sweep.plan.nodes] == [Status.WAITING] * 2
     assert not sweep.store.is_finished(pretrain.key)
 
@@ -140,7 +139,7 @@ def test_what_is_trained_again_takes_with_it_what_starts_from_it(tmp_path: Path)
 def test_an_answer_is_kept_for_every_sweep_of_the_storage(tmp_path: Path) -> None:
     finished(tmp_path)
     sweep = opened(tmp_path, NEW)
-    sweep = keep_old(sweep, old_runs(sweep))
+    sweep = keep_runs(sweep, found_runs(sweep))
     assert text_of(sweep) is None
     for environment in (NEW, OLD):
         assert text_of(opened(tmp_path, environment, "another")) is None

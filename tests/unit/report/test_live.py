@@ -17,7 +17,7 @@ import pytest
 
 from music_rllib.errors import TrackingError
 from music_rllib.experiment import sweep_files
-from music_rllib.experiment.location import SweepLocation
+from music_rllib.experiment.sweep_files import SweepLocation
 from music_rllib.report.live import server
 from music_rllib.report.live.state import Progress
 from music_rllib.store.lease import this_machine

@@ -15,10 +15,10 @@ import yaml
 from music_rllib import load_sweep as load_frames
 from music_rllib import names
 from music_rllib.config.load import load_sweep
-from music_rllib.experiment.changes import keep_settings
-from music_rllib.experiment.listener import Failure
-from music_rllib.experiment.open_sweep import OpenSweep, keep_record, open_sweep
+from music_rllib.experiment.open_sweep import OpenSweep, open_sweep
 from music_rllib.experiment.plan import Node, make_plan
+from music_rllib.experiment.record import keep_record
+from music_rllib.experiment.scheduler import Failure
 from music_rllib.program import main
 from music_rllib.report import cli as report
 from music_rllib.report.limitations import missing
@@ -27,7 +27,7 @@ from music_rllib.results.analysis import analyse
 from music_rllib.results.read import read_sweep
 from music_rllib.results.study import study_of
 from music_rllib.store.history import HISTORY, Report, RunResult, last_values, to_json_lines
-from music_rllib.store.storage import DamagedError, sweep_folder
+from music_rllib.store.storage import DamagedError
 from music_rllib.sweep.listeners.state_file import StateFile
 
 PAUSE = 3_600_000
@@ -72,10 +72,8 @@ def opened_sweep(
     file = folder / "s.yaml"
     file.write_text(yaml.safe_dump(content))
     config = load_sweep(file, storage=str(folder / "results"))
-    own_folder = sweep_folder(config.storage, name)
-    opened = open_sweep(config, make_plan(config), config.storage, own_folder)
+    opened = open_sweep(config, make_plan(config), config.storage)
     keep_record(opened)
-    keep_settings(opened)
     return opened
 
 
@@ -334,7 +332,7 @@ def test_runs_of_an_earlier_algorithm_are_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     opened = play(tmp_path, seeds=1)
-    for module in ("experiment.plan", "experiment.changes", "experiment.run_info"):
+    for module in ("experiment.plan", "experiment.run_info"):
         monkeypatch.setattr(f"music_rllib.{module}.ALGORITHM_VERSION", "next")
     read = read_sweep(str(opened.folder)).sweep
     assert {run.status for run in read.runs} == {"FINISHED"}

@@ -19,10 +19,11 @@ from fsspec.implementations.memory import MemoryFileSystem  # type: ignore[impor
 from music_rllib import names
 from music_rllib.config.load import load_sweep
 from music_rllib.config.run_settings import RunSettings
-from music_rllib.experiment import location, sweep_files
-from music_rllib.experiment.continuation import continuation_key
-from music_rllib.experiment.open_sweep import OpenSweep, keep_record, open_sweep, remove_damaged
-from music_rllib.experiment.plan import Node, make_plan
+from music_rllib.experiment import open_sweep as open_sweep_module
+from music_rllib.experiment import sweep_files
+from music_rllib.experiment.open_sweep import OpenSweep, open_sweep, remove_damaged
+from music_rllib.experiment.plan import Node, continuation_key, make_plan
+from music_rllib.experiment.record import keep_record
 from music_rllib.experiment.scheduler import Status
 from music_rllib.experiment.sweep_files import as_json
 from music_rllib.labels import ShortLabels
@@ -35,7 +36,7 @@ from music_rllib.store import node_store
 from music_rllib.store import storage as storage_module
 from music_rllib.store.handoff import write_handoff
 from music_rllib.store.history import HISTORY, Report, RunResult, to_json_lines
-from music_rllib.store.storage import DamagedError, StorageFolder, sweep_folder
+from music_rllib.store.storage import DamagedError, StorageFolder
 from music_rllib.sweep import clean, driver, driver_lock
 from music_rllib.sweep.export import sweep_of_run
 from music_rllib.sweep.listeners.state_file import StateFile
@@ -82,9 +83,12 @@ def storage(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.
     memory.pseudo_dirs[:] = [""]
     bucket = StorageFolder(pafs.PyFileSystem(pafs.FSSpecHandler(memory)), "bucket/path")
     # All are loaded by now: one that was loaded later would keep this for good.
-    for module in (storage_module, node_store, sweep_files, location, clean, driver_lock):
-        monkeypatch.setattr(module, "open_storage", lambda _: bucket)
-    for module in (location, storage_module):
+    local = storage_module.open_storage
+    for module in (storage_module, node_store, sweep_files, open_sweep_module, clean, driver_lock):
+        monkeypatch.setattr(
+            module, "open_storage", lambda uri: bucket if "://" in uri else local(uri)
+        )
+    for module in (sweep_files, storage_module):
         monkeypatch.setattr(module, "check_answers", lambda _: None)
     return "s3://bucket/path"
 
@@ -103,8 +107,7 @@ def opened(storage: str, tmp_path: Path, **changes: Any) -> OpenSweep:
     path = tmp_path / "sweep.yaml"
     path.write_text(yaml.safe_dump(SWEEP | changes))
     config = load_sweep(path, storage=storage)
-    folder = sweep_folder(storage, config.name)
-    sweep = open_sweep(config, make_plan(config), storage, folder)
+    sweep = open_sweep(config, make_plan(config), storage)
     keep_record(sweep)
     return sweep
 
@@ -286,7 +289,7 @@ def test_best_takes_the_middle_run_of_the_best_condition(
 def test_what_best_writes_is_the_run_to_the_last_setting(name: str, tmp_path: Path) -> None:
     file = driver.DEFAULT_CONFIG if name == "default" else Path("tune_configs", f"{name}.yaml")
     config = load_sweep(REPOSITORY / file, storage=str(tmp_path))
-    sweep = open_sweep(config, make_plan(config), str(tmp_path), tmp_path / config.name)
+    sweep = open_sweep(config, make_plan(config), str(tmp_path))
     for key in {(node.stage, node.run.task.name): node.key for node in sweep.plan.nodes}.values():
         path = tmp_path / "run.yaml"
         path.write_text(yaml.safe_dump(sweep_of_run(sweep, key, tmp_path)))
@@ -441,7 +444,7 @@ def test_clean_keeps_a_last_checkpoint_that_another_sweep_shares(
     (kept,) = going["kept"]
     assert kept["what"] == f"last checkpoint of {node.label}: long has it too"
     assert len(last.names()) == 1
-    sweep_files.remove(storage, f"{longer.config.name}/plan.json")
+    longer.location.remove("plan.json")
     assert program("clean", f"{storage}/mine", "--yes").code == 0
     assert not last.names()
 
@@ -473,7 +476,7 @@ def test_a_sweep_goes_on_from_the_handoff_in_its_storage(
     (node,) = sweep.plan.nodes
     (tmp_path / "given").rename(tmp_path / "moved")
     for _ in ("begun with the folder", "gone on without it"):
-        again = location.find_sweep(f"{storage}/mine", None).open()
+        again = open_sweep_module.open_started(sweep_files.find_sweep(f"{storage}/mine", None))
         assert [one.key for one in again.plan.nodes] == [node.key]
         keep_record(again)
     assert program("status", f"{storage}/mine").code == 0
@@ -564,7 +567,7 @@ def test_a_damaged_record_is_said(
 ) -> None:
     played(storage, tmp_path)
     content, commands = DAMAGED[file]
-    sweep_files.keep(opened(storage, tmp_path, name="other"), file, content)
+    opened(storage, tmp_path, name="other").location.keep(file, content)
     message = f"other/{file} must be a sweep's {file[:-5]} as its driver writes it, got {content}"
     for command in commands:
         said = program(command, f"{storage}/other")
@@ -585,7 +588,7 @@ def test_stop_reaches_the_driver(
     try:
         sweep = opened(storage, tmp_path)
         with StateFile(sweep) as state_file:
-            assert sweep_files.is_alive(sweep_files.read(storage, "mine/state.json"))
+            assert sweep_files.is_alive(sweep.location.read("state.json"))
             refused = program("clean", f"{storage}/mine")
             assert (refused.code, "must not be running" in refused.errors) == (2, True)
             asked = program("stop", f"{storage}/mine", "--wait", "0")
@@ -604,9 +607,9 @@ def test_a_driver_that_was_killed_is_interrupted(
     sweep = opened(storage, tmp_path)
     with StateFile(sweep) as state_file:
         pass
-    state = sweep_files.read(storage, "mine/state.json")
+    state = sweep.location.read("state.json")
     state["driver"] |= {"ended": None, "outcome": "running", "pid": 2**22 + 1}
-    sweep_files.keep(sweep, sweep_files.STATE, sweep_files.as_json(state))
+    sweep.location.keep(sweep_files.STATE, sweep_files.as_json(state))
     assert state_file is not None
     assert program("status", f"{storage}/mine", "--json").document["state"] == "interrupted"
 
@@ -641,16 +644,17 @@ def test_a_run_that_queues_for_a_core_does_not_run_yet(
             Status.WAITING,
         ]
         state_file.end("stopped")
-    state = sweep_files.read(storage, "mine/state.json")
+    state = sweep.location.read("state.json")
     assert [one["run"] for one in state["running"]] == [at_work.label]
     assert state["stages"][0]["runs"] == {"started": 1, "waiting": 8}
 
 
 def test_the_recorded_configuration_is_the_sweeps(storage: str, tmp_path: Path) -> None:
-    from music_rllib.experiment.location import find_sweep
+    from music_rllib.experiment.open_sweep import open_started
+    from music_rllib.experiment.sweep_files import find_sweep
 
     sweep = opened(storage, tmp_path)
-    found = find_sweep(f"{storage}/mine", None).open()
+    found = open_started(find_sweep(f"{storage}/mine", None))
     assert [node.key for node in found.plan.nodes] == [node.key for node in sweep.plan.nodes]
     assert found.storage == storage
 
@@ -666,10 +670,10 @@ def test_a_sweep_is_found_by_its_folder_whatever_leads_there(
     (tmp_path / "results/mine/report").mkdir()
     monkeypatch.chdir(tmp_path / "results/mine/report")
     for place in ("..", "../", "../../../elsewhere/latest"):
-        assert location.find_sweep(place, None).place == f"{storage}/mine"
+        assert sweep_files.find_sweep(place, None).place == f"{storage}/mine"
     assert program("status", f"{storage}/push.yaml", "--json").document["sweep"] == "push.yaml"
     monkeypatch.setenv("HOME", f"{storage}/mine")
-    assert location.find_sweep("~", None).place == f"{storage}/mine"
+    assert sweep_files.find_sweep("~", None).place == f"{storage}/mine"
 
 
 def test_a_file_uri_names_one_folder(tmp_path: Path, program: Program) -> None:
@@ -763,7 +767,7 @@ def test_a_damaged_run_is_named_by_every_command_and_trained_again_when_asked(
     assert (said.code, f"DAMAGED {label(bad.label)}: " in said.output) == (1, True)
 
     removed: list[str] = []
-    again = open_sweep(sweep.config, sweep.plan, storage, sweep.folder, lenient=True)
+    again = open_sweep(sweep.config, sweep.plan, storage, lenient=True)
     assert not sweep.store.is_sound(bad.key)
     remove_damaged(again, removed.append)
     assert not sweep.store.is_finished(bad.key)
@@ -805,7 +809,7 @@ def test_a_search_asks_for_no_more_once_its_finalists_run(tmp_path: Path) -> Non
     def env_steps_to_come() -> Any:
         with StateFile(sweep) as state_file:
             state_file.end("stopped")
-        return sweep_files.read(storage, "mine/state.json")["env_steps"]["to_come"]
+        return sweep.location.read("state.json")["env_steps"]["to_come"]
 
     sweep.plan.add_trial("train", 0, {"tac.lr": 1e-3}, [0], "trial0")
     assert env_steps_to_come() == (3 + 2) * 4000

@@ -14,9 +14,8 @@ from music_rllib import names
 from music_rllib.config.load import load_sweep
 from music_rllib.config.schema import SweepConfig
 from music_rllib.config.tac_settings import LearnedAlpha, setting_text
-from music_rllib.experiment.listener import Failure
 from music_rllib.experiment.plan import Plan, make_plan
-from music_rllib.experiment.scheduler import Scheduler
+from music_rllib.experiment.scheduler import Failure, Scheduler
 from music_rllib.report.figures.palette import colour_of
 from music_rllib.schedules import Linear, Piecewise
 from music_rllib.store.history import Report, RunResult

@@ -1,0 +1,369 @@
+"""The record of a sweep's configuration, plan and settings, and changes since it was written.
+
+A run that the plan no longer has stays in the storage. `plan.json` keeps its key as one of an
+earlier version of the sweep, so that it can be named; nothing compares it. A later plan that has
+the run again uses it again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from music_rllib.config.run_settings import RETIRED
+from music_rllib.config.schema import SweepConfig
+from music_rllib.experiment.open_sweep import FINISHED, OpenSweep
+from music_rllib.experiment.plan import Node, Plan, budget_settings, continuation_key
+from music_rllib.experiment.sweep_files import (
+    CONFIG,
+    IN_STORAGE,
+    PLAN,
+    SETTINGS,
+    SweepLocation,
+    as_json,
+)
+from music_rllib.labels import in_runs
+from music_rllib.redaction import redact, without_secrets
+from music_rllib.store.node_store import NodeStore
+from music_rllib.store.storage import StorageError, database_url
+
+SHOWN = 10
+"""Lines of each list that are shown."""
+MOST_REASONS = 4
+"""Largest number of reasons in a sentence about earlier runs."""
+MOST_SETTINGS = 3
+"""Largest number of settings in a reason."""
+
+
+# Writing the record -------------------------------------------------------------------------------
+
+
+def keep_record(sweep: OpenSweep) -> None:
+    """Write the configuration, the plan and the runs' settings into the sweep's folder.
+
+    Raises:
+        StorageError: The folder can't be written.
+    """
+    location = sweep.location
+    configuration = as_json(_configuration(sweep.config))
+    unchanged = _unchanged_plan(sweep, configuration)
+    with contextlib.suppress(StorageError):  # a damaged record is replaced
+        sweep.earlier[:] = unchanged["earlier"] if unchanged else _earlier_runs(sweep)
+    location.keep(CONFIG, configuration)
+    keeps_trials = unchanged is not None and sweep.plan.searched and not sweep.plan.trials
+    if not keeps_trials:  # else the record has trials that the plan does not have yet
+        location.keep(PLAN, as_json(plan_document(sweep)))
+    runs = {
+        node.label: {
+            "key": node.key,
+            "settings": node.run.model_dump(mode="json"),
+            "source": node.source_key,
+        }
+        for node in sweep.plan.nodes
+    }
+    settings = {"algorithm": sweep.plan.algorithm, "runs": runs, "searched": _searched(sweep)}
+    location.keep(SETTINGS, json.dumps(settings, indent=1))
+
+
+def plan_document(sweep: OpenSweep) -> dict[str, Any]:
+    """The content of `plan.json`: all nodes so far, and those of earlier plans."""
+    keys = {node.key for node in sweep.plan.nodes}
+    nodes = [
+        {
+            "key": node.key,
+            "label": node.label,
+            "input": node.source_key,
+            "env_steps": node.run.env_steps,
+            "continuation": continuation_key(node.run, node.source_key),
+        }
+        for node in sweep.plan.nodes
+    ]
+    return {
+        "storage": redact(sweep.storage),
+        "algorithm": sweep.plan.algorithm,
+        "nodes": nodes,
+        "trials": sweep.plan.trials,
+        "environments": {task: dict(found) for task, found in sweep.environments.now.items()},
+        "earlier": [one for one in sweep.earlier if one["key"] not in keys],
+    }
+
+
+def _configuration(config: SweepConfig) -> dict[str, Any]:
+    """The whole configuration without secrets, as it is valid on every machine."""
+    document: dict[str, Any] = json.loads(as_json(without_secrets(config.document)))
+    if uri := (document.get("mlflow") or {}).get("tracking_uri"):
+        document["mlflow"]["tracking_uri"] = database_url(uri)
+    for stage, resolved in zip(document["stages"], config.stages, strict=True):
+        if resolved.source and resolved.source.checkpoint:
+            stage["init_from"]["checkpoint"] = f"{IN_STORAGE}{resolved.source.checkpoint.key}"
+    return document
+
+
+def _unchanged_plan(sweep: OpenSweep, configuration: str) -> dict[str, Any] | None:
+    """The content of `plan.json` if the plan has not changed since; else None."""
+    with contextlib.suppress(StorageError):
+        plan: dict[str, Any] | None = sweep.location.read(PLAN)
+        same = sweep.location.read(CONFIG) == json.loads(configuration)
+        if same and plan and plan.get("algorithm") == sweep.plan.algorithm and "earlier" in plan:
+            return plan
+    return None
+
+
+def _searched(sweep: OpenSweep) -> dict[str, dict[str, Any]]:
+    """Settings by stage and task that no search chooses, of stages with trials only."""
+    planned = {node.stage for node in sweep.plan.nodes if not node.part}
+    return {
+        stage.name: {
+            task: run.model_dump(mode="json") for task, run in stage.points[0].runs.items()
+        }
+        for stage in sweep.config.stages
+        if stage.name not in planned
+    }
+
+
+# Runs of earlier versions -------------------------------------------------------------------------
+
+
+def _earlier_runs(sweep: OpenSweep) -> list[dict[str, Any]]:
+    """The runs in `plan.json` that the plan does not have: `key`, `label` and `why` of each."""
+    recorded = sweep.location.read(PLAN) or {"nodes": []}
+    known = {one["key"]: one for one in (*recorded["nodes"], *recorded.get("earlier", ()))}
+    gone = known.keys() - {node.key for node in sweep.plan.nodes}
+    settings = (sweep.location.read(SETTINGS) or {}) if gone else {}
+    return [
+        {
+            "key": key,
+            "label": one["label"],
+            "why": one.get("why") or _why(one, sweep.plan, settings),
+        }
+        for key, one in known.items()
+        if key in gone
+    ]
+
+
+def _why(old: Mapping[str, Any], plan: Plan, settings: Mapping[str, Any]) -> str:
+    """The property of an earlier run that no run of the plan has.
+
+    Args:
+        old: The run in `plan.json`.
+        plan: The present plan.
+        settings: The content of `settings.json`, which may be of the plan that the run is from.
+    """
+    same = next((node for node in plan.nodes if node.label == old["label"]), None)
+    if same is None:
+        return _why_label(old["label"], plan)
+    before = settings.get("runs", {}).get(old["label"], {})
+    if before.get("key") == old["key"]:
+        changed = _differences(before["settings"], same.run.model_dump(mode="json"))
+        texts = [f"{place} = {json.dumps(value)}" for place, value, _ in changed]
+        if len(texts) > MOST_SETTINGS:
+            texts[MOST_SETTINGS:] = ["..."]
+        if texts:
+            return ", ".join(texts)
+        if settings.get("algorithm") != plan.algorithm:
+            return f"version {settings.get('algorithm')} of the algorithm"
+    elif old.get("env_steps", same.run.env_steps) != same.run.env_steps:
+        return f"env_steps = {old['env_steps']}"
+    return "trained from another source"
+
+
+def _why_label(label: str, plan: Plan) -> str:
+    """The part of an earlier run's label that no run of the plan has."""
+    stage, task, *values, seed = label.split("/")
+    runs = [run for run in plan.runs if run.stage == stage]
+    is_searched = any(one.name == stage for one in plan.searched)
+    if not runs and not is_searched:
+        return f"stage = {stage}"
+    if runs and seed not in {f"seed{run.seed}" for run in runs}:
+        return f"seed = {seed.removeprefix('seed')}"
+    if runs and task not in {run.task for run in runs}:
+        return f"task = {task}"
+    if is_searched:
+        return f"other trials of {stage}"
+    return "/".join(values).replace("=", " = ").replace(",", ", ") or "other settings"
+
+
+def earlier_text(location: SweepLocation) -> str | None:
+    """A sentence about a sweep's runs of earlier versions; None if there are none."""
+    recorded = (location.read(PLAN) or {}).get("earlier", ())
+    if not recorded:
+        return None
+    store = NodeStore(location.storage)
+    known = store.begun() | store.finished(one["key"] for one in recorded)
+    counts = Counter(one["why"] for one in recorded if one["key"] in known)
+    if not counts:
+        return None
+    reasons = [
+        f"{why} ({in_runs(number)})" if len(counts) > 1 else why
+        for why, number in counts.most_common(MOST_REASONS)
+    ]
+    if len(counts) > MOST_REASONS:
+        reasons.append(f"{len(counts) - MOST_REASONS} other reasons")
+    number = counts.total()
+    return (
+        f"{in_runs(number)} of an earlier version of this sweep {'is' if number == 1 else 'are'} "
+        f"not shown: {'; '.join(reasons)}."
+    )
+
+
+# Changes since the last run -----------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Changes:
+    """Differences of a sweep from its last run."""
+
+    name: str
+    differences: tuple[str, ...]
+    """Lines such as `tac.lr: 0.001 -> 0.0003 (4 runs)`."""
+    lost: tuple[str, ...]
+    """Labels and progress of runs whose results or checkpoints the changed sweep does not use."""
+
+    def __str__(self) -> str:
+        have = "its result" if len(self.lost) == 1 else "their results"
+        return "\n".join(
+            (
+                f"the configuration of sweep {self.name!r} has changed since it was last run:",
+                *_indented(self.differences),
+                f"{in_runs(len(self.lost))} would be retrained without using {have}:",
+                *_indented(self.lost),
+                "Choose: --accept-changes does that (the old results stay in the storage), "
+                "--name NEW keeps both sweeps, the old configuration uses the existing results.",
+            )
+        )
+
+
+def _indented(lines: tuple[str, ...]) -> list[str]:
+    more = [f"  ... and {len(lines) - SHOWN} more"] if len(lines) > SHOWN else []
+    return [f"  {line}" for line in lines[:SHOWN]] + more
+
+
+def changes_since(sweep: OpenSweep) -> Changes | None:
+    """Results of the sweep's last run that this one does not use; None if there are none.
+
+    Runs that are new, or that the plan no longer has, do not count.
+
+    Raises:
+        StorageError: The record of the last run can't be read.
+    """
+    try:
+        before = sweep.location.read(SETTINGS)
+        runs: Mapping[str, Any] = before["runs"]
+        algorithm = before["algorithm"]
+    except (KeyError, TypeError):
+        return None  # the first run of the sweep
+    keys = {node.key for node in sweep.plan.nodes}
+    counts: Counter[str] = Counter()
+    lost = []
+    changed_stages = []
+    short = sweep.short
+    for node in sweep.plan.nodes:
+        old = runs.get(node.label)
+        if old is None or old["key"] in keys:
+            continue
+        lines = list(_changed_settings(old["settings"], node.run.model_dump(mode="json")))
+        is_longer = (
+            len(lines) == 1
+            and old["source"] == node.source_key
+            and old["settings"]["env_steps"] < node.run.env_steps
+        )
+        if is_longer and sweep.continued_from(node) is not None:
+            continue
+        counts.update(lines)
+        changed_stages.append(node.stage)
+        if (progress := sweep.progress(old["key"])) is not None:
+            why = _why_not_continued(node) if is_longer and progress == FINISHED else ""
+            lost.append(f"{short(node.label)}: {progress}{why}")
+    for stage, changed in _changed_searches(sweep, before.get("searched", {}), changed_stages):
+        for old in sweep.recorded.get("nodes", ()):
+            if not old["label"].startswith(f"{stage}/") or old["key"] in keys:
+                continue
+            if (progress := sweep.progress(old["key"])) is not None:
+                counts.update(changed)
+                lost.append(f"{old['label']}: {progress}")
+    if not lost:
+        return None
+    lines = [f"{line} ({in_runs(count)})" for line, count in counts.items()]
+    if algorithm != sweep.plan.algorithm:
+        lines.append(f"version of the algorithm: {algorithm} -> {sweep.plan.algorithm}")
+    return Changes(
+        name=sweep.plan.name,
+        differences=tuple(lines or ["the runs that it starts from"]),
+        lost=tuple(lost),
+    )
+
+
+def _changed_searches(
+    sweep: OpenSweep, before: Mapping[str, Any], planned: Iterable[str]
+) -> Iterator[tuple[str, dict[str, None]]]:
+    """Searched stages with changed settings, and the lines of the changes, each once.
+
+    A setting that a search chooses or compares may be new in its space: that makes new trials.
+    `planned` are the stages whose other runs have changed.
+    """
+    chosen = [
+        name if ":" in name else f"{stage.name}:{name}"
+        for stage in sweep.config.stages
+        if stage.search is not None
+        for name in (*stage.search.space, *stage.search.compare)
+    ]
+    now = _searched(sweep)
+    changed = [*planned]
+    for stage in sweep.config.stages:
+        after, earlier = now.get(stage.name), before.get(stage.name)
+        if after is None or earlier is None:
+            continue
+        lines = {
+            line: None
+            for task in after.keys() & earlier.keys()
+            for line in _changed_settings(earlier[task], after[task])
+            if not any(f"{stage.name}:{line}".startswith((f"{one}:", f"{one}.")) for one in chosen)
+        }
+        if lines or (stage.source and stage.source.stage in changed):
+            changed.append(stage.name)
+            yield stage.name, lines
+
+
+def continued_runs_text(sweep: OpenSweep) -> list[str]:
+    """A line about runs that continue finished ones with fewer `env_steps`, if there are any."""
+    if not sweep.store.has_continuations():
+        return []
+    left = [node for node in sweep.plan.nodes if node.key not in sweep.finished]
+    steps = [done for node in left if (done := sweep.continued_from(node)) is not None]
+    if not steps:
+        return []
+    continues = "continues a finished run" if len(steps) == 1 else "continue finished runs"
+    return [
+        f"{in_runs(len(steps))} {continues} with fewer env_steps: {sum(steps):,} env steps less to "
+        "train."
+    ]
+
+
+def _why_not_continued(node: Node) -> str:
+    """The reason why a run with more `env_steps` does not continue the shorter one."""
+    if settings := budget_settings(node.run):
+        return f"; {' and '.join(settings)} would have had other values with the new env_steps"
+    return (
+        "; it has kept no checkpoint of its end (checkpoints.finished_mb, or its env_steps are not "
+        "a multiple of evaluation.interval and of 1,000)"
+    )
+
+
+def _changed_settings(before: Any, after: Any) -> Iterator[str]:
+    for place, old, new in _differences(before, after):
+        if tuple(place.split(".")) not in RETIRED:
+            yield f"{place}: {json.dumps(old)} -> {json.dumps(new)}"
+
+
+def _differences(before: Any, after: Any, place: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Dotted name, old and new value of each setting that differs."""
+    if isinstance(before, dict) and isinstance(after, dict):
+        for key in before | after:
+            inner = f"{place}.{key}" if place else str(key)
+            yield from _differences(before.get(key), after.get(key), inner)
+    elif before != after:
+        yield place, before, after
