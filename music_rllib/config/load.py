@@ -10,7 +10,6 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +74,7 @@ def load_sweep(
     config = _resolve(document, findings)
     if config is None:
         raise ConfigError(document.lines(findings.problems))
-    return replace(config, arguments=tuple(overrides))
+    return config
 
 
 def _checked_text(key: str, text: str) -> str:
@@ -180,7 +179,6 @@ def _resolve(document: Document, findings: Findings) -> SweepConfig | None:
         return None
     return SweepConfig(
         path=document.file.path,
-        text=document.file.text,
         document=data,
         name=header.name,
         seeds=header.seeds,

@@ -246,10 +246,6 @@ class SweepConfig:
     """A valid, resolved sweep."""
 
     path: Path
-    text: str = field(repr=False)
-    """The file's text."""
-    arguments: tuple[str, ...] = ()
-    """`KEY=VALUE` of the command line, which are part of `document` and not of `text`."""
     document: Mapping[str, Any] = field(repr=False)
     """The file's content as plain data, with the values of the command line."""
     name: str
