@@ -70,18 +70,18 @@ def best(
     After a search, the best policy is the first of the ranking on fresh seeds; before the ranking
     is complete, it is the best trial.
     """
+    from music_rllib.experiment.record import earlier_text
     from music_rllib.experiment.sweep_files import find_sweep
-    from music_rllib.store.storage import sweep_folder
     from music_rllib.sweep.export import entropies_text, export_best
 
     found = find_sweep(sweep, storage)
-    folder = output or sweep_folder(found.storage, found.name) / "best"
+    folder = output or found.folder / "best"
     chosen = export_best(found, stage, folder)
     if json:
         print_json(chosen)
         return 0
     console = console_for()
-    lines = [chosen["why"], entropies_text(chosen["entropies"]), found.earlier()]
+    lines = [chosen["why"], entropies_text(chosen["entropies"]), earlier_text(found)]
     lines += [f"{policy['task']}: {policy['folder']}" for policy in chosen["policies"]]
     for line in filter(None, lines):
         console.print(line, soft_wrap=True)
