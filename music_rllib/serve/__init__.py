@@ -1,7 +1,6 @@
-"""A trained policy behind HTTP: `music-rllib serve POLICY`.
+"""A trained policy over HTTP: `music-rllib serve POLICY`.
 
-`schema` has the requests and answers, `api` is the web application (no Ray), `application` puts it
-on Ray Serve, `command` is the command line.
+`api` is the web application (no Ray), `application` puts it on Ray Serve, `command` is the command.
 """
 
 TOKEN_VARIABLE = "MUSIC_RLLIB_SERVE_TOKEN"  # noqa: S105 - the name of a variable

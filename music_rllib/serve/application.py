@@ -24,8 +24,7 @@ from ray.serve.config import BackpressureConfig
 from music_rllib.policy import Policy, PolicyNetwork, find_policy, load_policy
 from music_rllib.runtime.process import give_back_freed_memory
 from music_rllib.serve import TOKEN_VARIABLE
-from music_rllib.serve.api import make_api, token_hash
-from music_rllib.serve.schema import Array, PolicyFacts, Rows, compute
+from music_rllib.serve.api import Array, PolicyFacts, Rows, compute, make_api, token_hash
 
 TOGETHER = 64
 """Most requests that are computed together."""
