@@ -61,7 +61,7 @@ def rows(repeats: int) -> Iterator[Row]:
     """Seconds from the command to the finished page and figures."""
     with TemporaryDirectory() as folder:
         sweep = make_sweep(Path(folder))
-        command = [sys.executable, "-m", "music_rllib.report", str(sweep)]
+        command = [sys.executable, "-m", "music_rllib", "report", str(sweep)]
         wall, cpu = middle([taken_by(lambda: _run(command)) for _ in range(repeats)])
         what = f"{len(make_plan(config(Path(folder))).nodes)} runs of {POINTS} points"
         yield Row("report", what, wall, "s", cpu=cpu, target=f"<= {TARGET:g} s", met=wall <= TARGET)

@@ -16,7 +16,7 @@ name, and else of the export docs/results/data/NAME. KIND is
   `success`, `stages`, or `curves`, with stages behind NAME if not all are meant, `metric`, with
   metrics, or `search`.
 
-    python -m music_rllib.report results/NAME --export docs/results/data/NAME --add
+    music-rllib report results/NAME --export docs/results/data/NAME --add
 """
 
 from __future__ import annotations

@@ -35,9 +35,8 @@ from music_rllib.envs.make import is_gymnasium_id
 from music_rllib.experiment.plan import make_plan
 from music_rllib.policy import PolicyError, load_policy
 from music_rllib.policy.rollout import open_task
-from music_rllib.report.limitations import missing
-from music_rllib.report.search_tables import search_in_words, search_tables
-from music_rllib.report.tables import runs_table
+from music_rllib.report.build import limitations
+from music_rllib.report.tables import runs_table, search_in_words, search_tables
 from music_rllib.results.archive import read_archive
 from music_rllib.results.conditions import find_stages
 from music_rllib.results.data import ReportError
@@ -308,7 +307,7 @@ def export(rng: random.Random, sound: Path, folder: Path) -> Callable[[], object
             search_in_words(search)
             list(search_tables(search))
         find_stages(sweep)
-        missing(sweep, [])
+        limitations(sweep, [])
         runs_table(sweep).to_csv()
 
     return read

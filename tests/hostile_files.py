@@ -607,9 +607,9 @@ def run(arguments: list[str]) -> tuple[object, str]:
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
         try:
             if arguments[0] == "report":
-                from music_rllib.report.cli import app
+                from music_rllib.program import app
 
-                return app(arguments[1:], standalone_mode=False), said.getvalue()
+                return app(arguments, standalone_mode=False), said.getvalue()
             from music_rllib.program import main
 
             return main(arguments), said.getvalue()

@@ -16,15 +16,15 @@ from music_rllib import names
 from music_rllib.report.figures.choice import Drawing
 from music_rllib.report.figures.draw import files
 from music_rllib.report.figures.palette import Style, styles_of
-from music_rllib.report.figures.plots import METRICS, Panel, curve_panel
+from music_rllib.report.figures.plots import METRICS, Subplot, curve_subplot
 from music_rllib.results import statistics as st
 from music_rllib.results.analysis import Curve, curve
 from music_rllib.results.conditions import Condition, StageRuns, find_stages
 from music_rllib.results.data import Sweep
 from music_rllib.results.statistics import Array
 
-PRETRAINING = ("MUSIC-u (pretraining, no reward)", Style("#9a9a9a", "o", "solid"))
-SCRATCH = ("HER alone, q = 1", Style("#4d4d4d", "D", "dashed"))
+PRETRAINING = ("MUSIC-u (pretraining, no reward)", Style("#9a9a9a", "o"))
+SCRATCH = ("HER alone, q = 1", Style("#4d4d4d", "D", (6, 3)))
 (SUCCESS,) = (metric for metric in METRICS if metric.name == names.EVAL_SUCCESS)
 
 
@@ -38,9 +38,9 @@ def learning_figure(sweep: Sweep, figures: dict[str, bytes]) -> Iterator[str]:
         stage="all stages",
         title="Success",
         caption="",
-        panels=(
-            _panel("mean action", evaluated, legend),
-            _panel("sampled policy", sampled, legend),
+        subplots=(
+            _subplot("mean action", evaluated, legend),
+            _subplot("sampled policy", sampled, legend),
         ),
         legend=list(legend.values()),
     )
@@ -49,7 +49,7 @@ def learning_figure(sweep: Sweep, figures: dict[str, bytes]) -> Iterator[str]:
 
 def overview() -> bytes:
     """A PNG of every complete study, the one with most seeds first."""
-    panels: list[Panel] = []
+    subplots: list[Subplot] = []
     entries: dict[str, Style] = {}
     studies = sorted(complete_studies(), key=lambda pair: -pair[1].planned[0].contrast.seeds[0])
     for sweep, study in studies:
@@ -57,9 +57,9 @@ def overview() -> bytes:
         first = study.planned[0]
         curves = [_shifted(sweep, curve(sweep, c, first.task, SUCCESS.name)) for c in legend]
         title = f"{first.task}, {first.contrast.seeds[0]} seeds"
-        panels.append(_panel(title, curves, legend))
+        subplots.append(_subplot(title, curves, legend))
         entries |= dict(legend.values())
-    return files(panels, list(entries.items()))[".png"]
+    return files(subplots, list(entries.items()))[".png"]
 
 
 def _legend(sweep: Sweep) -> dict[Condition, tuple[str, Style]]:
@@ -79,16 +79,18 @@ def _entry(stage: StageRuns, condition: Condition, style: Style) -> tuple[str, S
     )
 
 
-def _panel(title: str, curves: list[Curve], legend: dict[Condition, tuple[str, Style]]) -> Panel:
+def _subplot(
+    title: str, curves: list[Curve], legend: dict[Condition, tuple[str, Style]]
+) -> Subplot:
     styles = {condition: style for condition, (_, style) in legend.items()}
     metric = replace(SUCCESS, target=None)
-    panel = curve_panel(metric, title, curves, styles, with_epochs=False)
+    subplot = curve_subplot(metric, title, curves, styles)
 
     def draw(axes: Axes) -> None:
-        panel.draw(axes)
+        subplot.draw(axes)
         axes.set_xlabel("total environment steps")
 
-    return replace(panel, draw=draw)
+    return replace(subplot, draw=draw)
 
 
 def _shifted(sweep: Sweep, found: Curve | None) -> Curve:

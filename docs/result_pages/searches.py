@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from docs.result_pages.runs import provenance
 from docs.result_pages.words import row, rule
-from music_rllib.report.search_tables import search_in_words, search_tables
+from music_rllib.report.tables import search_in_words, search_tables
 from music_rllib.results.data import Sweep
 
 
@@ -15,9 +15,11 @@ def search_text(sweep: Sweep) -> Iterator[str]:
     for search in sweep.searches:
         yield search_in_words(search)
         for found in search_tables(search):
-            yield f"\n**{found.title}.** {found.note}\n"
-            yield row(*found.header)
-            yield rule(len(found.header))
-            yield from (row(*cells) for cells in found.rows)
+            if found.rows:
+                titles = [title for title, _ in found.heads]
+                yield f"\n**{found.title}.** {found.note}\n"
+                yield row(*titles)
+                yield rule(len(titles))
+                yield from (row(*(cell.text for cell in cells)) for cells in found.cells)
         yield ""
     yield provenance(sweep)

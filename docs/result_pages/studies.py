@@ -12,8 +12,7 @@ from docs.result_pages.figures import figure
 from docs.result_pages.runs import last_value
 from docs.result_pages.words import interval, percent, row, rule, spread, wait_text
 from music_rllib import names
-from music_rllib.report.figures.choice import slug, stage_drawings
-from music_rllib.report.study import study_drawings
+from music_rllib.report.figures.choice import slug, stage_drawings, study_drawings
 from music_rllib.results import statistics as st
 from music_rllib.results.analysis import THRESHOLDS, StageAnalysis, analyse
 from music_rllib.results.analysis_plan import analysis_plan

@@ -1,35 +1,39 @@
-"""Computes the report of a sweep and writes the page, its figures and its numbers."""
+"""Computes the report of a sweep, and writes the page, its figures, videos and tables."""
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import Executor
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
+import numpy as np
+
 from music_rllib import names
+from music_rllib.config.returns import Range, have_diverged
 from music_rllib.envs.tasks import Task
-from music_rllib.report.figures.choice import drawings_of_stages, stage_drawings
-from music_rllib.report.figures.draw import Figures, files
-from music_rllib.report.figures.overview import overview
-from music_rllib.report.figures.plots import METRICS
-from music_rllib.report.limitations import diverged, missing
-from music_rllib.report.page import Report, render
-from music_rllib.report.side_by_side import difference_tables
-from music_rllib.report.study import study_csv, study_drawings
-from music_rllib.report.tables import (
-    Table,
-    curves_table,
-    finals_table,
-    improvement_table,
-    runs_table,
-    waits_table,
+from music_rllib.experiment.environments import mixed
+from music_rllib.labels import ShortLabels, in_runs
+from music_rllib.report.charts import curves_csv
+from music_rllib.report.figures.choice import (
+    Drawing,
+    drawings_of_stages,
+    overview,
+    stage_drawings,
+    study_drawings,
 )
-from music_rllib.report.videos import make_films
-from music_rllib.results.analysis import analyse, analyse_stages
+from music_rllib.report.figures.draw import files
+from music_rllib.report.figures.plots import METRICS
+from music_rllib.report.page import SweepReport, render
+from music_rllib.report.tables import performance_tables, runs_table, study_files
+from music_rllib.report.two_sweeps import difference_tables
+from music_rllib.report.videos import Videos, make_videos
+from music_rllib.results.analysis import StageAnalysis, analyse, analyse_stages
 from music_rllib.results.data import ReportError, Sweep
+from music_rllib.results.statistics import Array
 from music_rllib.results.study import study_of
 
 PAGE = "report.html"
@@ -45,6 +49,13 @@ WANTED = (
     names.MI_REWARD_WEIGHT,
 )
 """Metrics that a report reads."""
+SHOWN = 5
+"""Largest number of labels in a sentence."""
+_STATES = {
+    "RUNNING": "still running, or killed without notice",
+    "KILLED": "stopped before the end; the same command continues",
+    "FAILED": "failed; see below",
+}
 
 
 def build_report(
@@ -53,56 +64,147 @@ def build_report(
     damaged: str | None = None,
     command: str = "",
     storage: str | None = None,
-    video_seed: int | None = None,
+    videos: bool = False,
     environments: Sequence[Task] = (),
-    beside: tuple[Sweep, Sweep] | None = None,
+    both: tuple[Sweep, Sweep] | None = None,
     live: bool = False,
-    processes: Executor | None = None,
-) -> Report:
-    """Compute the report of a sweep: numbers, figures, videos and notes.
+) -> SweepReport:
+    """Compute the report of a sweep: numbers, figures, videos and limitations.
 
     Args:
-        sweep: the sweep, with the metrics of `WANTED`.
-        damaged: a sentence about finished runs that are damaged in the storage, if there are any.
-        command: the command that makes this report.
-        storage: the storage that has the policies to film; None for an exported sweep.
-        video_seed: the seed of filmed episodes; None: no videos.
-        environments: tasks of the user that may be filmed, beside the built-in ones.
-        beside: the two sweeps that `sweep` puts side by side.
-        live: whether the sweep is running, so that runs to come are not reported as missing.
-        processes: worker processes that draw the figures, from `drawing_processes`.
+        sweep: The sweep, with the metrics of `WANTED`.
+        damaged: A sentence about finished runs that are damaged in the storage, if there are any.
+        command: The command that makes this report.
+        storage: The storage that has the policies for videos; None for an exported sweep.
+        videos: Whether to record videos.
+        environments: Tasks of the user that videos may show, besides the built-in ones.
+        both: The two sweeps that `sweep` consists of, in a report on two sweeps.
+        live: Whether the sweep is running, so that waiting runs are not reported as missing.
     """
-    figures = Figures(processes)
     analyses = analyse(sweep)
     stages = [analysis.stage for analysis in analyses]
     study = study_of(sweep)
-    # One by one: a process draws each while the next is computed.
-    for drawing in chain(
+    drawings = chain(
         *(stage_drawings(sweep, analysis) for analysis in analyses),
         drawings_of_stages(sweep, stages),
         study_drawings(study),
-    ):
-        figures.add(drawing)
-    gaps = missing(sweep, analyses, live=live or beside is not None)
-    for one in beside or ():  # each has a configuration of its own
-        gaps += [f"{one.name}: {line}" for line in missing(one, ())]
-    return Report(
+    )
+    sentences = limitations(sweep, analyses, live=live or both is not None)
+    for one in both or ():  # each has a plan of its own
+        sentences += [f"{one.name}: {line}" for line in limitations(one, ())]
+    return SweepReport(
         sweep=sweep,
         analyses=analyses,
         together=analyse_stages(sweep, stages),
         study=study,
-        figures=figures,
-        differences=() if beside is None else difference_tables(*beside, analyses),
-        limitations=[*gaps, *diverged(sweep), *filter(None, [damaged])],
+        drawings=list(_with_own_names(drawings)),
+        differences=() if both is None else difference_tables(*both, analyses),
+        limitations=[*sentences, *filter(None, [damaged])],
         command=command,
-        films=None
-        if video_seed is None
-        else make_films(sweep, analyses, storage, video_seed, environments),
+        videos=make_videos(sweep, analyses, storage, environments) if videos else Videos(),
     )
 
 
-def write_report(report: Report, folder: Path) -> Path:
-    """Write the page, `figures/*` (PNG, SVG, PDF), `videos/*` and `tables/*.csv` into `folder`.
+def _with_own_names(drawings: Iterator[Drawing]) -> Iterator[Drawing]:
+    """The drawings, each with a file name of its own."""
+    seen: Counter[str] = Counter()
+    for drawing in drawings:
+        seen[drawing.name] += 1
+        yield replace(drawing, number=seen[drawing.name])
+
+
+# Limitations ------------------------------------------------------------------------------------
+
+
+def limitations(
+    sweep: Sweep, analyses: Sequence[StageAnalysis], *, live: bool = False
+) -> list[str]:
+    """Sentences about runs that are missing, mixed or diverged.
+
+    In a `live` sweep no run is missing yet.
+    """
+    sentences = [] if live else [*_missing_runs(sweep)]
+    sentences += filter(None, [sweep.earlier])
+    tags = ((run, run.tags.get(names.TAG_ENVIRONMENT, "")) for run in sweep.runs)
+    sentences += mixed((run.task, run.name, digest) for run, digest in tags if run.is_finished)
+    return [*sentences, *_missing_results(sweep, analyses), *_diverged(sweep)]
+
+
+def _missing_runs(sweep: Sweep) -> Iterator[str]:
+    waiting = [run.name for run in sweep.runs if run.status == "SCHEDULED"]
+    if len(waiting) == len(sweep.runs):
+        yield "No run has begun, so there is nothing to draw or compare."
+    if waiting:
+        short = ShortLabels.of(run.name for run in sweep.runs)
+        yield f"{in_runs(len(waiting))} not begun: {_listed([*map(short, waiting)])}."
+    # Damaged runs have a cause as well, and a sentence of their own.
+    states = Counter(r.status for r in sweep.runs if not (r.status == "KILLED" and r.failure))
+    for state, text in _STATES.items():
+        if states[state]:
+            yield f"{in_runs(states[state])} {text}."
+
+
+def _missing_results(sweep: Sweep, analyses: Sequence[StageAnalysis]) -> Iterator[str]:
+    unevaluated = [
+        f"{task} ({names.word_of(metric)})"
+        for task in dict.fromkeys(run.task for run in sweep.runs)
+        if (metric := sweep.primary_metric(task))
+        and not any(len(sweep.series(i, metric)[0]) for i in sweep.on(task))
+    ]
+    if unevaluated:
+        yield f"No evaluation yet on {_listed(unevaluated)}."
+    for stage in (analysis.stage for analysis in analyses):
+        unfinished = [
+            condition.label
+            for condition in stage.conditions
+            if not any(sweep.runs[run].is_finished for run in condition.runs)
+        ]
+        if unfinished and len(unfinished) < len(stage.conditions):
+            yield f"Stage {stage.name}: no run of {_listed(unfinished)} has finished."
+
+
+def _diverged(sweep: Sweep) -> Iterator[str]:
+    """A sentence with the runs whose critics have diverged, if there are any."""
+    labels = [run.name for i, run in enumerate(sweep.runs) if _has_diverged(sweep, i)]
+    if labels:
+        labels = [*map(ShortLabels.of(run.name for run in sweep.runs), labels)]
+        yield (
+            f"The critics of {in_runs(len(labels))} diverged, to values that no reward explains "
+            f"({names.Q_MEAN}): {_listed(labels)}. These runs count like any other run."
+        )
+
+
+def _has_diverged(sweep: Sweep, run: int) -> bool:
+    def at_steps(metric: str) -> Array:
+        values = dict(zip(*sweep.series(run, metric), strict=True))
+        return np.array([values.get(step, 0.0) for step in steps])
+
+    params = sweep.runs[run].params
+    steps, means = sweep.series(run, names.Q_MEAN)
+    try:
+        low, high = map(float, params["task.reward_range"].strip("[]").split(","))
+        gamma = float(params["tac.gamma"])
+    except (KeyError, ValueError):
+        return False  # the reachable return is unknown
+    if not gamma < 1:
+        return False
+    if params.get("music.task_reward") == "False":
+        low = high = 0.0
+    weight = at_steps(names.MI_REWARD_WEIGHT).max(initial=0.0)
+    bonuses = at_steps(names.ALPHA) * at_steps(names.ENTROPY)
+    return bool(have_diverged(means, bonuses, Range(low - weight, high), gamma).any())
+
+
+def _listed(labels: Sequence[str]) -> str:
+    more = len(labels) - SHOWN
+    return "; ".join(labels[:SHOWN]) + (f"; and {more} more" if more > 0 else "")
+
+
+# Files ------------------------------------------------------------------------------------------
+
+
+def write_report(report: SweepReport, folder: Path) -> Path:
+    """Write the page, `figures/*` (PNG, SVG), `videos/*` and `tables/*.csv` into `folder`.
 
     Files of an earlier report that this one does not have are removed, and no others.
 
@@ -110,7 +212,7 @@ def write_report(report: Report, folder: Path) -> Path:
         The path of the page.
 
     Raises:
-        ReportError: if the folder is not writable.
+        ReportError: The folder is not writable.
     """
     earlier, made = made_files(folder), []
     try:
@@ -129,39 +231,33 @@ def write_report(report: Report, folder: Path) -> Path:
 
 
 _MADE = "figures/.made.json"
-"""The list of a report's files, since its folder may have others."""
+"""The list of a report's files; its folder may have others."""
 _FILE = re.compile(rf"{re.escape(PAGE)}|(?:figures|tables|videos)/[^/.][^/]*")
 
 
 def made_files(folder: Path) -> list[str]:
-    """Names of the files of the report in `folder`, below it; empty where there is none."""
+    """Paths of the files of the report in `folder`, below it; empty if there is no report."""
     try:
-        names = json.loads((folder / _MADE).read_text("utf-8"))
+        found = json.loads((folder / _MADE).read_text("utf-8"))
     except (OSError, ValueError):
         return []
-    names = names if isinstance(names, list) else []
-    return [name for name in names if isinstance(name, str) and _FILE.fullmatch(name)]
+    found = found if isinstance(found, list) else []
+    return [name for name in found if isinstance(name, str) and _FILE.fullmatch(name)]
 
 
-def _files_of(report: Report) -> Iterator[tuple[str, bytes]]:
-    """Names, below the report's folder, and contents of its files."""
+def _files_of(report: SweepReport) -> Iterator[tuple[str, bytes]]:
+    """Paths, below the report's folder, and contents of its files."""
     yield PAGE, render(report).encode()
-    panels = overview(report.sweep, [analysis.stage for analysis in report.analyses])
-    picture = [(PICTURE, files(panels, []))] if panels else []
-    for name, contents in chain(picture, report.figures.files()):
+    shown = overview(report.sweep, [analysis.stage for analysis in report.analyses])
+    pictures = [(PICTURE, files(shown, []))] if shown else []
+    drawn = ((drawing.name, files(drawing.subplots, drawing.legend)) for drawing in report.drawings)
+    for name, contents in chain(pictures, drawn):
         for suffix, content in contents.items():
             yield f"figures/{name}{suffix}", content
-    for film in report.films.films if report.films is not None else ():
-        yield f"videos/{film.name}", film.data
-    for table in _tables(report):
-        yield f"tables/{table.name}.csv", table.to_csv().encode()
-
-
-def _tables(report: Report) -> Iterable[Table]:
-    with_stages = [*report.analyses, *filter(None, [report.together])]
-    yield from study_csv(report.study)
-    yield finals_table(report.analyses)
-    yield waits_table(report.analyses)
-    yield improvement_table(with_stages)
-    yield runs_table(report.sweep)
-    yield curves_table(report.drawings)
+    for video in report.videos.videos:
+        yield f"videos/{video.file}", video.data
+    tables = [*performance_tables(report.with_stages), runs_table(report.sweep)]
+    numbers = [(table.name, table.to_csv()) for table in tables]
+    numbers.append(("curves", curves_csv(report.drawings)))
+    for name, text in (*study_files(report.study), *numbers):
+        yield f"tables/{name}.csv", text.encode()

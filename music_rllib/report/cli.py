@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import shlex
 import sys
 from collections.abc import Sequence
@@ -14,31 +15,32 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from music_rllib import names
-from music_rllib.command_line import add_command, called_as, new_app, run_app
+from music_rllib.command_line import called_as
 from music_rllib.errors import FAILED, BadInputError
 
 if TYPE_CHECKING:
-    from music_rllib.report.page import Report
+    from music_rllib.report.page import SweepReport
     from music_rllib.results.data import RunRecord, Sweep
     from music_rllib.results.read import SweepRead
 
 EXAMPLES = """\
 Examples:
   music-rllib report results/smoke
-      on the sweep in that folder, while it runs or afterwards
+      report on the sweep in that folder, during the sweep or afterwards
   music-rllib report s3://bucket/sweeps/smoke --output reports
-      on a sweep in a bucket, from any machine
+      report on a sweep in a bucket, from any machine
   music-rllib report results/smoke --serve
-      the same page while it runs, with its progress
+      the same page while the sweep runs, with its progress
   music-rllib report results/smoke results/other
-      what differs in the settings and in the results of two sweeps
+      differences in the settings and in the results of two sweeps
   music-rllib report results/smoke --export published/smoke --format csv
       its runs and metrics as plain tables; 'report published/smoke' reads them
   music-rllib report results/smoke --export published/smoke --add
-      the same, and what another machine has exported there stays
+      the same; keeps the runs that another machine exported there
 
-Exit codes: 0 the report is written, whatever state the sweep is in; 1 it is
-written without finished runs whose files are damaged; 2 there is no such sweep.
+Exit codes: 0 the report is written, whatever the state of the sweep; 1 the
+report is written without finished runs whose files are damaged; 2 there is no
+such sweep.
 """
 
 
@@ -53,8 +55,8 @@ def report(
     sweeps: Annotated[
         list[str],
         typer.Argument(
-            help="A sweep's folder or URI, an exported folder, or a sweep's name; two are put "
-            "side by side.",
+            help="A sweep's folder or URI, an exported folder, or a sweep's name; two for a "
+            "comparison of sweeps.",
             metavar="SWEEP",
         ),
     ],
@@ -65,42 +67,41 @@ def report(
     storage: Annotated[
         str | None,
         typer.Option(
-            help="Folder or URI of results, where SWEEP is a name; `results` by default.",
+            help="Folder or URI of results, if SWEEP is a name; `results` by default.",
             # A key in a URI on a command line could be read by everyone on the machine.
             envvar=names.VARIABLE_STORAGE,
             show_envvar=False,
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the filmed episodes.")] = 0,
     videos: Annotated[
-        bool, typer.Option(help="Film an episode for each q, where this machine can draw.")
+        bool, typer.Option(help="Record an episode for each q, if this machine can render.")
     ] = True,
     env: Annotated[
         Path | None,
         typer.Option(
-            help="A sweep's YAML file: the environments that it declares are made for videos, "
-            "beside the built-in tasks' and Gymnasium's own.",
+            help="A sweep's YAML file whose declared environments are created for videos, besides "
+            "built-in tasks and Gymnasium's environments.",
         ),
     ] = None,
     serve: Annotated[
         bool,
         typer.Option(
             "--serve",
-            help="Serve the page on loopback while the sweep runs, with its progress.",
+            help="Serve the page on this machine while the sweep runs, with its progress.",
         ),
     ] = False,
     port: Annotated[
-        int, typer.Option(min=0, max=65535, help="With --serve; 0 takes a free one.")
+        int, typer.Option(min=0, max=65535, help="With --serve; 0 selects a free port.")
     ] = 0,
     attach: Annotated[
-        bool, typer.Option("--attach", help="Also keep the report with the sweep's run in MLflow.")
+        bool, typer.Option("--attach", help="Also store the report with the sweep's run in MLflow.")
     ] = False,
     export: Annotated[
         Path | None,
         typer.Option(help="Write the sweep as tables into this folder instead of a report."),
     ] = None,
     format_: Annotated[
-        TableFormat, typer.Option("--format", help="Of the exported tables.")
+        TableFormat, typer.Option("--format", help="Format of the exported tables.")
     ] = TableFormat.parquet,
     add: Annotated[
         bool,
@@ -109,22 +110,25 @@ def report(
 ) -> int:
     """Write one page about a sweep, or about two.
 
-    Self-contained, with its figures (PNG, SVG, PDF) and numbers (CSV).
+    The page is self-contained; its figures (PNG, SVG) and numbers (CSV) are also files.
     """
     if add and export is None:
         raise BadInputError("--add must be given with --export")
     if serve and (export or output or attach):
         raise BadInputError("--serve must be given without --export, --output and --attach")
-    place = sweeps[0]
-    if len(sweeps) > 1:
-        _beside(sweeps, storage, output, alone=serve or attach or export is not None)
-    elif export is not None:
-        _export(place, storage, export, format_, add=add)
+    if len(sweeps) > 1 and (len(sweeps) > 2 or serve or attach or export is not None):
+        raise BadInputError(
+            "SWEEP must be given once, or twice for a comparison without --serve, --attach and "
+            "--export"
+        )
+    if export is not None:
+        _export(sweeps[0], storage, export, format_, add=add)
     elif serve:
-        _serve(place, storage, port)
+        _serve(sweeps[0], storage, port)
+    elif len(sweeps) > 1:
+        _report_on_two(sweeps, storage, output)
     else:
-        video_seed = seed if videos else None
-        return _report(place, storage, output, video_seed, env, attach=attach)
+        return _report(sweeps[0], storage, output, env, videos=videos, attach=attach)
     return 0
 
 
@@ -172,42 +176,37 @@ def _report(
     place: str,
     storage: str | None,
     output: Path | None,
-    video_seed: int | None,
     env: Path | None,
     *,
+    videos: bool,
     attach: bool,
 ) -> int:
-    from music_rllib.report.figures.processes import drawing_processes
+    from music_rllib.config.load import declared_tasks
+    from music_rllib.redaction import for_people, redact
+    from music_rllib.report.build import PICTURE, WANTED, build_report, write_report
+    from music_rllib.results.answer import answer
+    from music_rllib.results.read import read_sweep
 
-    # The processes load their modules while this one loads its own.
-    with drawing_processes() as processes:
-        from music_rllib.config.load import declared_tasks
-        from music_rllib.redaction import for_people, redact
-        from music_rllib.report.build import PICTURE, WANTED, build_report, write_report
-        from music_rllib.results.answer import answer
-        from music_rllib.results.read import read_sweep
-
-        source = read_sweep(place, storage, metrics=WANTED, lenient=True)
-        report = build_report(
-            source.sweep,
-            damaged=source.damaged,
-            storage=None if source.opened is None else source.opened.storage,
-            video_seed=video_seed,
-            environments=() if env is None else declared_tasks(env),
-            command=_command(),
-            processes=processes,
-        )
-        page = write_report(report, output or source.folder / "report")
-    for note in report.limitations:
-        typer.echo(f"missing: {for_people(note)}")
-    for line in answer(source.sweep, report.study):
-        typer.echo(for_people(line))
+    source = read_sweep(place, storage, metrics=WANTED, lenient=True)
+    made = build_report(
+        source.sweep,
+        damaged=source.damaged,
+        storage=None if source.opened is None else source.opened.storage,
+        videos=videos,
+        environments=() if env is None else declared_tasks(env),
+        command=_command(),
+    )
+    page = write_report(made, output or source.folder / "report")
+    for sentence in made.limitations:
+        typer.echo(f"missing: {for_people(sentence)}")
+    for sentence in answer(source.sweep, made.study):
+        typer.echo(for_people(sentence))
     typer.echo(f"Report: {page.absolute()}")
     picture = page.parent / "figures" / f"{PICTURE}.png"
     if picture.exists():
         typer.echo(f"Picture: {picture.absolute()}")
     if attach:
-        _attach(source, page.parent, report)
+        _attach(source, page.parent, made)
     if source.damaged is not None:
         typer.echo(f"error: {redact(source.damaged)}", err=True)
         return FAILED
@@ -221,45 +220,23 @@ def _command() -> str:
     return redact(shlex.join([*called_as(), *sys.argv[1:]]))
 
 
-def _beside(
-    places: Sequence[str],
-    storage: str | None,
-    output: Path | None,
-    *,
-    alone: bool,
-) -> None:
-    """Write a report of two sweeps; `alone`: an option was given that takes a single sweep."""
-    from music_rllib.report.figures.processes import drawing_processes
-    from music_rllib.results.data import ReportError
+def _report_on_two(places: Sequence[str], storage: str | None, output: Path | None) -> None:
+    from music_rllib.report.build import WANTED, build_report, write_report
+    from music_rllib.report.figures.choice import slug
+    from music_rllib.report.two_sweeps import joined_sweeps
+    from music_rllib.results.read import read_sweep
 
-    if len(places) > 2 or alone:
-        raise ReportError(
-            "SWEEP must be one, or two to put side by side; --serve, --attach and --export take one"
-        )
-    with drawing_processes() as processes:
-        from music_rllib.report.build import WANTED, build_report, write_report
-        from music_rllib.report.figures.choice import slug
-        from music_rllib.report.side_by_side import side_by_side
-        from music_rllib.results.read import read_sweep
-
-        sources = [read_sweep(place, storage, metrics=WANTED) for place in places]
-        first, second = (source.sweep for source in sources)
-        report = build_report(
-            side_by_side(first, second),
-            beside=(first, second),
-            command=_command(),
-            processes=processes,
-        )
-        folder = output or sources[0].folder / f"report-beside-{slug(second.name)}"
-        page = write_report(report, folder)
-    typer.echo(f"Report: {page.absolute()}")
+    sources = [read_sweep(place, storage, metrics=WANTED) for place in places]
+    first, second = (source.sweep for source in sources)
+    made = build_report(joined_sweeps(first, second), both=(first, second), command=_command())
+    folder = output or sources[0].folder / f"report-and-{slug(second.name)}"
+    typer.echo(f"Report: {write_report(made, folder).absolute()}")
 
 
 def _serve(place: str, storage: str | None, port: int) -> None:
     from music_rllib.experiment.sweep_files import find_sweep
     from music_rllib.report.build import WANTED, build_report
-    from music_rllib.report.live.server import LivePage, make_server, serve
-    from music_rllib.report.live.state import Progress
+    from music_rllib.report.live import LivePage, Progress, make_server, serve
     from music_rllib.report.page import render
     from music_rllib.results.read import read_stored
 
@@ -268,22 +245,21 @@ def _serve(place: str, storage: str | None, port: int) -> None:
 
     def make_page() -> str:
         source = read_stored(sweep, metrics=WANTED, lenient=True)
-        report = build_report(
+        made = build_report(
             source.sweep,
             damaged=source.damaged,
             command=_command(),
             live=progress.is_running(),
         )
-        return render(report, live=True)
+        return render(made, live=True)
 
     page = LivePage(make_page, progress)
     serve(make_server(page, port), page, typer.echo)
 
 
-def _attach(source: SweepRead, folder: Path, report: Report) -> None:
-    """Keep the report, in `folder`, with the sweep's run in MLflow."""
+def _attach(source: SweepRead, folder: Path, made: SweepReport) -> None:
+    """Store the report, in `folder`, with the sweep's run in MLflow."""
     from music_rllib.report.build import made_files
-    from music_rllib.report.tables import note
     from music_rllib.results.answer import answer
     from music_rllib.results.data import ReportError
     from music_rllib.tracking.store import SweepRun
@@ -291,19 +267,32 @@ def _attach(source: SweepRead, folder: Path, report: Report) -> None:
     if source.opened is None:
         raise ReportError("--attach must be given with a sweep in its storage, got an exported one")
     run = SweepRun.of(source.opened)
-    last = report.analyses[-1].stage.name if report.analyses else ""
-    drawn = sorted(report.drawings, key=lambda drawing: drawing.stage != last)
-    figure = f"report/figures/{drawn[0].name}.png" if drawn else None
-    said = answer(source.sweep, report.study)[1]
-    text = note(said, report.analyses, run.run_id, figure)
-    run.attach(folder, made_files(folder), "report", text)
+    note = _note(answer(source.sweep, made.study)[1], made, run.run_id)
+    run.attach(folder, made_files(folder), "report", note)
     typer.echo(f"Attached to the sweep's run in MLflow: {run.page}")
 
 
-app = new_app()
-add_command(app, "report", report, EXAMPLES)
+def _note(answer: str, made: SweepReport, run_id: str) -> str:
+    """The answer, the last stage's final values and a figure, in Markdown for MLflow's page."""
+    from music_rllib.report.tables import performance_tables
+
+    lines = [f"**{_escaped(answer)}**", ""]
+    last = ""
+    if made.analyses:
+        last = made.analyses[-1].stage.name
+        table = performance_tables(made.analyses[-1:])[0]
+        titles = [title for title, _ in table.heads]
+        rows = [titles, *([cell.text for cell in row] for row in table.cells)]
+        # MLflow's tables have no space between their columns.
+        lines += ["".join(f"| {_escaped(text)}&emsp;" for text in row) + "|" for row in rows]
+        lines.insert(3, "|---" * len(titles) + "|")
+    drawn = sorted(made.drawings, key=lambda drawing: drawing.stage != last)
+    if drawn:
+        figure = f"report/figures/{drawn[0].name}.png"
+        # MLflow serves its pages and its artifacts from the same origin.
+        lines += ["", f"![{figure}](get-artifact?path={figure}&run_uuid={run_id})"]
+    return "\n".join(lines)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run `python -m music_rllib.report` and return its exit code."""
-    return run_app(app, "python -m music_rllib.report", arguments)
+def _escaped(text: str) -> str:
+    return re.sub(r"([\\`*_\[\]<>|#!~])", r"\\\1", text)

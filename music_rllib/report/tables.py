@@ -1,192 +1,383 @@
-"""The report's numbers as CSV files, unrounded."""
+"""The tables of a report."""
 
 from __future__ import annotations
 
-import csv
-import io
-import re
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+import statistics
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
 
 from music_rllib import names
-from music_rllib.report.figures.choice import Drawing
+from music_rllib.report.table import (
+    DASH,
+    Code,
+    Difference,
+    Seconds,
+    Share,
+    Table,
+    estimate_of,
+    to_csv,
+)
 from music_rllib.results.analysis import StageAnalysis
-from music_rllib.results.conditions import SIDE_BY_SIDE
+from music_rllib.results.answer import (
+    claim_rows,
+    interval_in_words,
+    mean_rows,
+    not_excluded,
+    p_in_words,
+    verdict_in_words,
+)
 from music_rllib.results.data import Sweep
-from music_rllib.results.statistics import Estimate, interval_text, number
+from music_rllib.results.statistics import FEWEST_FOR_INTERVAL, SHOW_SEEDS_BELOW, Estimate
+from music_rllib.results.study import Study
+
+UNFOLDED_ROWS = 30
+"""Largest number of trials that the page shows unfolded."""
+
+Entry = Mapping[str, Any]
+"""A search in `search.json`, or one of its arms, trials or ranked settings."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Table:
-    """The content of one CSV file."""
-
-    name: str
-    columns: str
-    """Names of the columns, separated by spaces."""
-    rows: Sequence[Sequence[object]]
-
-    def to_csv(self) -> str:
-        """The rows below a header; NaN is `nan`, infinity `inf`."""
-        buffer = io.StringIO()
-        writer = csv.writer(buffer, lineterminator="\n")
-        writer.writerow(self.columns.split())
-        writer.writerows(self.rows)
-        return buffer.getvalue()
+# Comparisons of conditions ----------------------------------------------------------------------
 
 
-def _numbers(estimate: Estimate) -> tuple[float, float, float]:
-    return float(estimate.value), float(estimate.lower), float(estimate.upper)
-
-
-def finals_table(analyses: Iterable[StageAnalysis]) -> Table:
-    """Final values of each condition and of each of its seeds, means over the tasks."""
-    return Table(
-        name="final",
-        columns="stage tasks metric condition runs seeds mean lower upper each_seed "
-        "shannon_entropy shannon_entropy_lower shannon_entropy_upper tsallis_entropy "
-        "tsallis_entropy_lower tsallis_entropy_upper",
+def study_tables(study: Study) -> list[Table]:
+    """The comparisons, planned ones first, and the primary metric of each condition."""
+    kind = study.means[0].measure.kind_in_words if study.means else "area under the curve"
+    claims = (*study.planned, *study.unplanned)
+    measures = " or ".join(dict.fromkeys(claim.measure.words for claim in claims))
+    comparisons = Table(
+        title=f"Comparisons by the {kind}",
+        header=("Task", "Pair", "Difference", "Interval", "p", "Verdict", "Planned", "Seeds"),
         rows=[
             (
-                analysis.stage.name,
-                scope.name,
-                scope.metric,
-                final.condition.label,
-                final.runs,
-                final.seeds,
-                *_numbers(final.estimate),
-                " ".join(f"{score:g}" for score in final.scores.mean(axis=1)),
-                *analysis.entropies[scope.name, final.condition].numbers,
+                claim.task,
+                f"{claim.first} against {claim.second}",
+                Difference(claim.contrast.difference.value),
+                interval_in_words(claim),
+                p_in_words(claim).removeprefix("p = ") or None,
+                f"{verdict_in_words(claim)}{not_excluded(claim)}",
+                "yes" if claim.planned else "no",
+                " and ".join(map(str, dict.fromkeys(claim.contrast.seeds))),
             )
-            for analysis in analyses
-            for scope in analysis.scopes
-            for final in scope.finals
+            for claim in claims
         ],
+        note=f"Differences in {measures}. Seeds that both conditions have are compared in pairs "
+        "(Student's t-test), other seeds with Welch's t-test. Equivalence is tested with two "
+        "one-sided tests (TOST). p-values are adjusted (Holm) for the planned comparisons, or for "
+        "all comparisons if there is no plan. A failed run counts with the worst value.",
     )
-
-
-def note(answer: str, analyses: Iterable[StageAnalysis], run_id: str, figure: str | None) -> str:
-    """The answer, the last stage's final values and a figure, in Markdown for MLflow's page.
-
-    Args:
-        answer: The first sentence of the report's answer.
-        analyses: The analyses of the sweep's stages.
-        run_id: The MLflow id of the sweep's own run.
-        figure: The path of an artefact of that run; None if nothing is drawn.
-    """
-    rows: list[tuple[str, ...]] = [("task", "condition", "seeds", "final value", "95 %")]
-    for analysis in list(analyses)[-1:]:
-        for scope in analysis.scopes:
-            for final in scope.finals:
-                value = f"{names.word_of(scope.metric)} {number(final.value)}"
-                interval = interval_text(final.estimate)
-                label = final.condition.label
-                rows.append((scope.name, label, str(final.seeds), value, interval))
-    # MLflow's tables have no space between their columns.
-    lines = ["".join(f"| {_escaped(text)}&emsp;" for text in row) + "|" for row in rows]
-    lines.insert(1, "|---" * len(rows[0]) + "|")
-    lines = [f"**{_escaped(answer)}**", "", *lines]
-    if figure is not None:
-        # MLflow serves its pages and its artefacts from the same origin.
-        lines += ["", f"![{figure}](get-artifact?path={figure}&run_uuid={run_id})"]
-    return "\n".join(lines)
-
-
-def _escaped(text: str) -> str:
-    return re.sub(r"([\\`*_\[\]<>|#!~])", r"\\\1", text)
-
-
-def improvement_table(analyses: Iterable[StageAnalysis]) -> Table:
-    """Difference of the final values and probability of improvement of each pair."""
-    return Table(
-        name="probability_of_improvement",
-        columns="stage tasks first second probability_first_higher gap gap_lower gap_upper",
+    means = Table(
+        title=f"{kind.capitalize()} of each condition",
+        header=("Task", "Condition", "Measure", "Mean", "Each seed", "Finished", "Runs"),
         rows=[
             (
-                analysis.stage.name,
-                scope.name,
-                pair.first.condition.label,
-                pair.second.condition.label,
-                pair.improvement,
-                *_numbers(pair.gap),
+                mean.task,
+                mean.condition.short_label,
+                mean.measure.words,
+                mean.estimate,
+                sorted(mean.scores.by_seed.values()),
+                mean.scores.finished,
+                mean.runs,
             )
-            for analysis in analyses
-            for scope in analysis.scopes
-            for pair in scope.differences
+            for mean in study.means
         ],
+        note="The area under the learning curve is the mean over the budget (trapezoidal rule). A "
+        "failed run counts with the worst value.",
     )
+    return [comparisons, means]
 
 
-def waits_table(analyses: Iterable[StageAnalysis]) -> Table:
-    """Environment steps that each condition needs to each success rate."""
+def study_files(study: Study) -> Iterator[tuple[str, str]]:
+    """Names and contents of the CSV files of a study, with the fields of `compare --json`."""
+    means = [
+        row | {"by_seed": " ".join(f"{seed}:{score:g}" for seed, score in row["by_seed"].items())}
+        for row in mean_rows(study)
+    ]
+    claims = [
+        row
+        | {"seeds": " ".join(map(str, row["seeds"]))}
+        | {"in_words": "; ".join(filter(None, row["in_words"]))}
+        for row in claim_rows(study)
+    ]
+    yield "area_under_curve", to_csv(means)
+    yield "comparisons", to_csv(claims)
+
+
+def performance_tables(analyses: Sequence[StageAnalysis]) -> list[Table]:
+    """Final values, entropies, times to a threshold and differences of all stages."""
+    scopes = [(one, scope) for one in analyses for scope in one.scopes]
+    return [
+        Table(
+            name="final",
+            title="Final values",
+            header=("Stage", "Task", "Condition", "Metric", "Mean", "Each seed", "Seeds", "Runs"),
+            rows=[
+                (
+                    analysis.stage.name,
+                    scope.name,
+                    final.condition.label,
+                    names.word_of(scope.metric),
+                    final.estimate,
+                    sorted(final.scores.mean(axis=1).tolist()),
+                    final.seeds,
+                    final.runs,
+                )
+                for analysis, scope in scopes
+                for final in scope.finals
+            ],
+            note="Mean of the last evaluation of finished runs; over all tasks, of the seeds that "
+            f"have finished on each task. With {SHOW_SEEDS_BELOW} or more seeds, single seeds are "
+            "not listed.",
+        ),
+        Table(
+            name="entropies",
+            title="Final entropies of the policies",
+            header=("Stage", "Task", "Condition", "Shannon entropy (nats)", "S_q"),
+            rows=[
+                (analysis.stage.name, scope, condition.label, found.shannon, found.tsallis)
+                for analysis in analyses
+                for (scope, condition), found in analysis.entropies.items()
+                if any(found)
+            ],
+            note="Entropies of the policy over all action dimensions, means over finished runs. If "
+            "the Shannon entropies of two values of q differ, their results may differ because of "
+            "it and not because of q. S_q is computed with each run's own q: its values at "
+            "different q are not comparable.",
+        ),
+        _thresholds(analyses),
+        Table(
+            name="differences",
+            title="Differences of the final values",
+            header=("Stage", "Task", "Pair", "Difference", "Probability of improvement"),
+            rows=[
+                (
+                    analysis.stage.name,
+                    scope.name,
+                    f"{pair.first.condition.label} against {pair.second.condition.label}",
+                    pair.gap,
+                    Share(pair.improvement),
+                )
+                for analysis, scope in scopes
+                for pair in scope.differences
+            ],
+            note="Difference of the means, without a test. "
+            "Probability of improvement: a run of the first condition ends higher than a run of "
+            "the second (ties count half).",
+        ),
+    ]
+
+
+def _thresholds(analyses: Sequence[StageAnalysis]) -> Table:
     return Table(
         name="steps_to_threshold",
-        columns="stage task condition threshold runs reached median_env_steps lower upper each_run",
+        title="Environment steps to a success rate",
+        header=(
+            *("Stage", "Task", "Condition", "Success rate", "Reached", "Runs", "Median steps"),
+            "Each run",
+        ),
         rows=[
             (
                 analysis.stage.name,
-                wait.task,
-                wait.condition.label,
-                wait.threshold,
-                len(wait.steps),
-                int(wait.reached.sum()),
-                *_numbers(wait.median),
-                " ".join(
-                    f"{'' if reached else '>'}{steps:.0f}"
-                    for steps, reached in zip(wait.steps, wait.reached, strict=True)
-                ),
+                time.task,
+                time.condition.label,
+                Share(time.threshold),
+                int(time.reached.sum()),
+                len(time.steps),
+                time.median,
+                [
+                    f"{'' if reached else '>'}{steps:,.0f}"
+                    for steps, reached in sorted(
+                        zip(time.steps, time.reached, strict=True)
+                    )
+                ],
             )
             for analysis in analyses
-            for wait in analysis.times
+            for time in sorted(analysis.times, key=lambda time: (time.threshold, time.task))
         ],
+        note="First evaluation at or above the success rate. Runs that did not reach it are "
+        "censored at their last evaluation (Kaplan-Meier median). The interval is computed from "
+        f"the order of the runs and needs at least {FEWEST_FOR_INTERVAL} of them.",
+    )
+
+
+# Runs -------------------------------------------------------------------------------------------
+
+
+def budget_table(sweep: Sweep, analyses: Sequence[StageAnalysis]) -> Table:
+    """Environment steps and wall time of each stage."""
+    rows = []
+    for stage in (analysis.stage for analysis in analyses):
+        seconds = [s for run in stage.runs if (s := sweep.runs[run].seconds) is not None]
+        rows.append(
+            (
+                stage.name,
+                len(stage.runs),
+                sum(sweep.last_step(run) for run in stage.runs),
+                sum(sweep.runs[run].budget or 0 for run in stage.runs) or None,
+                Seconds(sum(seconds)) if seconds else None,
+                Seconds(statistics.median(seconds)) if seconds else None,
+            )
+        )
+    return Table(
+        title="Budget and wall time",
+        header=("Stage", "Runs", "Steps done", "Steps planned", "Wall time, all runs", "Median"),
+        rows=rows,
+        note="Environment steps. Wall time (h:min:s) is measured from a run's start to its last "
+        "report, including interruptions; running runs are not counted.",
     )
 
 
 def runs_table(sweep: Sweep) -> Table:
-    """Every run of the sweep, with its last evaluation and entropies."""
+    """Every run of the sweep, with its last evaluation and its entropies."""
     return Table(
         name="runs",
-        columns="run_id name stage task entropic_index seed status env_steps budget seconds "
-        "success_rate episode_return failure shannon_entropy tsallis_entropy",
+        title=f"All {len(sweep.runs)} runs",
+        folded=True,
+        header=(
+            *("Run", "Stage", "Task", "q", "Seed", "State", "Steps", "Budget", "Wall time"),
+            *("Success rate", "Return", "Shannon entropy", "S_q", "Cause of failure", "Key"),
+        ),
         rows=[
             (
-                run.run_id,
                 run.name,
                 run.stage,
                 run.task,
                 run.entropic_index,
                 run.seed,
-                run.status,
+                state_in_words(run.status),
                 sweep.last_step(position),
                 run.budget,
-                run.seconds,
+                None if run.seconds is None else Seconds(run.seconds),
                 sweep.final(position, names.EVAL_SUCCESS),
                 sweep.final(position, names.EVAL_RETURN),
-                run.failure,
                 *(sweep.final(position, metric) for metric in names.ENTROPIES),
+                run.failure,
+                Code(run.run_id),
             )
             for position, run in enumerate(sweep.runs)
         ],
     )
 
 
-def curves_table(drawings: Iterable[Drawing]) -> Table:
-    """The points of all learning curves; stages side by side have none but those of each stage."""
+def failures_table(sweep: Sweep) -> Table:
+    """The failed and the damaged runs, with the causes."""
     return Table(
-        name="curves",
-        columns="stage task condition metric env_steps runs mean lower upper",
+        title="Failed runs",
+        header=("Run", "Steps", "Cause"),
         rows=[
-            (drawing.stage, curve.task, curve.condition.label, drawing.metric.name, *point)
-            for drawing in drawings
-            if drawing.metric is not None and drawing.stage != SIDE_BY_SIDE
-            for curves in drawing.curves.values()
-            for curve in curves
-            for point in zip(
-                curve.steps.astype(int).tolist(),
-                curve.runs.tolist(),
-                curve.estimate.value.tolist(),
-                curve.estimate.lower.tolist(),
-                curve.estimate.upper.tolist(),
-                strict=True,
-            )
+            (run.name, sweep.last_step(position), Code(run.failure or "no cause was recorded"))
+            for position, run in enumerate(sweep.runs)
+            if run.status == "FAILED" or (run.status == "KILLED" and run.failure)
         ],
     )
+
+
+def origin_table(sweep: Sweep, command: str) -> Table:
+    """The storage, the code and the versions that the numbers come from."""
+    prefix = names.TAG_VERSION_PREFIX
+    versions = sorted(
+        f"{tag.removeprefix(prefix)} {value}"
+        for tag, value in sweep.tags.items()
+        if tag.startswith(prefix)
+    )
+    return Table(
+        title="Origin",
+        header=("Item", "Value"),
+        rows=[
+            ("Read from", Code(sweep.source)),
+            ("Git commit", Code(sweep.tags.get(names.TAG_GIT_COMMIT, "unknown"))),
+            ("Versions", ", ".join(versions) or "unknown"),
+            ("Command of this report", Code(command)),
+        ],
+    )
+
+
+def state_in_words(status: str) -> str:
+    """A word for the status of a run or a sweep."""
+    return {"KILLED": "stopped", "SCHEDULED": "waiting"}.get(status, status.lower())
+
+
+# Searches ---------------------------------------------------------------------------------------
+
+
+def search_in_words(search: Entry) -> str:
+    """A sentence with the search's mode, sampler, objectives and numbers of trials."""
+    states = [trial["state"] for arm in search["arms"] for trial in arm["trials"]]
+    counts = ", ".join(
+        f"{states.count(state)} {state}"
+        for state in ("judged", "pruned", "failed")
+        if state in states
+    )
+    aims = " and ".join(f"{aim['direction']} {aim['name']}" for aim in search["objectives"])
+    return f"{search['mode'].capitalize()} ({search['sampler']}): {aims}; trials: {counts}."
+
+
+def search_tables(search: Entry) -> Iterator[Table]:
+    """The ranking on fresh seeds, the importance of each setting, and every trial."""
+    trials = [trial for arm in search["arms"] for trial in arm["trials"]]
+    settings = list(dict.fromkeys(name for trial in trials for name in trial["values"]))
+    aims = [aim["name"] for aim in search["objectives"]]
+    yield Table(
+        title="Ranking on fresh seeds",
+        note="These settings were trained again with seeds that the search did not use, so that "
+        "selection does not bias them. Last column: the probability that a run of the best "
+        "setting ends higher than a run of this one.",
+        header=(
+            *("Rank", "Trial", *settings, *aims, "Seeds"),
+            *("In the search", "Probability that the best is better"),
+        ),
+        rows=[
+            (
+                place,
+                _setting(row["trial"]),
+                *(_setting(row["values"].get(name)) for name in settings),
+                *_objectives(row, "fresh", len(aims)),
+                len(row["scores"][0]) if row.get("scores") else None,
+                f"failed: {row['failure']}"
+                if "failure" in row
+                else [value for value in row.get("searched") or () if value is not None],
+                None if (better := row.get("best_is_better_with")) is None else Share(better),
+            )
+            for place, row in enumerate(search["ranking"] or (), start=1)
+        ],
+    )
+    for arm in search["arms"]:
+        values = ", ".join(f"{name} = {_setting(value)}" for name, value in arm["values"].items())
+        yield Table(
+            title=f"Importance of the settings{values and f' at {values}'}",
+            note="Share of the objective's variance over the trials (functional ANOVA).",
+            header=("Setting", "Share"),
+            rows=[(name, Share(share)) for name, share in (arm["importance"] or {}).items()],
+        )
+    yield Table(
+        title="Trials",
+        note="Each trial on the seeds of the search: selection biases the best one upwards.",
+        header=("Trial", *settings, "State", *aims, "Why it was stopped"),
+        folded=len(trials) > UNFOLDED_ROWS,
+        rows=[
+            (
+                trial["number"],
+                *(_setting(trial["values"].get(name)) for name in settings),
+                trial["state"],
+                *_objectives(trial, "objective", len(aims)),
+                trial["reason"] or "",
+            )
+            for trial in trials
+            if trial["state"] != "waiting"
+        ],
+    )
+
+
+def _setting(value: object) -> str:
+    return DASH if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _objectives(row: Entry, field: str, count: int) -> Iterator[Estimate | None]:
+    """The estimate of each objective; None where it is unknown."""
+    for aim in range(count):
+        value = (row.get(field) or [None] * count)[aim]
+        ends = (row.get("interval") or [(None, None)] * count)[aim]
+        low, high = (np.nan if end is None else end for end in ends)
+        yield None if value is None else estimate_of(value, low, high)

@@ -1,4 +1,4 @@
-"""Videos in a report: for each q an episode of the policy of its median run."""
+"""Videos in a report: for each q, an episode of the policy of its median run."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
 
 from music_rllib.envs.tasks import Task
 from music_rllib.errors import first_line
@@ -16,80 +15,73 @@ from music_rllib.results.analysis import StageAnalysis
 from music_rllib.results.data import RunRecord, Sweep
 from music_rllib.store.storage import below
 
-if TYPE_CHECKING:
-    from music_rllib.policy.policy import Policy
-
 MOST = 6
-"""Largest number of videos; if there would be more, only the first task is filmed."""
+"""Largest number of videos; if there would be more, only the first task has videos."""
+SEED = 0
+"""Seed of the episodes: every q has the same start and goal."""
+_OUTCOMES = {True: "goal reached", False: "goal not reached", None: "the task declares no success"}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Film:
-    """One filmed episode."""
+class Video:
+    """An episode."""
 
-    entropic_index: str
-    task: str
-    run: str
-    """Name of the run."""
-    success: bool | None
-    ending: str
-    """`mp4` or `gif`."""
+    label: str
+    """`q = 1.5 on FetchPush`."""
+    caption: str
+    file: str
+    """Name of its file, which ends with `.mp4` or `.gif`."""
     data: bytes
 
     @property
-    def name(self) -> str:
-        """Name of its file."""
-        return f"{slug(f'q-{self.entropic_index}-{self.task}')}.{self.ending}"
+    def is_gif(self) -> bool:
+        return self.file.endswith(".gif")
 
     @property
     def uri(self) -> str:
-        """The video as a data URI, as the page fetches nothing."""
-        kind = "video/mp4" if self.ending == "mp4" else "image/gif"
+        """The video as a data URI: the page must not fetch anything."""
+        kind = "image/gif" if self.is_gif else "video/mp4"
         return f"data:{kind};base64,{base64.b64encode(self.data).decode()}"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Films:
+class Videos:
     """The videos of a report, and the reason if some are missing."""
 
-    films: Sequence[Film] = ()
-    why_not: str | None = None
+    videos: Sequence[Video] = ()
+    missing: str | None = None
 
 
-def make_films(
+def make_videos(
     sweep: Sweep,
     analyses: Sequence[StageAnalysis],
     storage: str | None,
-    seed: int,
     environments: Sequence[Task] = (),
-) -> Films:
-    """Film the last stage's policies on the built-in tasks and in the user's `environments`.
+) -> Videos:
+    """Record the last stage's policies on the built-in tasks and in the user's `environments`.
 
-    It never fails: the result says why a video is missing.
+    It never fails: the result has the reason why a video is missing.
 
     Args:
-        sweep: the sweep.
-        analyses: the statistics of its stages.
-        storage: the storage that has the policies; None for an exported sweep.
-        seed: the seed of the episodes.
-        environments: tasks of the user.
+        sweep: The sweep.
+        analyses: The analyses of its stages.
+        storage: The storage that has the policies; None for an exported sweep.
+        environments: Tasks of the user.
     """
     if storage is None:
-        return Films(why_not="an exported sweep has no policies; report on the sweep itself")
+        return Videos(missing="an exported sweep has no policies; report on the sweep itself")
     chosen = list(_median_runs(sweep, analyses))
     if not chosen:
-        return Films(why_not="no run that was evaluated has finished")
-    films: list[Film] = []
+        return Videos(missing="no run that was evaluated has finished")
+    videos: list[Video] = []
     reasons: list[str] = []
     for q, run in chosen:
         try:
-            with TemporaryDirectory() as folder:
-                policy = _policy(storage, run, environments)
-                films.append(_film(policy, run, q, seed, Path(folder)))
+            videos.append(_record(storage, run, q, environments))
         # An environment may raise anything, and no video is worth losing the report.
         except Exception as error:
             reasons.append(f"{run.name}: {first_line(error)}")
-    return Films(films=films, why_not=reasons[0] if reasons else None)
+    return Videos(videos=videos, missing=reasons[0] if reasons else None)
 
 
 def _median_runs(
@@ -99,7 +91,6 @@ def _median_runs(
     if not analyses:
         return
     stage = analyses[-1].stage
-    # Of a search the chosen ones; its trials may be anything.
     conditions = stage.compared or stage.conditions
     qs = list(dict.fromkeys(condition.entropic_index for condition in conditions))
     tasks = stage.tasks if len(qs) * len(stage.tasks) <= MOST else stage.tasks[:1]
@@ -111,7 +102,7 @@ def _median_runs(
                 if condition.entropic_index == q
                 for run in condition.runs
                 if sweep.runs[run].task == task
-                and sweep.runs[run].status == "FINISHED"
+                and sweep.runs[run].is_finished
                 and (rate := sweep.final(run, sweep.primary_metric(task))) is not None
             ]
             if rated:
@@ -119,28 +110,23 @@ def _median_runs(
                 yield q, sweep.runs[median]
 
 
-def _policy(storage: str, run: RunRecord, environments: Sequence[Task]) -> Policy:
+def _record(storage: str, run: RunRecord, q: str, environments: Sequence[Task]) -> Video:
+    """An episode as an MP4, or as a GIF of ten times its size if there is no encoder."""
     from music_rllib.policy.policy import load_policy
-
-    return load_policy(below(storage, f"nodes/{run.node_key}"), environments)
-
-
-def _film(policy: Policy, run: RunRecord, q: str, seed: int, folder: Path) -> Film:
-    """An episode as an MP4, or as a GIF of ten times its size where there is no encoder."""
     from music_rllib.policy.video import VideoError, film, write_video
 
-    frames, (episode,) = film(policy, 1, seed, f"q = {q}  ·  {run.task}")
-    video = folder / "film.mp4"
-    try:
-        write_video(video, frames)
-    except VideoError:
-        video = folder / "film.gif"
-        write_video(video, frames)
-    return Film(
-        entropic_index=q,
-        task=run.task,
-        run=run.name,
-        success=episode.success,
-        ending=video.suffix.removeprefix("."),
-        data=video.read_bytes(),
-    )
+    policy = load_policy(below(storage, f"nodes/{run.node_key}"), environments)
+    frames, (episode,) = film(policy, 1, SEED, f"q = {q}  ·  {run.task}")
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "video.mp4"
+        try:
+            write_video(path, frames)
+        except VideoError:
+            path = path.with_suffix(".gif")
+            write_video(path, frames)
+        return Video(
+            label=f"q = {q} on {run.task}",
+            caption=f"{_OUTCOMES[episode.success]}. {run.name}",
+            file=f"{slug(f'q-{q}-{run.task}')}{path.suffix}",
+            data=path.read_bytes(),
+        )

@@ -1,4 +1,4 @@
-"""The report at a sweep's end, made by the report's own program."""
+"""The report at the end of a sweep, made by the `report` command in a process of its own."""
 
 from __future__ import annotations
 
@@ -18,18 +18,17 @@ TIMEOUT_SECONDS = 900.0
 def report_at_end(storage: str, name: str, tracking_uri: str | None, config: Path) -> str | None:
     """Make the report of a sweep and attach it to the sweep's run in MLflow.
 
-    In a process of its own: it draws on all CPUs, and whatever happens in it, the sweep is over and
-    its results are kept.
+    It runs in a process of its own: whatever happens in it, the results of the sweep are kept.
 
     Args:
         storage: Folder or URI of a bucket.
         name: The sweep's name.
         tracking_uri: MLflow's, password included; None for the file in the storage.
-        config: The sweep's YAML file, whose environments are filmed.
+        config: The sweep's YAML file, whose environments are recorded in videos.
 
     Returns:
-        The places of the page and its picture, or why there is no report, as a message; None where
-        `MUSIC_RLLIB_REPORT=off` asks for no report.
+        A message with the paths of the page and its picture, or with the reason why there is no
+        report; None if `MUSIC_RLLIB_REPORT=off` is set.
     """
     if os.environ.get(names.VARIABLE_REPORT, "").lower() in {"off", "0", "no", "false"}:
         return None
@@ -40,7 +39,7 @@ def report_at_end(storage: str, name: str, tracking_uri: str | None, config: Pat
     if is_remote(storage):
         # Its URI may hold a key, which everyone on the machine could read on a command line.
         environment[names.VARIABLE_STORAGE], place = storage, name
-    command = [sys.executable, "-m", "music_rllib.report", place]
+    command = [sys.executable, "-m", "music_rllib", "report", place]
     if config.is_file():
         command += ["--env", str(config.absolute())]
     try:
@@ -58,8 +57,8 @@ def report_at_end(storage: str, name: str, tracking_uri: str | None, config: Pat
         marks = ("Report: ", "Picture: ")
         made = [line for line in done.stdout.splitlines() if line.startswith(marks)]
         errors = done.stderr.strip().splitlines()
-        if made:  # also where it could not be attached, or where runs are damaged
+        if made:  # even if it could not be attached, or if runs are damaged
             return "\n".join(made if done.returncode == 0 else [*made, *errors[-1:]])
-        reason = errors[-1] if errors else f"it ended with {done.returncode}"
+        reason = errors[-1] if errors else f"it ended with exit code {done.returncode}"
     place = below(redact(storage), name)
-    return f"No report: {reason}. Make it with: python -m music_rllib.report {place}"
+    return f"No report: {reason}. Make it with: music-rllib report {place}"

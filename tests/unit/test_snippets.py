@@ -26,7 +26,6 @@ ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 MODULES = {
     "music_rllib.sweep": "music_rllib.program",
-    "music_rllib.report": "music_rllib.report.cli",
 }
 """What `python -m` starts, and where its application is."""
 OTHERS = {

@@ -6,30 +6,30 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import product
+from itertools import groupby, product
 
 from music_rllib import names
-from music_rllib.report.figures.palette import Style, styles_by_stage, styles_of
+from music_rllib.report.figures.palette import Style, styles_of
 from music_rllib.report.figures.plots import (
     METRICS,
     MOST_BANDS,
     Legend,
     Metric,
-    Panel,
-    curve_panel,
-    entropy_panel,
-    finals_panel,
-    profile_panel,
+    Subplot,
+    alpha_subplot,
+    contour_subplots,
+    curve_subplot,
+    entropy_subplot,
+    finals_subplot,
+    profile_subplot,
 )
-from music_rllib.report.figures.sensitivity import sensitivity_panels
 from music_rllib.results.analysis import Curve, FinalScores, Scope, StageAnalysis, curve
-from music_rllib.results.conditions import SIDE_BY_SIDE, Condition, StageRuns, stages_together
+from music_rllib.results.conditions import Condition, StageRuns, stages_together
 from music_rllib.results.data import Sweep
 from music_rllib.results.statistics import SHOW_SEEDS_BELOW
-from music_rllib.results.study import MOST_CONDITIONS
+from music_rllib.results.study import MOST_CONDITIONS, Study, alpha_sensitivity
 
 FINALS = {names.EVAL_SUCCESS: "Final success rate", names.EVAL_RETURN: "Final return"}
-PROFILES = "Performance profile"
 AGAINST_ENTROPY = "Performance against entropy"
 PERFORMANCE, EXPLORATION, INFORMATION = "Performance", "Exploration", "Information"
 SETTINGS, COST = "Settings", "Cost"
@@ -42,7 +42,6 @@ _GROUP_OF = {
     names.MI_BOUND: INFORMATION,
     names.MI_REWARD: INFORMATION,
 }
-SENSITIVITY = "Sensitivity"
 PRIMARY = tuple(metric.title for metric in METRICS[:2])
 """Titles of the curves of primary metrics: success rate and return."""
 OF_ALL_STAGES = tuple(
@@ -51,42 +50,39 @@ OF_ALL_STAGES = tuple(
     if metric.title in PRIMARY or metric.name == names.EVAL_DISPLACEMENT
 )
 """Curves that are drawn of all stages together; displacement shows an effect before success."""
-
-
 MOST_FACETS = 8
-"""Largest number of panels that the curves of one task are spread over."""
+"""Largest number of subplots that the curves of one task are spread over."""
+MOST_LINES = 8
+"""Largest number of lines in a subplot of the overview."""
+SEEN = 0.25
+"""Success rate below which the overview shows displacement instead."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Drawing:
-    """One figure of one stage: its panels, a legend and a caption."""
+    """One figure of one stage: its subplots, a legend and a caption."""
 
     stage: str
     title: str
     caption: str
-    panels: tuple[Panel, ...]
+    subplots: tuple[Subplot, ...]
     legend: Legend
     group: str = PERFORMANCE
     """The heading of the page under which it stands."""
     metric: Metric | None = None
     """The metric that learning curves show; None for other figures."""
     curves: Mapping[str, Sequence[Curve]] = field(default_factory=dict)
-    """The learning curves of each panel, by its title."""
+    """The learning curves of each subplot, by its title."""
     facets: Facets | None = None
-    """How conditions are spread over the panels of learning curves and of profiles."""
+    """How the conditions of learning curves are spread over subplots."""
     number: int = 1
-    """Tells drawings apart whose stages and titles are alike as file names."""
+    """Distinguishes drawings whose stages and titles are the same as file names."""
 
     @property
     def name(self) -> str:
         """The name of its files without their suffix, and its id in the page."""
         number = f" {self.number}" if self.number > 1 else ""
         return slug(f"{self.stage}-{self.title}{number}")
-
-    @property
-    def legend_is_of_conditions(self) -> bool:
-        """Whether each entry of the legend is one condition of the stage."""
-        return self.facets is not None and len(self.legend) == len(self.facets.styles)
 
 
 def slug(text: str) -> str:
@@ -100,11 +96,10 @@ def stage_drawings(sweep: Sweep, analysis: StageAnalysis) -> Iterator[Drawing]:
     yield from _curves(sweep, stage, METRICS)
     scopes = [replace(s, finals=s.compared) if s.compared else s for s in analysis.scopes]
     scopes = [scope for scope in scopes if len(scope.finals) > 1]
-    for metric_name, title in FINALS.items():
-        yield from _finals(stage, title, [one for one in scopes if one.metric == metric_name])
+    for metric, title in FINALS.items():
+        if of_metric := [scope for scope in scopes if scope.metric == metric]:
+            yield _finals(stage, title, of_metric)
     yield from _against_entropy(sweep, stage)
-    if any(len(scope.finals) > 1 for scope in analysis.scopes):
-        yield from _sensitivity(analysis)
 
 
 def _without_trials(sweep: Sweep, stage: StageRuns) -> StageRuns:
@@ -116,58 +111,6 @@ def _without_trials(sweep: Sweep, stage: StageRuns) -> StageRuns:
     return replace(stage, conditions=stage.compared, seeds=ranked)
 
 
-def _finals(stage: StageRuns, title: str, scopes: Sequence[Scope]) -> Iterator[Drawing]:
-    if not scopes:
-        return
-    yield Drawing(
-        stage=stage.name,
-        title=title,
-        caption="Large marks: mean; bars: 95 % intervals; small ticks: single runs.",
-        panels=tuple(panel for scope in scopes for panel in _finals_panels(stage, scope)),
-        legend=[],  # each row has its label
-    )
-    facets = Facets.of(stage)
-    runs = [final.scores.shape[0] for scope in scopes for final in scope.finals]
-    readable = len(stage.conditions) <= MOST_CONDITIONS and max(runs) > 1
-    if scopes[0].metric not in names.EVAL_RATES or not readable:
-        return  # bands of single runs fill the figure, and those of many conditions overlap
-    yield Drawing(
-        stage=stage.name,
-        title=PROFILES,
-        caption="Share of finished runs that end above each success rate, with 95 % bands. A line "
-        "that is above another everywhere is better at every standard.",
-        panels=tuple(profile_panel(scope, stage.conditions) for scope in scopes),
-        legend=[(condition.label, style) for condition, style in facets.styles.items()],
-        facets=facets,
-    )
-
-
-def _finals_panels(stage: StageRuns, scope: Scope) -> Iterator[Panel]:
-    facets = Facets.of(stage)
-    labels = {condition: facets.label(condition) for condition in stage.conditions}
-    panels: dict[str, list[FinalScores]] = {}
-    for final in scope.finals:
-        panels.setdefault(facets.title(scope.name, final.condition), []).append(final)
-    for title, shown in panels.items():
-        yield finals_panel(title, scope, shown, facets.styles, labels)
-
-
-def _against_entropy(sweep: Sweep, stage: StageRuns) -> Iterator[Drawing]:
-    by_q = _styles_by_q(stage)
-    # Other settings move the points, so that colour stands for q alone.
-    styles = {condition: by_q[condition.entropic_index] for condition in stage.conditions}
-    panels = [entropy_panel(sweep, task, styles) for task in stage.tasks]
-    if any(panels) and len(stage.conditions) > 1:
-        yield Drawing(
-            stage=stage.name,
-            title=AGAINST_ENTROPY,
-            caption="One point for each finished run. Where the values of q lie on one curve, the "
-            "entropy explains how they do; where they differ at the same entropy, q does.",
-            panels=tuple(filter(None, panels)),
-            legend=_legend_by_q(stage),
-        )
-
-
 def drawings_of_stages(sweep: Sweep, stages: Sequence[StageRuns]) -> Iterator[Drawing]:
     """Curves of all stages that train for the task, together; none for a single stage."""
     together = stages_together(stages)
@@ -175,41 +118,35 @@ def drawings_of_stages(sweep: Sweep, stages: Sequence[StageRuns]) -> Iterator[Dr
         yield from _curves(sweep, together, OF_ALL_STAGES)
 
 
-def named_by_stage(condition: Condition) -> str:
-    """The label of a condition of all stages together: `music-r, q = 1.5`."""
-    (_, stage), *others = condition.others
-    rest = replace(condition, others=tuple(others))
-    return f"{stage}, {rest.label}"
+# Curves -----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Facets:
-    """How a stage's conditions are spread over the panels of a figure."""
+    """How a stage's conditions are spread over the subplots of a figure."""
 
     setting: str
-    """The setting whose values have panels of their own; empty: the panels are tasks."""
+    """The setting whose values have subplots of their own; empty: only tasks have."""
     styles: Mapping[Condition, Style]
-    """Of all conditions of the stage; the same in each panel."""
+    """Of all conditions of the stage; the same in each subplot."""
 
     @classmethod
     def of(cls, stage: StageRuns) -> Facets:
-        """One panel for a task, unless it would have too many conditions."""
+        """One subplot for a task, unless it would have too many conditions."""
         setting = facet_of(stage.conditions)
         rest = {condition: _without(condition, setting) for condition in stage.conditions}
-        styles_of_all = styles_by_stage if stage.name == SIDE_BY_SIDE else styles_of
-        styles = styles_of_all(tuple(dict.fromkeys(rest.values())))
+        styles = styles_of(tuple(dict.fromkeys(rest.values())))
         return cls(setting, {condition: styles[rest[condition]] for condition in rest})
 
     def title(self, task: str, condition: Condition) -> str:
-        """The title of a condition's panel."""
+        """The title of a condition's subplot."""
         value = dict(condition.others).get(self.setting)
         return f"{task}, {self.setting} = {value}" if self.setting else task
 
     def label(self, condition: Condition) -> str:
-        """What a condition is called in its panel, whose title says the rest."""
-        rest = _without(condition, self.setting)
-        by_stage = any(name == "stage" for name, _ in rest.others)
-        return named_by_stage(rest) if by_stage else rest.label
+        """The condition's label in its subplot, `music-r, q = 1.5` in one of several stages."""
+        rest = _without(_without(condition, self.setting), "stage")
+        return ", ".join(filter(None, (dict(condition.others).get("stage"), rest.label)))
 
 
 def _without(condition: Condition, setting: str) -> Condition:
@@ -218,21 +155,17 @@ def _without(condition: Condition, setting: str) -> Condition:
 
 
 def facet_of(conditions: Sequence[Condition]) -> str:
-    """The setting that spreads conditions over panels where one has too many of them; else empty.
+    """The setting whose values have a subplot each if there are too many conditions; else empty.
 
-    Of the settings that leave few enough panels, the one with the fewest conditions in a panel.
+    Of the settings with few enough values, it leaves the fewest conditions in a subplot.
     """
     if len(conditions) <= MOST_CONDITIONS:
         return ""
-    values: dict[str, list[str]] = {}
-    for condition in conditions:
-        for name, value in condition.others:
-            values.setdefault(name, []).append(value)
-    most = {
-        name: max(Counter(found).values())
-        for name, found in values.items()
-        if name != "stage" and len(found) == len(conditions) and 1 < len(set(found)) <= MOST_FACETS
-    }
+    most = {}
+    for name in dict.fromkeys(name for one in conditions for name, _ in one.others):
+        values = Counter(dict(one.others).get(name) for one in conditions)
+        if name != "stage" and None not in values and 1 < len(values) <= MOST_FACETS:
+            most[name] = max(values.values())
     return min(most, key=lambda name: most[name], default="")
 
 
@@ -241,72 +174,178 @@ def _curves(sweep: Sweep, stage: StageRuns, metrics: Sequence[Metric]) -> Iterat
     facets = Facets.of(stage)
     labels = {facets.label(condition): style for condition, style in facets.styles.items()}
     for metric in metrics:
-        panels: dict[str, list[Curve]] = {}
+        by_title: dict[str, list[Curve]] = {}
         for task, condition in product(stage.tasks, stage.conditions):
             if metric.name == names.EVAL_RETURN != sweep.primary_metric(task):
-                continue  # the return is drawn of those tasks only that are judged by it
+                continue  # the return is drawn only of tasks whose primary metric it is
             found = curve(sweep, condition, task, metric.name)
             if found is not None:
-                panels.setdefault(facets.title(task, condition), []).append(found)
-        if panels:
+                by_title.setdefault(facets.title(task, condition), []).append(found)
+        if by_title:
             yield Drawing(
                 stage=stage.name,
                 title=metric.title,
-                caption=_caption(stage, metric, max(map(len, panels.values()))),
-                panels=tuple(
-                    curve_panel(
-                        metric, title, curves, facets.styles, with_epochs=not facets.setting
-                    )
-                    for title, curves in panels.items()
+                caption=_caption(stage, metric, max(map(len, by_title.values()))),
+                subplots=tuple(
+                    curve_subplot(metric, title, curves, facets.styles)
+                    for title, curves in by_title.items()
                 ),
                 legend=list(labels.items()),
                 group=_GROUP_OF.get(metric.name, PERFORMANCE),
                 metric=metric,
-                curves=panels,
+                curves=by_title,
                 facets=facets,
             )
 
 
 def _caption(stage: StageRuns, metric: Metric, lines: int) -> str:
     seeds = len(stage.seeds)
-    if lines > MOST_BANDS:
-        band = f"Mean over up to {seeds} seeds, without bands, which would hide each other."
-    elif seeds == 1:
-        band = "A single seed: each line is one run, and there is no band."
+    if seeds == 1:
+        text = "Each line is a single run."
     else:
-        band = f"Mean over up to {seeds} seeds with its 95 % band."
-        if seeds < SHOW_SEEDS_BELOW:
-            band += " The thinnest lines: single seeds."
-        band += " Dashed in turn: lines that coincide."
-    thin = "A line is thin where some of its runs had ended."
-    target = "" if metric.target is None else f" Dotted: {metric.target * 100:.0f} %."
-    return f"{band} {thin}{target}"
+        band = "" if lines > MOST_BANDS else " with its 95% confidence band"
+        text = f"Mean over up to {seeds} seeds{band}."
+        if band and seeds < SHOW_SEEDS_BELOW:
+            text += " Very thin lines are single seeds."
+    text += " A line gets thinner where some of its runs have ended."
+    return text + (f" Dotted: {metric.target:.0%}." if metric.target is not None else "")
 
 
-def _styles_by_q(stage: StageRuns) -> dict[str, Style]:
-    return {c.entropic_index: style for c, style in styles_of(stage.conditions).items()}
+# Final values, entropy --------------------------------------------------------------------------
 
 
-def _legend_by_q(stage: StageRuns) -> Legend:
-    styles = _styles_by_q(stage)
-    return [(f"q = {q}", style._replace(line="solid")) for q, style in styles.items()]
+def _finals(stage: StageRuns, title: str, scopes: Sequence[Scope]) -> Drawing:
+    facets, subplots = Facets.of(stage), []
+    labels = {condition: facets.label(condition) for condition in stage.conditions}
+    for scope in scopes:
+        by_title: dict[str, list[FinalScores]] = {}
+        for final in scope.finals:
+            by_title.setdefault(facets.title(scope.name, final.condition), []).append(final)
+        for name, shown in by_title.items():
+            subplots.append(finals_subplot(name, scope, shown, facets.styles, labels))
+    return Drawing(
+        stage=stage.name,
+        title=title,
+        caption="Large marks: mean. Bars: 95% CI. Small ticks: single runs.",
+        subplots=tuple(subplots),
+        legend=[],  # each row has its label
+    )
 
 
-def _sensitivity(analysis: StageAnalysis) -> Iterator[Drawing]:
-    """The final values over settings, where more than q varies."""
-    if panels := sensitivity_panels(analysis):
+def _against_entropy(sweep: Sweep, stage: StageRuns) -> Iterator[Drawing]:
+    # Other settings move the points, so that color and marker stand for q alone.
+    by_q = _styles_by_q(stage.conditions)
+    styles = {condition: by_q[condition.entropic_index] for condition in stage.conditions}
+    subplots = [entropy_subplot(sweep, task, styles) for task in stage.tasks]
+    if any(subplots) and len(stage.conditions) > 1:
         yield Drawing(
-            stage=analysis.stage.name,
-            title=SENSITIVITY,
-            caption=_SENSITIVITY,
-            panels=tuple(panels),
-            legend=_legend_by_q(analysis.stage),
-            group=SETTINGS,
+            stage=stage.name,
+            title=AGAINST_ENTROPY,
+            caption="One point for each finished run. If all q fall on one curve, entropy explains "
+            "performance; if they differ at equal entropy, q itself matters.",
+            subplots=tuple(filter(None, subplots)),
+            legend=_legend(by_q),
         )
 
 
-_SENSITIVITY = (
-    "Mean of what the runs ended at over the entropy coefficient α and the weight of "
-    "the MI reward, linear between the settings that were tried (marks); nothing outside of them "
-    "is known."
-)
+def _styles_by_q(conditions: Sequence[Condition]) -> dict[str, Style]:
+    """A style for each q, whatever other settings its conditions have."""
+    indices = dict.fromkeys(condition.entropic_index for condition in conditions)
+    alone = tuple(Condition(entropic_index=q, others=(), runs=()) for q in indices)
+    return {one.entropic_index: style for one, style in styles_of(alone).items()}
+
+
+def _legend(by_q: Mapping[str, Style]) -> Legend:
+    return [(f"q = {q}", style) for q, style in by_q.items()]
+
+
+# The study --------------------------------------------------------------------------------------
+
+
+def study_drawings(study: Study) -> Iterator[Drawing]:
+    """The performance profile of the primary metric, and its dependence on α and the MI weight."""
+    if study.stage is None or not study.means:
+        return
+    styles, kind = styles_of(study.stage.compared), study.means[0].measure.kind_in_words
+    shown = {mean.condition: styles[mean.condition] for mean in study.means}
+    rates = [mean for mean in study.means if mean.measure.is_rate]
+    by_task = [(task, list(found)) for task, found in groupby(rates, lambda mean: mean.task)]
+    if profiles := [
+        profile_subplot(task, means, styles)
+        for task, means in by_task
+        if 1 < len(means) <= MOST_CONDITIONS
+    ]:
+        yield Drawing(
+            stage=study.stage.name,
+            title=f"Performance profile of the {kind}",
+            caption="Share of finished runs above each value, with pointwise 95% bands.",
+            subplots=tuple(profiles),
+            legend=[(condition.short_label, style) for condition, style in shown.items()],
+        )
+    by_q = _styles_by_q(list(shown))
+    lines = groupby(alpha_sensitivity(study.means), lambda line: line.task)
+    if of_alpha := [alpha_subplot(task, list(found), by_q) for task, found in lines]:
+        yield Drawing(
+            stage=study.stage.name,
+            title=f"{kind.capitalize()} against α",
+            group=SETTINGS,
+            caption="Mean over the seeds with its 95% band, a line for each q. A comparison at one "
+            "value of α is the comparison of the lines at this α.",
+            subplots=tuple(of_alpha),
+            legend=_legend(by_q),
+        )
+    if contours := tuple(contour_subplots(study.means)):
+        yield Drawing(
+            stage=study.stage.name,
+            title=f"{kind.capitalize()} against α and MI weight",
+            group=SETTINGS,
+            caption="Mean over the seeds, interpolated between the tested settings (marks).",
+            subplots=contours,
+            legend=[],
+        )
+
+
+# The overview -----------------------------------------------------------------------------------
+
+
+def overview(sweep: Sweep, stages: Sequence[StageRuns]) -> tuple[Subplot, ...]:
+    """For each task its primary metric, the displacement of objects, and the MI bound.
+
+    The success rate is left out while it is below `SEEN` and objects have been moved.
+    """
+    tasks = dict.fromkeys(task for stage in stages for task in stage.tasks)
+    return tuple(subplot for task in tasks for subplot in _of_task(sweep, stages, task))
+
+
+def _of_task(sweep: Sweep, stages: Sequence[StageRuns], task: str) -> Iterator[Subplot]:
+    stages = [stage for stage in stages if task in stage.tasks]
+    shown = [(stage, condition) for stage in stages for condition in stage.compared]
+    style_of = styles_of(tuple(condition for _, condition in shown))
+    primary, found = sweep.primary_metric(task), {}
+    for name in (primary, names.EVAL_DISPLACEMENT, names.MI_BOUND):
+        curves = [(stage, curve(sweep, one, task, name)) for stage, one in shown]
+        found[name] = [
+            (stage, one)
+            for stage, one in curves
+            if one is not None
+            # Without the task's reward, success is chance. A frozen estimator has no bound.
+            and (name != primary or stage.has_task_reward)
+            and (name != names.MI_BOUND or one.estimate.value.max() > 0)
+        ]
+    best = max((float(one.estimate.value.max()) for _, one in found[primary]), default=0.0)
+    if primary in names.EVAL_RATES and best < SEEN and found[names.EVAL_DISPLACEMENT]:
+        del found[primary]
+    for metric in METRICS:
+        lines = found.get(metric.name, ())
+        if 0 < len(lines) <= MOST_LINES:
+            legend = [
+                (_name(stage, one.condition, several=len(stages) > 1), style_of[one.condition])
+                for stage, one in lines
+            ]
+            yield curve_subplot(metric, task, [one for _, one in lines], style_of, legend)
+
+
+def _name(stage: StageRuns, condition: Condition, *, several: bool) -> str:
+    """The condition by its stage if there are several, and by its label unless it is the only."""
+    label = condition.label if len(stage.compared) > 1 or not several else ""
+    return ", ".join(filter(None, (stage.name if several else "", label)))

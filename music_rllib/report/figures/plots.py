@@ -1,11 +1,7 @@
-"""Panels of learning curves, final values, profiles and entropies (the paper's Figures 4 to 7).
-
-A *panel* shows one task; its function `draw` draws it on given axes.
-"""
+"""Subplots of figures: learning curves, final values, profiles, entropies and settings."""
 
 from __future__ import annotations
 
-import itertools
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,42 +9,37 @@ from typing import Literal
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
 from matplotlib.lines import Line2D
-from matplotlib.ticker import EngFormatter
+from matplotlib.ticker import EngFormatter, LogFormatter
 
 from music_rllib import names
-from music_rllib.report.figures.palette import Style, styles_of
+from music_rllib.report.figures.palette import Style
 from music_rllib.results import statistics as st
 from music_rllib.results.analysis import Curve, FinalScores, Scope
-from music_rllib.results.conditions import Condition
+from music_rllib.results.conditions import ALPHA, Condition
 from music_rllib.results.data import Sweep
 from music_rllib.results.scores import Measure, measure_on, scores_of
-from music_rllib.results.statistics import SHOW_SEEDS_BELOW, Array, Estimate, interval_text, number
+from music_rllib.results.statistics import SHOW_SEEDS_BELOW, Array, Estimate
+from music_rllib.results.study import AlphaLine, Mean
 
 Legend = Sequence[tuple[str, Style]]
 """(label, style) pairs."""
+Styles = Mapping[Condition, Style]
 
-EPOCH = 80_000
-"""Environment steps of an epoch in the original MUSIC: 16 workers x 2 rollouts x 50 cycles x 50."""
-PANEL = (4.3, 3.0)
-"""Width and height in inches, at which 10 pt are readable on a page of 400 px."""
-_TOP_WITH_EPOCHS = 0.62
-SAME = 0.008
-"""Share of the axis within which lines cover each other."""
-_DASH = 2.5
-"""Length of the dashes of lines that cover others, in line widths."""
+HEIGHT = 3.0
+"""Height of a subplot in inches."""
 MOST_BANDS = 8
-"""Largest number of lines in a panel that have bands and lines of single seeds."""
-_MOST_RANKS = 9
-_CROWDED = 10
-"""Largest number of lines whose dashes tell how many others they cover; of more, one kind does."""
-_LABEL = 46
-"""Largest number of letters in a line of a row's label."""
+"""Largest number of lines in a subplot that have bands and lines of single seeds."""
+_LABEL = 26
+"""Largest number of letters in a line of a label inside a subplot."""
+MOST_TICKS = 8
+"""Largest number of values of a setting that each have a tick."""
+FEWEST_POINTS = 4
+"""Smallest number of settings that have contours."""
 TARGET = 0.85
 """Success rate that Figure 4 of the paper waits for."""
+RATE_LIMITS = (-0.03, 1.03)
 
 
 @dataclass(frozen=True)
@@ -63,7 +54,6 @@ class Metric:
     target: float | None = None
 
 
-RATE_LIMITS = (-0.03, 1.03)
 METRICS = (
     Metric(names.EVAL_SUCCESS, "Success rate", "success rate", RATE_LIMITS, TARGET),
     Metric(names.EVAL_RETURN, "Return", "return of an episode"),
@@ -77,122 +67,133 @@ METRICS = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Panel:
+class Subplot:
     """One task's part of a figure."""
 
     title: str
     draw: Callable[[Axes], None]
-    top: float = 0.32
-    """Margin in inches for the title and for an axis above the panel."""
-    height: float = PANEL[1]
-    """Height in inches, margins included."""
+    height: float = HEIGHT
+    """Height in inches."""
 
 
-def curve_panel(
-    metric: Metric,
-    title: str,
-    curves: Sequence[Curve],
-    styles: Mapping[Condition, Style],
-    *,
-    with_epochs: bool = True,
-) -> Panel:
-    """`metric` against environment steps, one line with its band per condition.
-
-    A second axis counts epochs of the original MUSIC if it is wanted and the curves have at least
-    one.
-    """
-    epochs = with_epochs and max(float(curve.steps[-1]) for curve in curves) >= EPOCH
-    ranks = _ranks(curves, metric)
-    numbers = {condition: number for number, condition in enumerate(styles)}
+def curve_subplot(
+    metric: Metric, title: str, curves: Sequence[Curve], styles: Styles, legend: Legend = ()
+) -> Subplot:
+    """`metric` against environment steps: a line with its band for each condition."""
     with_bands = len(curves) <= MOST_BANDS
 
     def draw(axes: Axes) -> None:
-        drawn = [
-            _draw_curve(
-                axes, curve, styles[curve.condition], rank, at / len(curves), seeds=with_bands
-            )
-            for at, (curve, rank) in enumerate(zip(curves, ranks, strict=True))
-        ]
+        for place, curve in enumerate(curves):
+            style = styles[curve.condition]
+            if with_bands and 1 < len(curve.values) < SHOW_SEEDS_BELOW:
+                axes.plot(curve.steps, curve.values.T, color=style.color, lw=0.6, alpha=0.55)
+            _draw_curve(axes, curve, style, place / len(curves))
         axes.autoscale_view()
-        # Limits are those of the lines: a band of two seeds may be many times as wide.
-        axes.set_ylim(axes.get_ylim())
-        for curve, artists in zip(curves, drawn, strict=True):
-            if with_bands:
-                colour = styles[curve.condition].colour
-                artists.append(_band(axes, curve.steps, curve.estimate, colour))
-            mark_condition(artists, numbers[curve.condition], curve.condition.label)
+        # The lines set the limits: a band of two seeds may be many times as wide.
+        axes.set_ylim(metric.limits or axes.get_ylim())
+        for curve in curves if with_bands else ():
+            _band(axes, curve.steps, curve.estimate, styles[curve.condition].color)
         axes.set_xlim(left=0.0)
-        axes.set_ylabel(metric.axis)
         axes.set_xlabel("environment steps")
+        axes.set_ylabel(metric.axis)
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-        if metric.limits is not None:
-            axes.set_ylim(*metric.limits)
         if metric.target is not None:
-            ink = mpl.rcParams["axes.edgecolor"]
-            axes.axhline(metric.target, color=ink, linewidth=0.8, linestyle=(0, (1, 3)))
-        if epochs:
-            _add_epochs(axes)
-
-    return Panel(title=title, draw=draw, **({"top": _TOP_WITH_EPOCHS} if epochs else {}))
-
-
-def profile_panel(scope: Scope, siblings: tuple[Condition, ...]) -> Panel:
-    """Share of finished runs that end above each success rate."""
-    styles = styles_of(siblings)
-    thresholds = np.linspace(0.0, 1.0, 41)
-    profiles = [(final, st.performance_profile(final.scores, thresholds)) for final in scope.finals]
-
-    def draw(axes: Axes) -> None:
-        for final, profile in profiles:
-            colour, line = styles[final.condition].colour, styles[final.condition].stroke
-            lines = axes.step(
-                thresholds, profile.value, where="post", color=colour, linestyle=line, linewidth=1.8
+            axes.axhline(metric.target, color=mpl.rcParams["axes.edgecolor"], lw=0.8, ls="dotted")
+        if legend:
+            short = [(textwrap.fill(label, _LABEL), style) for label, style in legend]
+            handles = legend_handles(short)
+            inside = axes.legend(
+                handles=handles, fontsize="small", framealpha=0.7, edgecolor="none"
             )
-            band = _band(axes, thresholds, profile, colour, step="post")
-            mark_condition([*lines, band], siblings.index(final.condition), final.condition.label)
-        axes.set_xlabel("final success rate τ")
-        axes.set_ylabel("share of runs above τ")
-        axes.set_xlim(-0.02, 1.02)
-        axes.set_ylim(-0.03, 1.03)
+            inside.set_in_layout(False)
 
-    return Panel(title=scope.name, draw=draw)
+    return Subplot(title=title, draw=draw)
 
 
-def finals_panel(
+def _draw_curve(axes: Axes, curve: Curve, style: Style, stagger: float) -> None:
+    """Draw the mean: thick where every run counts, thin after the first of them has ended."""
+    mean = curve.estimate.value
+    of_all_runs = np.where(curve.runs == curve.runs.max(), mean, np.nan)
+    every = max(1, len(curve.steps) // 8)
+    axes.plot(curve.steps, mean, color=style.color, linestyle=style.line, lw=0.8)
+    axes.plot(
+        curve.steps,
+        of_all_runs,
+        color=style.color,
+        linestyle=style.line,
+        lw=1.8,
+        marker=style.marker,
+        # Markers of lines that coincide stand beside each other.
+        markevery=(int(stagger * every), every),
+        markersize=5,
+    )
+
+
+def _band(
+    axes: Axes, at: Array, estimate: Estimate, color: str, step: Literal["post"] | None = None
+) -> None:
+    ends = (estimate.lower, estimate.upper)
+    axes.fill_between(at, *ends, color=color, alpha=0.2, linewidth=0, step=step)
+
+
+def finals_subplot(
     title: str,
     scope: Scope,
     shown: Sequence[FinalScores],
-    styles: Mapping[Condition, Style],
+    styles: Styles,
     labels: Mapping[Condition, str],
-) -> Panel:
-    """The final values of `shown`, some of `scope`, with their intervals and a mark for every run.
+) -> Subplot:
+    """Final values of `shown`, some of `scope`, with their intervals and a tick for each run.
 
-    Panels of the same scope have the same axis.
+    Subplots of the same scope have the same axis.
     """
     is_rate = scope.metric in names.EVAL_RATES
-    numbers = {condition: number for number, condition in enumerate(styles)}
-    rows, height = labelled_rows([labels[final.condition] for final in shown])
+    rows = [textwrap.fill(labels[final.condition], _LABEL) for final in shown]
+    lines = sum(row.count("\n") + 1.5 for row in rows)
 
     def draw(axes: Axes) -> None:
         scores = np.concatenate([final.scores.ravel() for final in scope.finals])
         # Intervals of two or three returns may be many times as wide as the runs' range.
         room = 0.5 * (np.ptp(scores) or 1.0)
-        limits = RATE_LIMITS if is_rate else (scores.min() - room, scores.max() + room)
-        axes.set_ylim(len(shown) - 0.5, -0.75)
-        axes.set_xlim(*limits)
-        axes.locator_params(axis="x", nbins=6)
-        rules_behind_rows(axes, len(shown))
-        for row, (final, label) in enumerate(zip(shown, rows, strict=True)):
-            artists = _draw_final(axes, row, final, styles[final.condition], label)
-            result = f"{number(final.value)}, {interval_text(final.estimate)}"
-            text = f"{final.condition.label}: {result}"
-            mark_condition(artists, numbers[final.condition], text)
+        axes.set_xlim(*(RATE_LIMITS if is_rate else (scores.min() - room, scores.max() + room)))
+        axes.set_ylim(len(shown) - 0.5, -0.5)
+        axes.set_yticks(range(len(shown)), rows)
+        axes.tick_params(axis="y", length=0)
+        axes.grid(visible=False, axis="y")
+        for row, final in enumerate(shown):
+            color, marker, _ = styles[final.condition]
+            runs = final.scores.ravel()
+            axes.plot(runs, np.full(len(runs), row + 0.25), "|", color=color, alpha=0.6, ms=7)
+            if final.estimate.has_interval:
+                ends = [float(final.estimate.lower), float(final.estimate.upper)]
+                axes.plot(ends, [row, row], color=color, lw=5, alpha=0.35)
+            axes.plot(final.estimate.value, row, marker, color=color, ms=7)
         axes.set_xlabel("final success rate" if is_rate else f"final {names.word_of(scope.metric)}")
 
-    return Panel(title=title, draw=draw, height=height)
+    return Subplot(title=title, draw=draw, height=max(HEIGHT, 1.0 + 0.2 * lines))
 
 
-def entropy_panel(sweep: Sweep, task: str, styles: Mapping[Condition, Style]) -> Panel | None:
+def profile_subplot(task: str, means: Sequence[Mean], styles: Styles) -> Subplot:
+    """Share of runs above each value of a task's primary metric, which is a rate."""
+    thresholds = np.linspace(0.0, 1.0, 101)
+
+    def draw(axes: Axes) -> None:
+        for mean in means:
+            style = styles[mean.condition]
+            scores = np.array(list(mean.scores.by_seed.values()))[:, np.newaxis]
+            profile = st.performance_profile(scores, thresholds)
+            axes.step(
+                thresholds, profile.value, where="post", color=style.color, linestyle=style.line
+            )
+            _band(axes, thresholds, profile, style.color, step="post")
+        axes.set_xlabel(f"{means[0].measure.words} τ")
+        axes.set_ylabel("share of runs above τ")
+        axes.set_ylim(*RATE_LIMITS)
+
+    return Subplot(title=task, draw=draw)
+
+
+def entropy_subplot(sweep: Sweep, task: str, styles: Styles) -> Subplot | None:
     """A point for each finished run on the task: its area under the curve over its entropy.
 
     Returns:
@@ -200,26 +201,22 @@ def entropy_panel(sweep: Sweep, task: str, styles: Mapping[Condition, Style]) ->
     """
     runs = [run for condition in styles for run in condition.runs]
     measure = measure_on(sweep, task, runs, "auc")
-    points = {condition: list(_by_entropy(sweep, condition, task, measure)) for condition in styles}
+    points = {condition: list(_points(sweep, condition, task, measure)) for condition in styles}
     if sum(map(len, points.values())) < 2:
         return None
 
     def draw(axes: Axes) -> None:
-        for place, (condition, pairs) in enumerate(points.items()):
-            style = styles[condition]
-            entropies, scores = zip(*pairs, strict=True) if pairs else ((), ())
-            marks = axes.plot(
-                entropies, scores, style.marker,
-                color=style.colour, markersize=6, alpha=0.75, mew=0,
-            )  # fmt: skip
-            mark_condition(marks, place, condition.label)
-        axes.set_xlabel("Shannon entropy at the end (nats)")
+        for condition, pairs in points.items():
+            color, marker, _ = styles[condition]
+            if pairs:
+                axes.plot(*zip(*pairs, strict=True), marker, color=color, ms=6, alpha=0.75, mew=0)
+        axes.set_xlabel("final Shannon entropy (nats)")
         axes.set_ylabel(measure.words)
 
-    return Panel(title=task, draw=draw)
+    return Subplot(title=task, draw=draw)
 
 
-def _by_entropy(
+def _points(
     sweep: Sweep, condition: Condition, task: str, measure: Measure
 ) -> Iterator[tuple[float, float]]:
     scores = scores_of(sweep, condition, task, measure).by_seed
@@ -230,145 +227,88 @@ def _by_entropy(
             yield entropy, scores[record.seed]
 
 
-def labelled_rows(labels: Sequence[str]) -> tuple[list[str], float]:
-    """Labels broken into lines that fit, and the height of a panel with a row per label."""
-    broken = [textwrap.fill(label, _LABEL, break_long_words=True) for label in labels]
-    lines = max((label.count("\n") + 1 for label in broken), default=1)
-    return broken, max(PANEL[1], 1.0 + len(labels) * (0.34 + 0.18 * lines))
+def alpha_subplot(task: str, lines: Sequence[AlphaLine], by_q: Mapping[str, Style]) -> Subplot:
+    """A line over α with its 95% band for each q."""
+
+    def draw(axes: Axes) -> None:
+        for line in lines:
+            color, marker, _ = by_q[line.entropic_index]
+            ends = (line.estimate.lower, line.estimate.upper)
+            axes.plot(line.alphas, line.estimate.value, color=color, marker=marker, lw=1.8)
+            axes.fill_between(line.alphas, *ends, color=color, alpha=0.15, linewidth=0)
+        alphas = np.unique(np.concatenate([line.alphas for line in lines]))
+        if alphas[0] > 0 and alphas[-1] / alphas[0] > 5:
+            axes.set_xscale("log")
+        if len(alphas) <= MOST_TICKS:
+            axes.set_xticks(alphas, [f"{alpha:g}" for alpha in alphas], minor=False)
+            axes.set_xticks([], minor=True)
+        elif axes.get_xscale() == "log":
+            # The scale's own labels are formulas, but text.parse_math is off.
+            axes.xaxis.set_major_formatter(LogFormatter())
+        axes.set_xlabel("α (entropy coefficient)")
+        axes.set_ylabel(lines[0].means[0].measure.words)
+
+    return Subplot(title=task, draw=draw)
 
 
-def rules_behind_rows(axes: Axes, rows: int, above: float = 0.14, below: float = 0.34) -> None:
-    """Draw grid lines behind each row's marks, and none behind its label."""
-    axes.set_yticks([])
-    axes.grid(visible=False)
-    low, high = axes.get_xlim()
-    at = [tick for tick in axes.get_xticks() if low <= tick <= high]
-    colour = mpl.rcParams["grid.color"]
-    for row in range(rows):
-        axes.vlines(at, row - above, row + below, color=colour, linewidth=0.8, zorder=0.5)
-    axes.set_xlim(low, high)
+def contour_subplots(means: Sequence[Mean]) -> Iterator[Subplot]:
+    """A contour over α and the MI reward's weight for each task and q where both of them vary."""
+    groups: dict[tuple[str, str], dict[tuple[float, float], list[float]]] = {}
+    for mean in means:
+        if (position := _position(mean.condition)) is not None:
+            group = groups.setdefault((mean.task, mean.condition.entropic_index), {})
+            group.setdefault(position, []).append(float(mean.estimate.value))
+    of_task = {task: [mean for mean in means if mean.task == task] for task, _ in groups}
+    for (task, q), points in groups.items():
+        where = np.array(list(points))
+        if len(where) >= FEWEST_POINTS and all(len(set(axis)) > 1 for axis in where.T):
+            values = np.array([np.mean(found) for found in points.values()])
+            yield _contour(f"{task}, q = {q}", where, values, of_task[task])
 
 
-def _ranks(curves: Sequence[Curve], metric: Metric) -> list[Array]:
-    """For each point of each curve, the number of earlier curves that run through it."""
-    if metric.limits is not None:
-        height = metric.limits[1] - metric.limits[0]
-    else:
-        values = np.concatenate([curve.estimate.value for curve in curves])
-        height = float(np.nanmax(values) - np.nanmin(values)) or 1.0
-    ranks = []
-    for place, curve in enumerate(curves):
-        rank = np.zeros(len(curve.steps))
-        for other in curves[:place]:
-            covered = np.interp(
-                curve.steps, other.steps, other.estimate.value, left=np.nan, right=np.nan
-            )
-            rank += np.abs(covered - curve.estimate.value) <= SAME * height
-        ranks.append(np.minimum(rank, _MOST_RANKS if len(curves) <= _CROWDED else 1))
-    return ranks
+def _position(condition: Condition) -> tuple[float, float] | None:
+    """The condition's α and weight; None if one of them is no number."""
+    settings = dict(condition.others)
+    try:
+        return float(settings.get(ALPHA, "")), float(settings.get("MI weight", ""))
+    except ValueError:
+        return None
 
 
-def _draw_curve(
-    axes: Axes, curve: Curve, style: Style, rank: Array, stagger: float, *, seeds: bool
-) -> list[Artist]:
-    """Draw a line: thick where every run counts, thin from where the first one ended.
+def _contour(title: str, where: Array, values: Array, of_task: Sequence[Mean]) -> Subplot:
+    """Contours at the same levels for every q of the task."""
+    levels = np.linspace(*_ends([float(mean.estimate.value) for mean in of_task]), 11)
 
-    With `seeds`, few of them have lines of their own. Where lines coincide the later ones are
-    dashed, so that each earlier one shows in the gaps.
-    """
-    colour, marker, line = style.colour, style.marker, style.stroke
-    value = curve.estimate.value
-    artists: list[Artist] = []
-    if seeds and 1 < len(curve.values) < SHOW_SEEDS_BELOW:
-        artists += axes.plot(curve.steps, curve.values.T, color=colour, linewidth=0.6, alpha=0.55)
-    whole = curve.runs == curve.runs.max()
-    stretches = _stretches(np.column_stack([curve.steps, value]), rank, whole)
-    for (covers, thick), parts in stretches.items():
-        dash = (0.0, (_DASH, _DASH * covers)) if covers else line
-        width = 1.8 if thick else 0.8
-        lines = LineCollection(parts, colors=colour, linestyles=[dash], linewidths=width, zorder=2)
-        artists.append(axes.add_collection(lines))
-    every = max(1, len(curve.steps) // 8)
-    marks = np.where(whole, value, np.nan)
-    artists += axes.plot(
-        curve.steps,
-        marks,
-        color=colour,
-        linestyle="none",
-        marker=marker,
-        markevery=(int(stagger * every), every),
-        markersize=5,
-    )
-    return artists
+    def draw(axes: Axes) -> None:
+        x, y = where.T
+        surface = axes.tricontourf(_scaled(x), _scaled(y), values, levels=levels, cmap="cividis")
+        axes.plot(_scaled(x), _scaled(y), "o", color="#ffffff", mec="#1a1a1a", ms=5, clip_on=False)
+        for set_ticks, at in ((axes.set_xticks, x), (axes.set_yticks, y)):
+            distinct = np.unique(at)
+            ticks = distinct[np.linspace(0, len(distinct) - 1, min(5, len(distinct))).astype(int)]
+            set_ticks(_scaled(ticks), [f"{tick:g}" for tick in ticks])
+        axes.set_xlabel("α (entropy coefficient)")
+        axes.set_ylabel("MI reward weight")
+        axes.grid(visible=False)
+        axes.figure.colorbar(surface, ax=axes, label=of_task[0].measure.words)
+
+    return Subplot(title=title, draw=draw)
 
 
-def _stretches(points: Array, rank: Array, whole: Array) -> dict[tuple[int, bool], list[Array]]:
-    """Parts of a curve by the number of curves they cover and by whether every run counts there."""
-    covers = np.minimum(rank[:-1], rank[1:])
-    changes = np.flatnonzero((np.diff(covers) != 0) | (whole[1:-1] != whole[2:])) + 1
-    ends = [0, *changes, len(covers)]
-    stretches: dict[tuple[int, bool], list[Array]] = {}
-    for first, last in itertools.pairwise(ends):
-        if first < last:
-            key = (int(covers[first]), bool(whole[first + 1]))
-            stretches.setdefault(key, []).append(points[first : last + 1])
-    return stretches
+def _ends(values: Sequence[float]) -> tuple[float, float]:
+    low, high = min(values), max(values)
+    return low, high if high > low else low + 1.0
 
 
-def _band(
-    axes: Axes,
-    at: Array,
-    estimate: Estimate,
-    colour: str,
-    step: Literal["post"] | None = None,
-) -> Artist:
-    return axes.fill_between(
-        at, estimate.lower, estimate.upper, color=colour, alpha=0.2, linewidth=0, step=step
-    )
-
-
-def _draw_final(axes: Axes, row: int, final: FinalScores, style: Style, label: str) -> list[Artist]:
-    colour, marker, _ = style
-    scores = final.scores.ravel()
-    places = np.full(len(scores), row + 0.22)
-    artists: list[Artist] = [*axes.plot(scores, places, "|", color=colour, alpha=0.6, markersize=7)]
-    estimate = final.estimate
-    if estimate.has_interval:
-        ends = [float(estimate.lower), float(estimate.upper)]
-        artists += axes.plot(ends, [row, row], color=colour, linewidth=5, alpha=0.35)
-    artists += axes.plot(estimate.value, row, marker, color=colour, markersize=7)
-    return [*artists, row_label(axes, row - 0.2, label)]
-
-
-def row_label(axes: Axes, height: float, label: str) -> Artist:
-    """Write a label above a row's marks, at a distance from the axis."""
-    return axes.annotate(
-        label,
-        (0.0, height),
-        xycoords=axes.get_yaxis_transform(),
-        xytext=(3.0, 0.0),
-        textcoords="offset points",
-        va="bottom",
-        fontsize="small",
-    )
-
-
-def mark_condition(artists: Sequence[Artist], condition: int, title: str) -> None:
-    """Mark artists as a condition's, by its number: the page shows and hides them by it."""
-    for artist in artists:
-        artist.set_gid(f"condition-{condition}-{title}")
+def _scaled(values: Array) -> Array:
+    """Logarithms of values that span more than a factor of five."""
+    is_wide = values.min() > 0 and values.max() / values.min() > 5
+    return np.asarray(np.log10(values) if is_wide else values)
 
 
 def legend_handles(legend: Legend) -> list[Line2D]:
     """A line with its marker for each entry of a legend."""
     return [
-        Line2D([], [], color=style.colour, marker=style.marker, linestyle=style.stroke, label=label)
+        Line2D([], [], color=style.color, marker=style.marker, linestyle=style.line, label=label)
         for label, style in legend
     ]
-
-
-def _add_epochs(axes: Axes) -> None:
-    scales = (lambda steps: np.divide(steps, EPOCH), lambda epochs: np.multiply(epochs, EPOCH))
-    above = axes.secondary_xaxis("top", functions=scales)
-    above.set_xlabel("epochs of 80 000 steps", fontsize="small", labelpad=2)
-    above.tick_params(labelsize="small", pad=1)

@@ -20,7 +20,6 @@ import yaml
 
 from music_rllib import load_sweep
 from music_rllib.program import main as sweep
-from music_rllib.report.cli import main as report
 from tests.integration.conftest import call
 
 pytestmark = pytest.mark.e2e
@@ -85,8 +84,8 @@ def test_results_in_hand(output: tuple[Path, str], monkeypatch: pytest.MonkeyPat
     success = known["success"]
     assert sorted(set(success["q"])) == [1.0, 1.5, 2.0]
     assert success["env_steps"].max() == 300
-    export = ["results/my_sweep", "--export", "published/my_sweep", "--format", "csv"]
-    said(report, folder, *export)
+    export = ["report", "results/my_sweep", "--export", "published/my_sweep", "--format", "csv"]
+    said(sweep, folder, *export)
     first, second = load_sweep("results/my_sweep"), load_sweep("published/my_sweep")
     pd.testing.assert_frame_equal(
         first.conditions.sort_values("q"), second.conditions.sort_values("q")

@@ -22,8 +22,8 @@ from music_rllib.experiment.open_sweep import open_sweep
 from music_rllib.experiment.plan import Node, make_plan
 from music_rllib.experiment.record import keep_record
 from music_rllib.experiment.scheduler import Failure
+from music_rllib.program import app
 from music_rllib.report.build import PAGE
-from music_rllib.report.cli import app
 from music_rllib.results.archive import Format, read_archive, write_archive
 from music_rllib.results.data import RunRecord, Sweep
 from music_rllib.results.read import read_sweep
@@ -174,7 +174,7 @@ def searched(sweep_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 def page(sweep_folder: Path) -> Path:
     """As a user makes it."""
     done = subprocess.run(
-        [sys.executable, "-m", "music_rllib.report", str(sweep_folder)],
+        [sys.executable, "-m", "music_rllib", "report", str(sweep_folder)],
         capture_output=True,
         text=True,
         check=False,
@@ -192,7 +192,7 @@ def page(sweep_folder: Path) -> Path:
 
 
 def run(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+    return CliRunner().invoke(app, ["report", *map(str, arguments)])
 
 
 def check_content(sweep: Sweep, nodes: list[Node]) -> None:
@@ -270,10 +270,10 @@ def test_the_page_shows_what_a_search_found(searched: Path, tmp_path: Path) -> N
     text = re.sub(r"<[^>]+>", "|", page.read_text().partition("Search of stage")[2])
     cells = [cell for cell in text.split("|") if cell.strip()]
     assert "trials: 1 judged, 1 pruned." in text
-    ranked = cells[cells.index("Best is better with") + 1 :]
+    ranked = cells[cells.index("Probability that the best is better") + 1 :]
     assert ranked[:8] == ["1", "0", "1.25", "0.69", "0.50 to 0.75", "2", "0.81", "–"]
     assert "failed: no memory" in ranked
-    assert ranked[ranked.index(Q) + 1] == "90 %"
+    assert ranked[ranked.index(Q) + 1] == "90%"
     assert "0.1 is not among the best &lt;2&gt;" in ranked
 
 
@@ -284,7 +284,7 @@ def test_a_report_needs_neither_ray_nor_mlflow(
     run(sweep_folder, "--export", exported)
     code = (
         "import sys; sys.modules['ray'] = sys.modules['mlflow'] = None\n"
-        "from music_rllib.report.cli import app; app(sys.argv[1:], standalone_mode=False)"
+        "from music_rllib.program import main; sys.exit(main(['report', *sys.argv[1:]]))"
     )
     command = [sys.executable, "-c", code, str(exported)]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
@@ -293,7 +293,7 @@ def test_a_report_needs_neither_ray_nor_mlflow(
         tables = (page.parent, exported / "report")
         one, other = ((folder / "tables" / f"{name}.csv").read_text() for folder in tables)
         # An export has only the runs that have begun.
-        assert [line for line in one.splitlines() if "SCHEDULED" not in line] == other.splitlines()
+        assert [line for line in one.splitlines() if ",waiting," not in line] == other.splitlines()
 
 
 def test_there_is_no_such_sweep(sweep_folder: Path, tmp_path: Path) -> None:

@@ -19,10 +19,10 @@ import pytest
 
 from music_rllib import names
 from music_rllib.experiment.sweep_files import SweepLocation
+from music_rllib.report import live
 from music_rllib.report.build import build_report
-from music_rllib.report.live import server
-from music_rllib.report.live.state import Progress
-from music_rllib.report.page import Report, render
+from music_rllib.report.live import Progress
+from music_rllib.report.page import SweepReport, render
 from music_rllib.results.archive import merged, read_archive
 from music_rllib.results.data import Sweep
 from tests.integration.devtools import Page
@@ -45,7 +45,7 @@ CHOOSE = """(([label, value]) => {
   list.value = value;
   list.dispatchEvent(new Event("change"));
 })(%r)"""
-ENDED = '[aria-label="What runs ended at"]'
+ENDED = '[aria-label="Final values"]'
 AXIS = "document.querySelector('#learning-curves .chart').textContent"
 
 
@@ -58,7 +58,7 @@ def two_tasks() -> Sweep:
 
 
 @pytest.fixture(scope="module")
-def page(report: Report, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def page(report: SweepReport, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("report") / "report.html"
     path.write_text(render(report))
     return path
@@ -74,8 +74,8 @@ async def drawn(page: Page, path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def report() -> Report:
-    return build_report(two_tasks(), command="python -m music_rllib.report results/two-tasks")
+def report() -> SweepReport:
+    return build_report(two_tasks(), command="music-rllib report results/two-tasks")
 
 
 @pytest.fixture
@@ -201,18 +201,18 @@ def test_printed_and_without_a_script_everything_is_there(
             await tab.view(800, 1000)
             await tab.without_script()
             await tab.go(page.as_uri())
-            await tab.wait_for("How to read this")
+            await tab.wait_for("Method")
             seen = await tab.evaluate(LOOK)
-            panels = await tab.evaluate(
-                "[...document.querySelectorAll('.panels svg')]"
+            subplots = await tab.evaluate(
+                "[...document.querySelectorAll('.subplots svg')]"
                 ".filter((one) => one.clientWidth > 200).length"
             )
-            return charts, {**seen, "panels": panels}
+            return charts, {**seen, "subplots": subplots}
 
     charts, seen = asyncio.run(use())
     assert charts >= 8
     assert seen["charts"] == 0
-    assert seen["panels"] >= 8
+    assert seen["subplots"] >= 8
     assert seen["width"] <= 800
     assert not seen["cut"]
     assert not seen["faint"]
@@ -223,14 +223,14 @@ def serve(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[Callable[[Callable[[], str]], str]]:
     """Serves the page of the sweep `tiny`, and gives its address."""
-    monkeypatch.setattr(server, "LEAST_PAUSE", 0.2)
-    monkeypatch.setattr(server, "_RELAX", 1.0)
+    monkeypatch.setattr(live, "LEAST_PAUSE", 0.2)
+    monkeypatch.setattr(live, "PAUSE_FACTOR", 1.0)
     place, opened = SweepLocation(storage=str(tmp_path), name="tiny"), ExitStack()
 
     def start(make_page: Callable[[], str]) -> str:
-        live = server.LivePage(make_page, Progress(place))
-        opened.callback(live.close)
-        http = server.make_server(live, 0)
+        shown = live.LivePage(make_page, Progress(place))
+        opened.callback(shown.close)
+        http = live.make_server(shown, 0)
         opened.callback(http.server_close)
         threading.Thread(target=http.serve_forever, daemon=True).start()
         opened.callback(http.shutdown)
@@ -243,7 +243,7 @@ def serve(
 def test_the_live_page_takes_up_what_is_new_and_leaves_the_reader_where_he_is(
     open_page: Callable[[], Page],
     serve: Callable[[Callable[[], str]], str],
-    report: Report,
+    report: SweepReport,
     tmp_path: Path,
 ) -> None:
     write_state(tmp_path, 100, time.time())

@@ -24,7 +24,6 @@ from mlflow import MlflowClient
 from music_rllib import load_sweep, names
 from music_rllib.program import main
 from music_rllib.report.build import PAGE
-from music_rllib.report.cli import main as report
 from tests.integration.conftest import (
     ENVIRONMENTS,
     SWEEP,
@@ -266,7 +265,7 @@ def test_a_finer_sweep_reuses_what_is_finished(
 def check_frames(folder: Path, export: Path) -> None:
     """The same from the storage and from an export."""
     place = folder / "results" / "points"
-    assert report([str(place), "--export", str(export)]) == 0
+    assert main(["report", str(place), "--export", str(export)]) == 0
     first, other = load_sweep(place), load_sweep(export)
     for name, order in (("curves", ["key", "metric", "env_steps"]), ("conditions", ["stage", "q"])):
         one, two = (getattr(read, name).sort_values(order) for read in (first, other))

@@ -19,7 +19,7 @@ from music_rllib.experiment.open_sweep import open_sweep
 from music_rllib.experiment.plan import make_plan
 from music_rllib.experiment.record import keep_record
 from music_rllib.experiment.run_info import run_info
-from music_rllib.report.cli import app
+from music_rllib.program import app
 from music_rllib.results.archive import read_archive
 from music_rllib.results.data import Sweep
 from music_rllib.store.history import Report
@@ -51,7 +51,7 @@ def log_published_sweep(folder: Path) -> str:
             tracker.mirror(run_info(node), partial(finished_run, opened.store, node))
         tracker.keep_view(comparison_view(plan, tracker.sweep_id, time.time()), VERSIONS)
         assert tracker.flush(60.0)
-    arguments = [str(folder / NAME), "--attach", "--no-videos"]
+    arguments = ["report", str(folder / NAME), "--attach", "--no-videos"]
     assert CliRunner().invoke(app, arguments).exit_code == 0
     return tracker.comparison_url().partition("/#/")[2]
 

@@ -95,9 +95,9 @@ def test_a_sweep_says_so_and_starts_nothing(
 
 
 def test_a_report_that_is_to_be_attached_says_so(uri: str, status: int, tmp_path: Path) -> None:
-    from music_rllib.report.cli import app
+    from music_rllib.program import app
 
     folder = kept_sweep(tmp_path, uri)
-    done = CliRunner().invoke(app, [str(folder), "--attach", "--no-videos"])
+    done = CliRunner().invoke(app, ["report", str(folder), "--attach", "--no-videos"])
     check(done.exit_code, done.stderr, status)
     assert (folder / "report" / "report.html").is_file()

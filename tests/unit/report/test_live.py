@@ -18,8 +18,8 @@ import pytest
 from music_rllib.errors import TrackingError
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.sweep_files import SweepLocation
-from music_rllib.report.live import server
-from music_rllib.report.live.state import Progress
+from music_rllib.report import live
+from music_rllib.report.live import Progress
 from music_rllib.store.lease import this_machine
 
 RUNNING = {"run": "train/A/seed0", "env_steps": 40, "budget": 100, "metric": "m", "value": None}
@@ -83,12 +83,12 @@ def test_speed_and_the_time_left_are_those_of_the_last_minutes(
 @pytest.fixture
 def served(found: SweepLocation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """The address of the page."""
-    monkeypatch.setattr(server, "LEAST_PAUSE", 0.05)
-    monkeypatch.setattr(server, "READ_SECONDS", 0.2)
+    monkeypatch.setattr(live, "LEAST_PAUSE", 0.05)
+    monkeypatch.setattr(live, "READ_SECONDS", 0.2)
     write_state(tmp_path, 100, time.time())
     made = iter(range(1000))
-    page = server.LivePage(lambda: f"<p>page {next(made)}", Progress(found))
-    http = server.make_server(page, 0)
+    page = live.LivePage(lambda: f"<p>page {next(made)}", Progress(found))
+    http = live.make_server(page, 0)
     thread = threading.Thread(target=http.serve_forever, daemon=True)
     thread.start()
     yield f"http://127.0.0.1:{http.server_port}"
@@ -155,7 +155,7 @@ def test_a_page_that_cannot_be_made_is_said_and_made_later(
     found: SweepLocation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its thread would end with the first error, and the page stay as it is without a word."""
-    monkeypatch.setattr(server, "LEAST_PAUSE", 0.05)
+    monkeypatch.setattr(live, "LEAST_PAUSE", 0.05)
     write_state(tmp_path, 100, time.time())
     answers: Iterator[Any] = chain(["one"], repeat(TrackingError("no answer"), 3), repeat("two"))
 
@@ -165,7 +165,7 @@ def test_a_page_that_cannot_be_made_is_said_and_made_later(
             raise answer
         return str(answer)
 
-    page = server.LivePage(make, Progress(found))
+    page = live.LivePage(make, Progress(found))
     said = set()
     deadline = time.monotonic() + 60
     while page.html != "two":
@@ -173,5 +173,5 @@ def test_a_page_that_cannot_be_made_is_said_and_made_later(
         assert time.monotonic() < deadline
         time.sleep(0.01)
     page.close()
-    assert "The page is an older one: no answer" in said
+    assert "The page is out of date: no answer" in said
     assert "error" not in page.state()

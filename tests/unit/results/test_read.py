@@ -20,9 +20,8 @@ from music_rllib.experiment.plan import Node, make_plan
 from music_rllib.experiment.record import keep_record
 from music_rllib.experiment.scheduler import Failure
 from music_rllib.program import main
-from music_rllib.report import cli as report
-from music_rllib.report.limitations import missing
-from music_rllib.report.web.sections import failures
+from music_rllib.report.build import limitations
+from music_rllib.report.tables import failures_table
 from music_rllib.results.analysis import analyse
 from music_rllib.results.read import read_sweep
 from music_rllib.results.study import study_of
@@ -153,7 +152,7 @@ class Shown:
         sentence: str | None = self.read.earlier
         assert self.compared["earlier"] == self.status["earlier"] == sentence
         assert self.frames.earlier == sentence
-        said = missing(self.read, analyse(self.read))
+        said = limitations(self.read, analyse(self.read))
         assert [line for line in said if "earlier version" in line] == [sentence] * bool(sentence)
         return sentence
 
@@ -283,9 +282,9 @@ def test_damaged_runs_raise_or_count_as_unfinished(tmp_path: Path) -> None:
     study = study_of(read.sweep)
     assert [claim.why for claim in study.claims] == ["1 run is not finished"]
     assert sum(mean.scores.failed for mean in study.means) == 0, "a damaged run is no bad one"
-    (row,) = failures(read.sweep).rows
+    (row,) = failures_table(read.sweep).rows
     assert row[0] == bad.label
-    assert missing(read.sweep, ()) == []
+    assert limitations(read.sweep, ()) == []
 
 
 def test_a_run_is_read_with_its_reports_and_code_versions(tmp_path: Path) -> None:
@@ -317,7 +316,7 @@ def test_adding_to_an_export_replaces_changed_runs(
 
     def exported(*options: str) -> dict[str, int | None]:
         place = str(tmp_path / "results" / "s")
-        assert report.main([place, "--export", str(export), *options]) == 0
+        assert main(["report", place, "--export", str(export), *options]) == 0
         return {run.name[-5:]: run.budget for run in read_sweep(str(export)).sweep.runs}
 
     play(tmp_path, seeds=2, qs=(1.0,))

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from music_rllib import names
+from music_rllib.report.figures.choice import study_drawings
 from music_rllib.report.figures.draw import files
-from music_rllib.report.study import study_csv, study_drawings, study_tables
+from music_rllib.report.tables import study_tables
 from music_rllib.results.analysis_plan import AnalysisPlan, PlanVersion, checked_plans, with_plan
 from music_rllib.results.analysis_plan import as_document as plans_as_document
 from music_rllib.results.answer import answer, seeds_needed
@@ -219,13 +220,11 @@ def test_sensitivity_to_alpha_has_a_line_for_each_q(rng: np.random.Generator) ->
     np.testing.assert_allclose(lines[0].estimate.value, [0.1, 0.2, 0.3], atol=0.04)
     assert np.all(lines[0].estimate.lower < lines[0].estimate.value)
     profile, area = study_drawings(found)
-    assert [len(drawing.panels) for drawing in (profile, area)] == [1, 1]
+    assert [len(drawing.subplots) for drawing in (profile, area)] == [1, 1]
     assert [label for label, _ in area.legend] == ["q = 1", "q = 1.5"]
-    assert files(area.panels, area.legend)
-    tables = {table.name: table for table in study_csv(found)}
-    assert [row[3] for row in tables["alpha_sensitivity"].rows] == [0.01, 0.02, 0.1] * 2
-    assert len(tables["area_under_curve"].rows) == 6
-    assert len(tables["comparisons"].rows) == 15
+    assert files(area.subplots, area.legend)
+    comparisons, means = study_tables(found)
+    assert (len(comparisons.rows), len(means.rows)) == (15, 6)
 
 
 def test_many_conditions_are_compared_with_q_1_at_equal_settings(rng: np.random.Generator) -> None:

@@ -16,7 +16,7 @@ from music_rllib.config.schema import SweepConfig
 from music_rllib.config.tac_settings import LearnedAlpha, setting_text
 from music_rllib.experiment.plan import Plan, make_plan
 from music_rllib.experiment.scheduler import Failure, Scheduler
-from music_rllib.report.figures.palette import colour_of
+from music_rllib.report.figures.palette import color_of
 from music_rllib.schedules import Linear, Piecewise
 from music_rllib.store.history import Report, RunResult
 from music_rllib.store.storage import resolve_storage, sweep_folder
@@ -138,7 +138,7 @@ def test_the_plan_says_what_follows_what_is_measured(tmp_path: Path) -> None:
     ]
     row = alpha_rows(plan)[1]
     assert (row["q"], row["q_at_start"], row["at_end"]) == ("2 to 1 by success rate", 2.0, 0.05)
-    assert colour_of(row["q"]) == colour_of("1"), "it has that of its last value"
+    assert color_of(row["q"]) == color_of("1"), "it has that of its last value"
 
 
 def test_results_have_a_row_per_run_whatever_became_of_it(plan: Plan) -> None:

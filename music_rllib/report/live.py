@@ -1,45 +1,133 @@
-"""The server of a running sweep's page, on loopback. It only shows; no request changes anything."""
+"""The live page: a report of a running sweep and its progress, served on this machine.
+
+The page is read-only: no request changes anything.
+"""
 
 from __future__ import annotations
 
 import json
+import shlex
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
+from functools import cached_property
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 from urllib.parse import urlsplit
 
+from music_rllib import names
 from music_rllib.errors import BadInputError, first_line
 from music_rllib.experiment import sweep_files
-from music_rllib.redaction import for_people
-from music_rllib.report.live.state import Progress
+from music_rllib.experiment.sweep_files import SweepLocation
+from music_rllib.labels import ShortLabels
+from music_rllib.redaction import for_people, redact
 from music_rllib.store.storage import StorageError
 
 HOST = "127.0.0.1"
 LEAST_PAUSE = 10.0
-"""Least seconds between two pages."""
-_RELAX = 4.0
+"""Smallest number of seconds between two pages."""
+PAUSE_FACTOR = 4.0
 """Pause between two pages as a multiple of the time that the last one took."""
 READ_SECONDS = 10.0
-"""Longest wait for more of a request, and for the next one on a connection."""
+"""Largest number of seconds to wait for more of a request, and for the next one."""
+WINDOW = 120.0
+"""Seconds over which the speed is measured."""
+SHOWN = 50
+"""Largest number of running runs, and of failed ones, on the page."""
+
+
+class Progress:
+    """Reads a sweep's `state.json` for the page."""
+
+    def __init__(self, location: SweepLocation) -> None:
+        self._location = location
+        self._seen: deque[tuple[float, int]] = deque()
+
+    def read(self) -> dict[str, Any]:
+        """State, steps, speed, stages, running and failed runs of the sweep.
+
+        Raises:
+            StorageError: `state.json` is damaged or cannot be read.
+        """
+        state = self._location.read(sweep_files.STATE)
+        if state is None:
+            return {"sweep": self._location.name, "state": "not started"}
+        driver, steps = state["driver"], state["env_steps"]
+        left = steps["left"] + steps["to_come"]
+        running = sweep_files.is_alive(state)
+        outcome = driver["outcome"]
+        speed = self._speed(driver["heartbeat"], steps["done"]) if running else None
+        return {
+            "sweep": self._location.name,
+            "state": "interrupted" if outcome == "running" and not running else outcome,
+            "command": self._command(outcome, running=running),
+            "done": steps["done"],
+            "left": left,
+            "at_most": steps["to_come"] > 0,
+            "speed": speed,
+            "seconds_left": left / speed if speed else None,
+            "stages": [{"name": one["name"], "runs": one["runs"]} for one in state["stages"]],
+            "running": [
+                one | {"run": self._short(one["run"]), "metric": names.word_of(one["metric"])}
+                for one in state["running"][:SHOWN]
+                if running
+            ],
+            "failures": [
+                {"run": self._short(one["run"]), "cause": one["cause"]}
+                for one in state["failures"][-SHOWN:]
+            ],
+        }
+
+    def is_running(self) -> bool:
+        """Whether the sweep's driver is alive; False if its state cannot be read."""
+        try:
+            return bool(self.read()["state"] == "running")
+        except StorageError:
+            return False
+
+    def _command(self, outcome: str, *, running: bool) -> str | None:
+        """The command that stops a running sweep or resumes a stopped one, without secrets."""
+        if outcome == "finished":
+            return None
+        name, storage = self._location.name, redact(self._location.storage)
+        verb = "stop" if running else "resume"
+        return shlex.join(["music-rllib", verb, name, "--storage", storage])
+
+    @cached_property
+    def _short(self) -> ShortLabels:
+        config = self._location.read(sweep_files.CONFIG) or {"tasks": [], "stages": []}
+        tasks = {*config["tasks"]}.union(*(stage.get("tasks") or () for stage in config["stages"]))
+        return ShortLabels((stage["name"] for stage in config["stages"]), tasks)
+
+    def _speed(self, now: float, done: int) -> float | None:
+        """Environment steps per second of all runs; None before two different states."""
+        seen = self._seen
+        if seen and (now < seen[-1][0] or done < seen[-1][1]):
+            seen.clear()  # another driver has taken over
+        if not seen or now > seen[-1][0]:
+            seen.append((now, done))
+        while len(seen) > 2 and now - seen[0][0] > WINDOW:
+            seen.popleft()
+        (begin, before), (end, after) = seen[0], seen[-1]
+        return (after - before) / (end - begin) if after > before else None
 
 
 class LivePage:
-    """The newest page, made again and again while the sweep runs."""
+    """The newest page, which is made again and again while the sweep runs."""
 
     def __init__(self, make: Callable[[], str], progress: Progress) -> None:
         """Make the first page.
 
         Raises:
-            ReportError: there is no sweep to report on.
+            ReportError: There is no sweep to report on.
         """
         self._make, self._progress = make, progress
         self.html, self.version = make(), 1
         self._problem: str | None = None
-        """Why the newest page could not be made."""
+        """The reason why the newest page could not be made."""
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._follow, name="live page", daemon=True)
         self._thread.start()
@@ -59,7 +147,7 @@ class LivePage:
 
     def _follow(self) -> None:
         took, before = 0.0, self.state().get("state")
-        while not self._ended.wait(max(LEAST_PAUSE, _RELAX * took)):
+        while not self._ended.wait(max(LEAST_PAUSE, PAUSE_FACTOR * took)):
             now = self.state().get("state")
             if now != "running" and now == before:
                 continue
@@ -67,7 +155,7 @@ class LivePage:
             try:
                 html = self._make()
             except Exception as error:  # the storage is busy or down: try again later
-                self._problem = f"The page is an older one: {for_people(first_line(error))}"
+                self._problem = f"The page is out of date: {for_people(first_line(error))}"
                 continue
             self._problem = None
             took = time.monotonic() - began
@@ -81,7 +169,7 @@ class Server(ThreadingHTTPServer):
     daemon_threads = True
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Print nothing about a tab that was closed, or about an address that is none."""
+        """Print nothing about a tab that was closed, or about an invalid address."""
         if not isinstance(sys.exception(), ConnectionError | ValueError):
             super().handle_error(request, client_address)
 
@@ -90,7 +178,7 @@ def make_server(page: LivePage, port: int) -> Server:
     """A server on the port.
 
     Raises:
-        BadInputError: the port is taken.
+        BadInputError: The port is in use.
     """
     handler = type("Handler", (_Handler,), {"page": page, "timeout": READ_SECONDS})
     try:

@@ -11,7 +11,7 @@ function time(seconds) {
   return hours ? `${hours} h ${minutes} min` : minutes ? `${minutes} min` : `${Math.round(seconds)} s`;
 }
 
-/** Replaces the parts of the page that have changed; the others stay where they are. */
+/** Replaces the parts of the page that have changed. */
 async function renew() {
   const page = new DOMParser().parseFromString(await (await asked("/")).text(), "text/html");
   data = JSON.parse(page.getElementById("data").textContent);
@@ -23,7 +23,7 @@ async function renew() {
     before.style.minHeight = `${before.offsetHeight}px`;
     const charts = new Map([...before.querySelectorAll("figure")].map((one) => [one.id, one.querySelector(".live")]));
     before.replaceChildren(...now.childNodes);
-    // The old charts stay in their place until the new ones are drawn.
+    // The old charts stay until the new ones are drawn.
     for (const figure of before.querySelectorAll("figure")) {
       const chart = charts.get(figure.id);
       if (chart) figure.querySelector(".live")?.replaceWith(chart);
@@ -48,10 +48,10 @@ function showState(state) {
   const head = element("p", {}, box);
   element("strong", {}, head, `The sweep is ${state.state}. `);
   if (state.done !== undefined) {
-    const speed = state.speed ? `, ${shown(state.speed)} env steps per second` : "";
+    const speed = state.speed ? `, ${shown(state.speed)} environment steps per second` : "";
     const most = state.at_most ? "at most " : "";
-    const left = state.seconds_left ? `, ${most}${time(state.seconds_left)} left` : "";
-    head.append(`${state.done.toLocaleString("en")} env steps done, ${most}${state.left.toLocaleString("en")} to go${speed}${left}. `);
+    const left = state.seconds_left ? `, ${most}${time(state.seconds_left)} more` : "";
+    head.append(`${state.done.toLocaleString("en")} environment steps done, ${most}${state.left.toLocaleString("en")} left${speed}${left}. `);
   }
   if (state.error) head.append(state.error);
   if (state.command) {
@@ -65,8 +65,8 @@ function showState(state) {
     bar(bars, stage.name, over, all, counts.map(([name, n]) => `${n} ${name}`).join(", "));
   }
   for (const run of state.running ?? []) {
-    const steps = `${run.done.toLocaleString("en")} of ${run.budget.toLocaleString("en")}`;
-    bar(bars, run.run, run.done, run.budget, `${steps}, ${run.metric} ${shown(run.value)}`);
+    const steps = `${run.env_steps.toLocaleString("en")} of ${run.budget.toLocaleString("en")}`;
+    bar(bars, run.run, run.env_steps, run.budget, `${steps}, ${run.metric} ${shown(run.value)}`);
   }
   for (const failure of state.failures ?? []) {
     const line = element("p", { class: "note" }, box);
@@ -81,7 +81,7 @@ async function look() {
   try {
     state = await (await asked("/state")).json();
   } catch {
-    showState({ state: "not to be reached: its page has ended" });
+    showState({ state: "unknown: the page's server has ended" });
     return;
   }
   showState(state);

@@ -1,5 +1,5 @@
-// A panel: a metric of several conditions on one task, as an SVG whose values can be read.
-// A curve: {label, colour, dash, x, mean, lower, upper, runs, seeds}; null stands for NaN.
+// A subplot: a metric of several conditions on one task, as an SVG whose values can be read.
+// A curve: {label, color, dashes, x, mean, lower, upper, runs, seeds}; null stands for NaN.
 "use strict";
 
 const MOST_BANDS = 8, LETTER = 6.9, SAME = 0.008, DASH = 7;
@@ -38,7 +38,7 @@ function ticksOf(low, high, count) {
   return ticks.map((value) => [value, text(Math.abs(value) < step * 1e-6 ? 0 : value)]);
 }
 
-/** Linear between the points of a curve; null outside of them. */
+/** Linear between the points of a curve; null outside its range. */
 function valueAt(x, xs, ys) {
   let right = xs.findIndex((one) => one >= x);
   if (right < 0 || (right === 0 && xs[0] > x)) return null;
@@ -72,7 +72,7 @@ function lineThrough(points) {
 
 function limitsOf(curves, metric) {
   if (metric.limits) return metric.limits;
-  // Limits are those of the lines: a band of two seeds may be many times as wide.
+  // The lines set the limits: a band of two seeds may be many times as wide.
   const all = curves.flatMap((curve) => [curve.mean, ...curve.seeds]).flat().filter((v) => v !== null);
   let low = all.length ? all.reduce((a, b) => Math.min(a, b)) : 0;
   let high = all.length ? all.reduce((a, b) => Math.max(a, b)) : 1;
@@ -80,10 +80,10 @@ function limitsOf(curves, metric) {
   return [low - 0.04 * (high - low), high + 0.04 * (high - low)];
 }
 
-let panels = 0;
+let subplots = 0;
 
-/** Draws the panel into `box` and replaces its content; metric: {title, axis, limits, target}. */
-function drawPanel(box, { title, curves, metric, xLabel }) {
+/** Draws the subplot into `box` and replaces its content; metric: {title, axis, limits, target}. */
+function drawSubplot(box, { title, curves, metric, xLabel }) {
   const width = Math.max(260, box.clientWidth || 400);
   const height = Math.round(Math.min(420, Math.max(210, width * 0.62)));
   const [low, high] = limitsOf(curves, metric);
@@ -100,7 +100,7 @@ function drawPanel(box, { title, curves, metric, xLabel }) {
     viewBox: `0 0 ${width} ${height}`, role: "img", tabindex: 0, class: "chart",
     "aria-label": `${metric.title}${title ? ", " + title : ""}. Left and right arrow keys read values.`,
   });
-  const clip = `clip-${++panels}`;
+  const clip = `clip-${++subplots}`;
   element("rect", { x: margin.left, y: margin.top - 2, width: plotWidth + 2, height: plotHeight + 4 },
     element("clipPath", { id: clip }, svg));
   if (title) element("text", { x: margin.left, y: 16, class: "title" }, svg, title);
@@ -131,37 +131,37 @@ function drawPanel(box, { title, curves, metric, xLabel }) {
 
 function drawCurves(parent, curves, px, py, height) {
   const at = (curve, values) => values.map((v, i) => (v === null ? null : [px(curve.x[i]), py(v)]));
-  // Bands of more lines hide each other; intervals are read beside the pointer.
+  // Bands of more lines would hide each other; the intervals are shown beside the pointer.
   for (const curve of curves.length <= MOST_BANDS ? curves : []) {
     const there = curve.x.map((_, i) => curve.lower[i] !== null && curve.upper[i] !== null);
     if (there.filter(Boolean).length > 1) {
       const keep = (values) => at(curve, values).filter((_, i) => there[i]);
       element("path", {
-        d: `${lineThrough([...keep(curve.upper), ...keep(curve.lower).reverse()])}Z`, fill: curve.colour, opacity: 0.15,
+        d: `${lineThrough([...keep(curve.upper), ...keep(curve.lower).reverse()])}Z`, fill: curve.color, opacity: 0.15,
       }, parent);
     }
     for (const seed of curve.seeds) {
-      element("path", { d: lineThrough(at(curve, seed)), stroke: curve.colour, class: "seed" }, parent);
+      element("path", { d: lineThrough(at(curve, seed)), stroke: curve.color, class: "seed" }, parent);
     }
   }
   const ranks = ranksOf(curves, height);
   curves.forEach((curve, number) => {
     const most = Math.max(...curve.runs), points = at(curve, curve.mean);
-    // Where curves coincide the later ones are dashed, so that each earlier one shows in the gaps.
+    // If curves coincide, the later ones are dashed, so that the earlier ones are visible in the gaps.
     const key = (i) => `${Math.min(ranks[number][i], ranks[number][i + 1])} ${curve.runs[i + 1] < most ? 1 : 0}`;
     for (let begin = 0; begin < points.length - 1;) {
       let end = begin + 1;
       while (end < points.length - 1 && key(end) === key(begin)) end++;
       const [rank, thin] = key(begin).split(" ").map(Number);
-      const dash = rank ? `${DASH} ${DASH * rank}` : curve.dash;
+      const dash = rank ? `${DASH} ${DASH * rank}` : curve.dashes;
       element("path", {
-        d: lineThrough(points.slice(begin, end + 1)), stroke: curve.colour, class: "curve",
+        d: lineThrough(points.slice(begin, end + 1)), stroke: curve.color, class: "curve",
         "stroke-width": thin ? 1 : 2.2, ...(dash ? { "stroke-dasharray": dash } : {}),
       }, parent);
       begin = end;
     }
     if (points.length === 1 && points[0]) {
-      element("circle", { cx: points[0][0], cy: points[0][1], r: 3, fill: curve.colour }, parent);
+      element("circle", { cx: points[0][0], cy: points[0][1], r: 3, fill: curve.color }, parent);
     }
   });
 }
@@ -188,7 +188,7 @@ function readable(box, svg, { curves, px, last, margin, plotHeight, xLabel }) {
     tip.replaceChildren(element("strong", {}, null, `${shown(x)} ${xLabel.replace(/ \((.*)\)/, ", $1")}`));
     for (const line of lines.slice(0, 12)) {
       const row = element("div", {}, tip);
-      element("span", { class: "dot" }, row).style.background = line.curve.colour;
+      element("span", { class: "dot" }, row).style.background = line.curve.color;
       row.append(line.text);
     }
     if (lines.length > 12) element("div", {}, tip, `and ${lines.length - 12} more`);

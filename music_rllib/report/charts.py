@@ -1,4 +1,4 @@
-"""The curves of a report as data for its page's script."""
+"""The learning curves of a report as data: for the page's script, and as a CSV file."""
 
 from __future__ import annotations
 
@@ -11,15 +11,17 @@ import numpy as np
 
 from music_rllib import names
 from music_rllib.report.figures.choice import Drawing, Facets
-from music_rllib.report.figures.palette import DASHES
-from music_rllib.report.figures.plots import EPOCH
+from music_rllib.report.table import to_csv
 from music_rllib.results.analysis import Curve
 from music_rllib.results.conditions import SIDE_BY_SIDE
 from music_rllib.results.data import Sweep
 from music_rllib.results.statistics import SHOW_SEEDS_BELOW, Array
 
-_FIGURES = 4
-"""Number of significant figures: more cannot be seen."""
+EPOCH = 80_000
+"""Environment steps of an epoch in the original MUSIC: 16 workers x 2 rollouts x 50 cycles x 50."""
+_DIGITS = 4
+"""Number of significant digits in the page."""
+_POINT = ("env_steps", "runs", "mean", "lower", "upper")
 
 KnownAxes = dict[tuple[tuple[int, ...], bytes], Mapping[str, Any]]
 """x axes by the runs and steps of a curve: all its metrics share them."""
@@ -55,41 +57,60 @@ def chart_data(sweep: Sweep, drawings: Sequence[Drawing]) -> dict[str, Any]:
     }
 
 
+def curves_csv(drawings: Iterable[Drawing]) -> str:
+    """The points of the learning curves of each stage."""
+    rows: list[dict[str, object]] = []
+    for drawing in drawings:
+        if drawing.metric is None or drawing.stage == SIDE_BY_SIDE:
+            continue
+        for curve in (one for curves in drawing.curves.values() for one in curves):
+            about = {
+                "stage": drawing.stage,
+                "task": curve.task,
+                "condition": curve.condition.label,
+                "metric": drawing.metric.name,
+            }
+            mean = curve.estimate
+            columns = (curve.steps.astype(int), curve.runs, mean.value, mean.lower, mean.upper)
+            points = zip(*(column.tolist() for column in columns), strict=True)
+            rows += [about | dict(zip(_POINT, point, strict=True)) for point in points]
+    return to_csv(rows)
+
+
 def _facets(drawing: Drawing) -> Facets:
     assert drawing.facets is not None, "learning curves have them"
     return drawing.facets
 
 
-def _panels(drawings: Sequence[Drawing]) -> list[str]:
-    return list(dict.fromkeys(panel for drawing in drawings for panel in drawing.curves))
+def _subplots(drawings: Sequence[Drawing]) -> list[str]:
+    return list(dict.fromkeys(title for drawing in drawings for title in drawing.curves))
 
 
 def _stage(name: str, drawings: Sequence[Drawing]) -> dict[str, Any]:
-    panels = _panels(drawings)
+    titles, facets = _subplots(drawings), _facets(drawings[0])
     together = name == SIDE_BY_SIDE
-    facets = _facets(drawings[0])
     return {
         "name": name,
         "together": together,
-        "panels": panels,
+        "subplots": titles,
         "faceted": bool(facets.setting),
-        "primary": [_primary(panel, drawings) for panel in panels],
+        "primary": [_primary(title, drawings) for title in titles],
         "conditions": [
             {
                 "label": (label := facets.label(condition)),
                 # Labels of all stages together begin with the stage: a condition has one key.
                 "key": label if together else f"{name}, {label}",
-                "colour": style.colour,
-                "dash": DASHES[style.line],
+                "color": style.color,
+                "dashes": " ".join(map(str, style.dashes)),
             }
             for condition, style in facets.styles.items()
         ],
     }
 
 
-def _primary(panel: str, drawings: Sequence[Drawing]) -> str:
-    """The return, which is drawn only for tasks that are judged by it, or success."""
-    drawn = [d.metric.name for d in drawings if d.metric is not None and panel in d.curves]
+def _primary(title: str, drawings: Sequence[Drawing]) -> str:
+    """The return, which is drawn only for tasks whose primary metric it is, or success."""
+    drawn = [d.metric.name for d in drawings if d.metric is not None and title in d.curves]
     primary = (names.EVAL_RETURN, names.EVAL_SUCCESS)
     return next((metric for metric in primary if metric in drawn), drawn[0])
 
@@ -98,24 +119,23 @@ def _curves(
     sweep: Sweep, drawing: Drawing, drawings: Sequence[Drawing], known: KnownAxes
 ) -> list[Mapping[str, Any]]:
     """The curves of one of a stage's `drawings`."""
-    panels, conditions = _panels(drawings), list(_facets(drawing).styles)
-    curves: list[Mapping[str, Any]] = []
-    for panel, found in drawing.curves.items():
-        for curve in found:
-            few = 1 < len(curve.values) < SHOW_SEEDS_BELOW
-            curves.append(
-                {
-                    "panel": panels.index(panel),
-                    "condition": conditions.index(curve.condition),
-                    **_x_axes(sweep, curve, known),
-                    "mean": _plain(curve.estimate.value),
-                    "lower": _plain(curve.estimate.lower),
-                    "upper": _plain(curve.estimate.upper),
-                    "runs": curve.runs.tolist(),
-                    "seeds": [_plain(values) for values in curve.values] if few else [],
-                }
-            )
-    return curves
+    titles, conditions = _subplots(drawings), list(_facets(drawing).styles)
+    return [
+        {
+            "subplot": titles.index(title),
+            "condition": conditions.index(curve.condition),
+            **_x_axes(sweep, curve, known),
+            "mean": _plain(curve.estimate.value),
+            "lower": _plain(curve.estimate.lower),
+            "upper": _plain(curve.estimate.upper),
+            "runs": curve.runs.tolist(),
+            "seeds": [_plain(values) for values in curve.values]
+            if 1 < len(curve.values) < SHOW_SEEDS_BELOW
+            else [],
+        }
+        for title, found in drawing.curves.items()
+        for curve in found
+    ]
 
 
 def _x_axes(sweep: Sweep, curve: Curve, known: KnownAxes) -> Mapping[str, Any]:
@@ -135,8 +155,8 @@ def _x_axes(sweep: Sweep, curve: Curve, known: KnownAxes) -> Mapping[str, Any]:
 def _mean_at(steps: Array, series: Iterable[tuple[Array, Array]]) -> list[float | None] | None:
     """Mean over the runs; None if no run has any value.
 
-    Where not all have got as far, it goes on by the mean of those that have: their increments, as
-    the mean of a few runs' values may lie before that of all runs.
+    After the first run has ended, the mean increases by the mean increments of the other runs: the
+    mean of their values could be smaller than the mean of all runs before.
     """
     rows = [
         np.interp(steps, at, values, left=np.nan, right=np.nan) for at, values in series if len(at)
@@ -157,6 +177,6 @@ def _mean_at(steps: Array, series: Iterable[tuple[Array, Array]]) -> list[float 
 
 def _plain(values: Array) -> list[float | None]:
     return [
-        float(f"{value:.{_FIGURES}g}") if finite else None
+        float(f"{value:.{_DIGITS}g}") if finite else None
         for value, finite in zip(values.tolist(), np.isfinite(values).tolist(), strict=True)
     ]

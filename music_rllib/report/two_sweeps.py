@@ -1,25 +1,22 @@
-"""Two sweeps as one, and tables of how their settings and results differ."""
+"""A report on two sweeps: both as one sweep, and tables of their differences."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from music_rllib import names
-from music_rllib.report.pieces import DASH, TextTable, number_cell
+from music_rllib.report.table import Table
 from music_rllib.results import statistics as st
 from music_rllib.results.analysis import FinalScores, StageAnalysis
 from music_rllib.results.archive import merged
 from music_rllib.results.data import RunRecord, Sweep
-from music_rllib.results.statistics import interval_text, number
 
 MOST_VALUES = 6
-"""Largest number of a setting's values that are shown for one sweep."""
+"""Largest number of a setting's values that are listed for one sweep."""
 
 
-def side_by_side(first: Sweep, second: Sweep) -> Sweep:
+def joined_sweeps(first: Sweep, second: Sweep) -> Sweep:
     """All runs of both sweeps; stage names begin with the sweep, so that stages are compared."""
     titles = _titles(first, second)
     both = merged(_renamed(first, titles[0]), _renamed(second, titles[1]))
@@ -41,8 +38,7 @@ def _renamed(sweep: Sweep, title: str) -> Sweep:
 def _renamed_run(run: RunRecord, title: str) -> RunRecord:
     """The run with the sweep's title in its name, stage and node keys.
 
-    A run that both sweeps took from the same node counts twice: otherwise one of them would lack
-    it.
+    A run that both sweeps have is two runs, as each of the sweeps is reported with all its runs.
     """
     keys = (names.TAG_NODE_KEY, names.TAG_SOURCE_NODE)
     links = {tag: f"{title}/{run.tags[tag]}" for tag in keys if run.tags.get(tag)}
@@ -52,29 +48,29 @@ def _renamed_run(run: RunRecord, title: str) -> RunRecord:
 
 def difference_tables(
     first: Sweep, second: Sweep, analyses: Sequence[StageAnalysis]
-) -> list[TextTable]:
+) -> list[Table]:
     """Settings that differ, and the final values of all conditions in both sweeps.
 
     Args:
-        first: the first sweep as it was read.
-        second: the second sweep as it was read.
-        analyses: of the sweep that :func:`side_by_side` makes of them.
+        first: The first sweep.
+        second: The second sweep.
+        analyses: The analyses of the sweep that :func:`joined_sweeps` makes of them.
     """
     titles = _titles(first, second)
     return [_settings_table(first, second, titles), _results_table(analyses, titles)]
 
 
-def _settings_table(first: Sweep, second: Sweep, titles: tuple[str, str]) -> TextTable:
+def _settings_table(first: Sweep, second: Sweep, titles: tuple[str, str]) -> Table:
     one, other = _setting_values(first), _setting_values(second)
     rows = [
         (*key, _values_text(one.get(key)), _values_text(other.get(key)))
         for key in sorted({*one, *other})
         if one.get(key) != other.get(key)
     ]
-    return TextTable(
+    return Table(
         title="Settings that differ",
-        header=("Stage", "Setting", *titles),
-        rows=rows or [("all", "none", DASH, DASH)],
+        header=("In stage", "Setting", *titles),
+        rows=rows or [("all", "none", None, None)],
     )
 
 
@@ -89,47 +85,44 @@ def _setting_values(sweep: Sweep) -> Mapping[tuple[str, str], set[str]]:
     return values
 
 
-def _values_text(values: set[str] | None) -> str:
+def _values_text(values: set[str] | None) -> str | None:
     if not values:
-        return DASH
+        return None
     more = len(values) - MOST_VALUES
     return ", ".join(sorted(values)[:MOST_VALUES]) + (f" and {more} more" if more > 0 else "")
 
 
-def _results_table(analyses: Sequence[StageAnalysis], titles: tuple[str, str]) -> TextTable:
-    one, other = (
-        {
-            # A setting of what a condition starts from has the sweep's title, too.
-            (
-                analysis.stage.name.removeprefix(start),
-                scope.name,
-                final.condition.label.replace(start, ""),
-            ): final
-            for analysis in analyses
-            if analysis.stage.name.startswith(start)
-            for scope in analysis.scopes
-            for final in scope.finals
-        }
-        for start in (f"{title}: " for title in titles)
-    )
+def _results_table(analyses: Sequence[StageAnalysis], titles: tuple[str, str]) -> Table:
+    one, other = (_finals(analyses, title) for title in titles)
     rows = []
     for key in dict.fromkeys((*one, *other)):
-        first, second = one.get(key), other.get(key)
-        difference, interval = DASH, DASH
-        if first is not None and second is not None:
-            gap = st.difference(second.estimate, first.estimate)
-            difference, interval = f"{float(gap.value):+.3g}", interval_text(gap)
-        rows.append((*key, _mean(first), _mean(second), number_cell(difference), interval))
-    return TextTable(
-        title="Results of both",
-        header=("Stage", "Task", "Condition", *titles, "Difference", "95 % interval"),
+        found = [finals[key].estimate if key in finals else None for finals in (one, other)]
+        first, second = found
+        gap = st.difference(second, first) if first is not None and second is not None else None
+        rows.append((*key, *found, gap))
+    return Table(
+        title="Final values of both sweeps",
+        header=("In stage", "Task", "Condition", *titles, "Difference"),
         rows=rows,
-        note="Means of the last evaluation of finished runs with their 95 % intervals; the "
-        "difference is the second's minus the first's.",
+        note="Means of the last evaluation of finished runs with their 95% CI. Difference: second "
+        "sweep minus first sweep.",
     )
 
 
-def _mean(final: FinalScores | None) -> str:
-    if final is None or np.isnan(final.value):
-        return DASH
-    return f"{number(final.value)} ({interval_text(final.estimate)})"
+def _finals(
+    analyses: Sequence[StageAnalysis], title: str
+) -> dict[tuple[str, str, str], FinalScores]:
+    """Final values of a sweep by stage, task and condition, without its title."""
+    start = f"{title}: "
+    return {
+        # A setting of what a condition starts from has the sweep's title, too.
+        (
+            analysis.stage.name.removeprefix(start),
+            scope.name,
+            final.condition.label.replace(start, ""),
+        ): final
+        for analysis in analyses
+        if analysis.stage.name.startswith(start)
+        for scope in analysis.scopes
+        for final in scope.finals
+    }

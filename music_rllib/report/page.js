@@ -7,7 +7,7 @@ const X_AXES = {
   seconds: "wall time",
   epochs: "epochs of 80,000 steps",
 };
-const choice = { stageName: null, stage: 0, metric: "", x: "steps", smooth: 1, conditions: new Set(), panels: new Set() };
+const choice = { stageName: null, stage: 0, metric: "", x: "steps", smooth: 1, conditions: new Set(), subplots: new Set() };
 let data = JSON.parse(document.getElementById("data").textContent);
 
 /** Means over the `width` nearest points; missing values stay missing. */
@@ -26,9 +26,9 @@ function timeUnit(curves) {
   return last >= 7200 ? [3600, "h"] : last >= 120 ? [60, "min"] : [1, "s"];
 }
 
-/** The selected curves of one panel, with the selected x axis and smoothing. */
-function chosen(stage, metric, panel) {
-  const found = (data.curves[stage]?.[metric] ?? []).filter((curve) => curve.panel === panel);
+/** The selected curves of one subplot, with the selected x axis and smoothing. */
+function chosen(stage, metric, subplot) {
+  const found = (data.curves[stage]?.[metric] ?? []).filter((curve) => curve.subplot === subplot);
   const kept = found.filter((curve) => !choice.conditions.has(data.stages[stage].conditions[curve.condition].key));
   const [unit, word] = timeUnit(kept);
   const xOf = {
@@ -58,29 +58,29 @@ const watcher = new IntersectionObserver((entries) => {
 }, { rootMargin: "600px" });
 
 function drawNow(box) {
-  const panel = pending.get(box);
+  const subplot = pending.get(box);
   pending.delete(box);
-  if (panel) drawPanel(box, { ...panel, ...chosen(panel.stage, panel.metric.name, panel.panel) });
+  if (subplot) drawSubplot(box, { ...subplot, ...chosen(subplot.stage, subplot.metric.name, subplot.subplot) });
 }
 
-/** Makes a box per panel of each stage, which is drawn when it comes near the window. */
+/** Makes a box for each subplot of each stage, which is drawn when it comes near the window. */
 function fill(parent, wanted) {
-  // The only one of a stage has no chip by which it could be shown again.
-  const isShown = (names, panel) => names.length < 2 || !choice.panels.has(names[panel]);
-  const boxes = wanted.filter(({ stage, panel }) => isShown(data.stages[stage].panels, panel));
+  // The only subplot of a stage has no checkbox.
+  const isShown = (names, subplot) => names.length < 2 || !choice.subplots.has(names[subplot]);
+  const boxes = wanted.filter(({ stage, subplot }) => isShown(data.stages[stage].subplots, subplot));
   while (parent.children.length > boxes.length) parent.lastChild.remove();
-  boxes.forEach((panel, i) => {
-    const box = parent.children[i] ?? element("div", { class: "panel" }, parent);
-    pending.set(box, panel);
+  boxes.forEach((subplot, i) => {
+    const box = parent.children[i] ?? element("div", { class: "subplot" }, parent);
+    pending.set(box, subplot);
     watcher.unobserve(box);
     watcher.observe(box);
   });
 }
 
-function panelsOf(metric, stages) {
-  return stages.flatMap((stage) => data.stages[stage].panels.map((name, panel) => ({ stage, panel, name })))
-    .map((one) => ({ ...one, metric: metricOf(metric || data.stages[one.stage].primary[one.panel]) }))
-    .filter((one) => (data.curves[one.stage]?.[one.metric.name] ?? []).some((curve) => curve.panel === one.panel));
+function subplotsOf(metric, stages) {
+  return stages.flatMap((stage) => data.stages[stage].subplots.map((name, subplot) => ({ stage, subplot, name })))
+    .map((one) => ({ ...one, metric: metricOf(metric || data.stages[one.stage].primary[one.subplot]) }))
+    .filter((one) => (data.curves[one.stage]?.[one.metric.name] ?? []).some((curve) => curve.subplot === one.subplot));
 }
 
 function drawAll() {
@@ -88,7 +88,7 @@ function drawAll() {
   const several = own.length > 1;
   for (const figure of document.querySelectorAll("figure[data-metric]")) {
     const large = figure.dataset.metric === "";
-    const wanted = panelsOf(large ? choice.metric : figure.dataset.metric, large ? [choice.stage] : own);
+    const wanted = subplotsOf(large ? choice.metric : figure.dataset.metric, large ? [choice.stage] : own);
     const parent = figure.querySelector(".live");
     fill(parent, wanted.map((one) => ({
       ...one,
@@ -96,13 +96,8 @@ function drawAll() {
     })));
     figure.classList.add("drawn");
   }
-  for (const part of document.querySelectorAll("[data-stage] [data-condition]")) {
-    const stage = data.stages[+part.closest("[data-stage]").dataset.stage];
-    const condition = stage?.conditions[+part.dataset.condition];
-    part.style.display = condition && choice.conditions.has(condition.key) ? "none" : "";
-  }
-  for (const part of document.querySelectorAll(".static [data-panel]")) {
-    part.hidden = choice.panels.has(part.dataset.panel);
+  for (const part of document.querySelectorAll(".static [data-subplot]")) {
+    part.hidden = choice.subplots.has(part.dataset.subplot);
   }
 }
 
@@ -123,14 +118,14 @@ function chips(parent, title, all, off) {
   if (entries.length < 2) return;
   const group = element("fieldset", { class: "chips" }, parent);
   element("legend", {}, group, title);
-  for (const { key, label, colour, dash } of entries) {
+  for (const { key, label, color, dashes } of entries) {
     const chip = element("label", { class: "chip" }, group);
     const tick = element("input", { type: "checkbox" }, chip);
     tick.checked = !off.has(key);
     tick.addEventListener("change", () => { off[tick.checked ? "delete" : "add"](key); drawAll(); });
-    if (colour) {
+    if (color) {
       const line = element("svg", { width: 24, height: 8, "aria-hidden": "true" }, chip);
-      element("line", { x1: 0, x2: 24, y1: 4, y2: 4, stroke: colour, "stroke-width": 3, "stroke-dasharray": dash || "none" }, line);
+      element("line", { x1: 0, x2: 24, y1: 4, y2: 4, stroke: color, "stroke-width": 3, "stroke-dasharray": dashes || "none" }, line);
     }
     chip.append(label);
   }
@@ -160,12 +155,12 @@ function controls() {
       controls();
     });
   }
-  select(row, "metric", [["", "what the task is judged by"], ...available.map((one) => [one.name, one.title])],
+  select(row, "metric", [["", "primary metric of the task"], ...available.map((one) => [one.name, one.title])],
     choice.metric, (value) => { choice.metric = value; });
   select(row, "against", Object.entries(X_AXES), choice.x, (value) => { choice.x = value; });
   select(row, "smooth", [1, 3, 5, 9, 15].map((n) => [n, n === 1 ? "no" : `mean of ${n} points`]), choice.smooth,
     (value) => { choice.smooth = +value; });
-  chips(parent, stage.faceted ? "panels" : "tasks", stage.panels.map((name) => ({ key: name, label: name })), choice.panels);
+  chips(parent, stage.faceted ? "subplots" : "tasks", stage.subplots.map((name) => ({ key: name, label: name })), choice.subplots);
   chips(parent, "conditions", stage.conditions, choice.conditions);
   parent.classList.toggle("tall", parent.offsetHeight > innerHeight / 5);
 }
@@ -206,7 +201,7 @@ function sortable() {
         sortBy(table, column, down);
       });
     });
-    // Another table of this name may have fewer columns.
+    // Another table with this name may have fewer columns.
     const [column, down] = orders.get(name) ?? [Infinity];
     if (column < table.tHead.rows[0].cells.length) sortBy(table, column, down);
   }
@@ -215,7 +210,7 @@ function sortable() {
 // ------------------------------------------------------------------------------------------------
 
 function refresh() {
-  // By its name: stages that begin later may come before it.
+  // By its name: stages that begin later may have smaller numbers.
   const found = data.stages.findIndex((one) => one.name === choice.stageName);
   choice.stage = found < 0 ? data.main : found;
   controls();

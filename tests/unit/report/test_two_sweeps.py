@@ -8,9 +8,9 @@ from pathlib import Path
 from music_rllib import names
 from music_rllib.report.build import build_report
 from music_rllib.report.page import render
-from music_rllib.report.pieces import DASH, Cell
-from music_rllib.report.side_by_side import side_by_side
+from music_rllib.report.two_sweeps import joined_sweeps
 from music_rllib.results.archive import read_archive
+from music_rllib.results.statistics import Estimate
 
 DATA = Path(__file__).parents[3] / "docs" / "results" / "data"
 
@@ -19,24 +19,24 @@ def test_the_page_of_two_sweeps_says_what_differs() -> None:
     first = read_archive(DATA / "proof-fetch-reach")
     changed = [replace(run, params={**run.params, "tac.alpha": "0.125"}) for run in first.runs]
     second = replace(first, name="other", runs=changed)
-    both = side_by_side(first, second)
+    both = joined_sweeps(first, second)
     assert len(both.runs) == 2 * len(first.runs), "runs of the same node are two"
-    made = build_report(both, beside=(first, second))
+    made = build_report(both, both=(first, second))
     assert made.limitations == []
     settings, results = made.differences
     ((_, setting, before, after),) = settings.rows
     assert (setting, after) == ("tac.alpha", "0.125")
     assert before == first.runs[0].params["tac.alpha"]
-    ((*_, mean, other, gap, _),) = results.rows
+    ((*_, mean, other, gap),) = results.rows
     assert mean == other
-    assert isinstance(gap, Cell)
-    assert float(gap.text) == 0
+    assert isinstance(gap, Estimate)
+    assert float(gap.value) == 0
     assert made.together is not None
     (scope,) = made.together.scopes
     assert {final.seeds for final in scope.finals} == {3}
     page = render(made)
     assert page.count("<h2>Differences</h2>") == 1
-    same = side_by_side(first, first)
+    same = joined_sweeps(first, first)
     assert {run.stage.partition(":")[0] for run in same.runs} == {
         "proof-fetch-reach (first)",
         "proof-fetch-reach (second)",
@@ -58,13 +58,16 @@ def test_conditions_that_their_pretraining_tells_apart_find_each_other() -> None
     ]
     first = replace(first, runs=runs)
     second = replace(first, name="other")
-    _, results = build_report(side_by_side(first, second), beside=(first, second)).differences
+    _, results = build_report(joined_sweeps(first, second), both=(first, second)).differences
     assert any("pre: music.lr" in str(label) for _, _, label, *_ in results.rows)
-    assert all(DASH not in (mean, other) for *_, mean, other, _, _ in results.rows)
+    assert all(
+        isinstance(value, Estimate) for *_, one, other, _ in results.rows for value in (one, other)
+    )
 
 
-def test_what_is_missing_is_said_of_the_sweep_that_lacks_it() -> None:
+def test_missing_runs_are_reported_with_their_sweep() -> None:
     first = read_archive(DATA / "proof-fetch-reach")
-    second = replace(first, name="other", runs=first.runs[:-1])
-    (missing,) = build_report(side_by_side(first, second), beside=(first, second)).limitations
+    *runs, last = first.runs
+    second = replace(first, name="other", runs=[*runs, replace(last, status="SCHEDULED")])
+    (missing,) = build_report(joined_sweeps(first, second), both=(first, second)).limitations
     assert missing.startswith("other: 1 run not begun")
