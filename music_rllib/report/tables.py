@@ -188,9 +188,7 @@ def _thresholds(analyses: Sequence[StageAnalysis]) -> Table:
                 time.median,
                 [
                     f"{'' if reached else '>'}{steps:,.0f}"
-                    for steps, reached in sorted(
-                        zip(time.steps, time.reached, strict=True)
-                    )
+                    for steps, reached in sorted(zip(time.steps, time.reached, strict=True))
                 ],
             )
             for analysis in analyses
