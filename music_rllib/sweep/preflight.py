@@ -28,7 +28,6 @@ from music_rllib.runtime.machine import check_reachable, cluster_address
 from music_rllib.runtime.process import early
 from music_rllib.store.handoff import open_handoff, read_handoff
 from music_rllib.store.node_store import NodeStore
-from music_rllib.training.hang_watch import place_in
 
 if TYPE_CHECKING:
     from music_rllib.envs.probe import Question
@@ -154,6 +153,8 @@ def _ends(process: subprocess.Popen[bytes], answers: Path, seconds: float | None
 
 def _why_it_ended(code: int, call: str, errors: str) -> str:
     """The rule that an environment broke whose process ended during a call."""
+    from music_rllib.training.hang_watch import place_in
+
     before = errors.partition("(most recent call first):\n")[0]
     place = place_in(errors, "envs/probe.py")
     at = f" at {place}" if place else ""
