@@ -21,13 +21,6 @@ def test_built_in_fetch_tasks_have_the_split_of_the_paper() -> None:
     assert weights["FetchPush"] == 1.0
 
 
-def test_the_hand_has_joint_angles_and_the_position_of_its_block() -> None:
-    task = BUILT_IN_TASKS["HandManipulateBlock"]
-    assert (task.env_id, task.horizon) == ("HandManipulateBlock-v1", 100)
-    assert task.agent_indices == tuple(range(24))
-    assert task.surrounding_indices == (54, 55, 56)
-
-
 def test_a_range_is_a_list_of_indices() -> None:
     task = Task.model_validate_json(
         '{"name": "T", "env_id": "E-v0", "horizon": 9, "agent_indices": "2:4",'

@@ -26,13 +26,11 @@ def checkout(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_the_commit_of_a_checkout(checkout: Path) -> None:
-    assert git_commit(checkout / "module.py") == git(checkout, "rev-parse", "HEAD")
-
-
-def test_a_changed_checkout_is_dirty(checkout: Path) -> None:
+def test_the_commit_of_a_checkout_is_marked_if_files_changed(checkout: Path) -> None:
+    commit = git(checkout, "rev-parse", "HEAD")
+    assert git_commit(checkout / "module.py") == commit
     (checkout / "module.py").write_text("a = 2\n")
-    assert git_commit(checkout / "module.py") == git(checkout, "rev-parse", "HEAD") + "-dirty"
+    assert git_commit(checkout / "module.py") == commit + "-dirty"
 
 
 def test_a_package_installed_inside_another_checkout_has_no_commit(checkout: Path) -> None:

@@ -41,13 +41,6 @@ def test_an_expected_message_is_hidden_and_others_are_shown(
     }
 
 
-def test_warnings_survive_in_chatty_loggers() -> None:
-    quiet.quiet_third_parties()
-    for name in quiet._CHATTY_LOGGERS:
-        assert not logging.getLogger(name).isEnabledFor(logging.INFO)
-        assert logging.getLogger(name).isEnabledFor(logging.WARNING)
-
-
 def test_only_the_warning_about_rllibs_own_environment_is_hidden() -> None:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

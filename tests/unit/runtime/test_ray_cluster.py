@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 import ray
-from pydantic import ValidationError
 
 from music_rllib.config.schema import Resources
 from music_rllib.runtime import ray_cluster
@@ -145,27 +144,6 @@ def test_only_as_many_runs_wait_as_fit_on_a_fixed_cluster(monkeypatch: pytest.Mo
     put_cluster(monkeypatch, SMALL, HEAD, group=None)
     capacity = _capacity(Resources())
     assert (capacity.now, capacity.at_once, capacity.waiting, capacity.remark) == (5, 5, 5, None)
-
-
-@pytest.mark.parametrize("settings", [{"gpus_per_run": -1}, {"memory_per_run": 0}])
-def test_impossible_amounts_are_refused(settings: dict[str, Any]) -> None:
-    with pytest.raises(ValidationError):
-        Resources(**settings)
-
-
-def test_a_trial_reserves_the_bundle_that_was_checked() -> None:
-    from music_rllib.config.load import load_sweep
-    from music_rllib.experiment.plan import make_plan
-    from music_rllib.sweep.driver import DEFAULT_CONFIG
-    from music_rllib.training.job import NodeJob
-    from music_rllib.training.worker import RunTrainable
-
-    node = make_plan(load_sweep(DEFAULT_CONFIG)).nodes[0]
-    wanted = Resources(cpus_per_run=2, gpus_per_run=0.5, memory_per_run=1.5)
-    job = NodeJob.of(node, "results", resources=wanted)
-    assert RunTrainable.default_resource_request(job.to_tune()).bundles == [wanted.bundle]
-    plain = NodeJob.of(node, "results")
-    assert RunTrainable.default_resource_request(plain.to_tune()).bundles == [{"CPU": 1}]
 
 
 @pytest.mark.parametrize("address", [None, "127.0.0.1:1"])
