@@ -1,1 +1,1 @@
-"""The plan of a sweep's runs, their scheduler, and the sweep's own files."""
+"""The plan of a sweep, its scheduler, and the record of its runs."""

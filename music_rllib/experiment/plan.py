@@ -1,8 +1,8 @@
-"""The plan of a sweep: which runs it has, and which nodes compute them, in order.
+"""The plan of a sweep: its runs, and the nodes that compute them, in order.
 
-A *run* is a stage's trial on one task with one seed. A *node* is what computes it: its key is the
-hash of everything that determines the result, so runs that are the same computation share a node,
-within a sweep and between sweeps.
+A *run* is a trial of a stage on one task with one seed. A *node* is the computation of a run: its
+key is the hash of everything that determines the result, so equal computations share a node, within
+a sweep and between sweeps.
 """
 
 from __future__ import annotations
@@ -30,23 +30,23 @@ REPORT_INTERVAL = 1_000
 
 @dataclass(frozen=True, kw_only=True)
 class Input:
-    """Where a node gets the network weights that it starts from."""
+    """The source of the network weights that a node starts from."""
 
     key: str
     """A node of the plan, or the node that holds an imported checkpoint."""
     task: Task
     """Task that the networks were trained on."""
     checkpoint: ImportedHandoff | None = None
-    """The checkpoint to import as `key`; None: `key` is a node of the plan."""
+    """The handoff to import as `key`; None if `key` is a node of the plan."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """One stage's trial on one task with one seed, as a person asks for it."""
+    """One trial of a stage on one task with one seed."""
 
     stage: str
     trial: int
-    """Position in the stage: its sources' trials times the points of its grid."""
+    """Position in the stage: the trials of its source times the points of its grid."""
     values: Mapping[str, Any]
     """The settings that differ between the stage's trials: dotted setting to value;
     `pretrain:tac.alpha` is a value of its source."""
@@ -73,8 +73,7 @@ class Node:
     run: RunSettings
     input: Input | None
     stage: str
-    """Stage of the first run that it computes; `trial`, `label`, `part` and `values` are that run's
-    too."""
+    """Stage of the first run that it computes, like `trial`, `label`, `part` and `values`."""
     trial: int
     label: str
     part: str = ""
@@ -87,12 +86,12 @@ class Node:
 
 
 class Plan:
-    """All runs of a sweep; those of searched stages are added as their trials are chosen."""
+    """All runs of a sweep; runs of searched stages are added when their trials are chosen."""
 
     def __init__(
         self, name: str, seeds: Sequence[int] = (), *, algorithm: str | None = None
     ) -> None:
-        """An empty plan, with keys of this version of the algorithm or of a given one."""
+        """An empty plan, with keys of the present version of the algorithm or of a given one."""
         self.name = name
         self.seeds = tuple(seeds)
         self.algorithm = algorithm or ALGORITHM_VERSION
@@ -106,7 +105,7 @@ class Plan:
 
     @property
     def runs(self) -> list[Run]:
-        """All runs, in the order in which they were planned."""
+        """All runs, in the order of planning."""
         return list(self._runs.values())
 
     @property
@@ -121,12 +120,12 @@ class Plan:
 
     @property
     def last_stage(self) -> Stage:
-        """The stage that the others lead to."""
+        """The last stage of the sweep."""
         return list(self._stages.values())[-1]
 
     @property
     def searched(self) -> tuple[Stage, ...]:
-        """Stages whose trials are searched for."""
+        """Stages with a search."""
         return tuple(stage for stage in self._stages.values() if stage.search is not None)
 
     @property
@@ -136,7 +135,7 @@ class Plan:
 
     @property
     def imports(self) -> tuple[Input, ...]:
-        """Checkpoints from outside that runs start from, each once."""
+        """Handoffs from outside that runs start from, each once."""
         inputs = [
             self._input(stage.source, 0, stage.tasks[0], 0)[0]
             for stage in self._stages.values()
@@ -146,7 +145,7 @@ class Plan:
 
     @property
     def settings(self) -> list[RunSettings]:
-        """Settings of all nodes, and of runs that stand for those of searches."""
+        """Settings of all nodes, and of example runs of the searches."""
         searched = (point for stage in self.searched for _, point in stage.examples())
         return [
             *(node.run for node in self._nodes.values()),
@@ -158,12 +157,11 @@ class Plan:
         return self._nodes[key]
 
     def add_stage(self, stage: Stage, *, with_runs: bool) -> None:
-        """Add a stage whose source, if it is a stage, is in the plan already.
+        """Add a stage; its source, if that is a stage, must be in the plan already.
 
         Args:
-            stage: The runs of a searched stage are left to `add_trial`.
-            with_runs: Whether a stage without a search has runs besides those that trials start
-                from.
+            stage: The stage; `add_trial` adds the runs of a searched stage.
+            with_runs: Add the runs of the grid, if the stage has no search.
         """
         self._stages[stage.name] = stage
         if stage.search is not None or not with_runs:
@@ -180,16 +178,16 @@ class Plan:
     def add_trial(
         self, stage: str, trial: int, values: Mapping[str, Any], seeds: Sequence[int], part: str
     ) -> list[Run]:
-        """Add the runs of a searched stage's trial and of what it starts from, if they are new.
+        """Add the runs of a searched stage's trial and the runs that it starts from.
 
-        The `values` are dotted settings, those of the source `STAGE:setting`; `part` is the trial's
-        name in labels.
+        The `values` are dotted settings, `STAGE:setting` for a source stage; `part` is the name of
+        the trial in labels.
 
         Returns:
-            The trial's runs, those with the same seed together.
+            The trial's runs, grouped by seed.
 
         Raises:
-            ConfigError: The values make no valid settings.
+            ConfigError: The values are not valid settings.
         """
         searched = self._stages[stage]
         point = searched.resolve({k: value for k, value in values.items() if ":" not in k})
@@ -215,7 +213,7 @@ class Plan:
     def _trial_input(
         self, source: Source | None, values: Mapping[str, Any], task: Task, seed: int
     ) -> Input | None:
-        """The node that a trial's run starts from, planned if it isn't yet."""
+        """The node that a trial's run starts from; adds it to the plan if it is new."""
         if source is None or source.stage is None:
             return self._input(source, 0, task, seed)[0]
         task = source.task or task
@@ -259,7 +257,7 @@ class Plan:
         return run
 
     def _source_trials(self, source: Source | None) -> list[int]:
-        """Trials of a source stage: each gives one to every point, so that two grids multiply."""
+        """Trials of a source stage, each of which is combined with every point of the grid."""
         if source is None or source.stage is None:
             return [0]
         return sorted({run.trial for run in self._runs.values() if run.stage == source.stage})
@@ -267,7 +265,7 @@ class Plan:
     def _input(
         self, source: Source | None, source_trial: int, task: Task, seed: int
     ) -> tuple[Input | None, dict[str, Any]]:
-        """What a run starts from, and the values of the source's trial."""
+        """The input of a run, and the values of the source's trial."""
         if source is None:
             return None, {}
         task = source.task or task
@@ -283,18 +281,18 @@ class Plan:
 
 
 def shared_runs(plan: Plan) -> list[str]:
-    """A line about each stage some of whose runs are, to the last setting, an earlier stage's."""
+    """A line about each stage with runs whose settings are all equal to an earlier stage's."""
     counts = Counter((run.stage, plan.node(run.key).stage) for run in plan.runs)
     return [
-        f"{stage}: {in_runs(count)} that {first} has, too: trained once, and in reports, "
-        f"comparisons and hypotheses {first}'s alone"
+        f"{stage}: {in_runs(count)} equal to runs of {first}: trained once, and counted for "
+        f"{first} only in reports, comparisons and hypotheses"
         for (stage, first), count in counts.items()
         if stage != first
     ]
 
 
 def short(value: Any, setting: str) -> str:
-    """A value of a (dotted) setting in a few characters: `1.5`, `256x256` for layers, `[-20,0]`."""
+    """A value of a dotted setting as short text: `1.5`, `256x256` for layers, `[-20,0]`."""
     if isinstance(value, bool) or value is None:
         return {True: "true", False: "false", None: "null"}[value]
     if isinstance(value, Mapping):
@@ -308,9 +306,9 @@ def short(value: Any, setting: str) -> str:
 def node_key(run: RunSettings, source: str | None, algorithm: str | None = None) -> str:
     """Key of the node that computes `run` from the weights of node `source`.
 
-    It depends on all that determines the numbers and on nothing else: not on names, on where things
-    are stored, on MLflow or on resources. It is the same on every machine. Without `algorithm`, it
-    is that of this version of the algorithm.
+    It depends on everything that determines the numbers and on nothing else: not on names, places,
+    MLflow or resources. It is the same on every machine. `algorithm` is a version of the algorithm,
+    by default the present one.
     """
     content = {"run": run.identity(), "source": source, "algorithm": algorithm or ALGORITHM_VERSION}
     return content_key(content)
@@ -350,12 +348,12 @@ def is_continuable(run: RunSettings) -> bool:
 
 
 def make_plan(config: SweepConfig, *, algorithm: str | None = None) -> Plan:
-    """The plan of a valid sweep, with keys of this or of a given version of the algorithm."""
+    """The plan of a sweep, with keys of the present or of a given version of the algorithm."""
     plan = Plan(config.name, config.seeds, algorithm=algorithm)
     sources = [(stage.search, stage.source.stage) for stage in config.stages if stage.source]
     varied = {source for search, source in sources if search and source in stages_in(search)}
     used = {source for search, source in sources if not (search and source in varied)}
     for stage in config.stages:
-        # A stage that only trials start from, each with settings of its own for it, has no others.
+        # A stage whose settings are chosen by trials of another one has no runs of its own.
         plan.add_stage(stage, with_runs=stage.name not in varied - used)
     return plan

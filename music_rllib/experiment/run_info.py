@@ -24,27 +24,26 @@ from music_rllib.version import ALGORITHM_VERSION
 
 @dataclass(frozen=True, kw_only=True)
 class RunInfo:
-    """One run of the sweep, as MLflow shows it."""
+    """The representation of a run in MLflow."""
 
     node_key: str
-    """The node's content hash, by which the run is found again."""
     name: str
-    """The name in MLflow's lists, for example ``q=1.5 seed 0 FetchPush finetune``."""
+    """The name in MLflow's lists, for example `q=1.5 seed 0 FetchPush finetune`."""
     config: Mapping[str, object]
     """All settings of the run, which become MLflow's params."""
     tags: Mapping[str, object] = field(default_factory=dict)
-    """``names.TAG_*`` to values; None is left out."""
+    """`names.TAG_*` to values; None is omitted."""
     settings: Mapping[str, float] = field(default_factory=dict)
-    """``names.SETTING_*`` to numbers, logged as metrics at step 0, so that MLflow compares them."""
+    """`names.SETTING_*` to numbers, logged as metrics at step 0, so that MLflow compares them."""
     source_node: str | None = None
-    """Node key of the run whose handoff this one starts from."""
+    """Node key of the run that this one starts from."""
 
 
 _SHORT = {"tac.entropic_index": "q", "music.mi_reward_weight": "weight"}
 
 
 def run_name(node: Node) -> str:
-    """What differs between runs first, then task and stage: `q=1.5 seed 0 FetchPush finetune`."""
+    """Varied settings first, then task and stage: `q=1.5 seed 0 FetchPush finetune`."""
     counts = Counter(name.rpartition(".")[2] for name in node.values)
     parts = []
     for name, value in sorted(node.values.items(), key=lambda item: item[0] not in _SHORT):
@@ -56,7 +55,7 @@ def run_name(node: Node) -> str:
 
 
 def run_info(node: Node, environment: Fingerprint | None = None) -> RunInfo:
-    """How MLflow shows a node that uses an environment with this fingerprint."""
+    """The representation in MLflow of a node whose environment has this fingerprint."""
     run = node.run
     config: dict[str, Any] = run.model_dump(mode="json")
     q, alpha, weight = run.tac.entropic_index, run.tac.alpha, run.music.mi_reward_weight
@@ -93,9 +92,9 @@ def _at_start(
     value: float | Linear | Piecewise | Measured | LearnedAlpha | MatchedAlpha | NormalisedAlpha,
     run: RunSettings,
 ) -> float:
-    """A setting's number at environment step 0."""
+    """The value of a setting at environment step 0."""
     if isinstance(value, LearnedAlpha):
         return value.initial
-    # The number in the settings, which is alpha at q = 1. Its value at q is a metric of the run.
+    # The number in the settings is alpha at q = 1; its value at q is a metric of the run.
     given = value.value if isinstance(value, MatchedAlpha | NormalisedAlpha) else value
     return value_at(given, 0, run.env_steps)

@@ -15,19 +15,19 @@ class Status(StrEnum):
     """The state of a node."""
 
     WAITING = "waiting"
-    """It waits for its input, or for its turn."""
+    """It waits for its input or its turn."""
     STARTED = "started"
-    """It is handed out to be computed."""
+    """It is being computed."""
     FINISHED = "finished"
     REUSED = "reused"
     """It was in the store before this sweep started."""
     FAILED = "failed"
     SKIPPED = "skipped"
-    """What it starts from failed or was skipped."""
+    """Its input failed or was skipped."""
     PAUSED = "paused"
-    """It is computed up to its trial's rung, and kept."""
+    """It is computed up to its trial's rung."""
     PRUNED = "pruned"
-    """It is computed no further: its trial was stopped early, or failed."""
+    """It is not computed any further: its trial was stopped early, or failed."""
 
 
 DONE = (Status.FINISHED, Status.REUSED)
@@ -38,7 +38,7 @@ class Scheduler:
     """The nodes of a plan and their states."""
 
     def __init__(self, plan: Plan, finished: Collection[str]) -> None:
-        """All nodes of `plan`: those with a key in `finished` are done, the others wait."""
+        """All nodes of `plan`; nodes with a key in `finished` are done, the others wait."""
         self._nodes = {node.key: node for node in plan.nodes}
         seeds = list(dict.fromkeys(node.run.seed for node in plan.nodes))
         by_seed = sorted(self._nodes.values(), key=lambda node: seeds.index(node.run.seed))
@@ -58,7 +58,7 @@ class Scheduler:
         return key in self._nodes
 
     def is_planned(self, key: str) -> bool:
-        """Whether the node was in the plan before any search asked for it."""
+        """Whether the node was in the plan before any search requested it."""
         return key in self._turns
 
     def node(self, key: str) -> Node:
@@ -71,7 +71,7 @@ class Scheduler:
 
     @property
     def all_handed_out(self) -> bool:
-        """Whether no node waits any more."""
+        """Whether no node waits."""
         return Status.WAITING not in self._status.values()
 
     @property
@@ -80,11 +80,11 @@ class Scheduler:
         return self.all_handed_out and Status.STARTED not in self._status.values()
 
     def next_ready(self) -> Node | None:
-        """The waiting node whose input is done and whose turn it is; None where there is none.
+        """The next waiting node whose input is done; None if there is none.
 
-        All nodes of a seed come before those of the next seed, so that a sweep that is cut can
+        All nodes of a seed come before those of the next seed, so that an interrupted sweep can
         compare its settings; within a seed they come in the order of the plan. Nodes that a search
-        has added come last, in the order in which they were added.
+        has added come last, in the order of their addition.
         """
         ready = (node for node in self.having(Status.WAITING) if self._input_is_there(node))
         return min(
@@ -97,12 +97,12 @@ class Scheduler:
         return self._status[node.input.key] in DONE
 
     def request(self, node: Node, until: int | None, *, finished: bool) -> None:
-        """Add a node that a search asks for, or let one that is there be computed further.
+        """Add a node that a search requests, or have a known one computed further.
 
         Args:
-            node: The node, after the node that it starts from.
-            until: Environment steps up to which it is to be computed; None: to its end.
-            finished: Whether a node that is new here is in the store.
+            node: The node; its input must be known.
+            until: Environment steps up to which it is to be computed; None for its end.
+            finished: Whether the node, if it is new, is in the store.
         """
         key = node.key
         if key not in self._nodes:
@@ -134,24 +134,24 @@ class Scheduler:
         self.changes += 1
 
     def until(self, key: str) -> int | None:
-        """Environment steps up to which the node is to be computed for now; None: to its end."""
+        """Environment steps up to which the node is to be computed; None for its end."""
         return self._until.get(key)
 
     def pause(self, key: str, env_steps: int) -> None:
-        """Record that the node is computed that far; it waits again if more is wanted by now."""
+        """Record that the node is computed that far; it waits if more was requested meanwhile."""
         until = self._until.get(key)
         more = until is None or until > env_steps
         self._move(key, Status.STARTED, Status.WAITING if more else Status.PAUSED)
 
     def prune(self, key: str) -> bool:
-        """Compute the node no further; False where it is not waiting or paused."""
+        """Stop computing the node; returns False if it is not waiting or paused."""
         if self._status[key] not in (Status.WAITING, Status.PAUSED):
             return False
         self._move(key, self._status[key], Status.PRUNED)
         return True
 
     def start(self, key: str) -> None:
-        """Record that the node is handed out."""
+        """Record that the node is being computed."""
         self._move(key, Status.WAITING, Status.STARTED)
 
     def finish(self, key: str) -> None:
@@ -159,7 +159,7 @@ class Scheduler:
         self._move(key, Status.STARTED, Status.FINISHED)
 
     def fail(self, key: str) -> list[Node]:
-        """Record that the node failed; the waiting ones that need it are skipped, and returned."""
+        """Record that the node failed; skips and returns the waiting nodes that depend on it."""
         self._move(key, Status.STARTED, Status.FAILED)
         dependants = list(self._dependants({key}))
         for node in dependants:
@@ -189,16 +189,16 @@ class Failure(NamedTuple):
 
 
 class Listener:
-    """Receives a sweep's events in the driver's loop, so it must be quick and must not raise."""
+    """Receives a sweep's events in the driver's loop; it must be fast and must not raise."""
 
     def started(self, node: Node) -> None:
-        """A worker has begun to compute the node."""
+        """A worker started computing the node."""
 
     def reported(self, node: Node, reports: list[Report]) -> None:
-        """The node has new reports; after a restart, those of its checkpoint once more."""
+        """The node has new reports; after a restart, all reports of its checkpoint again."""
 
     def noted(self, node: Node, text: str) -> None:
-        """A message about the node that is no failure."""
+        """A message about the node, other than a failure."""
 
     def remarked(self, text: str) -> None:
         """A message about the whole sweep."""
@@ -210,13 +210,13 @@ class Listener:
         """The run failed."""
 
     def skipped(self, node: Node, because: Node) -> None:
-        """The node won't be computed, because another one failed."""
+        """The node won't be computed because another node failed."""
 
     def paused(self, node: Node) -> None:
         """The node is computed up to its trial's rung."""
 
     def pruned(self, node: Node, reason: str) -> None:
-        """The node isn't computed any further, because its trial was stopped early."""
+        """The node isn't computed any further because its trial was stopped early."""
 
     def tick(self) -> None:
-        """The driver's loop went round once."""
+        """Called in every iteration of the driver's loop."""

@@ -107,7 +107,7 @@ class SweepLocation:
         for stage in document["stages"]:
             match stage.get("init_from"):
                 case {"checkpoint": str(place)} as source if place.startswith(IN_STORAGE):
-                    source["checkpoint"] = str(store.folder(place.removeprefix(IN_STORAGE)))
+                    source["checkpoint"] = str(store.lasting_files(place.removeprefix(IN_STORAGE)))
         return document
 
     def config(self, seeds: str | None = None) -> SweepConfig:

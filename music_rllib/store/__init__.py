@@ -1,1 +1,1 @@
-"""What outlasts a process: finished runs, handoffs, leases, a sweep's own files."""
+"""Storage in a folder or a bucket: finished runs, checkpoints, handoffs and leases."""

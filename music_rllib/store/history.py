@@ -11,7 +11,7 @@ HISTORY = "history.jsonl"
 
 
 class Report(BaseModel):
-    """Metrics of a run at one moment; they may be NaN (`NaN` in JSON)."""
+    """Metrics of a run at one time; they may be NaN (`NaN` in JSON)."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="constants")
 
@@ -19,7 +19,7 @@ class Report(BaseModel):
     seconds: float
     """Training time so far, over all attempts at this run."""
     timestamp_ms: int
-    """Unix time of the report. MLflow gets it too, so that logging a report twice is harmless."""
+    """Unix time of the report. MLflow receives it too, so that logging it twice is harmless."""
     metrics: dict[str, float]
 
 
@@ -29,7 +29,7 @@ class RunResult(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="constants")
 
     label: str
-    """Label of the run that made it; another sweep may give the same node another label."""
+    """Label of the run that computed it; another sweep may use a different label."""
     env_steps: int
     seconds: float
     metrics: dict[str, float]
@@ -48,13 +48,13 @@ def from_json_lines(data: bytes) -> list[Report]:
     """Inverse of `to_json_lines`.
 
     Raises:
-        ValueError: A line is no report.
+        ValueError: A line is not a report.
     """
     return _REPORTS.validate_json(b"[%s]" % b",".join(data.splitlines()))
 
 
 def last_values(reports: Iterable[Report]) -> dict[str, float]:
-    """The last value of each metric; not every report has all metrics."""
+    """The last value of each metric; a report may lack some metrics."""
     values: dict[str, float] = {}
     for report in reports:
         values |= report.metrics

@@ -42,8 +42,8 @@ CONTINUATIONS, VERIFIED = "continuations", "verified.json"
 TRAIN_AGAIN = "to retrain damaged runs, give 'run' or 'resume' --retrain-damaged"
 
 
-class NodeStore:
-    """The finished nodes and the work folders of the storage `uri` (see `open_storage`).
+class NodeStore(SealedFolders):
+    """The finished nodes of the storage `uri` (see `open_storage`), and its work folders.
 
     Methods raise DamagedError if a node does not exist or differs from its manifest, and
     StorageError if the storage cannot be reached or written.
@@ -52,24 +52,20 @@ class NodeStore:
     def __init__(self, uri: str) -> None:
         self.uri = uri
         self._root = open_storage(uri)
-        self._nodes = SealedFolders(self._root / "nodes")
-
-    def path(self, key: str) -> str:
-        """Path of a node, whether it exists or not."""
-        return self._nodes.path(key)
+        super().__init__(self._root / "nodes")
 
     def is_finished(self, key: str) -> bool:
         """Whether the node has been published."""
-        return self._nodes.exists(key)
+        return self.exists(key)
 
     def finished(self, keys: Iterable[str]) -> set[str]:
         """The published nodes among `keys`."""
-        present = set(keys).intersection(self._nodes.folder.folders())
-        return set(self._nodes.folder.having(MANIFEST, present))
+        present = set(keys).intersection(self.folder.folders())
+        return set(self.folder.having(MANIFEST, present))
 
     def result(self, key: str) -> RunResult | None:
         """The result of a finished run; None for an imported handoff."""
-        return self._result(self._nodes.manifest(key))
+        return self._result(self.manifest(key))
 
     def _result(self, manifest: Manifest) -> RunResult | None:
         result = manifest.meta.get("result")
@@ -82,20 +78,20 @@ class NodeStore:
     def history(self, key: str) -> list[Report]:
         """All reports of a finished run."""
         try:
-            return from_json_lines(self._nodes.read(key, HISTORY))
+            return from_json_lines(self.read(key, HISTORY))
         except ValueError as error:
             raise DamagedError(f"{self.path(key)}/{HISTORY} must hold reports: {error}") from error
 
     def environment(self, key: str) -> Fingerprint | None:
         """Fingerprint of the environment that a finished run used; None if it is not recorded."""
-        return environment_of(self._nodes.manifest(key))
+        return environment_of(self.manifest(key))
 
     def lines(self, key: str) -> tuple[bytes, dict[str, str], Fingerprint | None]:
         """The `HISTORY` of a finished run, and its code and environment as passed to `publish`."""
-        manifest = self._nodes.manifest(key)
+        manifest = self.manifest(key)
         known = manifest.meta.get("provenance")
         provenance = known.items() if isinstance(known, dict) else ()
-        lines = self._nodes.read(key, HISTORY, manifest)
+        lines = self.read(key, HISTORY, manifest)
         return lines, {k: str(value) for k, value in provenance}, environment_of(manifest)
 
     def publish(
@@ -117,20 +113,12 @@ class NodeStore:
             meta["environment"] = dict(environment)
         if provenance is not None:
             meta["provenance"] = dict(provenance)
-        with self._nodes.sealing(key, meta) as staging:
+        with self.sealing(key, meta) as staging:
             # The modes of a temporary folder, which only its owner may read, are not copied.
             for file in filter(Path.is_file, folder.rglob("*")):
                 target = staging / file.relative_to(folder)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(file, target)
-
-    def tidy(self, key: str) -> None:
-        """Delete the remains of killed attempts to publish a node; needs the node's lease."""
-        self._nodes.tidy(key)
-
-    def fetch(self, key: str, folder: Path) -> None:
-        """Copy a finished node's files into `folder`, verified."""
-        self._nodes.fetch(key, folder)
 
     @contextlib.contextmanager
     def files(self, key: str) -> Iterator[Path]:
@@ -145,7 +133,7 @@ class NodeStore:
             self.fetch(key, Path(copy))
             yield Path(copy)
 
-    def folder(self, key: str) -> Path:
+    def lasting_files(self, key: str) -> Path:
         """As `files`, until the program ends."""
         stack = contextlib.ExitStack()
         atexit.register(stack.close)
@@ -154,7 +142,7 @@ class NodeStore:
     def verify(self, key: str) -> None:
         """Check that a finished node matches its manifest."""
         try:
-            self._nodes.check(key)
+            self.check(key)
         except DamagedError as error:
             raise DamagedError(f"{error}; {TRAIN_AGAIN}") from error
 
@@ -184,7 +172,7 @@ class NodeStore:
     @cached_property
     def _verified(self) -> dict[str, str]:
         """Fingerprint of the files of each verified node."""
-        with contextlib.suppress(OSError, ValueError):
+        with contextlib.suppress(OSError, ValueError, TypeError):
             content = json.loads(self._root.read(VERIFIED) or b"") if self._root.is_local else {}
             return {key: str(value) for key, value in dict(content).items()}
         return {}
@@ -206,7 +194,7 @@ class NodeStore:
     def _fingerprint(self, key: str) -> str | None:
         """A hash of the files' inodes, sizes and times; None if a file is new or missing."""
         digest, newest = hashlib.sha256(), 0
-        for path in map(Path, self._nodes.files(key)):
+        for path in map(Path, self.paths(key)):
             try:
                 status = path.stat()
             except FileNotFoundError:
@@ -219,7 +207,7 @@ class NodeStore:
         return None if time.time() - newest / 1e9 < SETTLED_SECONDS else digest.hexdigest()[:20]
 
     def _check(self, key: str) -> None:
-        manifest = self._nodes.check(key)
+        manifest = self.check(key)
         result = self._result(manifest)
         # The manifest has no hash of its own, but the history has the values of its result too.
         if self._root.is_local and result is not None and HISTORY in manifest.files:
@@ -230,10 +218,6 @@ class NodeStore:
                     f"{self.path(key)}/{MANIFEST} must have the last values of {HISTORY}, it has "
                     "others"
                 )
-
-    def remove(self, key: str) -> None:
-        """Delete a node, so that it is trained again."""
-        self._nodes.remove(key)
 
     def begun(self) -> set[str]:
         """Keys of the runs that have a work folder."""

@@ -195,7 +195,7 @@ class SealedFolders:
             _check_size(source, expected, info.size)
         return manifest
 
-    def files(self, name: str) -> list[str]:
+    def paths(self, name: str) -> list[str]:
         """Paths of the manifest and of the folder's files."""
         manifest = self.manifest(name)
         own = [self._source(manifest, file) for file in sorted(manifest.files)]

@@ -119,12 +119,14 @@ def _is_driven(location: SweepLocation, state: Mapping[str, Any] | None) -> bool
 
 
 def _nodes(location: SweepLocation) -> list[dict[str, Any]]:
-    """The nodes of a sweep's plan, and the imported handoffs that they start from."""
+    """The nodes of a sweep's plan and of its earlier versions, and imported handoffs."""
     nodes = location.nodes()
+    earlier = (location.read(sweep_files.PLAN) or {}).get("earlier", ())
     imported = {node["input"]: None for node in nodes if str(node["input"]).startswith(IMPORTED)}
     return [
         *nodes,
         *({"key": key, "label": f"{key} (imported)", "input": None} for key in imported),
+        *({**one, "label": f"{one['label']} (earlier version)", "input": None} for one in earlier),
     ]
 
 

@@ -235,7 +235,7 @@ def _stage(sweep: OpenSweep, node: Node, folder: Path) -> dict[str, Any]:
         place = {"stage": sweep.plan.node(given.key).stage}
         source = {"init_from": place | {"task": given.task.name}}
     elif given is not None:
-        checkpoint = sweep.store.folder(given.key)
+        checkpoint = sweep.store.lasting_files(given.key)
         if is_remote(sweep.storage):  # the copy that this is does not stay
             checkpoint = shutil.copytree(checkpoint, folder / "source", dirs_exist_ok=True)
         place = {"checkpoint": str(checkpoint.absolute())}

@@ -5,8 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from functools import partial
-from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from music_rllib import names
 from music_rllib.envs.fingerprint import Fingerprint
@@ -75,10 +73,9 @@ def finished_run(store: NodeStore, node: Node) -> StoredRun:
         DamagedError: The run's history cannot be read.
     """
     reports, policy = store.history(node.key), None
-    with TemporaryDirectory() as folder:
-        try:
-            store.fetch(node.key, Path(folder))
-            policy = policy_from_folder(Path(folder), [node.run.task]).to_bytes()
-        except (OSError, ValueError, StorageError) as error:
-            logger.warning("MLflow gets no policy of %s: %s", node.label, error)
+    try:
+        with store.files(node.key) as folder:
+            policy = policy_from_folder(folder, [node.run.task]).to_bytes()
+    except (OSError, ValueError, StorageError) as error:
+        logger.warning("MLflow gets no policy of %s: %s", node.label, error)
     return StoredRun(reports, policy)

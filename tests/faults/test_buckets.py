@@ -43,7 +43,7 @@ def bucket(program: Program) -> Iterator[str]:
     own.stop()
 
 
-def test_a_driver_in_a_new_pod_goes_on(
+def test_a_driver_in_a_new_pod_continues(
     program: Program, unbroken: Path, bucket: str, server: MlflowServer, tmp_path: Path
 ) -> None:
     program.write(sweeps.document(storage=bucket, mlflow={"tracking_uri": server.uri}))

@@ -41,7 +41,7 @@ def finish(sweep: OpenSweep, folder: Path, *labels: str) -> None:
             sweep.store.publish(node.key, folder / "made", RESULT)
 
 
-def test_what_changed_and_what_it_leaves_behind(
+def test_changed_settings_and_affected_runs_are_listed(
     tmp_path: Path, sweep_document: dict[str, Any]
 ) -> None:
     first = opened(tmp_path, sweep_document)
@@ -72,7 +72,7 @@ def test_what_changed_and_what_it_leaves_behind(
     assert "--name NEW" in text
 
 
-def test_more_env_steps_are_no_change_where_finished_runs_can_be_gone_on_from(
+def test_more_env_steps_continue_finished_runs_without_a_question(
     tmp_path: Path, sweep_document: dict[str, Any]
 ) -> None:
     sweep_document["stages"] = sweep_document["stages"][:1]
@@ -182,7 +182,7 @@ def test_a_second_driver_is_refused_and_a_dead_one_does_not_count(
     assert file.read() is None
 
 
-def test_a_driver_that_was_suspended_ends_where_another_one_has_its_sweep(
+def test_a_suspended_driver_exits_if_another_one_has_its_sweep(
     tmp_path: Path, sweep_document: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And goes on where that one has ended since."""

@@ -52,7 +52,7 @@ def clock(program: Program, tmp_path: Path) -> Clock:
     return Clock(program, folder)
 
 
-def test_an_hour_ahead_and_then_an_hour_back(
+def test_a_clock_that_jumps_forward_and_back(
     program: Program, clock: Clock, unbroken: Path, tmp_path: Path
 ) -> None:
     process = sweeps.start_until(program, "pretrain/seed0: 8")
@@ -65,7 +65,7 @@ def test_an_hour_ahead_and_then_an_hour_back(
     comparison.same(unbroken, tmp_path / "results")
 
 
-def test_killed_an_hour_ahead_and_continued_in_time(
+def test_killed_with_a_fast_clock_and_resumed(
     program: Program, clock: Clock, unbroken: Path, tmp_path: Path
 ) -> None:
     """What the dead ones hold in an hour's time keeps nobody waiting."""

@@ -96,7 +96,7 @@ DAMAGE: list[tuple[str, str, Callable[[Path], None]]] = [
 
 
 @pytest.mark.parametrize(("where", "file", "damage"), DAMAGE)
-def test_a_damaged_newest_checkpoint_costs_an_interval_and_no_number(
+def test_a_damaged_newest_checkpoint_changes_no_number(
     where: str,
     file: str,
     damage: Callable[[Path], None],
@@ -152,7 +152,7 @@ def _of_another_task(folder: Path) -> None:
     path.write_text(json.dumps(content))
 
 
-def test_a_consumer_refuses_a_handoff_that_is_not_what_it_should_be(tmp_path: Path) -> None:
+def test_a_run_refuses_a_damaged_handoff(tmp_path: Path) -> None:
     source = job(tmp_path, settings("music-u", env_steps=200))
     compute(source)
     node = job(tmp_path, settings("music-r"), source)
@@ -184,7 +184,7 @@ def test_a_consumer_refuses_a_handoff_that_is_not_what_it_should_be(tmp_path: Pa
     assert compute(node)[-1].get(CAUSE) is None, "the good one trains"
 
 
-def test_a_run_that_somebody_else_computes_is_waited_for(
+def test_a_run_of_another_process_is_waited_for(
     cut: tuple[Path, Path, NodeJob], tmp_path: Path
 ) -> None:
     """A worker that outlived its driver, or another sweep: no collision, and no second training."""
@@ -207,7 +207,7 @@ def test_a_run_that_somebody_else_computes_is_waited_for(
     trial.stop()
 
 
-def test_a_dead_owner_whose_clock_was_ahead_is_not_waited_for_until_then(
+def test_a_dead_owner_with_a_fast_clock_is_not_waited_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     node = job(tmp_path, settings("tac"))
@@ -223,7 +223,7 @@ def test_a_dead_owner_whose_clock_was_ahead_is_not_waited_for_until_then(
     trial.stop()
 
 
-def test_a_worker_whose_lease_is_taken_over_writes_nothing_more_and_reuses(
+def test_a_worker_that_lost_its_lease_stops_writing_and_reuses(
     cut: tuple[Path, Path, NodeJob], tmp_path: Path
 ) -> None:
     """It was suspended; the other one finishes the run, and deletes the folder that it had."""
@@ -253,7 +253,7 @@ def test_a_worker_whose_lease_is_taken_over_writes_nothing_more_and_reuses(
 
 
 @pytest.mark.parametrize("theirs", ["released", "deleted"])
-def test_a_worker_whose_lease_is_lost_to_nobody_goes_on(
+def test_a_worker_whose_lease_nobody_took_continues(
     theirs: str, cut: tuple[Path, Path, NodeJob], tmp_path: Path
 ) -> None:
     """Whoever took the run over has stopped; or somebody deleted the folder below a checkpoint."""
@@ -275,7 +275,7 @@ def test_a_worker_whose_lease_is_lost_to_nobody_goes_on(
     assert numbers(tmp_path, node) == numbers(whole, node)
 
 
-def test_a_run_that_is_paused_between_reports_loses_nothing(
+def test_a_run_saved_between_reports_loses_nothing(
     cut: tuple[Path, Path, NodeJob], tmp_path: Path
 ) -> None:
     """As on a signal: saved after whatever round of training, and continued."""
@@ -332,7 +332,7 @@ print(count)
 """
 
 
-def test_a_kill_at_any_step_of_saving_leaves_a_sound_checkpoint(tmp_path: Path) -> None:
+def test_a_kill_at_any_step_of_saving_leaves_an_intact_checkpoint(tmp_path: Path) -> None:
     def storage(number: int) -> Path:
         folder = tmp_path / str(number)
         work = NodeStore(str(folder)).work_folder("a" * 20)
@@ -369,7 +369,7 @@ def test_a_kill_at_any_step_of_saving_leaves_a_sound_checkpoint(tmp_path: Path) 
     assert found == {"2000", "3000"}
 
 
-def test_checkpoints_are_pruned_as_the_sweep_says(tmp_path: Path) -> None:
+def test_checkpoints_keep_prunes_old_checkpoints(tmp_path: Path) -> None:
     node = job(tmp_path, settings("tac", env_steps=1000)).model_copy(
         update={"checkpoints": Checkpoints(keep=3)}
     )

@@ -31,7 +31,7 @@ def check_end(program: Program, output: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["raylet", "gcs_server"])
-def test_a_local_ray_that_dies_ends_the_driver_in_good_order(
+def test_the_driver_exits_when_a_local_ray_dies(
     name: str, program: Program, unbroken: Path
 ) -> None:
     process = sweeps.start_until(program, "pretrain/seed0: started")
@@ -45,7 +45,7 @@ def test_a_local_ray_that_dies_ends_the_driver_in_good_order(
     comparison.same(unbroken, program.folder / "results")
 
 
-def test_a_cluster_whose_head_dies_ends_the_driver_in_good_order(
+def test_the_driver_exits_when_the_head_of_a_cluster_dies(
     two_nodes: tuple[str, int], program: Program, unbroken: Path
 ) -> None:
     address, raylet = two_nodes

@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[2]
 SEED = os.environ.get("FUZZ_SEED", "0")
 
 
-def test_no_changed_file_does_what_it_should_not(pytestconfig: pytest.Config) -> None:
+def test_randomly_changed_files_are_handled_safely(pytestconfig: pytest.Config) -> None:
     """See `tests/fuzz.py`; it says which case of which seed, and where its files are."""
     seconds = 60 if "thorough" in pytestconfig.option.markexpr else 6
     done = subprocess.run(

@@ -82,7 +82,7 @@ def test_a_call_that_does_not_return_ends_the_worker_and_leaves_its_stack(
 
 
 @pytest.mark.parametrize("what", ["works", "stopped"])
-def test_what_takes_its_time_is_no_hang(what: str, tmp_path: Path) -> None:
+def test_slow_calls_and_updates_are_not_hangs(what: str, tmp_path: Path) -> None:
     """Many short calls, a long update, and a process that was stopped within a call."""
     with worker(tmp_path, what) as process:
         assert process.stdout is not None
@@ -138,7 +138,7 @@ def test_the_message_names_the_call_and_the_place(record: str, call: str, place:
     assert second == f"it hangs at {place}"
 
 
-def test_one_that_hangs_while_it_is_checked_ends_the_program(program: Program) -> None:
+def test_an_environment_that_hangs_in_the_checks_ends_the_program(program: Program) -> None:
     document = sweeps.document(tasks=["Hanging"])
     document["environments"] = {
         "Hanging": document["environments"]["Point"]
@@ -155,9 +155,7 @@ def test_one_that_hangs_while_it_is_checked_ends_the_program(program: Program) -
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("locked", [False, True])
-def test_a_run_whose_environment_hangs_fails_and_the_others_finish(
-    locked: bool, program: Program
-) -> None:
+def test_a_hanging_environment_fails_its_run_only(locked: bool, program: Program) -> None:
     document: dict[str, Any] = sweeps.document(tasks=["Point", "Hanging"])
     document["environments"]["Hanging"] = document["environments"]["Point"] | {
         "env_id": "point_env:Hanging-v0",

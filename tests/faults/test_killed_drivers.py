@@ -41,7 +41,7 @@ def test_a_killed_worker_then_sigterm_then_a_killed_driver(
 @pytest.mark.thorough
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("sign", ["starting a local Ray", "pretrain/seed0: ", "finetune/"])
-def test_told_to_stop_in_each_stage(
+def test_stopped_in_each_stage(
     number: signal.Signals, sign: str, program: Program, unbroken: Path
 ) -> None:
     process = sweeps.start_until(program, sign)
@@ -61,9 +61,7 @@ def test_told_to_stop_in_each_stage(
 
 
 @pytest.mark.thorough
-def test_a_signal_to_the_whole_process_group_costs_an_interval_and_no_number(
-    program: Program, unbroken: Path
-) -> None:
+def test_a_signal_to_the_process_group_changes_no_number(program: Program, unbroken: Path) -> None:
     """As `timeout` and Slurm send it: Ray ends as well, before anything can be saved."""
     process = sweeps.start_until(program, "pretrain/seed0: started")
     time.sleep(1.0)
@@ -90,7 +88,7 @@ def test_a_second_signal_ends_it_at_once(program: Program, unbroken: Path) -> No
 
 
 @pytest.mark.thorough
-def test_a_run_whose_worker_dies_again_and_again_fails_with_the_cause(
+def test_a_run_whose_worker_dies_repeatedly_fails_with_the_cause(
     program: Program, unbroken: Path
 ) -> None:
     document = sweeps.document()

@@ -28,7 +28,7 @@ def locked(file: Path) -> Iterator[None]:
     connection.close()
 
 
-def test_a_locked_study_is_said_and_waited_for(
+def test_a_locked_study_prints_a_warning_and_is_waited_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     options = storage._engine_options
@@ -54,7 +54,7 @@ def test_a_locked_study_is_said_and_waited_for(
 
 
 @pytest.mark.thorough
-def test_a_locked_mlflow_holds_no_run_up_and_has_each_step_once(
+def test_a_locked_mlflow_delays_no_run_and_has_each_step_once(
     program: Program, unbroken: Path
 ) -> None:
     results = program.folder / "results"

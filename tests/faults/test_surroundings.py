@@ -60,7 +60,7 @@ def as_nobody(folder: Path, environment: dict[str, str], *command: str) -> tuple
     return done.returncode, done.stdout, done.stderr
 
 
-def test_a_user_without_rights_or_home_in_another_language(
+def test_another_user_without_home_in_another_language(
     public: Path, turkish: dict[str, str], unbroken: Path
 ) -> None:
     environment = os.environ | turkish

@@ -48,7 +48,7 @@ def let_expire(*leases: Path) -> None:
         lease.write_text(json.dumps(content | {"expires": time.time() - 1}))
 
 
-def test_a_suspended_sweep_waits_for_the_one_that_took_its_runs_over(
+def test_a_suspended_sweep_waits_for_the_new_owner_of_its_runs(
     program: Program, other: sweeps.OwnProgram, unbroken: Path, tmp_path: Path
 ) -> None:
     process = sweeps.start_until(program, "pretrain/seed0: started")
@@ -68,7 +68,7 @@ def test_a_suspended_sweep_waits_for_the_one_that_took_its_runs_over(
     assert theirs == comparison.logged(f"sqlite:///{unbroken}/mlflow.db")
 
 
-def test_a_suspended_driver_goes_on_where_nobody_drives_its_sweep(
+def test_a_suspended_driver_continues_if_nobody_took_its_sweep(
     program: Program, other: sweeps.OwnProgram, unbroken: Path, tmp_path: Path
 ) -> None:
     """A second one finds its lease expired, and is refused by what it keeps for MLflow."""

@@ -93,7 +93,7 @@ def test_a_changed_environment_is_named_with_its_runs_and_under_every_name(
     assert len(lines) == 3
 
 
-def test_checkpoints_and_ends_of_shorter_runs_count_too(tmp_path: Path) -> None:
+def test_checkpoints_and_ends_of_shorter_runs_are_checked(tmp_path: Path) -> None:
     first = opened(tmp_path, OLD)
     pretrain = first.plan.nodes[0]
     place = first.store.continuation(continuation_key(pretrain.run, None))
@@ -110,7 +110,7 @@ def test_checkpoints_and_ends_of_shorter_runs_count_too(tmp_path: Path) -> None:
     assert not place.names()
 
 
-def test_what_is_trained_again_takes_with_it_what_starts_from_it(tmp_path: Path) -> None:
+def test_runs_that_start_from_a_retrained_run_are_retrained(tmp_path: Path) -> None:
     finished(tmp_path)
     sweep = opened(tmp_path, NEW)
     pretrain, finetune = sweep.plan.nodes
@@ -136,7 +136,7 @@ def test_what_is_trained_again_takes_with_it_what_starts_from_it(tmp_path: Path)
     assert not sweep.store.is_finished(pretrain.key)
 
 
-def test_an_answer_is_kept_for_every_sweep_of_the_storage(tmp_path: Path) -> None:
+def test_a_decision_applies_to_every_sweep_in_the_storage(tmp_path: Path) -> None:
     finished(tmp_path)
     sweep = opened(tmp_path, NEW)
     sweep = keep_runs(sweep, found_runs(sweep))
@@ -152,7 +152,7 @@ def test_an_answer_is_kept_for_every_sweep_of_the_storage(tmp_path: Path) -> Non
     )
 
 
-def test_runs_of_earlier_versions_do_not_say_and_are_used(tmp_path: Path) -> None:
+def test_runs_without_a_recorded_environment_are_used(tmp_path: Path) -> None:
     finished(tmp_path, None)
     assert text_of(opened(tmp_path, NEW)) is None
 

@@ -62,7 +62,7 @@ def test_every_node_comes_after_its_input(tmp_path: Path) -> None:
         seen.add(node.key)
 
 
-def test_the_grid_of_a_source_multiplies(tmp_path: Path) -> None:
+def test_the_grid_of_a_source_multiplies_the_runs(tmp_path: Path) -> None:
     gridded = PRETRAIN | {"grid": {"tac.alpha": [0.1, 0.2]}}
     sweep = plan(tmp_path, stages=[gridded, FINETUNE])
     runs = [run for run in sweep.runs if run.stage == "finetune"]
@@ -86,7 +86,7 @@ def test_the_grid_of_a_source_multiplies(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_only_layers_are_written_with_an_x(
+def test_only_layer_sizes_are_joined_with_x(
     tmp_path: Path, setting: str, value: Any, label: str
 ) -> None:
     stage = {"name": "train", "variant": "tac", "grid": {setting: [value]}}
@@ -105,8 +105,8 @@ def test_equal_computations_are_one_node(tmp_path: Path) -> None:
     assert {node.key for node in direct.nodes} == {node.key for node in sweep.nodes}
     assert shared_runs(direct) == []
     assert shared_runs(sweep) == [
-        "twin: 1 run that pretrain has, too: trained once, and in reports, comparisons and "
-        "hypotheses pretrain's alone"
+        "twin: 1 run equal to runs of pretrain: trained once, and counted for pretrain only in "
+        "reports, comparisons and hypotheses"
     ]
 
 
@@ -167,7 +167,7 @@ def test_every_setting_is_part_of_the_key(changes: dict[str, Any]) -> None:
     assert node_key(settings(**changes), None) != node_key(settings(), None)
 
 
-def test_what_counts_as_moved_is_part_of_the_key_where_it_counts() -> None:
+def test_moved_distance_is_part_of_the_key_only_if_used() -> None:
     task = BUILT_IN_TASKS["FetchPush"].model_copy(update={"moved_distance": 0.02})
     assert node_key(settings(task=task), None) == node_key(settings(), None)
     moved = {"replay": {"hindsight_episodes": "moved"}}
@@ -183,7 +183,7 @@ def test_source_and_algorithm_version_are_part_of_the_key(
     assert len(keys) == 4
 
 
-def test_spelling_a_default_out_changes_nothing() -> None:
+def test_an_explicit_default_does_not_change_the_key() -> None:
     spelt = settings(tac={"lr": 1e-3, "entropic_index": 1}, env_steps=200_000)
     assert node_key(spelt, None) == node_key(settings(), None)
 
@@ -246,7 +246,7 @@ def test_a_trial_starts_from_the_runs_of_a_grid_with_one_point(tmp_path: Path) -
     assert len([one for one in sweep.runs if one.stage == "pretrain"]) == 1
 
 
-def test_a_search_far_behind_a_grid_is_refused(tmp_path: Path) -> None:
+def test_a_search_two_stages_after_a_grid_is_refused(tmp_path: Path) -> None:
     search = {"space": {"tac.lr": {"float": [1e-4, 1e-2]}}, "trials": 2}
     far = {"name": "far", "variant": "music-r", "init_from": "finetune", "search": search}
     pretrain = PRETRAIN | {"grid": {"tac.entropic_index": [1.0, 2.0]}}

@@ -54,7 +54,7 @@ def test_nodes_wait_for_their_inputs(plan: Plan) -> None:
     assert third.label == "b/FetchPush/tac.entropic_index=1/seed1"
 
 
-def test_one_after_the_other_a_seed_is_done_before_the_next(plan: Plan) -> None:
+def test_all_runs_of_a_seed_precede_the_next_seed(plan: Plan) -> None:
     scheduler = Scheduler(plan, finished=())
     order = []
     while (ready := scheduler.next_ready()) is not None:
@@ -75,7 +75,7 @@ def test_finished_nodes_are_reused(plan: Plan) -> None:
     assert ready.stage == "b"
 
 
-def test_a_failure_skips_all_that_depend_on_it_and_nothing_else(plan: Plan) -> None:
+def test_a_failure_skips_exactly_its_dependents(plan: Plan) -> None:
     scheduler = Scheduler(plan, finished=())
     for node in plan.nodes[:2]:
         scheduler.start(node.key)
@@ -92,9 +92,7 @@ def test_a_failure_skips_all_that_depend_on_it_and_nothing_else(plan: Plan) -> N
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_in_any_order_of_events_every_node_is_handed_out_once_after_its_input(
-    plan: Plan, seed: int
-) -> None:
+def test_every_node_starts_once_and_after_its_input(plan: Plan, seed: int) -> None:
     """Plays Tune: asks the searcher, completes or fails running nodes in random order."""
     rng = random.Random(seed)
     scheduler = Scheduler(plan, finished=())

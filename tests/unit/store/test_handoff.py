@@ -39,7 +39,7 @@ def handoff(tmp_path: Path) -> Path:
     return tmp_path / "handoff"
 
 
-def test_weights_come_back_as_they_were(handoff: Path) -> None:
+def test_weights_round_trip(handoff: Path) -> None:
     found = read_handoff(handoff, ["normaliser", "mi_estimator"], PUSH)
     assert list(found) == ["normaliser", "mi_estimator"]
     for name, arrays in found.items():
@@ -59,7 +59,7 @@ def test_weights_come_back_as_they_were(handoff: Path) -> None:
     ),
     order=st.sampled_from(["C", "F", "reversed"]),
 )
-def test_any_array_survives(
+def test_any_array_round_trips(
     tmp_path_factory: pytest.TempPathFactory, array: np.ndarray[Any, Any], order: str
 ) -> None:
     folder = tmp_path_factory.mktemp("handoff")
@@ -70,7 +70,7 @@ def test_any_array_survives(
     np.testing.assert_array_equal(found, laid)
 
 
-def test_a_task_may_have_another_name_but_nothing_else(handoff: Path) -> None:
+def test_only_the_name_of_a_task_may_differ(handoff: Path) -> None:
     read_handoff(handoff, ["normaliser"], PUSH.model_copy(update={"name": "Mine"}))
     with pytest.raises(HandoffError, match="must be of task FetchSlide, it is of FetchPush"):
         read_handoff(handoff, ["normaliser"], SLIDE)
@@ -79,7 +79,7 @@ def test_a_task_may_have_another_name_but_nothing_else(handoff: Path) -> None:
         read_handoff(handoff, ["normaliser"], other_split)
 
 
-def test_a_node_folder_holds_its_handoff_below(handoff: Path) -> None:
+def test_a_handoff_is_found_in_a_node_folder(handoff: Path) -> None:
     folder, manifest = open_handoff(handoff.parent)
     assert folder == handoff
     assert manifest.info == INFO
@@ -91,7 +91,7 @@ def refusal(folder: Path, modules: tuple[str, ...] = ("mi_estimator",)) -> str:
     return str(error.value)
 
 
-def test_missing_things_are_named(handoff: Path) -> None:
+def test_missing_parts_are_named(handoff: Path) -> None:
     assert "there is no such folder" in refusal(handoff / "nowhere")
     assert "it lacks policy (made by music-u)" in refusal(handoff, ("policy", "normaliser"))
     (handoff / "mi_estimator.safetensors").unlink()
@@ -156,14 +156,14 @@ def test_arrays_must_be_those_of_the_manifest(handoff: Path) -> None:
     assert "must have the arrays in handoff.json; wrong: x.weight" in refusal(handoff)
 
 
-def test_a_diverged_run_hands_nothing_over(tmp_path: Path) -> None:
+def test_weights_of_a_diverged_run_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"policy\.w must be finite"):
         write_handoff(tmp_path, {"policy": {"w": np.array([1.0, np.nan])}}, INFO)
     with pytest.raises(HandoffError):
         open_handoff(tmp_path)
 
 
-def test_the_content_hash_follows_weights_and_task_only(tmp_path: Path) -> None:
+def test_the_content_hash_depends_on_weights_and_task_only(tmp_path: Path) -> None:
     def content_hash(name: str, weights: NetworkWeights, **changes: Any) -> str:
         info = INFO.model_copy(update=changes)
         return write_handoff(tmp_path / name, weights, info).content_hash

@@ -47,7 +47,7 @@ def elsewhere(what: str = "another sweep", seconds: float = 60.0) -> Lease:
     return lease.model_copy(update={"machine": "another one", "host": "far-away", "pid": 1})
 
 
-def test_a_held_lease_is_refused_and_its_holder_named(place: LeaseFile) -> None:
+def test_a_valid_lease_is_refused_and_its_owner_named(place: LeaseFile) -> None:
     theirs = elsewhere()
     assert place.acquire(theirs) is None
     holder = place.acquire(Lease.of_this_process("mine"))
@@ -57,7 +57,7 @@ def test_a_held_lease_is_refused_and_its_holder_named(place: LeaseFile) -> None:
     assert place.acquire(Lease.of_this_process("mine")) is None
 
 
-def test_an_expired_lease_is_taken_over_and_its_old_owner_writes_no_more(place: LeaseFile) -> None:
+def test_an_expired_lease_is_taken_over_and_its_old_owner_stops_writing(place: LeaseFile) -> None:
     theirs, mine = elsewhere(seconds=-1.0), Lease.of_this_process("mine")
     assert place.acquire(theirs) is None
     assert place.acquire(mine) is None
@@ -84,7 +84,7 @@ def test_a_lease_is_renewed_while_it_is_held(place: LeaseFile) -> None:
     assert place.read() is None
 
 
-def test_the_lease_of_a_process_that_was_killed_here_needs_no_waiting(tmp_path: Path) -> None:
+def test_the_lease_of_a_dead_local_process_is_taken_over_at_once(tmp_path: Path) -> None:
     code = (
         "import sys, time\n"
         "from music_rllib.store.lease import Lease, LeaseFile\n"
@@ -108,7 +108,7 @@ def test_the_lease_of_a_process_that_was_killed_here_needs_no_waiting(tmp_path: 
     assert file.acquire(mine) is None
 
 
-def test_of_many_at_once_one_gets_it(tmp_path: Path) -> None:
+def test_exactly_one_of_many_processes_gets_the_lease(tmp_path: Path) -> None:
     path = str(tmp_path / "lease.json")
     won: list[str] = []
 
@@ -125,7 +125,7 @@ def test_of_many_at_once_one_gets_it(tmp_path: Path) -> None:
     assert len(won) == 1
 
 
-def test_half_a_lease_is_none(tmp_path: Path) -> None:
+def test_an_incomplete_lease_file_is_ignored(tmp_path: Path) -> None:
     path = tmp_path / "lease.json"
     path.write_text('{"owner": "x", "pi')
     file = lease_file(path)
@@ -140,7 +140,7 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
         file.acquire(Lease.of_this_process("mine"))
 
 
-def test_a_clock_that_jumps_an_hour_takes_no_lease_from_a_living_owner(
+def test_a_live_owner_keeps_its_lease_when_the_clock_jumps(
     place: LeaseFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """After a jump forwards or backwards the lease is renewed at once, by the new time."""
@@ -160,7 +160,7 @@ def test_a_clock_that_jumps_an_hour_takes_no_lease_from_a_living_owner(
     held.release()
 
 
-def test_a_lease_from_a_time_that_is_yet_to_come_holds_while_it_is_renewed(
+def test_a_lease_dated_in_the_future_is_valid_while_renewed(
     place: LeaseFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The owner's clock is ahead, or this clock was set back after the owner died."""
@@ -179,7 +179,7 @@ def test_a_lease_from_a_time_that_is_yet_to_come_holds_while_it_is_renewed(
     assert place.acquire(mine) is None
 
 
-def test_who_lost_a_lease_is_told_and_leaves_no_folder(tmp_path: Path) -> None:
+def test_an_owner_that_lost_its_lease_leaves_no_folder(tmp_path: Path) -> None:
     """Another sweep took the run over, finished it and deleted its folder."""
     path = tmp_path / "work" / "key" / "lease.json"
     file, mine = lease_file(path), Lease.of_this_process("m", 0.4)
@@ -203,7 +203,7 @@ def test_waiting_for_a_lease_writes_nothing(place: LeaseFile, tmp_path: Path) ->
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_a_lease_is_acquired_while_its_folder_is_deleted_again_and_again(tmp_path: Path) -> None:
+def test_a_lease_is_acquired_while_its_folder_is_deleted(tmp_path: Path) -> None:
     folder, over = tmp_path / "work", threading.Event()
 
     def delete() -> None:
@@ -225,7 +225,7 @@ def test_a_lease_is_acquired_while_its_folder_is_deleted_again_and_again(tmp_pat
         deleting.join()
 
 
-def test_a_process_is_the_same_after_the_time_of_day_was_set(
+def test_a_process_is_recognized_after_the_clock_changed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """psutil's time of the boot, from which it computes start times, jumps by an hour too."""

@@ -90,7 +90,7 @@ def test_a_published_node_comes_back_verified(
     assert (tmp_path / "fetched" / "handoff" / "w.bin").read_bytes() == b"weights"
 
 
-def test_a_node_is_published_once_and_for_good(store: NodeStore, produced: Path) -> None:
+def test_a_published_node_is_not_replaced(store: NodeStore, produced: Path) -> None:
     store.publish(KEY, produced, RESULT)
     (produced / "handoff" / "w.bin").write_bytes(b"other")
     store.publish(KEY, produced, RESULT.model_copy(update={"label": "other"}))
@@ -104,7 +104,7 @@ def test_an_imported_handoff_has_no_result(store: NodeStore, produced: Path) -> 
     assert store.result("handoff-1") is None
 
 
-def test_what_is_not_there_is_named(store: NodeStore) -> None:
+def test_a_missing_node_is_named(store: NodeStore) -> None:
     with pytest.raises(DamagedError, match=r"nodes/absent/manifest\.json must exist"):
         store.result("absent")
 
@@ -168,7 +168,7 @@ def test_damage_is_found_and_named(
     assert store.is_sound(KEY)
 
 
-def test_what_was_sound_is_not_read_again_and_damage_since_is_found(
+def test_verified_files_are_read_once_and_later_damage_is_found(
     tmp_path: Path, produced: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read: list[str] = []
@@ -199,7 +199,7 @@ def test_what_was_sound_is_not_read_again_and_damage_since_is_found(
 
 
 @pytest.mark.parametrize("content", [b"", b"[]", b'{"a": 1', b"\xff", b'{"KEY": null}'])
-def test_a_damaged_list_of_what_is_sound_costs_a_second_reading(
+def test_with_a_damaged_verified_json_files_are_read_again(
     tmp_path: Path, produced: Path, content: bytes
 ) -> None:
     local_store(tmp_path).publish(KEY, produced, RESULT)
@@ -210,7 +210,7 @@ def test_a_damaged_list_of_what_is_sound_costs_a_second_reading(
     assert list(local_store(tmp_path).damage([KEY])) == [KEY]
 
 
-def test_a_file_that_was_written_just_now_is_read_again(tmp_path: Path, produced: Path) -> None:
+def test_a_new_file_is_read_again(tmp_path: Path, produced: Path) -> None:
     """It may be written again without a change of its time stamp."""
     store = local_store(tmp_path)
     store.publish(KEY, produced, RESULT)
@@ -218,9 +218,7 @@ def test_a_file_that_was_written_just_now_is_read_again(tmp_path: Path, produced
     assert not (tmp_path / "storage" / "verified.json").exists()
 
 
-def test_a_result_in_the_manifest_that_is_not_the_end_of_the_history(
-    tmp_path: Path, produced: Path
-) -> None:
+def test_a_result_that_contradicts_its_history_is_damaged(tmp_path: Path, produced: Path) -> None:
     store = local_store(tmp_path)
     store.publish(KEY, produced, RESULT.model_copy(update={"metrics": {"m": 0.5}}))
     assert store.damage([KEY]) == {}, "it is the last value"
@@ -230,7 +228,7 @@ def test_a_result_in_the_manifest_that_is_not_the_end_of_the_history(
     assert "manifest.json must have the last values of history.jsonl" in str(error)
 
 
-def test_a_manifest_without_a_sound_result_is_damage(store: NodeStore, produced: Path) -> None:
+def test_a_manifest_with_an_invalid_result_is_damaged(store: NodeStore, produced: Path) -> None:
     store.publish(KEY, produced, RESULT)
     path = f"{store.path(KEY)}/manifest.json"
     with store._root.filesystem.open_input_stream(path) as stream:
@@ -242,10 +240,10 @@ def test_a_manifest_without_a_sound_result_is_damage(store: NodeStore, produced:
         store.result(KEY)
 
 
-def test_sizes_tell_without_reading(store: NodeStore, produced: Path) -> None:
+def test_sizes_are_checked_without_reading(store: NodeStore, produced: Path) -> None:
     store.publish(KEY, produced, RESULT)
     assert store.damage([KEY]) == {}
-    (weights,) = [file for file in store._nodes.files(KEY) if file.endswith("w.bin")]
+    (weights,) = [file for file in store.paths(KEY) if file.endswith("w.bin")]
     with store._root.filesystem.open_output_stream(weights) as sink:
         sink.write(b"weight")
     (error,) = store.damage([KEY]).values()
@@ -256,7 +254,7 @@ def test_sizes_tell_without_reading(store: NodeStore, produced: Path) -> None:
 
 
 @pytest.mark.parametrize("mask", [0o022, 0o077, 0o007])
-def test_who_may_read_a_node_is_up_to_the_umask(tmp_path: Path, produced: Path, mask: int) -> None:
+def test_the_umask_decides_who_can_read_a_node(tmp_path: Path, produced: Path, mask: int) -> None:
     """So a group can share a storage, and a single user can keep it private."""
     shutil.rmtree(tmp_path / "storage", ignore_errors=True)
     before = os.umask(mask)
@@ -284,7 +282,7 @@ def test_who_may_read_a_node_is_up_to_the_umask(tmp_path: Path, produced: Path, 
     ],
     ids=["torn", "path", "prefix", "name"],
 )
-def test_an_unsound_manifest_is_refused(
+def test_an_invalid_manifest_is_refused(
     tmp_path: Path, produced: Path, text: str, message: str
 ) -> None:
     store = local_store(tmp_path)
@@ -294,9 +292,7 @@ def test_an_unsound_manifest_is_refused(
         store.result(KEY)
 
 
-def test_a_folder_that_was_copied_without_its_manifest_is_replaced(
-    tmp_path: Path, produced: Path
-) -> None:
+def test_a_folder_without_a_manifest_is_replaced(tmp_path: Path, produced: Path) -> None:
     store = local_store(tmp_path)
     (tmp_path / "storage" / "nodes" / KEY / "rest").mkdir(parents=True)
     assert not store.is_finished(KEY)
@@ -373,7 +369,7 @@ def test_a_save_that_fails_leaves_the_older_checkpoint(store: NodeStore) -> None
         assert (newest.folder / "state").read_text() == "good"
 
 
-def test_a_damaged_checkpoint_is_skipped_aloud(tmp_path: Path) -> None:
+def test_a_damaged_checkpoint_is_skipped_with_a_warning(tmp_path: Path) -> None:
     work = local_store(tmp_path).work_folder(KEY)
     for env_steps in (1000, 2000):
         with work.new_checkpoint(env_steps) as draft:
@@ -395,7 +391,7 @@ def test_a_damaged_checkpoint_is_skipped_aloud(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("keep", [1, 2])
-def test_what_is_saved_after_damage_stays_and_replaces_it(store: NodeStore, keep: int) -> None:
+def test_checkpoints_after_damage_replace_the_damaged_ones(store: NodeStore, keep: int) -> None:
     """The run begins anew, and has fewer steps than the damaged checkpoint for a while."""
     work = store.work_folder("0" * 20, keep)
     parts: list[str] = []
@@ -423,7 +419,7 @@ def test_what_is_saved_after_damage_stays_and_replaces_it(store: NodeStore, keep
     assert warnings == []
 
 
-def test_storage_that_cannot_be(tmp_path: Path) -> None:
+def test_an_invalid_storage_is_refused(tmp_path: Path) -> None:
     with pytest.raises(StorageError, match="must be a folder or an s3:// or gs:// URI"):
         open_storage("ftp://host/path")
     (tmp_path / "file").write_text("")
@@ -443,7 +439,7 @@ def test_storage_paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         assert open_storage(f"s3://k:s%2F1@bucket/{key}?region=x").path == f"bucket/{key}"
 
 
-def test_reports_survive_as_json_lines() -> None:
+def test_reports_round_trip_as_json_lines() -> None:
     reports = [
         Report(env_steps=i, seconds=i / 3, timestamp_ms=i, metrics={"a": 0.1 * i, "b/c": -i})
         for i in range(3)
@@ -452,14 +448,14 @@ def test_reports_survive_as_json_lines() -> None:
     assert len(to_json_lines(reports).splitlines()) == 3
 
 
-def test_the_last_value_of_a_metric_counts_where_later_reports_lack_it() -> None:
+def test_the_last_value_of_each_metric_counts() -> None:
     def report(env_steps: int, **metrics: float) -> Report:
         return Report(env_steps=env_steps, seconds=0, timestamp_ms=0, metrics=metrics)
 
     assert last_values([report(1, a=1, b=1), report(2, a=2)]) == {"a": 2, "b": 1}
 
 
-def test_canonical_json_has_one_spelling() -> None:
+def test_canonical_json_is_unique() -> None:
     assert canonical_json({"b": 1.0, "a": [True, None]}) == '{"a":[true,null],"b":1.0}'
     with pytest.raises(ValueError, match="not JSON compliant"):
         canonical_json(float("nan"))

@@ -416,6 +416,15 @@ def test_clean_lists_and_deletes_what_no_other_sweep_has(
     assert (gone.code, ": other)" in gone.errors) == (2, True)
 
 
+def test_clean_deletes_runs_of_earlier_versions_of_the_plan(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    sweep = played(storage, tmp_path)
+    opened(storage, tmp_path, seeds=[0])
+    assert program("clean", f"{storage}/mine", "--all", "--yes").code == 0
+    assert not any(sweep.store.is_finished(node.key) for node in sweep.plan.nodes)
+
+
 def test_clean_is_refused_while_a_sweep_is_being_started(
     storage: str, tmp_path: Path, program: Program
 ) -> None:
@@ -742,7 +751,7 @@ def test_a_damaged_run_is_named_by_every_command_and_trained_again_when_asked(
     sweep = played(storage, tmp_path)
     good, bad = sweep.plan.nodes[0], sweep.plan.nodes[4]
     label = ShortLabels.of(node.label for node in sweep.plan.nodes)
-    history = next(file for file in sweep.store._nodes.files(bad.key) if file.endswith(HISTORY))
+    history = next(file for file in sweep.store.paths(bad.key) if file.endswith(HISTORY))
     with sweep.store._root.filesystem.open_output_stream(history) as sink:
         sink.write(b"")
     place, file = f"{storage}/mine", str(tmp_path / "sweep.yaml")

@@ -28,7 +28,7 @@ def tree(folder: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("place", ["free", "folder", "folder/deep/er", "link", "folder/../free"])
-def test_a_folder_that_can_be_made_is_not_made(tmp_path: Path, place: str) -> None:
+def test_checking_a_folder_does_not_create_it(tmp_path: Path, place: str) -> None:
     Path(tmp_path, "folder").mkdir()
     Path(tmp_path, "link").symlink_to("folder")
     before = tree(tmp_path)
@@ -55,7 +55,7 @@ def test_a_folder_that_can_be_made_is_not_made(tmp_path: Path, place: str) -> No
         (os.fsdecode(b"\xff"), r"UTF-8 text .* got '.*\\udcff'"),
     ],
 )
-def test_a_place_for_nothing_is_refused(tmp_path: Path, place: str, message: str) -> None:
+def test_an_unusable_folder_is_refused(tmp_path: Path, place: str, message: str) -> None:
     Path(tmp_path, "file").touch()
     Path(tmp_path, "folder").mkdir()
     os.mkfifo(tmp_path / "fifo")
@@ -73,12 +73,14 @@ def test_a_place_for_nothing_is_refused(tmp_path: Path, place: str, message: str
 
 
 @pytest.mark.parametrize("place", ["/dev/null", "/dev/full", "/proc/self", "/proc/x", "/sys/x"])
-def test_devices_and_what_only_looks_like_folders(place: str) -> None:
+def test_devices_and_system_folders_are_refused(place: str) -> None:
     with pytest.raises(StorageError, match=f"{place.rpartition('/')[0]}.* must be a writable"):
         check_storage(place, "sweep")
 
 
-def test_a_folder_of_somebody_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_of_another_user_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The error is simulated, because root may write everywhere."""
 
     def refuse(dir: Path) -> None:  # noqa: A002
@@ -89,14 +91,14 @@ def test_a_folder_of_somebody_else(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         check_storage(str(tmp_path), "sweep")
 
 
-def test_nobodys_home_and_bytes_that_are_no_text() -> None:
+def test_unknown_homes_and_invalid_text_are_refused() -> None:
     with pytest.raises(StorageError, match="home that is known, got '~nobody-at-all/x'"):
         resolve_storage("~nobody-at-all/x")
     with pytest.raises(ConfigError, match=r"^--storage must be UTF-8 text, got '\\udcff'$"):
         load_sweep(DEFAULT_CONFIG, storage=os.fsdecode(b"\xff"))
 
 
-def test_a_bucket_that_does_not_answer_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bucket_that_does_not_answer_times_out(monkeypatch: pytest.MonkeyPatch) -> None:
     """The system accepts the connection, and nothing answers; the client would wait for minutes."""
     monkeypatch.setattr(storage_module, "ANSWER_SECONDS", 1.0)
     with socket.create_server(("127.0.0.1", 0)) as silent:
@@ -114,7 +116,7 @@ def test_a_bucket_that_does_not_answer_is_given_up(monkeypatch: pytest.MonkeyPat
 @pytest.mark.parametrize(
     "storage", ["s3://bucket/sweeps", "s3://b?endpoint_override=h:1&scheme=http"]
 )
-def test_a_sweep_s_uri_is_its_storage_s_with_its_options_at_the_end(storage: str) -> None:
+def test_a_sweep_uri_keeps_the_options_of_its_storage(storage: str) -> None:
     uri = below(storage, "mine")
     assert storage_and_name(uri) == (storage, "mine")
     assert uri.partition("?")[0].endswith("/mine")
