@@ -114,7 +114,7 @@ class Document:
         """One line per problem: place, key, rule and value. The command line comes first."""
         found = {
             (place.source != COMMAND_LINE.source, place.line, self._line(place, problem)): None
-            for problem in _merged(problems)
+            for problem in problems
             for place in [self.place(problem.path)]
         }
         in_order = sorted(found, key=lambda one: one[:2])
@@ -143,19 +143,3 @@ def _unshared(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _unshared(inner) for key, inner in value.items()}
     return [_unshared(inner) for inner in value] if isinstance(value, list) else value
-
-
-def _merged(problems: Iterable[Problem]) -> Iterable[Problem]:
-    """Problems, where values in one list of a grid that break the same rule are one problem."""
-    groups: dict[tuple[KeyPath, str], list[Problem]] = {}
-    for problem in dict.fromkeys(problems):
-        path, rule = problem
-        if len(path) > 3 and path[2] == "grid" and isinstance(path[-1], int):
-            path, rule = path[:-1], rule.partition(", got ")[0]
-        groups.setdefault((path, rule), []).append(problem)
-    for (path, rule), group in groups.items():
-        if len(group) == 1:
-            yield group[0]
-            continue
-        values = [value for one in group if (value := one.rule.partition(", got ")[2])]
-        yield Problem(path, rule + f", got {', '.join(values)}" if values else rule)

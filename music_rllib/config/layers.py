@@ -10,10 +10,7 @@ import copy
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-from pydantic import create_model
-
 from music_rllib.config.problems import (
-    Findings,
     KeyPath,
     Problem,
     known_fields,
@@ -32,48 +29,26 @@ from music_rllib.config.run_settings import (
     without_retired,
 )
 from music_rllib.envs.tasks import Task
-from music_rllib.schedules import StrictModel
 
 PlacedPoint = Mapping[str, tuple[KeyPath, Any]]
 """Dotted setting to (place below the stage, value) at one point of a grid or search."""
-
-_FIELDS: dict[str, Any] = {
-    name: (field.rebuild_annotation(), field.default)
-    for name, field in RunSettings.model_fields.items()
-    if name in LAYER_KEYS
-}
-Layer = create_model("Settings", __base__=StrictModel, **_FIELDS)
-"""The settings that `defaults`, a stage, its `per_task` and a grid point may have."""
 
 
 def all_settings() -> list[str]:
     """Names of all settings of a run, dotted for those in groups."""
     return [
         *LAYER_KEYS,
-        *(f"{section}.{name}" for section in SECTIONS for name in known_fields(Layer, (section,))),
+        *(
+            f"{section}.{name}"
+            for section in SECTIONS
+            for name in known_fields(RunSettings, (section,))
+        ),
     ]
 
 
 def is_in(setting: str, group: str) -> bool:
     """Whether a dotted setting is `group`, or below it."""
     return f"{setting}.".startswith(f"{group}.")
-
-
-def check_defaults(defaults: Mapping[str, Any], findings: Findings) -> None:
-    """Check `defaults` as far as possible before they are merged with a stage."""
-    for key in defaults.keys() - set(LAYER_KEYS):
-        findings.add((key,), unknown(key, all_settings()))
-    given = {
-        key: value
-        for key, value in without_retired(defaults).items()
-        if key in LAYER_KEYS and (key not in SECTIONS or value is not None)
-    }
-    own = Findings()
-    own.validate(Layer, given)
-    for path, rule in own.problems:
-        # A rule between fields of a group depends on the variant, too.
-        if len(path) > 1 or not isinstance(given[str(path[0])], dict):
-            findings.add(path, for_a_grid(rule, path, given))
 
 
 def for_a_grid(rule: str, path: KeyPath, settings: Any) -> str:
@@ -99,31 +74,16 @@ class Layers:
     def put(self, path: KeyPath, value: Any, origin: KeyPath) -> None:
         """Set the value at `path`, which is written at `origin` in the sweep's document."""
         here = self.data
-        for part in path[:-1]:
-            inner = here.get(str(part))
-            here[str(part)] = dict(inner) if isinstance(inner, Mapping) else {}
-            here = here[str(part)]
+        for position, part in enumerate(map(str, path[:-1]), start=1):
+            inner = here.setdefault(part, {})
+            if not isinstance(inner, Mapping) and position == 1:  # an invalid group
+                return
+            if not isinstance(inner, Mapping):
+                self._origins[path[:position]] = origin
+            here[part] = dict(inner) if isinstance(inner, Mapping) else {}
+            here = here[part]
         here[str(path[-1])] = copy.deepcopy(value)
         self._origins[path] = origin
-
-    def put_dotted(self, dotted: str, value: Any, origin: KeyPath) -> Problem | None:
-        """Set one value of a grid or search; returns the problem if that is impossible."""
-        path = tuple(dotted.split("."))
-        if path[0] not in LAYER_KEYS:
-            if path[0] in {"seed", "seeds", "task", "tasks"}:
-                hint = f"; list them under '{path[0].removesuffix('s')}s'"
-                return Problem(origin, f"{path[0]} is never a grid dimension{hint}")
-            key = origin[:-1] if isinstance(origin[-1], int) else origin  # once for all values
-            return Problem(key, unknown(dotted, all_settings()))
-        try:
-            above = lookup(self.data, path[:-1])
-        except LookupError:
-            above = {}
-        if len(path) > 2 and not isinstance(above, Mapping):
-            name = ".".join(path[:-1])
-            return Problem(origin, f"needs {name} to be a mapping, got {shown(above)}")
-        self.put(path, value, origin)
-        return None
 
     def origin(self, path: KeyPath, otherwise: KeyPath) -> KeyPath:
         """The place where the value at `path` was written; below `otherwise` for a default."""
@@ -200,8 +160,11 @@ def merge(
             twice = ", ".join(name for name in value if f"{dotted}.{name}" in point)
             rule = f"must not hold a field that varies by itself too, got {twice}"
             problems.append(Problem(once, rule))
-        elif problem := layers.put_dotted(dotted, value, place):
-            problems.append(problem)
+        elif dotted.partition(".")[0] not in LAYER_KEYS:
+            known = (*all_settings(), "seeds", "tasks")
+            problems.append(Problem(once, unknown(dotted, known)))
+        else:
+            layers.put(tuple(dotted.split(".")), value, place)
     layers.data = without_retired(layers.data)
     # Contradictions of the variant are reported also if other settings are invalid.
     music = layers.data["music"]

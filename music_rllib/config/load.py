@@ -15,12 +15,12 @@ from typing import Any
 
 from music_rllib.config.document import Document, Place
 from music_rllib.config.hypotheses import check_analysis, unnamed_differences
-from music_rllib.config.layers import all_settings, check_defaults
+from music_rllib.config.layers import all_settings
 from music_rllib.config.overrides import lay_overrides, parse_overrides, preset_path
 from music_rllib.config.presets import read_preset
 from music_rllib.config.problems import ConfigError, Findings, shown, unknown
 from music_rllib.config.returns import Range, cut_off
-from music_rllib.config.run_settings import RunSettings
+from music_rllib.config.run_settings import LAYER_KEYS, RunSettings
 from music_rllib.config.schema import Header, Stage, SweepConfig
 from music_rllib.config.search import FINAL_SEED
 from music_rllib.config.stages import resolve_stage
@@ -136,7 +136,8 @@ def _resolve(document: Document, findings: Findings) -> SweepConfig | None:
     registry = _registry(data, findings)
     header = _header(data, findings)
     defaults = _mapping(data.get("defaults"))
-    check_defaults(defaults, findings.below("defaults"))
+    for key in defaults.keys() - set(LAYER_KEYS):
+        findings.add(("defaults", key), unknown(key, all_settings()))
 
     def find_tasks(names: Iterable[str], findings: Findings) -> tuple[Task, ...]:
         tasks = []

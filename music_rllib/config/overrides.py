@@ -32,6 +32,11 @@ def parse_overrides(arguments: Iterable[str]) -> dict[str, Any]:
         key, equals, text = argument.partition("=")
         if not equals or not all(key.split(".")):
             raise _refusal(f"must be KEY=VALUE like tac.alpha=0.1, got {shown(argument)}")
+        if key.partition(".")[0] in LAYER_KEYS and key.count(".") > 1:
+            setting = ".".join(key.split(".")[:2])
+            raise _refusal(
+                f"{key} must be a whole setting, {setting}={{...}}, got {shown(argument)}"
+            )
         if key.partition(".")[0] not in (*LAYER_KEYS, *Header.model_fields):
             raise _refusal(f"{key} {unknown(key, (*all_settings(), *Header.model_fields))}")
         try:
@@ -66,40 +71,18 @@ def lay_overrides(document: Document, overrides: Mapping[str, Any]) -> None:
             varies.
     """
     for key, value in overrides.items():
-        parts = tuple(key.split("."))
-        places: list[KeyPath] = [parts]
-        if parts[0] in LAYER_KEYS:
-            places = _places_of_setting(document, key, value)
-        elif parts[0] == "stages" and len(parts) > 1:
-            places = [_place_in_stage(document, key)]
-        for place in places:
-            document.put(place, value)
-
-
-def _places_of_setting(document: Document, key: str, value: Any) -> list[KeyPath]:
-    """The places at which a setting holds in every stage; removes values that would replace it."""
-    layers: list[KeyPath] = []
-    for index, stage in enumerate(_stages(document)):
-        _check_not_varied(stage, key, value)
-        tasks = find(stage, ("per_task",))
-        layers.append(("stages", index))
-        layers += [
-            ("stages", index, "per_task", task)
-            for task in (tasks if isinstance(tasks, dict) else ())
-        ]
-    parts = tuple(key.split("."))
-    if len(parts) <= 2:
-        for layer in layers:
-            if isinstance(group := find(document.data, (*layer, *parts[:-1])), dict):
-                group.pop(parts[-1], None)
-        layers = []
-    # A key inside of a value, as tac.alpha.value is, replaces it in every mapping that has one.
-    places: list[KeyPath] = [
-        (*layer, *parts)
-        for layer in [("defaults",), *layers]
-        if isinstance(find(document.data, (*layer, *parts[:-1])), dict)
-    ]
-    return places or [("defaults", *parts)]
+        place: KeyPath = tuple(key.split("."))
+        if place[0] in LAYER_KEYS:
+            for stage in _stages(document):
+                _check_not_varied(stage, key, value)
+                tasks = find(stage, ("per_task",))
+                for layer in (stage, *(tasks.values() if isinstance(tasks, dict) else ())):
+                    if isinstance(group := find(layer, place[:-1]), dict):
+                        group.pop(place[-1], None)
+            place = ("defaults", *place)
+        elif place[0] == "stages" and len(place) > 1:
+            place = _place_in_stage(document, key)
+        document.put(place, value)
 
 
 def _check_not_varied(stage: Mapping[str, Any], key: str, value: Any) -> None:

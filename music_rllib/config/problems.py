@@ -51,13 +51,16 @@ def shown(value: Any, limit: int = 60) -> str:
 
 def same(first: Any, second: Any) -> bool:
     """Whether two values are equal as settings: 1 and 1.0 are, 1 and true are not."""
-    if isinstance(first, bool) or isinstance(second, bool):
-        return first is second
-    if isinstance(first, Mapping) and isinstance(second, Mapping):
-        return first.keys() == second.keys() and all(same(first[key], second[key]) for key in first)
-    if isinstance(first, list | tuple) and isinstance(second, list | tuple):
-        return len(first) == len(second) and all(map(same, first, second))
-    return bool(first == second)
+    return bool(_comparable(first) == _comparable(second))
+
+
+def _comparable(value: Any) -> Any:
+    """A hashable form of plain data, which is equal for values that are equal as settings."""
+    if isinstance(value, Mapping):
+        return frozenset((key, _comparable(inner)) for key, inner in value.items())
+    if isinstance(value, list | tuple):
+        return tuple(map(_comparable, value))
+    return (bool, value) if isinstance(value, bool) else value
 
 
 def lookup(document: Any, path: Iterable[str | int]) -> Any:
@@ -110,8 +113,10 @@ class Findings:
         return Findings((*self.path, *keys), self.problems)
 
     def add(self, path: KeyPath, rule: str) -> None:
-        """Add a problem."""
-        self.problems.append(Problem(self.path + path, rule))
+        """Add a problem unless it is known."""
+        problem = Problem(self.path + path, rule)
+        if problem not in self.problems:
+            self.problems.append(problem)
 
     def validate(self, kind: type[Model], value: Any) -> Model | None:
         """Validate `value` as a `kind`; add the problems and return None if it is invalid."""
@@ -124,18 +129,11 @@ class Findings:
 
     def forbid_repeats(self, values: Any, path: KeyPath) -> None:
         """Add a problem for each repeated entry of the list `values`; 1 and 1.0 are the same."""
-        seen: set[tuple[bool, Any]] = set()
-        others: list[Any] = []
+        seen = set()
         for position, value in enumerate(values if isinstance(values, list | tuple) else ()):
-            if isinstance(value, str | int | float | None):
-                # Equal numbers have equal hashes, whatever their type; so have 1 and true.
-                again = (isinstance(value, bool), value) in seen
-                seen.add((isinstance(value, bool), value))
-            else:
-                again = any(same(value, other) for other in others)
-                others.append(value)
-            if again:
+            if _comparable(value) in seen:
                 self.add((*path, position), f"must not repeat, got {shown(value)} again")
+            seen.add(_comparable(value))
 
 
 def from_json(kind: type[Model], value: Any) -> Model:

@@ -15,10 +15,10 @@ from music_rllib.config.space import Choice, Dimension, listed
 from music_rllib.schedules import StrictModel
 
 FINAL_SEED = 1_000_000
-"""First fresh seed of final rankings. Seeds of a search are smaller."""
+"""First fresh seed of final rankings; the seeds of a search are smaller."""
 
 MOST_SEARCH_POINTS = 100_000
-"""Largest grid with `sampler: grid`: more than anyone can train, and still quick to list."""
+"""Largest grid with `sampler: grid`: more than anyone can train, and quick to list."""
 
 
 class Objective(StrictModel):
@@ -27,15 +27,16 @@ class Objective(StrictModel):
     metric: str = "evaluation/success_rate"
     """A metric as MLflow shows it (docs/algorithms.md); `env_steps` for the budget itself."""
     read: Literal["last", "best", "mean", "steps_to"] = "last"
-    """A run's number: the metric's last value, its best one, the mean over the run, or the
-    environment steps until it reaches `threshold` (the budget where it never does)."""
+    """A run's number: the metric's last value, its best value, its mean over the run, or the
+    environment steps until it reaches `threshold` (the budget if it never does)."""
     threshold: float | None = None
-    """Value of the metric that `steps_to` waits for."""
+    """Value of the metric for `read: steps_to`."""
     aggregate: Literal["iqm", "mean", "median", "worst_task"] = "iqm"
-    """A trial's number from those of its runs (seeds times tasks): interquartile mean, mean or
-    median over all of them, or the mean over seeds for the worst task."""
+    """A trial's number from its runs' numbers (seeds times tasks): interquartile mean, mean or
+    median over all runs, or the mean over seeds for the worst task."""
     direction: Literal["maximize", "minimize"] | None = None
-    """null: minimize with `read: steps_to`, else maximize."""
+    """Whether a larger or a smaller number is better; null: minimize with `read: steps_to`,
+    otherwise maximize."""
 
     @model_validator(mode="after")
     def _threshold_belongs(self) -> Self:
@@ -61,33 +62,34 @@ class Objective(StrictModel):
 
 
 def _one_or_several(value: Any) -> str:
-    """Tag of the member of `Objectives` that a value is meant to be; errors are about that one."""
+    """Tag of the member of `Objectives` that `value` should be."""
     return "several" if isinstance(value, list | tuple) else "one"
 
 
 Objectives = Annotated[
-    Annotated[Objective, Tag("one")] | Annotated[list[Objective], Tag("several")],
+    Annotated[Objective, Tag("one")]
+    | Annotated[list[Objective], Field(min_length=1), Tag("several")],
     Discriminator(_one_or_several),
 ]
 
 
 class Rung(StrictModel):
-    """A point of a trial at which it may be stopped."""
+    """A point of a trial at which the trial may be pruned."""
 
     seeds: int | None = Field(None, gt=0)
-    """Number of first seeds that have run up to here, no more than the sweep has; null: all."""
+    """Number of the sweep's first seeds that have run up to this point; null: all."""
     env_steps: int | None = Field(None, gt=0)
-    """Environment steps of these runs, rounded up to the next evaluation, and no more than the
-    longest run has; null: to the end."""
+    """Environment steps of these runs, rounded up to the next evaluation, and at most those of the
+    longest run; null: to the end."""
 
 
 class Pruning(StrictModel):
-    """Successive halving over budgets and seeds; a confidence interval may keep a trial."""
+    """Successive halving over budgets and seeds; a confidence interval can keep a trial."""
 
     rungs: tuple[Rung, ...] = Field(min_length=1)
     """Rungs in order; each has at least the seeds and environment steps of the one before."""
     keep: float = Field(0.5, gt=0, lt=1)
-    """A trial continues if it is in this best share of those that have reached the rung, ..."""
+    """A trial continues if it is in this best share of the trials that reached the rung, ..."""
     confidence: float = Field(0.9, gt=0, lt=1)
     """... or if its interval at this confidence reaches the best trial's value there."""
     warm_up: int = Field(4, gt=0)
@@ -95,28 +97,27 @@ class Pruning(StrictModel):
 
 
 class FinalRanking(StrictModel):
-    """Runs of the best trials on fresh seeds, which had no part in choosing them."""
+    """Runs of the best trials on fresh seeds, which were not used to select them."""
 
     trials: int = Field(3, gt=0)
     """Number of best trials; in `compare` mode for each value."""
     baselines: bool = False
-    """Whether the evaluated `points_to_evaluate` run again too, whatever their values, as baselines
-    for the best trials."""
+    """Whether the evaluated `points_to_evaluate` also run on the fresh seeds, as baselines."""
     seeds: int = Field(5, gt=0)
     """Fresh seeds of each trial."""
     env_steps: int | None = Field(None, gt=0)
-    """Budget of these runs; null: that of the search's runs."""
+    """Budget of these runs; null: the budget of the search's runs."""
 
     def most(self, points: int) -> int:
-        """Largest number of trials in it, for a search with `points` `points_to_evaluate`."""
+        """Largest number of ranked trials, if `points` points were given to evaluate."""
         return self.trials + (points if self.baselines else 0)
 
 
 class WarmStart(StrictModel):
-    """An earlier study that the sampler learns from; its trials are not ranked again."""
+    """An earlier study that the sampler starts with; its trials are not ranked again."""
 
     study: str
-    """Its name, as `music-rllib status` shows it, or the beginning of it."""
+    """Its name, as `music-rllib status` shows it, or the beginning of its name."""
     storage: str | None = None
     """Its Optuna storage: a database URL or a sqlite file; null: this search's storage."""
 
@@ -129,7 +130,7 @@ class SearchSettings(StrictModel):
     the same number of trials and the same seeds, and then a comparison of these values."""
     space: dict[str, Dimension] = Field(min_length=1)
     """Dotted setting to its range or choices; `STAGE:setting` for a setting of the stage that this
-    one starts from."""
+    stage starts from."""
     compare: dict[str, Annotated[list[JsonValue], Field(min_length=2)]] = Field(
         default_factory=dict
     )
@@ -138,27 +139,27 @@ class SearchSettings(StrictModel):
     """Optuna's TPE, CMA-ES (numbers only) and NSGA-II (several objectives), random, or all points
     of a grid in order, at most 100,000."""
     trials: int | None = Field(None, gt=0)
-    """Number of trials, at most the number of points; null with `grid`: all points. No point is
-    tried twice."""
+    """Number of trials, at most the number of points; null with `grid`: all points. Each trial has
+    another point."""
     startup_trials: int = Field(5, gt=0)
     """Random trials before TPE or CMA-ES proposes."""
     population: int = Field(10, gt=1)
     """Size of a generation of CMA-ES and NSGA-II."""
     concurrent: int = Field(2, gt=0)
-    """Trial n is proposed from the results of the trials up to n minus this, when these are
-    complete. Larger keeps more CPUs busy, smaller learns sooner. A study is reproducible with the
-    same value only."""
+    """Trial n is proposed from the results of the trials up to n minus this number, when they are
+    complete. Larger keeps more CPUs busy; smaller uses results earlier. A study is reproducible
+    only with the same value."""
     seed: int = Field(0, ge=0, lt=2**31)
     """Seed of the sampler."""
     objective: Objectives = Objective()
-    """What is optimised; a list of several gives a Pareto front."""
+    """The number to optimize; a list of several gives a Pareto front."""
     points_to_evaluate: list[dict[str, JsonValue]] = Field(default_factory=list)
-    """Points, or parts of points, that are the first trials, exactly as written. Each value must be
-    in the space, and a setting with `when` must stand beside the settings that it depends on."""
+    """Points, or parts of points, of the first trials, exactly as written. Each value must be in
+    the space, and a setting with `when` needs the settings that it depends on beside it."""
     pruning: Pruning | None = None
-    """When trials are stopped early; null: every trial runs to its end on all seeds."""
+    """When trials are pruned; null: every trial runs to its end on all seeds."""
     final: FinalRanking | None = FinalRanking()
-    """The final ranking on fresh seeds; null: none, and the best value found is biased upwards."""
+    """The final ranking on fresh seeds; null: none, so the best value found is biased upwards."""
     study: str | None = Field(None, min_length=1)
     """Name under which drivers share a study; null: the sweep's name."""
     storage: str | None = Field(None, min_length=1)
@@ -174,36 +175,23 @@ class SearchSettings(StrictModel):
 
     @cached_property
     def count(self) -> int:
-        """Number of trials of each study: none has the point of another one."""
+        """Number of trials of each study, at most the number of points."""
         if self.points is None:
             return self.trials or 0
         return min(self.trials or len(self.points), len(self.points))
 
     @cached_property
     def points(self) -> list[dict[str, Any]] | None:
-        """All points; None where they can't be counted, or are more than `MOST_SEARCH_POINTS`."""
-        if any(dimension.size is None for dimension in self.space.values()):
-            return None
-        try:
-            return self.grid()
-        except ValueError:
-            return None
-
-    def grid(self) -> list[dict[str, Any]]:
         """All points, the last dimension varying fastest.
 
-        Raises:
-            ValueError: There are more than `MOST_SEARCH_POINTS`.
+        None for a continuous space, and for more than `MOST_SEARCH_POINTS`.
         """
         points: list[dict[str, Any]] = [{}]
         for name, dimension in self.space.items():
             exists = [dimension.applies(point) for point in points]
             size = sum((dimension.size or 0) if there else 1 for there in exists)
-            if size > MOST_SEARCH_POINTS:  # counted before any of them is made
-                raise ValueError(
-                    f"space must have at most {MOST_SEARCH_POINTS:,} points with sampler: grid, "
-                    f"got {size:,} up to {name}"
-                )
+            if dimension.size is None or size > MOST_SEARCH_POINTS:  # counted before they are made
+                return None
             values = dimension.values() or ()
             points = [
                 {**point, **extra}
@@ -254,7 +242,7 @@ class SearchSettings(StrictModel):
                 if other not in names[:position]:
                     yield f"space.{name}.when must name settings that stand above it, got {other!r}"
                     continue
-                # An empty list is a mistake too: with either, this setting never exists.
+                # With an empty list or an impossible value, this setting never exists.
                 values = listed(wanted)
                 if not values or not all(map(self.space[other].contains, values)):
                     yield f"space.{name}.when must hold values of {other}, got {json.dumps(wanted)}"
@@ -294,7 +282,8 @@ class SearchSettings(StrictModel):
             for name, dimension in self.space.items():
                 if dimension.size is None:
                     yield f"space.{name} must have a step to be part of a grid, got none"
-            self.grid()  # raises an error if it is too large
+            if self.points is None:
+                yield f"space must have at most {MOST_SEARCH_POINTS:,} points with sampler: grid, got more"
         elif self.trials is None:
             yield f"trials must be given with sampler: {self.sampler}, got null"
         if self.sampler == "cmaes":
@@ -306,8 +295,6 @@ class SearchSettings(StrictModel):
                     )
         if self.sampler == "cmaes" and len(self.objectives) > 1:
             yield "sampler must be tpe, nsga2, random or grid for several objectives, got cmaes"
-        if not self.objectives:
-            yield "objective must be given, got an empty list"
 
     def _broken_pruning(self) -> Iterator[str]:
         if self.pruning is None:

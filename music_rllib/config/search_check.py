@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from music_rllib import names
 from music_rllib.config.layers import PlacedPoint
-from music_rllib.config.problems import ConfigError, Findings, KeyPath, shown
-from music_rllib.config.run_settings import RunSettings
+from music_rllib.config.problems import ConfigError, Findings, shown
 from music_rllib.config.schema import Point, Stage
 from music_rllib.config.search import SearchSettings
 from music_rllib.config.space import Choice
 from music_rllib.envs.tasks import closest
-
-ResolveAt = Callable[[PlacedPoint, Findings], Point]
 
 _METRICS = frozenset(
     value
     for key, value in vars(names).items()
     if key.isupper()
     and isinstance(value, str)
-    and not value.isupper()  # a variable of the environment
+    and not value.isupper()  # an environment variable
     and not key.startswith(("TAG_", "KIND_", "ARTEFACT_", "SETTING_"))
 )
 _OF_SUCCESS = frozenset(
@@ -32,17 +28,16 @@ _OF_SUCCESS = frozenset(
 
 
 def of_stage(values: Mapping[str, Any], stage: str) -> dict[str, Any]:
-    """The dotted settings that have the prefix of `stage`, without it."""
-    prefix = f"{stage}:"
+    """The dotted settings that have the prefix of `stage`, without the prefix."""
     return {
-        name.removeprefix(prefix): value
+        name.removeprefix(f"{stage}:"): value
         for name, value in values.items()
-        if name.startswith(prefix)
+        if name.startswith(f"{stage}:")
     }
 
 
 def stages_in(search: SearchSettings) -> set[str]:
-    """Stages whose settings are part of the search, besides its own."""
+    """Other stages whose settings are part of the search."""
     return {name.partition(":")[0] for name in (*search.space, *search.compare) if ":" in name}
 
 
@@ -51,12 +46,14 @@ def check_search(
     search: SearchSettings,
     earlier: Mapping[str, Stage | None],
     seeds: int,
-    resolve_at: ResolveAt,
+    resolve_at: Callable[[PlacedPoint, Findings], Point],
     findings: Findings,
 ) -> None:
     """Check a stage's `search` and the stage that its runs start from.
 
     Args:
+        stage: The stage.
+        search: Its search.
         earlier: The stages above this one by name; None for an invalid one.
         seeds: Number of the sweep's seeds; 0 if they are invalid.
         resolve_at: Gives the stage's settings at a point.
@@ -68,8 +65,7 @@ def check_search(
         if rule := _broken_metric(objective.metric, stage):
             several = (position,) if len(search.objectives) > 1 else ()
             in_search.add(("objective", *several, "metric"), rule)
-    above = _source_of(stage, earlier)
-    source = above
+    above = source = _source_of(stage, earlier)
     while source is not None:
         if source.search is None and len(source.points) > 1:
             findings.add(
@@ -78,7 +74,16 @@ def check_search(
                 f"{source.name!r}; search its settings as '{source.name}:...'",
             )
         source = _source_of(source, earlier)
+    if foreign := stages_in(search) - ({above.name} if above else set()):
+        known = f", which is {above.name!r}" if above else "; this one starts from none"
+        in_search.add(
+            ("space",),
+            f"must name settings of this stage or of the one it starts from{known}, "
+            f"got '{min(foreign)}:...'",
+        )
+        return
     _check_values(search, above, resolve_at, findings)
+    _check_points_to_evaluate(search, in_search)
     if len(findings.problems) == problems_before:  # the budget is a valid number then
         _check_rungs(search, seeds, most_env_steps(search, stage.points), in_search)
 
@@ -125,45 +130,36 @@ def _check_rungs(search: SearchSettings, seeds: int, env_steps: int, findings: F
 
 
 def _check_values(
-    search: SearchSettings, above: Stage | None, resolve_at: ResolveAt, findings: Findings
+    search: SearchSettings,
+    above: Stage | None,
+    resolve_at: Callable[[PlacedPoint, Findings], Point],
+    findings: Findings,
 ) -> None:
-    """Every end of the space, compared value and given point must make valid settings."""
+    """Every end of the space and every compared value must make valid settings."""
     in_search = findings.below("search")
-    for name in stages_in(search):
-        if above is None or name != above.name:
-            known = f", which is {above.name!r}" if above else "; this one starts from none"
-            in_search.add(
-                ("space",),
-                f"must name settings of this stage or of the one it starts from{known}, "
-                f"got '{name}:...'",
-            )
-            return
     problems_before = len(findings.problems)
     for name, values in search.compare.items():
         in_search.forbid_repeats(values, ("compare", name))
     for name, dimension in search.space.items():
         if isinstance(dimension, Choice):
             in_search.forbid_repeats(dimension.choice, ("space", name, "choice"))
-    tried: list[tuple[KeyPath, Any, _Runs]] = []
+    found: list[tuple[str, Any, Any]] = []
     for section, name, point in _points_to_check(search):
         if name not in point:
-            rule = f"must be able to hold, got {shown(search.space[name].when)}"
+            rule = f"must be satisfiable, got {shown(search.space[name].when)}"
             in_search.add((section, name, "when"), rule)
             continue
-        placed = {key: at for key, at in point.items() if ":" not in key}
-        own = resolve_at(placed, findings)
+        own = {key: at for key, at in point.items() if ":" not in key}
+        runs = resolve_at(own, findings).runs
         if search.final is not None and search.final.env_steps is not None:
             budget = (("search", "final", "env_steps"), search.final.env_steps)
-            resolve_at({**placed, "env_steps": budget}, findings)
-        theirs = None if above is None else _runs_above(above, point, findings)
-        tried.append(((section, name), point[name][1], (own.runs, theirs)))
-    if len(findings.problems) == problems_before:
-        _forbid_equal_values(tried, in_search)
-    _check_given_points(search, in_search)
-
-
-_Runs = tuple[Mapping[str, RunSettings], Mapping[str, RunSettings] | None]
-"""Settings of a stage's runs by task, and of the runs that they start from."""
+            resolve_at({**own, "env_steps": budget}, findings)
+        everything = (name, runs, None if above is None else _runs_above(above, point, findings))
+        # Two values may be two spellings of one schedule, and so the same runs.
+        if len(findings.problems) == problems_before and everything in found and runs:
+            value = shown(point[name][1])
+            in_search.add((section, name), f"must not have two equal values, got {value} again")
+        found.append(everything)
 
 
 def _points_to_check(search: SearchSettings) -> Iterator[tuple[str, str, PlacedPoint]]:
@@ -176,16 +172,7 @@ def _points_to_check(search: SearchSettings) -> Iterator[tuple[str, str, PlacedP
             yield "compare", name, {name: (("search", "compare", name, position), value)}
 
 
-def _forbid_equal_values(tried: Sequence[tuple[KeyPath, Any, _Runs]], findings: Findings) -> None:
-    """Two values may be two spellings of one schedule, and so the same runs."""
-    for (where, _, one), (elsewhere, value, other) in itertools.combinations(tried, 2):
-        if where == elsewhere and one == other and other[0]:
-            findings.add(where, f"must not have two equal values, got {shown(value)} again")
-
-
-def _runs_above(
-    above: Stage, point: PlacedPoint, findings: Findings
-) -> Mapping[str, RunSettings] | None:
+def _runs_above(above: Stage, point: PlacedPoint, findings: Findings) -> Mapping[str, Any] | None:
     """Settings of the stage above at a point, with problems at their place in this stage."""
     theirs = of_stage({name: value for name, (_, value) in point.items()}, above.name)
     if not theirs:
@@ -199,21 +186,16 @@ def _runs_above(
         return None
 
 
-def _check_given_points(search: SearchSettings, findings: Findings) -> None:
-    """Each value of `points_to_evaluate` must be in the space, and beside what it depends on.
+def _check_points_to_evaluate(search: SearchSettings, findings: Findings) -> None:
+    """Each given value must be in the space, and beside the values that it depends on.
 
-    The sampler chooses what a point leaves open: a setting that depends on that might be dropped.
+    The sampler chooses what a point omits: a setting that depends on that might be dropped.
     """
     for position, point in enumerate(search.points_to_evaluate):
-        existing: dict[str, Any] = {}
-        for name, dimension in search.space.items():
-            if name not in point:
-                continue
-            path, value = ("points_to_evaluate", position, name), point[name]
+        for name, value in point.items():
+            dimension, path = search.space[name], ("points_to_evaluate", position, name)
             if not dimension.contains(value):
                 findings.add(path, f"must be {dimension.rule}, got {shown(value)}")
-            elif dimension.applies(existing):
-                existing[name] = value
-            else:
+            elif not dimension.applies(point):
                 wanted = " and ".join(f"{key}: {shown(one)}" for key, one in dimension.when.items())
                 findings.add(path, f"must only be given beside {wanted}, got {shown(point)}")

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Mapping
-from typing import Annotated, Any, Self, TypeGuard
+from typing import Annotated, Any, Self
 
 from pydantic import Discriminator, Field, JsonValue, Tag, model_validator
 
@@ -18,7 +17,7 @@ class _Dimension(StrictModel):
     has this value, or one of a list of values."""
 
     def applies(self, chosen: Mapping[str, Any]) -> bool:
-        """Whether this dimension exists beside the values that are chosen already."""
+        """Whether this dimension exists beside the values that are already chosen."""
         return all(
             name in chosen and any(same(chosen[name], value) for value in listed(wanted))
             for name, wanted in self.when.items()
@@ -30,22 +29,18 @@ def listed(wanted: JsonValue) -> list[JsonValue]:
     return wanted if isinstance(wanted, list) else [wanted]
 
 
-def _is_number(value: Any) -> TypeGuard[float]:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
 class _Range(_Dimension):
     bounds: tuple[float, float]
     """Lowest and highest value, both possible."""
     log: bool = False
     """Whether to search in the logarithm."""
     step: float | None = Field(None, gt=0)
-    """Only the lowest value and those that are whole steps above it are possible."""
+    """Restricts values to the lowest one plus whole multiples of the step."""
 
     @property
     def _given_step(self) -> float | None:
         """The step; None if it excludes no value."""
-        return self.step
+        return None if isinstance(self, IntRange) and self.step == 1 else self.step
 
     @model_validator(mode="after")
     def _is_a_range(self) -> Self:
@@ -63,55 +58,51 @@ class _Range(_Dimension):
         return self
 
     @property
-    @abstractmethod
     def size(self) -> int | None:
-        """Number of values; None if they can't be counted."""
+        """Number of values; None for a continuous range."""
+        low, high = self.bounds
+        return None if self.step is None else int(min((high - low) / self.step, 1e18) + 1e-9) + 1
 
-    @abstractmethod
-    def _at(self, position: int) -> Any:
+    def _at(self, position: int) -> float:
         """The value at a position in the order of values."""
+        value = self.bounds[0] + position * (self.step or 0)
+        return value if isinstance(self, IntRange) else float(f"{value:.12g}")
 
     def ends(self) -> tuple[Any, ...]:
-        """Values that must be valid for the whole range to be."""
+        """Both ends; if they are valid settings, the range is valid."""
         return self.bounds
 
     @property
     def reachable(self) -> tuple[Any, Any]:
-        """The ends, the upper one a whole number of steps above the lower."""
+        """Both ends, the upper one a whole number of steps above the lower one."""
         return self.bounds if self.size is None else (self._at(0), self._at(self.size - 1))
 
     def values(self) -> tuple[Any, ...] | None:
-        """All values, for a grid; None if they can't be counted."""
+        """All values, for a grid; None for a continuous range."""
         return None if self.size is None else tuple(map(self._at, range(self.size)))
+
+    def contains(self, value: Any) -> bool:
+        """Whether `value` is one of the values."""
+        low, high = self.reachable
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not (number and low <= value <= high):
+            return False
+        steps = 0.0 if self.step is None else (value - low) / self.step
+        return bool(abs(steps - round(steps)) < 1e-8)  # Optuna's tolerance
 
     @property
     def rule(self) -> str:
-        """The rule of its values in words: `in [1, 2] and whole steps of 0.5 from 1`."""
+        """The rule of its values: `in [1, 2] and whole steps of 0.5 from 1`."""
         (low, high), step = self.bounds, self._given_step
+        number = "a whole number " if isinstance(self, IntRange) else ""
         steps = "" if step is None else f" and whole steps of {step:g} from {low:g}"
-        return f"in [{low:g}, {high:g}]{steps}"
+        return f"{number}in [{low:g}, {high:g}]{steps}"
 
 
 class FloatRange(_Range):
     """A real number."""
 
     bounds: tuple[float, float] = Field(alias="float")
-
-    @property
-    def size(self) -> int | None:
-        low, high = self.bounds
-        return None if self.step is None else int(min((high - low) / self.step, 1e18) + 1e-9) + 1
-
-    def _at(self, position: int) -> float:
-        return float(f"{self.bounds[0] + position * (self.step or 0.0):.12g}")
-
-    def contains(self, value: Any) -> bool:
-        """Whether it is one of the values, however many there are."""
-        low, high = self.reachable
-        if not (_is_number(value) and low <= value <= high):
-            return False
-        steps = 0.0 if self.step is None else (value - low) / self.step
-        return bool(abs(steps - round(steps)) < 1e-8)  # Optuna's tolerance
 
 
 class IntRange(_Range):
@@ -120,35 +111,15 @@ class IntRange(_Range):
     bounds: tuple[int, int] = Field(alias="int")
     step: int = Field(1, gt=0)
 
-    @property
-    def _given_step(self) -> float | None:
-        return None if self.step == 1 else self.step
-
-    @property
-    def size(self) -> int:
-        return (self.bounds[1] - self.bounds[0]) // self.step + 1
-
-    def _at(self, position: int) -> int:
-        return self.bounds[0] + position * self.step
-
-    def contains(self, value: Any) -> bool:
-        """Whether it is one of the values, however many there are."""
-        low, high = self.bounds
-        return _is_number(value) and low <= value <= high and (value - low) % self.step == 0
-
-    @property
-    def rule(self) -> str:
-        return f"a whole number {super().rule}"
-
 
 class Choice(_Dimension):
-    """One of some values of any kind: numbers, text, schedules."""
+    """One of some values of any type: numbers, text, schedules."""
 
     choice: list[JsonValue] = Field(min_length=1)
     """The values."""
 
     def ends(self) -> tuple[Any, ...]:
-        """Values that must be valid for all of them to be."""
+        """All values; each must be a valid setting."""
         return tuple(self.choice)
 
     @property
@@ -161,30 +132,32 @@ class Choice(_Dimension):
         return tuple(self.choice)
 
     def contains(self, value: Any) -> bool:
-        """Whether it is one of the values."""
+        """Whether `value` is one of the values."""
         return any(same(value, option) for option in self.choice)
 
     @property
     def rule(self) -> str:
-        """The rule of its values in words."""
+        """The rule of its values."""
         return f"one of {shown(self.choice)}"
 
 
-def _kind(value: Any) -> str | None:
-    """Tag of the kind of dimension that a value is meant to be; errors are about that one."""
-    if isinstance(value, _Dimension):
-        return {FloatRange: "real", IntRange: "whole", Choice: "options"}[type(value)]
-    tags = {"float": "real", "int": "whole", "choice": "options"}
-    claimed = [tag for key, tag in tags.items() if isinstance(value, dict) and key in value]
-    return claimed[0] if len(claimed) == 1 else None
+_KINDS = {"float": FloatRange, "int": IntRange, "choice": Choice}
+
+
+def _tag(value: Any) -> str | None:
+    """Tag of the member of `Dimension` that `value` should be."""
+    if not isinstance(value, dict):
+        return type(value).__name__
+    tags = [kind.__name__ for key, kind in _KINDS.items() if key in value]
+    return tags[0] if len(tags) == 1 else None
 
 
 Dimension = Annotated[
-    Annotated[FloatRange, Tag("real")]
-    | Annotated[IntRange, Tag("whole")]
-    | Annotated[Choice, Tag("options")],
+    Annotated[FloatRange, Tag("FloatRange")]
+    | Annotated[IntRange, Tag("IntRange")]
+    | Annotated[Choice, Tag("Choice")],
     Discriminator(
-        _kind,
+        _tag,
         custom_error_type="dimension",
         custom_error_message="must have exactly one of float, int and choice",
     ),

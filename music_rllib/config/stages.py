@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -195,13 +196,14 @@ def _grid_points(grid: Mapping[str, list[Any]]) -> list[PlacedPoint]:
 
 
 def _forbid_equal_points(points: tuple[Point, ...], findings: Findings) -> None:
-    """Two values may be two spellings of one schedule: the same trial twice."""
+    """Reject two points that are the same trial, such as two spellings of one schedule."""
     seen = set()
     for point in points:
         runs = tuple(run.model_dump_json() for run in point.runs.values())
         if runs and runs in seen:
-            rule = f"must not have two equal points, got {shown(point.values)} again"
-            findings.add(("grid",), rule)
+            findings.add(
+                ("grid",), f"must not have two equal points, got {shown(point.values)} again"
+            )
         seen.add(runs)
 
 
@@ -266,10 +268,9 @@ def _check_checkpoint(
                 f"if that is meant, say 'task: {made_for.name}' beside it",
             )
     problems_before = len(findings.problems)
-    theirs = checkpoint.manifest.info.architecture
-    runs = [run for _, point in stage.examples() for run in point.runs.values()]
-    pairs = [((made_for, theirs), run) for run in runs]
-    _check_fit(stage, pairs, str(checkpoint.folder), findings)
+    for _, point in stage.examples():
+        theirs = checkpoint.manifest.info.architecture
+        _check_fit(stage, point, made_for, theirs, str(checkpoint.folder), findings)
     if len(findings.problems) > problems_before:
         return
     for needed in {handed_over(run) for point in stage.points for run in point.runs.values()}:
@@ -294,45 +295,33 @@ def _check_stage(stage: Stage, task: Task | None, above: Stage, findings: Findin
                 f"needs a run of {wanted.name} in stage {above.name}, whose tasks are "
                 f"{', '.join(known)}; name one: {{stage: {above.name}, task: ...}}",
             )
-    pairs: list[tuple[tuple[Task, Architecture], RunSettings]] = []
     for values, point in stage.examples():
-        for theirs in _points_at(above, of_stage(values, above.name)):
-            sources = [(run.task, run.architecture) for run in theirs.runs.values()]
-            pairs += itertools.product(sources, point.runs.values())
-    _check_fit(stage, pairs, f"stage {above.name}", findings)
-
-
-def _points_at(stage: Stage, values: Mapping[str, Any]) -> Sequence[Point]:
-    """The stage's points, or the one at searched values; none where these are not valid."""
-    if not values:
-        return stage.points
-    try:
-        return [stage.resolve(values)]
-    except ConfigError:  # a problem of its own
-        return []
+        searched = of_stage(values, above.name)
+        with contextlib.suppress(ConfigError):  # invalid values are a problem of their own
+            for source in [above.resolve(searched)] if searched else above.points:
+                for run in source.runs.values():
+                    origin = f"stage {above.name}"
+                    _check_fit(stage, point, run.task, run.architecture, origin, findings)
 
 
 def _check_fit(
     stage: Stage,
-    pairs: Iterable[tuple[tuple[Task, Architecture], RunSettings]],
+    point: Point,
+    task: Task,
+    architecture: Architecture,
     origin: str,
     findings: Findings,
 ) -> None:
-    """Settings that shape the handed-over arrays must be equal on both sides."""
+    """Settings that shape the handed-over arrays must equal those of the source."""
     starts_from = VARIANTS[stage.variant].starts_from
-    rules: dict[str, None] = {}
-    for (task, theirs), run in pairs:
-        for name in theirs.differences(run.architecture, starts_from):
-            rules[f"needs the same {name} in stage {stage.name} as in {origin}"] = None
-        if starts_from == "estimator" and _split_sizes(task) != _split_sizes(run.task):
-            rule = (
+    theirs = (len(task.agent_indices), len(task.surrounding_indices))
+    for run in point.runs.values():
+        for name in architecture.differences(run.architecture, starts_from):
+            findings.add((), f"needs the same {name} in stage {stage.name} as in {origin}")
+        ours = (len(run.task.agent_indices), len(run.task.surrounding_indices))
+        if starts_from == "estimator" and ours != theirs:
+            findings.add(
+                (),
                 f"needs as many agent and surrounding indices in {run.task.name} as in "
-                f"{task.name} ({origin}): {_split_sizes(run.task)} and {_split_sizes(task)}"
+                f"{task.name} ({origin}): {ours} and {theirs}",
             )
-            rules[rule] = None
-    for rule in rules:
-        findings.add((), rule)
-
-
-def _split_sizes(task: Task) -> tuple[int, int]:
-    return len(task.agent_indices), len(task.surrounding_indices)

@@ -163,7 +163,7 @@ def test_a_grid_is_counted_before_it_is_made() -> None:
     settings = {"space": space, "sampler": "grid"}
 
     def refused() -> None:
-        with pytest.raises(ValidationError, match=r"at most 100,000 points .* got 1,001,000 up to"):
+        with pytest.raises(ValidationError, match=r"at most 100,000 points .* got more"):
             SearchSettings.model_validate(settings)
 
     assert memory_of(refused) < 5_000_000
@@ -203,7 +203,7 @@ MISTAKES: list[tuple[Document, str]] = [
     ),
     (
         {"space": {"seed": {"int": [1, 2]}}},
-        "seed is never a grid dimension",
+        "space.seed is not a known setting",
     ),
     (
         {"space": {"tac.lr": {"float": [0.1, 1], "when": {"tac.tau": 1}}}},
@@ -285,11 +285,11 @@ MISTAKES: list[tuple[Document, str]] = [
                 }
             }
         },
-        "space.tac.tau.when must be able to hold, got {",
+        "space.tac.tau.when must be satisfiable, got {",
     ),
     (
         {"sampler": "grid", "space": {"tac.batch_size": {"int": [1, 50_000_000]}}},
-        "space must have at most 100,000 points with sampler: grid, got 50,000,000",
+        "space must have at most 100,000 points with sampler: grid, got more",
     ),
     (
         COMPARED | {"compare": {"tac.entropic_index": [1.0, 1]}},
