@@ -283,7 +283,8 @@ class SearchSettings(StrictModel):
                 if dimension.size is None:
                     yield f"space.{name} must have a step to be part of a grid, got none"
             if self.points is None:
-                yield f"space must have at most {MOST_SEARCH_POINTS:,} points with sampler: grid, got more"
+                most = f"{MOST_SEARCH_POINTS:,}"
+                yield f"space must have at most {most} points with sampler: grid, got more"
         elif self.trials is None:
             yield f"trials must be given with sampler: {self.sampler}, got null"
         if self.sampler == "cmaes":
