@@ -118,54 +118,18 @@ def test_mlflows_own_variable_stands_in_for_an_absent_setting(
 
 BAD: list[tuple[Document, str]] = [
     (document(colour="red"), "sweep.yaml:1: colour is not a known setting"),
-    (
-        document(stages=[PRETRAIN | {"tac": {"entropic_index": 0}}]),
-        "stages.pretrain.tac.entropic_index must be > 0, got 0",
-    ),
-    (
-        document(stages=[PRETRAIN | {"tac": {"entropic_index": float("nan")}}]),
-        "stages.pretrain.tac.entropic_index must be a finite number, got nan",
-    ),
-    (document(tasks=["FetchPusch"]), "got 'FetchPusch' (did you mean 'FetchPush'?)"),
-    (document(tasks=["FetchReach"]), "got FetchReach, which has none"),
     (document(resources={"num_cpus": 4096}), "resources.num_cpus must be <= "),
-    (
-        document(mlflow={"tracking_uri": "http://127.0.0.1:9"}),
-        "mlflow.tracking_uri must name an MLflow server that answers, got http://127.0.0.1:9",
-    ),
-    (document(mlflow={"tracking_uri": "mlruns"}), "mlflow.tracking_uri must be "),
-    (document(storage="ftp://host/x"), "storage must be a folder or an s3:// or gs:// URI"),
     (document(storage="/dev/null/x"), "/dev/null must be a writable folder"),
-    (document(storage="/proc/self"), "/proc/self must be a writable folder, for /proc/self/s: "),
     (document(storage="x" * 300), "File name too long"),
     (
         document(defaults={"replay": {"capacity": 10**18}}),
         "stage pretrain: replay.capacity must fit into the memory of this machine",
     ),
-    (from_checkpoint(Path("nowhere")), "nowhere must hold a handoff"),
     (
         document(
             tasks=["Mine"],
             environments={"Mine": {"env_id": "Nope-v7", "horizon": 5}},
             stages=[{"name": "a", "variant": "tac"}],
-        ),
-        "environments.Mine: env_id must name an environment that can be made, got 'Nope-v7'",
-    ),
-    (
-        document(
-            tasks=["Mine"],
-            environments={"Mine": {"env_id": "Nope-v7", "horizon": 5, "success_key": None}},
-            stages=[
-                {
-                    "name": "a",
-                    "variant": "tac",
-                    "search": {
-                        "space": {"tac.lr": {"float": [0.001, 0.01]}},
-                        "trials": 2,
-                        "objective": {"metric": "evaluation/episode_return"},
-                    },
-                }
-            ],
         ),
         "environments.Mine: env_id must name an environment that can be made, got 'Nope-v7'",
     ),
@@ -192,8 +156,6 @@ def test_bad_input_is_refused_before_anything_starts(
     program: Program, tmp_path: Path, bad: Document, message: str
 ) -> None:
     for command in ("run", "plan"):
-        if command == "plan" and "server that answers" in message:
-            continue  # a plan needs no MLflow
         result = program(bad, command=command)
         assert result.exit_code == 2, result.output
         assert message in result.stderr
@@ -407,8 +369,8 @@ LONG = "x" * 300
     ("arguments", "message"),
     [
         # An empty option is not left out.
-        (("run", "sweep.yaml", "--name", ""), "--name must "),
-        (("plan", "sweep.yaml", "--storage", ""), "--storage must not be empty"),
+        (("run", "sweep.yaml", "--name", ""), "--name: name must "),
+        (("plan", "sweep.yaml", "--storage", ""), "--storage: storage must not be empty"),
         (("plan", "sweep.yaml", "--seeds", ""), "--seeds must be a number of seeds"),
         (("status", "s", "--storage", ""), "--storage must not be empty, got ''"),
         (("status", "sweep.yaml", "--storage", ""), "--storage must not be empty, got ''"),

@@ -71,12 +71,16 @@ class Said:
 Program = Callable[..., Said]
 
 
-@pytest.fixture(params=["folder", "bucket"])
+IN_A_BUCKET = pytest.mark.parametrize("storage", ["folder", "bucket"], indirect=True)
+"""For tests of commands that read, write or delete in the storage themselves."""
+
+
+@pytest.fixture
 def storage(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Where the sweep is; the bucket is a file system without renames or folders of its own."""
+    """Storage of the sweep; the bucket is a file system without renames or folders of its own."""
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     monkeypatch.chdir(tmp_path)
-    if request.param == "folder":
+    if getattr(request, "param", "folder") == "folder":
         return str(tmp_path / "results")
     memory = MemoryFileSystem()
     memory.store.clear()
@@ -149,6 +153,7 @@ def played(storage: str, tmp_path: Path, runs: int = 9, seeds: int = 3) -> OpenS
     return sweep
 
 
+@IN_A_BUCKET
 def test_status_and_compare(storage: str, tmp_path: Path, program: Program) -> None:
     played(storage, tmp_path)
     place = f"{storage}/mine"
@@ -261,6 +266,7 @@ def test_compare_counts_unfinished_runs(storage: str, tmp_path: Path, program: P
     assert "1 of 3" in text
 
 
+@IN_A_BUCKET
 def test_best_takes_the_middle_run_of_the_best_condition(
     storage: str, tmp_path: Path, program: Program
 ) -> None:
@@ -396,6 +402,7 @@ def test_returns_of_different_tasks_are_never_averaged(
     assert "Small: train: q = 2 is first by return" in chosen["why"]
 
 
+@IN_A_BUCKET
 def test_clean_lists_and_deletes_what_no_other_sweep_has(
     storage: str, tmp_path: Path, program: Program
 ) -> None:
@@ -425,6 +432,7 @@ def test_clean_deletes_runs_of_earlier_versions_of_the_plan(
     assert not any(sweep.store.is_finished(node.key) for node in sweep.plan.nodes)
 
 
+@IN_A_BUCKET
 def test_clean_is_refused_while_a_sweep_is_being_started(
     storage: str, tmp_path: Path, program: Program
 ) -> None:
@@ -438,6 +446,7 @@ def test_clean_is_refused_while_a_sweep_is_being_started(
     assert program("clean", f"{storage}/mine", "--all", "--yes").code == 0
 
 
+@IN_A_BUCKET
 def test_clean_keeps_a_last_checkpoint_that_another_sweep_shares(
     storage: str, tmp_path: Path, program: Program
 ) -> None:
@@ -491,6 +500,7 @@ def test_a_sweep_goes_on_from_the_handoff_in_its_storage(
     assert program("status", f"{storage}/mine").code == 0
 
 
+@IN_A_BUCKET
 def test_clean_deletes_a_handoff_unless_another_sweep_starts_from_it(
     storage: str, tmp_path: Path, program: Program
 ) -> None:
@@ -570,6 +580,7 @@ DAMAGED = {
 }
 
 
+@IN_A_BUCKET
 @pytest.mark.parametrize("file", DAMAGED)
 def test_a_damaged_record_is_said(
     storage: str, tmp_path: Path, program: Program, file: str
@@ -587,6 +598,7 @@ def test_a_damaged_record_is_said(
     assert program("status", f"{storage}/mine").code == 0
 
 
+@IN_A_BUCKET
 def test_stop_reaches_the_driver(
     storage: str, tmp_path: Path, program: Program, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -745,6 +757,7 @@ def test_plan_as_json_with_more_seeds(
     assert (bad.code, "--seeds must be a number of seeds" in bad.errors) == (2, True)
 
 
+@IN_A_BUCKET
 def test_a_damaged_run_is_named_by_every_command_and_trained_again_when_asked(
     storage: str, tmp_path: Path, program: Program
 ) -> None:
