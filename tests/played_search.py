@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import random
-import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -18,9 +17,10 @@ from music_rllib.config.load import load_sweep
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.experiment.open_sweep import OpenSweep, open_sweep
 from music_rllib.experiment.plan import Node, make_plan
+from music_rllib.experiment.scheduler import Failure
 from music_rllib.search.controller import SearchController
-from music_rllib.search.opening import open_searches
-from music_rllib.search.summary import outcome
+from music_rllib.search.outcome import outcome
+from music_rllib.search.searches import open_searches
 from music_rllib.store.history import HISTORY, Report, RunResult, last_values, to_json_lines
 from music_rllib.tune.runner import DagSearcher
 
@@ -72,23 +72,17 @@ class Driver:
         config = load_sweep(path, storage=str(folder / "results"))
         plan = make_plan(config)
         self.sweep: OpenSweep = open_sweep(config, plan, config.storage)
-        self._time = time.time()  # as another driver's clock, which judges whether this one lives
         self.computed: list[str] = []
         self.pruned: dict[str, str] = {}
         self.controller = SearchController(
             self.sweep,
             open_searches(self.sweep),
             pruned=lambda node, reason: self.pruned.__setitem__(node.label, reason),
-            now=self._clock,
         )
         self.controller.recall()
         self._formula = formula
         self._rng = random.Random(seed)
         self._running: list[tuple[Node, int | None]] = []
-
-    def _clock(self) -> float:
-        self._time += 10.0  # other drivers are looked at each time
-        return self._time
 
     def play(
         self,
@@ -98,10 +92,11 @@ class Driver:
     ) -> None:
         """Go on to the end, or until so many pieces of runs have been computed."""
         scheduler = self.sweep.scheduler
-        searcher = DagSearcher(scheduler, lambda node: {"key": node.key}, self.controller.advance)
+        searcher = DagSearcher(scheduler, lambda node: {"key": node.key}, self.controller)
         running = self._running
         while stop_after is None or len(self.computed) < stop_after:
             suggestion = None
+            self.controller.refresh()  # looks at other drivers each time
             if len(running) < slots:
                 suggestion = searcher.suggest("t")
             if suggestion == Searcher.FINISHED and not running:
@@ -113,6 +108,7 @@ class Driver:
                 node, until = running.pop(self._rng.randrange(len(running)))
                 if fails(node):
                     scheduler.fail(node.key)
+                    self.controller.failed(node, Failure("it failed", self.sweep.folder))
                 else:
                     self._compute(node, until)
             else:
@@ -136,9 +132,11 @@ class Driver:
         self.controller.reported(node, reports)
         if until is not None:
             self.sweep.scheduler.pause(node.key, until)
+            self.controller.paused(node)
             return
-        publish(self.sweep, node, reports)
+        result = publish(self.sweep, node, reports)
         self.sweep.scheduler.finish(node.key)
+        self.controller.finished(node, result)
 
     def trials(self, arm: int = 0) -> list[dict[str, Any]]:
         """As plain data, with plain numbers."""
@@ -151,7 +149,7 @@ class Driver:
         return found
 
 
-def publish(sweep: OpenSweep, node: Node, reports: list[Report]) -> None:
+def publish(sweep: OpenSweep, node: Node, reports: list[Report]) -> RunResult:
     folder = sweep.folder / "made"
     folder.mkdir(parents=True, exist_ok=True)
     (folder / HISTORY).write_bytes(to_json_lines(reports))
@@ -162,6 +160,7 @@ def publish(sweep: OpenSweep, node: Node, reports: list[Report]) -> None:
         metrics=last_values(reports),
     )
     sweep.store.publish(node.key, folder, result)
+    return result
 
 
 def searched(folder: Path, search: Document | None = None, **changes: Any) -> Driver:

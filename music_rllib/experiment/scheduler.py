@@ -44,8 +44,6 @@ class Scheduler:
         by_seed = sorted(self._nodes.values(), key=lambda node: seeds.index(node.run.seed))
         self._turns = {node.key: turn for turn, node in enumerate(by_seed)}
         self._until: dict[str, int] = {}
-        self.changes = 0
-        """Number of changes of state so far."""
         self._status = {
             key: Status.REUSED if key in finished else Status.WAITING for key in self._nodes
         }
@@ -131,7 +129,6 @@ class Scheduler:
     def _add(self, node: Node, status: Status) -> None:
         self._nodes[node.key] = node
         self._status[node.key] = status
-        self.changes += 1
 
     def until(self, key: str) -> int | None:
         """Environment steps up to which the node is to be computed; None for its end."""
@@ -176,7 +173,6 @@ class Scheduler:
     def _move(self, key: str, before: Status, after: Status) -> None:
         assert self._status[key] is before, f"{key} is {self._status[key]}, not {before}"
         self._status[key] = after
-        self.changes += 1
 
 
 class Failure(NamedTuple):

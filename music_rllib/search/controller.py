@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from optuna.trial import FrozenTrial, TrialState
@@ -14,13 +14,15 @@ from music_rllib.config.search import FINAL_SEED, SearchSettings
 from music_rllib.errors import first_line
 from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.plan import Node, Run
-from music_rllib.experiment.scheduler import DONE, LOST, Listener, Status
+from music_rllib.experiment.scheduler import DONE, LOST, Failure, Listener, Status
 from music_rllib.redaction import redact
-from music_rllib.search.objective import aggregates, prune, score
+from music_rllib.results.statistics import Array
+from music_rllib.search.objective import aggregate, reason_to_prune, score, up_to
+from music_rllib.search.sampler import VALUES
+from music_rllib.search.searches import Finalist, RunningTrial, Search
 from music_rllib.search.storage import DATABASE_ERRORS
-from music_rllib.search.study_record import SCORES, VALUES
-from music_rllib.search.trials import Active, Arm, Array, Finalist, Search, ranked, up_to
-from music_rllib.store.history import Report
+from music_rllib.search.study import SCORES, OptunaStudy
+from music_rllib.store.history import Report, RunResult
 from music_rllib.store.storage import DamagedError
 
 POLL_SECONDS = 1.0
@@ -28,7 +30,11 @@ POLL_SECONDS = 1.0
 
 
 class SearchController(Listener):
-    """Fills the scheduler with the runs that the searches want next, and judges finished ones."""
+    """Ends a trial when the last of its runs ends, and claims the next one when a run is wanted.
+
+    A trial's point depends only on the trials up to its number minus `concurrent`, and pruning on
+    the trials that had ended when it was proposed: the order of events does not matter.
+    """
 
     def __init__(
         self,
@@ -38,132 +44,116 @@ class SearchController(Listener):
         reused: Callable[[Node], None] = lambda node: None,
         pruned: Callable[[Node, str], None] = lambda node, reason: None,
         say: Callable[[str], None] = lambda text: None,
-        now: Callable[[], float] = time.monotonic,
     ) -> None:
         """Control the searches of `sweep`.
 
         Args:
             sweep: Its plan and scheduler grow.
             searches: The opened searches.
-            reused: Called with each wanted node that is in the store already.
-            pruned: Called with each node that is computed no further, and the reason.
+            reused: Called with each requested node that is already in the store.
+            pruned: Called with each node that is not computed any further, and the reason.
             say: Called with one line about the end of each trial.
-            now: A clock in seconds.
         """
         self.searches = list(searches)
         self._scheduler, self._plan, self._store = sweep.scheduler, sweep.plan, sweep.store
         self._environments = sweep.environments
-        self._reused, self._pruned, self._say, self._now = reused, pruned, say, now
+        self._reused, self._pruned, self._say = reused, pruned, say
         self._reports: dict[str, dict[int, Report]] = {}
         """Reports of unfinished runs, by node key and environment step."""
-        self._changes_seen = -1
-        self._polled = -POLL_SECONDS
-        self._more = True
+        self._refreshed = time.monotonic()
         self._database_lost = False
-        """Whether the last look at the database failed."""
+        """Whether the database did not answer the last time."""
 
     @property
     def over(self) -> bool:
         """Whether every search has its ranking, or can't have one."""
         return all(search.over for search in self.searches)
 
+    # -- events ------------------------------------------------------------------------------
+
     def reported(self, node: Node, reports: list[Report]) -> None:
-        """Keep the reports by which a trial may be judged before its runs have finished."""
+        """Keep the reports of a run, which may be scored before it has finished."""
         if node.part:
-            self._reports.setdefault(node.key, {}).update(
-                {report.env_steps: report for report in reports}
-            )
+            by_step = {report.env_steps: report for report in reports}
+            self._reports.setdefault(node.key, {}).update(by_step)
+
+    def finished(self, node: Node, result: RunResult) -> None:
+        """Score the trials whose last run has finished."""
+        self._score_trials()
+
+    def paused(self, node: Node) -> None:
+        """Score the trials whose last run has reached the rung."""
+        self._score_trials()
+
+    def failed(self, node: Node, failure: Failure) -> None:
+        """End the trials whose run has failed."""
+        self._score_trials()
 
     def tick(self) -> None:
-        """Show other drivers that this one lives, also while Tune asks for nothing."""
-        for search in self.searches:
-            for arm in search.arms:
-                with contextlib.suppress(*DATABASE_ERRORS):
-                    arm.study.sign()
+        """Regularly look at the trials of other drivers."""
+        now = time.monotonic()
+        if now - self._refreshed >= POLL_SECONDS:
+            self._refreshed = now
+            self.refresh()
 
-    def advance(self) -> bool:
-        """Judge the trials that can be judged, and ask the scheduler for what is wanted next.
+    def refresh(self) -> None:
+        """Show other drivers that this one is alive, and read their trials."""
+        with self._database():
+            for search in self.searches:
+                for study in search.studies:
+                    study.heartbeat()
+                    study.refresh()
+        self._score_trials()
 
-        Returns:
-            Whether more may be wanted later.
+    def propose(self) -> None:
+        """Claim trials until a run is ready, unless the next trial must wait for earlier ones.
+
+        Claims only what this driver has room for: the other trials are for other drivers.
         """
-        now = self._now()
-        if self._changes_seen == self._scheduler.changes and now - self._polled < POLL_SECONDS:
-            return self._more
-        self._polled = now
+        self._score_trials()
+        while self._scheduler.next_ready() is None and self._claim():
+            self._score_trials()
+
+    def stop(self) -> None:
+        """Release this driver's trials, and add those of other drivers to the plan."""
+        for search in self.searches:
+            for study in search.studies:
+                with contextlib.suppress(*DATABASE_ERRORS):  # they are taken over in any case
+                    study.release()
+        with contextlib.suppress(*DATABASE_ERRORS):  # the plan lacks the trials of other drivers
+            self.recall()
+
+    def recall(self) -> None:
+        """Add the runs of all ended trials to the plan; other drivers may have run them."""
+        for search in self.searches:
+            self._recall(search)
+
+    @contextlib.contextmanager
+    def _database(self) -> Iterator[None]:
+        """Print a warning if the database does not answer; the next event tries again."""
         try:
-            self._advance_all()
+            yield
         except DATABASE_ERRORS as error:
-            # What was begun is begun again next time; runs go on meanwhile.
             if not self._database_lost:
                 cause = first_line(error.__cause__ or error)
                 self._say(f"the study's database does not answer, trying again: {redact(cause)}")
             self._database_lost = True
-            return True
-        self._database_lost = False
-        self._changes_seen = self._scheduler.changes
-        self._more = not self.over
-        return self._more
+        else:
+            self._database_lost = False
 
-    def _advance_all(self) -> None:
-        for search in self.searches:
-            for arm in search.arms:
-                arm.study.refresh()
-        while True:
-            before = self._scheduler.changes
-            moved = [self._advance(search) for search in self.searches]
-            if not any(moved) and before == self._scheduler.changes:
-                break
-
-    def _advance(self, search: Search) -> bool:
-        moved = False
-        for arm in search.arms:
-            arm.study.sign()
-            for active in list(arm.active.values()):
-                moved |= self._judge(arm, active)
-            # Only what this driver has room for: the rest is for others.
-            while self._scheduler.next_ready() is None:
-                trial = arm.study.claim()
-                if trial is None:
-                    break
-                moved = True
-                arm.active[trial.number] = Active(trial)
-                self._want_rung(arm, arm.active[trial.number])
-        if all(arm.finalists is None and arm.ended for arm in search.arms):
-            self._recall(search)
-            for arm in search.arms:
-                arm.finalists = self._choose(arm)
-            moved = True
-        for arm in search.arms:
-            for finalist in arm.finalists or ():
-                moved |= self._judge_finalist(search.settings, finalist)
-        return moved
-
-    def stop(self) -> None:
-        """Give this driver's trials back, and add those of other drivers to the plan."""
-        for search in self.searches:
-            for arm in search.arms:
-                with contextlib.suppress(*DATABASE_ERRORS):  # they are taken over in any case
-                    arm.study.release()
-        with contextlib.suppress(*DATABASE_ERRORS):  # the plan lacks what others have judged
-            self.recall()
-
-    def recall(self) -> None:
-        """Add the runs of all ended trials to the plan, which other drivers may have judged."""
-        for search in self.searches:
-            self._recall(search)
+    # -- runs --------------------------------------------------------------------------------
 
     def _recall(self, search: Search) -> None:
-        for arm in search.arms:
-            for trial in arm.study.trials():
+        for study in search.studies:
+            for trial in study.trials():
                 if not trial.state.is_finished() or VALUES not in trial.user_attrs:
                     continue
                 reached = max(map(int, trial.user_attrs.get(SCORES, {})), default=0)
                 rung = search.rungs[min(reached, len(search.rungs) - 1)]
                 try:
-                    runs = self._plan_runs(arm, trial, self._plan.seeds[: rung.seeds])
+                    runs = self._plan_runs(search, study, trial, self._plan.seeds[: rung.seeds])
                 except ConfigError:
-                    continue  # that is why it failed
+                    continue  # the reason why the trial failed
                 for node in (node for run in runs for node in self._nodes_of(run)):
                     if not self._scheduler.knows(node.key):
                         finished = self._store.is_finished(node.key)
@@ -171,19 +161,22 @@ class SearchController(Listener):
                         if finished:
                             self._reused(node)
 
-    # -- runs --------------------------------------------------------------------------------
-
     def _plan_runs(
-        self, arm: Arm, trial: FrozenTrial, seeds: Sequence[int], phase: str = "trial"
+        self,
+        search: Search,
+        study: OptunaStudy,
+        trial: FrozenTrial,
+        seeds: Sequence[int],
+        phase: str = "trial",
     ) -> list[Run]:
-        """The runs of a trial, which are added to the plan; arms take turns in its numbers.
+        """The runs of a trial, which are added to the plan; the studies' trials alternate there.
 
         Raises:
-            ConfigError: Its point makes no valid settings.
+            ConfigError: The settings of its point are not valid.
         """
-        number = trial.number * len(arm.search.arms) + arm.position
+        number = trial.number * len(search.studies) + search.studies.index(study)
         part = f"{phase}{trial.number}"
-        return self._plan.add_trial(arm.search.stage.name, number, arm.point(trial), seeds, part)
+        return self._plan.add_trial(search.stage.name, number, study.point(trial), seeds, part)
 
     def _nodes_of(self, run: Run) -> list[Node]:
         """The node of a run, after the planned node that it starts from, if there is one."""
@@ -192,61 +185,97 @@ class SearchController(Listener):
             return [node]
         return [self._plan.node(node.input.key), node]
 
-    def _want(self, run: Run, until: int | None) -> None:
+    def _request(self, run: Run, until: int | None) -> None:
+        """Ask for a run up to an environment step; None: to its end."""
         for node in self._nodes_of(run):
             new = not self._scheduler.knows(node.key)
-            # One that is damaged is handed out: the worker that finds it there says what is wrong.
-            # So does one of another environment.
-            finished = new and self._store.is_sound(node.key) and self._is_of_now(node)
-            paused = node.key == run.key and until is not None and until < node.run.env_steps
-            self._scheduler.request(node, until if paused else None, finished=finished)
+            # A damaged node, or one of another environment, goes to a worker, which reports it.
+            finished = new and self._store.is_sound(node.key) and self._is_current(node)
+            pauses = node.key == run.key and until is not None and until < node.run.env_steps
+            self._scheduler.request(node, until if pauses else None, finished=finished)
             if finished:
                 self._reused(node)
 
-    def _is_of_now(self, node: Node) -> bool:
-        task, found = node.run.task.name, self._store.environment(node.key)
-        return not self._environments.differences(task, found)
+    def _is_current(self, node: Node) -> bool:
+        """Whether a node in the store was computed with the environment of today."""
+        found = self._store.environment(node.key)
+        return not self._environments.differences(node.run.task.name, found)
 
-    def _want_rung(self, arm: Arm, active: Active) -> None:
+    def _request_rung(self, search: Search, one: RunningTrial) -> None:
         """Ask for the runs up to the trial's rung."""
-        rung = arm.search.rungs[active.rung]
+        rung = search.rungs[one.rung]
+        seeds = self._plan.seeds[: rung.seeds]
         try:
-            active.runs = self._plan_runs(arm, active.trial, self._plan.seeds[: rung.seeds])
+            one.runs = self._plan_runs(search, one.study, one.trial, seeds)
         except ConfigError as error:
-            self._end(arm, active, TrialState.FAIL, "; ".join(error.lines))
+            self._end(search, one, TrialState.FAIL, "; ".join(error.lines))
             return
-        for run in active.runs:
-            self._want(run, rung.env_steps)
+        for run in one.runs:
+            self._request(run, rung.env_steps)
 
     # -- trials ------------------------------------------------------------------------------
 
-    def _judge(self, arm: Arm, active: Active) -> bool:
-        """End a trial or move it to its next rung; False where its runs are not there yet."""
-        search = arm.search
-        states = {run.key: self._scheduler[run.key] for run in active.runs}
-        lost = [run for run in active.runs if states[run.key] in LOST]
+    def _claim(self) -> bool:
+        """Claim one trial, and ask for its runs; False if none can be claimed now."""
+        with self._database():
+            for search in self.searches:
+                for study in search.studies:
+                    if (trial := study.claim()) is not None:
+                        one = RunningTrial(study, trial)
+                        search.running.append(one)
+                        self._request_rung(search, one)
+                        return True
+        return False
+
+    def _score_trials(self) -> None:
+        """Score the trials whose runs have all ended, and choose finalists after the last one."""
+        with self._database():
+            changed = True
+            while changed:
+                changed = False
+                for search in self.searches:
+                    changed |= self._advance(search)
+
+    def _advance(self, search: Search) -> bool:
+        changed = False
+        for one in list(search.running):
+            changed |= self._score_trial(search, one)
+        if search.finalists is None and all(study.has_ended for study in search.studies):
+            self._recall(search)
+            search.finalists = [
+                one for study in search.studies for one in self._choose(search, study)
+            ]
+            changed = True
+        for finalist in search.finalists or ():
+            changed |= self._score_finalist(search.settings, finalist)
+        return changed
+
+    def _score_trial(self, search: Search, one: RunningTrial) -> bool:
+        """End a trial or move it to its next rung; False if its runs have not ended yet."""
+        states = {run.key: self._scheduler[run.key] for run in one.runs}
+        lost = [run for run in one.runs if states[run.key] in LOST]
         if lost:
             why = f"{lost[0].label} {states[lost[0].key]}"
-            self._end(arm, active, TrialState.FAIL, why, lost=True)
+            self._end(search, one, TrialState.FAIL, why, lost=True)
             return True
         if not all(state in DONE or state is Status.PAUSED for state in states.values()):
             return False
+        objectives = search.settings.objectives
         try:
-            scores = self._scores(search.settings, active.runs, search.rungs[active.rung].env_steps)
+            scores = self._scores(search.settings, one.runs, search.rungs[one.rung].env_steps)
         except (ValueError, DamagedError) as error:
-            self._end(arm, active, TrialState.FAIL, str(error))
+            self._end(search, one, TrialState.FAIL, str(error))
             return True
-        values = aggregates(search.settings.objectives, scores)
-        value = values[0] if len(values) == 1 else None
+        values = [aggregate(*pair) for pair in zip(objectives, scores, strict=True)]
         kept = [of_objective.tolist() for of_objective in scores]
-        arm.study.report(active.trial, active.rung, value, kept)
-        if active.rung == len(search.rungs) - 1:
-            self._end(arm, active, TrialState.COMPLETE, values=values)
-        elif (reason := self._prunes(arm, active, scores[0])) is not None:
-            self._end(arm, active, TrialState.PRUNED, reason)
+        one.study.report(one.trial, one.rung, values[0] if len(values) == 1 else None, kept)
+        if one.rung == len(search.rungs) - 1:
+            self._end(search, one, TrialState.COMPLETE, values=values)
+        elif (reason := self._reason_to_prune(search, one, scores[0])) is not None:
+            self._end(search, one, TrialState.PRUNED, reason)
         else:
-            active.rung += 1
-            self._want_rung(arm, active)
+            one.rung += 1
+            self._request_rung(search, one)
         return True
 
     def _scores(
@@ -274,57 +303,53 @@ class SearchController(Listener):
             return self._store.history(key)
         return [report for _, report in sorted(self._reports.get(key, {}).items())]
 
-    def _prunes(self, arm: Arm, active: Active, scores: Array) -> str | None:
-        """Why the trial is stopped at its rung; None: it goes on.
+    def _reason_to_prune(self, search: Search, one: RunningTrial, scores: Array) -> str | None:
+        """Why the trial is stopped at its rung; None if it continues.
 
-        It is compared with the trials that had all ended when it was chosen, so that the answer
-        doesn't depend on who was faster.
+        It is compared with the trials that had all ended when it was proposed.
         """
-        search, number = arm.search, active.trial.number
-        pruning = search.settings.pruning
+        number, pruning = one.trial.number, search.settings.pruning
         assert pruning is not None
         if number < pruning.warm_up:
             return None
-        earlier = arm.study.trials()[: max(0, number - search.settings.concurrent + 1)]
+        earlier = one.study.trials()[: max(0, number - search.settings.concurrent + 1)]
 
         def scores_at(rung: int) -> dict[int, Array]:
             kept = {trial.number: trial.user_attrs.get(SCORES, {}) for trial in earlier}
             return {n: np.asarray(at[str(rung)][0]) for n, at in kept.items() if str(rung) in at}
 
-        env_steps = search.rungs[active.rung].env_steps
+        env_steps = search.rungs[one.rung].env_steps
         steps = "" if env_steps is None else f" after {env_steps:,} env steps"
-        verdict = prune(
+        return reason_to_prune(
             search.settings.objectives[0],
             pruning,
             scores=scores,
-            others=scores_at(active.rung),
+            others=scores_at(one.rung),
             whole=scores_at(len(search.rungs) - 1),
-            place=f"with {scores.shape[0]} of {len(self._plan.seeds)} seeds{steps}",
+            rung=f"with {scores.shape[0]} of {len(self._plan.seeds)} seeds{steps}",
         )
-        return verdict.reason if verdict.stop else None
 
     def _end(
         self,
-        arm: Arm,
-        active: Active,
+        search: Search,
+        one: RunningTrial,
         state: TrialState,
         reason: str = "",
         values: Sequence[float] | None = None,
         *,
         lost: bool = False,
     ) -> None:
-        """Record the end of a trial, and compute those of its runs no further that no other has."""
-        arm.study.end(active.trial, state, values, reason, lost=lost)
-        del arm.active[active.trial.number]
+        """Record the end of a trial, and stop those of its runs that no other trial needs."""
+        one.study.end(one.trial, state, values, reason, lost=lost)
+        search.running.remove(one)
         if state is TrialState.COMPLETE:
             text = ", ".join(f"{value:.4g}" for value in values or ())
         else:
             text = f"{'stopped early' if state is TrialState.PRUNED else 'FAILED'}, {reason}"
-        self._say(f"{arm.label} trial {active.trial.number}: {text}")
-        arms = (arm for search in self.searches for arm in search.arms)
-        wanted = {run.key for arm in arms for other in arm.active.values() for run in other.runs}
-        for run in active.runs:
-            if run.key in wanted or self._scheduler.is_planned(run.key):
+        self._say(f"{search.label(one.study)} trial {one.trial.number}: {text}")
+        needed = {run.key for each in self.searches for other in each.running for run in other.runs}
+        for run in one.runs:
+            if run.key in needed or self._scheduler.is_planned(run.key):
                 continue
             self._reports.pop(run.key, None)
             if self._scheduler.prune(run.key):
@@ -332,33 +357,32 @@ class SearchController(Listener):
 
     # -- the final ranking -------------------------------------------------------------------
 
-    def _choose(self, arm: Arm) -> list[Finalist]:
+    def _choose(self, search: Search, study: OptunaStudy) -> list[Finalist]:
         """The best trials of an ended study, and its baselines, to be run on fresh seeds."""
-        settings = arm.search.settings
-        final = settings.final
+        final = search.settings.final
         if final is None:
             return []
         seeds = range(FINAL_SEED, FINAL_SEED + final.seeds)
         finalists: list[Finalist] = []
-        for trial in ranked(settings, arm.study.trials()):
-            values = arm.point(trial)
+        for trial in study.ranked():
+            values = study.point(trial)
             if any(finalist.values == values for finalist in finalists):
                 continue  # the same point twice is one finalist
             # The given points are the study's first trials.
-            baseline = final.baselines and trial.number < len(settings.points_to_evaluate)
-            if len(finalists) >= final.trials and not baseline:
+            given = len(search.settings.points_to_evaluate)
+            if len(finalists) >= final.trials and not (final.baselines and trial.number < given):
                 continue
-            runs = self._plan_runs(arm, trial, seeds, phase="final")
+            runs = self._plan_runs(search, study, trial, seeds, phase="final")
             for run in runs:
-                self._want(run, None)
-            searched = tuple(trial.values or ())
+                self._request(run, None)
+            searched = tuple(trial.values)
             finalists.append(
                 Finalist(number=trial.number, values=values, searched=searched, runs=runs)
             )
         return finalists
 
-    def _judge_finalist(self, settings: SearchSettings, finalist: Finalist) -> bool:
-        """Read a finalist's scores; False where it has them already, or its runs are missing."""
+    def _score_finalist(self, settings: SearchSettings, finalist: Finalist) -> bool:
+        """Score a finalist; False if it has its scores already, or its runs have not ended."""
         if finalist.over:
             return False
         states = [self._scheduler[run.key] for run in finalist.runs]

@@ -1,10 +1,10 @@
 """The points of trials: a function of the settings, the trial's number and earlier results.
 
-Each trial has a sampler of its own, seeded by the study's seed and the trial's number, which sees
-the results of exactly the trials up to `number - concurrent`. So it doesn't matter in which order
-runs finish, how many drivers there are, or whether the study was interrupted: the points are the
-same. No trial has the point of an earlier one, as long as there are others: the sampler is asked
-again, and where it insists, the trial gets the nearest point that is left.
+Each trial has its own sampler, seeded by the study's seed and the trial's number, with the results
+of exactly the trials up to `number - concurrent`. Therefore the points depend neither on the order
+in which runs finish, nor on the number of drivers, nor on interruptions. No trial repeats the point
+of an earlier one while other points remain: the sampler proposes again, and if it repeats itself,
+the trial gets the nearest remaining point.
 """
 
 from __future__ import annotations
@@ -30,15 +30,16 @@ from optuna.trial import FrozenTrial, TrialState, create_trial
 from music_rllib.config.problems import same
 from music_rllib.config.search import SearchSettings
 from music_rllib.config.space import Choice, Dimension, FloatRange, IntRange
-from music_rllib.search.study_record import VALUES
 
+VALUES = "values"
+"""Attribute of a trial: its point."""
 ATTEMPTS = 8
-"""Proposals that a sampler makes for a trial before the nearest point that is left is taken."""
+"""Proposals of a sampler for one trial before the nearest remaining point is used."""
 DRAWS = 200
-"""Random points that are drawn where points cannot be counted."""
+"""Random points that are drawn if the space's points cannot be counted."""
 DIGITS = 6
-"""Significant digits of a proposed number: more would make a point's hash depend on the last bit of
-a machine's logarithm."""
+"""Significant digits of a proposed number: with more digits, the hash of a point would depend on
+the last bit of a machine's logarithm."""
 
 optuna.logging.set_verbosity(optuna.logging.WARNING)
 
@@ -50,29 +51,29 @@ class Proposer:
         self,
         settings: SearchSettings,
         points: Sequence[Mapping[str, Any]] = (),
-        prior: Sequence[FrozenTrial] = (),
+        warm_start: Sequence[FrozenTrial] = (),
     ) -> None:
-        """Propose `points` first, and learn from the finished trials `prior` of an older study."""
+        """Propose `points` first; the sampler also uses the complete trials `warm_start`."""
         self._settings = settings
         self._points = list(points)
-        self._prior = list(prior)
+        self._warm_start = list(warm_start)
 
     def propose(
-        self, number: int, judged: Sequence[FrozenTrial], running: Sequence[FrozenTrial]
+        self, number: int, ended: Sequence[FrozenTrial], running: Sequence[FrozenTrial]
     ) -> FrozenTrial:
         """A waiting trial at the point of trial `number`.
 
         Args:
             number: The trial's number, from 0.
-            judged: Trials 0 to `number - concurrent`, all of them ended.
-            running: The trials after those and before `number`, whose points are known.
+            ended: Trials 0 to `number - concurrent`, all of them ended.
+            running: The trials between those and `number`, which have points.
         """
         space = self._settings.space
         if self._settings.sampler == "grid":
             return trial_at(space, (self._settings.points or [])[number])
-        tried = {_name(space, trial.user_attrs[VALUES]) for trial in (*judged, *running)}
+        tried = {_key(space, trial.user_attrs[VALUES]) for trial in (*ended, *running)}
         given = self._points[number] if number < len(self._points) else {}
-        if given and _name(space, given) in tried:
+        if given and _key(space, given) in tried:
             given = {}
         study = optuna.create_study(
             directions=[
@@ -80,7 +81,7 @@ class Proposer:
             ],
             sampler=self._sampler(number),
         )
-        study.add_trials([*self._prior, *judged])
+        study.add_trials([*self._warm_start, *ended])
         for other in running:
             study.add_trial(
                 create_trial(
@@ -93,10 +94,10 @@ class Proposer:
         for attempt in range(ATTEMPTS if countable else ATTEMPTS + 2 * DRAWS):
             if attempt == ATTEMPTS:
                 study.sampler = RandomSampler(seed=self._seed(number) ^ 1)
-            if attempt == ATTEMPTS + DRAWS:  # every point that is left has another value
+            if attempt == ATTEMPTS + DRAWS:  # no remaining point has the given values
                 given = {}
-            values = self._asked(study, given)
-            if _name(space, values) not in tried:
+            values = self._sampled(study, given)
+            if _key(space, values) not in tried:
                 break
         else:
             values = self._nearest(values, tried, given, self._seed(number)) or values
@@ -104,8 +105,8 @@ class Proposer:
         system_attrs.pop("fixed_params", None)
         return trial_at(space, values, system_attrs=system_attrs)
 
-    def _asked(self, study: optuna.Study, given: Mapping[str, Any]) -> dict[str, Any]:
-        """A point of the sampler's, with the values that are `given`."""
+    def _sampled(self, study: optuna.Study, given: Mapping[str, Any]) -> dict[str, Any]:
+        """A point from the sampler, with the `given` values."""
         if given:
             study.enqueue_trial(_encoded(self._settings.space, given))
         values: dict[str, Any] = {}
@@ -116,15 +117,15 @@ class Proposer:
                 if dimension.applies(values):
                     values[name] = _suggest(trial, name, dimension)
                     if name in given and isinstance(dimension, FloatRange):
-                        values[name] = float(given[name])  # not rounded: a person wrote it
+                        values[name] = float(given[name])  # as written in the file, not rounded
         return values
 
     def _nearest(
         self, values: Mapping[str, Any], tried: set[str], given: Mapping[str, Any], seed: int
     ) -> dict[str, Any] | None:
-        """The nearest point that is not tried, one with `given` values if there is any."""
+        """The nearest untried point, with the `given` values if such a point remains."""
         space = self._settings.space
-        left = [p for p in self._settings.points or () if _name(space, p) not in tried]
+        left = [p for p in self._settings.points or () if _key(space, p) not in tried]
         fitting = [p for p in left if all(same(p.get(name), given[name]) for name in given)]
         left = fitting or left
         random.Random(seed).shuffle(left)
@@ -142,7 +143,7 @@ class Proposer:
                 case "tpe":
                     return TPESampler(
                         n_startup_trials=settings.startup_trials,
-                        # Points that are being judged count as bad, so that no two are the same.
+                        # Running trials count as bad, so that their points are not proposed again.
                         constant_liar=True,
                         seed=seed,
                     )
@@ -159,17 +160,17 @@ class Proposer:
         return RandomSampler(seed=seed)
 
 
-def _name(space: Mapping[str, Dimension], values: Mapping[str, Any]) -> str:
-    """A text that equal points share: as their dimensions spell them, to a machine's last bits."""
-    spelt = _encoded(space, values)
+def _key(space: Mapping[str, Dimension], values: Mapping[str, Any]) -> str:
+    """A text that equal points share, whatever the last bits of their numbers."""
+    params = _encoded(space, values)
     numbers = (name for name in values if not isinstance(space[name], Choice))
-    return _json(spelt | {name: f"{values[name]:.12g}" for name in numbers})
+    return _json(params | {name: f"{values[name]:.12g}" for name in numbers})
 
 
 def _distance(
     space: Mapping[str, Dimension], one: Mapping[str, Any], other: Mapping[str, Any]
 ) -> float:
-    """Sum over the dimensions: 1 for another choice, or the share of the range between numbers."""
+    """Sum over the dimensions: 1 for another choice, a fraction of the range for numbers."""
     total = 0.0
     for name, dimension in space.items():
         if name in one and name in other and not isinstance(dimension, Choice):
@@ -183,13 +184,13 @@ def _distance(
 def trial_at(
     space: Mapping[str, Dimension],
     values: Mapping[str, Any],
-    judged: Sequence[float] | None = None,
+    objective: Sequence[float] | None = None,
     system_attrs: Mapping[str, Any] | None = None,
 ) -> FrozenTrial:
-    """A trial at a point: complete with the objective values `judged`, or else waiting."""
+    """A trial at a point: complete if its `objective` values are given, else waiting."""
     return create_trial(
-        state=TrialState.WAITING if judged is None else TrialState.COMPLETE,
-        values=judged,
+        state=TrialState.WAITING if objective is None else TrialState.COMPLETE,
+        values=objective,
         params=_encoded(space, values),
         distributions={name: _distribution(space[name]) for name in values},
         user_attrs={VALUES: dict(values)},
@@ -225,7 +226,7 @@ def _suggest(trial: optuna.Trial, name: str, dimension: Dimension) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """A value as a category of Optuna: scalars as they are, anything else as JSON text."""
+    """A value as a category of Optuna: a scalar, or JSON text for anything else."""
     return value if value is None or isinstance(value, bool | int | float | str) else _json(value)
 
 
@@ -234,10 +235,10 @@ def _json(value: Any) -> str:
 
 
 def _encoded(space: Mapping[str, Dimension], values: Mapping[str, Any]) -> dict[str, Any]:
-    """A point in Optuna's form."""
+    """The parameters of a point in Optuna."""
     params = dict(values)
     for name, value in values.items():
         if isinstance(dimension := space[name], Choice):
-            # As the choice spells it: Optuna must find 1 among [1.0, 1.5].
+            # The equal value of the choice: Optuna must find 1 in [1.0, 1.5].
             params[name] = _plain(next(v for v in dimension.choice if same(v, value)))
     return params

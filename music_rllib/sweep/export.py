@@ -26,13 +26,11 @@ from music_rllib.results.data import RunRecord, Sweep
 from music_rllib.results.planned import LastValues
 from music_rllib.results.read import searches_of
 from music_rllib.results.statistics import with_interval
-from music_rllib.search.ranking import (
-    Scored,
+from music_rllib.search.best import (
+    ScoredCondition,
     best_so_far,
-    is_of,
-    leader,
-    measure_of,
-    scored_conditions,
+    condition_of,
+    ranking_metric,
 )
 from music_rllib.store.storage import StorageError, is_remote, write_atomically
 
@@ -56,7 +54,7 @@ def export_best(location: SweepLocation, stage_name: str | None, output: Path) -
     stage = opened.config.stage(stage_name)
     sweep = LastValues(opened.plan).sweep(opened.results())
     searches = searches_of(location, opened.config)
-    metric = measure_of(stage, sweep).metric
+    metric = ranking_metric(stage, sweep).metric
     best = _best(opened, stage, sweep, metric, searches)
     others = best.pop("other_tasks", None)
     if not others:
@@ -94,10 +92,7 @@ def _best(
         if stage.search is not None:
             needed = f"a scored trial of stage {stage.name}"
         raise BadInputError(f"SWEEP must have {needed}, {opened.config.name} has none")
-    search = next((one for one in searches if one["stage"] == stage.name), None)
-    if stage.search is not None and search is not None and (first := leader(search)) is not None:
-        best |= {"metric": stage.search.objectives[0].label, "trial": first.trial}
-    return best
+    return best if stage.search is None else best | {"metric": stage.search.objectives[0].label}
 
 
 def _export_condition(
@@ -109,13 +104,13 @@ def _export_condition(
     output: Path,
 ) -> dict[str, Any]:
     """Export the policies of one condition, on all its tasks or on the task of `best`."""
-    scored = _scored(opened, stage, sweep, best, metric)
+    scored = condition_of(best, stage, opened.plan, sweep, metric)
     if scored is None:
         raise BadInputError(
             f"SWEEP must have the runs of its best trial, {best['trial']} of stage {stage.name}: "
             f"{redact(opened.storage)} has none of them"
         )
-    success = _scored(opened, stage, sweep, best, names.EVAL_SUCCESS)
+    success = condition_of(best, stage, opened.plan, sweep, names.EVAL_SUCCESS)
     chosen: dict[str, Any] = {
         "sweep": opened.config.name,
         "stage": stage.name,
@@ -149,7 +144,7 @@ def _export_condition(
     return chosen | {"policies": policies}
 
 
-def _reason(stage: Stage, best: Mapping[str, Any], scored: Scored) -> str:
+def _reason(stage: Stage, best: Mapping[str, Any], scored: ScoredCondition) -> str:
     by, condition = best["by"], scored.condition
     level = best.get("level", 0)
     rank = f"ties for first with {level} more" if level else "is first"
@@ -162,14 +157,6 @@ def _reason(stage: Stage, best: Mapping[str, Any], scored: Scored) -> str:
     if scored.complete:
         return text
     return f"{text}, of {len(condition.runs)} planned: no condition has all of its runs"
-
-
-def _scored(
-    opened: OpenSweep, stage: Stage, sweep: Sweep, best: Mapping[str, Any], metric: str
-) -> Scored | None:
-    """The runs of the best condition, with their scores by a metric; None if there are none."""
-    candidates = scored_conditions(stage.name, opened.plan, sweep, metric, best.get("task"))
-    return next((one for one in candidates if is_of(one, stage, best)), None)
 
 
 def _median_run(sweep: Sweep, condition: Condition, task: str, metric: str) -> RunRecord | None:

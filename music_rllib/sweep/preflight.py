@@ -206,7 +206,7 @@ def verify_inputs(scheduler: Scheduler, store: NodeStore) -> None:
 def check_searches(opened: OpenSweep) -> None:
     """Check that the studies of the searches can be opened."""
     if opened.plan.searched:
-        from music_rllib.search.opening import check_studies
+        from music_rllib.search.searches import check_studies
 
         check_studies(opened)
 

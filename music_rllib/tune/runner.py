@@ -9,7 +9,7 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from ray import tune
 from ray.tune.experiment import Trial
@@ -26,8 +26,16 @@ from music_rllib.training.worker import RunTrainable
 from music_rllib.tune.events import RESTARTS, TuneEvents
 from music_rllib.tune.stopping import StopSignals
 
-if TYPE_CHECKING:
-    from music_rllib.search.controller import SearchController
+
+class Searches(Protocol):
+    """The searches of a sweep, which decide on new runs."""
+
+    def propose(self) -> None:
+        """Add the next runs to the scheduler if it has none that is ready."""
+
+    @property
+    def over(self) -> bool:
+        """Whether no more runs will be added."""
 
 
 class DagSearcher(Searcher):
@@ -42,7 +50,7 @@ class DagSearcher(Searcher):
         self,
         scheduler: Scheduler,
         config_of: Callable[[Node], dict[str, Any]],
-        advance: Callable[[], bool] = lambda: False,
+        searches: Searches | None = None,
         stopped: Callable[[], bool] = lambda: False,
     ) -> None:
         """Suggest the nodes of `scheduler`.
@@ -50,25 +58,25 @@ class DagSearcher(Searcher):
         Args:
             scheduler: Has the nodes and their statuses.
             config_of: Makes the Tune config of a node.
-            advance: Lets the searches add nodes to the scheduler; returns whether they may add
-                more later.
-            stopped: Returns whether nothing more is to be suggested.
+            searches: Add nodes to the scheduler.
+            stopped: Returns whether the sweep was stopped.
         """
         super().__init__()
         self._scheduler = scheduler
         self._config_of = config_of
-        self._advance = advance
+        self._searches = searches
         self._stopped = stopped
 
     def suggest(self, trial_id: str) -> dict[str, Any] | str | None:
         """The config of a node that can run, None for "not now", or `FINISHED`."""
         if self._stopped():
             return str(Searcher.FINISHED)
-        more = self._advance()
+        if self._searches is not None:
+            self._searches.propose()
         node = self._scheduler.next_ready()
         if node is None:
-            done = self._scheduler.all_handed_out and not more
-            return str(Searcher.FINISHED) if done else None
+            over = self._searches is None or self._searches.over
+            return str(Searcher.FINISHED) if self._scheduler.all_handed_out and over else None
         self._scheduler.start(node.key)
         return self._config_of(node)
 
@@ -93,7 +101,7 @@ def compute(
     listeners: Sequence[Listener],
     on_stop: Callable[[], None],
     on_ray_gone: Callable[[str | None], None],
-    controller: SearchController | None,
+    searches: Searches | None,
 ) -> int | None:
     """Compute the waiting nodes, and those that searches ask for.
 
@@ -103,7 +111,7 @@ def compute(
         on_stop: Called, in a signal handler, when the user asks to stop.
         on_ray_gone: Called, in a thread, before the process ends because Ray has: with the cause,
             or None where the user's signal has ended that as well.
-        controller: The searches; None where there are none.
+        searches: The controller of the searches, if there are any.
 
     Returns:
         The signal that stopped the sweep; None if everything was computed.
@@ -128,7 +136,7 @@ def compute(
             environment=sweep.environments.now.get(node.run.task.name),
             same_environments=sweep.environments.same(node.run.task.name),
         ).to_tune(),
-        advance=(lambda: False) if controller is None else controller.advance,
+        searches=searches,
         stopped=lambda: stopping.received is not None,
     )
     with (
@@ -145,7 +153,7 @@ def compute(
             tune_config=tune.TuneConfig(
                 search_alg=searcher,
                 # As many as the searcher suggests; -1 is without an end.
-                num_samples=-1 if controller else len(sweep.scheduler.having(Status.WAITING)),
+                num_samples=-1 if searches else len(sweep.scheduler.having(Status.WAITING)),
                 reuse_actors=_may_share_processes(sweep),
                 trial_name_creator=_trial_name,
                 trial_dirname_creator=_trial_name,
@@ -168,7 +176,7 @@ def compute(
             # one for a summary that nobody reads.
             if stopping.received is None or _has_working_folder():
                 raise
-    done = sweep.scheduler.complete and (controller is None or controller.over)
+    done = sweep.scheduler.complete and (searches is None or searches.over)
     return None if done else stopping.received
 
 

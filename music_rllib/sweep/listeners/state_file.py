@@ -23,7 +23,7 @@ from music_rllib.experiment.plan import Node
 from music_rllib.experiment.record import plan_document
 from music_rllib.experiment.scheduler import Failure, Listener, Status
 from music_rllib.results.planned import LastValues
-from music_rllib.search.ranking import best_in_words, best_so_far
+from music_rllib.search.best import best_so_far, best_text
 from music_rllib.store.history import Report, RunResult, last_values
 from music_rllib.store.lease import process_start, this_machine
 from music_rllib.store.storage import StorageError, is_remote
@@ -151,7 +151,7 @@ class StateFile(Listener):
             for arm in search["arms"]
         ]
         best = self._state["best"]
-        return lines, None if best is None else f"best so far: {best_in_words(best)}"
+        return lines, None if best is None else f"best so far: {best_text(best)}"
 
     # -- the state ---------------------------------------------------------------------------
 

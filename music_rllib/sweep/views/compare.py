@@ -20,7 +20,7 @@ from music_rllib.results.conditions import Condition, find_stages
 from music_rllib.results.read import StoredSweep, read_stored
 from music_rllib.results.statistics import SHOW_SEEDS_BELOW, Estimate, difference, with_interval
 from music_rllib.results.study import study_of
-from music_rllib.search.ranking import measure_of
+from music_rllib.search.best import ranking_metric
 from music_rllib.sweep.views.text import new_table, percent, setting_cells
 
 IN_THE_SEARCH = "in the search"
@@ -51,15 +51,15 @@ def compare_document(
     stored = read.sweep
     if metric is not None:
         _check_metric(read, metric)
-    measure = measure_of(settings, stored)
-    shown = metric or (measure.metric if settings.search else None)
-    maximised = not minimize and (measure.maximised or shown != measure.metric)
+    ranking = ranking_metric(settings, stored)
+    shown = metric or (ranking.metric if settings.search else None)
+    maximised = not minimize and (ranking.maximised or shown != ranking.metric)
     study = study_of(stored, settings.name, metric=metric, maximised=maximised or metric is None)
     short = ShortLabels.of(run.name for run in stored.runs)
     return {
         "sweep": location.name,
         "stage": settings.name,
-        "metric": shown or measure.metric,
+        "metric": shown or ranking.metric,
         "direction": "maximize" if maximised else "minimize",
         "groups": list(_groups(read, settings.name, shown, maximised)),
         "answer": answer(stored, study),

@@ -13,7 +13,7 @@ from rich.text import Text
 from music_rllib import names
 from music_rllib.experiment.plan import short
 from music_rllib.labels import ShortLabels
-from music_rllib.search.ranking import best_in_words
+from music_rllib.search.best import best_text
 from music_rllib.store.node_store import TRAIN_AGAIN
 from music_rllib.sweep.views.text import clock, measured, new_table
 
@@ -63,7 +63,7 @@ def _progress_lines(state: Mapping[str, Any]) -> Iterator[str]:
     if state["earlier"] is not None:
         yield state["earlier"]
     if state["best"] is not None:
-        yield f"Best so far: {best_in_words(state['best'])}"
+        yield f"Best so far: {best_text(state['best'])}"
     for search in state["searches"]:
         for arm in search["arms"]:
             yield _study_text(search, arm)

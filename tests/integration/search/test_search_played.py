@@ -33,8 +33,8 @@ from music_rllib.experiment import sweep_files
 from music_rllib.experiment.record import changes_since, keep_record
 from music_rllib.experiment.scheduler import Status
 from music_rllib.program import main
-from music_rllib.search.opening import learnings
-from music_rllib.search.summary import outcome
+from music_rllib.search.outcome import outcome
+from music_rllib.search.searches import warm_starts
 from music_rllib.store.storage import StorageError
 from music_rllib.sweep.listeners.state_file import StateFile
 from tests.played_search import SPACE, Document, Driver, document, points, searched, success
@@ -113,7 +113,7 @@ def test_searches_that_share_runs_both_end(tmp_path: Path, slots: int) -> None:
 def test_a_trial_that_another_driver_has_ended_is_left_to_it(tmp_path: Path) -> None:
     shared = document({"storage": f"sqlite:///{tmp_path}/x.db", "study": "q"}, seeds=[0])
     one, other = (Driver(tmp_path, shared | {"name": name}) for name in ("a", "b"))
-    mine, theirs = (driver.controller.searches[0].arms[0].study for driver in (one, other))
+    mine, theirs = (driver.controller.searches[0].studies[0] for driver in (one, other))
     theirs.trials()  # as they are before the first one is ended
     first = mine.claim()
     assert first is not None
@@ -378,7 +378,7 @@ def test_importance_names_what_matters(tmp_path: Path) -> None:
 def recorded(folder: Path, content: Document) -> Driver:
     """The sweep as a later driver finds it, and its files as a driver's end leaves them."""
     driver = Driver(folder, content)
-    driver.controller.advance()
+    driver.controller.propose()
     keep_record(driver.sweep)
     with StateFile(driver.sweep) as state_file:
         state_file.searches = lambda: outcome(driver.controller, thorough=False)
@@ -583,8 +583,8 @@ def test_a_warm_start_learns_from_every_value_of_a_comparison(tmp_path: Path) ->
         driver = searched(tmp_path, search, name=f"warm{count}", seeds=[0])
         (arm,) = driver.outcome()["arms"]
         assert arm["learnt_from"] == count
-        (line,) = learnings(driver.controller.searches)
-        assert line.startswith(f"finetune: learnt from {count} of 4 trials of s/finetune/tac.")
+        (line,) = warm_starts(driver.controller.searches)
+        assert line.startswith(f"finetune: warm start from {count} of 4 trials of s/finetune/tac.")
 
 
 def test_a_comparison_learns_for_each_value_from_trials_with_it(tmp_path: Path) -> None:
@@ -593,7 +593,7 @@ def test_a_comparison_learns_for_each_value_from_trials_with_it(tmp_path: Path) 
     driver = searched(tmp_path, COMPARED | warm, name="warm", seeds=[0])
     theirs = before.outcome()["arms"]
     for number, arm in enumerate(driver.outcome()["arms"]):
-        prior = driver.controller.searches[0].arms[number].study.prior
+        prior = driver.controller.searches[0].studies[number].warm_start
         assert [list(trial.values) for trial in prior] == [
             trial["objective"] for trial in theirs[number]["trials"]
         ]
@@ -608,9 +608,8 @@ def test_a_warm_start_that_would_learn_nothing_is_refused(tmp_path: Path) -> Non
     content = document(COMPARED | {"warm_start": warm_from(tmp_path, "s/")}, name="warm", seeds=[0])
     content["stages"][1]["search"]["compare"] = {"tac.entropic_index": [7.0, 8.0]}
     message = (
-        r"search.warm_start.study must have judged trials that warm/finetune/tac.entropic_index=7 "
-        r"can learn from, got s/finetune @\w+, none of whose 2 trials has the same objectives and "
-        "lies in the space"
+        r"search.warm_start.study must have complete trials with the objectives of "
+        r"warm/finetune/tac.entropic_index=7 and in its space, got s/finetune @\w+: none of 2"
     )
     with pytest.raises(StorageError, match=message):
         Driver(tmp_path, content)
@@ -619,7 +618,7 @@ def test_a_warm_start_that_would_learn_nothing_is_refused(tmp_path: Path) -> Non
 def test_a_warm_start_from_what_is_not_there(tmp_path: Path) -> None:
     gone = tmp_path / "results/mistyped/study.db"
     search = {"warm_start": {"study": "s", "storage": str(gone)}}
-    message = r"search.warm_start.storage must be an sqlite file that is there, got .*/study.db"
+    message = r"search.warm_start.storage must be an existing SQLite file, got .*/study.db"
     with pytest.raises(StorageError, match=message):
         Driver(tmp_path, document(search))
     assert not gone.exists()
@@ -716,11 +715,11 @@ def test_a_dead_drivers_trials_are_taken_over(tmp_path: Path) -> None:
     search = {"storage": f"sqlite:///{tmp_path}/shared.db", "study": "together"}
     dead = Driver(tmp_path, document(search))
     dead.play(stop_after=4)
-    study = dead.controller.searches[0].arms[0].study
+    study = dead.controller.searches[0].studies[0]
     held = [trial.number for trial in study.trials() if trial.state.name == "RUNNING"]
     assert held
     driver = Driver(tmp_path, document(search))
-    mine = driver.controller.searches[0].arms[0].study
+    mine = driver.controller.searches[0].studies[0]
     mine.release_the_dead()
     assert [t.number for t in mine.trials() if t.state.name == "RUNNING"] == held, "it is alive"
     later = 10_000_000_000.0
@@ -736,7 +735,7 @@ def test_a_driver_that_was_taken_for_dead_changes_nothing_any_more(tmp_path: Pat
     silent = Driver(tmp_path / "silent", document(search))
     silent.play(stop_after=5)
     other = Driver(tmp_path / "other", document(search))
-    other.controller.searches[0].arms[0].study.release_the_dead(10_000_000_000.0)
+    other.controller.searches[0].studies[0].release_the_dead(10_000_000_000.0)
     other.play()
     before = other.trials()
     silent.play()
@@ -762,7 +761,7 @@ def test_a_database_that_comes_and_goes_costs_nothing(tmp_path: Path) -> None:
         (tmp_path / folder).mkdir()
     whole = searched(tmp_path / "whole")
     driver = Driver(tmp_path / "flaky", document({}))
-    study = driver.controller.searches[0].arms[0].study
+    study = driver.controller.searches[0].studies[0]
     sound, flaky = study._storage, Flaky(study._storage, 1)
     study._storage = flaky  # type: ignore[assignment]
     while not driver.controller.over:

@@ -18,10 +18,9 @@ from music_rllib import names
 from music_rllib.config.load import load_sweep, warnings_of
 from music_rllib.config.problems import ConfigError
 from music_rllib.config.search import Objective, Pruning, Rung, SearchSettings
-from music_rllib.search.objective import aggregate, prune, score
-from music_rllib.search.sampler import Proposer, trial_at
-from music_rllib.search.storage import same_database
-from music_rllib.search.study_record import VALUES, fits
+from music_rllib.search.new_study import fits
+from music_rllib.search.objective import aggregate, reason_to_prune, score
+from music_rllib.search.sampler import VALUES, Proposer, trial_at
 from music_rllib.store.history import Report
 from tests.played_search import Document, document
 
@@ -69,19 +68,14 @@ def test_a_trial_is_stopped_only_if_its_interval_says_so() -> None:
     pruning = Pruning(rungs=(Rung(seeds=2),), keep=0.3, confidence=0.9)
     others = {n: np.array([[0.7 + 0.01 * n], [0.72 + 0.01 * n]]) for n in range(6)}
 
-    def verdict(values: list[float]) -> Any:
-        scores = np.array(values)[:, None]
-        return prune(Objective(), pruning, scores=scores, others=others, place="here")
+    def reason(values: list[float], **objective: Any) -> str | None:
+        scores, one = np.array(values)[:, None], Objective(**objective)
+        return reason_to_prune(one, pruning, scores=scores, others=others, rung="here")
 
-    assert verdict([0.2, 0.22]).stop
-    assert "[0.1" in verdict([0.2, 0.22]).reason
-    assert not verdict([0.9, 0.9]).stop
-    wide = verdict([0.2, 0.9])
-    assert not wide.stop
-    assert "its interval" in wide.reason
-    lower = Objective(direction="minimize")
-    worse = prune(lower, pruning, scores=np.array([[2.0], [2.1]]), others=others, place="here")
-    assert worse.stop
+    assert "90% interval [0.1" in str(reason([0.2, 0.22]))
+    assert reason([0.9, 0.9]) is None
+    assert reason([0.2, 0.9]) is None, "its interval is wide"
+    assert reason([2.0, 2.1], direction="minimize") is not None
 
 
 @pytest.mark.parametrize("how", ["iqm", "mean", "median", "worst_task"])
@@ -94,7 +88,7 @@ def test_a_trial_as_good_as_its_only_rival_is_seldom_stopped(
     draws = rng.normal(size=(1500, 2, 3, tasks)) + apart * np.arange(tasks)
     objective, pruning = Objective(aggregate=how), Pruning(rungs=(Rung(seeds=3),))
     stopped = [
-        prune(objective, pruning, scores=mine, others={0: rival}, place="here").stop
+        reason_to_prune(objective, pruning, scores=mine, others={0: rival}, rung="here") is not None
         for mine, rival in draws
     ]
     assert np.mean(stopped) < 0.125 + 2 * math.sqrt(0.125 * 0.875 / len(draws))
@@ -105,16 +99,16 @@ def test_the_spread_counts_each_seed_of_a_trial_once() -> None:
     whole = {number: rng.normal(size=(4, 1)) for number in range(3)}
     pruning = Pruning(rungs=(Rung(seeds=2),), keep=0.1)
 
-    def reason(seeds: int, more: Mapping[int, Any]) -> str:
+    def reason(seeds: int, more: Mapping[int, Any]) -> str | None:
         others = {number: scores[:seeds] + 50 for number, scores in whole.items()}
         mine = np.zeros((seeds, 1))
-        return prune(
-            Objective(), pruning, scores=mine, others=others, whole=more, place="here"
-        ).reason
+        return reason_to_prune(
+            Objective(), pruning, scores=mine, others=others, whole=more, rung="here"
+        )
 
-    assert reason(2, whole) == reason(2, {}), "their seeds here tell the spread"
-    assert "[-inf, inf]" in reason(1, {})
-    assert "does not reach" in reason(1, whole), "only their later seeds do"
+    assert reason(2, whole) == reason(2, {}) is not None, "their seeds here give the spread"
+    assert reason(1, {}) is None, "one seed each has no spread"
+    assert "does not reach" in str(reason(1, whole)), "their later seeds give it"
 
 
 @pytest.mark.parametrize("name", ["search", "compare"])
@@ -480,25 +474,3 @@ def test_a_search_ends_with_its_last_point_and_says_so(tmp_path: Path) -> None:
     assert line == (
         "finetune: search.trials is 20, and the space has 9 points: the search ends after 9 trials"
     )
-
-
-@pytest.mark.parametrize(
-    ("other", "same"),
-    [
-        ("studies.db", True),
-        ("~/studies.db", True),
-        ("~nobody-at-all/studies.db", False),
-        ("sqlite:///studies.db", True),
-        ("./here/../studies.db", True),
-        ("{here}/studies.db", True),
-        ("sqlite:///{here}/studies.db", True),
-        ("others.db", False),
-        ("postgresql://host/studies.db", False),
-    ],
-)
-def test_a_database_is_known_by_any_of_its_names(
-    other: str, same: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("HOME", str(tmp_path))
-    assert same_database("studies.db", other.format(here=tmp_path)) is same

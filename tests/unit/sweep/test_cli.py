@@ -186,7 +186,7 @@ REFUSED: list[tuple[Document, str]] = [
     ),
     (
         searched(warm_start={"study": "older/a", "storage": "sqlite:///older.db"}),
-        "search.warm_start.storage must be an sqlite file that is there, got sqlite:///older.db",
+        "search.warm_start.storage must be an existing SQLite file, got sqlite:///older.db",
     ),
     (
         document(resources={"num_cpus": 1, "memory_per_run": 1e6}),

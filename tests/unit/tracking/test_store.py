@@ -14,7 +14,6 @@ from sqlalchemy import create_engine
 from sqlalchemy.engine import make_url
 
 from music_rllib.errors import TrackingError
-from music_rllib.search.storage import same_database
 from music_rllib.store.storage import database_url, sqlite_url
 from music_rllib.tracking import store as store_module
 from music_rllib.tracking.store import RECORD, SweepRecord, check_reachable, resolve_store
@@ -69,7 +68,6 @@ def test_a_database_is_the_file_in_the_storage_whatever_its_name(
     (tmp_path / name).mkdir()
     monkeypatch.chdir(tmp_path / name)
     assert make_url(database_url("sqlite:///x.db")).database == f"{tmp_path}/{name}/x.db"
-    assert same_database("x.db", f"{tmp_path}/{name}/x.db")
 
 
 def test_postgresql_is_reached_by_the_driver_that_is_installed() -> None:

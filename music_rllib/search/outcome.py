@@ -1,4 +1,4 @@
-"""The results of a sweep's searches, as plain data."""
+"""The results of a sweep's searches, as plain data for files, tables and MLflow."""
 
 from __future__ import annotations
 
@@ -9,25 +9,31 @@ import numpy as np
 import optuna
 from optuna.trial import FrozenTrial, TrialState
 
-from music_rllib.config.search import SearchSettings
 from music_rllib.redaction import redact
 from music_rllib.results.statistics import improvement
 from music_rllib.search.controller import SearchController
-from music_rllib.search.objective import aggregates, interval
+from music_rllib.search.objective import aggregate, interval
+from music_rllib.search.sampler import VALUES
+from music_rllib.search.searches import Finalist, Search
 from music_rllib.search.storage import DATABASE_ERRORS
-from music_rllib.search.study import Study
-from music_rllib.search.study_record import LOST, REASON, SCORES, VALUES
-from music_rllib.search.trials import Arm, Array, Finalist, Search, ranked
+from music_rllib.search.study import LOST, REASON, SCORES, OptunaStudy
 
 IMPORTANCE_TRIALS = 4
-"""Completed trials that an estimate of the settings' importance needs."""
+"""Complete trials that an estimate of the settings' importance needs."""
+_STATES = {
+    TrialState.COMPLETE: "judged",
+    TrialState.PRUNED: "pruned",
+    TrialState.FAIL: "failed",
+    TrialState.RUNNING: "running",
+    TrialState.WAITING: "waiting",
+}
 
 
 def outcome(controller: SearchController, *, thorough: bool = True) -> list[dict[str, Any]]:
-    """The state of each search as plain data, for files, tables and MLflow.
+    """The state of each search.
 
-    Intervals and importance, which take a while, are only in a `thorough` one. The list is empty
-    where the database does not answer: the results are in the node store too.
+    Only a `thorough` one has intervals and importance, which take a while to compute. The list is
+    empty if the database does not answer: the results are in the node store too.
     """
     try:
         return [_search(search, thorough) for search in controller.searches]
@@ -49,47 +55,36 @@ def _search(search: Search, thorough: bool) -> dict[str, Any]:
             for objective in settings.objectives
         ],
         "storage": None if settings.storage is None else redact(settings.storage),
-        "arms": [_arm(search, arm, thorough) for arm in search.arms],
+        "arms": [_study(search, study, thorough) for study in search.studies],
         "ranking": _ranking(search, thorough),
         "complete": search.over,
     }
 
 
-def _arm(search: Search, arm: Arm, thorough: bool) -> dict[str, Any]:
-    trials = arm.study.trials()
-    best = ranked(search.settings, trials)
-    states = [trial.state.name for trial in trials]
+def _study(search: Search, study: OptunaStudy, thorough: bool) -> dict[str, Any]:
+    trials, best = study.trials(), study.ranked()
+    states = [_STATES[trial.state] for trial in trials]
     return {
-        "values": dict(arm.values),
-        "study": arm.study.name,
-        "learnt_from": len(arm.study.prior),
-        "judged": states.count("COMPLETE"),
-        "pruned": states.count("PRUNED"),
-        "failed": states.count("FAIL"),
-        "running": states.count("RUNNING"),
-        "trials": [_trial(search, arm, trial, thorough) for trial in trials],
+        "values": study.compared,
+        "study": study.name,
+        "learnt_from": len(study.warm_start),
+        **{state: states.count(state) for state in ("judged", "pruned", "failed", "running")},
+        "trials": [_trial(search, study, trial, thorough) for trial in trials],
         "best": best[0].number if best else None,
         "front": [t.number for t in best] if len(search.settings.objectives) > 1 else [],
-        "importance": _importance(arm.study, search.settings) if thorough else {},
+        "importance": _importance(study) if thorough else {},
     }
 
 
-_STATES = {
-    TrialState.COMPLETE: "judged",
-    TrialState.PRUNED: "pruned",
-    TrialState.FAIL: "failed",
-    TrialState.RUNNING: "running",
-    TrialState.WAITING: "waiting",
-}
-
-
-def _trial(search: Search, arm: Arm, trial: FrozenTrial, thorough: bool) -> dict[str, Any]:
+def _trial(
+    search: Search, study: OptunaStudy, trial: FrozenTrial, thorough: bool
+) -> dict[str, Any]:
     scores = trial.user_attrs.get(SCORES, {})
     last = scores[max(scores, key=int)] if scores else None
     document = {
         "number": trial.number,
         "state": _STATES[trial.state],
-        "values": {**arm.values, **trial.user_attrs.get(VALUES, {})},
+        "values": {**study.compared, **trial.user_attrs.get(VALUES, {})},
         "objective": list(trial.values) if trial.state is TrialState.COMPLETE else None,
         "scores": last,
         "reason": trial.user_attrs.get(REASON),
@@ -101,7 +96,7 @@ def _trial(search: Search, arm: Arm, trial: FrozenTrial, thorough: bool) -> dict
 
 
 def _intervals(search: Search, scores: Sequence[Any]) -> list[list[float]]:
-    """Ends of each objective's 95 % interval over seeds; NaN where a single run has none."""
+    """Ends of each objective's 95% interval over seeds; NaN for a single run."""
     estimates = [
         interval(objective, np.asarray(of_objective), search.stage.evaluation_episodes)
         for objective, of_objective in zip(search.settings.objectives, scores, strict=True)
@@ -109,20 +104,20 @@ def _intervals(search: Search, scores: Sequence[Any]) -> list[list[float]]:
     return [[float(estimate.lower), float(estimate.upper)] for estimate in estimates]
 
 
-def _importance(study: Study, settings: SearchSettings) -> dict[str, float]:
+def _importance(study: OptunaStudy) -> dict[str, float]:
     """Share of the first objective's variance by setting (fANOVA), the largest first.
 
-    Empty where too few trials are complete, or all have the same value.
+    Empty if too few trials are complete, or if all have the same value.
     """
-    judged = [trial for trial in study.trials() if trial.state is TrialState.COMPLETE]
-    if len(judged) < IMPORTANCE_TRIALS or len({trial.values[0] for trial in judged}) < 2:
+    complete = [trial for trial in study.trials() if trial.state is TrialState.COMPLETE]
+    if len(complete) < IMPORTANCE_TRIALS or len({trial.values[0] for trial in complete}) < 2:
         return {}
-    if all(len({str(t.params.get(name)) for t in judged}) < 2 for name in settings.space):
+    if all(len({str(t.params.get(name)) for t in complete}) < 2 for name in study.settings.space):
         return {}
     try:
         shares = optuna.importance.get_param_importances(
             study.as_optuna(),
-            evaluator=optuna.importance.FanovaImportanceEvaluator(seed=settings.seed),
+            evaluator=optuna.importance.FanovaImportanceEvaluator(seed=study.settings.seed),
             target=lambda trial: float(trial.values[0]),
         )
     except (ValueError, RuntimeError):  # no setting that all trials have, or no variance
@@ -132,26 +127,25 @@ def _importance(study: Study, settings: SearchSettings) -> dict[str, float]:
 
 def _ranking(search: Search, thorough: bool) -> list[dict[str, Any]]:
     """Finalists by their values on fresh seeds, the best first, each compared with the best."""
-    finalists = [finalist for arm in search.arms for finalist in arm.finalists or ()]
     maximised = search.settings.objectives[0].maximised
-    rows = [_finalist(search, f, f.scores, thorough) for f in finalists if f.scores is not None]
+    finalists = search.finalists or []
+    rows = [_finalist(search, one, thorough) for one in finalists if one.scores is not None]
     rows.sort(key=lambda row: row["fresh"][0], reverse=maximised)
     if not thorough:
         return rows
     for row in rows[1:]:
         better = improvement(np.asarray(rows[0]["scores"][0]), np.asarray(row["scores"][0]))
         row["best_is_better_with"] = better if maximised else 1 - better
-    failed = [finalist for finalist in finalists if finalist.failure]
     return rows + [
         {"trial": finalist.number, "values": dict(finalist.values), "failure": finalist.failure}
-        for finalist in failed
+        for finalist in finalists
+        if finalist.failure
     ]
 
 
-def _finalist(
-    search: Search, finalist: Finalist, scores: Sequence[Array], thorough: bool
-) -> dict[str, Any]:
-    fresh = aggregates(search.settings.objectives, scores)
+def _finalist(search: Search, finalist: Finalist, thorough: bool) -> dict[str, Any]:
+    scores = finalist.scores or []
+    fresh = [aggregate(*pair) for pair in zip(search.settings.objectives, scores, strict=True)]
     row = {
         "trial": finalist.number,
         "values": dict(finalist.values),

@@ -1,0 +1,235 @@
+"""The best condition or trial of a stage, and the metric that ranks it.
+
+Searches are read as the plain data of `outcome`, so that the files of a sweep are enough, without
+the databases of its studies.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from music_rllib import names
+from music_rllib.config.schema import Stage
+from music_rllib.config.search import SearchSettings
+from music_rllib.experiment.plan import Plan, short
+from music_rllib.labels import in_runs, symbol
+from music_rllib.results import statistics as st
+from music_rllib.results.conditions import AVERAGED, Condition, final_scores, find_stages
+from music_rllib.results.data import Sweep
+from music_rllib.results.statistics import Estimate, with_interval
+from music_rllib.search.objective import interval
+
+
+class RankingMetric(NamedTuple):
+    """The metric whose last value ranks the runs of a stage."""
+
+    metric: str
+    maximised: bool = True
+
+
+def ranking_metric(stage: Stage, sweep: Sweep) -> RankingMetric:
+    """The metric of a stage's search, or else that of its tasks.
+
+    A search's metric that no run has reported, such as the budget, is not used.
+    """
+    if stage.search is not None:
+        objective = stage.search.objectives[0]
+        own = enumerate(sweep.runs)
+        done = [at for at, run in own if run.stage == stage.name and run.is_finished]
+        if not done or any(len(sweep.column(at, objective.metric).step) for at in done):
+            # Fewer steps to a threshold are better, and so are higher values of the metric.
+            maximised = objective.maximised or objective.read == "steps_to"
+            return RankingMetric(objective.metric, maximised)
+    return RankingMetric(stage.primary_metric)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScoredCondition:
+    """A condition of a stage with the mean of its scores."""
+
+    condition: Condition
+    values: Mapping[str, Any]
+    """Settings that differ between the stage's conditions, as the plan has them."""
+    estimate: Estimate
+    """Mean over the tasks that have a result, with its 95% interval."""
+    runs: int
+    """Number of its runs that have a score."""
+    complete: bool
+    """Whether every planned run is finished."""
+
+    @property
+    def value(self) -> float:
+        return float(self.estimate.value)
+
+    @property
+    def ends(self) -> list[float]:
+        """The ends of the interval."""
+        return [float(self.estimate.lower), float(self.estimate.upper)]
+
+
+def scored_conditions(
+    stage: str, plan: Plan, sweep: Sweep, metric: str, task: str | None = None
+) -> list[ScoredCondition]:
+    """The conditions of a stage that have a score by a metric, on all tasks or on one."""
+    found = []
+    for condition in (c for one in find_stages(sweep) if one.name == stage for c in one.conditions):
+        if task is not None:
+            own = tuple(run for run in condition.runs if sweep.runs[run].task == task)
+            condition = replace(condition, runs=own)
+        tasks = dict.fromkeys(sweep.runs[run].task for run in condition.runs)
+        scores = final_scores(sweep, condition, dict.fromkeys(tasks, metric))
+        known = scores[:, ~np.isnan(scores).all(axis=0)]
+        if known.size:
+            episodes = sweep.episodes(condition.runs) if metric in names.EVAL_RATES else None
+            found.append(
+                ScoredCondition(
+                    condition=condition,
+                    values=plan.node(sweep.runs[condition.runs[0]].node_key).values,
+                    estimate=st.estimate(known, episodes),
+                    runs=int(np.sum(~np.isnan(known))),
+                    complete=all(sweep.runs[run].is_finished for run in condition.runs),
+                )
+            )
+    return found
+
+
+def condition_of(
+    best: Mapping[str, Any], stage: Stage, plan: Plan, sweep: Sweep, metric: str
+) -> ScoredCondition | None:
+    """The condition that :func:`best_so_far` has described; None if it has no score by a metric."""
+    for scored in scored_conditions(stage.name, plan, sweep, metric, best.get("task")):
+        same_seeds = stage.search is None or scored.condition.is_fresh == best["on_fresh_seeds"]
+        if same_seeds and dict(scored.values) == best["values"]:
+            return scored
+    return None
+
+
+def best_so_far(
+    stages: Sequence[Stage],
+    plan: Plan,
+    sweep: Sweep,
+    searches: Sequence[Mapping[str, Any]],
+) -> dict[str, Any] | None:
+    """The best condition of the last of `stages` that has one, as plain data.
+
+    `sweep` has the runs of the plan, and `searches` is the `outcome` of its searches so far.
+    """
+    by_stage = {search["stage"]: search for search in searches}
+    for stage in reversed(stages):
+        if stage.search is None:
+            best = _best_condition(stage, plan, sweep)
+        else:
+            best = _best_trial(stage, stage.search, by_stage.get(stage.name))
+        if best is not None:
+            entropies = {
+                metric: {"value": scored.value, "interval": scored.ends}
+                for metric in names.ENTROPIES
+                if (scored := condition_of(best, stage, plan, sweep, metric)) is not None
+            }
+            return best | {"entropies": entropies}
+    return None
+
+
+def _best_condition(stage: Stage, plan: Plan, sweep: Sweep) -> dict[str, Any] | None:
+    """The best condition, or that of each task if the metric's scale differs between tasks.
+
+    In the second case, the row of the first task has the others under `other_tasks`.
+    """
+    metric = ranking_metric(stage, sweep).metric
+    tasks = list(dict.fromkeys(run.task for run in sweep.runs if run.stage == stage.name))
+    if metric in AVERAGED or len(tasks) < 2:
+        return _best_row(scored_conditions(stage.name, plan, sweep, metric), stage, metric)
+    rows = []
+    for task in tasks:
+        row = _best_row(scored_conditions(stage.name, plan, sweep, metric, task), stage, metric)
+        rows += [] if row is None else [row | {"task": task}]
+    return rows[0] | {"other_tasks": rows[1:]} if rows else None
+
+
+def _best_row(
+    candidates: Sequence[ScoredCondition], stage: Stage, metric: str
+) -> dict[str, Any] | None:
+    """The condition with the best mean, among complete ones if there are any."""
+    finite = [scored for scored in candidates if math.isfinite(scored.value)]
+    ranked = [scored for scored in finite if scored.complete] or finite
+    if not ranked:
+        return None
+    best = max(ranked, key=lambda scored: scored.value)
+    planned = len(best.condition.runs)
+    return {
+        "stage": stage.name,
+        "values": dict(best.values),
+        "by": names.word_of(metric),
+        "metric": metric,
+        "direction": "maximize",
+        "value": best.value,
+        "level": sum(math.isclose(scored.value, best.value) for scored in ranked) - 1,
+        "interval": best.ends,
+        "runs": planned if best.complete else best.runs,
+        "planned": planned,
+        "on_fresh_seeds": False,
+    }
+
+
+def _best_trial(
+    stage: Stage, settings: SearchSettings, search: Mapping[str, Any] | None
+) -> dict[str, Any] | None:
+    """The best trial of a search: by the complete final ranking, or else the best so far."""
+    if search is None:
+        return None
+    objective = settings.objectives[0]
+    best = [arm["trials"][arm["best"]] for arm in search["arms"] if arm["best"] is not None]
+    ranking = [row for row in search["ranking"] if "failure" not in row]
+    if search["complete"] and ranking:
+        first, values = ranking[0], [row["fresh"][0] for row in ranking]
+        number, value = first["trial"], values[0]
+    elif best:
+        sign = 1.0 if objective.maximised else -1.0
+        first, ranking = max(best, key=lambda trial: sign * float(trial["objective"][0])), []
+        number, value = first["number"], first["objective"][0]
+        trials = (trial for arm in search["arms"] for trial in arm["trials"])
+        values = [trial["objective"][0] for trial in trials if trial["objective"]]
+    else:
+        return None
+    scores = np.asarray(first["scores"][0], float)
+    estimate = interval(objective, scores, stage.evaluation_episodes)
+    direction = "maximize" if objective.maximised else "minimize"
+    return {
+        "stage": stage.name,
+        "trial": number,
+        "values": dict(first["values"]),
+        "by": f"{objective.label} ({direction})",
+        "metric": objective.metric,
+        "direction": direction,
+        "value": value,
+        "level": sum(math.isclose(other, value) for other in values) - 1,
+        "interval": [float(estimate.lower), float(estimate.upper)],
+        "runs": scores.size,
+        "planned": scores.size,
+        "on_fresh_seeds": bool(ranking),
+    }
+
+
+def best_text(best: Mapping[str, Any]) -> str:
+    """The result of `best_so_far` in a line."""
+    if others := best.get("other_tasks"):
+        rows = ({**best, "other_tasks": ()}, *others)
+        return "; ".join(f"{row['task']}: {best_text(row)}" for row in rows)
+    values = ", ".join(
+        f"{symbol(name)} = {short(value, name)}" for name, value in best["values"].items()
+    )
+    number = with_interval(best["value"], best["interval"])
+    runs, planned = best["runs"], best.get("planned", best["runs"])
+    level = f" and {best['level']} more" if best.get("level") else ""  # they tie
+    text = f"{best['stage']} {values}".rstrip() + f"{level}: {best.get('by', 'success')} {number}, "
+    if runs < planned:
+        text += f"{runs} of {planned} runs (no condition has all of its runs yet)"
+    else:
+        text += f"{in_runs(runs)}{' on fresh seeds' if best['on_fresh_seeds'] else ''}"
+    entropy = best.get("entropies", {}).get(names.SHANNON_ENTROPY)
+    return text if entropy is None else f"{text}, entropy {entropy['value']:.3g} nats"

@@ -1,0 +1,197 @@
+"""The searches of a sweep: checked before the sweep starts, then opened with their studies."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from optuna.trial import FrozenTrial
+
+from music_rllib.config.schema import Stage
+from music_rllib.config.search import Rung, SearchSettings
+from music_rllib.config.search_check import most_env_steps
+from music_rllib.experiment.open_sweep import OpenSweep
+from music_rllib.experiment.plan import Run, node_key
+from music_rllib.results.statistics import Array
+from music_rllib.search.new_study import no_study_error
+from music_rllib.search.storage import known_studies, open_studies
+from music_rllib.search.study import OptunaStudy
+
+STUDY_FILE = "study.db"
+"""File in the sweep's folder."""
+
+
+@dataclass(eq=False)
+class RunningTrial:
+    """A trial that this driver runs."""
+
+    study: OptunaStudy
+    trial: FrozenTrial
+    runs: list[Run] = field(default_factory=list)
+    """Its runs at the rung."""
+    rung: int = 0
+
+
+@dataclass
+class Finalist:
+    """A trial that runs again on fresh seeds."""
+
+    number: int
+    values: Mapping[str, Any]
+    """Its point, with the compared values."""
+    searched: tuple[float, ...]
+    """Its objective values in the search."""
+    runs: list[Run]
+    scores: list[Array] | None = None
+    """For each objective `[seeds, tasks]` on fresh seeds; None until all runs have ended."""
+    failure: str = ""
+
+    @property
+    def over(self) -> bool:
+        """Whether it has its scores, or can't have them."""
+        return self.scores is not None or bool(self.failure)
+
+
+@dataclass
+class Search:
+    """A searched stage."""
+
+    stage: Stage
+    settings: SearchSettings
+    rungs: tuple[Rung, ...]
+    """The rungs of a trial; the last one is its end."""
+    studies: list[OptunaStudy]
+    """A study for each compared value, or one study."""
+    running: list[RunningTrial] = field(default_factory=list)
+    finalists: list[Finalist] | None = None
+    """None until all studies have ended."""
+
+    @property
+    def over(self) -> bool:
+        """Whether its ranking is complete, or can't be."""
+        return self.finalists is not None and all(one.over for one in self.finalists)
+
+    def label(self, study: OptunaStudy) -> str:
+        """`finetune tac.alpha=0.1`, for messages."""
+        values = (f"{name}={value}" for name, value in study.compared.items())
+        return " ".join((self.stage.name, *values))
+
+
+def check_studies(sweep: OpenSweep) -> None:
+    """Check that the searches' databases and the studies of their warm starts exist.
+
+    Nothing is created, so that a sweep that is only planned leaves nothing behind.
+
+    Raises:
+        StorageError: A database can't be used, or there is no such study.
+    """
+    earlier: list[str] = []
+    """Beginnings of the names of earlier stages' studies, which are created before this one's."""
+    for stage in sweep.plan.searched:
+        settings = stage.search
+        assert settings is not None
+        base, storage = _base(sweep, stage), _storage(sweep, settings)
+        # The sweep's folder may not exist yet.
+        known = known_studies(storage) if settings.storage or Path(storage).exists() else []
+        exists = any(name.startswith((f"{base} @", f"{base}/")) for name in known)
+        warm = settings.warm_start
+        if warm is not None and not exists:
+            if warm.storage is not None:
+                known = known_studies(warm.storage, warm_start=True)
+            if not (
+                any(name.startswith(warm.study) for name in (*known, *earlier))
+                or any(warm.study.startswith(name) for name in earlier)
+            ):
+                raise no_study_error(warm, known)
+        earlier.append(base)
+
+
+def open_searches(sweep: OpenSweep) -> list[Search]:
+    """Open the studies of a sweep's searched stages; missing studies are created.
+
+    Raises:
+        StorageError: A study's storage can't be used.
+    """
+    return [_open_search(sweep, stage) for stage in sweep.plan.searched]
+
+
+def warm_starts(searches: Sequence[Search]) -> list[str]:
+    """One line for each study with a warm start, with the studies that its trials come from."""
+    return [
+        f"{search.label(study)}: {study.warm_start_text}"
+        for search in searches
+        for study in search.studies
+        if study.warm_start_text
+    ]
+
+
+def _base(sweep: OpenSweep, stage: Stage) -> str:
+    """The beginning of the names of a stage's studies."""
+    assert stage.search is not None
+    return f"{stage.search.study or sweep.config.name}/{stage.name}"
+
+
+def _storage(sweep: OpenSweep, settings: SearchSettings) -> str:
+    return settings.storage or str(sweep.folder / STUDY_FILE)
+
+
+def _open_search(sweep: OpenSweep, stage: Stage) -> Search:
+    settings = stage.search
+    assert settings is not None
+    sweep.folder.mkdir(parents=True, exist_ok=True)
+    storage, determined_by = open_studies(_storage(sweep, settings)), _determined_by(sweep, stage)
+    studies = [
+        OptunaStudy(
+            storage,
+            _base(sweep, stage),
+            settings,
+            determined_by,
+            compared=values,
+            # The file is in the sweep's folder, which this process has locked.
+            alone=settings.storage is None,
+        )
+        for values in settings.compared()
+    ]
+    rungs = _rungs(sweep, stage, settings)
+    return Search(stage=stage, settings=settings, rungs=rungs, studies=studies)
+
+
+def _rungs(sweep: OpenSweep, stage: Stage, settings: SearchSettings) -> tuple[Rung, ...]:
+    seeds, env_steps = len(sweep.plan.seeds), most_env_steps(settings, stage.points)
+    end = Rung(seeds=seeds)
+    rungs = [
+        Rung(
+            seeds=rung.seeds or seeds,
+            # A rung at the whole budget is the end of a run, where nothing is paused.
+            env_steps=None if (rung.env_steps or env_steps) >= env_steps else rung.env_steps,
+        )
+        for rung in (settings.pruning.rungs if settings.pruning else ())
+    ]
+    return (*dict.fromkeys(rung for rung in rungs if rung != end), end)
+
+
+def _determined_by(sweep: OpenSweep, stage: Stage) -> dict[str, Any]:
+    """Plain data of the settings that the stage's runs share, except the searched ones."""
+    (point,) = stage.points
+    source = stage.source
+    source_runs = next(
+        (
+            above.points[0].runs
+            for above in sweep.config.stages
+            if source is not None and above.name == source.stage
+        ),
+        {},
+    )
+    checkpoint = source.checkpoint if source is not None else None
+    # Values of another environment do not count. The earliest stands for all equal ones.
+    tasks = sorted({*point.runs, *source_runs} & sweep.environments.now.keys())
+    environments = {task: sweep.environments.earliest(task) for task in tasks}
+    return {
+        **({"environments": environments} if environments else {}),
+        "seeds": list(sweep.plan.seeds),
+        "runs": {task: node_key(run, None) for task, run in point.runs.items()},
+        "source": {task: node_key(run, None) for task, run in source_runs.items()},
+        "checkpoint": None if checkpoint is None else checkpoint.manifest.content_hash,
+    }
