@@ -1,20 +1,18 @@
-"""Write the results pages and their figures from the runs in docs/results/data alone.
+"""Write the results pages and their figures from the runs in docs/results/data.
 
-python -m docs.generate_results            # writes them and the picture of the README
+python -m docs.generate_results            # write them and the picture of the README
 python -m docs.generate_results --check    # exit code 1 if a page is out of date
 
 The texts of the pages are in docs/results (`PAGES`), the code of their tables in result_pages. The
-generator replaces `{{ KIND NAME }}` by a table of the sweep NAME: of all of its runs that any
-export in docs/results/data has, whichever sweep computed them, if tune_configs has a sweep of that
-name, and else of the export docs/results/data/NAME. KIND is
+generator replaces `{{ KIND NAME }}` by a table of the sweep NAME. If tune_configs has a sweep of
+this name, the table has all its runs that any export in docs/results/data has, whichever sweep
+trained them; otherwise it has the runs of the export docs/results/data/NAME. KIND is
 
 - without NAME, over the three studies of q: `headline`, `summary`, `sampled` or `robustness`;
-- of a planned study: `verdict`, with the hypothesis, `answer`, `outcomes`, with stages, `seeds`,
-  `cells`, `figure`, with the name of one, `learning`, `equal-total`, `hours` or `progress` of its
-  runs;
-- of any sweep: `totals`, with a pretrained stage and one from scratch, `runs`, `provenance`,
-  `success`, `stages`, or `curves`, with stages behind NAME if not all are meant, `metric`, with
-  metrics, or `search`.
+- for a planned study: `verdict` (with the hypothesis), `answer`, `outcomes` (with stages),
+  `seeds`, `cells`, `figure` (with its name), `learning`, `equal-total`, `hours` or `progress`;
+- for any sweep: `totals` (with a pretrained stage and one from scratch), `runs`, `provenance`,
+  `success`, `stages` or `curves` (with stages, if not all), `metric` (with metrics), or `search`.
 
     music-rllib report results/NAME --export docs/results/data/NAME --add
 """
@@ -50,7 +48,7 @@ from docs.result_pages.totals import totals_table
 
 FOLDER = Path(__file__).parent
 PAGES = {"results.md": "page.md", "lab/claims.md": "claims.md", "lab/appendix.md": "appendix.md"}
-"""Pages and their texts in docs/results."""
+"""Pages, and their texts in docs/results."""
 PICTURE = FOLDER / "img" / "overview.png"
 FIGURES = FOLDER / "results" / "figures"
 NOTICE = "<!-- Written by docs/generate_results.py from docs/results/{} and docs/results/data. -->"
@@ -58,7 +56,7 @@ NOT_RUN = "*Not run yet.*"
 
 
 def main() -> int:
-    """Writes the pages, or checks them."""
+    """Write the pages, or check them."""
     figures: dict[str, bytes] = {}
     texts = {FOLDER / name: page(name, figures) for name in PAGES}
     if "--check" in sys.argv[1:]:
@@ -83,7 +81,7 @@ def main() -> int:
 
 
 def page(name: str, figures: dict[str, bytes]) -> str:
-    """A page with its tables filled in; the figures that it shows go into `figures`."""
+    """A page with its tables; adds its figures to `figures`."""
     words: dict[str, Callable[..., str]] = {
         "headline": headline,
         "summary": lambda: "\n".join(summary_table()),

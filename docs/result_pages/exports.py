@@ -1,4 +1,4 @@
-"""Sweeps of tune_configs, and what has been exported of their runs."""
+"""Sweeps of tune_configs and their exported runs."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from music_rllib.version import ALGORITHM_VERSION
 ROOT = Path(__file__).parents[2]
 DATA, CONFIGS = ROOT / "docs" / "results" / "data", ROOT / "tune_configs"
 EARLIER = tuple(str(version) for version in range(int(ALGORITHM_VERSION) - 1, 1, -1))
-"""Earlier versions of the algorithm, the latest first: their runs stand in for missing ones."""
+"""Earlier versions of the algorithm, the latest first; their runs replace missing ones."""
 
 
 @cache
 def sweep_called(name: str) -> Sweep | None:
-    """What has been exported of a sweep's runs; None where nothing has."""
+    """The exported runs of a sweep; None without any."""
     config = config_of(name)
     if config is not None and not (plan := make_plan(config)).searched:
         earlier = [make_plan(config, algorithm=version) for version in EARLIER]
@@ -39,7 +39,7 @@ def sweep_called(name: str) -> Sweep | None:
 
 @cache
 def config_of(name: str) -> SweepConfig | None:
-    """The sweep of that name in tune_configs; None where there is none."""
+    """The sweep of this name in tune_configs, or None."""
     files = sorted(CONFIGS.glob("**/*.yaml"))
     found = (file for file in files if f"name: {name}\n" in file.read_text("utf-8"))
     file = next(found, None)
@@ -48,12 +48,12 @@ def config_of(name: str) -> SweepConfig | None:
 
 @cache
 def exports() -> list[Sweep]:
-    """All that there are."""
+    """All exports."""
     return [read_archive(folder) for folder in sorted(DATA.iterdir()) if is_archive(folder)]
 
 
 def progress(sweep: Sweep) -> tuple[int, int]:
-    """Runs that have finished, and those that the sweep's file plans."""
+    """Numbers of finished and of planned runs."""
     config = config_of(sweep.name)
     planned = len(make_plan(config).nodes) if config else len(sweep.runs)
     return sum(run.status == "FINISHED" for run in sweep.runs), planned
@@ -66,16 +66,16 @@ def is_complete(sweep: Sweep) -> bool:
 
 
 def progress_text(name: str) -> str:
-    """How far a sweep of tune_configs is, in words."""
+    """Progress of a sweep of tune_configs, in words."""
     sweep = sweep_called(name)
     if sweep is None:
-        return "not begun"
+        return "not started"
     finished, planned = progress(sweep)
-    return f"{'complete' if is_complete(sweep) else 'under way'}, {finished} of {planned} runs"
+    return f"{'complete' if is_complete(sweep) else 'running'}, {finished} of {planned} runs"
 
 
 def hours_text(name: str) -> str:
-    """Wall time of a sweep's runs, summed, in hours."""
+    """Sum of the wall times of a sweep's runs in hours."""
     sweep = sweep_called(name)
     return f"{sum(run.seconds or 0.0 for run in sweep.runs) / 3600:.1f}" if sweep else "0"
 

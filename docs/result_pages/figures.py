@@ -10,7 +10,7 @@ from music_rllib.results.data import Sweep
 
 
 def figure(sweep: Sweep, drawing: Drawing, figures: dict[str, bytes]) -> Iterator[str]:
-    """Puts the drawing into `figures` and shows it."""
+    """Add a drawing to `figures` and show it."""
     name = f"{slug(sweep.name)}-{drawing.name}.svg"
     figures[name] = files(drawing.subplots, drawing.legend)[".svg"]
     yield f"![{drawing.title} of {sweep.name}, {drawing.stage}](results/figures/{name})"

@@ -1,4 +1,4 @@
-"""Learning curves over all environment steps, pretraining included; the picture of the README."""
+"""Learning curves over total environment steps, with pretraining; the picture of the README."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def learning_figure(sweep: Sweep, figures: dict[str, bytes]) -> Iterator[str]:
 
 
 def overview() -> bytes:
-    """A PNG of every complete study, the one with most seeds first."""
+    """A PNG of all complete studies, the one with the most seeds first."""
     subplots: list[Subplot] = []
     entries: dict[str, Style] = {}
     studies = sorted(complete_studies(), key=lambda pair: -pair[1].planned[0].contrast.seeds[0])
@@ -63,7 +63,7 @@ def overview() -> bytes:
 
 
 def _legend(sweep: Sweep) -> dict[Condition, tuple[str, Style]]:
-    """Label and style of each condition: what is compared by q has the colour of its q."""
+    """Label and style of each condition; conditions compared by q have the color of their q."""
     legend: dict[Condition, tuple[str, Style]] = {}
     for stage in find_stages(sweep):
         for condition, style in styles_of(stage.conditions).items():
@@ -94,13 +94,13 @@ def _subplot(
 
 
 def _shifted(sweep: Sweep, found: Curve | None) -> Curve:
-    """The curve behind the steps of its runs' pretraining."""
+    """The curve shifted by the pretraining steps of its runs."""
     assert found is not None, "runs of a complete study have been evaluated"
     return replace(found, steps=found.steps + steps_before(sweep, found.condition.runs[0]))
 
 
 def _sampled(sweep: Sweep, condition: Condition, task: str) -> Curve | None:
-    """Success of training episodes, means over the steps from evaluation to evaluation."""
+    """Success rate of training episodes, averaged between two evaluations."""
     evaluated = curve(sweep, condition, task, names.EVAL_SUCCESS)
     if evaluated is None:
         return None

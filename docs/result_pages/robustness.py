@@ -14,11 +14,11 @@ from music_rllib.results.data import Sweep
 from music_rllib.results.scores import scores_of
 
 MORE = {"claims-slide": 1}
-"""Number of hypotheses that were dropped from a study before its first run."""
+"""Number of hypotheses dropped from a study before its first run."""
 
 
 def robustness_list() -> Iterator[str]:
-    """Of each decided comparison of two q, in how many cases its verdict stays."""
+    """For each decided comparison of two q, how often its verdict stays the same."""
     for sweep, study in complete_studies():
         for at, claim in enumerate(study.planned):
             if claim in between_q(study.planned) and claim.verdict is not Verdict.UNDECIDED:
@@ -45,7 +45,7 @@ def _stability(sweep: Sweep, planned: Sequence[Claim], at: int) -> str:
 
 
 def _without(sweep: Sweep, claim: Claim, left_out: int) -> Contrast:
-    """A claim's contrast without one of its paired seeds."""
+    """The contrast of a claim without one of its paired seeds."""
     ((first, second),) = claim.pairs
     sides = [
         scores_of(sweep, condition, claim.task, claim.measure).by_seed

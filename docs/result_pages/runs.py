@@ -1,4 +1,4 @@
-"""Single runs: how far each is, and last values of metrics."""
+"""Single runs: progress and last values of metrics."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from music_rllib.results.statistics import first_passage, number
 
 
 def runs_table(sweep: Sweep) -> Iterator[str]:
-    """Each run, failures too: how far, how well, how long, under which code."""
+    """Every run, also failed ones: steps, result, time, versions."""
     yield row(
-        "run", "state", "env steps", "last evaluation", f"first >= {percent(THRESHOLD)} at", "time"
+        "run", "state", "env steps", "last evaluation", f"first ≥ {percent(THRESHOLD)} at", "time"
     )
     yield rule(6)
     for position in sorted(range(len(sweep.runs)), key=lambda i: natural(sweep.runs[i].name)):
@@ -47,7 +47,7 @@ def runs_table(sweep: Sweep) -> Iterator[str]:
 
 
 def _last(sweep: Sweep, run: int) -> str:
-    """What its task is judged by, at the end; empty before the first evaluation."""
+    """The last value of the primary metric; empty before the first evaluation."""
     metric = sweep.primary_metric(sweep.runs[run].task)
     value = sweep.final(run, metric)
     if value is None:
@@ -56,7 +56,7 @@ def _last(sweep: Sweep, run: int) -> str:
 
 
 def _first(passage: tuple[float, bool] | None) -> str:
-    """The step of a first passage; empty where the task has no success rate."""
+    """The step of a first passage; empty for a task without a success rate."""
     if passage is None:
         return ""
     steps, reached = passage
@@ -64,7 +64,7 @@ def _first(passage: tuple[float, bool] | None) -> str:
 
 
 def provenance(sweep: Sweep) -> str:
-    """Commits, versions and the evaluation's size that the runs were made with."""
+    """Commits, versions and evaluation episodes of the runs."""
     commits = all_of(run.tags.get(names.TAG_GIT_COMMIT, "")[:7] for run in sweep.runs)
     versions = sorted(
         {
@@ -88,7 +88,9 @@ def metric_table(sweep: Sweep, *metrics: str) -> Iterator[str]:
         if position:
             yield ""
         seeds = analysis.stage.seeds
-        yield row("task", "condition", "metric", *(f"seed {seed}" for seed in seeds), "mean [95 %]")
+        yield row(
+            "task", "condition", "metric", *(f"seed {seed}" for seed in seeds), "mean [95% CI]"
+        )
         yield rule(len(seeds) + 4)
         for task in analysis.stage.tasks:
             for condition in analysis.stage.conditions:
@@ -102,7 +104,7 @@ def metric_table(sweep: Sweep, *metrics: str) -> Iterator[str]:
 
 
 def last_value(sweep: Sweep, run: int | None, metric: str) -> float:
-    """Of a finished run; NaN otherwise."""
+    """The last value of a finished run; NaN otherwise."""
     if run is None or sweep.runs[run].status != "FINISHED":
         return float("nan")
     value = sweep.final(run, metric)

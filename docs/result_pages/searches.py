@@ -1,4 +1,4 @@
-"""Searches: what was tried and found."""
+"""Searches: trials, ranking and importances."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from music_rllib.results.data import Sweep
 
 
 def search_text(sweep: Sweep) -> Iterator[str]:
-    """How it searched, its ranking on fresh seeds, importances and trials."""
+    """The method of each search, its ranking on fresh seeds, importances and trials."""
     for search in sweep.searches:
         yield search_in_words(search)
         for found in search_tables(search):

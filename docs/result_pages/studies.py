@@ -1,4 +1,4 @@
-"""Studies that were planned: their answers, and what stands beside them."""
+"""Planned studies: answers, tables and figures."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from docs.result_pages.exports import config_of, is_complete, progress_text, sweep_called
 from docs.result_pages.figures import figure
 from docs.result_pages.runs import last_value
-from docs.result_pages.words import interval, percent, row, rule, spread, wait_text
+from docs.result_pages.words import percent, rate_cells, row, rule, spread, wait_text
 from music_rllib import names
 from music_rllib.report.figures.choice import slug, stage_drawings, study_drawings
 from music_rllib.results import statistics as st
@@ -23,10 +23,10 @@ from music_rllib.results.study import Mean, study_of
 
 
 def verdict_text(name: str, *words: str) -> str:
-    """What a study says of a hypothesis of its plan; until all of its runs have finished, how far.
+    """The verdict on a hypothesis of a study's plan; before all runs have finished, its progress.
 
     Raises:
-        ValueError: if its plan has no such hypothesis.
+        ValueError: The plan has no such hypothesis.
     """
     config, hypothesis = config_of(name), " ".join(words)
     plan = analysis_plan(config) if config else None
@@ -43,7 +43,7 @@ def verdict_text(name: str, *words: str) -> str:
 
 
 def answer_text(sweep: Sweep) -> Iterator[str]:
-    """A study's answer; before all of its runs have finished only how far it is."""
+    """The answer of a study; before all runs have finished only its progress."""
     yield f"**{progress_text(sweep.name).capitalize()}.**"
     if is_complete(sweep):
         yield ""
@@ -51,14 +51,14 @@ def answer_text(sweep: Sweep) -> Iterator[str]:
 
 
 def outcomes_table(sweep: Sweep, *stages: str) -> Iterator[str]:
-    """One column per condition: what was planned to be counted, and below it what was not."""
-    rates = (f"steps after pretraining to {percent(rate)}: median [95 %]" for rate in THRESHOLDS)
+    """One column per condition: the planned metric, and below it other numbers."""
+    rates = (f"steps after pretraining to {percent(rate)}: median [95% CI]" for rate in THRESHOLDS)
     columns = [
         [
             "",
-            "**area under the curve, mean action: mean [95 %]**",
+            "**area under the curve, mean action: mean [95% CI]**",
             "the same, sampled policy",
-            "success at the end: mean [95 %]",
+            "success at the end: mean [95% CI]",
             *rates,
             "Shannon entropy at the end, nats",
             "S_q at the end",
@@ -89,7 +89,7 @@ def _outcomes(sweep: Sweep, analysis: StageAnalysis, mean: Mean, prefix: str) ->
     measure = replace(mean.measure, metric=names.TRAIN_SUCCESS)
     sampled = scores_of(sweep, mean.condition, mean.task, measure)
     yield spread(st.estimate(np.array([*sampled.by_seed.values()])[:, np.newaxis], np.inf))
-    yield interval(final)[0]
+    yield rate_cells(final)[0]
     for wait in analysis.times:
         if (wait.condition, wait.task) == key:
             yield wait_text(wait.median)
@@ -99,7 +99,7 @@ def _outcomes(sweep: Sweep, analysis: StageAnalysis, mean: Mean, prefix: str) ->
 
 
 def seeds_table(sweep: Sweep) -> Iterator[str]:
-    """The area under the curve of every seed."""
+    """The area under the curve of each seed."""
     means = study_of(sweep).means
     yield row("seed", *(mean.condition.short_label for mean in means))
     yield rule(1 + len(means))
@@ -109,7 +109,7 @@ def seeds_table(sweep: Sweep) -> Iterator[str]:
 
 
 def cells(sweep: Sweep) -> Iterator[str]:
-    """A row for each α and a column for each q: area under the curve, entropy at the end, seeds."""
+    """A row for each α and a column for each q: area under the curve, final entropy, seeds."""
     means = study_of(sweep).means
     by_cell = {(mean.condition.entropic_index, alpha_of(sweep, mean)): mean for mean in means}
     qs, alphas = (sorted({cell[i] for cell in by_cell}, key=float) for i in (0, 1))
@@ -120,7 +120,7 @@ def cells(sweep: Sweep) -> Iterator[str]:
 
 
 def alpha_of(sweep: Sweep, mean: Mean) -> str:
-    """Of a condition's runs."""
+    """α of a condition."""
     return sweep.runs[mean.condition.runs[0]].tags[names.TAG_ALPHA]
 
 
@@ -136,10 +136,10 @@ def cell_text(sweep: Sweep, mean: Mean | None) -> str:
 
 
 def named_figure(sweep: Sweep, name: str, figures: dict[str, bytes]) -> Iterator[str]:
-    """The figure of that name, of the stage that is compared.
+    """A figure of the compared stage.
 
     Raises:
-        ValueError: if there is none.
+        ValueError: There is no such figure.
     """
     study = study_of(sweep)
     stages = [

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from docs.result_pages.figures import figure
-from docs.result_pages.words import THRESHOLD, interval, row, rule, wait_text
+from docs.result_pages.words import THRESHOLD, rate_cells, row, rule, wait_text
 from music_rllib.report.figures.choice import PRIMARY, drawings_of_stages, stage_drawings
 from music_rllib.results.analysis import StageAnalysis, analyse, time_to_threshold
 from music_rllib.results.conditions import Condition, find_stages
@@ -13,7 +13,7 @@ from music_rllib.results.data import Sweep
 
 
 def success(sweep: Sweep, figures: dict[str, bytes], stages: Sequence[str] = ()) -> Iterator[str]:
-    """Per stage: final success and steps to the threshold, and the curves."""
+    """For each stage: final success, steps to the threshold, and curves."""
     for analysis in analyse(sweep):
         if stages and analysis.stage.name not in stages:
             continue
@@ -44,9 +44,9 @@ def stages_table(sweep: Sweep, *stages: str) -> Iterator[str]:
 
 _OUTCOME = (
     "finished",
-    "success, last evaluation: mean [95 %]",
-    "each seed, %",
-    f"steps to {100 * THRESHOLD:.0f} %: median [95 %]",
+    "success, last evaluation: mean [95% CI]",
+    "each seed (%)",
+    f"steps to {100 * THRESHOLD:.0f}%: median [95% CI]",
     "each run",
 )
 
@@ -54,7 +54,7 @@ _OUTCOME = (
 def outcomes(
     sweep: Sweep, analysis: StageAnalysis, task: str
 ) -> Iterator[tuple[Condition, tuple[str, ...]]]:
-    """Each condition with a run of the task, and what `_OUTCOME` names."""
+    """Each condition with a run of the task, and its cells for `_OUTCOME`."""
     (scope,) = [scope for scope in analysis.scopes if scope.name == task]
     finals = {final.condition: final for final in scope.finals}
     for condition in analysis.stage.conditions:
@@ -65,7 +65,7 @@ def outcomes(
                 condition,
                 (
                     f"{done} of {len(runs)}",
-                    *interval(finals.get(condition)),
+                    *rate_cells(finals.get(condition)),
                     *_times(sweep, condition, task),
                 ),
             )

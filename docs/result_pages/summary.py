@@ -1,4 +1,4 @@
-"""The answer at the top of the results page: one sentence and one table, from the verdicts."""
+"""The answer at the top of the results page: a sentence and a table of verdicts."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ PAPER = {
     ("FetchSlide", "q = 1.5", "q = 1"): "Figure 6: comparable; text: better",
 }
 SEEDS_FOR_COLLAPSES = 16
-"""Seeds of which one collapses with 80 % chance if one in ten runs does: 1 - 0.9^16 = 0.81."""
+"""Seeds that show a collapse of one in ten runs with 80% probability: 1 - 0.9^16 = 0.81."""
 BETWEEN_STAGES = "stage = "
 """Start of the labels of a comparison of two stages."""
 
 
 @cache
 def complete_studies() -> list[tuple[Sweep, Study]]:
-    """The studies all of whose runs have finished."""
+    """The studies whose runs have all finished."""
     sweeps = map(sweep_called, STUDIES)
     return [(sweep, study_of(sweep)) for sweep in sweeps if sweep and is_complete(sweep)]
 
 
 def sampled(sweep: Sweep, study: Study) -> tuple[Claim, ...]:
-    """The planned comparisons, of the success of training episodes: those sample their actions."""
+    """The planned comparisons by the success of training episodes, whose actions are sampled."""
     first, *_ = study.planned
     pairs = [(claim.first, claim.second, claim.pairs) for claim in study.planned]
     measures = {first.task: replace(first.measure, metric=names.TRAIN_SUCCESS)}
@@ -48,7 +48,7 @@ def between_q(claims: Sequence[Claim]) -> list[Claim]:
 
 
 def headline() -> str:
-    """One sentence: what q does on each task, by the verdicts on the mean action."""
+    """One sentence: the effect of q on each task, by the verdicts on the mean action."""
     claims = [c for _, study in complete_studies() for c in between_q(study.planned)]
     better = [pair for c in claims if (pair := winner_and_loser(c)) and pair[0] == "q = 1.5"]
     parts = [f"q = 1.5 needs fewer steps than {loser} on {task}" for _, loser, task in better]
@@ -75,7 +75,7 @@ def winner_and_loser(claim: Claim) -> tuple[str, str, str] | None:
 
 
 def _alike(claims: Sequence[Claim]) -> str:
-    """Which q are equivalent on a task."""
+    """The q that are equivalent on a task."""
     alike = [claim for claim in claims if claim.verdict is Verdict.EQUIVALENT]
     seeds = min(claim.contrast.seeds[0] for claim in claims)
     pairs = " and ".join(f"{claim.first} to {claim.second}" for claim in alike)
@@ -87,7 +87,7 @@ def _alike(claims: Sequence[Claim]) -> str:
 
 
 def sampled_sentence() -> str:
-    """Comparisons of two q by the sampled policy whose interval excludes 0, in words."""
+    """Comparisons of two q by the sampled policy whose CI excludes 0, in words."""
     where: dict[tuple[str, str, str], list[str]] = {}
     for sweep, study in complete_studies():
         for claim in between_q(sampled(sweep, study)):

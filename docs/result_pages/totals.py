@@ -1,4 +1,4 @@
-"""Comparisons at an equal number of environment steps in all, pretraining included."""
+"""Comparisons at equal total environment steps, with pretraining."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rows and numbers as the pages write them."""
+"""Table rows and formatted numbers."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from music_rllib.results.analysis import FinalScores
 from music_rllib.results.statistics import number
 
 THRESHOLD = 0.9
-"""Success rate that the proofs of the appendix wait for."""
+"""Success rate of the proofs in the appendix."""
 
 
 def row(*cells: object) -> str:
-    """A row of a table."""
+    """A table row."""
     return "| " + " | ".join(map(str, cells)) + " |"
 
 
 def rule(columns: int) -> str:
-    """The line below a table's header."""
+    """The line below a table header."""
     return "|" + "---|" * columns
 
 
-def interval(final: FinalScores | None) -> tuple[str, str]:
-    """A final rate with its interval, and each seed's; empty where none has finished."""
+def rate_cells(final: FinalScores | None) -> tuple[str, str]:
+    """A final rate with its interval, and the rate of each seed; empty without a finished seed."""
     if final is None:
         return "", ""
     found = final.estimate
@@ -45,8 +45,8 @@ def spread(found: st.Estimate) -> str:
 
 
 def percent(share: float) -> str:
-    """`57 %`."""
-    return f"{100 * share:.0f} %"
+    """`57%`."""
+    return f"{100 * share:.0f}%"
 
 
 def wait_text(median: st.Estimate) -> str:
@@ -67,11 +67,11 @@ def clock(seconds: float | None) -> str:
 
 
 def all_of(values: Iterable[str]) -> str:
-    """All different ones, as code."""
+    """The distinct values, as code."""
     return ", ".join(f"`{value}`" for value in sorted(set(values) - {""}))
 
 
 def natural(name: str) -> list[tuple[int, int | str]]:
-    """Sorts seed10 after seed9."""
+    """Sorting key: seed10 after seed9."""
     parts = re.split(r"(\d+)", name)
     return [(0, int(part)) if part.isdigit() else (1, part) for part in parts]
