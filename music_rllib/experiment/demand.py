@@ -1,8 +1,8 @@
 """Lower bounds of the memory and time that runs need, computed from their settings.
 
-The bound of memory omits what does not depend on the settings: the interpreter, its libraries, an
-environment's own data. An observation counts up to the largest index of the task's split into agent
-and surroundings.
+The bound of memory omits everything that does not depend on the settings: the interpreter, its
+libraries, an environment's own data. The size of an observation is taken from the largest index of
+the task's agent and surroundings.
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ def _weights(inputs: int, hidden_sizes: tuple[int, ...]) -> int:
 
 
 def _observation(task: Task) -> int:
-    """Numbers of an observation, as far as the task's indices tell."""
+    """Size of an observation, up to the largest index of the task."""
     return 1 + max((*task.agent_indices, *task.surrounding_indices), default=0)
 
 

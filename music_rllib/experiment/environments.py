@@ -1,4 +1,4 @@
-"""Runs in the storage that were computed in a different environment, and what to do with them."""
+"""Runs in the storage that used a different environment: find, retrain or keep them."""
 
 from __future__ import annotations
 
@@ -168,7 +168,7 @@ class Answer:
             StorageError: The decision can't be recorded.
         """
         for run in self.again:
-            say(f"{run.label}: {run.progress}; deleting that, the run is trained again")
+            say(f"{run.label}: {run.progress}; deleted, to be retrained")
         if kept := [run for run in self.left if run.differences]:
             say(f"using {in_runs(len(kept))} of a different environment (--keep-runs)")
         sweep = remove_runs(sweep, self.again)

@@ -73,7 +73,7 @@ class OpenSweep:
     scheduler: Scheduler
     environments: Environments = field(default_factory=Environments)
     damaged: Mapping[str, str] = field(default_factory=dict)
-    """Key of each finished node that is damaged and to be trained again, with a message."""
+    """Key of each damaged finished node, which will be retrained, with a message."""
     recorded: Mapping[str, Any] = field(default_factory=dict)
     """Content of `plan.json` when the sweep was opened; empty if there was none."""
     earlier: list[dict[str, Any]] = field(default_factory=list)
@@ -159,7 +159,7 @@ def open_sweep(
         scheduler=Scheduler(plan, finished - damaged.keys()),
         environments=Environments.of(environments, storage) if environments else Environments(),
         damaged={
-            key: f"{labels[key]}: damaged, is trained again: {why}" for key, why in damaged.items()
+            key: f"{labels[key]}: damaged, will be retrained: {why}" for key, why in damaged.items()
         },
         recorded=recorded,
     )

@@ -354,6 +354,6 @@ def make_plan(config: SweepConfig, *, algorithm: str | None = None) -> Plan:
     varied = {source for search, source in sources if search and source in stages_in(search)}
     used = {source for search, source in sources if not (search and source in varied)}
     for stage in config.stages:
-        # A stage whose settings are chosen by trials of another one has no runs of its own.
+        # If trials choose the settings of a source stage, the stage has no other runs.
         plan.add_stage(stage, with_runs=stage.name not in varied - used)
     return plan

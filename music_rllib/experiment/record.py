@@ -93,7 +93,7 @@ def plan_document(sweep: OpenSweep) -> dict[str, Any]:
 
 
 def _configuration(config: SweepConfig) -> dict[str, Any]:
-    """The whole configuration without secrets, as it is valid on every machine."""
+    """The whole configuration without secrets, in a form that is valid on every machine."""
     document: dict[str, Any] = json.loads(as_json(without_secrets(config.document)))
     if uri := (document.get("mlflow") or {}).get("tracking_uri"):
         document["mlflow"]["tracking_uri"] = database_url(uri)

@@ -1,4 +1,4 @@
-"""The states of a sweep's nodes while it runs, and the interface of what receives its events."""
+"""The states of a sweep's nodes while it runs, and the interface of listeners to its events."""
 
 from __future__ import annotations
 

@@ -182,7 +182,7 @@ def open_handoff(folder: Path) -> tuple[Path, HandoffManifest]:
     """The folder and the manifest of a handoff in `folder`, or in its folder `handoff/`.
 
     Raises:
-        HandoffError: There is no handoff, or its manifest is not valid.
+        HandoffError: The handoff does not exist, or its manifest is not valid.
     """
     for candidate in (folder, folder / "handoff"):
         path = candidate / MANIFEST
@@ -192,7 +192,7 @@ def open_handoff(folder: Path) -> tuple[Path, HandoffManifest]:
                 return candidate, HandoffManifest.model_validate(content)
             except (ValueError, OSError) as error:
                 raise HandoffError(f"{path} must be a handoff manifest: {_reason(error)}") from None
-    found = "the folder is there" if folder.is_dir() else "there is no such folder"
+    found = "the folder exists" if folder.is_dir() else "the folder does not exist"
     raise HandoffError(f"{folder} must hold a handoff ({MANIFEST} and weights): {found}")
 
 
@@ -222,7 +222,7 @@ def read_handoff(
     if absent:
         raise HandoffError(
             f"{folder} must have {', '.join(networks)}; it lacks {', '.join(absent)} "
-            f"(made by {manifest.info.variant})"
+            f"(trained with {manifest.info.variant})"
         )
     return {name: _read_weights(folder, manifest.modules[name]) for name in networks}
 

@@ -149,4 +149,4 @@ def _decode(tree: Any, arrays: Mapping[str, npt.NDArray[Any]]) -> Any:
             return [_decode(inner, arrays) for inner in content]
         case "tuple":
             return tuple(_decode(inner, arrays) for inner in content)
-    raise ValueError(f"there is no kind {kind!r}")
+    raise ValueError(f"unknown kind {kind!r}")

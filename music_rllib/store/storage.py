@@ -41,7 +41,7 @@ try:
 except (StorageError, OSError) as error:
     sys.exit(str(error.__cause__ or error))
 if bucket.type.name == "NotFound":
-    sys.exit("there is no such bucket")
+    sys.exit("the bucket does not exist")
 """
 
 
@@ -362,7 +362,7 @@ def check_answers(storage: str) -> None:
         )
         reason = done.stderr.strip().rpartition("\n")[2] if done.returncode else ""
     except subprocess.TimeoutExpired:
-        reason = f"there was no answer within {ANSWER_SECONDS:g} s"
+        reason = f"no answer within {ANSWER_SECONDS:g} s"
     if reason:
         raise StorageError(
             f"storage must be a bucket that answers, got {redact(storage)!r}: {redact(reason)}. "

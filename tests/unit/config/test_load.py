@@ -594,7 +594,9 @@ def test_a_checkpoint_from_outside_is_checked_before_anything_starts(
     document = from_checkpoint(push)
     document["stages"][0]["variant"] = "music-f"
     (line,) = problems(document)
-    assert "it lacks policy, critics, value, value_target, normaliser (made by music-u)" in line
+    assert (
+        "it lacks policy, critics, value, value_target, normaliser (trained with music-u)" in line
+    )
 
     weights = tmp_path / "push" / "mi_estimator.safetensors"
     weights.write_bytes(weights.read_bytes()[:-1])

@@ -188,7 +188,7 @@ def test_a_file_with_other_content_is_refused(tmp_path: Path) -> None:
     handoff = Trained(_run()).write(tmp_path) / "handoff" / "policy.safetensors"
     with pytest.raises(PolicyFileError, match="header"):
         PolicyNetwork.from_file(handoff)
-    with pytest.raises(PolicyError, match="there is no such folder"):
+    with pytest.raises(PolicyError, match="the folder does not exist"):
         load_policy(tmp_path / "nowhere")
 
 

@@ -92,12 +92,12 @@ def refusal(folder: Path, modules: tuple[str, ...] = ("mi_estimator",)) -> str:
 
 
 def test_missing_parts_are_named(handoff: Path) -> None:
-    assert "there is no such folder" in refusal(handoff / "nowhere")
-    assert "it lacks policy (made by music-u)" in refusal(handoff, ("policy", "normaliser"))
+    assert "the folder does not exist" in refusal(handoff / "nowhere")
+    assert "it lacks policy (trained with music-u)" in refusal(handoff, ("policy", "normaliser"))
     (handoff / "mi_estimator.safetensors").unlink()
     assert "mi_estimator.safetensors must be readable" in refusal(handoff)
     (handoff / "handoff.json").unlink()
-    assert "the folder is there" in refusal(handoff)
+    assert "the folder exists" in refusal(handoff)
 
 
 def test_damage_is_named(handoff: Path) -> None:
