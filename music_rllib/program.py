@@ -1,14 +1,27 @@
-"""`music-rllib`: every command of the package."""
+"""`music-rllib`: every command of the package, its help, exit codes and errors.
+
+A command is a function whose parameters are its arguments (Typer) and which returns its exit code.
+Every `--help` imports all commands: their modules load heavy libraries only inside functions.
+"""
 
 from __future__ import annotations
 
+import io
+import os
+import signal
+import sys
 from collections.abc import Callable, Sequence
-from typing import Annotated
+from pathlib import Path
+from types import TracebackType
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
 from music_rllib import __version__
-from music_rllib.command_line import PROGRAM, add_command, new_app, run_app
+from music_rllib.command_line import PROGRAM
+from music_rllib.errors import BAD_INPUT, BadInputError
+from music_rllib.redaction import for_people
 from music_rllib.report import cli as report
 from music_rllib.runtime.quiet import prepare_environment, quiet_third_parties
 from music_rllib.serve import command as serve
@@ -49,9 +62,76 @@ SIGTERM.
 """
 
 
-app = new_app(epilog=EPILOG, add_completion=True)
+class _KeepsExamples:
+    """A help page whose examples keep their line breaks."""
+
+    epilog: str | None
+
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:
+        if self.epilog:
+            formatter.write(f"\n{self.epilog.strip()}\n")
+
+
+class Command(_KeepsExamples, TyperCommand):
+    """A command whose function returns its exit code; a `BadInputError` becomes one message."""
+
+    def invoke(self, ctx: typer.Context) -> Any:  # type: ignore[override]
+        """Run the function and exit with its code."""
+        sys.excepthook = _print_unexpected
+        try:
+            _check_current_folder()
+            code = super().invoke(ctx)
+        except BadInputError as error:
+            print(f"error: {for_people(error)}", file=sys.stderr)
+            code = BAD_INPUT
+        except KeyboardInterrupt:
+            code = 128 + signal.SIGINT
+        except BrokenPipeError:
+            # The reader has closed the pipe (`| head`); this avoids a second error at exit.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            code = 0
+        raise typer.Exit(int(code or 0))
+
+
+class Group(_KeepsExamples, TyperGroup):
+    """The program, which explains that `run` is missing before a sweep's file."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if args and args[0].endswith((".yaml", ".yml")):
+            ctx.fail(f"COMMAND must come first: {ctx.command_path} run {args[0]}")
+        return super().parse_args(ctx, args)
+
+
+def _check_current_folder() -> None:
+    """Reject a deleted or unreadable current folder, which Ray and relative paths need."""
+    try:
+        Path.cwd()
+    except OSError as error:
+        raise BadInputError(
+            f"the current folder must exist and be readable: {error.strerror}. "
+            "Change to another folder"
+        ) from error
+
+
+def _print_unexpected(
+    kind: type[BaseException], error: BaseException, trace: TracebackType | None
+) -> None:
+    """Print the traceback of a defect without passwords that its message may contain."""
+    import traceback
+
+    print(for_people("".join(traceback.format_exception(kind, error, trace))), file=sys.stderr)
+
+
+_HELP = {"help_option_names": ["-h", "--help"]}
+app = typer.Typer(
+    cls=Group,
+    epilog=EPILOG,
+    context_settings=_HELP,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
 for _name, (_function, _examples) in COMMANDS.items():
-    add_command(app, _name, _function, _examples)
+    app.command(_name, cls=Command, epilog=_examples, context_settings=_HELP)(_function)
 
 
 @app.callback(invoke_without_command=True)
@@ -66,7 +146,7 @@ def program(
         typer.echo(f"{PROGRAM} {__version__}")
         raise typer.Exit
     if context.invoked_subcommand is None:
-        # Without a command the help is an answer, not an error: on standard output, exit code 0.
+        # Without a command, print the help to standard output and exit with 0.
         typer.echo(context.get_help())
 
 
@@ -75,4 +155,11 @@ def main(arguments: Sequence[str] | None = None, program_name: str = PROGRAM) ->
     # Ray and MLflow read their environment while they are imported.
     prepare_environment()
     quiet_third_parties()
-    return run_app(app, program_name, arguments)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a terminal without α shows it as \u03b1
+            stream.reconfigure(errors="backslashreplace")
+    try:
+        app(None if arguments is None else list(arguments), prog_name=program_name)
+    except SystemExit as end:
+        return end.code if isinstance(end.code, int) else int(bool(end.code))
+    return 0

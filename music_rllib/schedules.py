@@ -1,9 +1,9 @@
 """Schedules of scalar settings (q, alpha, the MI weight) over a run.
 
-A setting is a plain number (constant), a :class:`Linear` ramp over fractions of the run's budget
-(the curriculum of Lee et al. 2019, "TAC with curricula": 10 % to 90 % of training) or a
+A setting is a number (constant), a :class:`Linear` ramp over fractions of the run's budget (the
+curriculum of Lee et al. 2019, "TAC with curricula": 10% to 90% of training) or a
 :class:`Piecewise` table of environment steps. Each holds its last value to the end of the run. q
-and the MI weight may also be :class:`Measured`: a function of the run's success rate or entropy.
+and the MI weight can also be :class:`Measured`: a function of the run's success rate or entropy.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
     AfterValidator,
@@ -24,13 +24,13 @@ from pydantic import (
 )
 
 Quantity = Literal["success_rate", "shannon_entropy"]
-"""Quantities that a `Measured` setting may follow."""
+"""Quantities that a `Measured` setting can follow."""
 QUANTITIES = {"success_rate": "success rate", "shannon_entropy": "Shannon entropy"}
-"""Quantity to its name in text."""
+"""Name of each quantity in text."""
 
 
 class StrictModel(BaseModel):
-    """Settings that never change, and hold no unknown key, infinity or NaN."""
+    """Immutable settings without unknown keys, infinities and NaN."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -39,11 +39,11 @@ class Linear(StrictModel):
     """Straight line from `start` to `end` between two fractions of the run's budget."""
 
     schedule: Literal["linear"] = "linear"
-    """Says which kind of schedule this is."""
+    """The kind of schedule."""
     start: float
-    """Value at the beginning."""
+    """First value."""
     end: float
-    """Value at the end."""
+    """Last value."""
     begin: float = Field(0.1, ge=0.0, le=1.0)
     """Fraction of the budget up to which the value is `start`."""
     finish: float = Field(0.9, ge=0.0, le=1.0)
@@ -62,11 +62,11 @@ class Piecewise(StrictModel):
     """Values at given environment steps, joined by lines or held until the next one."""
 
     schedule: Literal["piecewise"] = "piecewise"
-    """Says which kind of schedule this is."""
+    """The kind of schedule."""
     points: tuple[tuple[int, float], ...] = Field(min_length=1)
-    """(environment steps, value) pairs; the first one must be at step 0."""
+    """(environment steps, value) pairs; the first pair must be at step 0."""
     interpolation: Literal["linear", "hold"] = "linear"
-    """Between two points: a straight line, or the value of the earlier one."""
+    """Between two points: a straight line, or the value of the earlier point."""
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -111,62 +111,60 @@ class Follower:
 
     def __init__(self, schedule: Measured) -> None:
         self._schedule = schedule
-        self._before: float | None = None
-        """The smoothed quantity before the current round, and when it was measured."""
-        self._steps_before = self._env_steps = self._count = 0
-        self._sum = 0.0
-        """Of the current round's `_count` measurements, after `_env_steps`."""
-        self._mean: float | None = None
-        self.measured: float | None = None
-        """The quantity, smoothed, and monotone where asked; None before the first measurement."""
+        self._state: dict[str, Any] = {
+            "measured": None,
+            "mean": None, "env_steps": 0, "sum": 0.0, "count": 0,
+            "before": None, "steps_before": 0,
+        }  # fmt: skip
+        """`measured` is the followed quantity. The smoothed quantity was `mean` after `env_steps`,
+        with `count` measurements in that round, and `before` in the round before it."""
+
+    @property
+    def measured(self) -> float | None:
+        """The quantity, smoothed and monotone as configured; None before any measurement."""
+        measured: float | None = self._state["measured"]
+        return measured
 
     def observe(self, quantity: Quantity, measured: float, env_steps: int) -> None:
         """Add a measurement made after `env_steps`, unless it is of another quantity.
 
-        Measurements after the same `env_steps` form a round; its mean is what is smoothed.
+        Measurements after the same `env_steps` form a round, whose mean is smoothed.
         """
-        schedule = self._schedule
+        schedule, state = self._schedule, self._state
         if quantity != schedule.follows or not math.isfinite(measured):
             return
         if schedule.smoothing > 0:
             measured = self._smoothed(measured, env_steps)
-        self._mean, self._env_steps = measured, env_steps
-        if schedule.monotone and self.measured is not None:
+        state |= {"mean": measured, "env_steps": env_steps}
+        if schedule.monotone and state["measured"] is not None:
             best = max if schedule.follows == "success_rate" else min
-            measured = best(measured, self.measured)
-        self.measured = measured
+            measured = best(measured, state["measured"])
+        state["measured"] = measured
 
     def _smoothed(self, measured: float, env_steps: int) -> float:
-        """The moving average, with a measurement of the current round or of a new one."""
-        if env_steps != self._env_steps:
-            self._before, self._steps_before = self._mean, self._env_steps
-            self._sum, self._count = 0.0, 0
-        self._sum, self._count = self._sum + measured, self._count + 1
-        mean = self._sum / self._count
-        if self._before is None:
+        """The moving average, with a measurement of the current round or of a new round."""
+        state = self._state
+        if env_steps != state["env_steps"]:
+            state |= {"before": state["mean"], "steps_before": state["env_steps"]}
+            state |= {"sum": 0.0, "count": 0}
+        state |= {"sum": state["sum"] + measured, "count": state["count"] + 1}
+        mean: float = state["sum"] / state["count"]
+        if state["before"] is None:
             return mean
-        kept = math.exp((self._steps_before - env_steps) / self._schedule.smoothing)
-        return mean + kept * (self._before - mean)
+        kept = math.exp((state["steps_before"] - env_steps) / self._schedule.smoothing)
+        return mean + kept * (float(state["before"]) - mean)
 
     def state(self) -> dict[str, float | None]:
         """The state for a checkpoint."""
-        return {
-            "mean": self._mean, "env_steps": self._env_steps, "measured": self.measured,
-            "before": self._before, "steps_before": self._steps_before,
-            "sum": self._sum, "count": self._count,
-        }  # fmt: skip
+        return dict(self._state)
 
-    def load_state(self, state: dict[str, float | None]) -> None:
+    def load_state(self, state: Mapping[str, float | None]) -> None:
         """Restore the state of a checkpoint."""
-        self._mean, self.measured = state["mean"], state["measured"]
-        self._env_steps = int(state["env_steps"] or 0)
-        self._before = state.get("before")  # states of version 3 lack the rest
-        self._steps_before = int(state.get("steps_before") or 0)
-        self._sum, self._count = state.get("sum") or 0.0, int(state.get("count") or 0)
+        self._state = dict(state)
 
 
 def _kind(value: object) -> str | None:
-    """Tag of the member of `Schedule` that a value is meant to be; errors are about that one."""
+    """Tag of the member of `Schedule` that `value` should be."""
     if isinstance(value, dict):
         return "measured" if "follows" in value else value.get("schedule")
     if isinstance(value, Measured):
@@ -207,7 +205,10 @@ def value_at(
     """The schedule's value after `env_steps` of `total_env_steps` environment steps.
 
     Args:
-        measured: the quantity that a `Measured` follows; None before the first measurement.
+        schedule: The schedule.
+        env_steps: Environment steps done.
+        total_env_steps: The run's budget.
+        measured: The quantity that a `Measured` follows; None before the first measurement.
     """
     match schedule:
         case Linear():
@@ -242,7 +243,7 @@ def _interpolated(points: Sequence[tuple[float, float]], at: float) -> float:
 
 
 def _between(value: float, one: float, other: float) -> float:
-    """The value, which rounding may have moved beyond one of the ends."""
+    """The value, limited to both ends, beyond which rounding may have moved it."""
     return min(max(value, min(one, other)), max(one, other))
 
 
@@ -259,32 +260,27 @@ def extremes(schedule: float | Linear | Piecewise | Measured) -> tuple[float, fl
 
 
 def check_measurable(settings: Mapping[str, object], *, success: bool, entropy: bool) -> None:
-    """Refuse settings that follow a quantity that the run does not measure.
+    """Reject settings that follow a quantity that the run does not measure.
 
     Args:
-        settings: dotted name to value.
-        success: whether the task declares success.
-        entropy: whether the policy has an entropy.
+        settings: Dotted name to value.
+        success: Whether the task declares success.
+        entropy: Whether the policy has an entropy.
 
     Raises:
-        ValueError: names the setting.
+        ValueError: Names the setting.
     """
+    lacking = {
+        "success_rate": None if success else "on a task without success (success_key: null)",
+        "shannon_entropy": None if entropy else "for policy: deterministic (it has no entropy)",
+    }
     for name, value in settings.items():
-        follows = value.follows if isinstance(value, Measured) else None
-        if follows == "success_rate" and not success:
-            raise ValueError(
-                f"{name}.follows must not be success_rate on a task that declares no success "
-                "(success_key: null)"
-            )
-        if follows == "shannon_entropy" and not entropy:
-            raise ValueError(
-                f"{name}.follows must not be shannon_entropy for policy: deterministic (it has no "
-                "entropy)"
-            )
+        if isinstance(value, Measured) and (reason := lacking[value.follows]):
+            raise ValueError(f"{name}.follows must not be {value.follows} {reason}")
 
 
 def bounded(rule: str, holds: Callable[[float], bool]) -> AfterValidator:
-    """A pydantic validator that `holds` is true of a schedule's smallest and largest value."""
+    """A pydantic validator that `holds` for a schedule's smallest and largest value."""
 
     def check(
         schedule: float | Linear | Piecewise | Measured,

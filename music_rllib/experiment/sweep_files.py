@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import math
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Set
@@ -19,6 +18,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from music_rllib.command_line import plain
 from music_rllib.config.load import load_sweep
 from music_rllib.config.problems import shown
 from music_rllib.config.schema import SweepConfig
@@ -189,15 +189,6 @@ def is_alive(state: Mapping[str, Any] | None) -> bool:
     if driver["machine"] == this_machine():
         return runs_here(driver["pid"], driver["process_started"])
     return bool(time.time() - driver["heartbeat"] < SILENCE_SECONDS)
-
-
-def plain(value: Any) -> Any:
-    """`value` as JSON can represent it: null instead of NaN and infinity."""
-    if isinstance(value, dict):
-        return {str(key): plain(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(inner) for inner in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def as_json(document: Any) -> str:

@@ -19,6 +19,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from music_rllib import names
+from music_rllib.command_line import plain
 from music_rllib.errors import BadInputError, first_line
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.sweep_files import SweepLocation
@@ -218,7 +219,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._json(HTTPStatus.NOT_FOUND, {"error": "there is no such page"})
 
     def _json(self, status: HTTPStatus, document: Any) -> None:
-        text = json.dumps(sweep_files.plain(document), ensure_ascii=False)
+        text = json.dumps(plain(document), ensure_ascii=False)
         self._answer(status, text, "application/json")
 
     def _answer(self, status: HTTPStatus, text: str, kind: str) -> None:
