@@ -8,7 +8,7 @@ import os
 import shlex
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -16,6 +16,7 @@ import typer
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.segment import Segment
+    from rich.table import Table
 
 PROGRAM = "music-rllib"
 WIDTH = 160
@@ -70,6 +71,36 @@ def console_for(*, as_json: bool = False) -> Console:
         if terminal and "COLUMNS" not in os.environ
         else shutil.get_terminal_size((WIDTH, 24)).columns,
     )
+
+
+def new_table(title: str, heads: Iterable[str], left: Collection[str] = ()) -> Table:
+    """A table whose cells are folded and never cut.
+
+    Args:
+        title: Text above it.
+        heads: Heads of its columns, in order.
+        left: Heads of the left-aligned columns of text; numbers are right-aligned.
+    """
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left", box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for head in heads:
+        table.add_column(head, justify="left" if head in left else "right", overflow="fold")
+    return table
+
+
+def percent(value: float | None) -> str:
+    """`35 %`, or `-` for None."""
+    return "-" if value is None else f"{100 * value:.0f} %"
+
+
+def clock(seconds: float | None) -> str:
+    """`1:02:03`, `2:03`, or `-` for None."""
+    if seconds is None:
+        return "-"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
 def print_json(document: Any) -> None:

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Group
 
+from music_rllib.command_line import clock, new_table
 from music_rllib.config.schema import SweepConfig
 from music_rllib.runtime import machine
 from music_rllib.sweep.views.budget import RunGroup
-from music_rllib.sweep.views.text import clock, new_table
 
 if TYPE_CHECKING:
     from music_rllib.training.sample_run import RunSample

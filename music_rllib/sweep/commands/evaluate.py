@@ -140,7 +140,7 @@ def _interval(successes: list[bool]) -> list[float] | None:
 
 
 def _show(document: dict[str, Any]) -> None:
-    from music_rllib.sweep.views.text import new_table, percent
+    from music_rllib.command_line import new_table, percent
 
     title = (
         f"{document['task']}, {document['variant']}, training seed {document['training_seed']}, "

@@ -10,6 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from music_rllib import names
+from music_rllib.command_line import new_table, percent
 from music_rllib.errors import BadInputError
 from music_rllib.experiment.environments import mixed
 from music_rllib.experiment.sweep_files import SweepLocation
@@ -21,7 +22,7 @@ from music_rllib.results.read import StoredSweep, read_stored
 from music_rllib.results.statistics import SHOW_SEEDS_BELOW, Estimate, difference, with_interval
 from music_rllib.results.study import study_of
 from music_rllib.search.best import ranking_metric
-from music_rllib.sweep.views.text import new_table, percent, setting_cells
+from music_rllib.sweep.views.text import setting_cells
 
 IN_THE_SEARCH = "in the search"
 """Part of a group of trials on the seeds that they were chosen by."""

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import closing
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
 from music_rllib import names
+from music_rllib.command_line import new_table
 from music_rllib.config.load import warnings_of
 from music_rllib.config.schema import Source, Stage, SweepConfig
 from music_rllib.config.search import SearchSettings
@@ -24,8 +25,9 @@ from music_rllib.experiment.record import plan_document
 from music_rllib.labels import in_runs
 from music_rllib.redaction import redact
 from music_rllib.schedules import QUANTITIES, Linear, Measured, Piecewise, value_at
-from music_rllib.sweep.views.budget import search_budget
-from music_rllib.sweep.views.text import new_table
+
+if TYPE_CHECKING:
+    from music_rllib.sweep.views.budget import SearchBudget
 
 
 def plan_view(config: SweepConfig, plan: Plan, finished: Collection[str]) -> RenderableType:
@@ -33,16 +35,16 @@ def plan_view(config: SweepConfig, plan: Plan, finished: Collection[str]) -> Ren
     heads = ("stage", "trials", "runs", "env steps per run", "env steps", "finished")
     table = new_table(f"Sweep {plan.name}", heads, left=["stage"])
     seeds = len(config.seeds)
+    budgets = _budgets(config)
     for stage in config.stages:
-        table.add_row(stage.name, *_stage_cells(stage, plan, finished, seeds))
+        cells = _stage_cells(stage, plan, finished, budgets.get(stage.name))
+        table.add_row(stage.name, *cells)
     lines = [*(_stage_text(stage, seeds) for stage in config.stages), _summary(plan, finished)]
-    searched = [stage for stage in config.stages if stage.search is not None]
-    if searched:
-        budgets = [search_budget(stage, seeds) for stage in searched]
-        runs = sum(budget.runs for budget in budgets)
-        steps = sum(budget.env_steps for budget in budgets)
+    if budgets:
+        runs = sum(budget.runs for budget in budgets.values())
+        steps = sum(budget.env_steps for budget in budgets.values())
         lines[-1] += f" Searches: up to {runs} more runs and {steps:,} more env steps"
-        fresh = any(stage.search and stage.search.final and stage.source for stage in searched)
+        fresh = any(one.search and one.search.final and one.source for one in config.stages)
         lines[-1] += ", without the source runs of fresh seeds." if fresh else "."
     parts: list[RenderableType] = [table, *map(Text, lines)]
     if rows := alpha_rows(plan):
@@ -50,10 +52,21 @@ def plan_view(config: SweepConfig, plan: Plan, finished: Collection[str]) -> Ren
     return Group(*parts, *(Text(adaptive_text(row)) for row in adaptive_rows(plan)))
 
 
-def _stage_cells(stage: Stage, plan: Plan, finished: Collection[str], seeds: int) -> list[str]:
-    if stage.search is not None:
-        studies, budget = len(stage.search.compared()), search_budget(stage, seeds)
-        trials = stage.search.count
+def _budgets(config: SweepConfig) -> dict[str, SearchBudget]:
+    """Name of each searched stage to the budget of its search."""
+    searched = [stage for stage in config.stages if stage.search is not None]
+    if not searched:
+        return {}
+    from music_rllib.sweep.views.budget import search_budget
+
+    return {stage.name: search_budget(stage, len(config.seeds)) for stage in searched}
+
+
+def _stage_cells(
+    stage: Stage, plan: Plan, finished: Collection[str], budget: SearchBudget | None
+) -> list[str]:
+    if stage.search is not None and budget is not None:
+        studies, trials = len(stage.search.compared()), stage.search.count
         return [
             f"{studies} x {trials}" if studies > 1 else str(trials),
             f"≤ {budget.runs}",
@@ -145,6 +158,7 @@ def _summary(plan: Plan, finished: Collection[str]) -> str:
 def plan_answer(opened: OpenSweep, changes: str) -> dict[str, Any]:
     """The plan as plain data, with the changes since the last run of the sweep."""
     config, plan = opened.config, opened.plan
+    budgets = _budgets(config)
     searches = [
         {
             "stage": stage.name,
@@ -152,7 +166,7 @@ def plan_answer(opened: OpenSweep, changes: str) -> dict[str, Any]:
             "sampler": stage.search.sampler,
             "studies": len(stage.search.compared()),
             "trials": stage.search.count,
-            "runs_at_most": search_budget(stage, len(config.seeds)).runs,
+            "runs_at_most": budgets[stage.name].runs,
             "space": stage.search.model_dump(mode="json", by_alias=True)["space"],
         }
         for stage in config.stages

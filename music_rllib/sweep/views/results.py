@@ -10,12 +10,13 @@ from rich.table import Table
 from rich.text import Text
 
 from music_rllib import names
+from music_rllib.command_line import clock, new_table, percent
 from music_rllib.experiment.plan import Plan, short
 from music_rllib.experiment.scheduler import Status
 from music_rllib.labels import ShortLabels
 from music_rllib.results.statistics import with_interval
 from music_rllib.store.history import RunResult
-from music_rllib.sweep.views.text import clock, measured, new_table, percent, setting_cells
+from music_rllib.sweep.views.text import measured, setting_cells
 
 _STYLES = {Status.FAILED: "red", Status.SKIPPED: "yellow", Status.WAITING: "yellow"}
 _STATES = {Status.STARTED: "interrupted", Status.WAITING: "not started"}

@@ -11,11 +11,12 @@ from rich.table import Table
 from rich.text import Text
 
 from music_rllib import names
+from music_rllib.command_line import clock, new_table
 from music_rllib.experiment.plan import short
 from music_rllib.labels import ShortLabels
 from music_rllib.search.best import best_text
 from music_rllib.store.node_store import TRAIN_AGAIN
-from music_rllib.sweep.views.text import clock, measured, new_table
+from music_rllib.sweep.views.text import measured
 
 _STATUSES = (
     *("finished", "reused", "started", "interrupted", "waiting", "paused", "pruned"),

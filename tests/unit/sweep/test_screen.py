@@ -11,6 +11,7 @@ import yaml
 from rich.console import Console, RenderableType
 
 from music_rllib import names
+from music_rllib.command_line import clock, percent
 from music_rllib.config.load import load_sweep
 from music_rllib.config.schema import SweepConfig
 from music_rllib.config.tac_settings import LearnedAlpha, setting_text
@@ -23,7 +24,6 @@ from music_rllib.store.storage import resolve_storage, sweep_folder
 from music_rllib.sweep.listeners.screen import Display, Throughput
 from music_rllib.sweep.views.plan import adaptive_rows, adaptive_text, alpha_rows, plan_view
 from music_rllib.sweep.views.results import results_table
-from music_rllib.sweep.views.text import clock, percent
 
 DOCUMENT: dict[str, Any] = {
     "name": "s",
