@@ -219,7 +219,7 @@ class TACConfigBase(AlgorithmConfig):
                 where = ".".join(str(part) for part in problem["loc"] if part not in _TAGS)
                 rule = problem["msg"].removeprefix("Value error, ")
                 value = "" if "got " in rule else f", got {problem['input']!r}"
-                problems.append(f"{prefix}{where}: {rule}{value}" if where else f"{rule}{value}")
+                problems.append(f"{prefix}{where}: {rule}{value}" if where else rule)
             raise ValueError("; ".join(problems)) from None
 
     def validate(self) -> None:

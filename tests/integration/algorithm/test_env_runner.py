@@ -60,7 +60,8 @@ def runner(
     config = TACConfig().environment(env).debugging(seed=seed).callbacks(**(callbacks or {}))
     config.env_runners(num_envs_per_env_runner=settings.pop("num_envs", 2))
     config.music(**{k: settings.pop(k) for k in list(settings) if k in ("goals",)})
-    config.surrounding_indices = (3, 4, 5) if env == "FetchPush-v4" else ()
+    if env == "FetchPush-v4":
+        config.agent_indices, config.surrounding_indices = (0, 1, 2), (3, 4, 5)
     config.training(hidden_sizes=(8,), **settings)
     config.in_evaluation = evaluation
     config.success_if_missing = missing
