@@ -68,7 +68,7 @@ def test_a_learned_alpha_reaches_a_width() -> None:
 
 
 @pytest.mark.parametrize("form", ["per_dimension", "joint"])
-def test_alpha_follows_q_where_it_is_scaled_for_it(form: str) -> None:
+def test_a_scaled_alpha_follows_q(form: str) -> None:
     shared = {"entropic_index": RAMP, "entropy_form": form, "total_env_steps": 1_000}
     controls: dict[str, tuple[Any, Callable[[float], float]]] = {
         "matched_width": (0.1, lambda q: matched_alpha(0.3, q, 0.1, ACTIONS, form)),

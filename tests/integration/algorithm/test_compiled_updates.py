@@ -120,7 +120,7 @@ def check(settings: dict[str, Any], weights: bool = False) -> None:
 @pytest.mark.parametrize("q", [0.1, 0.5, 1.0, 1.0 + 1e-7, 1.5, 2.0, 3.0, 5.0])
 @pytest.mark.parametrize("form", ["per_dimension", "joint"])
 @pytest.mark.parametrize("backbone", ["TAC", "SAC"])
-def test_gradients_are_autograds_at_every_q(q: float, form: str, backbone: str) -> None:
+def test_gradients_equal_autograd_at_every_q(q: float, form: str, backbone: str) -> None:
     check({**BACKBONES[backbone], "entropic_index": q, "entropy_form": form})
 
 
@@ -136,14 +136,14 @@ def test_gradients_are_autograds_at_every_q(q: float, form: str, backbone: str) 
     ],
     ids=str,
 )
-def test_gradients_are_autograds_with_every_setting(
+def test_gradients_equal_autograd_with_every_setting(
     backbone: str, settings: dict[str, Any]
 ) -> None:
     check({**BACKBONES[backbone], "entropic_index": 1.5, **settings}, weights=True)
 
 
 @pytest.mark.parametrize("alpha", [0.4, {"learned": True}])
-def test_gradients_are_autograds_where_bounds_are_active(alpha: Any) -> None:
+def test_gradients_equal_autograd_at_active_bounds(alpha: Any) -> None:
     settings = {"entropic_index": 5.0, "alpha": alpha, **ACTIVE_BOUNDS}
     check(settings)
     built, batch = ready(**settings)
@@ -184,7 +184,7 @@ def test_critics_of_equal_value_share_the_policys_gradient() -> None:
 
 
 @pytest.mark.parametrize("backbone", list(BACKBONES))
-def test_updates_at_once_have_the_bits_of_one_by_one(backbone: str) -> None:
+def test_updates_in_one_call_are_bit_identical_to_single_updates(backbone: str) -> None:
     batches = [ready(**BACKBONES[backbone])[1] for _ in range(5)]
     for k, batch in enumerate(batches):
         batch["rewards"] += k
@@ -216,7 +216,7 @@ def test_updates_at_once_have_the_bits_of_one_by_one(backbone: str) -> None:
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("policy_critic", ["min", "first"])
 @pytest.mark.parametrize("backbone", list(BACKBONES))
-def test_what_is_not_finite_spoils_what_it_spoils_in_autograd(
+def test_non_finite_values_spread_as_in_autograd(
     backbone: str, policy_critic: str, bad: float
 ) -> None:
     """One bad number in each column of a minibatch and each parameter, target networks included."""
@@ -268,7 +268,7 @@ def product(left: Any, right: Any, transposed: tuple[bool, bool], out: Any) -> N
     [(256, 28, 128), (5, 3, 1), (1, 1, 7), (256, 128, 128), (130, 250, 320), (0, 3, 4)],
 )
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_products_are_numpys_however_matrices_lie(
+def test_products_equal_numpy_for_every_transposition(
     rows: int, inner: int, columns: int, dtype: Any
 ) -> None:
     rng = np.random.default_rng(0)
@@ -285,7 +285,7 @@ def test_products_are_numpys_however_matrices_lie(
 
 @pytest.mark.usefixtures("local_ray")
 @pytest.mark.parametrize("settings", list(VARIANTS.values()), ids=list(VARIANTS))
-def test_a_training_has_autograds_numbers_to_rounding(
+def test_compiled_training_equals_autograd_to_rounding(
     settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     register_uneven()
@@ -313,7 +313,7 @@ HOOKS = (
 
 
 @pytest.mark.parametrize("hook", HOOKS)
-def test_a_learners_own_methods_are_called(hook: str) -> None:
+def test_overridden_methods_of_a_learner_are_called(hook: str) -> None:
     calls = []
 
     def own(self: TACLearner, *args: Any, **kwargs: Any) -> Any:
@@ -350,7 +350,7 @@ def test_learning_rates_of_rllibs_schedulers_are_used() -> None:
     assert algo.learner_group._learner._adam["networks"].param_groups[0]["lr"] == 1e-3 / 4
 
 
-def test_remote_learners_arrays_are_only_read() -> None:
+def test_the_learner_accepts_read_only_arrays() -> None:
     """RLlib's arrays of another process can't be written to, of which PyTorch would warn."""
     algo = build(music={"estimator": "frozen", "prioritise_replay": True})
     learner_ = algo.learner_group._learner
@@ -365,7 +365,7 @@ def test_remote_learners_arrays_are_only_read() -> None:
         learner_.diagnose(episodes)
 
 
-def test_a_converted_module_is_taken_over_anew() -> None:
+def test_a_converted_module_keeps_learning() -> None:
     algo = build()
     learner_ = algo.learner_group._learner
     algo.train()
@@ -386,7 +386,7 @@ def test_a_converted_module_is_taken_over_anew() -> None:
         ("", False, "OpenBLAS"),
     ],
 )
-def test_the_library_follows_from_the_machines_description(
+def test_the_blas_library_depends_on_the_cpu_vendor(
     vendor: str, has_mkl: bool, expected: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(blas, "_cpu_vendor", lambda: vendor)

@@ -93,7 +93,7 @@ def test_a_split_beyond_the_observation_is_refused() -> None:
         TrajectoryEnvRunner(config=config, worker_index=0, num_workers=0)
 
 
-def test_every_episode_has_fresh_goals_and_one_seed_fixes_them_all() -> None:
+def test_every_episode_has_a_new_goal_fixed_by_the_seed() -> None:
     def goals(seed: int, evaluation: bool) -> np.ndarray:
         made = runner(seed=seed, evaluation=evaluation)
         episodes = made.sample(num_episodes=5) + made.sample(num_episodes=3)
@@ -194,7 +194,7 @@ def test_an_episode_that_tac_ends_is_truncated_in_callbacks() -> None:
     assert "is_success" in episode.get_infos(-1)
 
 
-def test_state_between_calls_is_all_there_is() -> None:
+def test_a_restored_runner_plays_the_same_episodes() -> None:
     one, other = runner(), runner()
     one.sample()
     other.set_state(one.get_state())
@@ -203,7 +203,7 @@ def test_state_between_calls_is_all_there_is() -> None:
         np.testing.assert_array_equal(ours.actions, theirs.actions)
 
 
-def test_where_success_is_declared_a_step_that_does_not_say_it_has_none() -> None:
+def test_a_step_without_the_declared_success_key_has_no_success() -> None:
     made = runner(SaysSuccessAtTheEnd, num_envs=3, max_episode_steps=6, missing=False)
     episodes = made.sample(num_episodes=40)
     assert {episode.terminated for episode in episodes} == {True, False}
@@ -232,7 +232,7 @@ def test_terminated_episodes_of_different_lengths_and_foreign_action_bounds() ->
     ).all()
 
 
-def test_number_of_timesteps_and_episodes_are_honoured() -> None:
+def test_sample_plays_the_given_number_of_steps_or_episodes() -> None:
     made = runner(Countdown, num_envs=2, max_episode_steps=10)
     assert len(made.sample(num_episodes=5)) == 5
     assert sum(map(len, made.sample(num_timesteps=30))) >= 30
@@ -247,7 +247,7 @@ def test_number_of_timesteps_and_episodes_are_honoured() -> None:
         {"normalise_observations": False, "log_std_form": "tanh"},
     ],
 )
-def test_it_acts_by_the_numbers_of_its_module(settings: dict[str, Any]) -> None:
+def test_the_runner_acts_as_its_module(settings: dict[str, Any]) -> None:
     made = runner(Countdown, num_envs=2, max_episode_steps=10, **settings)
     rng = np.random.default_rng(0)
     module = made.module
@@ -331,7 +331,7 @@ def test_a_bad_number_is_named_with_its_environment_episode_and_step(bad: float)
     )
 
 
-def test_no_action_that_is_not_finite_reaches_an_environment() -> None:
+def test_a_non_finite_action_stops_before_the_environment() -> None:
     made = runner(Countdown, num_envs=2, max_episode_steps=6)
     made.module.state_dict()["policy.2.bias"][0] = float("nan")
     with pytest.raises(BadNumberError, match=r"step 0: the policy's action\[0\] is nan, it must"):

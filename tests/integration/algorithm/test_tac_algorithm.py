@@ -142,7 +142,7 @@ def test_same_seed_gives_bit_identical_metrics_and_weights(music: dict[str, Any]
         ({"warmup_steps": 250}, [0, 0, 10]),
     ],
 )
-def test_updates_start_with_or_apart_from_the_policys_actions(
+def test_warmup_steps_delay_or_advance_the_first_update(
     settings: dict[str, Any], updates: list[int]
 ) -> None:
     algo = build(**settings)
@@ -311,7 +311,7 @@ def test_own_networks_act_learn_and_are_restored(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("settings", [HER, DDPG], ids=["tac", "ddpg"])
-def test_target_networks_keep_no_history_of_their_averages(settings: dict[str, Any]) -> None:
+def test_target_networks_have_no_autograd_history(settings: dict[str, Any]) -> None:
     """With one, each average of an update would stay in memory, half a kilobyte a tensor."""
     algo = build(**settings)
     fingerprint(algo, 2)
@@ -320,7 +320,7 @@ def test_target_networks_keep_no_history_of_their_averages(settings: dict[str, A
     assert all(target.is_leaf and not target.requires_grad for target in learner._targets)
 
 
-def test_q_bias_is_what_its_definition_says() -> None:
+def test_q_bias_equals_its_definition() -> None:
     """With critics that say 3 and a target value of -7, the bias can be computed by hand."""
     algo = build(music=None, alpha=0.0, gamma=0.9)
     learner = algo.learner_group._learner
@@ -501,7 +501,7 @@ def test_a_bad_setting_is_refused(settings: dict[str, Any], message: str) -> Non
         ),
     ],
 )
-def test_settings_that_contradict_each_other_are_refused(make: Any, message: str) -> None:
+def test_contradictory_settings_are_refused(make: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make(TACConfig().environment("Pendulum-v1")).validate()
 
@@ -517,7 +517,7 @@ def test_settings_that_contradict_each_other_are_refused(make: Any, message: str
         (lambda c: c.environment("FetchPush-v4").training(gamma=0.9, alpha=0.0), None),
     ],
 )
-def test_bounds_that_cut_off_values_within_reach_are_warned_of(make: Any, said: str | None) -> None:
+def test_target_bounds_that_cut_off_reachable_values_print_a_warning(make: Any, said: str | None) -> None:
     config = make(TACConfig().training(target_bounds=(-50.0, 0.0)))
     if said is None:
         config.validate()
@@ -526,7 +526,7 @@ def test_bounds_that_cut_off_values_within_reach_are_warned_of(make: Any, said: 
             config.validate()
 
 
-def test_tune_searches_tacs_settings_as_those_of_any_algorithm(tmp_path: Path) -> None:
+def test_tune_searches_over_settings_of_tac(tmp_path: Path) -> None:
     config = TACConfig().environment("Pendulum-v1").env_runners(num_envs_per_env_runner=1)
     config.training(**{**SMALL, "entropic_index": tune.grid_search([1.0, 1.5])})
     stop = {"training_iteration": 1}

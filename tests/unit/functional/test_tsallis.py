@@ -192,7 +192,7 @@ def test_forms_agree_at_q_1_and_differ_elsewhere() -> None:
 
 
 @pytest.mark.parametrize(("q", "width"), [(2.0, 0.0327), (3.0, 0.1143)])
-def test_where_the_joint_forms_tangent_begins(q: float, width: float) -> None:
+def test_the_joint_form_uses_its_tangent_below_documented_widths(q: float, width: float) -> None:
     """At the mode of four Gaussians: widths that policies have (docs/algorithms.md)."""
     for factor, active in ((1.01, False), (0.99, True)):
         log_density = -math.log(factor * width * math.sqrt(2 * math.pi))

@@ -70,7 +70,7 @@ def test_identity_on_two_frames_is_never_positive() -> None:
     assert (transition_bounds(estimator, x, y) > 0).any()
 
 
-def test_transition_bound_is_the_bound_written_out() -> None:
+def test_transition_bound_equals_its_formula() -> None:
     torch.manual_seed(1)
     estimator = make_estimator(3, 2)
     x, y = torch.randn(5, 2, 3), torch.randn(5, 2, 2)
@@ -88,7 +88,7 @@ def trained_by(
     return found, means, [estimator._flat.gradient(p).clone() for p in estimator.parameters()]
 
 
-def test_bound_and_gradients_are_those_of_layer_by_layer() -> None:
+def test_compiled_bound_and_gradients_equal_autograd() -> None:
     generator = torch.Generator().manual_seed(2)
     estimator = make_estimator(3, 2, hidden_size=20).double()
     x, y = (torch.randn(4, 11, n, generator=generator).double() for n in (3, 2))
@@ -113,7 +113,7 @@ def test_bound_and_gradients_are_those_of_layer_by_layer() -> None:
 
 
 @pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf])
-def test_what_is_not_finite_spoils_what_it_spoils_in_autograd(bad: float) -> None:
+def test_non_finite_values_spread_as_in_autograd(bad: float) -> None:
     estimator = make_estimator(2, 2, hidden_size=8).double()
     frames = torch.randn(4, 6, 4, generator=torch.Generator().manual_seed(0)).double()
     permutations = time_permutations(4, 6, torch.Generator().manual_seed(1))
@@ -132,7 +132,7 @@ def test_what_is_not_finite_spoils_what_it_spoils_in_autograd(bad: float) -> Non
                 assert torch.equal(one.isfinite(), other.isfinite())
 
 
-def test_updates_are_those_of_adam_after_the_bounds_of_each() -> None:
+def test_compiled_estimator_updates_equal_adam() -> None:
     torch.manual_seed(0)
     ours = make_estimator(2, 2, hidden_size=32)
     theirs = copy.deepcopy(ours)
@@ -179,7 +179,7 @@ def correlated(rows: int) -> tuple[Tensor, Tensor]:
 
 
 @pytest.mark.parametrize(("offset", "spread"), [(1e6, 0.5), (-3e3, 1.0), (0.0, 1e4), (5e5, 3e4)])
-def test_inputs_far_from_0_are_learned_from_like_others(offset: float, spread: float) -> None:
+def test_inputs_far_from_0_reach_the_same_bound(offset: float, spread: float) -> None:
     def bound(x: Tensor, y: Tensor, *, adapts: bool) -> float:
         torch.manual_seed(0)
         estimator = make_estimator(2, 2, hidden_size=32)
@@ -203,7 +203,7 @@ def test_inputs_far_from_0_are_learned_from_like_others(offset: float, spread: f
         assert bound(*far, adapts=False) == pytest.approx(0, abs=1e-12), "what this is for"
 
 
-def test_inputs_near_0_are_used_raw_and_the_state_says_what_is_not() -> None:
+def test_inputs_near_0_are_raw_and_scaling_is_part_of_the_state() -> None:
     x, y = correlated(20)
     estimator, copy = make_estimator(2, 2), make_estimator(2, 2)
     before = estimator(x + 1.3, y)
@@ -229,7 +229,7 @@ INSIDE = torch.arange(11) < COUNTS.unsqueeze(1)
 
 
 @pytest.mark.parametrize("draws", [None, 1])
-def test_of_unequal_trajectories_each_is_shuffled_by_itself(draws: int | None) -> None:
+def test_padding_is_never_shuffled_into_a_trajectory(draws: int | None) -> None:
     generator = torch.Generator().manual_seed(0)
     times = [time_permutations(4, 11, generator, draws=draws, inside=INSIDE) for _ in range(500)]
     for drawn in times:
@@ -241,7 +241,7 @@ def test_of_unequal_trajectories_each_is_shuffled_by_itself(draws: int | None) -
     assert ((first - 500 / 7).abs() < 5 * 8).all()
 
 
-def test_bound_of_unequal_trajectories_is_that_of_each_by_itself() -> None:
+def test_bounds_of_padded_trajectories_equal_bounds_of_each_alone() -> None:
     generator = torch.Generator().manual_seed(2)
     estimator = make_estimator(3, 2, hidden_size=20).double()
     x, y = (torch.randn(4, 11, n, generator=generator).double() for n in (3, 2))

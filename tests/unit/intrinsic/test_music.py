@@ -28,7 +28,7 @@ def transitions(rows: int) -> tuple[Tensor, Tensor]:
 
 
 @pytest.mark.parametrize(("rows", "draws"), [(4096, 16), (256, 1), (32, 1), (300, 2), (1000, 4)])
-def test_each_worker_of_256_rows_draws_its_own_shuffle(rows: int, draws: int) -> None:
+def test_every_256_rows_draw_their_own_shuffle(rows: int, draws: int) -> None:
     one, updates = music(), 100 if rows > 1000 else 1000
     states, followers = transitions(rows)
     drawn = one.draw(updates, updates * rows, None, torch.Generator().manual_seed(2), first=False)
@@ -51,7 +51,7 @@ def test_each_worker_of_256_rows_draws_its_own_shuffle(rows: int, draws: int) ->
 
 
 @pytest.mark.parametrize("shuffle", ["random", "independent"])
-def test_compiled_updates_see_the_shuffles_of_the_reference(shuffle: str) -> None:
+def test_compiled_rewards_use_the_drawn_shuffles(shuffle: str) -> None:
     one, updates, rows = music(shuffle), 3, 600
     states, followers = transitions(updates * rows)
     trajectories = {"obs": torch.randn(updates * 520, 9, 6)}

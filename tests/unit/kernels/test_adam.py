@@ -88,7 +88,7 @@ def saved(state: dict[str, object]) -> dict[str, object]:
 
 @pytest.mark.parametrize("carried", [deep_copied, saved])
 @pytest.mark.parametrize("behind", [0, 1, 4])
-def test_it_goes_on_from_a_state(carried: Callable[..., dict[str, object]], behind: int) -> None:
+def test_it_continues_from_a_loaded_state(carried: Callable[..., dict[str, object]], behind: int) -> None:
     training = Training()
     for _ in range(behind):
         training.step()
@@ -122,7 +122,7 @@ def test_gradients_are_forgotten_or_made_zero() -> None:
 
 
 @pytest.mark.parametrize("behind", [0, 3])
-def test_a_flat_step_has_the_numbers_and_the_state_of_adam(behind: int) -> None:
+def test_a_compiled_step_has_the_numbers_and_the_state_of_adam(behind: int) -> None:
     training = Training()
     for _ in range(behind):
         training.step()

@@ -25,7 +25,7 @@ print(twice(21), sum(twice.stats.cache_hits.values()), before, is_kept(twice))
 """
 
 
-def test_the_next_process_finds_what_was_compiled_until_the_source_changes(tmp_path: Path) -> None:
+def test_machine_code_is_cached_until_the_source_changes(tmp_path: Path) -> None:
     program = tmp_path / "program.py"
 
     def result_and_hits() -> str:
@@ -57,7 +57,7 @@ while not pathlib.Path({str(go)!r}).exists():
     assert sorted(hits) == ["0", "1", "1"]
 
 
-def test_where_nothing_can_be_written_each_process_compiles(
+def test_without_a_writable_cache_each_process_compiles(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def nowhere(*_: Any) -> None:
@@ -70,7 +70,7 @@ def test_where_nothing_can_be_written_each_process_compiles(
     assert "no locator available" in caplog.text
 
 
-def test_a_full_disk_stops_nothing(
+def test_a_full_disk_only_prints_a_warning(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def full(*_: Any) -> None:

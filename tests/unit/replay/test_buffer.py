@@ -40,7 +40,7 @@ def replay(capacity: int, **settings: Any) -> TrajectoryReplay:
 
 @given(lengths=st.lists(st.integers(1, 5), min_size=1, max_size=40))
 @settings(deadline=None)
-def test_keeps_the_newest_whole_episodes_whatever_their_lengths(lengths: list[int]) -> None:
+def test_the_ring_keeps_the_newest_whole_episodes_of_any_length(lengths: list[int]) -> None:
     buffer, model = replay(12), deque[tuple[int, int]]()
     for number, steps in enumerate(lengths):
         buffer.extend([episode(number, steps, terminated=steps < 5)])
@@ -112,7 +112,7 @@ def moving_replay(**settings: Any) -> TrajectoryReplay:
     return replay(1100, hindsight_k=4.0, hindsight_episodes="moved", **settings)
 
 
-def test_hindsight_of_moved_episodes_leaves_out_those_that_reach_every_goal_at_once() -> None:
+def test_hindsight_of_moved_episodes_excludes_episodes_at_rest() -> None:
     buffer = moving_replay()
     buffer.extend([resting(n, 5) for n in range(3)])
     # Nothing has moved yet: hindsight takes what there is.
@@ -169,7 +169,7 @@ def dense(achieved: np.ndarray, desired: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("jitter", [1e-6, 0.049])
-def test_where_a_distance_is_given_jitter_is_no_move_even_with_dense_rewards(jitter: float) -> None:
+def test_jitter_within_moved_distance_does_not_count_as_moved(jitter: float) -> None:
     def shaken(number: int, by: float) -> Trajectory:
         played = resting(number, 5)
         frames = played.frames.copy()
@@ -193,7 +193,7 @@ def test_where_a_distance_is_given_jitter_is_no_move_even_with_dense_rewards(jit
     assert batch.inputs[batch.inputs[:, 3] >= 0, 0].min() == 50
 
 
-def test_trajectories_of_one_length_come_whole_and_in_order() -> None:
+def test_trajectories_of_one_length_are_drawn_whole_without_padding() -> None:
     buffer = replay(100)
     buffer.extend([episode(n, 5) for n in range(3)])
     whole = buffer.sample_trajectories(6_000)
@@ -205,7 +205,7 @@ def test_trajectories_of_one_length_come_whole_and_in_order() -> None:
     assert buffer.sample_trajectories(9, width=2).observations.shape == (9, 6, 2)
 
 
-def test_trajectories_of_any_length_come_whole_each_by_its_steps() -> None:
+def test_trajectories_are_drawn_whole_in_proportion_to_their_steps() -> None:
     buffer = replay(1_000)
     # Mostly short ones, some of a single step, and the longest right at the ring's end.
     lengths = [2] * 40 + [1] * 7 + [4] * 5 + [5]
@@ -224,7 +224,7 @@ def test_trajectories_of_any_length_come_whole_each_by_its_steps() -> None:
     assert counts[40:47].max() == 0
 
 
-def test_single_steps_are_whole_trajectories_where_there_is_nothing_else() -> None:
+def test_single_step_trajectories_are_drawn_only_without_others() -> None:
     buffer = replay(100)
     buffer.extend([episode(n, 1) for n in range(3)])
     assert buffer.sample_trajectories(9).observations.shape == (9, 2, 3)
@@ -233,7 +233,7 @@ def test_single_steps_are_whole_trajectories_where_there_is_nothing_else() -> No
 
 
 @given(st.lists(st.integers(1, 6), min_size=1, max_size=6))
-def test_trajectories_are_put_side_by_side_as_they_are_read(counts: list[int]) -> None:
+def test_trajectories_are_padded_with_their_last_frame(counts: list[int]) -> None:
     rng = np.random.default_rng(0)
     frames = [rng.normal(size=(count, 2)).astype(np.float32) for count in counts]
     whole = WholeTrajectories.of(frames)
@@ -249,7 +249,7 @@ def test_trajectories_are_put_side_by_side_as_they_are_read(counts: list[int]) -
     choice=st.sampled_from(["all", "moved"]),
 )
 @settings(deadline=None, max_examples=40)
-def test_restored_replay_is_the_same_and_goes_on_the_same(lengths: list[int], choice: str) -> None:
+def test_a_restored_replay_draws_the_same_transitions(lengths: list[int], choice: str) -> None:
     original, restored = (replay(12, hindsight_k=4.0, hindsight_episodes=choice) for _ in range(2))
     made = [(resting if n % 2 else episode)(n, steps) for n, steps in enumerate(lengths)]
     original.extend(made)
@@ -266,7 +266,7 @@ def test_restored_replay_is_the_same_and_goes_on_the_same(lengths: list[int], ch
         np.testing.assert_array_equal(getattr(ours, field), getattr(theirs, field))
 
 
-def test_memory_is_what_the_documentation_says() -> None:
+def test_memory_is_as_documented() -> None:
     layout = ReplayLayout(observation=25, action=4, goal=3, horizon=50)
     buffer = TrajectoryReplay(layout, 1_000_000, np.random.default_rng(0))
     assert buffer.nbytes == pytest.approx(151e6, rel=0.005)
@@ -319,7 +319,7 @@ def test_tree_holds_the_weights_and_draws_in_proportion(
     assert copy.total == tree.total
 
 
-def test_dense_ranks_leave_the_least_out_and_share_ties() -> None:
+def test_dense_ranks_exclude_the_least_and_share_ties() -> None:
     np.testing.assert_array_equal(rank_weights(np.array([0.3, 0.1, 0.3, 0.7])), [1, 0, 1, 2])
     np.testing.assert_array_equal(rank_weights(np.array([0.2, 0.2])), [1, 1])
 

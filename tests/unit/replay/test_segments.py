@@ -79,7 +79,7 @@ batches = st.lists(st.lists(st.integers(1, 5), max_size=7), min_size=1, max_size
     most=st.integers(1, 5),
 )
 @settings(max_examples=60, deadline=None)
-def test_saved_loaded_and_saved_again_it_is_the_same_bytes(
+def test_saving_a_loaded_replay_gives_the_same_bytes(
     lengths: list[list[int]], td: bool, ranked: bool, seed: int, most: int, tmp_path_factory: Any
 ) -> None:
     """After random contents and wrap-arounds, whatever was written at which checkpoint."""
@@ -141,7 +141,7 @@ def test_a_checkpoint_writes_only_what_is_new(disk: Disk) -> None:
     assert disk.written == 0
 
 
-def test_segments_of_overwritten_trajectories_are_needed_no_more(disk: Disk) -> None:
+def test_segments_of_overwritten_trajectories_are_dropped(disk: Disk) -> None:
     rng, replay, segments = np.random.default_rng(0), make(20), list[Segment]()
     for _ in range(5):
         replay.extend([episode(rng, 5), episode(rng, 5)])
@@ -149,7 +149,7 @@ def test_segments_of_overwritten_trajectories_are_needed_no_more(disk: Disk) -> 
     assert [(segment.first, segment.end) for segment in segments] == [(6, 8), (8, 10)]
 
 
-def test_what_does_not_fit_is_refused(disk: Disk) -> None:
+def test_missing_or_too_many_trajectories_are_refused(disk: Disk) -> None:
     rng, replay = np.random.default_rng(0), make(20)
     replay.extend([episode(rng, 5)])
     first = new_segments(replay, [], disk.write)
@@ -186,6 +186,6 @@ def test_plain_states_keep_values_and_types(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("value", [object(), {(1, 2): 3}, np.array(["text"]), {"x": [print]}])
-def test_what_is_no_plain_state_is_refused(value: Any, tmp_path: Path) -> None:
+def test_an_object_in_the_state_is_refused(value: Any, tmp_path: Path) -> None:
     with pytest.raises(TypeError, match=r"^state\S* must "):
         write_state(tmp_path, value)

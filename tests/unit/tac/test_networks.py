@@ -81,7 +81,7 @@ def test_frozen_critics_pass_gradients_to_their_inputs_only() -> None:
 @pytest.mark.parametrize(
     ("bounds", "first_std"), [((-20.0, 2.0), 1.234e-4), ((-5.0, 2.0), 0.2231)], ids=str
 )
-def test_log_std_is_cut_off_at_its_bounds_or_scaled_between_them(
+def test_log_std_is_clamped_to_its_bounds_or_scaled_between_them(
     bounds: tuple[float, float], first_std: float
 ) -> None:
     """TAC-2020 writes -20 + 11 (tanh(x) + 1), the original MUSIC's SAC -5 + 3.5 (tanh(x) + 1)."""

@@ -45,7 +45,7 @@ def exact_moments(values: Numbers) -> tuple[float, float]:
     sizes=st.lists(st.integers(1, 30), min_size=1, max_size=5),
     seed=st.integers(0, 99),
 )
-def test_moments_are_those_of_all_that_was_seen_at_any_offset(
+def test_moments_equal_exact_moments_at_any_offset(
     offset: float, spread: float, sizes: list[int], seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -81,21 +81,21 @@ def test_narrow_features_are_divided_by_epsilon_and_all_are_clipped() -> None:
     value=st.floats(-1e9, 1e9, width=32),
     sizes=st.lists(st.integers(1, 999), min_size=1, max_size=6),
 )
-def test_a_feature_that_never_varied_says_nothing_later(value: float, sizes: list[int]) -> None:
+def test_a_feature_that_was_constant_stays_0_until_the_next_update(value: float, sizes: list[int]) -> None:
     normaliser = fed(*(np.full((size, 1), value, np.float32) for size in sizes))
     assert float(normaliser(torch.tensor([value + abs(value) + 1.0]))) == 0.0
     normaliser.update(torch.tensor([[value + abs(value) + 1.0]]))
     assert float(normaliser(torch.tensor([2 * (value + abs(value) + 1.0) - value]))) > 0
 
 
-def test_flicker_between_two_neighbours_of_float32_is_no_variation() -> None:
+def test_adjacent_float32_values_count_as_constant() -> None:
     for value in np.array([1.0, 1.34, 1.99, 1e6], np.float32):
         neighbour = np.nextafter(value, np.float32(np.inf))
         normaliser = fed(np.tile([[value], [neighbour]], (50, 1)))
         assert float(normaliser(torch.tensor([2.0 * value]))) == 0.0
 
 
-def test_it_is_part_of_the_state_and_changes_nothing_before_its_first_update() -> None:
+def test_the_normalizer_is_identity_at_first_and_part_of_the_state() -> None:
     fresh = RunningNormaliser(2, epsilon=0.01, clip=5.0)
     torch.testing.assert_close(fresh(torch.tensor([1.0, -2.0])), torch.tensor([1.0, -2.0]))
     fresh.update(torch.randn(10, 2))
@@ -115,7 +115,7 @@ def of_music_u(rng: np.random.Generator, rows: int, constant: float) -> Numbers:
 
 
 @pytest.mark.parametrize("constant", [0.0, 1.34, 1e6])
-def test_what_the_source_saw_as_a_constant_begins_anew_and_the_rest_goes_on(
+def test_constants_of_the_source_run_are_reset_and_other_moments_kept(
     constant: float,
 ) -> None:
     rng = np.random.default_rng(0)
