@@ -12,6 +12,7 @@ from ray.rllib.core import DEFAULT_MODULE_ID
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 
+from music_rllib.config.problems import problems_of
 from music_rllib.config.returns import Range, cut_off
 from music_rllib.config.tac_settings import TACSettings
 from music_rllib.envs.tasks import BUILT_IN_TASKS, LAST_SEED, Indices, check_split
@@ -162,6 +163,14 @@ class TACConfigBase(AlgorithmConfig):
         fields = _prefixed("replay", settings, ReplaySettings)
         return self._set(fields, moved_distance=moved_distance)
 
+    def use(self, settings: AlgorithmSettings) -> Self:
+        """Take over validated settings, such as those of a sweep's run; nothing is validated."""
+        for part, (_, prefix) in zip(settings, _MODELS, strict=True):
+            for name, value in part:
+                setattr(self, prefix + name, value)
+        self._settings = settings
+        return self
+
     def _set(self, settings: Mapping[str, Any], **optional: Any) -> Self:
         """Set attributes; those of `optional` only if they are provided."""
         given = {name: value for name, value in optional.items() if value is not NotProvided}
@@ -214,13 +223,9 @@ class TACConfigBase(AlgorithmConfig):
         try:
             return model.model_validate(values)
         except ValidationError as error:
-            problems = []
-            for problem in error.errors():
-                where = ".".join(str(part) for part in problem["loc"] if part not in _TAGS)
-                rule = problem["msg"].removeprefix("Value error, ")
-                value = "" if "got " in rule else f", got {problem['input']!r}"
-                problems.append(f"{prefix}{where}: {rule}{value}" if where else rule)
-            raise ValueError("; ".join(problems)) from None
+            found = problems_of(error, values, model)
+            lines = (f"{prefix}{'.'.join(map(str, path))} {rule}".lstrip() for path, rule in found)
+            raise ValueError("\n".join(lines)) from None
 
     def validate(self) -> None:
         if not self.in_evaluation and (problems := list(ignored_settings(self))):
@@ -338,13 +343,6 @@ _MODELS: tuple[tuple[type[BaseModel], str], ...] = (
 )
 """Types of `AlgorithmSettings`, and the prefix of their fields as attributes of the config."""
 _FIELDS = frozenset(prefix + name for model, prefix in _MODELS for name in model.model_fields)
-_TAGS = frozenset(
-    {
-        *("constant", "linear", "piecewise", "measured", "scheduled", "learned"),
-        *("policy", "gaussian_noise"),
-    }
-)
-"""Tags of unions, which pydantic adds to an error's location."""
 
 
 def _prefixed(method: str, settings: Mapping[str, Any], model: type[BaseModel]) -> dict[str, Any]:

@@ -26,6 +26,7 @@ from music_rllib.store.history import Report
 from music_rllib.store.serialization import read_arrays, read_state, write_arrays, write_state
 from music_rllib.store.work_folder import NewCheckpoint, SavedCheckpoint
 from music_rllib.tac.algorithm import TAC, TACConfig
+from music_rllib.tac.config import AlgorithmSettings, Split
 from music_rllib.tac.env_runner import DISPLACEMENT, MOVED, SUCCESS_ANY, SUCCESS_LAST
 from music_rllib.tac.networks import for_another_run
 
@@ -52,14 +53,14 @@ def algorithm_config(run: RunSettings) -> TACConfig:
     config = TACConfig()
     config.environment(run.task.env_id, env_config=dict(run.task.env_kwargs))
     config.env_runners(num_env_runners=0, num_envs_per_env_runner=run.num_envs)
-    config.training(**dict(run.tac), total_env_steps=run.env_steps)
-    config.max_episode_steps = min(run.tac.max_episode_steps or run.task.horizon, run.task.horizon)
-    config.music(
-        agent_indices=run.task.agent_indices,
-        surrounding_indices=run.task.surrounding_indices,
-        **dict(run.music),
+    steps = min(run.tac.max_episode_steps or run.task.horizon, run.task.horizon)
+    split = Split(
+        agent_indices=run.task.agent_indices, surrounding_indices=run.task.surrounding_indices
     )
-    config.replay(moved_distance=run.task.moved_distance, **dict(run.replay))
+    tac = run.tac.model_copy(update={"max_episode_steps": steps})
+    config.use(AlgorithmSettings(tac, run.music, run.replay, split))
+    config.training(total_env_steps=run.env_steps)
+    config.replay(moved_distance=run.task.moved_distance)
     config.success_key, config.success_if_missing = run.task.success_key, False
     config.seed_range = run.task.seed_range
     # `TrainingRun` evaluates at given environment steps.

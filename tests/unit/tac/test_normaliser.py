@@ -81,7 +81,7 @@ def test_narrow_features_are_divided_by_epsilon_and_all_are_clipped() -> None:
     value=st.floats(-1e9, 1e9, width=32),
     sizes=st.lists(st.integers(1, 999), min_size=1, max_size=6),
 )
-def test_a_feature_that_was_constant_stays_0_until_the_next_update(value: float, sizes: list[int]) -> None:
+def test_a_constant_feature_stays_0_until_the_next_update(value: float, sizes: list[int]) -> None:
     normaliser = fed(*(np.full((size, 1), value, np.float32) for size in sizes))
     assert float(normaliser(torch.tensor([value + abs(value) + 1.0]))) == 0.0
     normaliser.update(torch.tensor([[value + abs(value) + 1.0]]))
