@@ -37,15 +37,6 @@ def check(folder: Path, *tasks: dict[str, Any], **replay: Any) -> list[str]:
     return check_environments(make_plan(load_sweep(path)))
 
 
-def test_tasks_that_fit_pass(tmp_path: Path) -> None:
-    tasks = (
-        PUSH,
-        PUSH | {"horizon": 20, "success_key": None},
-        PUSH | {"horizon": 80, "env_kwargs": {"max_episode_steps": 80}},
-    )
-    assert check(tmp_path, *tasks, hindsight_k=4.0) == []
-
-
 MISFITS: list[tuple[dict[str, Any], str]] = [
     (PUSH | {"env_id": "FetchPsh-v4"}, "env_id must name an environment that can be made"),
     (
@@ -58,17 +49,8 @@ MISFITS: list[tuple[dict[str, Any], str]] = [
         "env_kwargs: {max_episode_steps: 80} would raise that",
     ),
     (
-        PUSH | {"success_key": "is_succes"},
-        "success_key must be null or a key of info (is_success), "
-        "got 'is_succes' (did you mean 'is_success'?)",
-    ),
-    (
         {"env_id": "CartPole-v1", "horizon": 100},
         "the action space must be a bounded one-dimensional Box",
-    ),
-    (
-        {"env_id": "Pendulum-v1", "horizon": 200, "success_key": None},
-        "must have goals for replay.hindsight_k > 0, its observations have none",
     ),
     (
         {"env_id": "HandManipulatePen-v1", "horizon": 100},
@@ -78,8 +60,9 @@ MISFITS: list[tuple[dict[str, Any], str]] = [
 
 
 def test_tasks_that_do_not_fit_are_named(tmp_path: Path) -> None:
+    fits = PUSH | {"horizon": 80, "env_kwargs": {"max_episode_steps": 80}}
     with pytest.raises(TaskError) as caught:
-        check(tmp_path, *(task for task, _ in MISFITS), hindsight_k=4.0)
+        check(tmp_path, *(task for task, _ in MISFITS), fits, hindsight_k=4.0)
     lines = str(caught.value).splitlines()
     for i, (line, (_, rule)) in enumerate(zip(lines, MISFITS, strict=True)):
         assert line.startswith(f"environments.T{i}: {rule}")

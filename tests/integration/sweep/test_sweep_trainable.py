@@ -219,8 +219,9 @@ def test_a_task_sets_the_distance_that_counts_as_moved() -> None:
         return run.network_weights()["policy"]["0.weight"]
 
     # 100 is beyond every movement; without a distance, the reward decides.
-    np.testing.assert_array_equal(weights(100.0, "moved"), weights(None, "all"))
-    assert (weights(None, "moved") != weights(None, "all")).any()
+    without = weights(None, "all")
+    np.testing.assert_array_equal(weights(100.0, "moved"), without)
+    assert (weights(None, "moved") != without).any()
 
 
 @pytest.mark.usefixtures("local_ray")
