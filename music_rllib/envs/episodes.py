@@ -151,7 +151,7 @@ class Recording:
                 step, given, computed = found
                 raise BadNumberError.at(
                     f"{self._name}, step {step}",
-                    "replay.hindsight_k must be 0 where compute_reward is not the whole reward of "
+                    "replay.hindsight_k must be 0 if compute_reward is not the whole reward of "
                     f"a step: a step returned reward {given:g}, compute_reward gives {computed:g}",
                 )
         return episode

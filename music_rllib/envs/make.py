@@ -198,7 +198,7 @@ def goal_reward_of(env: Env, seed: int = 0) -> GoalReward:
     if problem:
         rule, reason = problem
         raise ValueError(
-            f"replay.hindsight_k must be 0 where {rule}: with {name_of(env)}, {reason}"
+            f"replay.hindsight_k must be 0 if {rule}: with {name_of(env)}, {reason}"
         )
     return reward
 

@@ -210,7 +210,7 @@ def test_relabeled_rewards_equal_those_of_an_episode_with_that_goal(task: Task, 
 def test_environments_whose_rewards_hindsight_cannot_use_are_refused() -> None:
     scaled = gym.wrappers.TransformReward(make_env("FetchReach-v4"), lambda r: 2 * float(r))
     for env, message in (
-        (make_env("HandManipulatePen-v1"), "must be 0 where compute_reward.*HandManipulatePen-v1"),
+        (make_env("HandManipulatePen-v1"), "must be 0 if compute_reward.*HandManipulatePen-v1"),
         (scaled, "a step returned reward -2, compute_reward gives -1"),
         (make_env("Pendulum-v1"), "must be 0 without a goal environment: Pendulum-v1"),
     ):

@@ -54,7 +54,7 @@ MISFITS: list[tuple[dict[str, Any], str]] = [
     ),
     (
         {"env_id": "HandManipulatePen-v1", "horizon": 100},
-        "replay.hindsight_k must be 0 where compute_reward does not compute each row",
+        "replay.hindsight_k must be 0 if compute_reward does not compute each row",
     ),
 ]
 

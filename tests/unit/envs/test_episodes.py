@@ -218,5 +218,5 @@ class Reach(gym.Env[Any, Any]):
 
 def test_an_additional_cost_of_actions_is_found() -> None:
     goal_reward_of(Reach(0.0))
-    with pytest.raises(ValueError, match="must be 0 where compute_reward is not the whole reward"):
+    with pytest.raises(ValueError, match="must be 0 if compute_reward is not the whole reward"):
         goal_reward_of(Reach(0.5))
