@@ -1,4 +1,4 @@
-"""An environment that costs next to nothing: a point that pushes another one to a goal."""
+"""A cheap environment: a point that pushes another point to a goal."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ Array = NDArray[np.float32]
 
 
 class Point(gym.Env[dict[str, Array], Array]):
-    """Observation: agent (2), object (2), which drifts with the agent's actions.
+    """Observation: agent (2) and object (2), which moves with the agent's actions.
 
     Args:
-        fail_at: the environment's lifetime step at which it raises; for tests of failures.
-        nan_at: the one at which the object's position is NaN.
+        fail_at: step, counted over all episodes, at which it raises an error.
+        nan_at: step, counted likewise, at which the object's position becomes NaN.
     """
 
     def __init__(self, fail_at: int | None = None, nan_at: int | None = None) -> None:
@@ -72,10 +72,10 @@ class Point(gym.Env[dict[str, Array], Array]):
 
 
 class Meeting(Point):
-    """Leaves the node's name in `folder` and waits for that of another node.
+    """Write the node's name to `folder`, and wait until another node has done so.
 
     Args:
-        folder: where the runs meet.
+        folder: shared folder.
     """
 
     def __init__(self, folder: str) -> None:
@@ -83,7 +83,7 @@ class Meeting(Point):
 
         super().__init__()
         if not ray.is_initialized():
-            return  # the driver only looks at it
+            return  # in the driver
         Path(folder, ray.get_runtime_context().get_node_id()).touch()
         for _ in range(1500):
             if len(list(Path(folder).iterdir())) > 1:
@@ -93,11 +93,11 @@ class Meeting(Point):
 
 
 class Hanging(Point):
-    """Does not return from a step.
+    """Never return from a step.
 
     Args:
-        at: the environment's lifetime step.
-        locked: whether it holds Python's lock while it hangs, as a simulator in C may.
+        at: number of the step, counted over all episodes.
+        locked: whether it holds Python's lock meanwhile, as a simulator in C may.
     """
 
     def __init__(self, at: int = 50, locked: bool = False) -> None:
@@ -115,11 +115,7 @@ class Hanging(Point):
 
 
 class Paced(Point):
-    """Takes its time as long as there is no file at `fast`, so that it can be interrupted.
-
-    Args:
-        fast: the file.
-    """
+    """Step slowly until the file `fast` exists, so that a run can be interrupted."""
 
     def __init__(self, fast: str) -> None:
         super().__init__()
@@ -132,7 +128,7 @@ class Paced(Point):
 
 
 class HandOver(Point):
-    """Is drawn in a size of its own, and takes no action beyond bounds that float32 can't hold."""
+    """Render in an unusual size, and check actions against bounds that float32 can't represent."""
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
 
