@@ -197,9 +197,7 @@ def goal_reward_of(env: Env, seed: int = 0) -> GoalReward:
         problem = _BY_ROW, f"it raises {one_line(error)}"
     if problem:
         rule, reason = problem
-        raise ValueError(
-            f"replay.hindsight_k must be 0 if {rule}: with {name_of(env)}, {reason}"
-        )
+        raise ValueError(f"replay.hindsight_k must be 0 if {rule}: with {name_of(env)}, {reason}")
     return reward
 
 
