@@ -262,7 +262,7 @@ def _attach(source: SweepRead, folder: Path, made: SweepReport) -> None:
     from music_rllib.report.build import made_files
     from music_rllib.results.answer import answer
     from music_rllib.results.data import ReportError
-    from music_rllib.tracking.store import SweepRun
+    from music_rllib.tracking.tracker import SweepRun
 
     if source.opened is None:
         raise ReportError("--attach must be given with a sweep in its storage, got an exported one")

@@ -9,7 +9,7 @@ import re
 import shutil
 import sqlite3
 import warnings
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -76,6 +76,23 @@ def mlflow_reason(error: Exception) -> str:
     return f"{line} {hint}".rstrip()
 
 
+@contextlib.contextmanager
+def answers_named(store: TrackingStore, action: str) -> Iterator[None]:
+    """Turn MLflow's errors into one that names the store and what it must do.
+
+    Raises:
+        TrackingError: MLflow does not answer, or refuses.
+    """
+    try:
+        yield
+    except TrackingError:
+        raise
+    except Exception as error:
+        raise TrackingError(
+            f"MLflow at {store.public_uri} must {action}, it answered: {mlflow_reason(error)}"
+        ) from error
+
+
 class KnownRun(NamedTuple):
     """A run that exists in MLflow."""
 
@@ -105,17 +122,10 @@ class Experiment:
         """Parent runs of other plans of the sweep."""
         self._known: dict[str, KnownRun] | None = None
         """Runs by node key ("" for the parent run); None until the server has listed them."""
-        try:
+        with answers_named(store, f"accept the experiment {name!r}"):
             self.client = open_client(store)
             """Sends the requests about one run."""
             self.id = self._find_or_create()
-        except TrackingError:
-            raise
-        except Exception as error:
-            raise TrackingError(
-                f"MLflow at {store.public_uri} must accept the experiment {name!r}, "
-                f"it answered: {mlflow_reason(error)}"
-            ) from error
 
     # -- finding and creating runs -----------------------------------------------------------
 

@@ -15,7 +15,6 @@ from music_rllib.policy.policy import policy_from_folder
 from music_rllib.store.history import Report, RunResult
 from music_rllib.store.node_store import NodeStore
 from music_rllib.store.storage import StorageError
-from music_rllib.tracking.client import Status
 from music_rllib.tracking.run_queue import StoredRun
 from music_rllib.tracking.tracker import Tracker
 
@@ -32,13 +31,10 @@ class MlflowListener(Listener):
         self.tracker = tracker
         self._store = store
         self._environments = environments
-        self._running: set[str] = set()
-        """Keys of nodes whose run has started and not ended."""
 
     def started(self, node: Node) -> None:
         """Start the node's MLflow run, or continue an earlier one."""
         self.tracker.start(run_info(node, self._environments.get(node.run.task.name)))
-        self._running.add(node.key)
 
     def reported(self, node: Node, reports: list[Report]) -> None:
         """Log metrics with their original time, so that repeats are identical."""
@@ -48,22 +44,17 @@ class MlflowListener(Listener):
         """Log a run that this sweep or an earlier one has finished, with its policy."""
         info = run_info(node, self._store.environment(node.key))
         self.tracker.mirror(info, partial(finished_run, self._store, node))
-        self._running.discard(node.key)
 
     def failed(self, node: Node, failure: Failure) -> None:
         """End the run with its cause."""
-        if node.key not in self._running:
+        if not self.tracker.is_running(node.key):
             self.started(node)
-        self._end(node, "FAILED", {names.TAG_FAILURE: failure.cause})
+        self.tracker.end(node.key, "FAILED", {names.TAG_FAILURE: failure.cause})
 
     def pruned(self, node: Node, reason: str) -> None:
         """End a run that was stopped early, with the reason."""
-        if node.key in self._running:
-            self._end(node, "KILLED", {names.TAG_PRUNED: reason})
-
-    def _end(self, node: Node, status: Status, tags: dict[str, str]) -> None:
-        self.tracker.end(node.key, status, tags)
-        self._running.discard(node.key)
+        if self.tracker.is_running(node.key):
+            self.tracker.end(node.key, "KILLED", {names.TAG_PRUNED: reason})
 
 
 def finished_run(store: NodeStore, node: Node) -> StoredRun:

@@ -10,14 +10,11 @@ import shlex
 import shutil
 import socket
 import sys
-import tempfile
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 from urllib.parse import unquote, urlsplit
 
-from music_rllib import names
 from music_rllib.errors import TrackingError
 from music_rllib.experiment.sweep_files import SweepLocation, as_json
 from music_rllib.redaction import redact
@@ -26,7 +23,6 @@ from music_rllib.store.storage import StorageError, database_url, sqlite_url
 if TYPE_CHECKING:
     import requests
 
-    from music_rllib.experiment.open_sweep import OpenSweep
 
 CONNECT_SECONDS = 3.0
 ANSWER_SECONDS = 5.0
@@ -119,66 +115,6 @@ class SweepRecord:
             location.write(RECORD, as_json(asdict(self)))
         except StorageError as error:
             raise TrackingError(str(error)) from error
-
-
-@dataclass(frozen=True, kw_only=True)
-class SweepRun:
-    """The parent run of a sweep's current plan in MLflow."""
-
-    store: TrackingStore
-    experiment_id: str
-    run_id: str
-
-    @classmethod
-    def of(cls, sweep: OpenSweep) -> SweepRun:
-        """The run that the sweep's record names.
-
-        Raises:
-            TrackingError: The sweep was not tracked.
-        """
-        record = SweepRecord.read(sweep.storage, sweep.config.name)
-        if record is None or not record.run_id:
-            raise TrackingError(
-                f"--attach must be given with a sweep that was tracked, {sweep.config.name} has no "
-                "run in MLflow: run the sweep again, which reuses finished runs"
-            )
-        # The record has no password; the driver of a sweep passes the whole URI to the report.
-        uri = os.environ.get(names.VARIABLE_TRACKING_URI) or record.tracking_uri
-        store = resolve_store(uri, sweep.storage)
-        return cls(store=store, experiment_id=record.experiment_id, run_id=record.run_id)
-
-    @property
-    def page(self) -> str:
-        """The address of the run's page, or its id if no server shows it."""
-        if not self.store.is_server:
-            return f"run {self.run_id}"
-        return f"{self.store.pages}/#/experiments/{self.experiment_id}/runs/{self.run_id}"
-
-    def attach(self, folder: Path, files: Iterable[str], name: str, note: str) -> None:
-        """Log `files` of `folder` as artifacts below `name`, and set the run's description.
-
-        Raises:
-            TrackingError: MLflow does not answer, or refuses the files.
-        """
-        check_reachable(self.store)
-        from music_rllib.tracking.client import mlflow_reason, open_client
-
-        try:
-            with tempfile.TemporaryDirectory() as copy:  # one upload of these files only
-                for file in files:
-                    target = Path(copy, file)
-                    target.parent.mkdir(exist_ok=True)
-                    shutil.copyfile(folder / file, target)
-                client = open_client(self.store)
-                client.log_artifacts(self.run_id, copy, name)
-                client.set_tag(self.run_id, names.TAG_NOTE, note)
-        except TrackingError:
-            raise
-        except Exception as error:
-            raise TrackingError(
-                f"MLflow at {self.store.public_uri} must take the report, it answered: "
-                f"{mlflow_reason(error)}"
-            ) from error
 
 
 def resolve_store(tracking_uri: str | None, storage: str) -> TrackingStore:

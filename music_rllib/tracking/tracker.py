@@ -9,10 +9,14 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import shlex
+import shutil
 import uuid
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import TracebackType
 from typing import Self
 from urllib.parse import urlencode
@@ -22,15 +26,28 @@ import yaml
 from music_rllib import names
 from music_rllib.command_line import PROGRAM
 from music_rllib.errors import TrackingError
+from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.run_info import RunInfo
 from music_rllib.redaction import redact, without_secrets
 from music_rllib.store.history import Report
 from music_rllib.store.serialization import content_key
 from music_rllib.store.storage import below
-from music_rllib.tracking.client import Experiment, Status, mlflow_reason
+from music_rllib.tracking.client import (
+    Experiment,
+    Status,
+    answers_named,
+    mlflow_reason,
+    open_client,
+)
 from music_rllib.tracking.run_queue import RunQueue, StoredRun
 from music_rllib.tracking.sender import Pending, Sender
-from music_rllib.tracking.store import SweepRecord, check_reachable, mlflow_version, resolve_store
+from music_rllib.tracking.store import (
+    SweepRecord,
+    TrackingStore,
+    check_reachable,
+    mlflow_version,
+    resolve_store,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -143,6 +160,10 @@ class Tracker:
         self._parent.put_text(name, content)
         self._sender.add(self._parent)
 
+    def is_running(self, node_key: str) -> bool:
+        """Whether a run was started and has not ended."""
+        return node_key in self._runs and self._runs[node_key].is_running
+
     def run_id(self, node_key: str) -> str | None:
         """MLflow's id of a run; None until the server has the run."""
         queue = self._runs.get(node_key)
@@ -224,13 +245,8 @@ class Tracker:
         parent = RunQueue(self._experiment, "", {names.TAG_SWEEP: self._name})
         parent.start(RunInfo(node_key="", name=self._name, config=config))
         parent.put_text(names.ARTEFACT_SWEEP_CONFIG, _as_yaml(config))
-        try:
+        with answers_named(self.store, "accept the sweep's run"):
             parent.attach()
-        except Exception as error:
-            raise TrackingError(
-                f"MLflow at {self.store.public_uri} must accept the sweep's run, "
-                f"it answered: {mlflow_reason(error)}"
-            ) from error
         return parent
 
     def _queue(self, node_key: str) -> RunQueue:
@@ -238,6 +254,56 @@ class Tracker:
             tags = {names.TAG_SWEEP: self._name, names.TAG_PARENT_RUN: self.parent_run_id}
             self._runs[node_key] = RunQueue(self._experiment, node_key, tags)
         return self._runs[node_key]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepRun:
+    """The parent run of a sweep's current plan in MLflow."""
+
+    store: TrackingStore
+    experiment_id: str
+    run_id: str
+
+    @classmethod
+    def of(cls, sweep: OpenSweep) -> SweepRun:
+        """The run that the sweep's record names.
+
+        Raises:
+            TrackingError: The sweep was not tracked.
+        """
+        record = SweepRecord.read(sweep.storage, sweep.config.name)
+        if record is None or not record.run_id:
+            raise TrackingError(
+                f"--attach must be given with a sweep that was tracked, {sweep.config.name} has no "
+                "run in MLflow: run the sweep again, which reuses finished runs"
+            )
+        # The record has no password; the driver of a sweep passes the whole URI to the report.
+        uri = os.environ.get(names.VARIABLE_TRACKING_URI) or record.tracking_uri
+        store = resolve_store(uri, sweep.storage)
+        return cls(store=store, experiment_id=record.experiment_id, run_id=record.run_id)
+
+    @property
+    def page(self) -> str:
+        """The address of the run's page, or its id if no server shows it."""
+        if not self.store.is_server:
+            return f"run {self.run_id}"
+        return f"{self.store.pages}/#/experiments/{self.experiment_id}/runs/{self.run_id}"
+
+    def attach(self, folder: Path, files: Iterable[str], name: str, note: str) -> None:
+        """Log `files` of `folder` as artifacts below `name`, and set the run's description.
+
+        Raises:
+            TrackingError: MLflow does not answer, or refuses the files.
+        """
+        check_reachable(self.store)
+        with answers_named(self.store, "take the report"), TemporaryDirectory() as copy:
+            for file in files:  # one upload of these files only
+                target = Path(copy, file)
+                target.parent.mkdir(exist_ok=True)
+                shutil.copyfile(folder / file, target)
+            client = open_client(self.store)
+            client.log_artifacts(self.run_id, copy, name)
+            client.set_tag(self.run_id, names.TAG_NOTE, note)
 
 
 _NOT_PLANNED = {"storage", "resources", "mlflow", "checkpoints", "analysis"}

@@ -29,8 +29,7 @@ from music_rllib.policy import PolicyNetwork
 from music_rllib.store.history import Report
 from music_rllib.tracking.policy_model import write_model
 from music_rllib.tracking.run_queue import StoredRun
-from music_rllib.tracking.store import SweepRun
-from music_rllib.tracking.tracker import Tracker
+from music_rllib.tracking.tracker import SweepRun, Tracker
 from tests.integration.mlflow_server import MlflowServer
 
 MakeTracker = Callable[..., Tracker]
