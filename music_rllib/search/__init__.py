@@ -1,1 +1,1 @@
-"""Searching for good trials with Optuna: proposals, judgement, studies. Knows no Ray."""
+"""Searches with Optuna: points, studies, the value of a trial, early stopping. Imports no Ray."""

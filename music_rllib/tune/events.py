@@ -24,13 +24,13 @@ from music_rllib.training.job import NodeJob
 from music_rllib.training.worker import CAUSE, NOTES, PAUSED, REPORTS, TRACEBACK
 
 RESTARTS = 3
-"""How often a run whose worker died is started again; one that raises an error fails at once."""
+"""Restarts of a run whose worker dies. A run that raises an error fails at once."""
 
-_COLOUR = re.compile(r"\x1b\[[0-9;]*m")
+_COLOR = re.compile(r"\x1b\[[0-9;]*m")
 
 
 class TuneEvents(Callback):
-    """Moves nodes in the scheduler as Tune's trials go on and end, and tells the listeners.
+    """Updates the scheduler when Tune's trials change, and passes the events to the listeners.
 
     Tune calls it with keywords only.
     """
@@ -38,7 +38,7 @@ class TuneEvents(Callback):
     def __init__(
         self, scheduler: Scheduler, store: NodeStore, listeners: Iterable[Listener], failures: Path
     ) -> None:
-        """Listen to Tune.
+        """Pass events of Tune to `listeners`.
 
         Args:
             scheduler: Has the nodes and their statuses.
@@ -52,7 +52,7 @@ class TuneEvents(Callback):
         self._failures = failures
 
     def __getstate__(self) -> dict[str, Any]:
-        # Tune pickles its callbacks into a snapshot, which nobody reads.
+        # Tune pickles its callbacks into a snapshot that is never read.
         return {}
 
     def on_step_end(self, **_: Any) -> None:
@@ -73,7 +73,7 @@ class TuneEvents(Callback):
                 listener.reported(node, reports)
 
     def on_trial_complete(self, *, trial: Trial, **_: Any) -> None:
-        """The trial says that it is done: it failed, was paused, or has published its result."""
+        """The trial ended: it failed, paused, or published its result."""
         try:
             self._complete(self._node(trial), trial)
         finally:
@@ -99,38 +99,38 @@ class TuneEvents(Callback):
             listener.finished(node, result)
 
     def on_trial_error(self, *, trial: Trial, **_: Any) -> None:
-        """The trial's worker died, or never came up, and is not started again."""
+        """The trial's worker died or never started, and is not restarted."""
         error = _error_of(trial)
         text = "".join(traceback.format_exception(error)) if error else _text_of(trial)
-        text = _COLOUR.sub("", text)
+        text = _COLOR.sub("", text)
         self._fail(self._node(trial), cause_of(error, text), text)
 
     def on_trial_recover(self, *, trial: Trial, **_: Any) -> None:
-        """The trial's worker died, and another one continues the run."""
-        text = _COLOUR.sub("", _text_of(trial))
+        """The trial's worker died, and another worker resumes the run."""
+        text = _COLOR.sub("", _text_of(trial))
         cause = redact(cause_of(_error_of(trial), text)).splitlines()[0]
         text = (
-            f"{cause} Another worker goes on from the last checkpoint "
+            f"{cause} Another worker resumes from the last checkpoint "
             f"({trial.run_metadata.num_failures} of {RESTARTS} times)."
         )
         node = self._node(trial)
         if self._store.work_folder(node.key).folder.read(RECORD) is not None:
-            text = "its environment hangs, so its worker was ended; another one will say where"
+            text = "its environment hangs, so its worker was ended; the next worker prints where"
         for listener in self._listeners:
             listener.noted(node, text)
 
     def _fail(self, node: Node, cause: str, text: str) -> None:
-        """Keep the traceback `text` in a file, fail the node, and skip what depends on it."""
-        # An environment may say anything, its database's password too.
+        """Write the traceback `text` to a file, fail the node, and skip its dependants."""
+        # An environment's message may hold a password.
         cause, text = redact(cause), redact(text)
-        # A name has 255 bytes at most; the key tells apart what was cut.
+        # A file name has at most 255 bytes; the key distinguishes shortened labels.
         label = re.sub(r"[^A-Za-z0-9._=,-]+", "_", node.label)[:150]
         log = self._failures / f"{label}-{node.key}.txt"
         try:
             log.parent.mkdir(parents=True, exist_ok=True)
             log.write_text(f"{node.label} (node {node.key})\n\n{text}\n", encoding="utf-8")
-        except OSError as error:  # perhaps the very reason of the failure: the others go on
-            cause += f"\n(the traceback could not be kept: {error})"
+        except OSError as error:  # possibly the reason of the failure
+            cause += f"\n(the traceback could not be written: {error})"
         dependants = self._scheduler.fail(node.key)
         for listener in self._listeners:
             listener.failed(node, Failure(cause, log))
@@ -142,17 +142,17 @@ class TuneEvents(Callback):
 
 
 def _error_of(trial: Trial) -> BaseException | None:
-    """The exception, from the file that this very process has just written."""
+    """The exception, from a file that this process has just written."""
     try:
         error = cloudpickle.loads(Path(trial.pickled_error_file).read_bytes())
     except Exception:
-        # Not every exception survives pickling; its text is there in any case.
+        # Not every exception can be pickled; its text is always available.
         return None
     return error if isinstance(error, BaseException) else None
 
 
 def _text_of(trial: Trial) -> str:
-    """The traceback that Tune has written into a file."""
+    """The traceback that Tune has written to a file."""
     try:
         return Path(trial.error_file).read_text(encoding="utf-8")
     except OSError as error:
@@ -160,7 +160,7 @@ def _text_of(trial: Trial) -> str:
 
 
 def _free(trial: Trial) -> None:
-    """Empty what a trial that is done has reported: Tune keeps every trial, and nobody reads it."""
+    """Free the reports of an ended trial, which Tune keeps and nobody reads."""
     metadata = trial.run_metadata
     metadata.metric_analysis, metadata.metric_n_steps = {}, {}
     metadata.last_result = {**metadata.last_result, REPORTS: "", NOTES: []}

@@ -83,16 +83,13 @@ class DagSearcher(Searcher):
     def on_trial_complete(
         self, trial_id: str, result: dict[str, Any] | None = None, error: bool = False
     ) -> None:
-        """Do nothing: the callback `TuneEvents`, which has the cause, moves the node.
-
-        Tune calls it before it asks for the next suggestion.
-        """
+        """Do nothing: the callback `TuneEvents` updates the node before the next suggestion."""
 
     def save_to_dir(self, checkpoint_dir: str, session_str: str = "default") -> None:
         """Save nothing."""
 
     def __getstate__(self) -> dict[str, Any]:
-        # Tune pickles the searcher into its snapshot, which nobody reads.
+        # Tune pickles the searcher into a snapshot that is never read.
         return {}
 
 
@@ -109,8 +106,8 @@ def compute(
         sweep: Afterwards, its scheduler has the status of each node.
         listeners: Receive the events of runs.
         on_stop: Called, in a signal handler, when the user asks to stop.
-        on_ray_gone: Called, in a thread, before the process ends because Ray has: with the cause,
-            or None where the user's signal has ended that as well.
+        on_ray_gone: Called, in a thread, before the process ends because Ray has ended: with the
+            cause, or None if the user's signal ended Ray too.
         searches: The controller of the searches, if there are any.
 
     Returns:
@@ -152,7 +149,7 @@ def compute(
             RunTrainable,
             tune_config=tune.TuneConfig(
                 search_alg=searcher,
-                # As many as the searcher suggests; -1 is without an end.
+                # As many as the searcher suggests; -1 means no limit.
                 num_samples=-1 if searches else len(sweep.scheduler.having(Status.WAITING)),
                 reuse_actors=_may_share_processes(sweep),
                 trial_name_creator=_trial_name,
@@ -163,17 +160,17 @@ def compute(
                 storage_path=folder,
                 verbose=0,
                 callbacks=[events, stopping],
-                # For workers that die; one that raises has the error in its result.
+                # For workers that die; errors of a run are in its result.
                 failure_config=tune.FailureConfig(max_failures=RESTARTS),
-                # Checkpoints are the trainable's own; Tune's would hold nothing.
+                # The trainable writes its own checkpoints.
                 checkpoint_config=tune.CheckpointConfig(checkpoint_at_end=False),
             ),
         )
         try:
             tuner.fit()
         except FileNotFoundError:
-            # Ray deletes a stopped job's working folder while its driver still ends, and Tune needs
-            # one for a summary that nobody reads.
+            # Ray deletes the working folder of a stopped job before its driver has ended, and Tune
+            # needs one for a summary that is never read.
             if stopping.received is None or _has_working_folder():
                 raise
     done = sweep.scheduler.complete and (searches is None or searches.over)
@@ -181,9 +178,9 @@ def compute(
 
 
 def _may_share_processes(sweep: OpenSweep) -> bool:
-    """Whether runs may follow one another in a process, which saves seconds of imports each.
+    """Whether a process may compute several runs, which saves seconds of imports for each.
 
-    A user's environment may keep state in its module, so its runs get a new process each.
+    A user's environment may keep state in its module, so each of its runs has a new process.
     """
     from music_rllib.envs.make import known_environment
 
@@ -199,15 +196,15 @@ def _has_working_folder() -> bool:
 
 
 def _trial_name(trial: Trial) -> str:
-    # A node that a search continues is a second trial of Tune's.
+    # A node that a search continues is another trial of Tune.
     return f"{NodeJob.from_tune(trial.config).key}-{trial.trial_id}"
 
 
 @contextlib.contextmanager
 def _tune_folder(sweep: OpenSweep) -> Iterator[str]:
-    """A folder for the files of Tune, which nobody reads; all machines of the cluster reach it."""
+    """A folder for Tune's files, which are never read; every machine of the cluster reaches it."""
     if cluster_address() is None:
-        # Not in the storage: a full one must not end the runs that have no need of it.
+        # Not in the storage: if that is full, Tune must not stop the runs.
         with tempfile.TemporaryDirectory(
             prefix="music-tune-", ignore_cleanup_errors=True
         ) as folder:
@@ -228,34 +225,33 @@ _EXPECTED_MESSAGES = (
     "Could not fetch metrics",
     "Failed to fetch metrics",
 )
-"""Beginnings of what Tune logs when it is stopped or a trial failed: the sweep says it itself."""
+"""Beginnings of Tune's messages about stops and failed trials, which the sweep prints itself."""
 
 
-def _is_news(record: logging.LogRecord) -> bool:
+def _is_unexpected(record: logging.LogRecord) -> bool:
     return not record.getMessage().startswith(_EXPECTED_MESSAGES)
 
 
 @contextlib.contextmanager
 def _quiet_tune(waiting: int) -> Iterator[None]:
-    """Set what Tune reads from the environment only, and filter its log.
+    """Set options that Tune reads from the environment only, and filter its log.
 
     Args:
-        waiting: Trials that may wait for an actor: as many as can run start side by side, and an
-            autoscaler adds nodes for those that wait.
+        waiting: Number of trials that may wait for an actor. An autoscaler adds machines for them.
     """
     settings = {
         "TUNE_MAX_PENDING_TRIALS_PG": str(waiting),
         "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",
         "TUNE_PRINT_ALL_TRIAL_ERRORS": "0",
-        # Relative paths in a user's environment keep their meaning.
+        # Keep the working folder for relative paths in a user's environment.
         "RAY_CHDIR_TO_TRIAL_DIR": "0",
-        # Nobody reads Tune's snapshots.
+        # Tune's snapshots are never read.
         "TUNE_GLOBAL_CHECKPOINT_S": "3600",
     }
     before = {name: os.environ[name] for name in settings if name in os.environ}
     os.environ.update(settings)
     for name in _LOGGERS:
-        logging.getLogger(name).addFilter(_is_news)
+        logging.getLogger(name).addFilter(_is_unexpected)
     try:
         yield
     finally:
@@ -263,4 +259,4 @@ def _quiet_tune(waiting: int) -> Iterator[None]:
             os.environ.pop(name, None)
         os.environ.update(before)
         for name in _LOGGERS:
-            logging.getLogger(name).removeFilter(_is_news)
+            logging.getLogger(name).removeFilter(_is_unexpected)

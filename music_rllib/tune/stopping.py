@@ -1,4 +1,4 @@
-"""Signals: the first lets runs save their state and ends the sweep, the second ends it at once."""
+"""Signals: the first saves the runs and stops the sweep, the second stops it at once."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from music_rllib.training.worker import STOPPED
 
 WATCH_SECONDS = 0.3
 GROUP_SECONDS = 3.0
-"""After a local Ray has died, a signal that ended it may still be on its way to this process."""
+"""Wait after a local Ray has ended: the signal that ended it may still reach this process."""
 
 
 class StopSignals(tune.Callback):
-    """Ctrl-C and SIGTERM end Tune's loop in good order: when every run has saved its state.
+    """Ctrl-C and SIGTERM end Tune's loop after every run has saved its state.
 
-    That takes as long as a round of training, some seconds at most; after the grace time the loop
-    ends in any case, and what has not been saved is computed again later. The same happens where a
-    local Ray gets the signal too, as from `timeout` and Slurm, which signal a whole process group.
+    Saving takes one training iteration, a few seconds. After the grace time the loop ends anyway,
+    and unsaved steps are computed again later. The same holds if a local Ray gets the signal too:
+    `timeout` and Slurm signal a whole process group.
 
-    A Ray that has died ends the process as well, with exit code 1: the main thread may be waiting
-    for it, which Ray lets it do for a minute, or for good.
+    If Ray dies, the process ends with exit code 1, because the main thread could wait for Ray for
+    a minute, or forever.
 
     Tune calls it with keywords only.
     """
@@ -50,8 +50,8 @@ class StopSignals(tune.Callback):
         Args:
             on_stop: Called at the first signal.
             grace_seconds: How long runs may take to save their state.
-            on_ray_gone: Called, in a thread, before the process ends because its Ray has ended:
-                with the cause, or None where that was told to stop as well.
+            on_ray_gone: Called, in a thread, before the process ends because Ray has ended: with
+                the cause, or None if the signal ended Ray too.
         """
         self.received: int | None = None
         self.flag = StopFlag(f"stop-{uuid.uuid4().hex}")
@@ -60,7 +60,7 @@ class StopSignals(tune.Callback):
         self._on_ray_gone = on_ray_gone
         self._asked_at = 0.0
         self._running: set[str] = set()
-        """Trials with something to save."""
+        """Trials that have to save their state."""
         self._handlers_before: dict[int, Any] = {}
         self._end_loop: Callable[[], None] | None = None
         self._left = threading.Event()
@@ -70,7 +70,7 @@ class StopSignals(tune.Callback):
 
     def __enter__(self) -> None:
         if threading.current_thread() is threading.main_thread():
-            # After `ray.init`, which sets handlers of its own.
+            # After `ray.init`, which sets its own handlers.
             early.install()
             early.check()
             self._handlers_before = {number: signal.getsignal(number) for number in SIGNALS}
@@ -87,7 +87,7 @@ class StopSignals(tune.Callback):
     # -- Tune's callbacks -----------------------------------------------------------------
 
     def setup(self, **_: Any) -> None:
-        """Tune has just set its handler of SIGINT, which ends its loop: keep it for later."""
+        """Keep Tune's new handler of SIGINT, which ends its loop, for later."""
         if not self._handlers_before:
             return
         tunes_handler = signal.getsignal(signal.SIGINT)
@@ -95,7 +95,7 @@ class StopSignals(tune.Callback):
         def end_loop() -> None:
             if callable(tunes_handler):
                 tunes_handler(signal.SIGINT, None)
-            for number in SIGNALS:  # Tune has set the one that was there before
+            for number in SIGNALS:  # Tune has restored the earlier ones
                 signal.signal(number, self._stop_at_once)
 
         self._end_loop = end_loop
@@ -117,7 +117,7 @@ class StopSignals(tune.Callback):
     on_trial_error = on_trial_recover = on_trial_complete
 
     def on_step_end(self, **_: Any) -> None:
-        """End Tune's loop, which went round once, where everything is saved or time is up."""
+        """End Tune's loop when every run is saved, or after the grace time."""
         if self.received is None or self._end_loop is None:
             return
         if not self._running or time.monotonic() - self._asked_at >= self._grace:
@@ -130,7 +130,7 @@ class StopSignals(tune.Callback):
         self.received, self._asked_at = number, time.monotonic()
         for each in SIGNALS:
             signal.signal(each, self._stop_at_once)
-        # Not in here: the main thread may be in the middle of talking to Ray.
+        # In a thread: the main thread may be in a call of Ray.
         threading.Thread(target=self._tell_workers, daemon=True).start()
         self._on_stop()
 
@@ -139,7 +139,7 @@ class StopSignals(tune.Callback):
             self.flag.set()
 
     def _watch_ray(self) -> None:
-        """End the process when Ray ends: whoever waits for it waits for good, or is aborted."""
+        """End the process when Ray ends, because a thread that waits for Ray never returns."""
         watch = RayWatch()
         while not self._left.wait(WATCH_SECONDS):
             if (cause := watch.look()) is None:

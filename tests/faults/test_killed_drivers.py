@@ -25,7 +25,7 @@ def test_a_killed_worker_then_sigterm_then_a_killed_driver(
     sweeps.kill_a_worker(process)
     output = sweeps.read_until(process, ": FAILED", "finetune/q=1/seed0: s")
     assert "The worker process died" in output
-    assert f"Another worker goes on from the last checkpoint (1 of {RESTARTS} times)." in output
+    assert f"Another worker resumes from the last checkpoint (1 of {RESTARTS} times)." in output
     process.send_signal(signal.SIGTERM)
     output, errors = process.communicate(timeout=sweeps.PATIENCE)
     assert process.returncode == 128 + signal.SIGTERM, output + errors

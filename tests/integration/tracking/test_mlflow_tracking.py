@@ -53,7 +53,7 @@ def report(step: int, metrics: dict[str, float] | None = None, time: float = 0.0
 
 
 def later(steps: Iterable[int]) -> list[Report]:
-    """Measured anew, in the order of their steps."""
+    """Reports of these steps, measured now."""
     now = time.time() - 1_700_000_000
     return [report(step, time=now + step / 1000) for step in steps]
 
@@ -74,7 +74,7 @@ def run_info(node_key: str, **changes: object) -> RunInfo:
 
 
 class FreshStore(NamedTuple):
-    """A store that a first sweep made, and what a user saw of that."""
+    """A store that a first sweep created, and its output."""
 
     database: Path
     screen: str
@@ -82,7 +82,7 @@ class FreshStore(NamedTuple):
 
 @pytest.fixture(scope="module")
 def fresh_store(tmp_path_factory: pytest.TempPathFactory) -> FreshStore:
-    """Made once: MLflow's tables take seconds, copying the file does not."""
+    """Created once, because MLflow's tables take seconds and a copy does not."""
     folder = tmp_path_factory.mktemp("first")
     code = (
         "import sys; from music_rllib.tracking.tracker import Tracker; "
@@ -103,7 +103,7 @@ def storage(tmp_path: Path, fresh_store: FreshStore) -> Path:
 
 @pytest.fixture
 def tracker_on(storage: Path) -> Iterator[MakeTracker]:
-    """Opens trackers on the test's storage, and lets go of those that a test left open."""
+    """Opens trackers on the test's storage, and closes them after the test."""
     opened: list[Tracker] = []
 
     def make(**changes: object) -> Tracker:
@@ -125,7 +125,7 @@ def client_of(storage: Path) -> MlflowClient:
 
 
 def runs_of(client: MlflowClient, experiment: str = "smoke") -> dict[str, Run]:
-    """The experiment's runs by name; a run that is there twice is a failure."""
+    """The experiment's runs by name, each only once."""
     found = client.get_experiment_by_name(experiment)
     assert found is not None
     runs = list(client.search_runs([found.experiment_id]))
@@ -138,10 +138,10 @@ def logged_steps(client: MlflowClient, run: Run, metric: str = names.EVAL_SUCCES
     return [point.step for point in client.get_metric_history(run.info.run_id, metric)]
 
 
-def test_a_run_of_another_environment_takes_the_place_of_the_earlier_one(
+def test_a_run_of_another_environment_replaces_the_earlier_one(
     storage: Path, tracker_on: MakeTracker
 ) -> None:
-    """Or of the same one, where its result was deleted to train it again."""
+    """So does a run whose result was deleted to train it again."""
 
     def info(environment: str) -> RunInfo:
         return run_info("a", tags={names.TAG_ENVIRONMENT: environment})
@@ -242,10 +242,10 @@ def test_a_resumed_sweep_continues_its_runs(storage: Path, tracker_on: MakeTrack
     }
 
 
-def test_a_changed_plan_has_a_run_of_its_own_and_the_view_shows_its_runs_alone(
+def test_a_changed_plan_has_its_own_parent_run_and_current_runs(
     storage: Path, tracker_on: MakeTracker
 ) -> None:
-    """Extended, and then back: params never change, and runs of other plans stay where they are."""
+    """The params of a plan never change, and runs of other plans stay with their parents."""
     client, parents = client_of(storage), []
     plans = ({"a": 600}, {"a": 600, "b": 600}, {"c": 1000}, {"a": 600, "b": 600})
     for plan in plans:
@@ -273,10 +273,10 @@ def test_a_changed_plan_has_a_run_of_its_own_and_the_view_shows_its_runs_alone(
     assert len(found) == 3 + 3, "each run is there once"
 
 
-def test_another_driver_that_has_the_storage_alone_goes_on_with_the_runs(
+def test_another_driver_continues_the_runs_from_the_storage_alone(
     storage: Path, tracker_on: MakeTracker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As in a new pod, where only the bucket and the server are the same."""
+    """As in a new pod, with only the bucket and the server of the first."""
     kept: dict[str, str] = {}  # stands for a bucket
     monkeypatch.setattr(sweep_files, "write", lambda _, path, text: kept.update({path: text}))
     monkeypatch.setattr(
@@ -299,7 +299,7 @@ def test_another_driver_that_has_the_storage_alone_goes_on_with_the_runs(
     assert logged_steps(client, run, names.SETTING_ENTROPIC_INDEX) == [0]
 
 
-def test_a_failed_run_that_succeeds_later_shows_no_failure(
+def test_a_failed_run_that_succeeds_later_has_no_failure_tag(
     storage: Path, tracker_on: MakeTracker
 ) -> None:
     tracker = tracker_on()
@@ -313,10 +313,10 @@ def test_a_failed_run_that_succeeds_later_shows_no_failure(
     assert names.TAG_FAILURE not in run.data.tags
 
 
-def test_a_run_that_ends_and_goes_on_again_and_again_loses_nothing(
+def test_a_run_that_is_paused_many_times_loses_nothing(
     storage: Path, tracker_on: MakeTracker
 ) -> None:
-    """As a search does with a run that it stops at each rung."""
+    """As a search pauses a run at each rung."""
     tracker = tracker_on()
     for number, step in enumerate(STEPS):
         tracker.start(run_info("a"))
@@ -327,7 +327,7 @@ def test_a_run_that_ends_and_goes_on_again_and_again_loses_nothing(
     assert logged_steps(client_of(storage), runs_of(client_of(storage))["finetune/a"]) == STEPS
 
 
-def test_a_sweep_that_was_deleted_and_begun_anew_has_runs_of_its_own(
+def test_a_deleted_sweep_that_starts_again_has_new_runs(
     storage: Path, tracker_on: MakeTracker
 ) -> None:
     parents = []
@@ -339,7 +339,7 @@ def test_a_sweep_that_was_deleted_and_begun_anew_has_runs_of_its_own(
     assert parents[0] != parents[1]
 
 
-def test_a_reused_node_comes_with_its_history_once(storage: Path, tracker_on: MakeTracker) -> None:
+def test_a_reused_node_is_logged_once(storage: Path, tracker_on: MakeTracker) -> None:
     tracker = tracker_on()
     tracker.mirror(run_info("old"), stored(STEPS))
     tracker.mirror(run_info("old"), stored(STEPS))
@@ -455,7 +455,7 @@ def test_each_model_has_its_own_policy_and_leaves_nothing_in_memory(
         np.testing.assert_allclose(acted, np.tanh([run, run]), atol=1e-6)
 
 
-def test_more_metrics_than_one_request_may_hold(storage: Path, tracker_on: MakeTracker) -> None:
+def test_more_metrics_than_the_limit_of_a_request(storage: Path, tracker_on: MakeTracker) -> None:
     tracker = tracker_on()
     tracker.start(run_info("a", config={f"p{i:03}": i for i in range(150)}))
     for step in range(1, 8):
@@ -470,7 +470,7 @@ def test_more_metrics_than_one_request_may_hold(storage: Path, tracker_on: MakeT
     assert logged_steps(client, run, "group/399") == list(range(1, 8))
 
 
-def test_a_deleted_run_does_not_hold_up_the_others(
+def test_a_deleted_run_does_not_delay_the_others(
     storage: Path, tracker_on: MakeTracker, caplog: pytest.LogCaptureFixture
 ) -> None:
     tracker = tracker_on()
@@ -490,7 +490,7 @@ def test_a_deleted_run_does_not_hold_up_the_others(
     assert f"music-rllib resume {storage}/smoke" in message
 
     again = tracker_on()
-    again.mirror(run_info("gone"), stored([2000, 4000]))  # it gets a new run, with all it had
+    again.mirror(run_info("gone"), stored([2000, 4000]))  # it gets a new run with its whole history
     assert not again.close(timeout=20.0)
     runs = runs_of(client)
     assert logged_steps(client, runs["finetune/kept"]) == [2000, 4000]
@@ -511,14 +511,14 @@ def test_a_report_is_attached_to_the_sweeps_run(
     assert noted == "**q = 1.5 is better**"
 
 
-def test_a_newcomers_screen_stays_clean(fresh_store: FreshStore) -> None:
+def test_tracking_prints_nothing(fresh_store: FreshStore) -> None:
     assert fresh_store.screen == ""
 
 
-def test_a_second_store_starts_from_the_tables_of_the_first(
+def test_a_second_store_starts_from_empty_tables_of_the_first(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nothing of the first store is in it but empty tables."""
+    """It has nothing else of the first store."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     for name in ("first", "second"):
         folder = tmp_path / name
@@ -562,7 +562,7 @@ def test_a_killed_driver_leaves_neither_gaps_nor_duplicates(
 
     tracker = tracker_on()
     tracker.start(run_info("a", config={"seed": 0}, settings={}))
-    # The history of its checkpoint, and what it repeats.
+    # The history of its checkpoint, and repeated steps.
     now = time.time() - 1_700_000_000
     steps = range(1, reached + 50)
     tracker.log("a", [report(step, {names.EVAL_SUCCESS: float(step)}, now) for step in steps])
@@ -584,7 +584,7 @@ def test_a_killed_driver_leaves_neither_gaps_nor_duplicates(
 def server(
     tmp_path_factory: pytest.TempPathFactory, fresh_store: FreshStore
 ) -> Iterator[MlflowServer]:
-    """Started before the first test, since it takes long to come up; the last test waits."""
+    """Started before the first test, because the start takes long; the last test waits for it."""
     folder = tmp_path_factory.mktemp("server")
     shutil.copy(fresh_store.database, folder)
     server = MlflowServer(folder)
@@ -593,7 +593,7 @@ def server(
     server.signal(signal.SIGKILL)
 
 
-def test_a_view_is_kept_for_the_mlflow_that_knows_it(tracker_on: MakeTracker) -> None:
+def test_a_view_is_saved_if_mlflow_has_a_known_version(tracker_on: MakeTracker) -> None:
     tracker = tracker_on()
     plain = tracker.comparison_url()
     tracker.keep_view("{}", ["2.0", "3"])
@@ -603,10 +603,10 @@ def test_a_view_is_kept_for_the_mlflow_that_knows_it(tracker_on: MakeTracker) ->
     assert "viewStateShareKey" not in other.comparison_url()
 
 
-def test_a_server_killed_while_logging_loses_and_doubles_nothing(
+def test_a_server_killed_while_logging_loses_and_duplicates_nothing(
     server: MlflowServer, tracker_on: MakeTracker, policy: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Killed and started again mid-way; later it hangs, and the next driver sends the rest."""
+    """Killed and started again; later it hangs, and the next driver sends the rest."""
     server.wait()
     tracker = tracker_on(tracking_uri=server.uri)
     tracker.start(run_info("a"))
@@ -616,7 +616,7 @@ def test_a_server_killed_while_logging_loses_and_doubles_nothing(
         time.sleep(0.005)
     server.signal(signal.SIGKILL)
     tracker.log("a", [report(step, time=step) for step in steps[100:200]])
-    tracker.start(run_info("b"))  # a run whose first word meets a dead server
+    tracker.start(run_info("b"))  # a run whose first request meets a dead server
     tracker.log("b", [report(1)])
     assert not tracker.flush(1.0)
     assert tracker.pending().error is not None

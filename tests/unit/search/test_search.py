@@ -1,4 +1,4 @@
-"""Searches: what a trial is worth, and mistakes in their settings."""
+"""Searches: values of trials, early stopping, points, and mistakes in the settings."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_aggregates(how: str, expected: float) -> None:
     assert aggregate(Objective(aggregate=how), scores) == pytest.approx(expected)
 
 
-def test_the_worst_task_of_something_minimised_is_the_highest() -> None:
+def test_the_worst_task_of_a_minimized_objective_is_the_highest() -> None:
     objective = Objective(aggregate="worst_task", direction="minimize")
     assert aggregate(objective, np.array([[1.0, 9.0], [3.0, 11.0]])) == 10.0
 
@@ -51,7 +51,7 @@ def test_the_worst_task_of_something_minimised_is_the_highest() -> None:
         ({"metric": "env_steps"}, 3000.0),
     ],
 )
-def test_a_runs_number(objective: Document, expected: float) -> None:
+def test_scores_of_a_run(objective: Document, expected: float) -> None:
     history = [
         Report(env_steps=1000 * at, seconds=0, timestamp_ms=0, metrics={names.EVAL_SUCCESS: value})
         for at, value in ((1, 0.2), (2, 0.8), (3, 0.5))
@@ -59,12 +59,12 @@ def test_a_runs_number(objective: Document, expected: float) -> None:
     assert score(Objective(**objective), history, 5000) == pytest.approx(expected)
 
 
-def test_arriving_behind_the_budget_is_no_worse_than_never() -> None:
+def test_a_threshold_after_the_budget_counts_as_the_budget() -> None:
     late = Report(env_steps=5200, seconds=0, timestamp_ms=0, metrics={names.EVAL_SUCCESS: 1.0})
     assert score(Objective(read="steps_to", threshold=0.9), [late], 5000) == 5000
 
 
-def test_a_trial_is_stopped_only_if_its_interval_says_so() -> None:
+def test_a_trial_is_stopped_only_if_its_interval_is_below_the_best() -> None:
     pruning = Pruning(rungs=(Rung(seeds=2),), keep=0.3, confidence=0.9)
     others = {n: np.array([[0.7 + 0.01 * n], [0.72 + 0.01 * n]]) for n in range(6)}
 
@@ -80,10 +80,10 @@ def test_a_trial_is_stopped_only_if_its_interval_says_so() -> None:
 
 @pytest.mark.parametrize("how", ["iqm", "mean", "median", "worst_task"])
 @pytest.mark.parametrize(("tasks", "apart"), [(1, 0.0), (8, 0.0), (8, 20.0)])
-def test_a_trial_as_good_as_its_only_rival_is_seldom_stopped(
+def test_a_trial_as_good_as_its_only_rival_is_rarely_stopped(
     how: str, tasks: int, apart: float
 ) -> None:
-    """With 90 % intervals in one of eight cases or less, however far the tasks are apart."""
+    """At most one in eight with 90% intervals, however far apart the tasks are."""
     rng = np.random.default_rng(0)
     draws = rng.normal(size=(1500, 2, 3, tasks)) + apart * np.arange(tasks)
     objective, pruning = Objective(aggregate=how), Pruning(rungs=(Rung(seeds=3),))
@@ -112,7 +112,7 @@ def test_the_spread_counts_each_seed_of_a_trial_once() -> None:
 
 
 @pytest.mark.parametrize("name", ["search", "compare"])
-def test_the_shipped_examples_are_sound(name: str) -> None:
+def test_the_packaged_examples_are_valid(name: str) -> None:
     config = load_sweep(Path(__file__).parents[3] / f"tune_configs/{name}.yaml")
     settings = config.stages[-1].search
     assert settings is not None
@@ -123,7 +123,7 @@ def test_the_shipped_examples_are_sound(name: str) -> None:
 
 
 def memory_of(call: Callable[[], Any]) -> int:
-    """Bytes that `call` has allocated at its worst."""
+    """Peak bytes that `call` allocates."""
     tracemalloc.start()
     try:
         call()
@@ -142,16 +142,14 @@ def memory_of(call: Callable[[], Any]) -> int:
         ({"choice": [1.0, {"a": [1]}]}, [1, {"a": [1.0]}], [True, {"a": [True]}, {"a": 1}, 2]),
     ],
 )
-def test_which_values_a_dimension_has(
-    dimension: Document, inside: list[Any], outside: list[Any]
-) -> None:
+def test_values_of_a_dimension(dimension: Document, inside: list[Any], outside: list[Any]) -> None:
     found = SearchSettings.model_validate({"space": {"x": dimension}, "trials": 1}).space["x"]
     assert [value for value in inside if not found.contains(value)] == []
     assert [value for value in outside if found.contains(value)] == []
-    assert memory_of(lambda: found.contains(15)) < 100_000, "none of the others is made"
+    assert memory_of(lambda: found.contains(15)) < 100_000, "it must not create all values"
 
 
-def test_a_grid_is_counted_before_it_is_made() -> None:
+def test_a_grid_is_counted_before_its_points_are_created() -> None:
     numbers = {"int": [1, 1000]}
     space = {"x": {"choice": ["a", "b"]}, "y": numbers, "z": numbers | {"when": {"x": "a"}}}
     settings = {"space": space, "sampler": "grid"}
@@ -381,7 +379,7 @@ def test_a_mistake_in_the_objective_is_one_error(
 
 
 @pytest.mark.parametrize("objective", [{}, [{"metric": names.EVAL_RETURN}, {}]])
-def test_success_is_no_objective_where_a_task_declares_none(objective: Any, tmp_path: Path) -> None:
+def test_success_needs_a_task_that_declares_it(objective: Any, tmp_path: Path) -> None:
     swing = {"env_id": "Pendulum-v1", "horizon": 50, "success_key": None}
     content = document({}, tasks=["FetchPush", "Swing"], environments={"Swing": swing})
     content["stages"] = [
@@ -400,7 +398,7 @@ def test_success_is_no_objective_where_a_task_declares_none(objective: Any, tmp_
     load_sweep(path)
 
 
-def test_a_rung_may_be_beyond_the_shorter_tasks(tmp_path: Path) -> None:
+def test_a_rung_may_exceed_the_budget_of_shorter_tasks(tmp_path: Path) -> None:
     content = document({"pruning": {"rungs": [{"env_steps": 5000}]}})
     content["tasks"] = ["FetchPush", "FetchSlide"]
     content["stages"][1]["per_task"] = {"FetchSlide": {"env_steps": 6000}}
@@ -424,7 +422,7 @@ ONE_OR_MANY: Document = {
     "tac.bootstrap": {"choice": ["value", "critics"]},
     "tac.alpha": {"float": [0.01, 1.0], "log": True, "when": {"tac.bootstrap": "critics"}},
 }
-"""One point, and an interval of others."""
+"""One point, and a range of others."""
 FEW_OR_MANY: Document = {
     "tac.batch_size": {"choice": [*range(1, 21)]},
     "tac.alpha": {"float": [0.01, 1.0], "log": True, "when": {"tac.batch_size": 20}},
@@ -444,7 +442,7 @@ FEW_OR_MANY: Document = {
     ],
 )
 def test_no_point_is_tried_twice(sampler: str, space: Document, trials: int) -> None:
-    """A trial's point is a function of those before it: whoever proposes it, in whatever order."""
+    """A trial's point is a function of the earlier ones only."""
     settings = SearchSettings.model_validate(
         {"sampler": sampler, "space": space, "trials": 1000, "concurrent": 2}
     )
@@ -453,10 +451,10 @@ def test_no_point_is_tried_twice(sampler: str, space: Document, trials: int) -> 
     given = [point, {}, point]
     found: list[Document] = []
     for number in range(trials):
-        shown = [trial_at(settings.space, point, [0.0]) for point in found[: max(0, number - 1)]]
+        ended = [trial_at(settings.space, point, [0.0]) for point in found[: max(0, number - 1)]]
         running = [trial_at(settings.space, point) for point in found[max(0, number - 1) :]]
         one, other = (
-            Proposer(settings, given).propose(number, shown, running).user_attrs[VALUES]
+            Proposer(settings, given).propose(number, ended, running).user_attrs[VALUES]
             for _ in range(2)
         )
         assert one == other
@@ -467,7 +465,7 @@ def test_no_point_is_tried_twice(sampler: str, space: Document, trials: int) -> 
     assert settings.count == (1000 if space in (ONE_OR_MANY, FEW_OR_MANY) else trials)
 
 
-def test_a_search_ends_with_its_last_point_and_says_so(tmp_path: Path) -> None:
+def test_a_search_with_few_points_prints_where_it_ends(tmp_path: Path) -> None:
     path = tmp_path / "sweep.yaml"
     path.write_text(yaml.safe_dump(document({"space": CHOICES, "trials": 20})))
     (line,) = warnings_of(load_sweep(path))
