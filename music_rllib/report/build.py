@@ -61,7 +61,7 @@ _STATES = {
 def build_report(
     sweep: Sweep,
     *,
-    damaged: str | None = None,
+    damaged: str = "",
     command: str = "",
     storage: str | None = None,
     videos: bool = False,
@@ -73,7 +73,7 @@ def build_report(
 
     Args:
         sweep: The sweep, with the metrics of `WANTED`.
-        damaged: A sentence about finished runs that are damaged in the storage, if there are any.
+        damaged: A sentence about finished runs that are damaged in the storage; empty if none is.
         command: The command that makes this report.
         storage: The storage that has the policies for videos; None for an exported sweep.
         videos: Whether to record videos.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
@@ -153,25 +152,16 @@ def _x_axes(sweep: Sweep, curve: Curve, known: KnownAxes) -> Mapping[str, Any]:
 
 
 def _mean_at(steps: Array, series: Iterable[tuple[Array, Array]]) -> list[float | None] | None:
-    """Mean over the runs; None if no run has any value.
+    """Mean over the runs that have got as far; None if no run has any value.
 
-    After the first run has ended, the mean increases by the mean increments of the other runs: the
-    mean of their values could be smaller than the mean of all runs before.
+    It never decreases, although the mean of fewer runs may be smaller than the mean of all.
     """
-    rows = [
-        np.interp(steps, at, values, left=np.nan, right=np.nan) for at, values in series if len(at)
-    ]
+    rows = [np.interp(steps, at, own, left=np.nan, right=np.nan) for at, own in series if len(at)]
     if not rows:
         return None
-    means = np.full(len(steps), np.nan)
-    reached = ~np.isnan(rows).all(axis=0)
-    begun = np.asarray(rows)[:, reached]
-    if not begun.size:
-        return _plain(means)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # of the mean of no run
-        first, gains = np.nanmean(begun[:, 0]), np.nanmean(np.diff(begun, axis=1), axis=0)
-    means[reached] = first + np.concatenate([[0.0], np.cumsum(gains)])
+    values, means = np.array(rows), np.full(len(steps), np.nan)
+    reached = ~np.isnan(values).all(axis=0)
+    means[reached] = np.maximum.accumulate(np.nanmean(values[:, reached], axis=0))
     return _plain(means)
 
 

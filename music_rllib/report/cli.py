@@ -125,10 +125,8 @@ def report(
         _export(sweeps[0], storage, export, format_, add=add)
     elif serve:
         _serve(sweeps[0], storage, port)
-    elif len(sweeps) > 1:
-        _report_on_two(sweeps, storage, output)
     else:
-        return _report(sweeps[0], storage, output, env, videos=videos, attach=attach)
+        return _report(sweeps, storage, output, env, videos=videos, attach=attach)
     return 0
 
 
@@ -173,7 +171,7 @@ def _is_kept(sweep: Sweep, run: RunRecord) -> bool:
 
 
 def _report(
-    place: str,
+    places: Sequence[str],
     storage: str | None,
     output: Path | None,
     env: Path | None,
@@ -184,31 +182,39 @@ def _report(
     from music_rllib.config.load import declared_tasks
     from music_rllib.redaction import for_people, redact
     from music_rllib.report.build import PICTURE, WANTED, build_report, write_report
+    from music_rllib.report.figures.choice import slug
+    from music_rllib.report.two_sweeps import joined_sweeps
     from music_rllib.results.answer import answer
     from music_rllib.results.read import read_sweep
 
-    source = read_sweep(place, storage, metrics=WANTED, lenient=True)
+    first, *others = (read_sweep(place, storage, metrics=WANTED, lenient=True) for place in places)
+    sweep, both, name = first.sweep, None, "report"
+    for other in others:
+        both = (first.sweep, other.sweep)
+        sweep, name = joined_sweeps(*both), f"report-and-{slug(other.sweep.name)}"
+    damaged = " ".join(source.damaged for source in (first, *others) if source.damaged)
     made = build_report(
-        source.sweep,
-        damaged=source.damaged,
-        storage=None if source.opened is None else source.opened.storage,
-        videos=videos,
+        sweep,
+        damaged=damaged,
+        storage=None if first.opened is None else first.opened.storage,
+        videos=videos and both is None,
         environments=() if env is None else declared_tasks(env),
+        both=both,
         command=_command(),
     )
-    page = write_report(made, output or source.folder / "report")
+    page = write_report(made, output or first.folder / name)
     for sentence in made.limitations:
         typer.echo(f"missing: {for_people(sentence)}")
-    for sentence in answer(source.sweep, made.study):
+    for sentence in answer(sweep, made.study):
         typer.echo(for_people(sentence))
     typer.echo(f"Report: {page.absolute()}")
     picture = page.parent / "figures" / f"{PICTURE}.png"
     if picture.exists():
         typer.echo(f"Picture: {picture.absolute()}")
     if attach:
-        _attach(source, page.parent, made)
-    if source.damaged is not None:
-        typer.echo(f"error: {redact(source.damaged)}", err=True)
+        _attach(first, page.parent, made)
+    if damaged:
+        typer.echo(f"error: {redact(damaged)}", err=True)
         return FAILED
     return 0
 
@@ -218,19 +224,6 @@ def _command() -> str:
     from music_rllib.redaction import redact
 
     return redact(shlex.join([*called_as(), *sys.argv[1:]]))
-
-
-def _report_on_two(places: Sequence[str], storage: str | None, output: Path | None) -> None:
-    from music_rllib.report.build import WANTED, build_report, write_report
-    from music_rllib.report.figures.choice import slug
-    from music_rllib.report.two_sweeps import joined_sweeps
-    from music_rllib.results.read import read_sweep
-
-    sources = [read_sweep(place, storage, metrics=WANTED) for place in places]
-    first, second = (source.sweep for source in sources)
-    made = build_report(joined_sweeps(first, second), both=(first, second), command=_command())
-    folder = output or sources[0].folder / f"report-and-{slug(second.name)}"
-    typer.echo(f"Report: {write_report(made, folder).absolute()}")
 
 
 def _serve(place: str, storage: str | None, port: int) -> None:
@@ -247,7 +240,7 @@ def _serve(place: str, storage: str | None, port: int) -> None:
         source = read_stored(sweep, metrics=WANTED, lenient=True)
         made = build_report(
             source.sweep,
-            damaged=source.damaged,
+            damaged=source.damaged or "",
             command=_command(),
             live=progress.is_running(),
         )

@@ -9,7 +9,6 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from itertools import chain, groupby
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +34,7 @@ from music_rllib.report.tables import (
 from music_rllib.report.videos import Videos
 from music_rllib.results.analysis import StageAnalysis
 from music_rllib.results.answer import answer, planned_in_words
-from music_rllib.results.conditions import SIDE_BY_SIDE
+from music_rllib.results.conditions import SIDE_BY_SIDE, StageRuns
 from music_rllib.results.data import Sweep
 from music_rllib.results.study import Study
 
@@ -177,8 +176,7 @@ def _question(report: SweepReport) -> str:
     aim = " or ".join("success rate" if word == "success" else word for word in metrics)
     budgets = [budget for run in stage.runs if (budget := report.sweep.runs[run].budget)]
     steps = f", {statistics.median(budgets):,.0f} environment steps per run" if budgets else ""
-    seeds = "1 seed" if len(stage.seeds) == 1 else f"{len(stage.seeds)} seeds"
-    where = f"on {_enumerated(stage.tasks)} ({seeds}{steps})"
+    where = f"on {_enumerated(stage.tasks)} ({_seeds(stage)}{steps})"
     labels = [condition.short_label for condition in stage.compared or stage.conditions]
     if len(labels) == 1:
         return f"What {aim} does {labels[0]} reach {where}?"
@@ -255,24 +253,16 @@ def _remarks(report: SweepReport) -> Iterable[Sequence[str]]:
                 f"Budgets differ: final values are read after {_enumerated(steps, 'or')} steps, "
                 "where the shortest stage ends."
             )
-        heading = f"Stage {stage.name} ({stage.variant}), seeds {_in_ranges(stage.seeds)}"
+        seeds = " to ".join(dict.fromkeys((stage.seeds[0], stage.seeds[-1])))
+        heading = f"Stage {stage.name} ({stage.variant}), {_seeds(stage)} ({seeds})"
         if analysis is report.together:
             heading = "Stages side by side, over the conditions that all of them have"
         if remarks or len(report.analyses) > 1:
             yield [heading, *remarks]
 
 
-def _in_ranges(seeds: Sequence[str]) -> str:
-    """`0, 1, 1000 to 1019`."""
-    if not all(seed.isdecimal() for seed in seeds):
-        return ", ".join(seeds)  # a run without a seed
-    ordered = sorted(map(int, seeds))
-    runs = [
-        [seed for _, seed in run]
-        for _, run in groupby(enumerate(ordered), key=lambda pair: pair[1] - pair[0])
-    ]
-    ranges = [[f"{run[0]} to {run[-1]}"] if len(run) > 2 else map(str, run) for run in runs]
-    return ", ".join(chain.from_iterable(ranges))
+def _seeds(stage: StageRuns) -> str:
+    return "1 seed" if len(stage.seeds) == 1 else f"{len(stage.seeds)} seeds"
 
 
 def _enumerated(words: Sequence[str], last: str = "and") -> str:

@@ -108,7 +108,7 @@ class Table:
                     values[f"{column}_lower"] = float(value.lower)
                     values[f"{column}_upper"] = float(value.upper)
                 else:
-                    values[column] = " ".join(map(str, value)) if isinstance(value, list) else value
+                    values[column] = value
             rows.append(values)
         return to_csv(rows)
 
@@ -119,8 +119,15 @@ def to_csv(rows: Sequence[Mapping[str, object]]) -> str:
     columns = list(dict.fromkeys(name for row in rows for name in row))
     writer = csv.DictWriter(buffer, columns, lineterminator="\n")
     writer.writeheader()
-    writer.writerows(rows)
+    writer.writerows({name: _plain(value) for name, value in row.items()} for row in rows)
     return buffer.getvalue()
+
+
+def _plain(value: object) -> object:
+    """`0 1 2` for a list, and `0:0.5 1:0.6` for a mapping."""
+    if isinstance(value, Mapping):
+        return " ".join(f"{key}:{one:g}" for key, one in value.items())
+    return " ".join(map(str, value)) if isinstance(value, list) else value
 
 
 def estimate_of(value: float, lower: float, upper: float) -> Estimate:

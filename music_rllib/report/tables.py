@@ -91,18 +91,8 @@ def study_tables(study: Study) -> list[Table]:
 
 def study_files(study: Study) -> Iterator[tuple[str, str]]:
     """Names and contents of the CSV files of a study, with the fields of `compare --json`."""
-    means = [
-        row | {"by_seed": " ".join(f"{seed}:{score:g}" for seed, score in row["by_seed"].items())}
-        for row in mean_rows(study)
-    ]
-    claims = [
-        row
-        | {"seeds": " ".join(map(str, row["seeds"]))}
-        | {"in_words": "; ".join(filter(None, row["in_words"]))}
-        for row in claim_rows(study)
-    ]
-    yield "area_under_curve", to_csv(means)
-    yield "comparisons", to_csv(claims)
+    yield "area_under_curve", to_csv(mean_rows(study))
+    yield "comparisons", to_csv(claim_rows(study))
 
 
 def performance_tables(analyses: Sequence[StageAnalysis]) -> list[Table]:
@@ -204,7 +194,7 @@ def _thresholds(analyses: Sequence[StageAnalysis]) -> Table:
 
 
 def budget_table(sweep: Sweep, analyses: Sequence[StageAnalysis]) -> Table:
-    """Environment steps and wall time of each stage."""
+    """Environment steps and training time of each stage."""
     rows = []
     for stage in (analysis.stage for analysis in analyses):
         seconds = [s for run in stage.runs if (s := sweep.runs[run].seconds) is not None]
@@ -219,11 +209,11 @@ def budget_table(sweep: Sweep, analyses: Sequence[StageAnalysis]) -> Table:
             )
         )
     return Table(
-        title="Budget and wall time",
-        header=("Stage", "Runs", "Steps done", "Steps planned", "Wall time, all runs", "Median"),
+        title="Budget and training time",
+        header=("Stage", "Runs", "Steps done", "Steps planned", "Training time, all runs", "Median"),
         rows=rows,
-        note="Environment steps. Wall time (h:min:s) is measured from a run's start to its last "
-        "report, including interruptions; running runs are not counted.",
+        note="Environment steps. Training time (h:min:s) excludes interruptions; running runs are "
+        "not counted.",
     )
 
 
@@ -234,7 +224,7 @@ def runs_table(sweep: Sweep) -> Table:
         title=f"All {len(sweep.runs)} runs",
         folded=True,
         header=(
-            *("Run", "Stage", "Task", "q", "Seed", "State", "Steps", "Budget", "Wall time"),
+            *("Run", "Stage", "Task", "q", "Seed", "State", "Steps", "Budget", "Training time"),
             *("Success rate", "Return", "Shannon entropy", "S_q", "Cause of failure", "Key"),
         ),
         rows=[

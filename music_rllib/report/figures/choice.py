@@ -54,8 +54,6 @@ MOST_FACETS = 8
 """Largest number of subplots that the curves of one task are spread over."""
 MOST_LINES = 8
 """Largest number of lines in a subplot of the overview."""
-SEEN = 0.25
-"""Success rate below which the overview shows displacement instead."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -309,43 +307,32 @@ def study_drawings(study: Study) -> Iterator[Drawing]:
 
 
 def overview(sweep: Sweep, stages: Sequence[StageRuns]) -> tuple[Subplot, ...]:
-    """For each task its primary metric, the displacement of objects, and the MI bound.
-
-    The success rate is left out while it is below `SEEN` and objects have been moved.
-    """
+    """For each task its primary metric, the displacement of objects, and the MI bound."""
     tasks = dict.fromkeys(task for stage in stages for task in stage.tasks)
     return tuple(subplot for task in tasks for subplot in _of_task(sweep, stages, task))
 
 
 def _of_task(sweep: Sweep, stages: Sequence[StageRuns], task: str) -> Iterator[Subplot]:
     stages = [stage for stage in stages if task in stage.tasks]
-    shown = [(stage, condition) for stage in stages for condition in stage.compared]
-    style_of = styles_of(tuple(condition for _, condition in shown))
-    primary, found = sweep.primary_metric(task), {}
-    for name in (primary, names.EVAL_DISPLACEMENT, names.MI_BOUND):
-        curves = [(stage, curve(sweep, one, task, name)) for stage, one in shown]
-        found[name] = [
-            (stage, one)
-            for stage, one in curves
-            if one is not None
-            # Without the task's reward, success is chance. A frozen estimator has no bound.
-            and (name != primary or stage.has_task_reward)
-            and (name != names.MI_BOUND or one.estimate.value.max() > 0)
-        ]
-    best = max((float(one.estimate.value.max()) for _, one in found[primary]), default=0.0)
-    if primary in names.EVAL_RATES and best < SEEN and found[names.EVAL_DISPLACEMENT]:
-        del found[primary]
+    shown = {condition: stage for stage in stages for condition in stage.compared}
+    styles, primary = styles_of(tuple(shown)), sweep.primary_metric(task)
     for metric in METRICS:
-        lines = found.get(metric.name, ())
-        if 0 < len(lines) <= MOST_LINES:
-            legend = [
-                (_name(stage, one.condition, several=len(stages) > 1), style_of[one.condition])
-                for stage, one in lines
-            ]
-            yield curve_subplot(metric, task, [one for _, one in lines], style_of, legend)
-
-
-def _name(stage: StageRuns, condition: Condition, *, several: bool) -> str:
-    """The condition by its stage if there are several, and by its label unless it is the only."""
-    label = condition.label if len(stage.compared) > 1 or not several else ""
-    return ", ".join(filter(None, (stage.name if several else "", label)))
+        if metric.name not in (primary, names.EVAL_DISPLACEMENT, names.MI_BOUND):
+            continue
+        curves = [
+            found
+            for condition, stage in shown.items()
+            # Without the task's reward, success is chance. A frozen estimator has no bound.
+            if (stage.has_task_reward or metric.name != primary)
+            and (found := curve(sweep, condition, task, metric.name)) is not None
+            and (metric.name != names.MI_BOUND or found.estimate.value.max() > 0)
+        ]
+        if 0 < len(curves) <= MOST_LINES:
+            legend = []
+            for condition in (one.condition for one in curves):
+                stage = shown[condition]
+                parts = [stage.name] if len(stages) > 1 else []
+                if len(stage.compared) > 1 or not parts:
+                    parts.append(condition.label)
+                legend.append((", ".join(parts), styles[condition]))
+            yield curve_subplot(metric, task, curves, styles, legend)

@@ -1,7 +1,7 @@
-"""Writes the state of a running sweep, and stops the sweep when a file asks for it.
+"""Writes the state of a running sweep to `state.json`, and stops the sweep on `stop.json`.
 
-`state.json` is written every few seconds: `status` reads it, from any machine that reaches the
-storage. `stop.json` in the same folder asks the driver to stop, as Ctrl-C would.
+`state.json` is written every few seconds. `status` and the live page read it, on any machine that
+reaches the storage. `stop.json` in the same folder stops the driver like Ctrl-C.
 """
 
 from __future__ import annotations
@@ -31,26 +31,25 @@ from music_rllib.store.work_folder import steps_of
 from music_rllib.sweep.views.budget import searched_runs
 
 LOCAL_SECONDS, REMOTE_SECONDS = 2.0, 15.0
-"""Between two writes of `state.json`, in a folder and in a bucket."""
+"""Seconds between two writes of `state.json`, in a folder and in a bucket."""
 MOST_FAILURES = 1000
-"""Failures that are kept, the newest."""
+"""Largest number of failures in `state.json`, the newest ones."""
 
 
 class StateFile(Listener):
-    """Keeps `state.json` up to date, and looks for `stop.json`, in a thread of its own."""
+    """Keeps `state.json` up to date and checks for `stop.json` in a thread of its own."""
 
     def __init__(self, sweep: OpenSweep) -> None:
-        """Describe `sweep`."""
         self._sweep = sweep
         self.searches: Callable[[], list[dict[str, Any]]] = list
-        """Returns the outcome of the sweep's searches so far."""
+        """Function that returns the results of the sweep's searches so far."""
         self.unfinished: dict[str, RunResult] = {}
-        """Node key to what a run that is not finished has spent and measured."""
+        """Node key to the steps, time and last metrics of an unfinished run."""
         self._checkpointed = _checkpointed_steps(sweep)
         self._results: dict[str, RunResult] = {}
         self._last_values = LastValues(sweep.plan)
-        self._at_work: set[str] = set()
-        """Keys of handed-out nodes that a worker has begun; the others queue for a core in Tune."""
+        self._in_workers: set[str] = set()
+        """Keys of nodes whose run a worker has started; other started nodes wait for resources."""
         self._failures: list[dict[str, str]] = []
         self._driver: dict[str, Any] = {
             "pid": os.getpid(),
@@ -64,7 +63,7 @@ class StateFile(Listener):
         self._state: dict[str, Any] = {}
         self._next_update = 0.0
         self._written_trials = 0
-        """Trials in the `plan.json` that was written last."""
+        """Number of trials in the last `plan.json`."""
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="state_file", daemon=True)
         self._interval = REMOTE_SECONDS if is_remote(sweep.storage) else LOCAL_SECONDS
@@ -83,7 +82,7 @@ class StateFile(Listener):
             self.end("stopped" if kind is KeyboardInterrupt else "failed")
 
     def end(self, outcome: str) -> None:
-        """Write how the sweep ended: `finished`, `failed` or `stopped`."""
+        """Write the outcome of the sweep: `finished`, `failed` or `stopped`."""
         self._ended.set()
         self._thread.join(timeout=30.0)
         self._driver |= {"ended": time.time(), "outcome": outcome}
@@ -92,20 +91,20 @@ class StateFile(Listener):
             self._write()
 
     def status(self, key: str) -> Status:
-        """The node's status; one that was handed out waits until a worker has begun it."""
+        """The node's status; a started node counts as waiting until a worker has begun its run."""
         scheduler = self._sweep.scheduler
         if not scheduler.knows(key):
             return Status.WAITING
-        queued = scheduler[key] is Status.STARTED and key not in self._at_work
+        queued = scheduler[key] is Status.STARTED and key not in self._in_workers
         return Status.WAITING if queued else scheduler[key]
 
     # -- events of the driver's loop ---------------------------------------------------------
 
     def started(self, node: Node) -> None:
-        self._at_work.add(node.key)
+        self._in_workers.add(node.key)
 
     def paused(self, node: Node) -> None:
-        self._at_work.discard(node.key)
+        self._in_workers.discard(node.key)
 
     def reported(self, node: Node, reports: list[Report]) -> None:
         before = self.unfinished.get(node.key)
@@ -121,7 +120,7 @@ class StateFile(Listener):
         self._results[node.key] = result
 
     def reused(self, node: Node) -> None:
-        """A node was in the store already, when the sweep began or when a search asked for it."""
+        """Read the result of a node that the store already had."""
         result = self._sweep.store.result(node.key)
         if result is not None:
             self._results[node.key] = result
@@ -132,12 +131,12 @@ class StateFile(Listener):
     def tick(self) -> None:
         if (began := time.monotonic()) >= self._next_update:
             self._update()
-            # A large sweep takes longer to describe: never more than a few per cent of the time.
+            # Describing a large sweep takes longer; it must not take more than 3% of the time.
             ended = time.monotonic()
             self._next_update = ended + max(self._interval, 30 * (ended - began))
 
     def headline(self) -> tuple[list[str], str | None]:
-        """A line for each stage and each search's study, and the best condition so far."""
+        """A line for each stage and for each study of a search, and the best condition so far."""
         lines = [
             f"{stage['name']}: "
             + ", ".join(f"{count} {status}" for status, count in stage["runs"].items())
@@ -156,7 +155,7 @@ class StateFile(Listener):
     # -- the state ---------------------------------------------------------------------------
 
     def _update(self) -> None:
-        """Describe the sweep anew; only from the driver's loop, as the scheduler may change."""
+        """Describe the sweep. Called only by the driver's loop, which changes the scheduler."""
         sweep = self._sweep
         counts: dict[str, Counter[str]] = {}
         steps_done = steps_left = 0
@@ -194,9 +193,8 @@ class StateFile(Listener):
             for stage in sweep.config.stages
         ]
         searches = self.searches()
-        # A stage without the task's reward is left out, as its success is chance; and one that
-        # tries a single setting, which is the best of nothing.
-        judged = [
+        # Without the task's reward, success is chance; with a single setting, there is no best.
+        compared = [
             stage
             for stage in sweep.config.stages
             if VARIANTS[stage.variant].fixed["task_reward"]
@@ -208,20 +206,20 @@ class StateFile(Listener):
             "stages": stages,
             "env_steps": {"done": steps_done, "left": steps_left, "to_come": self._to_come()},
             "running": running,
-            "best": best_so_far(judged, sweep.plan, now, searches),
+            "best": best_so_far(compared, sweep.plan, now, searches),
             "searches": searches,
             "pruned": [node.key for node in sweep.scheduler.having(Status.PRUNED)],
             "failures": self._failures[-MOST_FAILURES:],
         }
 
     def _to_come(self) -> int:
-        """Env steps of runs that the searches have not asked for yet, at most."""
+        """Largest number of environment steps of runs that the searches will still add."""
         config, plan = self._sweep.config, self._sweep.plan
         steps = 0
         for stage in config.stages:
             asked = [run for run in plan.runs if run.stage == stage.name]
             if stage.search is None or any(run.part.startswith("final") for run in asked):
-                continue  # the runs on fresh seeds are asked for last, and all at once
+                continue  # the runs on fresh seeds come last and all at once
             at_most = sum(one.runs * one.env_steps for one in searched_runs(config, stage))
             known = sum(node.run.env_steps for node in plan.nodes if node.stage == stage.name)
             steps += max(0, at_most - known)
@@ -230,25 +228,25 @@ class StateFile(Listener):
     # -- the thread --------------------------------------------------------------------------
 
     def _watch(self) -> None:
-        """Write the state at each interval; interrupt the process once where a file asks for it."""
+        """Write the state at each interval, and interrupt the process once if `stop.json` exists."""
         interrupted = False
         written = 0.0
         while not self._ended.wait(min(self._interval, 2.0)):
-            if not interrupted and self._is_told_to_stop():
+            if not interrupted and self._stop_requested():
                 interrupted = True
                 os.kill(os.getpid(), signal.SIGINT)
             if time.monotonic() - written >= self._interval:
-                with contextlib.suppress(StorageError):  # next time, perhaps
+                with contextlib.suppress(StorageError):  # the next write may succeed
                     self._write()
                 written = time.monotonic()
 
-    def _is_told_to_stop(self) -> bool:
+    def _stop_requested(self) -> bool:
         try:
             if self._sweep.location.read(sweep_files.STOP) is None:
                 return False
         except StorageError:
             return False
-        with contextlib.suppress(StorageError):  # whoever begins next deletes it
+        with contextlib.suppress(StorageError):  # the next driver deletes it
             self._sweep.location.remove(sweep_files.STOP)
         return True
 
@@ -262,7 +260,7 @@ class StateFile(Listener):
 
 
 def _checkpointed_steps(sweep: OpenSweep) -> dict[str, int]:
-    """Node key to the env steps in the last checkpoint of a run that is not finished."""
+    """Node key to the environment steps in the last checkpoint of an unfinished run."""
     begun = sweep.store.begun()
     nodes = (node for node in sweep.plan.nodes if node.key in begun)
     return {

@@ -39,24 +39,6 @@ def test_stages_stand_side_by_side_with_what_music_u_has_learnt() -> None:
     }
 
 
-def test_before_any_success_the_moved_object_is_shown_alone() -> None:
-    sweep = read_archive(DATA / "v3-fetch-push-music-f")
-    early = {
-        name: replace(
-            column,
-            **{
-                part: getattr(column, part)[column.step <= 10_000]
-                for part in ("run", "step", "value", "time")
-            },
-        )
-        for name, column in sweep.history.items()
-    }
-    assert list(subplots(replace(sweep, history=early))) == [
-        "FetchPush: object displacement (m)",
-        "FetchPush: MI bound (nats)",
-    ]
-
-
 def test_one_stage_is_told_by_its_q(tmp_path: Path) -> None:
     sweep = read_archive(DATA / "proof-fetch-push-her")
     assert subplots(sweep)["FetchPush: success rate"] == ["q = 1", "q = 1.5", "q = 2"]
