@@ -210,7 +210,14 @@ def budget_table(sweep: Sweep, analyses: Sequence[StageAnalysis]) -> Table:
         )
     return Table(
         title="Budget and training time",
-        header=("Stage", "Runs", "Steps done", "Steps planned", "Training time, all runs", "Median"),
+        header=(
+            "Stage",
+            "Runs",
+            "Steps done",
+            "Steps planned",
+            "Training time, all runs",
+            "Median",
+        ),
         rows=rows,
         note="Environment steps. Training time (h:min:s) excludes interruptions; running runs are "
         "not counted.",

@@ -228,7 +228,7 @@ class StateFile(Listener):
     # -- the thread --------------------------------------------------------------------------
 
     def _watch(self) -> None:
-        """Write the state at each interval, and interrupt the process once if `stop.json` exists."""
+        """Write the state at each interval; interrupt the process once if `stop.json` exists."""
         interrupted = False
         written = 0.0
         while not self._ended.wait(min(self._interval, 2.0)):
