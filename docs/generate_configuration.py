@@ -1,7 +1,7 @@
-"""Writes docs/configuration.md and a sweep's JSON Schema from the settings' own definitions.
+"""Writes docs/configuration.md and the JSON Schema of sweep files from the settings' definitions.
 
-python docs/generate_configuration.py            # writes it
-python docs/generate_configuration.py --check    # exit code 1 where it is out of date
+python docs/generate_configuration.py            # writes both
+python docs/generate_configuration.py --check    # exit code 1 if one is out of date
 """
 
 from __future__ import annotations
@@ -60,16 +60,15 @@ TARGET = Path(__file__).with_name("configuration.md")
 INTRODUCTION = """\
 # Configuration
 
-A sweep is one YAML file. This page lists every key; it is written by
-`docs/generate_configuration.py` from the settings' definitions, so that it cannot differ from them.
-[algorithms.md](algorithms.md) says what the settings mean in formulas,
-[add_an_environment.md](add_an_environment.md) how to declare a task.
+Use this page to look up the keys of a sweep's YAML file. `docs/generate_configuration.py` writes it
+from the definitions of the settings. [algorithms.md](algorithms.md) has the formulas behind the
+settings; [add_an_environment.md](add_an_environment.md) explains how to declare a task.
 
 ```yaml
 name: my_sweep
 tasks: [FetchPush]
 seeds: [0, 1, 2]
-defaults:                    # what every stage begins with
+defaults:                    # settings of every stage
   env_steps: 250000
   tac: {alpha: 0.05, gamma: 0.95, tau: 0.05}
 stages:
@@ -84,61 +83,62 @@ stages:
       tac.entropic_index: [1.0, 1.5, 2.0]
 ```
 
-Settings are laid over each other, later ones winning: what the variant brings along, the `preset`,
-`defaults`, the stage, what its `per_task` has for the task, the point of its `grid`. The groups
-`evaluation`, `tac`, `music` and `replay` are merged field by field. Whatever is wrong is reported
-before anything starts, all of it at once, each with file, line, key, rule and value. YAML is read
-by the rules of YAML 1.2 (`1e-3` is a number, `no` is text), `1e6` is a whole number where one is
-asked for, keys may not repeat, and unknown keys are errors.
+A setting can be written in several places. From the lowest to the highest priority they are: the
+variant, the `preset`, `defaults`, the stage, its `per_task` entry for the task, and the point of its
+`grid`. The groups `evaluation`, `tac`, `music` and `replay` are merged field by field.
 
-`preset: small` (for two cores), `paper`, `music-2021` or `tac-2020` takes over the settings of a
-file of [music_rllib/presets](../music_rllib/presets), which says where its numbers come from;
-`music-rllib presets` lists them.
+All problems of a file are reported at once, before anything starts, each with file, line, key, rule
+and value. Files follow YAML 1.2: `1e-3` is a number and `no` is text. `1e6` is accepted as an
+integer. Repeated and unknown keys are errors.
 
-Behind the file, `KEY=VALUE` replaces what it says, with values in YAML:
+`preset: small` (for two cores), `paper`, `music-2021` or `tac-2020` uses the settings of a file in
+[music_rllib/presets](../music_rllib/presets), which documents the source of its numbers.
+`music-rllib presets` lists the presets.
+
+On the command line, `KEY=VALUE` after the file replaces values of the file. Values are YAML:
 
 ```sh
 music-rllib run my_sweep.yaml tac.alpha=0.1 seeds=5 env_steps=1e6
 music-rllib plan my_sweep.yaml stages.finetune.grid.tac.entropic_index='[1, 1.25]'
 ```
 
-A setting (`tac.alpha`, `env_steps`) then holds in every stage, whatever the file says of it in
-`defaults`, in stages and under `per_task`; `stages.NAME.KEY` changes one stage, and a key of the
-file's top replaces that. What a `grid` or `search` varies can only be replaced there. The sweep's
-folder keeps the configuration with it (`config.json`), so that `resume` needs no repetition.
+A setting (`tac.alpha`, `env_steps`) replaces the values in `defaults`, in all stages and under
+`per_task`. `stages.NAME.KEY` changes one stage. A top-level key (`seeds`) replaces the value in the
+file. A setting that a `grid` or `search` varies can only be replaced there. The sweep's folder
+contains the complete configuration (`config.json`), which `resume` uses.
 """
 
 SEARCH_TEXT = """\
 ### Search
 
-A stage with `search` in place of `grid` finds its trials itself; [search.md](search.md) says which
-way answers which question.
+A stage with `search` instead of `grid` searches for its trials. [search.md](search.md) explains
+which kind of search answers which question.
 """
 
 VARIANTS_TEXT = """\
 ## Variants
 
-`variant` fixes some settings of `music`; to contradict it is an error. What it takes over comes
-from the run that `init_from` names. MUSIC-u's `music.mi_reward_weight` is 1 unless set, MUSIC-r's
-the task's `mi_reward_weight`.
+`variant` fixes some settings of `music`; other values are errors. The networks that it takes over
+come from the run that `init_from` names. The default of `music.mi_reward_weight` is 1 for MUSIC-u
+and the task's `mi_reward_weight` for MUSIC-r.
 """
 
 SCHEDULES_TEXT = """\
 ## Schedules
 
-Where a type says *schedule*, a number stands for a constant, and a mapping with `schedule` for a
-value that changes with the environment steps of the run. After its end a schedule holds its last
-value: `{schedule: linear, start: 1.0, end: 2.0}`,
+A setting of type *schedule* is a number (a constant) or a mapping with the key `schedule`, whose
+value changes with the environment steps of the run. After its end, a schedule keeps its last value.
+Examples: `{schedule: linear, start: 1.0, end: 2.0}`,
 `{schedule: piecewise, points: [[0, 1.0], [50000, 0.0]], interpolation: hold}`.
 """
 
 MEASURED_TEXT = """\
 ### Measured schedules
 
-Where it says *or measured*, a mapping with `follows` makes the value a function of what the run
-measures: `{follows: success_rate, points: [[0.2, 2.0], [0.9, 1.0]], monotone: true}`. Success is
-measured at evaluations (`evaluation.interval`), the entropy in the updates after each round of
-episodes. [comparing_q.md](comparing_q.md) has an example.
+A setting of type *measured* can also be a mapping with the key `follows`, which makes the value a
+function of a measured quantity: `{follows: success_rate, points: [[0.2, 2.0], [0.9, 1.0]],
+monotone: true}`. The success rate is measured at evaluations (`evaluation.interval`), the entropy in
+the updates after each round of episodes. [comparing_q.md](comparing_q.md) has an example.
 """
 
 # --- the document ------------------------------------------------------------------------------
@@ -159,11 +159,11 @@ def document() -> str:
             ]
         ),
         "## Stages",
-        "Beside these keys a stage has any of the [settings](#settings).",
+        "A stage has these keys and any of the [settings](#settings).",
         table([*rows(StageHeader, "", skip=("init_from",)), *init_from()]),
         SEARCH_TEXT,
         table(rows(SearchSettings, "search.")),
-        "Each entry of `search.space` is one of these:",
+        "An entry of `search.space` has exactly one of `float`, `int` and `choice`:",
         table(dimensions()),
         "An entry of `search.objective`:",
         table(rows(Objective, "objective.")),
@@ -180,7 +180,7 @@ def document() -> str:
         VARIANTS_TEXT,
         variants(),
         "## Settings",
-        "In `defaults` and in a stage as they stand here; in a `grid` with dots (`tac.lr`).",
+        "`defaults` and stages have groups (`tac: {lr: 0.001}`); a `grid` has dotted keys (`tac.lr`).",
         table(
             [
                 *rows(RunSettings, "", only=("env_steps", "num_envs")),
@@ -191,10 +191,10 @@ def document() -> str:
         table(rows(TACSettings, "tac.")),
         "A learned `tac.alpha`:",
         table(rows(LearnedAlpha, "tac.alpha.")),
-        "A `tac.alpha` that is scaled for each q, for a comparison at equal pressure "
+        "A `tac.alpha` that is scaled for each q, to compare q at equal pressure "
         "([comparing q](comparing_q.md)); its keys can be searched (`tac.alpha.value`):",
         table(rows(MatchedAlpha, "tac.alpha.")),
-        "or, by the entropy's largest value:",
+        "A `tac.alpha` that is scaled by the largest entropy of each q:",
         table(rows(NormalisedAlpha, "tac.alpha.")),
         "A `tac.behaviour` with noise:",
         table(rows(GaussianNoise, "tac.behaviour.")),

@@ -47,7 +47,7 @@ class Hypothesis(NamedTuple):
         """Parse a hypothesis.
 
         Raises:
-            ValueError: The text is none; says what one looks like.
+            ValueError: The text is not a hypothesis; the message has an example.
         """
         words = " ".join(text.split())
         match = _HYPOTHESIS.fullmatch(words)
@@ -62,7 +62,7 @@ class Hypothesis(NamedTuple):
 
 
 def _condition(text: str) -> dict[str, str]:
-    """The settings of `q = 1.5, tac.lr = 0.001`; empty if it is no such list."""
+    """The settings of `q = 1.5, tac.lr = 0.001`; empty if the text is not such a list."""
     settings = {}
     for part in _NEXT_SETTING.split(text):
         name, _, value = (piece.strip() for piece in part.partition("="))
@@ -74,12 +74,12 @@ def _condition(text: str) -> dict[str, str]:
 
 
 def _parsed(condition: Mapping[str, str]) -> dict[str, Any]:
-    """A condition's values; a stage may be called `1.0` beside one called `1`."""
+    """A condition's values; the names of stages stay text."""
     return {name: text if name == "stage" else parsed(text) for name, text in condition.items()}
 
 
 def parsed(text: str) -> Any:
-    """The value that a hypothesis, or a param in MLflow, has as text: `1.0`, `true`, `True`."""
+    """The value of a text in a hypothesis or an MLflow param: `1.0`, `true`, `True`."""
     with contextlib.suppress(ValueError):
         return float(text)
     with contextlib.suppress(ValueError, RecursionError):
@@ -103,16 +103,16 @@ class Analysis(StrictModel):
         ],
         ...,
     ] = Field(min_length=1, max_length=50)
-    """Two conditions each, with `better than`, `worse than`, `equivalent to` or `against` between
-    them: `q = 1.5 better than q = 1`. A condition is all runs that have these settings (`q`,
-    `alpha`, `weight`, a dotted setting, `stage`); if more settings vary, differences are averaged
-    over pairs that are equal in the others."""
+    """Two conditions each with `better than`, `worse than`, `equivalent to` or `against` between
+    them: `q = 1.5 better than q = 1`. A condition is all runs with these settings (`q`, `alpha`,
+    `weight`, a dotted setting, `stage`). If more settings vary, differences are averaged over pairs
+    with equal other settings."""
     stage: str | None = None
-    """Stage of the conditions; null: the last one. A condition may name another."""
+    """Stage of the conditions; null: the last stage. A condition can name another stage."""
     metric: Literal["auc", "final"] = "auc"
-    """Number of a run: the mean of the task's primary metric over the budget (the area under its
-    curve), or its last value."""
+    """Number to compare: the mean of the task's primary metric over the budget (the area under the
+    learning curve), or its last value."""
     margin: float | None = Field(None, gt=0)
-    """Differences below it do not matter: the margin of equivalence tests. null: 0.05 for a success
-    rate; it must be given for a return. One of 1 or more is a return's, beside which 0.05 stays
-    that of success rates."""
+    """Margin of equivalence tests: smaller differences do not matter. null: 0.05 for a success
+    rate; required for a return. If tasks of both kinds are compared, a margin of 1 or more applies
+    to returns, and success rates keep 0.05."""

@@ -1,7 +1,6 @@
-"""Settings of one run, and the variants that fix part of them (MUSIC, paper III-A and its code).
+"""Settings of one run, and the variants that fix some of them (MUSIC, paper III-A and its code).
 
-A *run* is one trial on one task with one seed. `RunSettings` holds everything that determines its
-numbers, apart from the weights it may start from, and nothing else.
+A *run* is one trial on one task with one seed.
 """
 
 from __future__ import annotations
@@ -22,22 +21,22 @@ from music_rllib.store.handoff import Architecture, HandoffInfo, Spaces
 
 Variant = Literal["tac", "music-u", "music-r", "music-f", "music-p"]
 StartsFrom = Literal["scratch", "estimator", "agent"]
-"""Source of the runs of a variant: nothing, a trained estimator, or a whole trained agent."""
+"""Source of a variant's network weights: nothing, a trained estimator, or a trained agent."""
 
 
 class VariantRules(NamedTuple):
-    """The settings that a variant fixes, and the source that it needs."""
+    """The settings that a variant fixes, and the source of its network weights."""
 
     fixed: Mapping[str, Any]
-    """Fields of `MusicSettings` that no layer of the configuration may contradict."""
+    """Fields of `MusicSettings`; a configuration that contradicts them is rejected."""
     without_effect: frozenset[str]
-    """Dotted settings without effect: ignored in `defaults`, refused in a stage."""
+    """Dotted settings without effect: ignored in `defaults`, rejected in a stage."""
     starts_from: StartsFrom = "scratch"
-    """The part of the run of `init_from` that is taken over."""
+    """The part of the run in `init_from` that is taken over."""
 
     @property
     def uses_mi(self) -> bool:
-        """Whether it uses mutual information, so that the task must have a split."""
+        """Whether it uses mutual information, which needs a task with a split."""
         return bool(self.fixed["estimator"] != "none")
 
 
@@ -86,7 +85,7 @@ VARIANTS: Mapping[Variant, VariantRules] = MappingProxyType(
 
 
 def variant_music(variant: Variant, task: Task) -> dict[str, Any]:
-    """Fields of `MusicSettings` that the variant sets on this task, below all other layers."""
+    """Fields of `MusicSettings` that the variant sets on a task, below all other layers."""
     music = dict(VARIANTS[variant].fixed)
     if variant == "music-u":
         music["mi_reward_weight"] = 1.0
@@ -96,7 +95,7 @@ def variant_music(variant: Variant, task: Task) -> dict[str, Any]:
 
 
 def contradiction(variant: Variant, fixed: Any, got: Any) -> str:
-    """The rule that a setting breaks if it contradicts its variant."""
+    """The rule that a setting breaks that contradicts its variant."""
     return f"must be {json.dumps(fixed)} for {variant}, got {json.dumps(got)}"
 
 
@@ -109,12 +108,12 @@ YOUNGER: tuple[tuple[str, str], ...] = (("tac", "log_std_form"), ("tac", "warmup
 """Group and name of settings that are newer than the node keys of finished runs."""
 
 RETIRED: Mapping[tuple[str, str], Any] = MappingProxyType({("tac", "precision"): "float32"})
-"""Group and name of removed settings, with the only value that a sweep's file may still give them.
+"""Group and name of removed settings, with the only value that a sweep's file can still give them.
 Node keys contain them, so that finished runs are found."""
 
 
 def without_retired(settings: Any) -> Any:
-    """A run's settings as plain data, without removed ones that have their last value."""
+    """A run's settings as plain data, without removed settings that have their last value."""
     for (section, name), kept in RETIRED.items():
         group = settings.get(section) if isinstance(settings, dict) else None
         if isinstance(group, dict) and group.get(name) == kept:
@@ -128,14 +127,14 @@ class Evaluation(StrictModel):
 
     interval: int = Field(5_000, gt=0)
     """Environment steps between two evaluations; the end of a run is always evaluated. Smaller
-    resolves the learning curve better, and takes more time."""
+    values resolve the learning curve better and take more time."""
     episodes: int = Field(20, gt=0)
-    """Episodes per evaluation. A success rate's standard error is at most .5 / sqrt of them: .11
-    with 20."""
+    """Episodes per evaluation. The standard error of a success rate is at most
+    0.5 / sqrt(episodes): 0.11 with 20."""
 
 
 class RunSettings(StrictModel):
-    """Everything that determines the numbers of one run, given the weights it starts from."""
+    """Everything that determines the numbers of one run, except its initial weights."""
 
     task: Task
     variant: Variant
@@ -143,8 +142,8 @@ class RunSettings(StrictModel):
     env_steps: int = Field(200_000, gt=0)
     """Budget: environment steps of training, over all sub-environments."""
     num_envs: int = Field(4, gt=0)
-    """Sub-environments stepped together. More make a step cheaper, and updates of the policy
-    rarer."""
+    """Sub-environments stepped together. Larger values make a step cheaper and updates of the
+    policy rarer."""
     evaluation: Evaluation = Evaluation()
     tac: TACSettings = TACSettings()
     music: MusicSettings = MusicSettings()
@@ -152,7 +151,7 @@ class RunSettings(StrictModel):
 
     @property
     def architecture(self) -> Architecture:
-        """Settings that determine the shapes of the networks' arrays, or their meaning."""
+        """Settings that determine the shapes or the meaning of the networks' arrays."""
         return Architecture(
             hidden_sizes=self.tac.hidden_sizes,
             policy=self.tac.policy,
@@ -164,7 +163,7 @@ class RunSettings(StrictModel):
         )
 
     def handoff_info(self, node_key: str, env_steps: int, spaces: Spaces) -> HandoffInfo:
-        """The description of a handoff of this run after `env_steps`."""
+        """Describe a handoff of this run after `env_steps`."""
         return HandoffInfo(
             task=self.task,
             variant=self.variant,
@@ -180,8 +179,8 @@ class RunSettings(StrictModel):
     def identity(self) -> dict[str, Any]:
         """Everything that determines the numbers, as plain data.
 
-        A setting of `YOUNGER` is omitted if it has its default: runs that do not use it keep the
-        identity that they had before it existed. A removed setting keeps its last value.
+        Settings of `YOUNGER` are omitted if they have their default: runs that do not use them keep
+        the identity that they had before. Removed settings keep their last value.
         """
         settings = self.model_dump(mode="json") | {"task": self.task.identity()}
         if self.replay.hindsight_episodes == "moved" and self.task.moved_distance is not None:

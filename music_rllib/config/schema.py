@@ -25,32 +25,34 @@ RESERVED_NAMES = frozenset(
     {"nodes", "work", "continuations", "verified.json"}
     | {"mlartifacts", "mlflow.db", "mlflow.db.lock"}
 )
-"""Entries of a storage folder that are no sweeps' folders."""
+"""Entries of a storage folder that are not sweeps' folders."""
 
 
 class MlflowSettings(StrictModel):
     """The MLflow server that metrics are logged to."""
 
     tracking_uri: str | None = None
-    """An MLflow server or database. null: a sqlite file and an artefact folder in the storage. Not
-    given: the environment variable `MLFLOW_TRACKING_URI`, and null without it."""
+    """An MLflow server or database. null: a SQLite file and an artifact folder in the storage. Not
+    given: the environment variable `MLFLOW_TRACKING_URI`, or null if it is not set."""
 
 
 class Resources(StrictModel):
     """Resources of runs."""
 
     num_cpus: int | None = Field(None, gt=0)
-    """CPUs of the local Ray, which is started if no cluster is given; null: all of the machine."""
+    """CPUs of the local Ray, which is started if no cluster is given; null: all CPUs of the
+    machine."""
     cpus_per_run: int = Field(1, gt=0)
     """CPUs reserved for a run; a run itself uses one."""
     gpus_per_run: float = Field(0.0, ge=0)
-    """GPUs reserved for a run, whose networks then train on one; with 0.25 four runs share one."""
+    """GPUs reserved for a run, whose networks then train on a GPU; with 0.25, four runs share a
+    GPU."""
     memory_per_run: float | None = Field(None, gt=0)
-    """GiB of memory reserved for a run, which limits the number of concurrent runs; null: memory is
-    not counted."""
+    """GiB of memory reserved for a run, which limits the number of concurrent runs; null: no
+    memory is reserved."""
     hang_minutes: float | None = Field(5.0, gt=0)
-    """Longest call of an environment's `step()` or `reset()`: after it the run fails with the stack
-    of the call, and other runs continue. null: no limit."""
+    """Minutes after which a call of an environment's `step()` or `reset()` counts as hanging: the
+    run fails with the stack of the call, and other runs continue. null: no limit."""
 
     @property
     def bundle(self) -> dict[str, float]:
@@ -75,14 +77,14 @@ class Checkpoints(StrictModel):
     """Checkpoints of runs; no run's result depends on them."""
 
     keep: int = Field(2, gt=0)
-    """Checkpoints kept for a run; older ones are used if the newest is damaged."""
+    """Checkpoints kept for a run; an older checkpoint is used if the newest one is damaged."""
     minutes: float = Field(10.0, gt=0)
-    """Time after which a run is saved again; it is also saved at each evaluation."""
+    """Minutes between two checkpoints of a run, which is also saved at each evaluation."""
     grace_seconds: float = Field(30.0, ge=0)
-    """Time that a stopping sweep gives its runs to be saved."""
+    """Seconds that a stopping sweep waits for its runs to be saved."""
     finished_mb: float = Field(256.0, ge=0)
-    """A finished run keeps its last checkpoint if its replay buffer takes at most so many
-    megabytes, so that the same run with more `env_steps` continues from there; 0: none is kept."""
+    """Largest replay buffer in megabytes with which a finished run keeps its last checkpoint, so
+    that the same run with more `env_steps` continues from there; 0: no checkpoint is kept."""
 
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=80)]
@@ -96,14 +98,14 @@ def _not_reserved(name: str) -> str:
 
 
 class Header(StrictModel):
-    """The keys of the file; what is below `environments`, `defaults` and `stages` is any value."""
+    """The keys of the file; values below `environments`, `defaults` and `stages` are not checked."""
 
     name: Annotated[Name, AfterValidator(_not_reserved)]
     """The sweep's name: its folder in the storage and its experiment in MLflow."""
     tasks: tuple[str, ...] = Field(min_length=1)
-    """Built-in tasks or those of `environments`; every trial has runs on each."""
+    """Built-in tasks or tasks of `environments`; every trial has runs on each task."""
     seeds: tuple[Seed, ...] = Field((0,), min_length=1, max_length=MOST_SEEDS)
-    """Every trial has runs with each. `5` is short for `[0, 1, 2, 3, 4]`."""
+    """Seeds of every trial's runs. `5` is short for `[0, 1, 2, 3, 4]`."""
     storage: str = Field("results", min_length=1)
     """Folder or bucket (`s3://`, `gs://`); the sweep's own folder is `<storage>/<name>`. `$NAME` is
     replaced by that environment variable."""
@@ -129,11 +131,11 @@ class InitFrom(StrictModel):
     stage: str | None = None
     """An earlier stage; a run starts from that stage's run with the same seed."""
     checkpoint: str | None = None
-    """Local folder of a handoff from outside the sweep, in place of a stage: one that `best` has
-    exported, or a finished run's, `STORAGE/nodes/KEY`. It is copied into the storage, from which
-    the sweep goes on and is compared, wherever the folder is by then."""
+    """Instead of a stage: local folder of a handoff from outside the sweep, exported by `best` or
+    of a finished run (`STORAGE/nodes/KEY`). It is copied into the storage, so that later commands do
+    not need the folder."""
     task: str | None = None
-    """Task of the run, or of the checkpoint, to start from; null: each run's own task."""
+    """Task of the run or the checkpoint to start from; null: each run's own task."""
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:
@@ -150,20 +152,20 @@ class StageHeader(StrictModel):
     variant: Variant
     """The algorithm; it fixes part of the settings (docs/algorithms.md)."""
     tasks: tuple[str, ...] | None = Field(None, min_length=1)
-    """Tasks of this stage; null: the sweep's."""
+    """Tasks of this stage; null: the tasks of the sweep."""
     init_from: InitFrom | None = None
-    """Source of its runs' weights. A bare name is short for `{stage: NAME}`."""
+    """Source of the runs' initial weights. A bare name is short for `{stage: NAME}`."""
     per_task: dict[str, dict[str, Any]] = Field(default_factory=dict)
-    """Task to settings that replace the stage's for it: `{FetchSlide: {env_steps: 300000}}`."""
+    """Task to settings for this task only: `{FetchSlide: {env_steps: 300000}}`."""
     grid: dict[str, Annotated[list[Any], Field(min_length=1)]] = Field(default_factory=dict)
-    """Dotted setting to its values; the product of all lists gives the stage's trials. Settings
-    that vary together are a group: `tac: [{entropic_index: 1, alpha: 0.05}, ...]`."""
+    """Dotted setting to its values; the stage's trials are the product of all lists. Settings that
+    vary together form a group: `tac: [{entropic_index: 1, alpha: 0.05}, ...]`."""
     search: SearchSettings | None = None
-    """A search for the trials in place of `grid` (docs/search.md)."""
+    """A search for the trials instead of `grid` (docs/search.md)."""
 
 
 IMPORTED = "handoff-"
-"""Beginning of the keys of nodes that are handoffs from outside."""
+"""Prefix of the keys of nodes that are handoffs from outside the sweep."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -176,20 +178,20 @@ class ImportedHandoff:
 
     @property
     def key(self) -> str:
-        """The node as which a storage has it."""
+        """Key of its node in a storage."""
         return f"{IMPORTED}{self.manifest.content_hash}"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Source:
-    """Source of the modules that a stage's runs take over."""
+    """Source of the network weights that a stage's runs take over."""
 
     stage: str | None = None
     """An earlier stage; each run starts from that stage's run with the same seed..."""
     checkpoint: ImportedHandoff | None = None
     """... or all runs start from this handoff."""
     task: Task | None = None
-    """Task of the source; None: the run's own."""
+    """Task of the source; None: the run's own task."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -211,14 +213,14 @@ class Stage:
     tasks: tuple[Task, ...]
     source: Source | None
     points: tuple[Point, ...]
-    """The grid's points; for a searched stage one, with everything that is not searched."""
+    """The grid's points; for a search one point, with the settings that are not searched."""
     search: SearchSettings | None = None
     resolve: Callable[[Mapping[str, Any]], Point] = field(compare=False, repr=False)
-    """Gives the point at which dotted settings replace this stage's; raises ConfigError."""
+    """Gives the point with dotted settings in place of this stage's; raises ConfigError."""
 
     @property
     def primary_metric(self) -> str:
-        """The metric that its runs are compared by: success if each task has one, else return."""
+        """The metric for comparing its runs: success if each task has it, otherwise return."""
         metrics = {task.primary_metric for task in self.tasks}
         return names.EVAL_SUCCESS if metrics == {names.EVAL_SUCCESS} else names.EVAL_RETURN
 
@@ -228,10 +230,10 @@ class Stage:
         return min(run.evaluation.episodes for point in self.points for run in point.runs.values())
 
     def examples(self) -> Iterator[tuple[Mapping[str, Any], Point]]:
-        """Points that stand for all that the stage may run, with their searched values.
+        """Points that represent everything that the stage can run, with their searched values.
 
-        Those of the grid; of a search the ends of its space, and each compared value. Values of the
-        source are called `STAGE:setting`. Points that are no valid settings are left out.
+        For a grid, all points; for a search, the ends of its space and each compared value. Values
+        of the source are called `STAGE:setting`. Points with invalid settings are omitted.
         """
         yield from (({}, point) for point in self.points)
         if self.search is not None:

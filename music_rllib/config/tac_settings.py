@@ -1,4 +1,4 @@
-"""Settings of TAC, declared and validated once, for YAML and for `TACConfig`."""
+"""Settings of TAC, declared once for YAML files and for `TACConfig`."""
 
 from __future__ import annotations
 
@@ -33,18 +33,17 @@ class LearnedAlpha(StrictModel):
     """Entropy coefficient learned towards a target entropy (Haarnoja et al. 2018b, eq. 18)."""
 
     learned: Literal[True]
-    """Says that alpha is learned."""
+    """Selects a learned alpha."""
     initial: float = Field(0.2, gt=0)
-    """Alpha at the beginning."""
+    """Initial alpha."""
     target_entropy: float | Literal["auto"] = "auto"
-    """Target for S_q of the policy. `auto`: the S_q of a density of e per action dimension, which
-    at q = 1 is SAC's usual minus the number of dimensions."""
+    """Target for S_q of the policy. `auto`: the S_q of a density of e per action dimension; at
+    q = 1 this is minus the number of dimensions, as usual in SAC."""
     target_shannon: float | None = None
-    """In place of `target_entropy`: target for the policy's Shannon entropy in nats, over all
-    action dimensions. It is the same at every q, so that policies of different q are equally
-    random."""
+    """Instead of `target_entropy`: target for the policy's Shannon entropy in nats, over all action
+    dimensions. It is the same at every q, so that policies of different q are equally random."""
     target_width: float | None = Field(None, gt=0)
-    """In place of `target_entropy`: target for the geometric mean of the policy's standard
+    """Instead of `target_entropy`: target for the geometric mean of the policy's standard
     deviations, before tanh. It is the same at every q."""
     lr: float = Field(3e-4, gt=0)
     """Adam's step size for log alpha."""
@@ -61,18 +60,18 @@ class LearnedAlpha(StrictModel):
         return self
 
     @model_serializer(mode="wrap")
-    def _without_what_is_not_given(self, dump: Any) -> dict[str, Any]:
-        """Omit targets that are not given, so that runs without them keep their older node keys."""
+    def _without_missing_targets(self, dump: Any) -> dict[str, Any]:
+        """Omit missing targets, so that runs without them keep their older node keys."""
         return {name: value for name, value in dump(self).items() if value is not None}
 
 
 class MatchedAlpha(StrictModel):
-    """Entropy coefficient for which every q exerts the same pressure at a reference width."""
+    """Entropy coefficient with the same entropy pressure for every q at a reference width."""
 
     value: PositiveSchedule = 0.2
     """Alpha at q = 1."""
     matched_width: float = Field(gt=0)
-    """Standard deviation of the policy, before tanh, at which every q exerts the pressure
+    """Standard deviation of the policy, before tanh, at which every q has the pressure
     `alpha dS_q / d ln sigma` of q = 1 (docs/comparing_q.md)."""
 
     def scaled(self, alpha: float, q: float, actions: int, form: str) -> float:
@@ -86,8 +85,8 @@ class NormalisedAlpha(StrictModel):
     value: PositiveSchedule = 0.2
     """Alpha at q = 1."""
     normalised: Literal[True]
-    """Divides S_q by that of the uniform policy, relative to q = 1. This raises alpha for q > 1, so
-    that the pressures on narrow policies differ more than with one alpha."""
+    """Divides S_q by the S_q of the uniform policy, relative to q = 1. This raises alpha for q > 1,
+    so that the pressures on narrow policies differ more than with one alpha."""
 
     def scaled(self, alpha: float, q: float, actions: int, form: str) -> float:
         """Alpha at q for a number of action dimensions."""
@@ -95,14 +94,14 @@ class NormalisedAlpha(StrictModel):
 
 
 class GaussianNoise(StrictModel):
-    """Behaviour of the original MUSIC: tanh(mean) plus noise, some actions uniformly random."""
+    """Behavior of the original MUSIC: tanh(mean) plus noise, with some uniformly random actions."""
 
     kind: Literal["gaussian_noise"]
-    """Says which kind of behaviour this is."""
+    """The kind of behavior."""
     std: float = Field(0.2, ge=0)
     """Standard deviation in units of the action space scaled to [-1, 1]."""
     random_share: float = Field(0.3, ge=0, le=1)
-    """Share of actions that are drawn uniformly instead."""
+    """Share of actions that are uniformly random instead."""
 
 
 def _alpha_kind(value: object) -> str:
@@ -121,7 +120,7 @@ Alpha = Annotated[
     | Annotated[NormalisedAlpha, Tag("NormalisedAlpha")],
     Discriminator(_alpha_kind),
 ]
-"""Entropy coefficient: a constant or a schedule, as it is or scaled for each q, or learned."""
+"""Entropy coefficient: a constant or a schedule, unchanged or scaled for each q, or learned."""
 
 
 def alpha_at(
@@ -150,78 +149,81 @@ Behaviour = Annotated[
     Annotated[Literal["policy"], Tag("policy")] | Annotated[GaussianNoise, Tag("gaussian_noise")],
     Discriminator(_behaviour_kind),
 ]
-"""How actions are chosen during training."""
+"""Method of choosing actions during training."""
 
 
 class TACSettings(StrictModel):
     """Settings of the Tsallis actor-critic (paper III-B, Fig. 3)."""
 
     entropic_index: Annotated[AdaptiveSchedule, bounded("> 0", lambda q: q > 0)] = 1.0
-    """q of ln_q: 1 is SAC, 2 the sparse Tsallis entropy. At the same `alpha` a larger q keeps
-    policies broader, since its pressure grows as they narrow."""
+    """q of ln_q: 1 is SAC, 2 the sparse Tsallis entropy. At the same `alpha`, a larger q keeps
+    policies broader, because its pressure grows as they narrow."""
     alpha: Alpha = 0.2
     """Entropy coefficient: a constant, a schedule, `{learned: true, ...}`, or, to compare q at
     equal pressure, `{value: ..., matched_width: ...}` (docs/comparing_q.md). Higher values explore
-    longer and slow the end of learning."""
+    longer and converge more slowly."""
     entropy_form: Literal["per_dimension", "joint"] = "per_dimension"
-    """ln_q summed over action dimensions (the TAC authors), or of the joint density (the paper),
-    whose pressure on a narrow policy grows with their number where q > 1."""
+    """ln_q summed over action dimensions (the TAC authors), or of the joint density (the paper).
+    The pressure of the joint form on a narrow policy grows with the number of dimensions if
+    q > 1."""
     policy: Literal["stochastic", "deterministic"] = "stochastic"
-    """Squashed Gaussian, or tanh(mean) only: with `bootstrap: critics` that is DDPG."""
+    """Squashed Gaussian, or only tanh(mean), which is DDPG with `bootstrap: critics`."""
     bootstrap: Literal["value", "critics"] = "value"
     """Value of the next state: the target value network (the paper), or target critics at the
     policy's next action (SAC with twin targets; with one critic, DDPG)."""
     policy_critic: Literal["first", "min"] = "min"
-    """Critic in the policy's loss: Q1 (the TAC authors) or min(Q1, Q2) (SAC practice), which
+    """Critic in the policy's loss: Q1 (the TAC authors) or min(Q1, Q2) (usual in SAC), which
     exploits the overestimates of one critic less."""
     hidden_sizes: tuple[Annotated[int, Field(gt=0)], ...] = Field((256, 256, 256), min_length=1)
     """Hidden layers (ReLU) of policy, value and critics. 3 x 256 takes nearly four times as long as
     3 x 128."""
     log_std_bounds: tuple[float, float] = (-20.0, 2.0)
-    """Range of the policy's log standard deviation. A higher lower end keeps noise in the actions
+    """Range of the policy's log standard deviation. A higher lower bound keeps noise in the actions
     until the end."""
     log_std_form: Literal["clamp", "tanh"] = "clamp"
-    """How log standard deviations are kept in that range: cut off at the bounds, so that they begin
-    near 0; or by a tanh that is scaled to the bounds, so that they begin in the middle (TAC-2020:
-    [-20, 2], original MUSIC's SAC: [-5, 2])."""
+    """Limits log standard deviations to that range: clipped at the bounds, so that they begin near
+    0; or by a tanh scaled to the bounds, so that they begin in the middle (TAC-2020: [-20, 2],
+    original MUSIC's SAC: [-5, 2])."""
     lr: float = Field(1e-3, gt=0)
-    """Adam's step size for policy, value and critics. Larger learns sooner, or diverges."""
+    """Adam's step size for policy, value and critics. Larger values learn in fewer steps, or
+    diverge."""
     gamma: float = Field(0.99, ge=0, lt=1)
     """Discount factor: the horizon is about 1 / (1 - gamma) steps."""
     tau: float = Field(0.005, gt=0, le=1)
-    """Moving-average ratio of the target networks. Larger propagates values sooner and less
-    smoothly."""
+    """Moving-average ratio of the target networks. Larger values follow the networks faster and
+    less smoothly."""
     target_update_interval: int = Field(1, gt=0)
     """Gradient updates between two updates of the target networks."""
     target_bounds: tuple[float, float] | None = None
     """Range to which critic targets are clipped (original MUSIC: plus/minus 4/(1-gamma)). It keeps
-    values from diverging; too narrow a range cuts off true values, of which a sweep warns."""
+    values from diverging. A sweep prints a warning if the range cuts off reachable values."""
     batch_size: int = Field(256, gt=0)
-    """Transitions per update. More make updates less noisy and slower."""
+    """Transitions per update. Larger values make updates less noisy and slower."""
     replay_ratio: float = Field(1.0, gt=0)
-    """Gradient updates per environment step. More learn more from each step and take longer:
-    updates are most of a run's time."""
+    """Gradient updates per environment step. Larger values learn more from each step and take
+    longer: updates are most of a run's time."""
     random_steps: int = Field(1_000, ge=0)
-    """First environment steps, with uniformly random actions. More give the first updates more
-    varied data, later."""
+    """First environment steps, with uniformly random actions. Larger values give the first updates
+    more varied data, but later."""
     warmup_steps: int | None = Field(None, ge=0)
-    """Environment steps before the first update, which count for no update. null: `random_steps`.
-    0: updates also follow random episodes, as in TAC-2020."""
+    """Environment steps before the first update, which `replay_ratio` does not count. null:
+    `random_steps`. 0: updates also follow random episodes, as in TAC-2020."""
     normalise_observations: bool = True
-    """Whether observations and goals are normalised by their running mean and standard deviation,
-    so that inputs of small numbers (metres, here) count as much as large ones."""
+    """Whether observations and goals are normalized by their running mean and standard deviation,
+    so that small inputs count as much as large inputs."""
     observation_clip: float = Field(5.0, gt=0)
-    """Normalised observations are clipped to plus/minus this."""
+    """Normalized observations are clipped to plus/minus this value."""
     normaliser_epsilon: float = Field(1e-2, gt=0)
-    """Smallest standard deviation that the normaliser divides by. Larger keeps inputs small that
-    hardly vary; smaller amplifies their noise."""
+    """Smallest standard deviation that the normalizer divides by. Larger values keep inputs small
+    that hardly vary; smaller values amplify their noise."""
     behaviour: Behaviour = "policy"
-    """Actions during training: samples of the policy, or with the original MUSIC's noise."""
+    """Actions during training: samples of the policy, or actions with the original MUSIC's
+    noise."""
     action_l2: float = Field(0.0, ge=0)
     """Weight of the policy's mean squared action, in [-1, 1], in its loss (original MUSIC: 1.0).
-    Higher makes actions gentler, perhaps too gentle to push."""
+    Higher values make actions smaller, possibly too small to push an object."""
     max_episode_steps: int | None = Field(None, gt=0)
-    """Steps after which episodes are truncated; needed if the environment has no time limit."""
+    """Steps after which episodes are truncated; required if the environment has no time limit."""
 
     @property
     def steps_before_updates(self) -> int:
