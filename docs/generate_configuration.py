@@ -84,8 +84,8 @@ stages:
 ```
 
 A setting can be written in several places. From the lowest to the highest priority they are: the
-variant, the `preset`, `defaults`, the stage, its `per_task` entry for the task, and the point of its
-`grid`. The groups `evaluation`, `tac`, `music` and `replay` are merged field by field.
+variant, the `preset`, `defaults`, the stage, its `per_task` entry for the task, and the point of
+its `grid`. The groups `evaluation`, `tac`, `music` and `replay` are merged field by field.
 
 All problems of a file are reported at once, before anything starts, each with file, line, key, rule
 and value. Files follow YAML 1.2: `1e-3` is a number and `no` is text. `1e6` is accepted as an
@@ -137,8 +137,8 @@ MEASURED_TEXT = """\
 
 A setting of type *measured* can also be a mapping with the key `follows`, which makes the value a
 function of a measured quantity: `{follows: success_rate, points: [[0.2, 2.0], [0.9, 1.0]],
-monotone: true}`. The success rate is measured at evaluations (`evaluation.interval`), the entropy in
-the updates after each round of episodes. [comparing_q.md](comparing_q.md) has an example.
+monotone: true}`. The success rate is measured at evaluations (`evaluation.interval`), the entropy
+in the updates after each round of episodes. [comparing_q.md](comparing_q.md) has an example.
 """
 
 # --- the document ------------------------------------------------------------------------------
@@ -180,7 +180,7 @@ def document() -> str:
         VARIANTS_TEXT,
         variants(),
         "## Settings",
-        "`defaults` and stages have groups (`tac: {lr: 0.001}`); a `grid` has dotted keys (`tac.lr`).",
+        "`defaults` and stages have groups (`tac: {lr: 0.001}`), a `grid` dotted keys (`tac.lr`).",
         table(
             [
                 *rows(RunSettings, "", only=("env_steps", "num_envs")),

@@ -98,7 +98,7 @@ def _not_reserved(name: str) -> str:
 
 
 class Header(StrictModel):
-    """The keys of the file; values below `environments`, `defaults` and `stages` are not checked."""
+    """The keys of the file; `environments`, `defaults` and `stages` are checked later."""
 
     name: Annotated[Name, AfterValidator(_not_reserved)]
     """The sweep's name: its folder in the storage and its experiment in MLflow."""
@@ -132,8 +132,8 @@ class InitFrom(StrictModel):
     """An earlier stage; a run starts from that stage's run with the same seed."""
     checkpoint: str | None = None
     """Instead of a stage: local folder of a handoff from outside the sweep, exported by `best` or
-    of a finished run (`STORAGE/nodes/KEY`). It is copied into the storage, so that later commands do
-    not need the folder."""
+    of a finished run (`STORAGE/nodes/KEY`). It is copied into the storage: later commands do not
+    need the folder."""
     task: str | None = None
     """Task of the run or the checkpoint to start from; null: each run's own task."""
 
