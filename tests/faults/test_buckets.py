@@ -52,7 +52,7 @@ def test_a_driver_in_a_new_pod_continues(
     program.environment |= {"HOME": str(tmp_path / "two"), names.VARIABLE_REPORT: "on"}
     code, output, errors = program.run("tac.lr=0.01", command="plan")
     assert code == 0, errors
-    assert "would be trained anew" in output
+    assert "would be retrained" in output
     output = sweeps.finish(program)
     assert "pretrain/seed0: finished earlier, reused" in output
     assert comparison.logged(server.uri) == comparison.logged(f"sqlite:///{unbroken}/mlflow.db")
