@@ -503,7 +503,8 @@ CORPUS: dict[str, Hostile] = {
         "must be a handoff manifest",
     ),
     "handoff: much is declared": Hostile(
-        _handoff(lambda m: m["modules"]["policy"].update(bytes=1 << 50)), "must have at most"
+        _handoff(lambda m: m["modules"]["policy"].update(bytes=1 << 50)),
+        "must have 1125899906842624 bytes, it has",
     ),
     "packed: large header": Hostile(_packed(_header(90 << 20)), "header must have at most"),
     "packed: a header beyond its file": Hostile(_packed(_header(1 << 60)), "header must have"),
