@@ -194,11 +194,11 @@ TAGS_OF_A_MODEL = (
 )
 """Tags of a run that its logged policy has too, besides ``source_run``."""
 
-# Artefacts --------------------------------------------------------------------------------------
-ARTEFACT_SWEEP_CONFIG = "config/sweep.yaml"
-ARTEFACT_SEARCH = "search/search.json"
+# Artifacts --------------------------------------------------------------------------------------
+ARTIFACT_SWEEP_CONFIG = "config/sweep.yaml"
+ARTIFACT_SEARCH = "search/search.json"
 """Trials, values, reasons, importance and the ranking on fresh seeds of a sweep's searches."""
-ARTEFACT_ANALYSIS_PLAN = "analysis/analysis_plan.json"
+ARTIFACT_ANALYSIS_PLAN = "analysis/analysis_plan.json"
 """Versions of the sweep's analysis plan, each with the time at which it was recorded."""
 
 # Environment variables --------------------------------------------------------------------------

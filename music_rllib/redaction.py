@@ -112,7 +112,7 @@ def flat_params(settings: Mapping[str, object]) -> dict[str, str]:
     """Nested ``settings`` as MLflow params: dotted names, scalars as text.
 
     A list is one param (JSON text). Secrets, lists of records and values above
-    ``MAX_PARAM_LENGTH`` characters are omitted: the whole configuration is an artefact anyway.
+    ``MAX_PARAM_LENGTH`` characters are omitted: the whole configuration is an artifact anyway.
     """
     flat = {}
     for name, value in _leaves(without_secrets(settings), ""):

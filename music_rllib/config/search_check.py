@@ -19,7 +19,7 @@ _METRICS = frozenset(
     if key.isupper()
     and isinstance(value, str)
     and not value.isupper()  # an environment variable
-    and not key.startswith(("TAG_", "KIND_", "ARTEFACT_", "SETTING_"))
+    and not key.startswith(("TAG_", "KIND_", "ARTIFACT_", "SETTING_"))
 )
 _OF_SUCCESS = frozenset(
     {names.EVAL_SUCCESS, names.EVAL_SUCCESS_ANY, names.TRAIN_SUCCESS, names.TRAIN_SUCCESS_ANY}

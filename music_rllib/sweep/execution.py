@@ -66,7 +66,7 @@ def compute_and_report(
     """
     if versions:
         plans = as_json(as_document(versions))
-        tracker.put_sweep_artifact(names.ARTEFACT_ANALYSIS_PLAN, plans)
+        tracker.put_sweep_artifact(names.ARTIFACT_ANALYSIS_PLAN, plans)
     with (
         Display(console, opened.plan, opened.scheduler) as display,
         StateFile(opened) as state_file,

@@ -46,6 +46,6 @@ def end_searches(
     searches = outcome(controller)
     if searches:
         text = as_json(searches)
-        tracker.put_sweep_artifact(names.ARTEFACT_SEARCH, text)
+        tracker.put_sweep_artifact(names.ARTIFACT_SEARCH, text)
         opened.location.keep(SEARCH, text)
     return searches

@@ -18,7 +18,7 @@ from music_rllib.policy import network
 from music_rllib.policy.network import PolicyNetwork
 
 MODEL_NAME = "policy"
-"""Name of the logged model, and of its artefact folder."""
+"""Name of the logged model, and of its artifact folder."""
 _POLICY_FILE = Path("artifacts", "policy.safetensors")
 """Path of the policy in the model's folder."""
 

@@ -13,12 +13,18 @@ import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
-from urllib.parse import unquote, urlsplit
+from urllib.parse import urlsplit
 
 from music_rllib.errors import TrackingError
 from music_rllib.experiment.sweep_files import SweepLocation, as_json
 from music_rllib.redaction import redact
-from music_rllib.store.storage import StorageError, database_url, sqlite_url
+from music_rllib.store.storage import (
+    StorageError,
+    database_url,
+    is_remote,
+    sqlite_url,
+    sweep_folder,
+)
 
 if TYPE_CHECKING:
     import requests
@@ -45,7 +51,7 @@ class TrackingStore:
     artifact_root: str | None
     """URI of the folder for artifacts; None if the server decides."""
     database: Path | None = None
-    """The sqlite file in the storage; None for other stores."""
+    """The SQLite file in the storage; None for other stores."""
 
     @property
     def public_uri(self) -> str:
@@ -54,14 +60,14 @@ class TrackingStore:
 
     @property
     def is_server(self) -> bool:
-        """Whether the store is an MLflow server and no database."""
+        """Whether the store is an MLflow server, not a database."""
         return self.uri.startswith(("http://", "https://"))
 
     def ui_command(self) -> str:
         """The command that serves MLflow's pages, or the address of the server."""
         if self.is_server:
             return self.public_uri
-        # The plain name, unless another `mlflow` comes first on the PATH.
+        # The plain name, unless another `mlflow` is first on the PATH.
         program, found = Path(sys.executable).with_name("mlflow"), shutil.which("mlflow")
         is_plain = not program.exists() or str(program) == found
         command = "mlflow" if is_plain else str(program)
@@ -122,14 +128,15 @@ def resolve_store(tracking_uri: str | None, storage: str) -> TrackingStore:
 
     Args:
         tracking_uri: A server (`http(s)://`), a database (`sqlite:///FILE`, `postgresql://...`),
-            or None for a sqlite file in `storage`.
-        storage: The sweep's storage, a folder or a bucket URI. Artifacts are kept there, unless a
-            server keeps them.
+            or None for an SQLite file in `storage`.
+        storage: The sweep's storage, a folder or a bucket URI. Artifacts are stored there, unless a
+            server stores them.
 
     Raises:
         TrackingError: The URI is none of these, or is None although `storage` is a bucket.
     """
-    folder = local_folder(storage)
+    remote = is_remote(storage)
+    folder = None if remote else sweep_folder(storage, "").expanduser().absolute()
     if folder is None:
         artifacts = f"{storage.partition('?')[0].rstrip('/')}/mlartifacts"
     else:
@@ -137,26 +144,17 @@ def resolve_store(tracking_uri: str | None, storage: str) -> TrackingStore:
     if tracking_uri is None:
         if folder is None:
             raise TrackingError(
-                "mlflow.tracking_uri must be set where storage is not a local folder, "
-                f"got storage {redact(storage)}: a sqlite file cannot live in a bucket. "
-                "Name an MLflow server there."
+                "mlflow.tracking_uri must be set if storage is not a local folder, "
+                f"got storage {redact(storage)}: a bucket cannot hold an SQLite file. "
+                "Name an MLflow server."
             )
         database = folder / "mlflow.db"
         return TrackingStore(uri=sqlite_url(database), artifact_root=artifacts, database=database)
     is_server = _checked_scheme(tracking_uri) in _SERVERS
     uri, known = database_url(tracking_uri), database_url(os.environ.get(VARIABLE, ""))
-    if redact(known) == uri:  # a sweep keeps its URI without the password
+    if redact(known) == uri:  # the sweep has its URI without the password
         uri = known
     return TrackingStore(uri=uri, artifact_root=None if is_server else artifacts)
-
-
-def local_folder(storage: str) -> Path | None:
-    """`storage` as an absolute path; None if it is a bucket."""
-    if storage.startswith("file://"):
-        return Path(unquote(urlsplit(storage).path))
-    if "://" in storage:
-        return None
-    return Path(storage).expanduser().absolute()
 
 
 def check_reachable(store: TrackingStore) -> None:
@@ -182,7 +180,7 @@ def check_reachable(store: TrackingStore) -> None:
 
 
 def mlflow_version(store: TrackingStore) -> str | None:
-    """Version of the MLflow that shows the store; None if a server does not say."""
+    """Version of the MLflow that shows the store; None if a server does not answer."""
     import mlflow
     import requests
 
@@ -206,20 +204,20 @@ def _checked_scheme(uri: str) -> str:
     """Scheme of a tracking URI.
 
     Raises:
-        TrackingError: MLflow has no such scheme, or the URI names no host.
+        TrackingError: MLflow has no such scheme, or the URI has no host.
     """
     scheme = uri.partition("://")[0].partition("+")[0] if "://" in uri else ""
     if scheme not in (*_SERVERS, *_DATABASES):
         raise TrackingError(
-            f"{_origin(uri)} must be null (a sqlite file in the storage folder), "
+            f"{_origin(uri)} must be null (an SQLite file in the storage folder), "
             f"http(s)://HOST:PORT or a database URI ({', '.join(_DATABASES)}), got {redact(uri)!r}"
         )
     try:
         parts = urlsplit(uri)
-        names_a_host = bool(parts.hostname) and parts.port != 0
+        has_host = bool(parts.hostname) and parts.port != 0
     except ValueError:
-        names_a_host = False
-    if scheme in _SERVERS and not names_a_host:
+        has_host = False
+    if scheme in _SERVERS and not has_host:
         raise TrackingError(
             f"{_origin(uri)} must name a host and a numeric port, got {redact(uri)!r}"
         )
@@ -229,12 +227,12 @@ def _checked_scheme(uri: str) -> str:
 def _unreachable(store: TrackingStore, reason: str) -> TrackingError:
     return TrackingError(
         f"{_origin(store.uri)} must name an MLflow server that answers, got {store.public_uri}: "
-        f"{reason}. Start that server, correct the URI, or leave it null for a local sqlite file."
+        f"{reason}. Start that server, correct the URI, or set it to null for a local SQLite file."
     )
 
 
 def _origin(uri: str) -> str:
-    """The name of what has set this URI, for messages."""
+    """The setting of this URI, for messages."""
     if uri != database_url(os.environ.get(VARIABLE, "")):
         return SETTING
     return f"{SETTING} (from the environment variable {VARIABLE})"

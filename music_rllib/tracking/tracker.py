@@ -244,7 +244,7 @@ class Tracker:
         """The parent run. It is created at once, as its children need its id."""
         parent = RunQueue(self._experiment, "", {names.TAG_SWEEP: self._name})
         parent.start(RunInfo(node_key="", name=self._name, config=config))
-        parent.put_text(names.ARTEFACT_SWEEP_CONFIG, _as_yaml(config))
+        parent.put_text(names.ARTIFACT_SWEEP_CONFIG, _as_yaml(config))
         with answers_named(self.store, "accept the sweep's run"):
             parent.attach()
         return parent

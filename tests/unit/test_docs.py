@@ -75,7 +75,7 @@ METRICS = {
     for key, value in vars(names).items()
     if key.isupper()
     and isinstance(value, str)
-    and not key.startswith(("TAG_", "KIND_", "ARTEFACT_", "VARIABLE_", "CURRENT", "SUPERSEDED"))
+    and not key.startswith(("TAG_", "KIND_", "ARTIFACT_", "VARIABLE_", "CURRENT", "SUPERSEDED"))
 }
 
 

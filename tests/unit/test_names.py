@@ -21,7 +21,7 @@ def test_every_name_is_one_that_mlflow_accepts() -> None:
 
 def test_no_two_metrics_share_a_name() -> None:
     metrics = [
-        value for key, value in CONSTANTS.items() if not key.startswith(("TAG_", "KIND_", "ARTEF"))
+        value for key, value in CONSTANTS.items() if not key.startswith(("TAG_", "KIND_", "ARTIF"))
     ]
     assert len(set(metrics)) == len(metrics)
 

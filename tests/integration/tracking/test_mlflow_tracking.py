@@ -204,7 +204,7 @@ def test_a_sweep_as_mlflow_shows_it(storage: Path, tracker_on: MakeTracker) -> N
     assert (point.step, point.timestamp) == (2000, 1_700_000_000_250)
     assert fine.data.tags[names.TAG_SOURCE_RUN] == pre.info.run_id
     found = client.list_artifacts(parent.info.run_id, "config")
-    assert [item.path for item in found] == [names.ARTEFACT_SWEEP_CONFIG]
+    assert [item.path for item in found] == [names.ARTIFACT_SWEEP_CONFIG]
     assert (storage / "mlartifacts" / "smoke" / parent.info.run_id).is_dir()
     assert fine.data.tags[names.TAG_FAILURE] == "ValueError: http://host is down"
     for path in storage.rglob("*"):

@@ -69,7 +69,7 @@ def test_secrets_are_used_and_written_nowhere(
     ).json()
     assert len(found["runs"]) == 2, "the sweep's run and the node's"
     assert not [secret for secret in SECRETS if secret in output]
-    # The storage, the server's database, artefacts and log, and what a second reader is shown.
+    # The storage, the server's database, artifacts and log, and what a second reader is shown.
     (settings,) = tmp_path.rglob("basic_auth.ini")  # the one place where MLflow takes it from
     assert stat.S_IMODE(settings.stat().st_mode) == 0o600
     found_in = holders(tmp_path, [*SECRETS, "planted-flask-key"])

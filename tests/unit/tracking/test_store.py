@@ -85,14 +85,14 @@ def test_a_file_uri_is_the_folder_that_it_names() -> None:
     assert store.artifact_root == "file:///data/a%20b/mlartifacts"
 
 
-def test_a_server_keeps_its_artefacts_itself() -> None:
+def test_a_server_keeps_its_artifacts_itself() -> None:
     store = resolve_store("http://u:secret@mlflow:5000", "s3://bucket/sweeps")
     assert store.artifact_root is None
     assert store.ui_command() == "http://mlflow:5000"
     assert store.pages == "http://mlflow:5000"
 
 
-def test_a_database_keeps_artefacts_in_the_storage() -> None:
+def test_a_database_keeps_artifacts_in_the_storage() -> None:
     store = resolve_store("postgresql+psycopg2://u:p@db/mlflow", "s3://bucket/sweeps/")
     assert store.artifact_root == "s3://bucket/sweeps/mlartifacts"
     assert "u:p" not in store.ui_command()
@@ -141,7 +141,7 @@ def test_a_damaged_record_is_named(tmp_path: Path, record: str) -> None:
 
 
 def test_a_bucket_needs_a_server() -> None:
-    with pytest.raises(TrackingError, match="must be set where storage is not a local folder"):
+    with pytest.raises(TrackingError, match="must be set if storage is not a local folder"):
         resolve_store(None, "s3://bucket/sweeps")
 
 
@@ -152,7 +152,7 @@ def test_an_unreachable_server_is_named_without_its_password() -> None:
         check_reachable(store)
     message = str(raised.value)
     assert f"http://127.0.0.1:{port}" in message
-    assert "leave it null" in message
+    assert "set it to null" in message
     assert "hunter2" not in message
 
 
