@@ -30,10 +30,16 @@ def rate_cells(final: FinalScores | None) -> tuple[str, str]:
     if final is None:
         return "", ""
     found = final.estimate
-    value, each = percent(final.value), ", ".join(f"{100 * x:.0f}" for x in final.each_seed)
+    value, each = percent(final.value), ", ".join(f"{100 * x:.0f}" for x in _each_seed(final))
     if not found.has_interval:
         return f"{value} (one seed)", each
     return f"{value} [{percent(float(found.lower))}, {percent(float(found.upper))}]", each
+
+
+def _each_seed(final: FinalScores) -> list[float]:
+    """Sorted rates of the seeds; empty if there are too many to show."""
+    rates = final.scores.mean(axis=1).tolist()
+    return sorted(rates) if final.seeds < st.SHOW_SEEDS_BELOW else []
 
 
 def spread(found: st.Estimate) -> str:

@@ -31,7 +31,7 @@ from music_rllib.report.page import SweepReport, render
 from music_rllib.report.tables import performance_tables, runs_table, study_files
 from music_rllib.report.two_sweeps import difference_tables
 from music_rllib.report.videos import Videos, make_videos
-from music_rllib.results.analysis import StageAnalysis, analyse, analyse_stages
+from music_rllib.results.analysis import StageAnalysis, analyse
 from music_rllib.results.data import ReportError, Sweep
 from music_rllib.results.statistics import Array
 from music_rllib.results.study import study_of
@@ -95,7 +95,6 @@ def build_report(
     return SweepReport(
         sweep=sweep,
         analyses=analyses,
-        together=analyse_stages(sweep, stages),
         study=study,
         drawings=list(_with_own_names(drawings)),
         differences=() if both is None else difference_tables(*both, analyses),
@@ -256,7 +255,7 @@ def _files_of(report: SweepReport) -> Iterator[tuple[str, bytes]]:
             yield f"figures/{name}{suffix}", content
     for video in report.videos.videos:
         yield f"videos/{video.file}", video.data
-    tables = [*performance_tables(report.with_stages), runs_table(report.sweep)]
+    tables = [*performance_tables(report.analyses), runs_table(report.sweep)]
     numbers = [(table.name, table.to_csv()) for table in tables]
     numbers.append(("curves", curves_csv(report.drawings)))
     for name, text in (*study_files(report.study), *numbers):

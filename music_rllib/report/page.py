@@ -70,8 +70,6 @@ class SweepReport:
 
     sweep: Sweep
     analyses: Sequence[StageAnalysis]
-    together: StageAnalysis | None
-    """Stages against each other; None if there is nothing to compare."""
     study: Study
     """The planned comparisons and all others."""
     drawings: Sequence[Drawing]
@@ -82,11 +80,6 @@ class SweepReport:
     videos: Videos
     differences: Sequence[Table] = ()
     """Tables of the differences of two sweeps."""
-
-    @property
-    def with_stages(self) -> list[StageAnalysis]:
-        """The comparison of stages, if there is one, and the analysis of each stage."""
-        return [*filter(None, [self.together]), *self.analyses]
 
 
 _PAGES = Environment(
@@ -198,7 +191,7 @@ def _large_figure(report: SweepReport, stages: Sequence[str]) -> Mapping[str, An
 def _groups(report: SweepReport) -> Iterable[Mapping[str, Any]]:
     """Figures, tables and remarks under each heading that has any."""
     stages = {drawing.stage for drawing in report.drawings if drawing.stage != SIDE_BY_SIDE}
-    performance = [*study_tables(report.study), *performance_tables(report.with_stages)]
+    performance = [*study_tables(report.study), *performance_tables(report.analyses)]
     tables = {
         PERFORMANCE: performance if report.analyses else [],
         COST: [budget_table(report.sweep, report.analyses), failures_table(report.sweep)],
@@ -236,7 +229,7 @@ def _figure(title: str, drawings: Sequence[Drawing]) -> Mapping[str, Any]:
 
 def _remarks(report: SweepReport) -> Iterable[Sequence[str]]:
     """A heading for each stage, and its peculiarities."""
-    for analysis in [*filter(None, [report.together]), *reversed(report.analyses)]:
+    for analysis in reversed(report.analyses):
         stage = analysis.stage
         remarks = []
         if stage.compared not in ((), stage.conditions):
@@ -247,16 +240,8 @@ def _remarks(report: SweepReport) -> Iterable[Sequence[str]]:
             remarks.append(f"It has one condition ({stage.conditions[0].label}): no comparison.")
         if len(stage.seeds) == 1:
             remarks.append(f"It has one seed ({stage.seeds[0]}): no intervals and no tests.")
-        if analysis.cut_at:
-            steps = sorted({f"{steps:,.0f}" for steps in analysis.cut_at.values()})
-            remarks.append(
-                f"Budgets differ: final values are read after {_enumerated(steps, 'or')} steps, "
-                "where the shortest stage ends."
-            )
         seeds = " to ".join(dict.fromkeys((stage.seeds[0], stage.seeds[-1])))
         heading = f"Stage {stage.name} ({stage.variant}), {_seeds(stage)} ({seeds})"
-        if analysis is report.together:
-            heading = "Stages side by side, over the conditions that all of them have"
         if remarks or len(report.analyses) > 1:
             yield [heading, *remarks]
 

@@ -8,7 +8,7 @@ evaluations of every run; a run that failed or is still running is censored at i
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import combinations
 from typing import NamedTuple
 
@@ -24,7 +24,6 @@ from music_rllib.results.conditions import (
     StageRuns,
     final_scores,
     find_stages,
-    stage_by_stage,
 )
 from music_rllib.results.data import Ints, Sweep
 from music_rllib.results.statistics import Array, Estimate
@@ -55,12 +54,6 @@ class FinalScores:
     @property
     def seeds(self) -> int:
         return len(self.scores)
-
-    @property
-    def each_seed(self) -> list[float]:
-        """Sorted means over the tasks of each seed; empty if there are too many to show."""
-        means = self.scores.mean(axis=1)
-        return sorted(means.tolist()) if self.seeds < st.SHOW_SEEDS_BELOW else []
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -142,12 +135,6 @@ class Entropies(NamedTuple):
     """In nats, over all action dimensions."""
     tsallis: Estimate | None
 
-    @property
-    def numbers(self) -> list[float]:
-        """Mean and both ends of the interval of each entropy; NaN without an entropy."""
-        triples = ((one.value, one.lower, one.upper) if one else (np.nan,) * 3 for one in self)
-        return [float(number) for triple in triples for number in triple]
-
 
 @dataclass(frozen=True, kw_only=True)
 class StageAnalysis:
@@ -158,9 +145,6 @@ class StageAnalysis:
     times: tuple[TimeToThreshold, ...]
     entropies: Mapping[tuple[str, Condition], Entropies]
     """Entropies by scope and condition."""
-    cut_at: Mapping[str, float]
-    """Environment steps at which final scores of a task were read; other tasks: at each run's
-    end."""
 
 
 def analyse(sweep: Sweep) -> list[StageAnalysis]:
@@ -168,28 +152,8 @@ def analyse(sweep: Sweep) -> list[StageAnalysis]:
     return [_analyse(sweep, stage) for stage in find_stages(sweep)]
 
 
-def analyse_stages(sweep: Sweep, stages: Sequence[StageRuns]) -> StageAnalysis | None:
-    """Compare stages with each other (:func:`stage_by_stage`); None if they share nothing.
-
-    If the stages have different budgets on a task, all are read at the end of the smallest one.
-    """
-    together = stage_by_stage(sweep, stages)
-    if together is None:
-        return None
-    cut_at = {}
-    for task in together.tasks:
-        budgets = {sweep.least_budget(task, one.runs) for one in together.compared}
-        if np.isfinite(list(budgets)).sum() > 1:
-            cut_at[task] = min(sweep.least_end(task, one.runs) for one in together.compared)
-    return _analyse(sweep, together, cut_at)
-
-
-def _analyse(
-    sweep: Sweep, stage: StageRuns, cut_at: Mapping[str, float] | None = None
-) -> StageAnalysis:
-    cut_at = cut_at or {}
-    ended = sweep.until(cut_at) if cut_at else sweep
-    scopes = stage_scopes(ended, stage)
+def _analyse(sweep: Sweep, stage: StageRuns) -> StageAnalysis:
+    scopes = stage_scopes(sweep, stage)
     rated = [task for task in stage.tasks if sweep.primary_metric(task) == names.EVAL_SUCCESS]
     times = (
         time_to_threshold(sweep, condition, task, threshold)
@@ -201,12 +165,7 @@ def _analyse(
         stage=stage,
         scopes=scopes,
         times=tuple(one for one in times if one is not None),
-        entropies={
-            (scope.name, final.condition): _entropies(ended, final.condition, stage, scope.name)
-            for scope in scopes
-            for final in scope.finals
-        },
-        cut_at=cut_at,
+        entropies=_entropies(sweep, stage, scopes),
     )
 
 
@@ -251,15 +210,19 @@ def _scope(
     )
 
 
-def _entropies(sweep: Sweep, condition: Condition, stage: StageRuns, scope: str) -> Entropies:
-    tasks = stage.tasks if scope == ALL_TASKS else (scope,)
-    runs = tuple(run for run in condition.runs if sweep.runs[run].task in tasks)
-    estimates = []
-    for metric in (names.SHANNON_ENTROPY, names.ENTROPY):
-        scores = final_scores(sweep, replace(condition, runs=runs), dict.fromkeys(tasks, metric))
-        complete = scores[~np.isnan(scores).any(axis=1)]
-        estimates.append(st.estimate(complete) if len(complete) else None)
-    return Entropies(*estimates)
+def _entropies(
+    sweep: Sweep, stage: StageRuns, scopes: Sequence[Scope]
+) -> dict[tuple[str, Condition], Entropies]:
+    shannon, tsallis = (
+        {
+            (scope.name, final.condition): final.estimate
+            for scope in stage_scopes(sweep, stage, metric)
+            for final in scope.finals
+        }
+        for metric in (names.SHANNON_ENTROPY, names.ENTROPY)
+    )
+    keys = [(scope.name, final.condition) for scope in scopes for final in scope.finals]
+    return {key: Entropies(shannon.get(key), tsallis.get(key)) for key in keys}
 
 
 def time_to_threshold(

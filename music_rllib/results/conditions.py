@@ -121,40 +121,6 @@ def stages_together(stages: Sequence[StageRuns]) -> StageRuns | None:
     )
 
 
-def stage_by_stage(sweep: Sweep, stages: Sequence[StageRuns]) -> StageRuns | None:
-    """One stage with a condition for each stage that trains for the task.
-
-    On each task, a condition has the runs of the settings that every stage has there. The result
-    is None if the stages share nothing.
-    """
-    together = stages_together(stages)
-    stages = [stage for stage in stages if stage.has_task_reward]
-    cells = [
-        {
-            (sweep.runs[run].task, condition.label)
-            for condition in stage.conditions
-            for run in condition.runs
-        }
-        for stage in stages
-    ]
-    if together is None or not (shared := set.intersection(*cells)):
-        return None
-    conditions = [
-        Condition(
-            entropic_index="",
-            others=(("stage", stage.name),),
-            runs=tuple(
-                run
-                for condition in stage.conditions
-                for run in condition.runs
-                if (sweep.runs[run].task, condition.label) in shared
-            ),
-        )
-        for stage in stages
-    ]
-    return replace(together, conditions=tuple(conditions))
-
-
 def find_stages(sweep: Sweep) -> list[StageRuns]:
     """The sweep's stages, in the order of their first runs."""
     stages: defaultdict[str, list[int]] = defaultdict(list)

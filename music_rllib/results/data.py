@@ -212,15 +212,6 @@ class Sweep:
         column = self.column(run, self.primary_metric(record.task))
         return column.step.astype(float), (column.time - record.started) / 1000
 
-    def until(self, steps: Mapping[str, float]) -> Sweep:
-        """The sweep with the values of each task's runs up to a number of environment steps."""
-        last = np.array([steps.get(run.task, np.inf) for run in self.runs])
-        cut = {
-            metric: column.select(column.step <= last[column.run])
-            for metric, column in self.history.items()
-        }
-        return replace(self, history=cut)
-
     def final(self, run: int, metric: str) -> float | None:
         """The last value of a metric of `runs[run]`; None unless it is finite."""
         values = self.column(run, metric).value
@@ -265,16 +256,6 @@ class Sweep:
         """
         own = [run for run in runs if self.runs[run].task == task]
         return min((float(self.runs[r].budget or self.last_step(r)) for r in own), default=np.inf)
-
-    def least_end(self, task: str, runs: Iterable[int]) -> float:
-        """Last step of the runs on a task with the smallest budget.
-
-        The last round, and its evaluation, can end after the budget.
-        """
-        own = [run for run in runs if self.runs[run].task == task]
-        least = self.least_budget(task, own)
-        ends = (self.last_step(run) for run in own if self.runs[run].budget == least)
-        return max([least, *ends])
 
 
 # Searches -----------------------------------------------------------------------------------------

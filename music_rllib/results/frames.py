@@ -41,9 +41,8 @@ _CURVE_COLUMNS = {
     "value": "float64",
     "time": "datetime64[ms, UTC]",
 }
-_ENTROPIES = [
-    f"{name}_entropy{end}" for name in ("shannon", "tsallis") for end in ("", "_lower", "_upper")
-]
+_ENDS = {"": "value", "_lower": "lower", "_upper": "upper"}
+_ENTROPIES = [f"{name}_entropy{end}" for name in ("shannon", "tsallis") for end in _ENDS]
 _CONDITION_COLUMNS = {
     **dict.fromkeys(("stage", "variant", "task", "condition"), "str"),
     "q": "float64",
@@ -161,7 +160,9 @@ def _conditions(sweep: Sweep) -> Iterator[dict[str, Any]]:
         for scope in analysis.scopes:
             for final in scope.finals:
                 condition = final.condition
-                entropies = analysis.entropies[scope.name, condition].numbers
+                entropies = zip(
+                    ("shannon", "tsallis"), analysis.entropies[scope.name, condition], strict=True
+                )
                 yield {
                     "stage": stage.name,
                     "variant": stage.variant,
@@ -174,7 +175,12 @@ def _conditions(sweep: Sweep) -> Iterator[dict[str, Any]]:
                     "mean": final.value,
                     "lower": float(final.estimate.lower),
                     "upper": float(final.estimate.upper),
-                    **dict(zip(_ENTROPIES, entropies, strict=True)),
+                    **{
+                        f"{name}_entropy{end}": float(getattr(entropy, attribute))
+                        for name, entropy in entropies
+                        if entropy is not None
+                        for end, attribute in _ENDS.items()
+                    },
                 }
 
 

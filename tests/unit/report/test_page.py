@@ -27,7 +27,7 @@ from music_rllib.report.figures.palette import DARK, LIGHT, color_of, marker_of
 from music_rllib.report.page import SweepReport, render
 from music_rllib.results.analysis import THRESHOLDS, analyse
 from music_rllib.results.answer import answer
-from music_rllib.results.conditions import SIDE_BY_SIDE, find_stages, stage_by_stage
+from music_rllib.results.conditions import SIDE_BY_SIDE, find_stages
 from music_rllib.results.data import Points, RunRecord, Sweep, columns
 from music_rllib.results.study import study_of
 
@@ -113,22 +113,6 @@ def said_about(sweep: Sweep) -> str:
 
 
 # What is said -----------------------------------------------------------------------------------
-
-
-def test_stages_of_other_budgets_are_read_where_the_shortest_ends() -> None:
-    """Both climb alike: at its own end the longer one is far ahead."""
-    runs = []
-    for seed in range(5):
-        final = 0.8 + 0.01 * seed
-        short = one_run("1", seed, stage="her", params={"env_steps": "100000"})
-        runs.append((short, climbing(final, 100_000)))
-        runs.append((one_run("1", seed), climbing(final)))
-    made = build_report(sweep_of(runs))
-    assert made.together is not None
-    (comparison,) = made.together.scopes[0].differences
-    assert float(comparison.gap.value) == pytest.approx(0)
-    page = unescape(render(made))
-    assert "final values are read after 100,000 steps, where the shortest stage ends." in page
 
 
 def test_stages_that_are_alike_as_file_names_keep_their_figures() -> None:
@@ -572,29 +556,6 @@ def test_stages_that_train_for_the_task_are_drawn_side_by_side() -> None:
     assert f'id="{drawing.name}"' in page
     for one in (of_stages("pretrain", "plain"), of_stages("plain")):
         assert SIDE_BY_SIDE not in {drawing.stage for drawing in build_report(one).drawings}
-
-
-def test_stages_are_compared_over_the_conditions_that_all_of_them_have() -> None:
-    finals = {"plain": {"1.0": 0.9, "1.5": 0.6, "2.0": 1.0}, "reward": {"1.0": 1.0, "1.5": 0.8}}
-    sweep = sweep_of(
-        [
-            (one_run(q, seed, stage=stage, variant="tac"), climbing(final))
-            for stage, of_stage in finals.items()
-            for q, final in of_stage.items()
-            for seed in range(2)
-        ]
-    )
-    report = build_report(sweep)
-    assert report.together is not None
-    (scope,) = report.together.scopes
-    (pair,) = scope.differences
-    assert [final.runs for final in (pair.first, pair.second)] == [4, 4]
-    # At the end: 1 and 0.8 against 0.9 and 0.6, twice each.
-    assert pair.improvement == 12 / 16
-    shown = render(report)
-    assert "stage = reward against stage = plain" in shown
-    plain = of_stages("plain")
-    assert stage_by_stage(plain, find_stages(plain)) is None
 
 
 def test_a_legend_stays_inside_its_figure() -> None:
