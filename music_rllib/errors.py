@@ -12,14 +12,19 @@ def message_of(error: BaseException) -> str:
 
 
 def first_line(error: BaseException) -> str:
-    """The first line of an error's message; its type's name where it has none."""
+    """The first line of an error's message, or its type's name."""
     return next(iter(message_of(error).strip().splitlines()), type(error).__name__)
 
 
 def one_line(error: BaseException) -> str:
-    """`ValueError: message` on one line, of at most 300 characters."""
-    text = f"{type(error).__name__}: {' '.join(message_of(error).split()) or '(no message)'}"
-    return text if len(text) <= 300 else text[:297] + "..."
+    """`ValueError: message` on one line of at most 300 characters."""
+    message = " ".join(message_of(error).split()) or "(no message)"
+    return shorten(f"{type(error).__name__}: {message}")
+
+
+def shorten(text: str, limit: int = 300) -> str:
+    """Cut a text to `limit` characters, ending with dots."""
+    return text if len(text) <= limit else text[: limit - 3] + "..."
 
 
 class BadInputError(Exception):

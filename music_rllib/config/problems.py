@@ -13,7 +13,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
 from music_rllib.envs.tasks import closest
-from music_rllib.errors import BadInputError
+from music_rllib.errors import BadInputError, shorten
 from music_rllib.labels import SYMBOLS
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -46,7 +46,7 @@ def shown(value: Any, limit: int = 60) -> str:
     except TypeError:
         text = repr(value)
     text = {"NaN": "nan", "Infinity": "inf", "-Infinity": "-inf"}.get(text, text)
-    return text if len(text) <= limit else text[: limit - 3] + "..."
+    return shorten(text, limit)
 
 
 def same(first: Any, second: Any) -> bool:

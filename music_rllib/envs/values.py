@@ -14,6 +14,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from music_rllib.errors import shorten
+
 LARGEST = 1e15
 """Largest accepted number. Returns are up to 100 times as large, and the sum of their squared
 errors over a minibatch must be within float32's range."""
@@ -113,13 +115,12 @@ def check_numbers(name: str, values: Any) -> None:
         )
 
 
-def shown(value: object, limit: int = 60) -> str:
-    """A value of an environment on one line of at most `limit` characters."""
+def shown(value: object) -> str:
+    """A value of an environment on one line of at most 60 characters."""
     try:
-        text = " ".join(repr(value).split())
+        return shorten(" ".join(repr(value).split()), 60)
     except Exception:  # a class of the environment
-        text = f"an object of type {type(value).__name__}"
-    return text if len(text) <= limit else text[: limit - 3] + "..."
+        return f"an object of type {type(value).__name__}"
 
 
 def vector(value: Any, name: str, size: int) -> NDArray[Any]:

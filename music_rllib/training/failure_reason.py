@@ -10,19 +10,18 @@ from contextlib import contextmanager
 import psutil
 from ray.exceptions import RayActorError, RayError, RayTaskError
 
-from music_rllib.errors import BadInputError, message_of
+from music_rllib.errors import BadInputError, message_of, shorten
 
 _DETAIL = re.compile(r"Worker exit detail: (.*?)(?: Some common causes include|$)", re.MULTILINE)
 _PLACE = re.compile(r"^\s*(pid|ip): (\S+)$", re.MULTILINE)
 
 
-def cause_of(error: BaseException | None, text: str, limit: int = 300) -> str:
-    """One or two lines that name the cause of a failure.
+def cause_of(error: BaseException | None, text: str) -> str:
+    """One or two lines of at most 300 characters that name the cause of a failure.
 
     Args:
         error: The exception that Ray raised in the driver; None if it could not be read.
         text: Its traceback, whose last line replaces a missing `error`.
-        limit: Maximum number of characters per line.
     """
     if isinstance(error, RayTaskError) and isinstance(error.cause, BaseException):
         error = error.cause
@@ -37,7 +36,7 @@ def cause_of(error: BaseException | None, text: str, limit: int = 300) -> str:
     else:
         first, *rest = _non_empty(message_of(error)) or ["(no message)"]
         lines = [f"{type(error).__name__}: {first}", *rest[:1]]
-    return "\n".join(line if len(line) <= limit else line[: limit - 3] + "..." for line in lines)
+    return "\n".join(map(shorten, lines))
 
 
 def trace_of(error: BaseException) -> str:
@@ -53,7 +52,7 @@ def trace_of(error: BaseException) -> str:
 
 @contextmanager
 def in_words_only() -> Iterator[None]:
-    """Turns an exception into its cause: another process may not be able to read its class."""
+    """Replace an exception by its cause, since other processes may lack its class."""
     try:
         yield
     except BaseException as error:
