@@ -23,8 +23,8 @@ from pydantic.json_schema import GenerateJsonSchema
 from pydantic_core import core_schema
 
 from music_rllib.config.analysis import Analysis
+from music_rllib.config.document import SCHEMA, shipped_presets
 from music_rllib.config.layers import all_settings
-from music_rllib.config.presets import SCHEMA, shipped_presets
 from music_rllib.config.run_settings import LAYER_KEYS, VARIANTS, Evaluation, RunSettings
 from music_rllib.config.schema import (
     Checkpoints,

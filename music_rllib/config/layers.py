@@ -24,7 +24,6 @@ from music_rllib.config.run_settings import (
     VARIANTS,
     RunSettings,
     Variant,
-    contradiction,
     variant_music,
     without_retired,
 )
@@ -166,12 +165,6 @@ def merge(
         else:
             layers.put(tuple(dotted.split(".")), value, place)
     layers.data = without_retired(layers.data)
-    # Contradictions of the variant are reported also if other settings are invalid.
-    music = layers.data["music"]
-    for field, fixed in rules.fixed.items():
-        if isinstance(music, Mapping) and music.get(field, fixed) != fixed:
-            origin = layers.origin(("music", field), stage_path)
-            problems.append(Problem(origin, contradiction(variant, fixed, music[field])))
     return layers, problems
 
 

@@ -13,11 +13,16 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from music_rllib.config.document import Document, Place
-from music_rllib.config.hypotheses import check_analysis, unnamed_differences
+from music_rllib.config.checks import check_analysis, unnamed_differences
+from music_rllib.config.document import (
+    Document,
+    Place,
+    lay_overrides,
+    parse_overrides,
+    preset_path,
+    read_preset,
+)
 from music_rllib.config.layers import all_settings
-from music_rllib.config.overrides import lay_overrides, parse_overrides, preset_path
-from music_rllib.config.presets import read_preset
 from music_rllib.config.problems import ConfigError, Findings, shown, unknown
 from music_rllib.config.returns import Range, cut_off
 from music_rllib.config.run_settings import LAYER_KEYS, RunSettings

@@ -229,6 +229,15 @@ class Stage:
         """Fewest episodes per evaluation of any of its runs."""
         return min(run.evaluation.episodes for point in self.points for run in point.runs.values())
 
+    @property
+    def most_env_steps(self) -> int:
+        """Environment steps of its longest run; 0 if they are unknown."""
+        own = max((run.env_steps for at in self.points for run in at.runs.values()), default=0)
+        space, compare = (self.search.space, self.search.compare) if self.search else ({}, {})
+        if (dimension := space.get("env_steps")) is not None:
+            return max(*map(int, dimension.ends()), own if dimension.when else 0)
+        return max((int(float(str(steps))) for steps in compare.get("env_steps", ())), default=own)
+
     def examples(self) -> Iterator[tuple[Mapping[str, Any], Point]]:
         """Points that represent everything that the stage can run, with their searched values.
 
@@ -237,7 +246,7 @@ class Stage:
         """
         yield from (({}, point) for point in self.points)
         if self.search is not None:
-            for values in (*(at for _, at in self.search.corners()), *self.search.compared()):
+            for values in (*(at for _, at in self.search.examples()), *self.search.compared()):
                 own = {name: value for name, value in values.items() if ":" not in name}
                 with contextlib.suppress(ConfigError):
                     yield values, self.resolve(own)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import cached_property
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import Discriminator, Field, JsonValue, Tag, model_validator
 
 from music_rllib.config.layers import varied_by
+from music_rllib.config.problems import KeyPath
 from music_rllib.config.space import Choice, Dimension, listed
 from music_rllib.schedules import StrictModel
 
@@ -19,6 +20,15 @@ FINAL_SEED = 1_000_000
 
 MOST_SEARCH_POINTS = 100_000
 """Largest grid with `sampler: grid`: more than anyone can train, and quick to list."""
+
+
+def of_stage(values: Mapping[str, Any], stage: str) -> dict[str, Any]:
+    """The dotted settings that have the prefix of `stage`, without the prefix."""
+    return {
+        name.removeprefix(f"{stage}:"): value
+        for name, value in values.items()
+        if name.startswith(f"{stage}:")
+    }
 
 
 class Objective(StrictModel):
@@ -205,16 +215,24 @@ class SearchSettings(StrictModel):
         choices = [[(name, value) for value in values] for name, values in self.compare.items()]
         return [dict(pairs) for pairs in itertools.product(*choices)]
 
-    def corners(self) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Points with one setting at an end of its dimension, which show whether the end is valid.
+    @property
+    def stages(self) -> set[str]:
+        """Other stages whose settings are part of the search."""
+        return {name.partition(":")[0] for name in (*self.space, *self.compare) if ":" in name}
+
+    def examples(self) -> Iterator[tuple[KeyPath, dict[str, Any]]]:
+        """Points that are valid if all values are: ends of the space, and compared values.
 
         Yields:
-            The setting, and the point, which has other settings at their first end.
+            The place of the varied setting below `search`, and the point.
         """
         first = {name: dimension.ends()[0] for name, dimension in self.space.items()}
         for name, dimension in self.space.items():
             for value in dimension.ends():
-                yield name, self._existing(first | {name: value}, keep=name)
+                yield ("space", name), self._existing(first | {name: value}, keep=name)
+        for name, values in self.compare.items():
+            for position, value in enumerate(values):
+                yield ("compare", name, position), {name: value}
 
     def _existing(self, point: dict[str, Any], keep: str) -> dict[str, Any]:
         """The settings of `point` that apply after those that `keep` depends on are set."""

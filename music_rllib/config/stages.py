@@ -12,6 +12,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from music_rllib.config.checks import check_search
 from music_rllib.config.layers import (
     PlacedPoint,
     all_settings,
@@ -37,7 +38,7 @@ from music_rllib.config.run_settings import (
     handed_over,
 )
 from music_rllib.config.schema import ImportedHandoff, Point, Source, Stage, StageHeader
-from music_rllib.config.search_check import check_search, of_stage
+from music_rllib.config.search import of_stage
 from music_rllib.envs.tasks import BUILT_IN_TASKS, Task, closest
 from music_rllib.limits import MOST_GRID_POINTS
 from music_rllib.store.handoff import Architecture, HandoffError, open_handoff, read_handoff
@@ -142,10 +143,8 @@ class _StageSettings:
                 runs[task.name] = from_json(RunSettings, data)
             except ValidationError as error:
                 for path, rule in problems_of(error, data, RunSettings):
-                    # Settings that contradict their variant can't be consistent among themselves.
-                    if not (problems and path == ("music",)):
-                        origin = layers.origin(path, self.path)
-                        findings.problems.append(Problem(origin, for_a_grid(rule, path, data)))
+                    origin = layers.origin(path, self.path)
+                    findings.problems.append(Problem(origin, for_a_grid(rule, path, data)))
         return Point(values={key: value for key, (_, value) in point.items()}, runs=runs)
 
     def resolve(self, values: Mapping[str, Any]) -> Point:

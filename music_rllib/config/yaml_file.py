@@ -114,16 +114,13 @@ class _StrictLoader(yaml.SafeLoader):
 
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012
 
-    _depth = _composed = 0
+    _depth = 0
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        """Reject deep nesting before Python's own limit, and too many values early."""
+        """Reject deep nesting before Python's own limit."""
         self._depth += 1
-        self._composed += 1
-        rule = f"must be nested at most {MOST_NESTED} levels deep"
-        if self._composed > MOST_YAML_VALUES:
-            rule = f"must have at most {MOST_YAML_VALUES} values"
-        if self._depth > MOST_NESTED or self._composed > MOST_YAML_VALUES:
+        if self._depth > MOST_NESTED:
+            rule = f"must be nested at most {MOST_NESTED} levels deep"
             mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]
             raise yaml.composer.ComposerError(None, None, rule, mark)
         try:

@@ -17,7 +17,7 @@ from pydantic import BaseModel
 
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.schema import ImportedHandoff, Source, Stage, SweepConfig
-from music_rllib.config.search_check import of_stage, stages_in
+from music_rllib.config.search import of_stage
 from music_rllib.envs.tasks import Task
 from music_rllib.labels import in_runs
 from music_rllib.schedules import Linear
@@ -351,7 +351,7 @@ def make_plan(config: SweepConfig, *, algorithm: str | None = None) -> Plan:
     """The plan of a sweep, with keys of the present or of a given version of the algorithm."""
     plan = Plan(config.name, config.seeds, algorithm=algorithm)
     sources = [(stage.search, stage.source.stage) for stage in config.stages if stage.source]
-    varied = {source for search, source in sources if search and source in stages_in(search)}
+    varied = {source for search, source in sources if search and source in search.stages}
     used = {source for search, source in sources if not (search and source in varied)}
     for stage in config.stages:
         # If trials choose the settings of a source stage, the stage has no other runs.

@@ -11,7 +11,6 @@ from optuna.trial import FrozenTrial
 
 from music_rllib.config.schema import Stage
 from music_rllib.config.search import Rung, SearchSettings
-from music_rllib.config.search_check import most_env_steps
 from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.plan import Run, node_key
 from music_rllib.results.statistics import Array
@@ -159,7 +158,7 @@ def _open_search(sweep: OpenSweep, stage: Stage) -> Search:
 
 
 def _rungs(sweep: OpenSweep, stage: Stage, settings: SearchSettings) -> tuple[Rung, ...]:
-    seeds, env_steps = len(sweep.plan.seeds), most_env_steps(settings, stage.points)
+    seeds, env_steps = len(sweep.plan.seeds), stage.most_env_steps
     end = Rung(seeds=seeds)
     rungs = [
         Rung(

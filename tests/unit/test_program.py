@@ -17,8 +17,8 @@ import yaml
 from typer.main import get_command
 
 from music_rllib import __version__
+from music_rllib.config.document import SCHEMA
 from music_rllib.config.load import load_sweep
-from music_rllib.config.presets import SCHEMA
 from music_rllib.program import app, main
 
 REPOSITORY = Path(__file__).parents[2]

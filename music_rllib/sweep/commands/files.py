@@ -148,7 +148,7 @@ def init(
     ] = Path("sweep.yaml"),
 ) -> int:
     """Write a commented sweep file to start from."""
-    from music_rllib.config.presets import starter
+    from music_rllib.config.document import starter
 
     text = starter(file)
     try:
@@ -165,7 +165,7 @@ def init(
 
 def presets(json: Json = False) -> int:
     """List the presets: sets of settings for 'preset: NAME' in a sweep file."""
-    from music_rllib.config.presets import SHIPPED, shipped_presets
+    from music_rllib.config.document import SHIPPED, shipped_presets
 
     shipped = shipped_presets()
     if json:
@@ -180,7 +180,7 @@ def presets(json: Json = False) -> int:
 
 def schema() -> int:
     """Print the JSON Schema of sweep files, for editors."""
-    from music_rllib.config.presets import SCHEMA
+    from music_rllib.config.document import SCHEMA
 
     typer.echo(SCHEMA.read_text(encoding="utf-8"), nl=False)
     return 0

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.schema import Stage, SweepConfig
-from music_rllib.config.search_check import most_env_steps
 from music_rllib.experiment.plan import Plan
 
 _WITHOUT_COST: dict[str, bool | set[str]] = {
@@ -50,7 +49,7 @@ def search_budget(stage: Stage, seeds: int) -> SearchBudget:
     """The budget of a searched stage in a sweep with this number of seeds."""
     search = stage.search
     assert search is not None
-    env_steps = most_env_steps(search, stage.points)
+    env_steps = stage.most_env_steps
     fresh_runs, fresh_env_steps = 0, env_steps
     runs_per_seed = len(search.compared()) * len(stage.tasks)
     if (final := search.final) is not None:

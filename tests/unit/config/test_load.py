@@ -438,7 +438,10 @@ BAD: list[tuple[Document, str]] = [
     (with_stage(1, grid={"music": [{"lr": 1.0}]}), "grid.music[0].lr has no effect with variant"),
     (with_stage(1, grid={"tac": [{"alfa": 1.0}]}), "alfa is not a known setting (did you mean"),
     (with_stage(1, grid={"tac": [{"lr": -1.0}]}), "grid.tac[0].lr must be > 0, got -1"),
-    (with_stage(1, grid={"music.estimator": ["none"]}), 'must be "frozen" for music-r, got "none"'),
+    (
+        with_stage(1, grid={"music.estimator": ["none"]}),
+        "stages.finetune.music: mi_reward_weight needs an estimator",
+    ),
     (asking("q = 1.5 or q = 1"), "analysis.hypotheses[0] must be two different conditions with"),
     (asking("q = 1 against q = 1"), "must be two different conditions with"),
     (asking("q = 3 against q = 1"), "(tac.entropic_index: 1, 1.5), got 3"),

@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 import torch
 
+from music_rllib.config.document import SHIPPED, shipped_presets
 from music_rllib.config.load import load_sweep, warnings_of
-from music_rllib.config.presets import SHIPPED, shipped_presets
 from music_rllib.config.problems import ConfigError
 from music_rllib.config.yaml_file import read_yaml
 from music_rllib.functional.actor_critic import critic_target

@@ -1,0 +1,332 @@
+"""Checks of searches and of hypotheses, before anything starts."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+from music_rllib import names
+from music_rllib.config.analysis import Analysis, Hypothesis, same_value
+from music_rllib.config.layers import PlacedPoint, is_in
+from music_rllib.config.problems import ConfigError, Findings, KeyPath, shown
+from music_rllib.config.run_settings import RunSettings
+from music_rllib.config.schema import Point, Stage
+from music_rllib.config.search import SearchSettings, of_stage
+from music_rllib.config.space import Choice
+from music_rllib.config.tac_settings import setting_text
+from music_rllib.envs.tasks import closest
+from music_rllib.redaction import flat_params
+
+_METRICS = frozenset(
+    value
+    for key, value in vars(names).items()
+    if key.isupper()
+    and isinstance(value, str)
+    and not value.isupper()  # an environment variable
+    and not key.startswith(("TAG_", "KIND_", "ARTIFACT_", "SETTING_"))
+)
+_OF_SUCCESS = frozenset(
+    {names.EVAL_SUCCESS, names.EVAL_SUCCESS_ANY, names.TRAIN_SUCCESS, names.TRAIN_SUCCESS_ANY}
+)
+"""Metrics of tasks that declare success."""
+
+
+def check_search(
+    stage: Stage,
+    search: SearchSettings,
+    earlier: Mapping[str, Stage | None],
+    seeds: int,
+    resolve_at: Callable[[PlacedPoint, Findings], Point],
+    findings: Findings,
+) -> None:
+    """Check a stage's `search` and the stage that its runs start from.
+
+    Args:
+        stage: The stage.
+        search: Its search.
+        earlier: The stages above this one by name; None for an invalid one.
+        seeds: Number of the sweep's seeds; 0 if they are invalid.
+        resolve_at: Gives the stage's settings at a point.
+        findings: Takes the problems; its path is the stage's.
+    """
+    problems_before = len(findings.problems)
+    in_search = findings.below("search")
+    for position, objective in enumerate(search.objectives):
+        if rule := _broken_metric(objective.metric, stage):
+            several = (position,) if len(search.objectives) > 1 else ()
+            in_search.add(("objective", *several, "metric"), rule)
+    above = source = _source_of(stage, earlier)
+    while source is not None:
+        if source.search is None and len(source.points) > 1:
+            findings.add(
+                ("init_from",),
+                "must lead to stages without a grid where trials are searched, got "
+                f"{source.name!r}; search its settings as '{source.name}:...'",
+            )
+        source = _source_of(source, earlier)
+    if foreign := search.stages - ({above.name} if above else set()):
+        known = f", which is {above.name!r}" if above else "; this one starts from none"
+        in_search.add(
+            ("space",),
+            f"must name settings of this stage or of the one it starts from{known}, "
+            f"got '{min(foreign)}:...'",
+        )
+        return
+    _check_values(search, above, resolve_at, findings)
+    _check_points_to_evaluate(search, in_search)
+    if len(findings.problems) == problems_before:  # the budget is a valid number then
+        _check_rungs(search, seeds, stage.most_env_steps, in_search)
+
+
+def _source_of(stage: Stage, earlier: Mapping[str, Stage | None]) -> Stage | None:
+    """The stage that a stage's runs start from; None if there is none, or an invalid one."""
+    return earlier.get(stage.source.stage) if stage.source and stage.source.stage else None
+
+
+def _broken_metric(metric: str, stage: Stage) -> str | None:
+    """The rule that an objective's metric breaks; None if each run reports it."""
+    if metric not in _METRICS:
+        hint = closest(metric, _METRICS)
+        return f"must be a metric that runs report, got {shown(metric)}{hint}"
+    without = [task.name for task in stage.tasks if task.success_key is None]
+    if metric in _OF_SUCCESS and without:
+        return (
+            f"must be a metric that {', '.join(without)} has too, which declares no success: write "
+            f"objective: {{metric: {names.EVAL_RETURN}}}, got {shown(metric)}"
+        )
+    return None
+
+
+def _check_rungs(search: SearchSettings, seeds: int, env_steps: int, findings: Findings) -> None:
+    """A trial must reach each rung before its end, or at its end."""
+    for position, rung in enumerate(search.pruning.rungs if search.pruning else ()):
+        path = ("pruning", "rungs", position)
+        if seeds and rung.seeds is not None and rung.seeds > seeds:
+            rule = f"must be <= {seeds}, the number of the sweep's seeds, got {rung.seeds}"
+            findings.add((*path, "seeds"), rule)
+        if env_steps and rung.env_steps is not None and rung.env_steps > env_steps:
+            rule = f"must be <= {env_steps}, the longest run's env steps, got {rung.env_steps}"
+            findings.add((*path, "env_steps"), rule)
+
+
+def _check_values(
+    search: SearchSettings,
+    above: Stage | None,
+    resolve_at: Callable[[PlacedPoint, Findings], Point],
+    findings: Findings,
+) -> None:
+    """Every end of the space and every compared value must make valid settings."""
+    in_search = findings.below("search")
+    problems_before = len(findings.problems)
+    for name, values in search.compare.items():
+        in_search.forbid_repeats(values, ("compare", name))
+    for name, dimension in search.space.items():
+        if isinstance(dimension, Choice):
+            in_search.forbid_repeats(dimension.choice, ("space", name, "choice"))
+    found: list[Any] = []
+    for path, example in search.examples():
+        section, name = path[0], str(path[1])
+        if name not in example:
+            rule = f"must be satisfiable, got {shown(search.space[name].when)}"
+            in_search.add((section, name, "when"), rule)
+            continue
+        point: dict[str, tuple[KeyPath, Any]]
+        point = {key: (("search", section, key), value) for key, value in example.items()}
+        point[name] = (("search", *path), example[name])
+        own = {key: at for key, at in point.items() if ":" not in key}
+        runs = resolve_at(own, findings).runs
+        if search.final is not None and search.final.env_steps is not None:
+            budget = (("search", "final", "env_steps"), search.final.env_steps)
+            resolve_at({**own, "env_steps": budget}, findings)
+        settings = (name, runs, None if above is None else _runs_above(above, point, findings))
+        # Two values can be two spellings of one schedule, and so the same runs.
+        if len(findings.problems) == problems_before and settings in found and runs:
+            value = shown(example[name])
+            in_search.add((section, name), f"must not have two equal values, got {value} again")
+        found.append(settings)
+
+
+def _runs_above(above: Stage, point: PlacedPoint, findings: Findings) -> Mapping[str, Any] | None:
+    """Settings of the stage above at a point, with problems at their place in this stage."""
+    theirs = of_stage({name: value for name, (_, value) in point.items()}, above.name)
+    if not theirs:
+        return None
+    try:
+        return above.resolve(theirs).runs
+    except ConfigError as error:
+        name = next(name for name in point if name.startswith(f"{above.name}:"))
+        for line in error.lines:
+            findings.add(point[name][0], f"in stage {above.name}, {line}")
+        return None
+
+
+def _check_points_to_evaluate(search: SearchSettings, findings: Findings) -> None:
+    """Each given value must be in the space, and beside the values that it depends on.
+
+    The sampler chooses what a point omits: a setting that depends on that might be dropped.
+    """
+    for position, point in enumerate(search.points_to_evaluate):
+        for name, value in point.items():
+            dimension, path = search.space[name], ("points_to_evaluate", position, name)
+            if not dimension.contains(value):
+                findings.add(path, f"must be {dimension.rule}, got {shown(value)}")
+            elif not dimension.applies(point):
+                wanted = " and ".join(f"{key}: {shown(one)}" for key, one in dimension.when.items())
+                findings.add(path, f"must only be given beside {wanted}, got {shown(point)}")
+
+
+# Hypotheses ---------------------------------------------------------------------------------------
+
+Settings = Mapping[str, str]
+"""Dotted settings of a run to their values as text; a schedule in words, and its parts."""
+
+
+def check_analysis(
+    analysis: Analysis, stages: Mapping[str, Stage | None], findings: Findings
+) -> None:
+    """Check that the hypotheses name conditions that the sweep has."""
+    if analysis.stage is not None and analysis.stage not in stages:
+        rule = f"must be one of {', '.join(stages)}, got {analysis.stage!r}"
+        findings.add(("analysis", "stage"), rule)
+        return
+    default = analysis.stage or next(reversed(list(stages)), "")
+    metrics = set()
+    for position, text in enumerate(analysis.hypotheses):
+        path = ("analysis", "hypotheses", position)
+        for condition in Hypothesis.of(text).sides:
+            name = condition.get("stage", default)
+            if name not in stages:
+                findings.add(path, f"must name one of the stages {', '.join(stages)}, got {name!r}")
+            elif (stage := stages[name]) is not None:
+                metrics |= {task.primary_metric for task in stage.tasks}
+                if broken := _broken_rule(stage, condition) or _broken_final(stage, condition):
+                    findings.add(path, broken)
+    if analysis.margin is None and names.EVAL_RETURN in metrics:
+        findings.add(("analysis", "margin"), "must be given for tasks without success, got null")
+    if (analysis.margin or 0) >= 1 and metrics == {names.EVAL_SUCCESS}:
+        rule = f"must be < 1 for a success rate (5 % are 0.05), got {analysis.margin:g}"
+        findings.add(("analysis", "margin"), rule)
+
+
+def _compared_runs(stage: Stage) -> list[Settings]:
+    """A run of each point of a grid, or compared value of a search; none if one is invalid."""
+    points = list(stage.points)
+    if stage.search is not None and stage.search.compare:
+        compared = stage.search.compared()
+        own = [{k: v for k, v in values.items() if ":" not in k} for values in compared]
+        try:
+            points = [stage.resolve(values) for values in own]
+        except ConfigError:
+            return []
+    if not all(point.runs for point in points):
+        return []
+    return [_settings(next(iter(point.runs.values()))) for point in points]
+
+
+def _settings(run: RunSettings) -> Settings:
+    """The settings of a run as tracking has them: params, and schedules in words."""
+    return flat_params(run.model_dump(mode="json")) | {
+        "tac.entropic_index": setting_text(run.tac.entropic_index),
+        "tac.alpha": setting_text(run.tac.alpha),
+        "music.mi_reward_weight": setting_text(run.music.mi_reward_weight),
+    }
+
+
+def _broken_rule(stage: Stage, condition: Mapping[str, str]) -> str | None:
+    """The rule that a condition breaks; None if the stage has such runs."""
+    if mapping := next((text for text in condition.values() if text.startswith("{")), None):
+        return f"must name a schedule in words, like '1 to 2' or 'learned', got {mapping}"
+    search, runs = stage.search, _compared_runs(stage)
+    if not runs:  # the stage's settings are invalid, which is a problem of its own
+        return None
+    space = [name for name in (search.space if search else ()) if ":" not in name]
+    fixed = {
+        name: text
+        for name, text in condition.items()
+        if name != "stage" and not any(is_in(name, one) for one in space)
+    }
+    for name, text in fixed.items():
+        values = list(dict.fromkeys(run[name] for run in runs if name in run))
+        if not values:
+            varied = [*(key for point in stage.points for key in point.values)]
+            varied += [key for key in (search.compare if search else ()) if ":" not in key]
+            settings = ", ".join(dict.fromkeys([*varied, *space])) or "nothing"
+            return f"must name settings, of which {stage.name} varies {settings}, got {name!r}"
+        if not any(same_value(text, value) for value in values):
+            has = ", ".join(values)
+            return f"must name values that {stage.name} has ({name}: {has}), got {text}"
+    if not any(_has(run, fixed) for run in runs):
+        pairs = ", ".join(f"{name} = {text}" for name, text in fixed.items())
+        return f"must name values that a run of {stage.name} has together, got {pairs}"
+    return None
+
+
+def _broken_final(stage: Stage, condition: Mapping[str, str]) -> str | None:
+    """The rule that a search's final ranking breaks; None if it has runs to compare.
+
+    The two conditions must have equal other settings, which tuned settings have only by chance.
+    """
+    search = stage.search
+    if search is None:
+        return None
+    if search.final is None:
+        return (
+            f"must be about runs on fresh seeds: write final: {{trials: 1}} in the search of "
+            f"{stage.name}, got final: null"
+        )
+    if search.sampler == "grid" and search.final.trials >= search.count:
+        return None
+    tuned = [name for name in condition if any(is_in(name, one) for one in search.space)]
+    if search.final.trials == 1 and tuned:
+        return (
+            "must not name what is tuned, as only the best trial has runs on fresh seeds: compare "
+            f"its values by mode: compare in the search of {stage.name}, got {tuned[0]!r}"
+        )
+    if search.final.trials == 1:
+        return None
+    always = [name for name, dimension in search.space.items() if not dimension.when]
+    if all(any(is_in(name, one) for name in condition) for one in always):
+        return None
+    return (
+        f"must name every setting in the space of {stage.name}, or be about the best trial alone: "
+        "write final: {trials: 1}, and mode: compare with the values that are compared, "
+        f"got final.trials: {search.final.trials}"
+    )
+
+
+def _has(run: Settings, condition: Mapping[str, str]) -> bool:
+    return all(name in run and same_value(text, run[name]) for name, text in condition.items())
+
+
+def unnamed_differences(
+    analysis: Analysis, stages: Mapping[str, Stage]
+) -> Iterator[tuple[str, list[str]]]:
+    """Hypotheses whose sides differ in settings that they do not name, and these settings.
+
+    Omits α, which the analysis plan describes, and the settings of MUSIC, in which stages of
+    different variants always differ.
+    """
+    default = analysis.stage or list(stages)[-1]
+    for text in analysis.hypotheses:
+        sides = Hypothesis.of(text).sides
+        named = {".".join(key.split(".")[:2]) for side in sides for key in side} | {"tac.alpha"}
+        first, second = (_all_values(stages[side.get("stage", default)], side) for side in sides)
+        differ = {key for key in first if first[key] != second[key]}
+        if unnamed := sorted({".".join(key.split(".")[:2]) for key in differ} - named):
+            yield text, unnamed
+
+
+def _all_values(stage: Stage, condition: Mapping[str, str]) -> Mapping[str, set[str]]:
+    """Dotted setting to the values that it has in the runs of a condition."""
+    settings = {name: text for name, text in condition.items() if name != "stage"}
+    runs: Sequence[Settings] = [
+        _settings(run) for point in stage.points for run in point.runs.values()
+    ]
+    values: defaultdict[str, set[str]] = defaultdict(set)
+    # The stage has no run with a searched setting yet: then all its runs are alike.
+    for run in [run for run in runs if _has(run, settings)] or runs:
+        for name, value in run.items():
+            if name in {"env_steps", "num_envs"} or name.startswith(("tac.", "replay.")):
+                values[name].add(value)
+    return values
