@@ -4,7 +4,7 @@ FAILED, BAD_INPUT = 1, 2
 
 
 def message_of(error: BaseException) -> str:
-    """An error's message; an environment's own error may fail to give one."""
+    """An error's message; an environment's error class can fail to give it."""
     try:
         return str(error)
     except Exception as own:
@@ -28,7 +28,7 @@ def shorten(text: str, limit: int = 300) -> str:
 
 
 class BadInputError(Exception):
-    """A mistake of the user, found before anything is started.
+    """A mistake of the user, found before anything starts.
 
     The message names the place, the rule and the value. Commands print it without a traceback.
     """
@@ -37,5 +37,5 @@ class BadInputError(Exception):
 class TrackingError(BadInputError, RuntimeError):
     """Tracking cannot be set up.
 
-    The message names the place (URI or path), the rule and what to do; it holds no password.
+    The message names the place (URI or path), the rule and a remedy; it contains no password.
     """

@@ -1,7 +1,7 @@
 """Short labels of runs: `q=1.5/seed0` in a sweep with one stage and one task.
 
-A run's whole label is `finetune/FetchPush/tac.entropic_index=1.5,tac.alpha=0.1/seed0`: its stage,
-its task, the settings in which its trial differs from others, its seed.
+A complete label is `finetune/FetchPush/tac.entropic_index=1.5,tac.alpha=0.1/seed0`: stage, task,
+the settings in which the trial differs from others, seed.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterable
 
 SYMBOLS = {"q": "entropic_index", "weight": "mi_reward_weight"}
-"""Symbol of a setting in papers, tables and labels to its name."""
+"""Short name of a setting in papers, tables and labels to its name."""
 _NAME = re.compile(r"(?<![\w.])(?:(?:tac|music|replay|evaluation)\.)?(\w+)(?==)")
 _ITEM = re.compile(r",(?=[\w:.-]+=)")
 
@@ -28,12 +28,12 @@ class ShortLabels:
 
     @classmethod
     def of(cls, labels: Iterable[str]) -> ShortLabels:
-        """For a sweep whose runs have these labels."""
+        """Create it for a sweep whose runs have these labels."""
         parts = [label.split("/") for label in labels]
         return cls((part[0] for part in parts), (part[1] for part in parts if len(part) > 1))
 
     def __call__(self, label: str) -> str:
-        """The short form of `label`; text that is no label of the sweep is returned unchanged."""
+        """The short form of `label`; other text is returned unchanged."""
         stage, _, rest = label.partition("/")
         task, _, rest = rest.partition("/")
         if stage not in self._stages or task not in self._tasks or not rest:
@@ -52,7 +52,7 @@ def _symbol(match: re.Match[str]) -> str:
 
 
 def label_matches(wanted: str, label: str) -> bool:
-    """Whether every part of `wanted` is a part of `label`, short or whole, in any order."""
+    """Whether every part of `wanted`, short or complete, is a part of `label`, in any order."""
     parts = [_items(part) for part in label.split("/")]
     return all(
         any(all(any(_same(item, other) for other in part) for item in given) for part in parts)
@@ -61,13 +61,13 @@ def label_matches(wanted: str, label: str) -> bool:
 
 
 def _items(part: str) -> list[tuple[str, str]]:
-    """Names and values of `tac.lr=0.1,q=2`; `FetchPush` and `seed0` are names without a value."""
+    """Names and values of `tac.lr=0.1,q=2`; `FetchPush` and `seed0` are names without values."""
     pairs = [item.partition("=")[::2] for item in _ITEM.split(part)]
     return [(f"seed{value}", "") if name == "seed" else (name, value) for name, value in pairs]
 
 
 def _same(given: tuple[str, str], item: tuple[str, str]) -> bool:
-    """Whether a given name and value are those of a label's item."""
+    """Whether a given name and value equal those of a label's item."""
     name = SYMBOLS.get(given[0], given[0])
     if name != item[0] and not item[0].endswith((f".{name}", f":{name}")):
         return False

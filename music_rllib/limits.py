@@ -1,12 +1,13 @@
 """Limits on files from outside, and functions that read within them.
 
-Policies, object folders, exported sweeps and YAML may come from strangers. Input beyond a limit is
-refused before it costs time or memory. Each limit is far above anything that a sweep writes.
+Policies, object folders, exported sweeps and YAML can come from strangers. Input beyond a limit is
+rejected before it costs time or memory. Each limit is far above what a sweep writes.
 """
 
 from __future__ import annotations
 
 import errno
+import itertools
 import json
 import os
 import re
@@ -26,11 +27,11 @@ MOST_NESTED = 64
 MOST_CONTAINERS = 200_000
 """Lists and mappings in a JSON document."""
 MOST_YAML_VALUES = 12_000
-"""Values in a YAML document; those of an alias count at each of its uses."""
+"""Values in a YAML document; the values of an alias count at each of its uses."""
 MOST_DIGITS = 100
 """Digits of an integer: the state of a random generator has 39."""
 MOST_INDICES = 10_000
-"""Indices of an observation that a task may list."""
+"""Indices of an observation that a task can list."""
 MOST_SEEDS = 10_000
 MOST_GRID_POINTS = 10_000
 """Points of a stage's grid."""
@@ -43,30 +44,25 @@ MOST_ROWS_PER_BYTE = 4
 MOST_TABLE_TEXT = 64 << 20
 """Characters in all cells of an exported table."""
 MOST_UNPACKED_BYTES = 32 << 20
-"""Size of an exported Parquet table after unpacking, to which `MOST_UNPACKED_PER_BYTE` is added."""
+"""Size of an unpacked Parquet table, beside `MOST_UNPACKED_PER_BYTE`."""
 MOST_UNPACKED_PER_BYTE = 16
 """Unpacked bytes for each byte of the file: real sweeps have 1.5 to 1.8."""
 MOST_COLUMNS = 10_000
 """Columns of an exported table."""
 
-# A string without an end reaches to the end: a new search at each quote would take quadratic time.
+# A string without an end extends to the end: a new search at each quote takes quadratic time.
 _TEXTS = re.compile(rb'"(?:[^"\\]++|\\.)*+"?', re.DOTALL)
 _LONG_NUMBER = re.compile(rb"\d{%d}" % (MOST_DIGITS + 1))
 _SURROGATE = re.compile(rb"\\u[dD][89a-fA-F]")
 _NO_BRACKETS = bytes(set(range(256)) - set(b"[]{}"))
-_KINDS = {
-    stat.S_IFIFO: "a FIFO",
-    stat.S_IFCHR: "a device",
-    stat.S_IFBLK: "a device",
-    stat.S_IFSOCK: "a socket",
-}
 
 
 def open_regular(path: Path | str, *, follow: bool = False) -> BinaryIO:
-    """Open a regular file for reading: other kinds of files may block or have no end.
+    """Open a regular file for reading; other kinds of files can block or have no end.
 
     Args:
-        follow: Whether `path` itself may be a link. Set it for a path that a user names, not for
+        path: The file.
+        follow: Whether `path` itself can be a link. Set it for a path that a user names, not for
             the files in a folder from elsewhere.
 
     Raises:
@@ -77,16 +73,14 @@ def open_regular(path: Path | str, *, follow: bool = False) -> BinaryIO:
         handle = os.open(path, flags)
     except OSError as error:
         if error.errno in (errno.ELOOP, errno.ENXIO):  # a link; a FIFO or socket
-            what = "a link" if error.errno == errno.ELOOP else "a socket"
-            raise OSError(error.errno, f"it is {what}, no regular file", str(path)) from None
+            raise OSError(error.errno, "it is not a regular file", str(path)) from None
         raise
     kind = stat.S_IFMT(os.fstat(handle).st_mode)
     if kind != stat.S_IFREG:
         os.close(handle)
         if kind == stat.S_IFDIR:
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-        what = _KINDS.get(kind, "something else")
-        raise OSError(errno.EINVAL, f"it is {what}, no regular file", str(path))
+        raise OSError(errno.EINVAL, "it is not a regular file", str(path))
     return os.fdopen(handle, "rb")
 
 
@@ -94,11 +88,11 @@ def read_regular(path: Path | str, most: int, *, follow: bool = False) -> bytes:
     """The content of a regular file of at most `most` bytes.
 
     Raises:
-        OSError: It is longer, or as for `open_regular`.
+        OSError: It is longer, or `open_regular` rejects it.
     """
     with open_regular(path, follow=follow) as file:
         size = os.fstat(file.fileno()).st_size
-        # It may grow while it is read.
+        # It can grow while it is read.
         data = b"" if size > most else file.read(most + 1)
         if (size := max(size, len(data))) > most:
             raise OSError(errno.EFBIG, f"it has {size} bytes, more than {most}", str(path))
@@ -106,10 +100,10 @@ def read_regular(path: Path | str, most: int, *, follow: bool = False) -> bytes:
 
 
 def read_json(data: bytes | str) -> Any:
-    """Parse JSON that may be hostile.
+    """Parse JSON that can be hostile.
 
     Raises:
-        ValueError: It is not JSON, or beyond a limit; names the limit.
+        ValueError: It is not JSON, or beyond a limit, which the message names.
     """
     raw = data.encode("utf-8", "surrogatepass") if isinstance(data, str) else data
     if len(raw) > MOST_JSON_BYTES:
@@ -123,7 +117,8 @@ def read_json(data: bytes | str) -> Any:
         raise ValueError(
             f"must have at most {MOST_CONTAINERS} lists and mappings, it has {len(brackets) // 2}"
         )
-    if _nesting_of(brackets) > MOST_NESTED:
+    depths = itertools.accumulate(1 if bracket in b"[{" else -1 for bracket in brackets)
+    if max(depths, default=0) > MOST_NESTED:
         raise ValueError(f"must be nested at most {MOST_NESTED} levels deep, it is deeper")
     try:
         value = json.loads(raw)
@@ -132,16 +127,6 @@ def read_json(data: bytes | str) -> Any:
     except RecursionError:
         raise ValueError("must be nested less deeply") from None
     return value
-
-
-def _nesting_of(brackets: bytes) -> int:
-    """Depth of nested pairs, at most `MOST_NESTED` + 1; 0 for unbalanced ones: no JSON."""
-    for level in range(MOST_NESTED + 1):
-        inner = brackets.replace(b"[]", b"").replace(b"{}", b"")
-        if inner == brackets:
-            return level if not brackets else 0
-        brackets = inner
-    return MOST_NESTED + 1
 
 
 def check_safetensors(data: bytes) -> None:

@@ -25,7 +25,7 @@ EVAL_TOUCHED = "evaluation/object_moved_share"
 EVAL_EPISODES = "evaluation/episodes"
 """Number of episodes behind the evaluation metrics of this step."""
 EVAL_RATES = frozenset({EVAL_SUCCESS, EVAL_SUCCESS_ANY, EVAL_TOUCHED})
-"""The evaluation metrics that are a share of the episodes."""
+"""Evaluation metrics that are a share of the episodes."""
 
 
 def primary_metric(success_key: str | None) -> str:
@@ -79,8 +79,8 @@ FOLLOWED = {
     ENTROPIC_INDEX: ENTROPIC_INDEX_FOLLOWS,
     MI_REWARD_WEIGHT: MI_REWARD_WEIGHT_FOLLOWS,
 }
-"""A setting's metric to that of the quantity it follows: a success rate, or an entropy in nats,
-smoothed and monotone as configured."""
+"""A setting's metric to the metric of the quantity that it follows: a success rate, or an entropy
+in nats, smoothed and monotone as configured."""
 CLIPPED_TARGETS = "bounds/target_share"
 """Share of critic targets that lie on `tac.target_bounds`."""
 Q_BIAS = "critics/bias"
@@ -108,17 +108,9 @@ SETTING_ALPHA = "setting/alpha"
 SETTING_MI_REWARD_WEIGHT = "setting/mi_reward_weight"
 
 GROUPS = (
-    "bounds",
-    "critics",
-    "entropy",
-    "evaluation",
-    "loss",
-    "mutual_information",
-    "schedule",
-    "setting",
-    "system",
-    "training",
-)
+    "bounds", "critics", "entropy", "evaluation", "loss",
+    "mutual_information", "schedule", "setting", "system", "training",
+)  # fmt: skip
 """Groups of the metrics above."""
 
 # Tags -------------------------------------------------------------------------------------------
@@ -133,18 +125,18 @@ TAG_SWEEP = "sweep"
 TAG_SWEEP_ID = "sweep_id"
 """Distinguishes sweeps of the same name on one server; kept in the sweep's folder."""
 TAG_NODE_KEY = "node_key"
-"""Content hash of the run's settings and source, by which a child run is found again."""
+"""Content hash of the run's settings and source, which identifies a child run."""
 TAG_ENVIRONMENT = "environment"
-"""Hash of what determines the run's environment beside its settings: source, models, versions."""
+"""Hash of the run's environment apart from its settings: source code, models, versions."""
 TAG_PLAN = "plan"
-"""Hash of the sweep's plan, on the parent run: a changed plan has a parent run of its own, since
+"""Hash of the sweep's plan, on the parent run. A changed plan has its own parent run, because
 MLflow's params never change."""
 TAG_CURRENT = "current"
 """``yes`` for the parent run of the current plan and for its runs, ``no`` for those of earlier
 plans."""
 CURRENT, SUPERSEDED = "yes", "no"
 TAG_LABEL = "label"
-"""The run's label in the sweep, which `sweep evaluate` takes."""
+"""The run's label in the sweep, which `evaluate` accepts."""
 TAG_STAGE = "stage"
 TAG_TRIAL = "trial"
 TAG_VARIANT = "variant"
@@ -155,16 +147,16 @@ TAG_ALPHA = "alpha"
 TAG_MI_REWARD_WEIGHT = "mi_reward_weight"
 TAG_CONFIG_HASH = "config_hash"
 TAG_SOURCE_RUN = "source_run"
-"""MLflow run id of the run whose handoff this run starts from."""
+"""MLflow run id of the run whose handoff initializes this run."""
 TAG_SOURCE_NODE = "source_node"
-"""Node key of the run, or hash of the checkpoint, that this run starts from."""
+"""Node key of the run, or hash of the imported handoff, that initializes this run."""
 TAG_INCOMPLETE = "incomplete"
 """Set on a finished run until its policy is logged."""
 TAG_PART = "part"
 """In a searched stage: ``trialN`` for a run of the search, ``finalN`` for a run of the final
-ranking, on fresh seeds. One estimate never mixes both: the choice of trials biases the former."""
+ranking on fresh seeds. Estimates never mix both: selection biases the former."""
 TAG_PRUNED = "pruned"
-"""Why the run was stopped early, together with its trial."""
+"""Why the run was pruned, together with its trial."""
 TAG_FAILURE = "failure"
 """First lines of the cause of a failed run."""
 TAG_GIT_COMMIT = "git_commit"
@@ -178,21 +170,12 @@ TAG_VIEW_PREFIX = "mlflow.sharedViewState."
 TAG_NOTE = "mlflow.note.content"
 """MLflow's tag for the description of a run, in Markdown."""
 EXPERIMENT_TAGS = {"mlflow.experimentKind": "custom_model_development"}
-"""Without it MLflow 3 shows an experiment as one of language models: traces, judges, prompts."""
+"""Without it, MLflow 3 shows an experiment on language models: traces, judges, prompts."""
 TAGS_OF_A_MODEL = (
-    TAG_SWEEP,
-    TAG_SWEEP_ID,
-    TAG_NODE_KEY,
-    TAG_STAGE,
-    TAG_TRIAL,
-    TAG_VARIANT,
-    TAG_TASK,
-    TAG_SEED,
-    TAG_ENTROPIC_INDEX,
-    TAG_ALPHA,
-    TAG_MI_REWARD_WEIGHT,
-)
-"""Tags of a run that its logged policy has too, besides ``source_run``."""
+    TAG_SWEEP, TAG_SWEEP_ID, TAG_NODE_KEY, TAG_STAGE, TAG_TRIAL, TAG_VARIANT,
+    TAG_TASK, TAG_SEED, TAG_ENTROPIC_INDEX, TAG_ALPHA, TAG_MI_REWARD_WEIGHT,
+)  # fmt: skip
+"""Tags of a run that its logged policy also has, in addition to ``source_run``."""
 
 # Artifacts --------------------------------------------------------------------------------------
 ARTIFACT_SWEEP_CONFIG = "config/sweep.yaml"
@@ -203,8 +186,8 @@ ARTIFACT_ANALYSIS_PLAN = "analysis/analysis_plan.json"
 
 # Environment variables --------------------------------------------------------------------------
 VARIABLE_TRACKING_URI = "MUSIC_RLLIB_TRACKING_URI"
-"""Where the report at a sweep's end is attached, password included."""
+"""MLflow server for the report at a sweep's end, password included."""
 VARIABLE_STORAGE = "MUSIC_RLLIB_STORAGE"
-"""Where the report at a sweep's end finds the storage, if that is a bucket."""
+"""Storage for the report at a sweep's end, if it is a bucket."""
 VARIABLE_REPORT = "MUSIC_RLLIB_REPORT"
-"""`off`: no report at a sweep's end."""
+"""`off`: write no report at a sweep's end."""

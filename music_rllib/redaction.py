@@ -1,7 +1,7 @@
 """Removes passwords and control characters from text and settings that leave the process.
 
-Text from elsewhere (an environment's exception, a file, a server) passes `redact` on its way to a
-file, the terminal or MLflow, and also `printable` on its way to the terminal.
+Text from elsewhere (an environment's exception, a file, a server) passes `redact` before it is
+written to a file, the terminal or MLflow, and also `printable` before the terminal.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ import re
 from collections.abc import Iterator, Mapping
 
 MAX_PARAM_LENGTH = 6000
-"""Longest value of a param that MLflow takes, in characters."""
+"""Longest value of an MLflow param, in characters."""
 
 _NAMES = (
     r"password|passwd|passphrase|pwd|secret|token|credential|authorization"
     r"|(?:api|access|private)[_-]?key"
 )
 _USER_INFO = re.compile(
-    # A database's password may hold what ends the host elsewhere, but then no port looks like it.
+    # A database's password can contain characters that end the host in other URIs.
     r"""(?P<scheme>[A-Za-z][A-Za-z0-9+.\-]{0,40}://)
     (?:[^/?\#\s'"]*@|[^/?\#@\s:'"\[]{0,999}:(?!\d{1,5}(?:[/?\#]|$))[^@\s]{0,999}@)""",
     re.VERBOSE,
@@ -34,14 +34,14 @@ _ASSIGNED_SECRET = re.compile(
     re.IGNORECASE | re.VERBOSE,
 )
 _BEARER = re.compile(r"(?P<name>\bBearer\s+)[\w.~+/=-]+")
-# C0 and C1 controls except line breaks and tabs, marks that change the direction of writing, marks
-# that are invisible, and unpaired surrogates, which no terminal can be given.
+# C0 and C1 controls except line breaks and tabs, marks that change the direction of writing,
+# invisible marks, and unpaired surrogates, which no terminal accepts.
 _UNPRINTABLE = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u2069\ufeff\ud800-\udfff]"
 )
 _SECRET_KEY = re.compile(_NAMES, re.I)
 _COUNTED_KEY = re.compile(r"tokens?", re.I)
-"""A number under such a name is how many there are, or one's id."""
+"""A number under such a name is a count or an id."""
 _KEYED_BY_TASK = ("environments", "per_task")
 _NOT_IN_A_NAME = re.compile(r"[^\w./\- ]")
 
@@ -49,9 +49,9 @@ _NOT_IN_A_NAME = re.compile(r"[^\w./\- ]")
 def redact(text: str) -> str:
     """``text`` without passwords.
 
-    Removed are ``user:password@`` in URIs, and values that are assigned (by ``=``, ``:`` or in a
-    URI's query) to a name that contains ``password``, ``token``, ``secret``, ``api_key``,
-    ``access_key``, ``credential`` and the like.
+    Removes ``user:password@`` in URIs, and values that are assigned (by ``=``, ``:`` or in a URI's
+    query) to a name that contains ``password``, ``token``, ``secret``, ``api_key``,
+    ``access_key``, ``credential`` or a similar word.
     """
     text = _USER_INFO.sub(lambda match: match["scheme"], text)
     text = _QUERY_SECRET.sub(lambda match: match["name"] + "***", text)
@@ -73,19 +73,19 @@ def printable(text: str) -> str:
 
 
 def for_people(text: object) -> str:
-    """An error or a remark without passwords and control characters, ready to be shown."""
+    """An error or a warning without passwords and control characters."""
     return printable(redact(str(text)))
 
 
 def without_secrets(settings: Mapping[str, object], *, of_tasks: bool = False) -> dict[str, object]:
     """A copy of nested ``settings`` with redacted text and without keys that name a secret.
 
-    A key names a secret if it contains a word of `redact`'s; ``n_tokens: 4`` does not, nor do the
-    names of tasks.
+    A key names a secret if it contains a word of `redact`. ``n_tokens: 4`` and the names of tasks
+    are not secrets.
 
     Args:
-        settings: the settings.
-        of_tasks: whether their keys are names of tasks.
+        settings: The settings.
+        of_tasks: Whether their keys are names of tasks.
     """
     return {
         str(key): _clean(str(key), value)

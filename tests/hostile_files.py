@@ -414,11 +414,11 @@ CORPUS: dict[str, Hostile] = {
     ),
     "yaml: a device": Hostile(
         _plan_strange("device"),
-        "is a device, no regular file",
+        "is not a regular file",
     ),
     "yaml: a FIFO": Hostile(
         _plan_strange("FIFO"),
-        "is a FIFO, no regular file",
+        "is not a regular file",
     ),
     "yaml: python": Hostile(_plan("a: !!python/object/apply:os.system [id]\n"), "must be valid"),
     "indices": Hostile(
@@ -449,10 +449,10 @@ CORPUS: dict[str, Hostile] = {
     "--seeds": Hostile(_plan_of("--seeds", "1000000"), "--seeds must be at most 10,000"),
     "--seeds of 5,001 digits": Hostile(_plan_of("--seeds", "1" * 5001), "--seeds must be"),
     "policy: a device": Hostile(
-        _policy("handoff/policy.safetensors", _replaced("device")), "is a link, no regular file"
+        _policy("handoff/policy.safetensors", _replaced("device")), "is not a regular file"
     ),
     "policy: a FIFO": Hostile(
-        _policy("handoff/policy.safetensors", _replaced("FIFO")), "is a FIFO, no regular file"
+        _policy("handoff/policy.safetensors", _replaced("FIFO")), "is not a regular file"
     ),
     "policy: sparse": Hostile(
         _policy("handoff/policy.safetensors", _replaced("sparse")), "it has 1099511627776"
@@ -555,12 +555,14 @@ CORPUS: dict[str, Hostile] = {
     "export: halves of characters": Hostile(
         _export("sweep.json", _json(lambda header: header.update(name="\ud800"))), "sweep.json:"
     ),
-    "export: a FIFO": Hostile(_export("sweep.json", _replaced("FIFO")), "sweep.json: it is a FIFO"),
+    "export: a FIFO": Hostile(
+        _export("sweep.json", _replaced("FIFO")), "sweep.json: it is not a regular file"
+    ),
     "export: a FIFO for a table": Hostile(
-        _export("metrics.parquet", _replaced("FIFO")), "metrics.parquet: it is a FIFO"
+        _export("metrics.parquet", _replaced("FIFO")), "metrics.parquet: it is not a regular file"
     ),
     "export: a device for a table": Hostile(
-        _export("runs.csv", _replaced("device"), "csv"), "runs.csv: it is a link"
+        _export("runs.csv", _replaced("device"), "csv"), "runs.csv: it is not a regular file"
     ),
     "export: many rows": Hostile(
         _export("metrics.parquet", _nulls(60_000_000)), "metrics.parquet: must have at most"
