@@ -81,7 +81,10 @@ def test_mistakes_are_named_where_they_are(
 
 
 def test_presets_are_listed_with_what_they_are() -> None:
-    assert shipped_presets()["small"] == "what learned soonest on a 2-core machine."
+    assert (
+        shipped_presets()["small"]
+        == "the settings that learned FetchPush in the fewest steps on a 2-core machine."
+    )
     assert all(line.endswith(".") for line in shipped_presets().values())
 
 
