@@ -100,9 +100,9 @@ def render(report: SweepReport, *, live: bool = False) -> str:
     data = chart_data(sweep, report.drawings)
     numbers = {stage["name"]: number for number, stage in enumerate(data["stages"])}
     sentences = answer(sweep, report.study)[1:] if report.analyses else []
-    # The claims are in large letters, the details of how runs were counted below in small ones.
-    counted = (i for i, line in enumerate(sentences) if line.startswith("Counted:"))
-    claims = next(counted, len(sentences))
+    # The verdicts are in large letters; the metric, seeds and control follow in small ones.
+    details = (i for i, line in enumerate(sentences) if line.startswith("Metric:"))
+    claims = next(details, len(sentences))
     planned = planned_in_words(report.study)
     page = _PAGES.get_template("page.html").render(
         style=(folder / "page.css").read_text(encoding="utf-8"),

@@ -36,7 +36,7 @@ UNFOLDED_ROWS = 30
 """Largest number of trials that the page shows unfolded."""
 
 Entry = Mapping[str, Any]
-"""A search in `search.json`, or one of its arms, trials or ranked settings."""
+"""A search in `search.json`, or one of its studies, trials or ranked settings."""
 
 
 # Comparisons of conditions ----------------------------------------------------------------------
@@ -295,15 +295,15 @@ def state_in_words(status: str) -> str:
 
 
 # Searches ---------------------------------------------------------------------------------------
+_TRIALS = {"judged": "scored", "pruned": "stopped early", "failed": "failed"}
+"""Word for each state of a trial in `search.json`."""
 
 
 def search_in_words(search: Entry) -> str:
     """A sentence with the search's mode, sampler, objectives and numbers of trials."""
-    states = [trial["state"] for arm in search["arms"] for trial in arm["trials"]]
+    states = [trial["state"] for study in search["arms"] for trial in study["trials"]]
     counts = ", ".join(
-        f"{states.count(state)} {state}"
-        for state in ("judged", "pruned", "failed")
-        if state in states
+        f"{states.count(state)} {word}" for state, word in _TRIALS.items() if state in states
     )
     aims = " and ".join(f"{aim['direction']} {aim['name']}" for aim in search["objectives"])
     return f"{search['mode'].capitalize()} ({search['sampler']}): {aims}; trials: {counts}."
@@ -311,7 +311,7 @@ def search_in_words(search: Entry) -> str:
 
 def search_tables(search: Entry) -> Iterator[Table]:
     """The ranking on fresh seeds, the importance of each setting, and every trial."""
-    trials = [trial for arm in search["arms"] for trial in arm["trials"]]
+    trials = [trial for study in search["arms"] for trial in study["trials"]]
     settings = list(dict.fromkeys(name for trial in trials for name in trial["values"]))
     aims = [aim["name"] for aim in search["objectives"]]
     yield Table(
@@ -338,13 +338,13 @@ def search_tables(search: Entry) -> Iterator[Table]:
             for place, row in enumerate(search["ranking"] or (), start=1)
         ],
     )
-    for arm in search["arms"]:
-        values = ", ".join(f"{name} = {_setting(value)}" for name, value in arm["values"].items())
+    for study in search["arms"]:
+        values = ", ".join(f"{name} = {_setting(value)}" for name, value in study["values"].items())
         yield Table(
             title=f"Importance of the settings{values and f' at {values}'}",
             note="Share of the objective's variance over the trials (functional ANOVA).",
             header=("Setting", "Share"),
-            rows=[(name, Share(share)) for name, share in (arm["importance"] or {}).items()],
+            rows=[(name, Share(share)) for name, share in (study["importance"] or {}).items()],
         )
     yield Table(
         title="Trials",
@@ -355,7 +355,7 @@ def search_tables(search: Entry) -> Iterator[Table]:
             (
                 trial["number"],
                 *(_setting(trial["values"].get(name)) for name in settings),
-                trial["state"],
+                _TRIALS.get(trial["state"], trial["state"]),
                 *_objectives(trial, "objective", len(aims)),
                 trial["reason"] or "",
             )

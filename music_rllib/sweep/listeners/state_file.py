@@ -144,10 +144,10 @@ class StateFile(Listener):
             if stage["runs"]
         ]
         lines += [
-            f"search of {search['stage']}: {arm['judged']} of {len(arm['trials'])} trials judged, "
-            f"{arm['pruned']} stopped early"
+            f"search of {search['stage']}: {study['judged']} of {len(study['trials'])} trials "
+            f"scored, {study['pruned']} stopped early"
             for search in self._state["searches"]
-            for arm in search["arms"]
+            for study in search["arms"]
         ]
         best = self._state["best"]
         return lines, None if best is None else f"best so far: {best_text(best)}"

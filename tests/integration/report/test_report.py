@@ -269,7 +269,7 @@ def test_the_page_shows_what_a_search_found(searched: Path, tmp_path: Path) -> N
     page = tmp_path / PAGE
     text = re.sub(r"<[^>]+>", "|", page.read_text().partition("Search of stage")[2])
     cells = [cell for cell in text.split("|") if cell.strip()]
-    assert "trials: 1 judged, 1 pruned." in text
+    assert "trials: 1 scored, 1 stopped early." in text
     ranked = cells[cells.index("Probability that the best is better") + 1 :]
     assert ranked[:8] == ["1", "0", "1.25", "0.69", "0.50 to 0.75", "2", "0.81", "–"]
     assert "failed: no memory" in ranked

@@ -1,4 +1,4 @@
-"""The live page: who may see it, and what it says of a sweep."""
+"""The live page: who can read it, and the progress that it shows."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def found(tmp_path: Path) -> SweepLocation:
     return SweepLocation(storage=str(tmp_path), name="tiny")
 
 
-def test_speed_and_the_time_left_are_those_of_the_last_minutes(
+def test_speed_and_time_left_are_measured_over_the_last_minutes(
     found: SweepLocation, tmp_path: Path
 ) -> None:
     progress, now = Progress(found), time.time()
@@ -68,11 +68,11 @@ def test_speed_and_the_time_left_are_those_of_the_last_minutes(
     seen = progress.read()
     assert (seen["state"], seen["done"], seen["left"]) == ("running", 200, 100)
     assert (seen["speed"], seen["seconds_left"]) == pytest.approx((10.0, 10.0))
-    assert [run["run"] for run in seen["running"]] == ["seed0"], "in short"
+    assert [run["run"] for run in seen["running"]] == ["seed0"], "the label is short"
     write_state(tmp_path, 200, now - 10, to_come=500)
     seen = progress.read()
     assert (seen["left"], seen["at_most"], seen["seconds_left"]) == (600, True, pytest.approx(60.0))
-    # A driver that has been silent for long does not run, whatever it said last.
+    # A driver without a recent heartbeat is not running.
     write_state(tmp_path, 200, now - 1000)
     seen = progress.read()
     assert (seen["state"], seen["speed"], seen["running"]) == ("interrupted", None, [])
@@ -108,9 +108,7 @@ def ask(url: str, method: str = "GET", **headers: str) -> tuple[int, str]:
         return error.code, error.read().decode()
 
 
-def test_only_requests_to_this_machine_are_answered_and_none_changes_anything(
-    served: str, tmp_path: Path
-) -> None:
+def test_only_requests_to_this_machine_are_answered(served: str, tmp_path: Path) -> None:
     for host in ("127.0.0.1", "localhost", "localhost:80"):  # browsers omit port 80
         assert ask(f"{served}/", Host=host)[0] == 200
     for host in ("evil.example", "evil.example:80", "127.0.0.1.evil.example"):
@@ -119,14 +117,14 @@ def test_only_requests_to_this_machine_are_answered_and_none_changes_anything(
     assert not (tmp_path / "tiny" / sweep_files.STOP).exists()
 
 
-def test_a_half_sent_request_is_given_up(served: str) -> None:
+def test_an_incomplete_request_is_closed(served: str) -> None:
     port = int(served.rpartition(":")[2])
     with socket.create_connection(("127.0.0.1", port), timeout=30) as client:
         client.sendall(b"GET / HTTP/1.1\r\nHost: local")
-        assert client.recv(1) == b"", "closed, and its thread has ended"
+        assert client.recv(1) == b"", "the connection is closed"
 
 
-def test_the_command_to_stop_or_resume_is_shown_without_keys(tmp_path: Path) -> None:
+def test_the_command_to_stop_or_resume_has_no_keys(tmp_path: Path) -> None:
     class Bucket(SweepLocation):
         def read(self, name: str) -> Any:
             return json.loads((tmp_path / "tiny" / name).read_text())
@@ -141,7 +139,7 @@ def test_the_command_to_stop_or_resume_is_shown_without_keys(tmp_path: Path) -> 
     assert progress.read()["command"] is None
 
 
-def test_the_page_is_made_anew_while_the_sweep_runs(served: str) -> None:
+def test_the_page_is_updated_while_the_sweep_runs(served: str) -> None:
     assert ask(f"{served}/")[1].startswith("<p>page ")
     before = json.loads(ask(f"{served}/state")[1])
     assert before["state"] == "running"
@@ -151,10 +149,10 @@ def test_the_page_is_made_anew_while_the_sweep_runs(served: str) -> None:
         time.sleep(0.05)
 
 
-def test_a_page_that_cannot_be_made_is_said_and_made_later(
+def test_a_page_that_fails_is_reported_and_made_later(
     found: SweepLocation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its thread would end with the first error, and the page stay as it is without a word."""
+    """The thread that makes pages survives an error."""
     monkeypatch.setattr(live, "LEAST_PAUSE", 0.05)
     write_state(tmp_path, 100, time.time())
     answers: Iterator[Any] = chain(["one"], repeat(TrackingError("no answer"), 3), repeat("two"))
@@ -166,12 +164,12 @@ def test_a_page_that_cannot_be_made_is_said_and_made_later(
         return str(answer)
 
     page = live.LivePage(make, Progress(found))
-    said = set()
+    errors = set()
     deadline = time.monotonic() + 60
     while page.html != "two":
-        said.add(page.state().get("error"))
+        errors.add(page.state().get("error"))
         assert time.monotonic() < deadline
         time.sleep(0.01)
     page.close()
-    assert "The page is out of date: no answer" in said
+    assert "The page is out of date: no answer" in errors
     assert "error" not in page.state()

@@ -1,4 +1,4 @@
-"""The picture of a sweep: which panels it has, and whose lines are in them."""
+"""The overview of a sweep: its subplots and their lines."""
 
 from __future__ import annotations
 
@@ -10,17 +10,15 @@ from matplotlib.figure import Figure
 from music_rllib import names
 from music_rllib.report.build import PICTURE, build_report, write_report
 from music_rllib.report.figures.choice import overview
-from music_rllib.report.figures.palette import styles_of
 from music_rllib.results.analysis import analyse
 from music_rllib.results.archive import read_archive
-from music_rllib.results.conditions import Condition
 from music_rllib.results.data import Sweep
 
 DATA = Path(__file__).parents[3] / "docs" / "results" / "data"
 
 
 def subplots(sweep: Sweep) -> dict[str, list[str]]:
-    """What is drawn of each task, and the legend of that."""
+    """Task and axis of each subplot, and its legend."""
     shown = {}
     for subplot in overview(sweep, [one.stage for one in analyse(sweep)]):
         axes = Figure().add_subplot()
@@ -31,7 +29,7 @@ def subplots(sweep: Sweep) -> dict[str, list[str]]:
     return shown
 
 
-def test_stages_stand_side_by_side_with_what_music_u_has_learnt() -> None:
+def test_the_overview_shows_all_stages_and_the_bound_of_music_u() -> None:
     assert subplots(read_archive(DATA / "v3-fetch-push-music-f")) == {
         "FetchPush: success rate": ["her", "music-f"],
         "FetchPush: object displacement (m)": ["her", "pretrain", "music-f"],
@@ -39,17 +37,9 @@ def test_stages_stand_side_by_side_with_what_music_u_has_learnt() -> None:
     }
 
 
-def test_one_stage_is_told_by_its_q(tmp_path: Path) -> None:
+def test_conditions_of_a_single_stage_are_labelled_by_q(tmp_path: Path) -> None:
     sweep = read_archive(DATA / "proof-fetch-push-her")
     assert subplots(sweep)["FetchPush: success rate"] == ["q = 1", "q = 1.5", "q = 2"]
     success = {names.EVAL_SUCCESS: sweep.history[names.EVAL_SUCCESS]}
     write_report(build_report(replace(sweep, history=success)), tmp_path)
     assert (tmp_path / "figures" / f"{PICTURE}.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_six_alphas_of_a_q_have_lines_of_their_own() -> None:
-    conditions = tuple(
-        Condition(entropic_index="1", others=(("α", str(a)),), runs=()) for a in range(6)
-    )
-    styles = styles_of(conditions).values()
-    assert len({style.line for style in styles}) == 6

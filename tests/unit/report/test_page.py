@@ -1,4 +1,4 @@
-"""Reports on sweeps in every state, from runs in memory: what is said, drawn and left open."""
+"""Reports on sweeps in every state, from runs in memory: sentences, tables and figures."""
 
 from __future__ import annotations
 
@@ -6,24 +6,26 @@ import csv
 import io
 import json
 import re
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from html import unescape
 from html.parser import HTMLParser
-from itertools import combinations, product
+from itertools import product
 from pathlib import Path
+from types import FrameType
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from matplotlib.collections import PolyCollection
 
+import music_rllib
 from music_rllib import names
 from music_rllib.report.build import build_report, made_files, write_report
 from music_rllib.report.charts import _mean_at, curves_csv
 from music_rllib.report.figures.choice import AGAINST_ENTROPY
 from music_rllib.report.figures.draw import TEXT_WIDTH, drawn_figure, files
-from music_rllib.report.figures.palette import DARK, LIGHT, color_of, marker_of
 from music_rllib.report.page import SweepReport, render
 from music_rllib.results.analysis import THRESHOLDS, analyse
 from music_rllib.results.answer import answer
@@ -108,14 +110,14 @@ def curve_rows(report: SweepReport) -> list[dict[str, str]]:
     return list(csv.DictReader(io.StringIO(curves_csv(report.drawings))))
 
 
-def said_about(sweep: Sweep) -> str:
+def answer_to(sweep: Sweep) -> str:
     return " ".join(answer(sweep, study_of(sweep)))
 
 
-# What is said -----------------------------------------------------------------------------------
+# Sentences ----------------------------------------------------------------------------------------
 
 
-def test_stages_that_are_alike_as_file_names_keep_their_figures() -> None:
+def test_stages_with_the_same_file_name_have_different_figures() -> None:
     runs = [
         (one_run(q, seed, stage=stage), climbing(0.1 * seed))
         for stage in ("run_1", "run-1")
@@ -135,8 +137,8 @@ def test_runs_without_a_seed_and_with_an_infinite_return_are_reported() -> None:
     assert render(build_report(sweep_of(runs)))
 
 
-def test_runs_whose_critics_diverged_are_named() -> None:
-    """With the MI reward a step is worth -1.5 at least, so that -60 at gamma 0.95 is too low."""
+def test_runs_with_diverged_critics_are_listed() -> None:
+    """With the MI reward, a step has a reward of at least -1.5: -60 is too low at gamma 0.95."""
     known = {"task.reward_range": "[-1.0, 0.0]", "tac.gamma": "0.95"}
 
     def run(
@@ -168,10 +170,12 @@ LOW, HIGH = [0.3, 0.32, 0.35, 0.31, 0.3], [0.9, 0.92, 0.88, 0.95, 0.9]
 
 
 @pytest.mark.parametrize("seeds", [2, 4, 5])
-def test_final_values_have_no_test_and_below_five_seeds_there_is_no_verdict(seeds: int) -> None:
-    """Conditions that are wholly apart: every word on the page that decides is the study's."""
+def test_final_values_have_no_test_and_verdicts_need_five_seeds(seeds: int) -> None:
+    """Completely separate conditions: only the study has verdicts on the page."""
     report = build_report(compared({"1": LOW[:seeds], "1.5": HIGH[:seeds]}))
     shown = Page(render(report)).text
+    (details,) = re.findall(r'<p class="soft details">([^<]*)', render(report))
+    assert details.startswith("Metric: mean success over 200,000 steps")
     assert ("superior" in shown) == (seeds == 5)
     assert (f"{seeds} seeds: no verdict below 5" in shown) == (seeds < 5)
     for word in ("ermutation", "winner", "is ahead", "by chance", "Decided"):
@@ -190,23 +194,23 @@ def searched(*runs: tuple[str, int, str, float]) -> Sweep:
 TRIALS = [("1", 0, "trial0", 0.5), ("1.2", 0, "trial1", 1.0), ("1.4", 0, "trial2", 0.9)]
 
 
-def test_trials_of_a_search_are_not_compared_on_the_seeds_that_chose_them() -> None:
+def test_trials_of_a_search_are_not_compared_on_its_seeds() -> None:
     sweep = searched(*TRIALS)
     (analysis,) = analyse(sweep)
     assert analysis.scopes[0].differences == ()
-    assert len(analysis.scopes[0].finals) == 3, "they are in the table all the same"
-    assert "No run that may be compared has finished yet." in said_about(sweep)
+    assert len(analysis.scopes[0].finals) == 3, "the table has them"
+    assert "No run that may be compared has finished yet." in answer_to(sweep)
 
 
-def test_of_a_search_the_ranking_on_fresh_seeds_is_what_is_said() -> None:
+def test_the_answer_of_a_search_is_about_fresh_seeds() -> None:
     fresh = [("1.2", seed, "final1", 0.6) for seed in (7, 8)]
     fresh += [("1", seed, "final0", 0.7) for seed in (7, 8)]
-    said = said_about(searched(*TRIALS, *fresh))
+    said = answer_to(searched(*TRIALS, *fresh))
     assert "q = 1.2 against q = 1 on FetchPush: 2 seeds: no verdict below 5, -0." in said
-    assert "1.4" not in said, "a trial that was not tried on fresh seeds"
+    assert "1.4" not in said, "this trial has no runs on fresh seeds"
 
 
-def test_of_a_search_the_ranking_is_drawn_as_soon_as_there_is_one() -> None:
+def test_figures_of_a_search_show_fresh_seeds_if_there_are_any() -> None:
     fresh = [(q, seed, "final1", 0.6) for q in ("1", "1.2") for seed in (7, 8)]
 
     def drawn(sweep: Sweep) -> set[str]:
@@ -217,7 +221,7 @@ def test_of_a_search_the_ranking_is_drawn_as_soon_as_there_is_one() -> None:
     assert drawn(searched(*TRIALS, *fresh)) == {f"q = {q}, seeds = fresh" for q in ("1", "1.2")}
 
 
-def test_how_random_policies_are_stands_beside_what_they_ended_at() -> None:
+def test_final_entropies_are_in_a_table_and_a_figure() -> None:
     sweep = compared({"1": [0.5, 0.6, 0.7], "2": [0.4, 0.5, 0.6]})
     last, entropies = STEPS[-1], {"1": [-0.4, -0.3, -0.2], "2": [0.2, 0.3, 0.4]}
     values = [value for q in entropies for value in entropies[q]]
@@ -232,13 +236,13 @@ def test_how_random_policies_are_stands_beside_what_they_ended_at() -> None:
     points = sorted(
         point for line in axes.lines for point in np.asarray(line.get_xydata()).tolist()
     )
-    # Of a straight line to `final` that begins at its tenth, which it has until then.
+    # Area under a straight line from 0.1 * final to final, constant before its first point.
     areas = [0.505 * final for final in (0.5, 0.6, 0.7, 0.4, 0.5, 0.6)]
     expected = sorted(zip(values, areas, strict=True))
     np.testing.assert_allclose(points, expected, rtol=1e-6)
 
 
-def test_a_run_that_failed_has_no_final_rate_but_counts_as_waiting() -> None:
+def test_a_failed_run_has_no_final_value_and_is_censored_in_times_to_a_threshold() -> None:
     failed = one_run("1", 1, status="FAILED")
     sweep = sweep_of([(one_run("1", 0), climbing(0.9)), (failed, climbing(0.9, upto=60_000))])
     (analysis,) = analyse(sweep)
@@ -249,8 +253,8 @@ def test_a_run_that_failed_has_no_final_rate_but_counts_as_waiting() -> None:
     assert (sum(half.reached), len(half.reached), float(half.median.value)) == (1, 2, 120_000)
 
 
-def test_over_all_tasks_only_seeds_that_finished_on_each_count() -> None:
-    """Otherwise a condition whose failures are on the hard task would look better."""
+def test_only_seeds_that_finished_on_every_task_count_over_all_tasks() -> None:
+    """Otherwise a condition that fails on the hard task would look better."""
     runs = [
         (one_run("1", seed, task=task), climbing(final))
         for task, finals in (("FetchPush", [0.9, 0.8]), ("FetchSlide", [0.3]))
@@ -262,7 +266,7 @@ def test_over_all_tasks_only_seeds_that_finished_on_each_count() -> None:
     assert push.finals[0].seeds == 2
 
 
-# Which runs are compared ------------------------------------------------------------------------
+# Conditions ---------------------------------------------------------------------------------------
 
 
 def labels(sweep: Sweep, stage: int = 0) -> list[str]:
@@ -270,7 +274,7 @@ def labels(sweep: Sweep, stage: int = 0) -> list[str]:
 
 
 def test_tasks_with_their_own_settings_share_a_condition() -> None:
-    """MUSIC-r's weight is 1, and .5 on FetchSlide: that is no difference between conditions."""
+    """MUSIC-r's weight is 1, and 0.5 on FetchSlide."""
     runs = [
         (one_run(q, seed, task=task), climbing(0.5))
         for task in ("FetchPush", "FetchSlide")
@@ -280,7 +284,7 @@ def test_tasks_with_their_own_settings_share_a_condition() -> None:
     assert labels(sweep_of(runs)) == ["q = 1.5", "q = 2", "q = 10"]
 
 
-def test_other_settings_and_the_source_tell_conditions_apart() -> None:
+def test_conditions_differ_in_settings_and_in_their_source() -> None:
     sources = [one_run(q, 0, stage="pretrain") for q in ("1", "2")]
     runs = [
         one_run("1.5", 0, params={"tac.lr": lr}, source_node=source.node_key)
@@ -296,7 +300,7 @@ def test_other_settings_and_the_source_tell_conditions_apart() -> None:
     ]
 
 
-def test_schedules_with_the_same_words_are_not_one_condition() -> None:
+def test_schedules_with_the_same_label_are_different_conditions() -> None:
     runs = [
         one_run("1 to 2", seed, params={"tac.entropic_index.begin": begin})
         for begin in ("0.1", "0.3")
@@ -307,11 +311,31 @@ def test_schedules_with_the_same_words_are_not_one_condition() -> None:
     assert all(label.startswith("q = 1 to 2 (") for label in found)
 
 
+def test_a_report_is_built_in_few_files() -> None:
+    package, sweep = Path(music_rllib.__file__).parent, compared({"1": LOW, "1.5": HIGH})
+    entered: set[str] = set()
+
+    def note(frame: FrameType, event: str, _: object) -> None:
+        code = frame.f_code
+        if event == "call" and code.co_name != "<module>" and str(package) in code.co_filename:
+            entered.add(str(Path(code.co_filename).relative_to(package)))
+
+    build_report(sweep)  # imports are not part of it
+    before = sys.getprofile()
+    sys.setprofile(note)
+    try:
+        build_report(sweep)
+    finally:
+        sys.setprofile(before)
+    assert "results/study.py" in entered
+    assert len(entered) <= 14, sorted(entered)
+
+
 # The page ---------------------------------------------------------------------------------------
 
 
 class Page(HTMLParser):
-    """Text, ids and whatever a browser would fetch."""
+    """Text, ids and everything that a browser would fetch."""
 
     def __init__(self, html: str) -> None:
         super().__init__()
@@ -342,7 +366,7 @@ class Page(HTMLParser):
 
 
 def row_of(page: str, *begin: str) -> list[str]:
-    """What stands in the one table row that begins so."""
+    """The other cells of the only table row that begins with these cells."""
     rows = [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in page.split("<tr>")]
     (found,) = [row[len(begin) :] for row in rows if row[: len(begin)] == list(begin)]
     return found
@@ -422,7 +446,7 @@ SCRIPT = "\"'><script>steal()</script><img src=//evil/x onerror=steal()><!-- $x_
 
 
 def hostile() -> Sweep:
-    """Somebody's sweep: a script in every text of it."""
+    """A sweep with a script in each of its texts."""
     tags = {names.TAG_ALPHA: SCRIPT, "failure": SCRIPT, "variant": SCRIPT}
     runs = [
         one_run(q, seed, task=SCRIPT, stage=stage, params={SCRIPT: q}, **tags)
@@ -457,7 +481,7 @@ def hostile() -> Sweep:
     )
 
 
-def test_a_script_in_any_text_of_a_sweep_is_shown_as_text() -> None:
+def test_a_script_in_any_text_of_a_sweep_is_escaped() -> None:
     made = replace(build_report(hostile()), command=SCRIPT, limitations=[SCRIPT])
     page = render(made)
     shown, harmless = Page(page), Page(render(build_report(grid_of_settings())))
@@ -465,7 +489,7 @@ def test_a_script_in_any_text_of_a_sweep_is_shown_as_text() -> None:
     assert not shown.handlers
     assert not shown.fetched
     assert not shown.open
-    # Whatever the page shows, it shows whole: no text ended a tag, or was taken for a formula.
+    # Every text is complete: none ended a tag or was parsed as a formula.
     assert shown.text.count(SCRIPT) > 50
     assert page.count("&lt;script&gt;steal()") == page.count("script&gt;steal()")
     labels = re.findall(r'<div role="img" aria-label="([^"]*)"', page)
@@ -478,7 +502,7 @@ def test_a_script_in_any_text_of_a_sweep_is_shown_as_text() -> None:
 
 
 def returning(finals: Mapping[str, Sequence[float]], task: str = "Reacher") -> Sweep:
-    """A task without success; each run's return climbs from -100 to its end."""
+    """A task without success; the return of each run rises from -100 to its final value."""
     runs = []
     for q, values in finals.items():
         for seed, final in enumerate(values):
@@ -489,7 +513,7 @@ def returning(finals: Mapping[str, Sequence[float]], task: str = "Reacher") -> S
     return sweep_of(runs)
 
 
-def test_a_task_without_success_is_judged_by_its_return_everywhere() -> None:
+def test_the_primary_metric_of_a_task_without_success_is_the_return() -> None:
     sweep = returning({"1": [-9, -8, -7, -9.5, -8.5], "1.5": [-5, -4, -6, -4.5, -5.5]})
     report = build_report(sweep)
     shown = Page(render(report))
@@ -505,7 +529,7 @@ def test_a_task_without_success_is_judged_by_its_return_everywhere() -> None:
     ]
 
 
-def test_tasks_with_and_without_success_stand_side_by_side_and_are_not_averaged() -> None:
+def test_tasks_with_and_without_success_are_not_averaged() -> None:
     both = [
         compared({"1": [0.5, 0.6], "1.5": [0.6, 0.7]}),
         returning({"1": [-9, -8], "1.5": [-5, -4]}),
@@ -525,7 +549,7 @@ def test_tasks_with_and_without_success_stand_side_by_side_and_are_not_averaged(
     ]
     titles = [drawing.title for drawing in report.drawings]
     assert {"Success rate", "Return", "Final success rate", "Final return"} <= set(titles)
-    assert all(len(d.subplots) == 1 for d in report.drawings), "each on its own tasks"
+    assert all(len(d.subplots) == 1 for d in report.drawings), "each on its own task"
 
 
 STAGES = {"pretrain": "music-u", "plain": "tac", "with-a-rather-long-name": "music-r"}
@@ -542,7 +566,7 @@ def of_stages(*stages: str) -> Sweep:
     )
 
 
-def test_stages_that_train_for_the_task_are_drawn_side_by_side() -> None:
+def test_stages_that_train_for_the_task_share_a_figure() -> None:
     report = build_report(of_stages(*STAGES))
     (drawing,) = [one for one in report.drawings if one.stage == SIDE_BY_SIDE]
     named = [(label, style.color, style.line) for label, style in drawing.legend]
@@ -569,10 +593,10 @@ def test_a_legend_stays_inside_its_figure() -> None:
         assert 0 <= box.y0 < box.y1 < figure.axes[0].get_window_extent().y0
 
 
-def test_figures_of_an_earlier_report_go_and_the_same_sweep_is_the_same_file(
+def test_a_new_report_removes_old_figures_and_equal_sweeps_have_equal_files(
     tmp_path: Path,
 ) -> None:
-    """And what else is in its folder stays."""
+    """Other files in the folder stay."""
     made = []
     for name in ("one", "two"):
         figures = tmp_path / name / "figures"
@@ -595,7 +619,7 @@ def test_figures_of_an_earlier_report_go_and_the_same_sweep_is_the_same_file(
     assert made[0] == made[1]
 
 
-def test_a_list_of_files_that_somebody_else_wrote_deletes_nothing_elsewhere(tmp_path: Path) -> None:
+def test_a_hostile_list_of_files_deletes_nothing_outside_the_report(tmp_path: Path) -> None:
     (tmp_path / "report" / "figures").mkdir(parents=True)
     kept = tmp_path / "figures" / "x.png"
     kept.parent.mkdir()
@@ -607,8 +631,8 @@ def test_a_list_of_files_that_somebody_else_wrote_deletes_nothing_elsewhere(tmp_
     assert kept.exists()
 
 
-def test_time_goes_on_where_a_quick_run_is_ahead_of_a_slow_one() -> None:
-    """The mean of those that have got as far may lie before that of all."""
+def test_wall_time_never_decreases_along_a_curve() -> None:
+    """The mean of the remaining runs may be smaller than the mean of all runs."""
     steps = np.arange(0.0, 500.0, 100.0)
     slow, quick = (steps[:4], 2 * steps[:4]), (steps, steps)
     assert _mean_at(steps, [slow, quick]) == [0.0, 150.0, 300.0, 450.0, 450.0]
@@ -617,11 +641,11 @@ def test_time_goes_on_where_a_quick_run_is_ahead_of_a_slow_one() -> None:
     assert _mean_at(steps, [(steps[:2], np.full(2, np.nan))]) == [None] * 5
 
 
-# Influence of settings --------------------------------------------------------------------------
+# Settings -----------------------------------------------------------------------------------------
 
 
 def grid_of_settings() -> Sweep:
-    """q decides, α helps a little, the weight does nothing; three seeds each."""
+    """q has a large effect, α a small one, the weight none; three seeds each."""
     runs = []
     for q, alpha, weight in product(("1", "2"), ("0.01", "0.1"), ("0.5", "1")):
         for seed in range(3):
@@ -632,7 +656,7 @@ def grid_of_settings() -> Sweep:
     return sweep_of(runs)
 
 
-def test_two_varied_settings_give_a_contour_for_each_q() -> None:
+def test_two_varied_settings_have_a_contour_for_each_q() -> None:
     report = build_report(grid_of_settings())
     subplots = {drawing.title: [p.title for p in drawing.subplots] for drawing in report.drawings}
     title = "Area under the curve against α and MI weight"
@@ -640,7 +664,7 @@ def test_two_varied_settings_give_a_contour_for_each_q() -> None:
     assert render(report).count(f"<h3>{title}</h3>") == 1
 
 
-def test_conditions_of_almost_the_same_color_have_other_lines_and_markers() -> None:
+def test_similar_colors_have_different_dashes_and_markers() -> None:
     drawing = build_report(compared({"1": [0.5, 0.6], "1.07177": [0.6, 0.7], "1.5": [0.6, 0.7]}))
     solid = [not style.dashes for _, style in drawing.drawings[0].legend]
     assert solid == [True, False, True]
@@ -648,7 +672,7 @@ def test_conditions_of_almost_the_same_color_have_other_lines_and_markers() -> N
     assert len(set(markers)) == 3, "points have no lines"
 
 
-def test_a_condition_of_a_search_looks_the_same_in_every_figure() -> None:
+def test_a_condition_has_the_same_style_in_every_figure() -> None:
     fresh = [(q, seed, "final1", 0.6) for q in ("1", "1.2", "1.4") for seed in (7, 8)]
     drawings = build_report(searched(*TRIALS, ("1.15", 0, "trial3", 0.1), *fresh)).drawings
     lines = {drawing.title: [style.line for _, style in drawing.legend] for drawing in drawings}
@@ -656,67 +680,10 @@ def test_a_condition_of_a_search_looks_the_same_in_every_figure() -> None:
     assert curves == areas
 
 
-# Colors ----------------------------------------------------------------------------------------
-
-COMPARED = ("0.5", "1", "1.5", "2", "3")
-# Machado, Oliveira and Fernandes 2009, severity 1.0, on linear RGB.
-VISION = {
-    "ordinary": np.eye(3),
-    "protanopia": np.array(
-        [
-            [0.152286, 1.052583, -0.204868],
-            [0.114503, 0.786281, 0.099216],
-            [-0.003882, -0.048116, 1.051998],
-        ]
-    ),
-    "deuteranopia": np.array(
-        [
-            [0.367322, 0.860646, -0.227968],
-            [0.280085, 0.672501, 0.047413],
-            [-0.01182, 0.04294, 0.968881],
-        ]
-    ),
-}
+# Many conditions ----------------------------------------------------------------------------------
 
 
-def linear(color: str) -> np.ndarray:
-    channels = np.array([int(color[at : at + 2], 16) / 255 for at in (1, 3, 5)])
-    return np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
-
-
-def lab(rgb: np.ndarray) -> np.ndarray:
-    to_xyz = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
-    x, y, z = np.cbrt(np.clip(np.array(to_xyz) @ rgb, 0, None) / [0.9505, 1.0, 1.089])
-    return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
-
-
-def contrast(one: str, other: str) -> float:
-    light, dark = sorted(float(linear(c) @ [0.2126, 0.7152, 0.0722]) for c in (one, other))[::-1]
-    return (light + 0.05) / (dark + 0.05)
-
-
-@pytest.mark.parametrize("vision", VISION)
-def test_the_paper_s_values_of_q_are_told_apart(vision: str) -> None:
-    seen = {q: lab(np.clip(VISION[vision] @ linear(color_of(q)), 0, 1)) for q in COMPARED}
-    for one, other in combinations(COMPARED, 2):
-        assert np.linalg.norm(seen[one] - seen[other]) > 15, (one, other)
-
-
-@pytest.mark.parametrize("q", [*COMPARED, "1.25", "1.75", "learned"])
-@pytest.mark.parametrize("paper", [LIGHT, DARK])
-def test_every_color_stands_out_from_the_paper(q: str, paper: str) -> None:
-    """WCAG 2.1 asks for 3:1 of graphics."""
-    assert contrast(color_of(q), paper) >= 3
-
-
-def test_a_color_depends_on_q_alone() -> None:
-    assert color_of("1.5") == color_of("1.50") == color_of("1 to 1.5")
-    assert len({color_of(str(q)) for q in np.arange(0.5, 3.01, 0.25)}) == 11
-    grid = ("1", "1.25", "1.5", "1.75", "2")
-    assert len({marker_of(q) for q in grid}) == len(grid)
-
-
-def test_a_grid_of_many_conditions_has_a_panel_for_each_value_of_the_setting_beside_q() -> None:
+def test_a_large_grid_has_a_subplot_for_each_value_of_a_setting() -> None:
     alphas, indices = ("0.01", "0.1", "1"), ("1", "1.5", "2")
     sweep = sweep_of(
         [
@@ -740,12 +707,12 @@ def test_a_grid_of_many_conditions_has_a_panel_for_each_value_of_the_setting_bes
     data = json.loads(page.group(1))
     (drawn,) = data["stages"]
     assert drawn["subplots"] == titles
-    # One switch and one color for a q, whichever panel it is in.
+    # A q has one checkbox and one color in all subplots.
     switches = {one["key"]: one["color"] for one in drawn["conditions"]}
     assert list(switches) == [f"finetune, q = {q}" for q in indices]
 
 
-def test_lines_of_more_conditions_than_bands_can_be_told_apart_have_none() -> None:
+def test_subplots_with_many_lines_have_no_bands() -> None:
     many = compared({f"1.{n}": [0.5, 0.6] for n in range(1, 10)})
     few = compared({f"1.{n}": [0.5, 0.6] for n in range(1, 9)})
     for sweep, has_bands in ((many, False), (few, True)):

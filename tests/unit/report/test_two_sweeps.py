@@ -1,4 +1,4 @@
-"""Two sweeps in one report: what was set otherwise, and what came of it."""
+"""A report on two sweeps: differences of settings and of results."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from music_rllib.results.statistics import Estimate
 DATA = Path(__file__).parents[3] / "docs" / "results" / "data"
 
 
-def test_the_page_of_two_sweeps_says_what_differs() -> None:
+def test_settings_and_results_that_differ_are_in_tables() -> None:
     first = read_archive(DATA / "proof-fetch-reach")
     changed = [replace(run, params={**run.params, "tac.alpha": "0.125"}) for run in first.runs]
     second = replace(first, name="other", runs=changed)
     both = joined_sweeps(first, second)
-    assert len(both.runs) == 2 * len(first.runs), "runs of the same node are two"
+    assert len(both.runs) == 2 * len(first.runs), "a run of both sweeps counts twice"
     made = build_report(both, both=(first, second))
     assert made.limitations == []
     settings, results = made.differences
@@ -40,7 +40,7 @@ def test_the_page_of_two_sweeps_says_what_differs() -> None:
     }
 
 
-def test_conditions_that_their_pretraining_tells_apart_find_each_other() -> None:
+def test_conditions_that_differ_in_their_pretraining_are_matched() -> None:
     first = read_archive(DATA / "proof-fetch-reach")
     source, other, *rest = first.runs
     runs = [
