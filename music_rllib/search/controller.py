@@ -108,7 +108,7 @@ class SearchController(Listener):
     def propose(self) -> None:
         """Claim trials until a run is ready, unless the next trial must wait for earlier ones.
 
-        Claims only what this driver has room for: the other trials are for other drivers.
+        Claims no more trials than this driver can run now, and leaves the others to other drivers.
         """
         self._score_trials()
         while self._scheduler.next_ready() is None and self._claim():

@@ -14,14 +14,13 @@ from typing import Any
 
 from optuna.exceptions import DuplicatedStudyError
 from optuna.storages import BaseStorage
-from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
 from music_rllib.config.problems import same
 from music_rllib.config.search import SearchSettings, WarmStart
 from music_rllib.experiment.plan import short
 from music_rllib.redaction import redact
-from music_rllib.search.sampler import VALUES
+from music_rllib.search.sampler import VALUES, directions_of
 from music_rllib.search.storage import open_studies, studies_of
 from music_rllib.store.serialization import content_key
 from music_rllib.store.storage import StorageError
@@ -95,14 +94,6 @@ def find_or_create(
             _set_attributes(storage, study, attributes())
         time.sleep(0.1)
     return study, name
-
-
-def directions_of(settings: SearchSettings) -> list[StudyDirection]:
-    """Optuna's direction of each objective."""
-    return [
-        StudyDirection.MAXIMIZE if objective.maximised else StudyDirection.MINIMIZE
-        for objective in settings.objectives
-    ]
 
 
 def fits(values: Mapping[str, Any], settings: SearchSettings) -> bool:

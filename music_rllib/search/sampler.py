@@ -25,6 +25,7 @@ from optuna.distributions import (
 )
 from optuna.exceptions import ExperimentalWarning
 from optuna.samplers import BaseSampler, CmaEsSampler, NSGAIISampler, RandomSampler, TPESampler
+from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState, create_trial
 
 from music_rllib.config.problems import same
@@ -76,10 +77,7 @@ class Proposer:
         if given and _key(space, given) in tried:
             given = {}
         study = optuna.create_study(
-            directions=[
-                "maximize" if o.maximised else "minimize" for o in self._settings.objectives
-            ],
-            sampler=self._sampler(number),
+            directions=directions_of(self._settings), sampler=self._sampler(number)
         )
         study.add_trials([*self._warm_start, *ended])
         for other in running:
@@ -158,6 +156,14 @@ class Proposer:
                 case "nsga2":
                     return NSGAIISampler(population_size=settings.population, seed=seed)
         return RandomSampler(seed=seed)
+
+
+def directions_of(settings: SearchSettings) -> list[StudyDirection]:
+    """Optuna's direction of each objective."""
+    return [
+        StudyDirection.MAXIMIZE if objective.maximised else StudyDirection.MINIMIZE
+        for objective in settings.objectives
+    ]
 
 
 def _key(space: Mapping[str, Dimension], values: Mapping[str, Any]) -> str:

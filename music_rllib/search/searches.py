@@ -163,7 +163,7 @@ def _rungs(sweep: OpenSweep, stage: Stage, settings: SearchSettings) -> tuple[Ru
     rungs = [
         Rung(
             seeds=rung.seeds or seeds,
-            # A rung at the whole budget is the end of a run, where nothing is paused.
+            # At the whole budget a run ends, so it is not paused.
             env_steps=None if (rung.env_steps or env_steps) >= env_steps else rung.env_steps,
         )
         for rung in (settings.pruning.rungs if settings.pruning else ())

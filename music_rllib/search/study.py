@@ -26,12 +26,11 @@ from music_rllib.search.new_study import (
     POINTS,
     WARM_START,
     WARM_START_TEXT,
-    directions_of,
     find_or_create,
 )
-from music_rllib.search.sampler import VALUES, Proposer, trial_at
+from music_rllib.search.sampler import VALUES, Proposer, directions_of, trial_at
 
-# Attributes of a trial, besides its point.
+# Attributes of a trial, in addition to its point.
 OWNER, REASON, SCORES = "owner", "reason", "scores"
 LOST = "lost"
 """The trial failed because one of its runs failed."""

@@ -78,7 +78,7 @@ def mlflow_reason(error: Exception) -> str:
 
 @contextlib.contextmanager
 def answers_named(store: TrackingStore, action: str) -> Iterator[None]:
-    """Turn MLflow's errors into one that names the store and what it must do.
+    """Turn MLflow's errors into one that names the store and the failed action.
 
     Raises:
         TrackingError: MLflow does not answer, or refuses.

@@ -106,8 +106,8 @@ def _files(observation_size: int, goal_size: int) -> Mapping[Path, bytes]:
             folder,
             python_model=str(code),
             artifacts={"policy": str(policy)},
-            # No signature: it would refuse what environments give (float64, one observation, an
-            # achieved goal); the policy checks sizes itself.
+            # No signature: it would refuse observations of environments, such as float64 numbers,
+            # single ones, or with an achieved goal. The policy checks sizes itself.
             signature=False,
             input_example=example,
             pip_requirements=requirements,

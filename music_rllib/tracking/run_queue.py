@@ -87,7 +87,7 @@ class RunQueue:
             self._ended = True
 
     def mirror(self, info: RunInfo, read: Callable[[], StoredRun]) -> None:
-        """The run is in the store: what `read` returns replaces all records in the queue."""
+        """The run is in the store: the result of `read` replaces all records in the queue."""
         with self._lock:
             self._info, self._ended = info, True
             self._records = deque([partial(self._send_stored, read)])

@@ -124,7 +124,7 @@ class Sender(threading.Thread):
     def _send_run(self, run: RunQueue) -> bool:
         try:
             run.send()
-        # The thread must survive every error; what was not sent stays in the queue.
+        # The thread must survive every error; unsent records stay in the queue.
         except Exception as error:
             reason = mlflow_reason(error)
             if is_lasting(error) or isinstance(error, DamagedError):

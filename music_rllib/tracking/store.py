@@ -1,4 +1,4 @@
-"""Where a sweep is logged: the tracking URI, the place of artifacts, the sweep's record and run.
+"""The store of a sweep in MLflow: tracking URI, place of artifacts, and the sweep's record.
 
 Loading this module does not load MLflow.
 """
@@ -111,7 +111,7 @@ class SweepRecord:
             ) from error
 
     def write(self, storage: str) -> None:
-        """Write the record to the storage, where drivers on other machines find it too.
+        """Write the record to the storage, so that drivers on other machines find it.
 
         Raises:
             TrackingError: The storage cannot be written.

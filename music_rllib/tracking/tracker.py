@@ -1,7 +1,7 @@
 """Logs a sweep to MLflow: an experiment, a parent run, and a child run per node.
 
-MLflow shows what running runs report and what the store has of finished ones. Only the constructor
-waits for a server; afterwards every call only fills a queue, which a thread sends
+MLflow gets the reports of running runs and the stored history of finished ones. Only the
+constructor waits for a server; afterwards every call only fills a queue, which a thread sends
 (:mod:`music_rllib.tracking.sender`).
 """
 
@@ -198,7 +198,7 @@ class Tracker:
         return self._sender.flush(timeout)
 
     def close(self, status: Status = "FINISHED", timeout: float = 20.0) -> Pending:
-        """End the parent run, send for at most `timeout` s, and return what is not delivered.
+        """End the parent run, send for at most `timeout` s, and return the undelivered records.
 
         Unfinished runs are marked KILLED; a later sweep continues them. A second call only
         returns the same value again.

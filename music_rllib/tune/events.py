@@ -115,7 +115,7 @@ class TuneEvents(Callback):
         )
         node = self._node(trial)
         if self._store.work_folder(node.key).folder.read(RECORD) is not None:
-            text = "its environment hangs, so its worker was ended; the next worker prints where"
+            text = "its environment hangs, so its worker was ended; the next worker names the call"
         for listener in self._listeners:
             listener.noted(node, text)
 

@@ -71,6 +71,12 @@ def test_the_objective_is_the_aggregate_of_the_trials_runs(tmp_path: Path) -> No
     assert driver.outcome()["arms"][0]["best"] == best["number"]
 
 
+def test_the_event_of_its_last_run_scores_a_trial(tmp_path: Path) -> None:
+    driver = Driver(tmp_path, document({"trials": 1}, seeds=[0]))
+    driver.play(stop_after=2)  # the pretraining and the run: no further run is asked for
+    assert [trial["state"] for trial in driver.trials()] == ["judged"]
+
+
 def test_trials_whose_source_fails_end_and_a_later_driver_reports_them(tmp_path: Path) -> None:
     """The failure of one seed ends a trial; its other seeds are pruned before they fail."""
     content = document({"trials": 2})
