@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 
@@ -30,7 +31,7 @@ from music_rllib.results.conditions import (
 )
 from music_rllib.results.data import RunRecord, Sweep
 from music_rllib.results.scores import Measure, Scores, first_result, measure_on, scores_of
-from music_rllib.results.statistics import Array, Estimate
+from music_rllib.results.statistics import Estimate
 
 MOST_CONDITIONS = 6
 """Number of conditions up to which all pairs are compared; otherwise each with a reference."""
@@ -301,49 +302,17 @@ def _rest(condition: Condition, named: set[str]) -> Values:
 
 # Sensitivity to α ---------------------------------------------------------------------------------
 
-
-@dataclass(frozen=True, kw_only=True)
-class AlphaLine:
-    """Mean scores of conditions on a task that differ only in α, by increasing α."""
-
-    task: str
-    entropic_index: str
-    others: Values
-    """The other settings."""
-    means: tuple[Mean, ...]
-    alphas: Array
-    """`[points]`."""
-    estimate: Estimate
-    """`[points]`."""
+AlphaLine = Sequence[tuple[float, Mean]]
+"""Values of α in increasing order, with the mean scores of conditions that differ only in α."""
 
 
-def alpha_sensitivity(means: Sequence[Mean]) -> list[AlphaLine]:
+def alpha_lines(means: Sequence[Mean]) -> list[AlphaLine]:
     """Lines with at least two values of α; conditions whose α is not a number are left out."""
-    groups: defaultdict[tuple[str, str, Values], list[tuple[float, Mean]]] = defaultdict(list)
+    groups: defaultdict[tuple[object, ...], list[tuple[float, Mean]]] = defaultdict(list)
     for mean in means:
         settings = dict(mean.condition.others)
-        try:
+        with suppress(ValueError):
             alpha = float(settings.pop(ALPHA, ""))
-        except ValueError:
-            continue
-        key = (mean.task, mean.condition.entropic_index, tuple(settings.items()))
-        groups[key].append((alpha, mean))
-    lines = []
-    for (task, entropic_index, others), points in groups.items():
-        if len(points) > 1:
-            alphas, ordered = zip(*sorted(points, key=lambda point: point[0]), strict=True)
-            ends = {
-                end: np.array([float(getattr(mean.estimate, end)) for mean in ordered])
-                for end in ("value", "lower", "upper")
-            }
-            lines.append(
-                AlphaLine(
-                    task=task,
-                    entropic_index=entropic_index,
-                    others=others,
-                    means=ordered,
-                    alphas=np.array(alphas),
-                    estimate=Estimate(**ends),
-                )
-            )
-    return lines
+            key = (mean.task, mean.condition.entropic_index, *settings.items())
+            groups[key].append((alpha, mean))
+    return [sorted(line, key=lambda point: point[0]) for line in groups.values() if len(line) > 1]

@@ -27,7 +27,7 @@ from music_rllib.results.analysis import Curve, FinalScores, Scope, StageAnalysi
 from music_rllib.results.conditions import Condition, StageRuns, stages_together
 from music_rllib.results.data import Sweep
 from music_rllib.results.statistics import SHOW_SEEDS_BELOW
-from music_rllib.results.study import MOST_CONDITIONS, Study, alpha_sensitivity
+from music_rllib.results.study import MOST_CONDITIONS, Study, alpha_lines
 
 FINALS = {names.EVAL_SUCCESS: "Final success rate", names.EVAL_RETURN: "Final return"}
 AGAINST_ENTROPY = "Performance against entropy"
@@ -281,7 +281,7 @@ def study_drawings(study: Study) -> Iterator[Drawing]:
             legend=[(condition.short_label, style) for condition, style in shown.items()],
         )
     by_q = _styles_by_q(list(shown))
-    lines = groupby(alpha_sensitivity(study.means), lambda line: line.task)
+    lines = groupby(alpha_lines(study.means), lambda line: line[0][1].task)
     if of_alpha := [alpha_subplot(task, list(found), by_q) for task, found in lines]:
         yield Drawing(
             stage=study.stage.name,

@@ -232,11 +232,15 @@ def alpha_subplot(task: str, lines: Sequence[AlphaLine], by_q: Mapping[str, Styl
 
     def draw(axes: Axes) -> None:
         for line in lines:
-            color, marker, _ = by_q[line.entropic_index]
-            ends = (line.estimate.lower, line.estimate.upper)
-            axes.plot(line.alphas, line.estimate.value, color=color, marker=marker, lw=1.8)
-            axes.fill_between(line.alphas, *ends, color=color, alpha=0.15, linewidth=0)
-        alphas = np.unique(np.concatenate([line.alphas for line in lines]))
+            color, marker, _ = by_q[line[0][1].condition.entropic_index]
+            own = [alpha for alpha, _ in line]
+            value, lower, upper = (
+                [float(getattr(mean.estimate, end)) for _, mean in line]
+                for end in ("value", "lower", "upper")
+            )
+            axes.plot(own, value, color=color, marker=marker, lw=1.8)
+            axes.fill_between(own, lower, upper, color=color, alpha=0.15, linewidth=0)
+        alphas = np.unique([alpha for line in lines for alpha, _ in line])
         if alphas[0] > 0 and alphas[-1] / alphas[0] > 5:
             axes.set_xscale("log")
         if len(alphas) <= MOST_TICKS:
@@ -246,7 +250,7 @@ def alpha_subplot(task: str, lines: Sequence[AlphaLine], by_q: Mapping[str, Styl
             # The scale's own labels are formulas, but text.parse_math is off.
             axes.xaxis.set_major_formatter(LogFormatter())
         axes.set_xlabel("α (entropy coefficient)")
-        axes.set_ylabel(lines[0].means[0].measure.words)
+        axes.set_ylabel(lines[0][0][1].measure.words)
 
     return Subplot(title=task, draw=draw)
 

@@ -18,7 +18,7 @@ from music_rllib.results.analysis_plan import as_document as plans_as_document
 from music_rllib.results.answer import answer, seeds_needed
 from music_rllib.results.claims import Verdict
 from music_rllib.results.data import Points, RunRecord, Sweep, columns
-from music_rllib.results.study import Study, alpha_sensitivity, study_of
+from music_rllib.results.study import Study, alpha_lines, study_of
 
 BUDGET = 10_000
 STEPS = np.arange(1000, BUDGET + 1, 1000)
@@ -212,13 +212,14 @@ def test_sensitivity_to_alpha_has_a_line_for_each_q(rng: np.random.Generator) ->
         for seed in range(4)
     ]
     found = study_of(sweep_of(runs))
-    lines = alpha_sensitivity(found.means)
-    assert [(line.entropic_index, list(line.alphas)) for line in lines] == [
-        ("1", [0.01, 0.02, 0.1]),
-        ("1.5", [0.01, 0.02, 0.1]),
+    lines = alpha_lines(found.means)
+    assert [[alpha for alpha, _ in line] for line in lines] == [[0.01, 0.02, 0.1]] * 2
+    assert [{mean.condition.entropic_index for _, mean in line} for line in lines] == [
+        {"1"},
+        {"1.5"},
     ]
-    np.testing.assert_allclose(lines[0].estimate.value, [0.1, 0.2, 0.3], atol=0.04)
-    assert np.all(lines[0].estimate.lower < lines[0].estimate.value)
+    values = [float(mean.estimate.value) for _, mean in lines[0]]
+    np.testing.assert_allclose(values, [0.1, 0.2, 0.3], atol=0.04)
     profile, area = study_drawings(found)
     assert [len(drawing.subplots) for drawing in (profile, area)] == [1, 1]
     assert [label for label, _ in area.legend] == ["q = 1", "q = 1.5"]
