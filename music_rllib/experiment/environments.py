@@ -131,52 +131,39 @@ def to_retrain(
     return [run for run in runs if run.key in chosen]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Answer:
-    """The user's decision about the runs in the storage."""
+def decide(
+    sweep: OpenSweep,
+    runs: Sequence[FoundRun],
+    retrain: Sequence[str],
+    *,
+    all_changed: bool,
+    keep: bool,
+) -> tuple[list[FoundRun], list[FoundRun]]:
+    """The runs to retrain, and the runs of different environments to keep.
 
-    again: Sequence[FoundRun]
-    """Runs whose results and checkpoints are deleted."""
-    left: Sequence[FoundRun]
+    Args:
+        sweep: The sweep.
+        runs: Its runs in the storage.
+        retrain: Names of `--retrain`.
+        all_changed: Retrain all runs of different environments.
+        keep: Keep the runs of different environments that are not retrained.
 
-    @classmethod
-    def to(
-        cls,
-        sweep: OpenSweep,
-        runs: Sequence[FoundRun],
-        retrain: Sequence[str],
-        *,
-        all_changed: bool,
-        keep: bool,
-    ) -> Answer:
-        """The decision by the options of the command line.
-
-        Raises:
-            BadInputError: A name fits no run, or no option decides about a changed environment.
-        """
-        again = to_retrain(sweep, runs, retrain, all_changed=all_changed)
-        left = [run for run in runs if run not in again]
-        if not keep and (text := changed_text(sweep, left)) is not None:
-            raise BadInputError(text)
-        return cls(again=again, left=left)
-
-    def carry_out(self, sweep: OpenSweep, say: Callable[[str], None]) -> OpenSweep:
-        """Delete runs, record the decision and print both; the caller must hold the sweep's lease.
-
-        Raises:
-            BadInputError: A run to delete is being computed.
-            StorageError: The decision can't be recorded.
-        """
-        for run in self.again:
-            say(f"{run.label}: {run.progress}; deleted, to be retrained")
-        if kept := [run for run in self.left if run.differences]:
-            say(f"using {in_runs(len(kept))} of a different environment (--keep-runs)")
-        sweep = remove_runs(sweep, self.again)
-        return keep_runs(sweep, kept) if kept else sweep
+    Raises:
+        BadInputError: A name fits no run, or no option decides about a changed environment.
+    """
+    again = to_retrain(sweep, runs, retrain, all_changed=all_changed)
+    changed = [run for run in runs if run.differences and run not in again]
+    if not keep and (text := changed_text(sweep, changed)) is not None:
+        raise BadInputError(text)
+    return again, changed
 
 
-def remove_runs(sweep: OpenSweep, runs: Sequence[FoundRun]) -> OpenSweep:
+def remove_runs(
+    sweep: OpenSweep, runs: Sequence[FoundRun], say: Callable[[str], None]
+) -> OpenSweep:
     """Delete results and checkpoints of runs; returns the sweep in which they wait.
+
+    The caller must hold the sweep's lease.
 
     Raises:
         BadInputError: One of them is being computed; nothing was deleted.
@@ -188,6 +175,7 @@ def remove_runs(sweep: OpenSweep, runs: Sequence[FoundRun]) -> OpenSweep:
                 f"{run.label} must not be running to be retrained, it is computed by {holder}"
             )
     for run in runs:
+        say(f"{run.label}: {run.progress}; deleted, to be retrained")
         sweep.store.remove(run.key)
         sweep.store.work_folder(run.key).clear()
         if run.continuation is not None:
@@ -196,19 +184,24 @@ def remove_runs(sweep: OpenSweep, runs: Sequence[FoundRun]) -> OpenSweep:
     return replace(sweep, scheduler=Scheduler(sweep.plan, finished))
 
 
-def keep_runs(sweep: OpenSweep, runs: Iterable[FoundRun]) -> OpenSweep:
+def accept_environments(
+    sweep: OpenSweep, runs: Sequence[FoundRun], say: Callable[[str], None]
+) -> OpenSweep:
     """Record that runs of different environments are used; returns the sweep that uses them.
 
     Raises:
         StorageError: The decision can't be recorded.
     """
-    storage = open_storage(sweep.storage)
-    document = read_json(storage, SAME_ENVIRONMENTS) or {"kept": []}
     answers = {
         (digest_of(run.environment), digest_of(sweep.environments.now[run.task])): run.differences
         for run in runs
-        if run.differences and run.environment is not None
+        if run.environment is not None
     }
+    if not answers:
+        return sweep
+    say(f"using {in_runs(len(runs))} of a different environment (--keep-runs)")
+    storage = open_storage(sweep.storage)
+    document = read_json(storage, SAME_ENVIRONMENTS) or {"kept": []}
     now = time.strftime("%Y-%m-%d %H:%M:%S")
     document["kept"] += [
         {"earlier": earlier, "later": later, "differences": list(lines), "answered": now}

@@ -21,7 +21,13 @@ from music_rllib.config.schema import MlflowSettings, SweepConfig
 from music_rllib.envs.modules import search_in
 from music_rllib.errors import BadInputError
 from music_rllib.experiment.demand import check_demand
-from music_rllib.experiment.environments import Answer, changed_text, found_runs
+from music_rllib.experiment.environments import (
+    accept_environments,
+    changed_text,
+    decide,
+    found_runs,
+    remove_runs,
+)
 from music_rllib.experiment.open_sweep import OpenSweep, open_sweep, remove_damaged
 from music_rllib.experiment.plan import make_plan, shared_runs
 from music_rllib.experiment.record import changes_since, continued_runs_text, keep_record
@@ -140,15 +146,15 @@ def run(
         changes = changes_since(opened)
         if changes is not None and not accept_changes:
             raise BadInputError(str(changes))
-        answer = Answer.to(
+        again, kept = decide(
             opened, found_runs(opened), retrain, all_changed=accept_changes, keep=keep_runs
         )
         with hold_driver_lock(opened, partial(_say, console)), early:
             remove_damaged(opened, warn)
-            opened = answer.carry_out(opened, warn)
+            opened = accept_environments(remove_runs(opened, again, warn), kept, warn)
             _check(console, opened)
             with open_tracker(opened) as tracker:
-                for retrained in answer.again:
+                for retrained in again:
                     tracker.forget(retrained.key)
                 keep_record(opened)
                 versions = _record_analysis_plan(console, opened)

@@ -165,9 +165,8 @@ class RunStorage:
         job = self._job
         if job.source_key is None or job.source_task is None:
             return None
-        with TemporaryDirectory() as folder:
-            self.store.fetch(job.source_key, Path(folder))  # checks all files of the node
-            return read_handoff(Path(folder), handed_over(job.run), job.source_task)
+        with self.store.files(job.source_key) as folder:
+            return read_handoff(folder, handed_over(job.run), job.source_task)
 
     def restore(self, training: TrainingRun) -> tuple[list[Report], float]:
         """Restore the newest checkpoint of the run, or else the end of a shorter run.

@@ -12,9 +12,9 @@ from music_rllib.config.load import load_sweep
 from music_rllib.envs.fingerprint import Fingerprint
 from music_rllib.errors import BadInputError
 from music_rllib.experiment.environments import (
+    accept_environments,
     changed_text,
     found_runs,
-    keep_runs,
     mixed,
     remove_runs,
     to_retrain,
@@ -105,7 +105,7 @@ def test_checkpoints_and_ends_of_shorter_runs_are_checked(tmp_path: Path) -> Non
         pass
     assert "is at 200 env steps" in str(text_of(longer))
     assert text_of(opened(tmp_path, OLD, env_steps=800)) is None
-    remove_runs(longer, to_retrain(longer, found_runs(longer), ["Lab"], all_changed=False))
+    remove_runs(longer, to_retrain(longer, found_runs(longer), ["Lab"], all_changed=False), print)
     assert not found_runs(longer)
     assert not place.names()
 
@@ -128,10 +128,10 @@ def test_runs_that_start_from_a_retrained_run_are_retrained(tmp_path: Path) -> N
     work = sweep.store.work_folder(finetune.key).lease
     assert work.acquire(lease) is None
     with pytest.raises(BadInputError, match=r"must not be running to be retrained, .* sweep 'oth"):
-        remove_runs(sweep, again)
+        remove_runs(sweep, again, print)
     assert sweep.store.is_finished(pretrain.key), "nothing was deleted"
     work.release(lease.owner)
-    sweep = remove_runs(sweep, again)
+    sweep = remove_runs(sweep, again, print)
     assert [sweep.scheduler[node.key] for node in sweep.plan.nodes] == [Status.WAITING] * 2
     assert not sweep.store.is_finished(pretrain.key)
 
@@ -139,7 +139,7 @@ def test_runs_that_start_from_a_retrained_run_are_retrained(tmp_path: Path) -> N
 def test_a_decision_applies_to_every_sweep_in_the_storage(tmp_path: Path) -> None:
     finished(tmp_path)
     sweep = opened(tmp_path, NEW)
-    sweep = keep_runs(sweep, found_runs(sweep))
+    sweep = accept_environments(sweep, found_runs(sweep), print)
     assert text_of(sweep) is None
     for environment in (NEW, OLD):
         assert text_of(opened(tmp_path, environment, "another")) is None
