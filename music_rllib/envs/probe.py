@@ -153,27 +153,29 @@ class Probe:
 
     def _try_seeds(self, env: Env, smallest: int, largest: int) -> None:
         """Name `seed_range` if the environment refuses only some seeds."""
-        try:
-            self._reset(env, largest)
+        if (refused := self._refusal(env, largest)) is None:
             return
-        except RefusedError as error:
-            refused = error
-        try:
-            if smallest < largest:
-                self._reset(env, smallest)
-                refused = RefusedError(
+        if smallest < largest:
+            largest_refused, refused = refused, self._refusal(env, smallest)
+            if refused is None:
+                raise RefusedError(
                     f"reset must accept all seeds of seed_range, {smallest} to {largest}: "
-                    f"{refused}; seed_range: [{smallest}, N] declares N as the largest"
+                    f"{largest_refused}; seed_range: [{smallest}, N] declares N as the largest"
                 )
-        except RefusedError as error:
             with contextlib.suppress(BaseException):  # raised if the seed is not the reason
                 env.reset()
-                error = RefusedError(
-                    f"{error}; reset() without a seed works: if only some seeds are allowed, "
+                refused = RefusedError(
+                    f"{refused}; reset() without a seed works: if only some seeds are allowed, "
                     "declare them with seed_range: [SMALLEST, LARGEST]"
                 )
-            refused = error
-        raise refused from None
+        raise refused
+
+    def _refusal(self, env: Env, seed: int) -> RefusedError | None:
+        try:
+            self._reset(env, seed)
+        except RefusedError as error:
+            return error
+        return None
 
     def _reset(self, env: Env, seed: int) -> Any:
         result = self._call(f"reset(seed={seed})", env.reset, seed=seed)

@@ -125,8 +125,6 @@ def shown(value: object) -> str:
 
 def vector(value: Any, name: str, size: int) -> NDArray[Any]:
     """The vector [size] of numbers that an environment returned as `name`."""
-    if type(value) is np.ndarray and value.shape == (size,) and value.dtype.kind in "fiub":
-        return value
     try:
         array = np.asarray(value)
     except Exception:
