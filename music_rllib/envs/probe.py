@@ -155,7 +155,8 @@ class Probe:
         """Name `seed_range` if the environment refuses only some seeds."""
         if (refused := self._refusal(env, largest)) is None:
             return
-        if smallest < largest:
+        raised = refused.__cause__ is not None
+        if raised and smallest < largest:
             largest_refused, refused = refused, self._refusal(env, smallest)
             if refused is None:
                 raise RefusedError(
