@@ -66,10 +66,7 @@ def console_for(*, as_json: bool = False) -> Console:
         emoji=False,
         highlight=False,
         stderr=as_json,
-        # Rich follows a terminal's size, but would use a COLUMNS of 0.
-        width=None
-        if terminal and "COLUMNS" not in os.environ
-        else shutil.get_terminal_size((WIDTH, 24)).columns,
+        width=None if terminal else shutil.get_terminal_size((WIDTH, 24)).columns,
     )
 
 

@@ -24,7 +24,7 @@ def _definitions(path: Path) -> dict[str, ast.stmt]:
 
 
 @pytest.mark.parametrize(("module", "name"), PLACES, ids=[f"{m}:{n}" for m, n in PLACES])
-def test_each_step_of_the_journeys_exists_under_its_name(module: str, name: str) -> None:
+def test_each_step_of_the_journeys_exists(module: str, name: str) -> None:
     path = ROOT.joinpath(*module.split(".")).with_suffix(".py")
     assert name in _definitions(path)
 

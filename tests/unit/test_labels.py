@@ -1,4 +1,4 @@
-"""Runs' labels in short: what is shown is understood, and means one run."""
+"""Short labels of runs: each matches one run."""
 
 import itertools
 
@@ -33,7 +33,7 @@ def test_parts_of_a_label_in_any_order(wanted: str, meant: bool) -> None:
 
 @pytest.mark.parametrize("stages", [["a"], ["a", "b"]])
 @pytest.mark.parametrize("tasks", [["FetchPush"], ["FetchPush", "FetchSlide"]])
-def test_what_is_shown_means_one_run(stages: list[str], tasks: list[str]) -> None:
+def test_a_short_label_matches_one_run(stages: list[str], tasks: list[str]) -> None:
     values = ["tac.entropic_index=1", "tac.entropic_index=1.5", "music.reward_scale=1,tac.tau=0.5"]
     cells = itertools.product(stages, tasks, values, ["seed0", "seed1", "seed10"])
     labels = ["/".join(cell) for cell in cells]
@@ -44,7 +44,7 @@ def test_what_is_shown_means_one_run(stages: list[str], tasks: list[str]) -> Non
     assert "q=1/" in short(labels[0])
 
 
-def test_what_is_no_label_of_the_sweep_stays() -> None:
+def test_other_text_is_not_shortened() -> None:
     short = ShortLabels(["a"], ["FetchPush"])
     assert short("a/FetchPush/seed0") == "seed0"
     assert short("handoff /somewhere/else") == "handoff /somewhere/else"
@@ -53,7 +53,7 @@ def test_what_is_no_label_of_the_sweep_stays() -> None:
     )
 
 
-def test_settings_have_the_names_that_labels_give_them() -> None:
+def test_settings_have_the_symbols_of_labels() -> None:
     named = {"tac.entropic_index": "q", "tac.alpha": "alpha", "env_steps": "env_steps"}
     named |= {"pretrain:tac.entropic_index": "pretrain:q", "music.mi_reward_weight": "weight"}
     assert {setting: symbol(setting) for setting in named} == named

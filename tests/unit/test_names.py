@@ -14,7 +14,7 @@ CONSTANTS = {
 }
 
 
-def test_every_name_is_one_that_mlflow_accepts() -> None:
+def test_mlflow_accepts_every_name() -> None:
     for value in CONSTANTS.values():
         _validate_metric_name(value)  # type: ignore[no-untyped-call]
 

@@ -1,4 +1,4 @@
-"""`music-rllib`: every command's help, quick and within 80 columns, with examples that hold."""
+"""The program: help within 80 columns, valid examples, starter file, presets, schema."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def examples() -> list[list[str]]:
     return found
 
 
-def test_a_terminal_of_ascii_and_a_deleted_folder_make_no_traceback(tmp_path: Path) -> None:
+def test_an_ascii_terminal_and_a_deleted_folder_print_no_traceback(tmp_path: Path) -> None:
     folder = tmp_path / "gone"
     folder.mkdir()
     (tmp_path / "α.yaml").write_text("name: α\n", encoding="utf-8")
@@ -95,7 +95,9 @@ print(raw.buffer.getvalue().decode("ascii"))
     assert done.stderr.count("the current folder must exist and be readable: No such file") == 6
 
 
-def test_help_has_one_look(capsys: pytest.CaptureFixture[str], monkeypatch: Any) -> None:
+def test_every_help_page_has_the_same_format(
+    capsys: pytest.CaptureFixture[str], monkeypatch: Any
+) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     for words in commands():
         text = help_of(words, capsys)
@@ -123,7 +125,7 @@ def test_help_and_version_load_nothing_heavy(tmp_path: Path) -> None:
     assert f"music-rllib {__version__}\n" in done.stdout
 
 
-def test_examples_are_calls_that_the_program_takes() -> None:
+def test_the_program_accepts_the_examples_of_its_help() -> None:
     """Every option and argument is known; what they name is not looked at."""
     found = examples()
     assert len(found) > 30
@@ -138,14 +140,14 @@ def test_examples_are_calls_that_the_program_takes() -> None:
         command.make_context("x", words)
 
 
-def test_mistakes_before_the_command_say_what_is_meant(capsys: pytest.CaptureFixture[str]) -> None:
+def test_mistakes_before_the_command_print_a_suggestion(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["statsu", "x"]) == 2
     assert "Did you mean 'status'?" in capsys.readouterr().err
     assert main(["my.yaml"]) == 2
     assert "music-rllib run my.yaml" in capsys.readouterr().err
 
 
-def test_init_writes_a_sweep_that_runs_and_replaces_none(
+def test_init_writes_a_valid_sweep_and_overwrites_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -176,7 +178,7 @@ def test_init_writes_a_sweep_that_runs_and_replaces_none(
         ("FILE NAME.yaml", "FILE_NAME"),
     ],
 )
-def test_init_writes_a_valid_name_and_a_command_that_runs(
+def test_init_writes_a_valid_name_and_command(
     file: str,
     name: str,
     tmp_path: Path,
@@ -197,7 +199,7 @@ def test_presets_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
     assert found == {path.stem for path in (REPOSITORY / "music_rllib/presets").glob("*.yaml")}
 
 
-def test_the_schema_takes_every_shipped_sweep_and_no_wrong_name(
+def test_the_schema_accepts_shipped_sweeps_and_rejects_unknown_names(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert main(["schema"]) == 0

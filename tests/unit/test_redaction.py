@@ -1,4 +1,4 @@
-"""What may be written down: flat params, no secrets."""
+"""Redaction of secrets, params of MLflow, and control characters on the terminal."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from rich.table import Table
 from rich.text import Text
 
-from music_rllib.command_line import WIDTH, console_for
+from music_rllib.command_line import console_for
 from music_rllib.program import main as sweep_main
 from music_rllib.redaction import (
     MAX_PARAM_LENGTH,
@@ -53,11 +53,11 @@ from music_rllib.redaction import (
         ("X-Api-Key: abc", 'X-Api-Key: "***"'),
     ],
 )
-def test_uris_lose_their_passwords_and_nothing_else(text: str, expected: str) -> None:
+def test_only_passwords_are_removed_from_text(text: str, expected: str) -> None:
     assert redact(text) == expected
 
 
-def test_secrets_are_left_out_at_every_depth() -> None:
+def test_secrets_are_omitted_at_every_depth() -> None:
     settings = {
         "mlflow": {"tracking_uri": "http://u:hunter2@h", "password": "hunter2"},
         "environments": [{"env_kwargs": {"api_key": "hunter2", "url": "s3://k:hunter2@b"}}],
@@ -70,7 +70,7 @@ def test_secrets_are_left_out_at_every_depth() -> None:
     assert "password" in settings["mlflow"]
 
 
-def test_names_and_numbers_that_sound_like_secrets_are_kept() -> None:
+def test_names_and_counts_of_tokens_are_kept() -> None:
     """Without them a sweep that is continued from its storage would be another one."""
     settings = {
         "tasks": ["TokenRing"],
@@ -108,13 +108,13 @@ def test_params_are_flat_text() -> None:
     }
 
 
-def test_params_that_mlflow_would_refuse_for_their_length_are_left_out() -> None:
+def test_params_longer_than_mlflows_limit_are_omitted() -> None:
     params = flat_params({"fits": "x" * MAX_PARAM_LENGTH, "long": "x" * (MAX_PARAM_LENGTH + 1)})
     assert list(params) == ["fits"]
 
 
 @given(st.text(), st.sampled_from(["password=", "https://me:", "token: ", "'secret': '"]))
-def test_what_is_redacted_stays_so(text: str, name: str) -> None:
+def test_redaction_is_idempotent(text: str, name: str) -> None:
     once = redact(f"{text}{name}hunter2@host'{text}")
     assert redact(once) == once
 
@@ -123,7 +123,7 @@ CONTROLS = "\x1b[31m\x07\x9b2J\r\u202e\ud800\x00"
 
 
 @given(st.text(alphabet=st.characters()))
-def test_what_is_printed_commands_no_terminal(text: str) -> None:
+def test_printable_text_has_no_control_characters(text: str) -> None:
     shown = printable(text + CONTROLS)
     shown.encode()
     assert not any(unicodedata.category(one) in {"Cc", "Cs"} for one in shown if one not in "\n\t")
@@ -144,16 +144,6 @@ def test_a_console_shows_markup_and_escapes_as_text(capsys: pytest.CaptureFixtur
     assert not any(unicodedata.category(one) == "Cc" for one in shown if one != "\n")
 
 
-@pytest.mark.parametrize(
-    ("columns", "width"), [("50", 50), ("abc", WIDTH), ("0", WIDTH), ("-3", WIDTH), ("", WIDTH)]
-)
-def test_a_console_is_as_wide_as_columns_says_if_that_is_a_width(
-    columns: str, width: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("COLUMNS", columns)
-    assert console_for().width == width
-
-
 def test_an_error_shows_control_characters_as_text(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -168,7 +158,7 @@ def test_an_error_shows_control_characters_as_text(
 
 
 @pytest.mark.parametrize("text", ["1" * 100_000, "token" * 20_000, "a://" * 20_000, "secret='" * 9])
-def test_redaction_takes_time_in_proportion_to_a_text(text: str) -> None:
+def test_redaction_takes_linear_time(text: str) -> None:
     """Quadratic, the first would take minutes."""
     began = time.process_time()
     redact(text)

@@ -1,4 +1,4 @@
-"""Schedules: their values, how they end, and what they refuse."""
+"""Schedules: their values, their ends, and mistakes."""
 
 import math
 from typing import Annotated, Any
@@ -71,7 +71,7 @@ def test_a_measured_value_lies_on_lines_between_its_points() -> None:
     assert before == 1.5, "before the first update a policy is as random as ever"
 
 
-def test_what_is_measured_is_averaged_by_its_age() -> None:
+def test_smoothing_weights_measurements_by_their_age() -> None:
     made, one = follower(smoothing=1000.0)
     one.observe("success_rate", 0.4, 5000)
     one.observe("shannon_entropy", -9.0, 5500)
@@ -89,7 +89,7 @@ def test_what_is_measured_is_averaged_by_its_age() -> None:
     rounds=st.lists(st.lists(st.floats(-5, 5), min_size=1, max_size=4), min_size=1, max_size=6),
     cut=st.integers(0, 20),
 )
-def test_what_is_smoothed_is_the_mean_of_each_round(rounds: list[list[float]], cut: int) -> None:
+def test_smoothing_uses_the_mean_of_each_round(rounds: list[list[float]], cut: int) -> None:
     made, one = follower("shannon_entropy", smoothing=300.0)
     seen, expected = 0, None
     for number, measured in enumerate(rounds):
@@ -106,7 +106,7 @@ def test_what_is_smoothed_is_the_mean_of_each_round(rounds: list[list[float]], c
 
 @pytest.mark.parametrize(("follows", "best"), [("success_rate", max), ("shannon_entropy", min)])
 @given(seen=st.lists(st.floats(-3, 3), min_size=1))
-def test_a_monotone_one_never_goes_back(follows: Quantity, best: Any, seen: list[float]) -> None:
+def test_a_monotone_value_never_goes_back(follows: Quantity, best: Any, seen: list[float]) -> None:
     _, one = follower(follows, monotone=True)
     for step, measured in enumerate(seen):
         one.observe(follows, measured, step)
@@ -130,7 +130,7 @@ def test_a_monotone_one_never_goes_back(follows: Quantity, best: Any, seen: list
         ({"start": 1}, "'schedule: linear', 'schedule: piecewise' or 'follows'"),
     ],
 )
-def test_bad_measured_ones_give_exactly_one_error(value: object, message: str) -> None:
+def test_an_invalid_measured_schedule_has_one_error(value: object, message: str) -> None:
     with pytest.raises(ValidationError, match=message) as caught:
         adaptive.validate_python(value)
     assert caught.value.error_count() == 1
@@ -156,7 +156,7 @@ def test_bad_measured_ones_give_exactly_one_error(value: object, message: str) -
         ({"schedule": "linear", "start": 1, "end": 2, "stop": 3}, "Extra inputs"),
     ],
 )
-def test_bad_schedules_give_exactly_one_error(value: object, message: str) -> None:
+def test_an_invalid_schedule_has_one_error(value: object, message: str) -> None:
     with pytest.raises(ValidationError, match=message) as caught:
         schedule.validate_python(value)
     assert caught.value.error_count() == 1

@@ -1,4 +1,4 @@
-"""Hypotheses of a sweep's file: those that it can test are accepted, all others refused."""
+"""Hypotheses in a sweep's file: testable ones are accepted, the others rejected."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ SOUND: list[tuple[str, Document]] = [
 
 
 @pytest.mark.parametrize(("hypothesis", "stage"), SOUND)
-def test_what_the_runs_can_tell_is_accepted(
+def test_testable_hypotheses_are_accepted(
     hypothesis: str, stage: Document, problems: Problems
 ) -> None:
     assert problems(hypothesis, stage) == []
@@ -171,7 +171,7 @@ UNTESTABLE: list[tuple[str, Document, str]] = [
 
 
 @pytest.mark.parametrize(("hypothesis", "stage", "message"), UNTESTABLE)
-def test_what_no_run_can_tell_is_refused(
+def test_untestable_hypotheses_are_rejected(
     hypothesis: str, stage: Document, message: str, problems: Problems
 ) -> None:
     lines = problems(hypothesis, stage)
@@ -185,9 +185,7 @@ def test_what_no_run_can_tell_is_refused(
         search(BEST, {"compare": {"tac.entropic_index": [1.0, 0.0]}}),
     ],
 )
-def test_a_value_that_is_invalid_is_no_second_mistake_of_the_hypothesis(
-    stage: Document, problems: Problems
-) -> None:
+def test_an_invalid_value_is_reported_once(stage: Document, problems: Problems) -> None:
     (line,) = problems("q = 0 better than q = 1", stage)
     assert "must be > 0, got 0" in line
 
@@ -195,10 +193,10 @@ def test_a_value_that_is_invalid_is_no_second_mistake_of_the_hypothesis(
 @pytest.mark.parametrize(
     "sides", [("q = 1", "q = 1.0"), ("a = true", "a = True"), ("a = [1, 2]", "a = [1.0,2]")]
 )
-def test_one_value_in_two_spellings_is_one_condition(sides: tuple[str, str]) -> None:
+def test_two_spellings_of_a_value_are_one_condition(sides: tuple[str, str]) -> None:
     with pytest.raises(ValueError, match="must be two different conditions"):
         Hypothesis.of(" against ".join(sides))
 
 
-def test_stages_are_told_apart_by_their_spelling() -> None:
+def test_stage_names_are_compared_as_text() -> None:
     assert Hypothesis.of("stage = 1 against stage = 1.0").relation == "against"

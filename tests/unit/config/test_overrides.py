@@ -1,4 +1,4 @@
-"""`KEY=VALUE` behind a sweep's file: what wins, what is recorded, what is refused."""
+"""`KEY=VALUE` arguments: precedence, places of changed values, and mistakes."""
 
 import json
 from pathlib import Path
@@ -45,7 +45,7 @@ def test_a_setting_holds_in_every_stage(tmp_path: Path) -> None:
     assert {(run.env_steps, run.tac.lr, run.tac.gamma) for run in after} == {(10**6, 1e-4, 0.9)}
 
 
-def test_the_result_is_that_of_a_file_that_says_the_same(tmp_path: Path) -> None:
+def test_overrides_equal_an_edited_file(tmp_path: Path) -> None:
     config = load(tmp_path, "seeds=5", "stages.second.env_steps=7e4", "name=other")
     assert (config.seeds, config.name) == ((0, 1, 2, 3, 4), "other")
     path = tmp_path / "written.yaml"
@@ -62,7 +62,7 @@ def test_the_result_is_that_of_a_file_that_says_the_same(tmp_path: Path) -> None
     assert load_sweep(kept).seeds == config.seeds
 
 
-def test_values_inside_of_a_setting_and_of_a_grid(tmp_path: Path) -> None:
+def test_values_inside_a_setting_and_a_grid(tmp_path: Path) -> None:
     config = load(
         tmp_path,
         "stages.second.tac.alpha.value=0.3",
@@ -74,7 +74,7 @@ def test_values_inside_of_a_setting_and_of_a_grid(tmp_path: Path) -> None:
     assert {run.tac.alpha.value for run in second} == {0.3}  # type: ignore[union-attr]
 
 
-def test_a_preset_of_the_command_line_lies_below_the_file(tmp_path: Path) -> None:
+def test_a_preset_of_the_command_line_is_below_the_file(tmp_path: Path) -> None:
     first = runs(load(tmp_path, "preset=small"))[0]
     assert (first.tac.tau, first.tac.gamma) == (0.05, 0.9)
 
@@ -89,7 +89,7 @@ stages:
 """
 
 
-def test_what_an_anchor_shares_changes_in_the_named_stage_only(tmp_path: Path) -> None:
+def test_an_override_changes_an_anchored_value_in_one_stage(tmp_path: Path) -> None:
     changes = ("stages.a.tac.lr=0.01", "stages.a.grid.tac.gamma=[0.7, 0.6]")
     first, second, third, fourth, _ = runs(load(tmp_path, *changes, text=SHARED))
     assert [(run.tac.lr, run.tac.gamma) for run in (first, second)] == [(0.01, 0.7), (0.01, 0.6)]
@@ -97,7 +97,7 @@ def test_what_an_anchor_shares_changes_in_the_named_stage_only(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("prefix", ["", "stages.first.", "stages.first.per_task.FetchReach."])
-def test_a_whole_group_replaces_its_fields_and_no_others(tmp_path: Path, prefix: str) -> None:
+def test_a_group_replaces_only_its_fields(tmp_path: Path, prefix: str) -> None:
     before = runs(load(tmp_path))[0]
     after = runs(load(tmp_path, f"{prefix}tac={{tau: 0.2, gamma: 0.8}}"))[0]
     assert (after.tac.tau, after.tac.gamma, after.tac.lr) == (0.2, 0.8, before.tac.lr)
@@ -116,7 +116,7 @@ stages:
 """
 
 
-def test_what_a_group_of_a_grid_does_not_vary_can_be_given(tmp_path: Path) -> None:
+def test_fields_that_a_grid_group_does_not_vary_can_be_overridden(tmp_path: Path) -> None:
     after = runs(load(tmp_path, "tac={gamma: 0.9}", text=GROUPED))
     assert [(run.tac.gamma, run.tac.alpha) for run in after] == [(0.9, 0.1), (0.9, 0.2)]
     searched = GROUPED.replace("grid: {tac: ", "search: {trials: 2, space: {tac: {choice: ")
@@ -173,7 +173,7 @@ def test_a_field_of_a_group_varies_once(tmp_path: Path, varied: str, message: st
     assert message in line
 
 
-def test_a_field_may_vary_where_the_group_lacks_it(tmp_path: Path) -> None:
+def test_a_field_may_vary_if_the_group_lacks_it(tmp_path: Path) -> None:
     alpha = "tac.alpha: {float: [0.1, 1], when: {tac: {tau: 0.1}}}"
     space = f"{{tac: {{choice: [{{tau: 0.1}}, {{alpha: 0.2}}]}}, {alpha}}}"
     stage = f"{{name: a, variant: tac, search: {{trials: 2, space: {space}}}}}"
@@ -201,14 +201,16 @@ REFUSED: list[tuple[str, str]] = [
 
 
 @pytest.mark.parametrize(("argument", "message"), REFUSED, ids=[one for one, _ in REFUSED])
-def test_each_mistake_is_named_once(tmp_path: Path, argument: str, message: str) -> None:
+def test_each_mistake_of_the_command_line_is_reported_once(
+    tmp_path: Path, argument: str, message: str
+) -> None:
     with pytest.raises(ConfigError) as refusal:
         load(tmp_path, argument)
     (line,) = refusal.value.lines
     assert message in line
 
 
-def test_mistakes_that_show_with_another_argument(tmp_path: Path) -> None:
+def test_mistakes_of_two_arguments(tmp_path: Path) -> None:
     for arguments, message in (
         (("stages.first.per_task=5", "tac.lr=0.1"), "per_task must be a mapping of keys to values"),
         (("tac.lr=0.1", "tac={lr: 0.2}"), "command line: tac.lr must not repeat"),
@@ -230,7 +232,7 @@ FILES: list[tuple[str, Any]] = [
 
 
 @pytest.mark.parametrize(("text", "message"), FILES, ids=[text for text, _ in FILES])
-def test_each_mistake_of_a_file_is_named_once(tmp_path: Path, text: str, message: str) -> None:
+def test_each_mistake_of_a_file_is_reported_once(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "sweep.yaml"
     stage = "{name: a, variant: tac, grid: {tac.entropic_index: [1, 2, 3], tac.tau: [.1, .2]}}"
     path.write_text(f"name: mine\ntasks: [FetchReach]\n{text}\nstages: [{stage}]\n")

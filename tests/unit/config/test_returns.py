@@ -1,4 +1,4 @@
-"""Bounds of targets against the returns that a configuration can reach."""
+"""Bounds of targets, and divergence, compared with the reachable returns."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def reached(
         ((-50, 0), {}, {"gamma": 0.9}, None),
     ],
 )
-def test_values_that_rewards_can_reach(
+def test_reachable_values_follow_from_rewards(
     bounds: tuple[float, float],
     music: dict[str, Any],
     tac: dict[str, Any],
@@ -65,7 +65,7 @@ def test_values_that_rewards_can_reach(
     assert reached(bounds, music, **tac) == (expected and pytest.approx(expected, rel=1e-3))
 
 
-def test_it_is_the_reward_of_a_bootstrapped_loop() -> None:
+def test_reachable_values_are_the_limit_of_bootstrapping() -> None:
     """Iterating r + gamma V at the largest and the least reward ends where it is said to."""
     low = high = 0.0
     for _ in range(5000):
@@ -130,7 +130,7 @@ PRETRAIN = "- {name: u, variant: music-u}"
         ),
     ],
 )
-def test_a_sweep_says_where_and_with_both_numbers(
+def test_the_warning_names_stage_task_and_both_ranges(
     stages: list[str], expected: list[str], tmp_path: Path
 ) -> None:
     path = tmp_path / "sweep.yaml"
@@ -150,7 +150,7 @@ def test_a_sweep_says_where_and_with_both_numbers(
         ([0, -41, -41], [math.nan, 0, 0], [False, True, True]),
     ],
 )
-def test_critics_that_no_return_explains_have_diverged(
+def test_critics_beyond_reachable_returns_have_diverged(
     means: list[float], bonuses: list[float], expected: list[bool]
 ) -> None:
     found = have_diverged(np.array(means), np.array(bonuses, float), SPARSE, 0.95)

@@ -1,4 +1,4 @@
-"""Reading YAML strictly: values are what they look like, and mistakes have a line."""
+"""Strict reading of YAML: types of scalars, and mistakes with their line."""
 
 import math
 from pathlib import Path
@@ -41,7 +41,7 @@ def read(tmp_path: Path, text: str) -> YamlFile:
         ("-.inf", -math.inf),
     ],
 )
-def test_scalars_are_what_they_look_like(tmp_path: Path, text: str, value: Any) -> None:
+def test_scalars_follow_yaml_1_2(tmp_path: Path, text: str, value: Any) -> None:
     found = read(tmp_path, f"key: {text}\n").data["key"]
     assert found == value
     assert type(found) is type(value)
@@ -70,7 +70,7 @@ def test_every_number_python_prints_is_read_back(
         ("a: 'x\u00a0y'  # and\u00a0here\n", "x\u00a0y"),
     ],
 )
-def test_tabs_may_separate_and_quoted_text_hold_any_space(
+def test_tabs_separate_tokens_and_quoted_text_keeps_any_space(
     tmp_path: Path, text: str, value: Any
 ) -> None:
     assert read(tmp_path, text).data == {"a": value}
@@ -106,7 +106,9 @@ def test_tabs_may_separate_and_quoted_text_hold_any_space(
         ("", "sweep.yaml: must be a mapping"),
     ],
 )
-def test_unsound_files_are_refused_with_their_line(tmp_path: Path, text: str, message: str) -> None:
+def test_invalid_files_are_rejected_with_their_line(
+    tmp_path: Path, text: str, message: str
+) -> None:
     with pytest.raises(ConfigError) as refusal:
         read(tmp_path, text)
     assert message in str(refusal.value)
@@ -122,7 +124,7 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
         read_yaml(tmp_path / "latin.yaml")
 
 
-def test_places_name_the_line_of_a_value_or_of_what_holds_it(tmp_path: Path) -> None:
+def test_a_place_is_the_line_of_a_value_or_of_its_parent(tmp_path: Path) -> None:
     path = tmp_path / "sweep.yaml"
     path.write_text("a: 1\nb:\n  - c: 2\n  - d:\n      e: 3\n")
     document = Document(path)
