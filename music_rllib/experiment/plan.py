@@ -47,7 +47,7 @@ class Run:
     stage: str
     trial: int
     """Position in the stage: the trials of its source times the points of its grid."""
-    values: Mapping[str, Any]
+    values: Mapping[str, Any] = field(compare=False)
     """The settings that differ between the stage's trials: dotted setting to value;
     `pretrain:tac.alpha` is a value of its source."""
     task: str
@@ -66,18 +66,11 @@ class Run:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Node:
-    """One computation."""
+class Node(Run):
+    """The computation of one run, and of all others with the same key."""
 
-    key: str
     run: RunSettings
     input: Input | None
-    stage: str
-    """Stage of the first run that it computes, like `trial`, `label`, `part` and `values`."""
-    trial: int
-    label: str
-    part: str = ""
-    values: Mapping[str, Any] = field(default_factory=dict, compare=False)
 
     @property
     def source_key(self) -> str | None:
@@ -242,16 +235,7 @@ class Plan:
             key=node_key(settings, node_input.key if node_input else None, self.algorithm),
             part=part,
         )
-        node = Node(
-            key=run.key,
-            run=settings,
-            input=node_input,
-            stage=run.stage,
-            trial=run.trial,
-            label=run.label,
-            part=run.part,
-            values=run.values,
-        )
+        node = Node(**vars(run), run=settings, input=node_input)
         self._runs.setdefault((run.label, run.key), run)
         self._nodes.setdefault(run.key, node)
         return run
