@@ -63,10 +63,10 @@ def study_tables(study: Study) -> list[Table]:
             )
             for claim in claims
         ],
-        note=f"Differences in {measures}. Seeds that both conditions have are compared in pairs "
-        "(Student's t-test), other seeds with Welch's t-test. Equivalence is tested with two "
-        "one-sided tests (TOST). p-values are adjusted (Holm) for the planned comparisons, or for "
-        "all comparisons if there is no plan. A failed run counts with the worst value.",
+        note=f"Differences in {measures}. Seeds are compared in pairs (Student's t-test) if both "
+        "conditions have the same seeds, otherwise with Welch's t-test. Equivalence is tested with "
+        "two one-sided tests (TOST). p-values are adjusted (Holm) for the planned comparisons, or "
+        "for all comparisons if there is no plan. A failed run counts with the worst value.",
     )
     means = Table(
         title=f"{kind.capitalize()} of each condition",

@@ -270,7 +270,7 @@ class _Trial(BaseModel):
     reason: str | None
 
 
-class _Arm(BaseModel):
+class _StudyOfOneValue(BaseModel):
     values: dict[str, JsonValue]
     importance: dict[str, float] | None
     trials: list[_Trial]
@@ -299,7 +299,7 @@ class _Search(BaseModel):
     mode: str
     sampler: str
     objectives: list[_Objective]
-    arms: list[_Arm]
+    arms: list[_StudyOfOneValue]
     ranking: list[_Ranked] | None
 
 
@@ -313,7 +313,7 @@ def checked_searches(document: Any) -> list[dict[str, Any]]:
     searches: list[dict[str, Any]] = document
     for search in searches:
         objectives, ranking = len(search["objectives"]), search["ranking"] or []
-        for row in [trial for arm in search["arms"] for trial in arm["trials"]] + ranking:
+        for row in [trial for one in search["arms"] for trial in one["trials"]] + ranking:
             for name in ("objective", "interval", "fresh"):
                 if row.get(name) and len(row[name]) != objectives:
                     raise ValueError(f"{name} must have {objectives} entries, got {len(row[name])}")
