@@ -25,7 +25,13 @@ from pydantic_core import core_schema
 from music_rllib.config.analysis import Analysis
 from music_rllib.config.document import SCHEMA, shipped_presets
 from music_rllib.config.layers import all_settings
-from music_rllib.config.run_settings import LAYER_KEYS, VARIANTS, Evaluation, RunSettings
+from music_rllib.config.run_settings import (
+    LAYER_KEYS,
+    VARIANTS,
+    Evaluation,
+    ReplaySettings,
+    RunSettings,
+)
 from music_rllib.config.schema import (
     Checkpoints,
     Header,
@@ -52,7 +58,6 @@ from music_rllib.config.tac_settings import (
 )
 from music_rllib.envs.tasks import BUILT_IN_TASKS, Task
 from music_rllib.intrinsic.settings import MusicSettings
-from music_rllib.replay.settings import ReplaySettings
 from music_rllib.schedules import Linear, Measured, Piecewise
 
 TARGET = Path(__file__).with_name("configuration.md")

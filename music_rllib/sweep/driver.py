@@ -31,9 +31,8 @@ from music_rllib.experiment.environments import (
 from music_rllib.experiment.open_sweep import OpenSweep, open_sweep, remove_damaged
 from music_rllib.experiment.plan import make_plan, shared_runs
 from music_rllib.experiment.record import changes_since, continued_runs_text, keep_record
-from music_rllib.experiment.sweep_files import STATE
+from music_rllib.experiment.sweep_files import ANALYSIS_PLAN, STATE
 from music_rllib.redaction import redact
-from music_rllib.results.analysis_plan import PLANS_TO_READ, PlanVersion, as_document, record_plan
 from music_rllib.runtime.machine import (
     check_cpus,
     check_memory_and_gpus,
@@ -98,7 +97,7 @@ def plan(config: SweepConfig, *, measure: bool = False, as_json: bool = False) -
         if changes:
             _say(console, changes, "yellow")
         document = plan_answer(opened, changes)
-        document["analysis_plan"] = as_document(_record_analysis_plan(console, opened))
+        document["analysis_plan"] = _record_analysis_plan(console, opened)
         if measure:
             document["cost"] = _measure(console, opened)
         console.print("The configuration is valid. Nothing was started.")
@@ -157,8 +156,8 @@ def run(
                 for retrained in again:
                     tracker.forget(retrained.key)
                 keep_record(opened)
-                versions = _record_analysis_plan(console, opened)
-                code = compute_and_report(console, opened, tracker, versions)
+                plans = _record_analysis_plan(console, opened)
+                code = compute_and_report(console, opened, tracker, plans)
         if as_json:
             print_json(opened.location.read(STATE) or {})
     except (KeyboardInterrupt, SystemExit) as stopped:
@@ -225,15 +224,19 @@ def _check(console: Console, opened: OpenSweep) -> None:
     preflight.check_ray(console, opened)
 
 
-def _record_analysis_plan(console: Console, opened: OpenSweep) -> Sequence[PlanVersion]:
-    """Keep the analysis plan before anything is trained; all of its versions."""
+def _record_analysis_plan(console: Console, opened: OpenSweep) -> list[dict[str, Any]]:
+    """Keep the analysis plan before anything is trained; all of its versions as plain data."""
+    if opened.config.analysis is None and opened.location.read(ANALYSIS_PLAN) is None:
+        return []
+    from music_rllib.results.analysis_plan import PLANS_TO_READ, as_document, record_plan
+
     versions = record_plan(opened)
     if versions:
         last = versions[-1]
         place = redact(f"{opened.storage}/{opened.config.name}/{PLANS_TO_READ}")
         recorded = f"version {last.version} recorded {last.recorded}, hash {last.hash[:12]}"
         _say(console, f"Analysis plan: {place}, {recorded}")
-    return versions
+    return as_document(versions)
 
 
 def _measure(console: Console, opened: OpenSweep) -> dict[str, Any]:

@@ -14,7 +14,6 @@ from music_rllib.errors import FAILED
 from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.scheduler import Status
 from music_rllib.experiment.sweep_files import as_json
-from music_rllib.results.analysis_plan import PlanVersion, as_document
 from music_rllib.runtime.machine import cluster_address
 from music_rllib.runtime.process import give_back_freed_memory, try_for
 from music_rllib.sweep.listeners.mlflow_view import VERSIONS, comparison_view
@@ -54,7 +53,7 @@ def open_tracker(opened: OpenSweep) -> Tracker:
 
 
 def compute_and_report(
-    console: Console, opened: OpenSweep, tracker: Tracker, versions: Sequence[PlanVersion]
+    console: Console, opened: OpenSweep, tracker: Tracker, plans: Sequence[dict[str, Any]]
 ) -> int:
     """Compute what is left, show the results and write the report; the exit code.
 
@@ -62,11 +61,10 @@ def compute_and_report(
         console: Shows progress and results.
         opened: The sweep, whose lock this process holds.
         tracker: As `open_tracker` returns it.
-        versions: The recorded versions of its analysis plan.
+        plans: The recorded versions of its analysis plan, as plain data.
     """
-    if versions:
-        plans = as_json(as_document(versions))
-        tracker.put_sweep_artifact(names.ARTIFACT_ANALYSIS_PLAN, plans)
+    if plans:
+        tracker.put_sweep_artifact(names.ARTIFACT_ANALYSIS_PLAN, as_json(plans))
     with (
         Display(console, opened.plan, opened.scheduler) as display,
         StateFile(opened) as state_file,

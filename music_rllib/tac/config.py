@@ -14,12 +14,12 @@ from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 
 from music_rllib.config.problems import problems_of
 from music_rllib.config.returns import Range, cut_off
+from music_rllib.config.run_settings import ReplaySettings
 from music_rllib.config.tac_settings import TACSettings
 from music_rllib.envs.tasks import BUILT_IN_TASKS, LAST_SEED, Indices, check_split
 from music_rllib.intrinsic.interface import IntrinsicReward
 from music_rllib.intrinsic.music import Music
 from music_rllib.intrinsic.settings import MusicSettings
-from music_rllib.replay.settings import ReplaySettings
 from music_rllib.runtime.quiet import quiet_third_parties
 from music_rllib.schedules import Linear, Measured, StrictModel, check_measurable
 from music_rllib.tac.env_runner import TrajectoryEnvRunner

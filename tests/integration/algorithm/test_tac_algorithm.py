@@ -16,12 +16,12 @@ from ray.rllib.core.rl_module.torch.torch_rl_module import TorchRLModule
 from torch import nn
 
 from music_rllib import TACConfig, names
+from music_rllib.config.run_settings import ReplaySettings
 from music_rllib.config.tac_settings import TACSettings
 from music_rllib.envs.make import make_env
 from music_rllib.envs.values import BadNumberError
 from music_rllib.intrinsic.music import HELD_OUT_STEPS
 from music_rllib.intrinsic.settings import MusicSettings
-from music_rllib.replay.settings import ReplaySettings
 from music_rllib.replay.trajectories import Trajectory
 from music_rllib.tac.algorithm import TAC
 from music_rllib.tac.rl_module import TACModule
