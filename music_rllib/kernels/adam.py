@@ -117,7 +117,6 @@ class FusedAdam(torch.optim.Adam):
     load_state_dict = unwrap(torch.optim.Adam.load_state_dict)
     state_dict = unwrap(torch.optim.Adam.state_dict)
     zero_grad = unwrap(torch.optim.Adam.zero_grad)
-    step = torch.no_grad()(unwrap(torch.optim.Adam.step))
 
     def __init__(self, parameters: Iterable[Tensor], lr: float) -> None:
         super().__init__(list(parameters), lr=lr, fused=True)
@@ -125,6 +124,14 @@ class FusedAdam(torch.optim.Adam):
         """The `state` whose tensors are views of `_moments`; loading a state replaces it."""
         self._moments: tuple[Tensor, Tensor, Tensor] | None = None
         """Flat first and second moments [S], and the number of steps [1]."""
+
+    @torch.no_grad()
+    def step(self, closure: Any = None) -> Any:
+        """Take one step by the parameters' gradients, without compiled code."""
+        self._moments = None
+        for state in self.state.values():
+            state["step"] = state["step"].clone()  # compiled steps share one counter
+        return unwrap(torch.optim.Adam.step)(self, closure)
 
     def step_of(self, flat: FlatParameters) -> AdamStep:
         """The arguments of `adam_step` for a step of all parameters by the gradients of `flat`.
