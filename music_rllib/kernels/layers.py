@@ -72,11 +72,11 @@ def add_bias(row: Array, bias: Array) -> None:
 
 
 @compiled
-def relu(row: Array) -> None:
-    """max(0, x)."""
+def add_bias_relu(row: Array, bias: Array) -> None:
+    """max(0, outputs plus bias), in one pass over the row."""
     zero = row.dtype.type(0)
-    for o in range(len(row)):
-        row[o] = max(row[o], zero)
+    for o in range(len(bias)):
+        row[o] = max(row[o] + bias[o], zero)
 
 
 @compiled
@@ -126,9 +126,10 @@ def forward(network: Network, inputs: Array) -> Array:
         weights = layer_weights(network, network.values, layer)
         linear(inputs, weights, network.by_outputs, out)
         for r in range(rows):
-            add_bias(out[r], bias)
             if layer < last:
-                relu(out[r])
+                add_bias_relu(out[r], bias)
+            else:
+                add_bias(out[r], bias)
         inputs = out
     return inputs
 
