@@ -39,7 +39,6 @@ from music_rllib.tac.objective import Losses, Objective, ScheduledSettings
 from music_rllib.tac.rl_module import ESTIMATOR_MODULE, TACForward, TACModule
 
 GRAD_UPDATES = "grad_updates"
-LOSSES = "losses"
 
 
 class TACLearner(TorchLearner):
@@ -60,7 +59,6 @@ class TACLearner(TorchLearner):
         self._grad_updates = 0
         self._losses: dict[str, Tensor] = {}
         self._observed: dict[str, Tensor] = {}
-        self._names_of_losses: list[str] = []
         self._td_errors: Tensor | None = None
         music, budget = self.config.settings.music, self.config.total_env_steps or 0
         actions = self._policy_module.action_size
@@ -171,9 +169,7 @@ class TACLearner(TorchLearner):
             rewards = functools.partial(self._learn_intrinsic, part)
             self._update_compiled(self._relabelled(part.columns, rewards))
             self._grad_updates += part.updates
-            losses = torch.stack([loss.view(part.updates) for loss in self._losses.values()], 1)
-            history.append({LOSSES: losses, **self._observed})
-        self._names_of_losses = list(self._losses)
+            history.append(self._losses | self._observed)
         return {name: torch.cat([each[name] for each in history]) for name in history[0]}
 
     @torch.no_grad()  # otherwise the targets would keep a graph of all their averages
@@ -189,15 +185,14 @@ class TACLearner(TorchLearner):
     def _step(self, minibatch: Minibatches) -> dict[str, Tensor]:
         """Update every network except the targets by autograd, on one minibatch.
 
-        Returns `LOSSES` [M], in the order of `_names_of_losses`, and tensors for the diagnostics.
+        Returns the losses [], and tensors for the diagnostics, by name.
         """
         self._losses, self._observed = {}, {}
         policy, (drawn,) = minibatch.columns[DEFAULT_MODULE_ID], minibatch.drawn
         ends = (policy[Columns.OBS], policy[Columns.NEXT_OBS])
         rewards = functools.partial(self._intrinsic.reward, *ends, drawn)
         self._update(self._relabelled(minibatch.columns, rewards))
-        self._names_of_losses = list(self._losses)
-        return {LOSSES: torch.stack(list(self._losses.values())), **self._observed}
+        return self._losses | self._observed
 
     def _minibatches(self, batch: MultiAgentBatch) -> Minibatches:
         """The minibatches of a batch, with random numbers for all updates."""
@@ -280,7 +275,7 @@ class TACLearner(TorchLearner):
 
     def _log_updates(self, outputs: Mapping[str, Tensor]) -> None:
         """Log the means of the updates' metrics; `outputs` are those of `_step`, stacked to K."""
-        losses_of_updates = dict(zip(self._names_of_losses, outputs[LOSSES].T, strict=True))
+        losses_of_updates = {name: outputs[name] for name in self._losses}
         q, alpha = self._now.entropic_index, float(self._objective.alpha)
         metrics = losses_of_updates | diagnostics.of_updates(outputs, self._settings, q)
         if self.config.settings.replay.priority == "td_error":

@@ -14,7 +14,6 @@ from music_rllib.functional.entropy_scale import (
     entropy_pressure,
     largest_entropy,
     matched_alpha,
-    normalised_alpha,
 )
 from tests.unit.functional.entropies import gaussian_entropy, joint_entropy
 
@@ -65,8 +64,3 @@ def test_the_largest_entropy_is_that_of_the_uniform_density(q: float) -> None:
     joint = integrate.dblquad(lambda x, y: summand(x, 0.25), -1, 1, -1, 1)[0]
     assert largest_entropy(q, 3) == pytest.approx(3 * one)
     assert largest_entropy(q, 2, "joint") == pytest.approx(joint)
-
-
-def test_a_normalised_alpha_is_larger_at_larger_q() -> None:
-    raised = [normalised_alpha(1.0, q) for q in (1.0, 1.5, 2.0)]
-    assert raised == pytest.approx([1.0, 1.183, 1.386], abs=1e-3)

@@ -266,11 +266,3 @@ def test_bounds_of_padded_trajectories_equal_bounds_of_each_alone() -> None:
     torch.testing.assert_close(
         estimator.bound(beside(x, y), whole, everything), estimator.bound(beside(x, y), whole)
     )
-
-
-def test_shuffle_moves_whole_frames() -> None:
-    values = torch.arange(24.0).reshape(2, 4, 3)
-    permutation = torch.tensor([[3, 2, 1, 0], [0, 1, 2, 3]])
-    shuffled = shuffle_time(values, permutation)
-    assert torch.equal(shuffled[0], values[0].flip(0))
-    assert torch.equal(shuffled[1], values[1])

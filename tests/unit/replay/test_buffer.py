@@ -62,13 +62,6 @@ def test_the_ring_keeps_the_newest_whole_episodes_of_any_length(lengths: list[in
         assert buffer.trajectories == min(len(lengths), 12 // 5)
 
 
-def test_full_episodes_fill_the_capacity_exactly() -> None:
-    buffer = replay(20)
-    buffer.extend([episode(n, 5) for n in range(11)])
-    assert len(buffer) == 20
-    assert set(buffer.sample_transitions(500).actions[:, 0]) == {7, 8, 9, 10}
-
-
 def test_transitions_are_drawn_uniformly_over_unequal_episodes() -> None:
     buffer = replay(100)
     buffer.extend([episode(0, 5), episode(1, 1), episode(2, 2)])
