@@ -1,4 +1,4 @@
-"""A policy as a Ray Serve application, whose replicas compute waiting requests together.
+"""A policy as a Ray Serve application; its replicas compute waiting requests together.
 
 `app` builds it for `serve run` and for `serve deploy` (cluster/serve.yaml), `application` for
 `music-rllib serve`.
@@ -27,9 +27,9 @@ from music_rllib.serve import TOKEN_VARIABLE
 from music_rllib.serve.api import Array, PolicyFacts, Rows, compute, make_api, token_hash
 
 TOGETHER = 64
-"""Most requests that are computed together."""
+"""Maximum number of requests that are computed together."""
 WAIT_SECONDS = 0.002
-"""Time that the first of them waits for others."""
+"""Time that the first request waits for others."""
 RETRY_SECONDS = 1
 """Value of the Retry-After header of a refused request."""
 
@@ -48,13 +48,13 @@ class ServeSettings(BaseModel):
     cpus_per_replica: float = Field(1.0, gt=0)
     """CPUs reserved for each."""
     max_requests: int = Field(256, ge=1)
-    """Most requests of a proxy that wait for a replica; further ones get status 503."""
+    """Maximum number of requests that wait for a replica; further ones get status 503."""
     token_required: bool = False
     """Refuse to start without a token in the environment; for services beyond loopback."""
 
 
 def app(settings: ServeSettings) -> Application:
-    """The application; every replica gets the same weights, which are loaded once.
+    """The application. The weights are loaded once, and every replica gets them.
 
     Raises:
         PolicyError: There is no such policy.

@@ -1,4 +1,4 @@
-"""The lease by which only one process at a time drives a sweep."""
+"""The lease that lets only one process at a time drive a sweep."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ FILE = "driver.json"
 
 
 def has_driver(storage: str, name: str) -> bool:
-    """Whether a process drives the sweep, or is about to: its `state.json` comes later."""
+    """Whether a process drives the sweep, even if it has not written `state.json` yet."""
     lease = LeaseFile(open_storage(storage) / name, FILE).read()
     return lease is not None and lease.holds()
 
 
 @contextlib.contextmanager
 def hold_driver_lock(sweep: OpenSweep, say: Callable[[str], None] = print) -> Iterator[None]:
-    """Hold the lease of the sweep's driver, which one process on any machine can have at a time.
+    """Hold the lease of the sweep's driver, which only one process on any machine can have.
 
-    A process that was suspended, and finds that another one drives the sweep by now, ends at once:
-    they would both write the sweep's files.
+    A process that was suspended ends at once if another process now drives the sweep, because both
+    would write the sweep's files.
 
     Args:
         sweep: The sweep to drive.
@@ -41,19 +41,18 @@ def hold_driver_lock(sweep: OpenSweep, say: Callable[[str], None] = print) -> It
     if holder is not None:
         raise StorageError(
             f"{folder} must be used by one process at a time, and another one has it: {holder}. "
-            "Wait for its end or stop it, or give this sweep another --name"
+            "Wait for its end, stop it, or give this sweep another --name"
         )
 
     def lost() -> None:
         again = Lease.of_this_process(owner)
         taken_by = file.acquire(again)
-        if taken_by is None:  # whoever had it has ended
+        if taken_by is None:  # the other process has ended
             held.append(HeldLease(file, again, lost))
             return
         say(
-            f"{folder} has been taken over while this process was suspended, by {taken_by}: this "
-            "one ends. See how far the sweep is with: python -m music_rllib.sweep status "
-            f"{sweep.folder}"
+            f"{folder} has been taken over by {taken_by} while this process was suspended; this "
+            f"process ends. Its progress: music-rllib status {sweep.folder}"
         )
         end_process(FAILED)
 

@@ -1,8 +1,7 @@
 """Gauges of a sweep for Prometheus, exported beside Ray's own by `ray.util.metrics`.
 
-The driver exports them and not the workers: a worker's gauges vanish with it, and a finished run's
-success rate would with them. Ray forgets a gauge that is not set again, so each is set regularly.
-`dashboards/` has the files that scrape and show them.
+The driver exports them, because a worker's gauges vanish with the worker. Ray forgets a gauge that
+is not set again, so each is set regularly. `dashboards/` has the files that scrape and show them.
 """
 
 from __future__ import annotations
@@ -23,18 +22,18 @@ from music_rllib.store.storage import write_atomically
 from music_rllib.tracking.sender import Pending
 
 TARGETS = ".prometheus"
-"""Folder beside the sweeps' own, whose NAME.json has the addresses of this Ray's metrics.
-Prometheus' file_sd wants the files of all sweeps in one folder."""
+"""Folder beside the sweeps' folders; its NAME.json has the addresses of this Ray's metrics.
+Prometheus' file_sd needs the files of all sweeps in one folder."""
 SET_SECONDS = 2.0
 KEPT = 100
-"""Runs that are over and still exported, the newest ones: what is exported every few seconds must
-not grow with a sweep of thousands."""
+"""Number of ended runs that are still exported, the newest ones, so that the export does not grow
+with a sweep of thousands of runs."""
 _RUN_TAGS = ("sweep", "stage", "variant", "task", "q", "seed", "run")
 _SWEEP_GAUGES = {
     "music_runs": ("sweep", "state"),
     "music_undelivered_records": ("sweep",),
 }
-"""Gauges of a whole sweep to their tags; all others are of a run."""
+"""Gauges of a whole sweep to their tags; all other gauges describe a run."""
 _METRICS = {
     "music_success_rate": names.EVAL_SUCCESS,
     "music_success_rate_any_step": names.EVAL_SUCCESS_ANY,
@@ -48,22 +47,22 @@ _RATES = {
     "music_grad_updates_per_second": names.GRAD_UPDATES,
 }
 GAUGES = {
-    "music_success_rate": "Success at the last step of evaluation episodes, of a run.",
-    "music_success_rate_any_step": "Success at any step of evaluation episodes, of a run.",
-    "music_episode_return": "Return of evaluation episodes, of a run.",
-    "music_mutual_information_bound_nats": "Bound on the mutual information, of a run.",
-    "music_env_steps": "Environment steps that a run has done.",
-    "music_grad_updates": "Gradient updates that a run has done.",
-    "music_env_steps_per_second": "Environment steps per second of a run; 0 when it is over.",
-    "music_grad_updates_per_second": "Gradient updates per second of a run; 0 when it is over.",
+    "music_success_rate": "Success rate of a run at the last step of evaluation episodes.",
+    "music_success_rate_any_step": "Success rate of a run at any step of evaluation episodes.",
+    "music_episode_return": "Mean return of a run in evaluation episodes.",
+    "music_mutual_information_bound_nats": "Bound on the mutual information of a run, in nats.",
+    "music_env_steps": "Environment steps of a run so far.",
+    "music_grad_updates": "Gradient updates of a run so far.",
+    "music_env_steps_per_second": "Environment steps per second of a run; 0 after its end.",
+    "music_grad_updates_per_second": "Gradient updates per second of a run; 0 after its end.",
     "music_runs": "Runs of a sweep by their state.",
     "music_undelivered_records": "Records that MLflow has not received yet.",
 }
-"""Name, to which Ray adds `ray_` in front, to its description."""
+"""Name of each gauge, without Ray's prefix `ray_`, to its description."""
 
 
 class PrometheusListener(Listener):
-    """Sets every gauge of a sweep, every few seconds."""
+    """Sets every gauge of a sweep every few seconds."""
 
     def __init__(
         self,
@@ -78,8 +77,8 @@ class PrometheusListener(Listener):
         Args:
             sweep: Its name.
             scheduler: Has the statuses of its nodes.
-            pending: Returns what MLflow has not received yet.
-            folder: The sweep's own; the addresses for Prometheus are written beside it.
+            pending: Returns the records that MLflow has not received yet.
+            folder: Folder of the sweep; the addresses for Prometheus are written beside it.
             now: A clock in seconds.
         """
         self._sweep = sweep
@@ -93,7 +92,7 @@ class PrometheusListener(Listener):
         """Node key to tags and values by gauge."""
         self._last_report: dict[str, Report] = {}
         self._ended: dict[str, None] = {}
-        """Keys of nodes that are over, in the order in which they ended."""
+        """Keys of ended nodes, in the order of their ends."""
 
     def reported(self, node: Node, reports: list[Report]) -> None:
         self._ended.pop(node.key, None)
@@ -128,12 +127,12 @@ class PrometheusListener(Listener):
             self._set_all()
 
     def close(self) -> None:
-        """Remove the addresses: with Ray, what could be scraped ends."""
+        """Remove the addresses, because the metrics end with Ray."""
         with contextlib.suppress(OSError):
             self._targets.unlink(missing_ok=True)
 
     def _end(self, node: Node) -> None:
-        """Keep the last values of a run that does not train now, with rates of 0."""
+        """Keep the last values of a run that does not train, with rates of 0."""
         _, values = self._values.setdefault(node.key, (self._tags(node), {}))
         values.update(dict.fromkeys(_RATES, 0.0))
         self._last_report.pop(node.key, None)
@@ -167,7 +166,7 @@ class PrometheusListener(Listener):
         self._gauges["music_undelivered_records"].set(pending.records, tags=tags)
 
     def _create_gauges(self) -> None:
-        """Create the gauges in Ray, and write the addresses where Prometheus looks for them."""
+        """Create the gauges in Ray, and write the addresses for Prometheus."""
         import ray
         from ray.util.metrics import Gauge
 

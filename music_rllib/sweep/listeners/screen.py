@@ -21,9 +21,9 @@ from music_rllib.sweep.views.text import evaluation_text, measured
 
 REFRESH_SECONDS = 0.5
 QUIET_SECONDS = 30.0
-"""Without a terminal, a run that has something new has a line at least this often."""
+"""Without a terminal, a running run prints its progress at least this often."""
 WIDE = 76
-"""Columns of a screen from which on the live table shows all that it can."""
+"""Smallest number of columns for the whole live table."""
 
 
 class Throughput:
@@ -74,7 +74,7 @@ class Throughput:
 
 
 class Display(Listener):
-    """Shows which runs train, their speed and the time left; prints a line for each that ends."""
+    """Shows running runs with their speed and remaining time; prints a line at the end of each."""
 
     def __init__(
         self,
@@ -83,7 +83,7 @@ class Display(Listener):
         scheduler: Scheduler,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Show on `console`; `now` is a clock in seconds."""
+        """Print on `console`; `now` is a clock in seconds."""
         self._console = console
         self._plan = plan
         self._scheduler = scheduler
@@ -115,7 +115,7 @@ class Display(Listener):
         self._live.stop()
 
     def say(self, text: str, style: str = "") -> None:
-        """Print a line that stays."""
+        """Print a line above the live table."""
         passed = clock(self._now() - self._began)
         self._console.print(Text(f"[{passed:>6}] {text}", style=style), soft_wrap=True)
 
@@ -223,7 +223,7 @@ class Display(Listener):
         return text if left is None else f"{text}, about {clock(left)} left"
 
     def _seconds_left(self) -> float | None:
-        """Time left if waiting runs train as fast as running ones, and never wait for each other.
+        """Remaining time if waiting runs train as fast as running ones, without further waits.
 
         None before every running run has a speed.
         """
