@@ -17,14 +17,13 @@ from music_rllib.report.figures.plots import (
     Metric,
     Subplot,
     alpha_subplot,
-    contour_subplots,
     curve_subplot,
     entropy_subplot,
     finals_subplot,
     profile_subplot,
 )
 from music_rllib.results.analysis import Curve, FinalScores, Scope, StageAnalysis, curve
-from music_rllib.results.conditions import Condition, StageRuns, stages_together
+from music_rllib.results.conditions import ALPHA, Condition, StageRuns, stages_together
 from music_rllib.results.data import Sweep
 from music_rllib.results.statistics import SHOW_SEEDS_BELOW
 from music_rllib.results.study import MOST_CONDITIONS, Study, alpha_lines
@@ -261,7 +260,7 @@ def _legend(by_q: Mapping[str, Style]) -> Legend:
 
 
 def study_drawings(study: Study) -> Iterator[Drawing]:
-    """The performance profile of the primary metric, and its dependence on α and the MI weight."""
+    """The performance profile of the primary metric, and its dependence on α."""
     if study.stage is None or not study.means:
         return
     styles, kind = styles_of(study.stage.compared), study.means[0].measure.kind_in_words
@@ -280,26 +279,21 @@ def study_drawings(study: Study) -> Iterator[Drawing]:
             subplots=tuple(profiles),
             legend=[(condition.short_label, style) for condition, style in shown.items()],
         )
-    by_q = _styles_by_q(list(shown))
-    lines = groupby(alpha_lines(study.means), lambda line: line[0][1].task)
-    if of_alpha := [alpha_subplot(task, list(found), by_q) for task, found in lines]:
+    if lines := alpha_lines(study.means):
+        alike = [_without(line[0][1].condition, ALPHA) for line in lines]
+        of_lines = styles_of(tuple(dict.fromkeys(alike)))
+        drawn = [(line, of_lines[one]) for line, one in zip(lines, alike, strict=True)]
         yield Drawing(
             stage=study.stage.name,
             title=f"{kind.capitalize()} against α",
             group=SETTINGS,
-            caption="Mean over the seeds with its 95% band, a line for each q. A comparison at one "
-            "value of α is the comparison of the lines at this α.",
-            subplots=tuple(of_alpha),
-            legend=_legend(by_q),
-        )
-    if contours := tuple(contour_subplots(study.means)):
-        yield Drawing(
-            stage=study.stage.name,
-            title=f"{kind.capitalize()} against α and MI weight",
-            group=SETTINGS,
-            caption="Mean over the seeds, interpolated between the tested settings (marks).",
-            subplots=contours,
-            legend=[],
+            caption="Mean over the seeds with its 95% band. A comparison at one value of α is the "
+            "comparison of the lines at this α.",
+            subplots=tuple(
+                alpha_subplot(task, list(found))
+                for task, found in groupby(drawn, lambda pair: pair[0][0][1].task)
+            ),
+            legend=[(condition.short_label, style) for condition, style in of_lines.items()],
         )
 
 

@@ -1,4 +1,4 @@
-"""Subplots of figures: learning curves, final values, profiles, entropies and settings."""
+"""Subplots of figures: learning curves, final values, profiles, entropies and α."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from music_rllib import names
 from music_rllib.report.figures.palette import Style
 from music_rllib.results import statistics as st
 from music_rllib.results.analysis import Curve, FinalScores, Scope
-from music_rllib.results.conditions import ALPHA, Condition
+from music_rllib.results.conditions import Condition
 from music_rllib.results.data import Sweep
 from music_rllib.results.scores import Measure, measure_on, scores_of
 from music_rllib.results.statistics import SHOW_SEEDS_BELOW, Array, Estimate
@@ -34,9 +34,7 @@ MOST_BANDS = 8
 _LABEL = 26
 """Largest number of letters in a line of a label inside a subplot."""
 MOST_TICKS = 8
-"""Largest number of values of a setting that each have a tick."""
-FEWEST_POINTS = 4
-"""Smallest number of settings that have contours."""
+"""Largest number of values of α that each have a tick."""
 TARGET = 0.85
 """Success rate that Figure 4 of the paper waits for."""
 RATE_LIMITS = (-0.03, 1.03)
@@ -227,20 +225,19 @@ def _points(
             yield entropy, scores[record.seed]
 
 
-def alpha_subplot(task: str, lines: Sequence[AlphaLine], by_q: Mapping[str, Style]) -> Subplot:
-    """A line over α with its 95% band for each q."""
+def alpha_subplot(task: str, lines: Sequence[tuple[AlphaLine, Style]]) -> Subplot:
+    """The primary metric of a task against α, each line with its 95% band."""
 
     def draw(axes: Axes) -> None:
-        for line in lines:
-            color, marker, _ = by_q[line[0][1].condition.entropic_index]
+        for line, style in lines:
             own = [alpha for alpha, _ in line]
             value, lower, upper = (
                 [float(getattr(mean.estimate, end)) for _, mean in line]
                 for end in ("value", "lower", "upper")
             )
-            axes.plot(own, value, color=color, marker=marker, lw=1.8)
-            axes.fill_between(own, lower, upper, color=color, alpha=0.15, linewidth=0)
-        alphas = np.unique([alpha for line in lines for alpha, _ in line])
+            axes.plot(own, value, color=style.color, linestyle=style.line, marker=style.marker)
+            axes.fill_between(own, lower, upper, color=style.color, alpha=0.2, linewidth=0)
+        alphas = np.unique([alpha for line, _ in lines for alpha, _ in line])
         if alphas[0] > 0 and alphas[-1] / alphas[0] > 5:
             axes.set_xscale("log")
         if len(alphas) <= MOST_TICKS:
@@ -250,64 +247,9 @@ def alpha_subplot(task: str, lines: Sequence[AlphaLine], by_q: Mapping[str, Styl
             # The scale's own labels are formulas, but text.parse_math is off.
             axes.xaxis.set_major_formatter(LogFormatter())
         axes.set_xlabel("α (entropy coefficient)")
-        axes.set_ylabel(lines[0][0][1].measure.words)
+        axes.set_ylabel(lines[0][0][0][1].measure.words)
 
     return Subplot(title=task, draw=draw)
-
-
-def contour_subplots(means: Sequence[Mean]) -> Iterator[Subplot]:
-    """A contour over α and the MI reward's weight for each task and q where both of them vary."""
-    groups: dict[tuple[str, str], dict[tuple[float, float], list[float]]] = {}
-    for mean in means:
-        if (position := _position(mean.condition)) is not None:
-            group = groups.setdefault((mean.task, mean.condition.entropic_index), {})
-            group.setdefault(position, []).append(float(mean.estimate.value))
-    of_task = {task: [mean for mean in means if mean.task == task] for task, _ in groups}
-    for (task, q), points in groups.items():
-        where = np.array(list(points))
-        if len(where) >= FEWEST_POINTS and all(len(set(axis)) > 1 for axis in where.T):
-            values = np.array([np.mean(found) for found in points.values()])
-            yield _contour(f"{task}, q = {q}", where, values, of_task[task])
-
-
-def _position(condition: Condition) -> tuple[float, float] | None:
-    """The condition's α and weight; None if one of them is no number."""
-    settings = dict(condition.others)
-    try:
-        return float(settings.get(ALPHA, "")), float(settings.get("MI weight", ""))
-    except ValueError:
-        return None
-
-
-def _contour(title: str, where: Array, values: Array, of_task: Sequence[Mean]) -> Subplot:
-    """Contours at the same levels for every q of the task."""
-    levels = np.linspace(*_ends([float(mean.estimate.value) for mean in of_task]), 11)
-
-    def draw(axes: Axes) -> None:
-        x, y = where.T
-        surface = axes.tricontourf(_scaled(x), _scaled(y), values, levels=levels, cmap="cividis")
-        axes.plot(_scaled(x), _scaled(y), "o", color="#ffffff", mec="#1a1a1a", ms=5, clip_on=False)
-        for set_ticks, at in ((axes.set_xticks, x), (axes.set_yticks, y)):
-            distinct = np.unique(at)
-            ticks = distinct[np.linspace(0, len(distinct) - 1, min(5, len(distinct))).astype(int)]
-            set_ticks(_scaled(ticks), [f"{tick:g}" for tick in ticks])
-        axes.set_xlabel("α (entropy coefficient)")
-        axes.set_ylabel("MI reward weight")
-        axes.grid(visible=False)
-        axes.figure.colorbar(surface, ax=axes, label=of_task[0].measure.words)
-
-    return Subplot(title=title, draw=draw)
-
-
-def _ends(values: Sequence[float]) -> tuple[float, float]:
-    low, high = min(values), max(values)
-    return low, high if high > low else low + 1.0
-
-
-def _scaled(values: Array) -> Array:
-    """Logarithms of values that span more than a factor of five."""
-    is_wide = values.min() > 0 and values.max() / values.min() > 5
-    return np.asarray(np.log10(values) if is_wide else values)
 
 
 def legend_handles(legend: Legend) -> list[Line2D]:

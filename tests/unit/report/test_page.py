@@ -24,7 +24,7 @@ import music_rllib
 from music_rllib import names
 from music_rllib.report.build import build_report, made_files, write_report
 from music_rllib.report.charts import _mean_at, curves_csv
-from music_rllib.report.figures.choice import AGAINST_ENTROPY
+from music_rllib.report.figures.choice import AGAINST_ENTROPY, SETTINGS
 from music_rllib.report.figures.draw import TEXT_WIDTH, drawn_figure, files
 from music_rllib.report.page import SweepReport, render
 from music_rllib.results.analysis import THRESHOLDS, analyse
@@ -656,12 +656,14 @@ def grid_of_settings() -> Sweep:
     return sweep_of(runs)
 
 
-def test_two_varied_settings_have_a_contour_for_each_q() -> None:
-    report = build_report(grid_of_settings())
-    subplots = {drawing.title: [p.title for p in drawing.subplots] for drawing in report.drawings}
-    title = "Area under the curve against α and MI weight"
-    assert subplots[title] == ["FetchPush, q = 1", "FetchPush, q = 2"]
-    assert render(report).count(f"<h3>{title}</h3>") == 1
+def test_each_combination_of_q_and_weight_has_a_line_over_alpha() -> None:
+    (drawing,) = [one for one in build_report(grid_of_settings()).drawings if one.group == SETTINGS]
+    assert [label for label, _ in drawing.legend] == [
+        f"q = {q}, MI weight = {weight}" for q in ("1", "2") for weight in ("0.5", "1")
+    ]
+    styles = [style for _, style in drawing.legend]
+    assert len({style.color for style in styles}) == 2
+    assert len({(style.color, style.dashes) for style in styles}) == 4
 
 
 def test_similar_colors_have_different_dashes_and_markers() -> None:
