@@ -283,7 +283,7 @@ def changes_since(sweep: OpenSweep) -> Changes | None:
             if not old["label"].startswith(f"{stage}/") or old["key"] in keys:
                 continue
             if (progress := sweep.progress(old["key"])) is not None:
-                counts.update(changed)
+                counts.update(list(changed))  # its keys: a mapping would add its values
                 lost.append(f"{old['label']}: {progress}")
     if not lost:
         return None
