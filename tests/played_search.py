@@ -1,4 +1,4 @@
-"""Searches whose runs are played by a formula in place of training; all else is real."""
+"""Searches with a formula in place of training; everything else is real."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def success(run: RunSettings, share: float) -> float:
 
 
 class Driver:
-    """One driver of a sweep; plays Tune with runs that end in random order."""
+    """One driver of a sweep; replaces Tune, with runs that end in random order."""
 
     def __init__(
         self, folder: Path, content: Document, formula: Formula = success, seed: int = 0
@@ -90,13 +90,13 @@ class Driver:
         slots: int = 2,
         fails: Callable[[Node], bool] = lambda node: False,
     ) -> None:
-        """Go on to the end, or until so many pieces of runs have been computed."""
+        """Run to the end, or until `stop_after` pieces of runs have been computed."""
         scheduler = self.sweep.scheduler
         searcher = DagSearcher(scheduler, lambda node: {"key": node.key}, self.controller)
         running = self._running
+        self.controller.refresh()
         while stop_after is None or len(self.computed) < stop_after:
             suggestion = None
-            self.controller.refresh()  # looks at other drivers each time
             if len(running) < slots:
                 suggestion = searcher.suggest("t")
             if suggestion == Searcher.FINISHED and not running:
