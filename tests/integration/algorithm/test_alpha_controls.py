@@ -1,4 +1,4 @@
-"""Alphas that make a comparison of q one at equal entropy: what they promise, on a bandit."""
+"""Alphas for comparing q at equal entropy reach their targets on a bandit."""
 
 from __future__ import annotations
 

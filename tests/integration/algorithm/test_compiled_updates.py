@@ -1,4 +1,4 @@
-"""Updates without autograd against autograd's: the same gradients, and the same training."""
+"""Compiled updates have the gradients and the training results of autograd."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ ACTIVE_BOUNDS = {"target_bounds": (-0.5, 0.5), "log_std_bounds": (-0.02, 0.02)}
 def both_gradients(
     built: TACLearner, batch: dict[str, Tensor]
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Autograd's and ours, by the parameters' names; what is measured of the update is compared."""
+    """Gradients of autograd and of compiled code, by parameter; compares losses and observed."""
     module = built.module[DEFAULT_MODULE_ID].unwrapped()
     trained = {n: p for n, p in module.named_parameters() if p.requires_grad and n != "log_alpha"}
     losses = built._losses_of(module.forward_train(batch)["tac"], batch)
@@ -90,7 +90,7 @@ def both_gradients(
 
 
 def ready(**settings: Any) -> tuple[TACLearner, dict[str, Tensor]]:
-    """A Learner in float64 whose policy is no longer the first one, and a minibatch."""
+    """A Learner in float64 whose policy differs from its initial one, and a minibatch."""
     built = learner(**settings)
     module = built.module[DEFAULT_MODULE_ID].unwrapped()
     generator = torch.Generator().manual_seed(1)
@@ -155,7 +155,7 @@ def test_gradients_equal_autograd_at_active_bounds(alpha: Any) -> None:
 
 @pytest.mark.parametrize("hidden", [(128, 128), (17, 200), (64,)], ids=str)
 def test_in_float32_gradients_differ_by_rounding(hidden: tuple[int, ...]) -> None:
-    # The first critic: which one is the smaller may hang on rounding.
+    # The first critic, because rounding may decide which one is smaller.
     settings = {"entropic_index": 1.5, "policy_critic": "first", "hidden_sizes": hidden}
     built, batch = ready(**settings)
     exact, _ = both_gradients(built, batch)
@@ -229,7 +229,7 @@ def test_non_finite_values_spread_as_in_autograd(
         for index in (0, tensor.numel() - 1):
             number = tensor.detach().flatten()[index].clone()
             tensor.detach().view(-1)[index] = bad
-            # Autograd multiplies a critic that the policy does not use by 0, which leaves NaN.
+            # Autograd multiplies a critic that the policy does not use by 0, which keeps NaN.
             gradients = policy_critic == "min" and np.isnan(bad)
             expected, found = spoilt(built, batch, gradients)
             tensor.detach().view(-1)[index] = number
@@ -240,7 +240,7 @@ def test_non_finite_values_spread_as_in_autograd(
 def spoilt(
     built: TACLearner, batch: dict[str, Tensor], gradients: bool
 ) -> tuple[dict[str, int], dict[str, int]]:
-    """How many numbers are not finite in autograd's and our losses, measures and gradients."""
+    """Counts of non-finite numbers in losses, observed tensors and gradients of both."""
     module = built.module[DEFAULT_MODULE_ID].unwrapped()
     trained = {n: p for n, p in module.named_parameters() if p.requires_grad}
     built._losses, built._observed = {}, {}
@@ -257,7 +257,7 @@ def spoilt(
     return count[0], count[1]
 
 
-@njit  # once for all sizes: compiling it takes seconds
+@njit  # compiled once for all sizes, because that takes seconds
 def product(left: Any, right: Any, transposed: tuple[bool, bool], out: Any) -> None:
     blas.multiply(left, transposed[0], right, transposed[1], out)
 
@@ -289,14 +289,14 @@ def test_compiled_training_equals_autograd_to_rounding(
     settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     register_uneven()
-    # Few updates: what is counted jumps where rounding has grown. Short episodes need a round more.
+    # Few updates: rounding errors grow, and then counts differ. Short episodes need one more round.
     rounds = 3 if "task" in settings else 2
     found = fingerprint(build(**settings), rounds)
     monkeypatch.setattr(TACLearner, "_needs_autograd", True)
     expected = fingerprint(build(**settings), rounds)
     assert found != expected, "they round differently: else both took the same way"
     for row, same in zip(found, expected, strict=True):
-        # Rewards of objects at rest lie at their end, but for the rounding of their bound.
+        # Rewards of objects at rest are at the lowest value, up to rounding of the bound.
         counted = row.pop(names.MI_REWARD_LOWEST, 0.0)
         assert counted == pytest.approx(same.pop(names.MI_REWARD_LOWEST, 0.0), abs=0.01)
         assert row == pytest.approx(same, rel=1e-3, abs=1e-4)
@@ -351,7 +351,7 @@ def test_learning_rates_of_rllibs_schedulers_are_used() -> None:
 
 
 def test_the_learner_accepts_read_only_arrays() -> None:
-    """RLlib's arrays of another process can't be written to, of which PyTorch would warn."""
+    """RLlib's arrays from another process are read-only; PyTorch would print a warning."""
     algo = build(music={"estimator": "frozen", "prioritise_replay": True})
     learner_ = algo.learner_group._learner
     episodes = algo.env_runner.sample(random_actions=True)

@@ -1,4 +1,4 @@
-"""The episode runner on real environments: whole episodes, seeds, goals, action bounds."""
+"""The environment runner on real environments: whole episodes, seeds, goals, action bounds."""
 
 import re
 from typing import Any
@@ -16,7 +16,7 @@ from music_rllib.tac.networks import RunningNormaliser
 
 
 class Countdown(gym.Env[Any, Any]):
-    """Terminates after a number of steps that its seed determines; its bounds are not -1 and 1."""
+    """Terminates after a number of steps given by its seed; action bounds are not -1 and 1."""
 
     observation_space = gym.spaces.Box(-100.0, 100.0, (2,))
     action_space = gym.spaces.Box(
@@ -38,7 +38,7 @@ class Countdown(gym.Env[Any, Any]):
 
 
 class SaysSuccessAtTheEnd(Countdown):
-    """Only an episode that terminates says anything of success."""
+    """Reports success only in episodes that terminate."""
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         *step, _ = super().step(action)
@@ -86,7 +86,7 @@ def test_fetch_episodes_are_whole_and_aligned() -> None:
 
 
 def test_a_split_beyond_the_observation_is_refused() -> None:
-    """Behind it lie goals and the action, which are no surroundings."""
+    """Entries after the observation are goals and the action, not the surrounding state."""
     config = TACConfig().environment("FetchPush-v4")
     config.agent_indices, config.surrounding_indices = (0, 1, 2), (3, 25)
     with pytest.raises(ValueError, match="surrounding_indices must be < 25, the size of the obs"):
@@ -113,7 +113,7 @@ def test_music_u_sees_no_goals_in_training_but_real_ones_in_evaluation() -> None
 
 
 class Seen(RLlibCallback):  # type: ignore[misc]
-    """Counts calls, logs a metric, and keeps the episodes that it was given."""
+    """Counts calls, logs a metric, and keeps the episodes."""
 
     def __init__(self) -> None:
         self.calls: list[tuple[str, int]] = []
@@ -220,7 +220,7 @@ def test_terminated_episodes_of_different_lengths_and_foreign_action_bounds() ->
     for episode in episodes:
         started = int(episode.frames[0, 0])
         assert len(episode) == min(started, 6)
-        assert episode.terminated == (started <= 6)  # longer ones are cut, which is no terminal
+        assert episode.terminated == (started <= 6)  # longer ones are truncated, not terminated
         assert (np.abs(episode.actions) <= 1).all()
         assert episode.successes is None
     seen = np.concatenate([env.seen for env in made.envs if isinstance(env, Countdown)])
@@ -269,7 +269,7 @@ def test_noise_of_the_original_music() -> None:
     actions = made._act(actor, inputs, explore=True, random_actions=False)
     mean = made._act(actor, inputs[:1], explore=False, random_actions=False)
     far = np.abs(actions - mean).max(1) > 5 * 0.05
-    # A uniform action is that near with probability (0.25)^2 at most.
+    # A uniform action is that close with a probability of at most 0.25^2.
     assert 0.25 < far.mean() < 0.32
     assert (actions - mean)[~far].std() == pytest.approx(0.05, abs=0.01)
     assert (np.abs(actions) <= 1).all()
@@ -280,7 +280,7 @@ def test_noise_of_the_original_music() -> None:
     [
         (gym.spaces.Discrete(3), "bounded one-dimensional Box of floats, got Discrete"),
         (gym.spaces.Box(-np.inf, np.inf, (2,)), "must be a bounded one-dimensional Box"),
-        # What a policy gives between whole numbers would all be cut to 0.
+        # A policy's actions between -1 and 1 would all be truncated to 0.
         (gym.spaces.Box(-1, 1, (2,), np.int32), "of floats, got Box"),
     ],
 )
@@ -305,7 +305,7 @@ def test_unusable_observations_and_missing_time_limit_are_named() -> None:
 @pytest.mark.parametrize("bad", [np.nan, -np.inf, 1e30])
 def test_a_bad_number_is_named_with_its_environment_episode_and_step(bad: float) -> None:
     class Spoilt(Countdown):
-        """In the second sub-environment's second episode the first step returns it."""
+        """The first step of the second sub-environment's second episode returns it."""
 
         def __init__(self, config: Any = None) -> None:
             super().__init__(config)

@@ -1,4 +1,4 @@
-"""Learning is alive: minutes of training, and a clear difference to a random policy."""
+"""Minutes of training give a clear improvement over a random policy."""
 
 from typing import Any
 
@@ -61,8 +61,7 @@ def music_u(**settings: Any) -> RunSettings:
 
 
 def test_music_u_learns_to_move_the_object_and_to_measure_it() -> None:
-    # One seed in eight is later than this, which one hangs on the rounding of the CPU: two of two
-    # are not.
+    # One seed in eight needs longer; rounding on the CPU decides which one. Two in a row rarely do.
     if not learns_to_move_and_measure(music_u(seed=1)):
         assert learns_to_move_and_measure(music_u(seed=2))
 

@@ -1,4 +1,4 @@
-"""TAC as an RLlib algorithm: same seed, same numbers; exact resume; no dead settings."""
+"""TAC as an RLlib algorithm: reproducible, exactly resumable, without dead settings."""
 
 import itertools
 from pathlib import Path
@@ -38,7 +38,7 @@ class OfflineCallbacks(RLlibCallback):  # type: ignore[misc]
 
 
 class OwnNetworks(TACModule):
-    """A policy and a value network of other layers, of a width that the user chooses."""
+    """A policy and a value network with other layers, of a given width."""
 
     def setup(self) -> None:
         super().setup()
@@ -98,7 +98,7 @@ def build(
 
 
 def fingerprint(algo: TAC, iterations: int) -> list[dict[str, float]]:
-    """Everything that a run's numbers are made of, iteration by iteration, and its weights."""
+    """All metrics of a run by iteration, and the sums of its weights."""
     rows = []
     for _ in range(iterations):
         result = algo.train()
@@ -178,7 +178,7 @@ def test_a_restored_checkpoint_continues_with_the_same_numbers(
     resumed = build(music=MUSIC_U, **settings)
     resumed.restore_from_path(tmp_path / "checkpoint")
     assert fingerprint(resumed, 2) == expected
-    # Also in the process that has gone on since: RLlib's own runners would keep newer weights.
+    # Also in a process that has trained further: RLlib's own runners would keep newer weights.
     unbroken.restore_from_path(tmp_path / "checkpoint")
     assert fingerprint(unbroken, 2) == expected
 
@@ -193,7 +193,7 @@ DDPG: dict[str, Any] = {
 ANNEALED = {"schedule": "linear", "start": 0.4, "end": 1.0}
 PER: dict[str, Any] = {"replay.priority": "td_error", "replay.importance_exponent": ANNEALED}
 
-# A changed value for every setting, and what else both runs that are compared need for it.
+# A changed value for every setting, and other settings that both compared runs need.
 CHANGES: dict[str, tuple[Any, dict[str, Any]]] = {
     "entropic_index": (1.5, {}),
     "alpha": (0.5, {}),
@@ -252,7 +252,7 @@ def last_weights(settings: dict[str, Any]) -> dict[str, float]:
 
 @pytest.fixture(scope="module")
 def bases() -> dict[str, dict[str, float]]:
-    """The runs that changes are compared with, one for each different base."""
+    """Results of the unchanged runs, by their settings."""
     return {}
 
 
@@ -312,7 +312,7 @@ def test_own_networks_act_learn_and_are_restored(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("settings", [HER, DDPG], ids=["tac", "ddpg"])
 def test_target_networks_have_no_autograd_history(settings: dict[str, Any]) -> None:
-    """With one, each average of an update would stay in memory, half a kilobyte a tensor."""
+    """Otherwise each update of the averages would stay in memory, half a kilobyte per tensor."""
     algo = build(**settings)
     fingerprint(algo, 2)
     learner = algo.learner_group._learner
@@ -321,7 +321,7 @@ def test_target_networks_have_no_autograd_history(settings: dict[str, Any]) -> N
 
 
 def test_q_bias_equals_its_definition() -> None:
-    """With critics that say 3 and a target value of -7, the bias can be computed by hand."""
+    """With critic values of 3 and a target value of -7, the bias is computed by hand."""
     algo = build(music=None, alpha=0.0, gamma=0.9)
     learner = algo.learner_group._learner
     module = learner.module["default_policy"]
@@ -363,7 +363,7 @@ def test_remote_runners_and_learner_learn_and_resume_like_local_ones(
 
 
 def register_uneven() -> None:
-    """`Uneven`: FetchReach with episodes of 1 to 50 steps, as their seeds say."""
+    """Register `Uneven`: FetchReach with episodes of 1 to 50 steps, depending on the seed."""
 
     def uneven(context: Any) -> gym.Env[Any, Any]:
         class Uneven(gym.Wrapper[Any, Any, Any, Any]):
@@ -393,7 +393,7 @@ def test_the_bound_on_fresh_episodes_is_taken_over_all_of_them(tmp_path: Path) -
     assert found[HELD_OUT_STEPS] == sum(n for n in steps[-2:] if n > 1)
     assert len(set(steps)) > 3
     assert abs(found["mutual_information/held_out_bound"]) < 0.5
-    # What has been measured and not yet reported is part of the state.
+    # Measurements that are not yet reported are part of the state.
     learner = algo.learner_group._learner
     assert learner._intrinsic.metrics() == {}
     held = algo.replay.packed(0)

@@ -1,4 +1,4 @@
-"""Alphas that weigh the entropies of different q alike, against derivatives and integrals."""
+"""Alphas that scale with q, compared with derivatives and integrals."""
 
 from __future__ import annotations
 

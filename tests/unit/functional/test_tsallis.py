@@ -38,7 +38,7 @@ def test_gradients_in_float32_are_the_slope_on_both_sides_of_the_bound(q: float)
     ln_q_of_log(log_x, q, max_exponent=MAX_EXPONENT).sum().backward()
     exponent = (q - 1.0) * log_x.detach().double()
     assert log_x.grad is not None
-    # The gradient of expm1 is its value + 1, which has the digits of 1.
+    # The gradient of expm1 is its value + 1, which has the precision of numbers near 1.
     expected = exponent.clamp(max=MAX_EXPONENT).exp()
     torch.testing.assert_close(log_x.grad.double(), expected, rtol=2e-6, atol=2e-7)
 
@@ -119,7 +119,7 @@ def test_no_density_on_the_action_interval_exceeds_the_uniform_one(q: float) -> 
 @pytest.mark.parametrize("q", [1.0, 1.3, 1.5, 2.0, 3.0])
 @pytest.mark.parametrize("alpha", [0.1, 1.0])
 def test_discrete_maximum_is_entmax(q: float, alpha: float) -> None:
-    """argmax <x, p> + alpha S_q(p) = entmax_q(x / (q alpha)), found by an optimiser of ours."""
+    """argmax <x, p> + alpha S_q(p) = entmax_q(x / (q alpha)), found by a numerical optimizer."""
     x = torch.tensor([0.3, 0.1, -0.2, 0.25], dtype=torch.float64)
 
     def loss(logits: np.ndarray) -> float:

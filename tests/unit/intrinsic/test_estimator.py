@@ -1,4 +1,4 @@
-"""Mutual-information oracles of algorithms: known values, invariances, the two-frame reward."""
+"""The bound on mutual information: known values, invariances, the two-frame reward."""
 
 import copy
 import math
@@ -21,7 +21,7 @@ from music_rllib.kernels.mutual_information import Data
 def make_estimator(
     agent_size: int, surrounding_size: int, hidden_size: int = 128
 ) -> MutualInformationEstimator:
-    """For observations of the agent's state followed by the surrounding one."""
+    """An estimator for observations of the agent's state followed by the surrounding state."""
     total = agent_size + surrounding_size
     return MutualInformationEstimator(range(agent_size), range(agent_size, total), hidden_size)
 
@@ -162,7 +162,7 @@ def test_resting_surroundings_earn_the_smallest_reward() -> None:
     x = torch.randn(10, 2, 3)
     y = torch.randn(10, 1, 3).expand(10, 2, 3)
     reward = intrinsic_reward(transition_bounds(estimator, x, y), 5000.0)
-    # An object at rest makes swapping its frames change nothing: bound <= 0, reward -1.
+    # For an object at rest, swapping its frames changes nothing: bound <= 0, reward -1.
     torch.testing.assert_close(reward, torch.full((10,), -1.0), atol=5000 * 1e-6, rtol=0)
 
 
@@ -236,7 +236,7 @@ def test_padding_is_never_shuffled_into_a_trajectory(draws: int | None) -> None:
         assert (drawn.sort(-1).values == torch.arange(11)).all()
         for row, count in zip(drawn, COUNTS.tolist(), strict=True):
             assert (row[:count] < count).all()
-    # Every frame of its own is as likely as any other: 71 of 500 expected, deviation 8.
+    # All frames of a trajectory are equally likely: 71 of 500 expected, deviation 8.
     first = torch.stack(times)[:, 2, 0].bincount(minlength=7)
     assert ((first - 500 / 7).abs() < 5 * 8).all()
 

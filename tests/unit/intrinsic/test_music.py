@@ -1,4 +1,4 @@
-"""`shuffle: random`, the original's time shuffle: whom a draw concerns, and what it is worth."""
+"""`shuffle: random`, the original's time shuffle: rows per draw, and the mean reward."""
 
 from typing import Any
 
@@ -37,13 +37,13 @@ def test_every_256_rows_draw_their_own_shuffle(rows: int, draws: int) -> None:
     assert (kept < -0.999).all()
     assert (swapped > -0.9).float().mean() > 0.3
     means = torch.stack([one.reward(states, followers, each).mean() for each in drawn]).double()
-    # The share of each draw is paid with probability 1/2: known mean and variance.
+    # Each draw is a swap with probability 1/2: known mean and variance.
     shares = torch.stack([part.sum() for part in (swapped - kept).tensor_split(draws)]) / rows
     deviation = float(0.5 * shares.double().square().sum().sqrt())
     expected = float((swapped + kept).double().mean() / 2)
     assert float(means.mean()) == pytest.approx(expected, abs=4 * deviation / updates**0.5)
     assert float(means.std()) == pytest.approx(deviation, rel=4 / (2 * updates) ** 0.5)
-    # Fresh episodes are measured by what the critics learn on average.
+    # Fresh episodes are measured with the mean reward that the critics learn.
     frames = torch.cat([states, followers[-1:]]).numpy()
     fresh = Trajectory(frames, states.numpy(), np.zeros(rows, np.float32), False)
     observed = one.observe([fresh], states, followers, torch.Generator())

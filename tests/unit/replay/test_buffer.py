@@ -1,4 +1,4 @@
-"""The replay against a plain list of episodes."""
+"""The replay, compared with a plain list of episodes."""
 
 import dataclasses
 from collections import deque
@@ -18,7 +18,7 @@ LAYOUT = ReplayLayout(observation=3, action=2, goal=1, horizon=5)
 
 
 def episode(number: int, steps: int, *, terminated: bool = False) -> Trajectory:
-    """Every number in it tells episode and step: observation = (number, step, 0)."""
+    """An episode whose numbers identify it and its step: observation = (number, step, 0)."""
     frames = np.zeros((steps + 1, LAYOUT.frame), np.float32)
     frames[:, 0] = number
     frames[:, 1] = np.arange(steps + 1)
@@ -86,7 +86,7 @@ def test_hindsight_takes_goals_achieved_later_and_recomputes_rewards() -> None:
     reached = later == step[relabelled] + 1
     np.testing.assert_array_equal(batch.rewards[relabelled], np.where(reached, 0.0, -1.0))
     assert (batch.rewards[~relabelled] == -1.0).all()
-    # `future` is uniform over what follows: from step 0, each of the five later states.
+    # `future` is uniform over later states: from step 0, over five of them.
     first = later[step[relabelled] == 0]
     assert np.bincount(first.astype(int), minlength=6)[1:].min() > 0.17 * len(first)
     # Sampling never writes into the store.
@@ -94,7 +94,7 @@ def test_hindsight_takes_goals_achieved_later_and_recomputes_rewards() -> None:
 
 
 def resting(number: int, steps: int) -> Trajectory:
-    """An episode that achieves the same goal all the time."""
+    """An episode whose achieved goal never changes."""
     played = episode(number, steps)
     frames = played.frames.copy()
     frames[:, 4] = frames[0, 4]
@@ -108,7 +108,7 @@ def moving_replay(**settings: Any) -> TrajectoryReplay:
 def test_hindsight_of_moved_episodes_excludes_episodes_at_rest() -> None:
     buffer = moving_replay()
     buffer.extend([resting(n, 5) for n in range(3)])
-    # Nothing has moved yet: hindsight takes what there is.
+    # Nothing has moved yet: hindsight uses all episodes.
     assert (buffer.sample_transitions(1_000).inputs[:, 3] >= 0).mean() > 0.7
     buffer.extend([episode(n, 5 if n % 2 else 3) for n in range(3, 15)])
     restored = moving_replay()
@@ -119,7 +119,7 @@ def test_hindsight_of_moved_episodes_excludes_episodes_at_rest() -> None:
         relabelled = goal >= 0
         assert relabelled.mean() == pytest.approx(0.8, abs=0.02)
         assert set(number[relabelled]) == set(range(3, 15))
-        # Uniform over the 48 transitions of those; the others are so over all that is held.
+        # Relabeled ones are uniform over the 48 transitions of these episodes, the others over all.
         assert (number[relabelled] % 2 == 1).mean() == pytest.approx(30 / 48, abs=0.02)
         assert set(number[~relabelled]) == set(range(15))
         later = goal[relabelled] - 100 * number[relabelled]
@@ -131,11 +131,11 @@ def test_hindsight_of_moved_episodes_excludes_episodes_at_rest() -> None:
 @pytest.mark.parametrize(
     ("moved", "others", "share"),
     [
-        # And what it gets as one of all, in place of .8.
+        # Plus its share as one of all episodes; without the limit it would be 0.8.
         ([5], 200, 0.4),
-        # Of unequal ones the longest gets as much, each transition as any other.
+        # With unequal lengths the limit is for the longest; all transitions are equally likely.
         ([5, 1, 1], 200, 0.4),
-        # From two of one length on it does not bind.
+        # With two or more of one length the limit has no effect.
         ([5, 5, 5], 100, 0.8 / 3),
         ([5] * 10, 100, 0.08),
     ],
@@ -304,7 +304,7 @@ def test_tree_holds_the_weights_and_draws_in_proportion(
     if weights.sum() > 1e-6:
         uniform = (np.arange(2000) + 0.5) / 2000
         drawn = np.bincount(tree.draw(uniform), minlength=size)
-        # Evenly spread uniform numbers: every count is its expectation, but for rounding.
+        # Evenly spread uniform numbers: every count equals its expectation up to rounding.
         assert (abs(drawn - 2000 * weights / weights.sum()) < 2).all()
         assert not drawn[weights == 0].any()
     copy = SumTree(size)
@@ -331,7 +331,7 @@ def test_music_p_draws_episodes_by_the_rank_of_their_priority() -> None:
     np.testing.assert_allclose(share, [0.25, 0.0, 0.5, 0.25], atol=0.01)
     steps = np.bincount(drawn[:, 1].astype(int)) / 60_000
     np.testing.assert_allclose(steps, 0.2, atol=0.01)
-    # The oldest episode makes room, and its rank goes with it.
+    # The oldest episode is dropped, with its rank.
     replay.extend([episode(4, 5)], np.array([0.2]))
     drawn = replay.sample_transitions(60_000).actions[:, 0].astype(int)
     share = np.bincount(drawn, minlength=5) / 60_000

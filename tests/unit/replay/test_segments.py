@@ -1,4 +1,4 @@
-"""A replay through its files: what is written, and that nothing is lost on the way."""
+"""The replay's files: what a checkpoint writes, and that nothing is lost."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def episode(rng: np.random.Generator, steps: int) -> Trajectory:
 
 
 class Disk:
-    """Segments by name, as they would lie on a disk, and how many bytes were written."""
+    """A folder of segments, which counts the bytes written to it."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -82,7 +82,7 @@ batches = st.lists(st.lists(st.integers(1, 5), max_size=7), min_size=1, max_size
 def test_saving_a_loaded_replay_gives_the_same_bytes(
     lengths: list[list[int]], td: bool, ranked: bool, seed: int, most: int, tmp_path_factory: Any
 ) -> None:
-    """After random contents and wrap-arounds, whatever was written at which checkpoint."""
+    """For random contents and wrap-arounds, with checkpoints at random times."""
     folder = tmp_path_factory.mktemp("replay")
     disk = Disk(folder)
     rng = np.random.default_rng(seed)

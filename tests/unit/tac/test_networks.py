@@ -1,4 +1,4 @@
-"""Distribution and networks of TAC, each against an independent computation."""
+"""Distribution and networks of TAC, compared with independent computations."""
 
 import math
 

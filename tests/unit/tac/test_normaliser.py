@@ -1,4 +1,4 @@
-"""The running normaliser against the moments of all that it has seen, in exact arithmetic."""
+"""The running normalizer, compared with moments in exact arithmetic."""
 
 from fractions import Fraction
 from typing import Any
@@ -27,7 +27,7 @@ def arrays(normaliser: RunningNormaliser) -> dict[str, Numbers]:
     return {name: tensor.numpy().copy() for name, tensor in normaliser.state_dict().items()}
 
 
-def going_on(moments: dict[str, Numbers]) -> RunningNormaliser:
+def restored(moments: dict[str, Numbers]) -> RunningNormaliser:
     normaliser = RunningNormaliser(len(moments["mean"]), epsilon=0.01, clip=5.0)
     normaliser.load_state_dict({name: torch.as_tensor(a) for name, a in moments.items()})
     return normaliser
@@ -61,7 +61,7 @@ def test_moments_equal_exact_moments_at_any_offset(
 def test_a_feature_far_from_0_is_normalised_like_any_other(offset: float, std: float) -> None:
     data = np.random.default_rng(0).normal(offset, std, (4000, 1)).astype(np.float32)
     got = fed(*np.array_split(data, 9))(torch.from_numpy(data)).numpy()
-    # What float32 leaves of it: at 1e6 its numbers are 1/16 apart.
+    # The resolution of float32: at 1e6 its numbers are 1/16 apart.
     exact = (data.astype(np.float64) - data.mean(dtype=np.float64)) / data.std(dtype=np.float64)
     step = float(np.spacing(np.float32(abs(offset)))) / std
     np.testing.assert_allclose(got, np.clip(exact, -5, 5), atol=1e-3 + step)
@@ -99,7 +99,7 @@ def test_the_normalizer_is_identity_at_first_and_part_of_the_state() -> None:
     fresh = RunningNormaliser(2, epsilon=0.01, clip=5.0)
     torch.testing.assert_close(fresh(torch.tensor([1.0, -2.0])), torch.tensor([1.0, -2.0]))
     fresh.update(torch.randn(10, 2))
-    copy = going_on(arrays(fresh))
+    copy = restored(arrays(fresh))
     more = torch.randn(5, 2)
     fresh.update(more)
     copy.update(more)
@@ -107,7 +107,7 @@ def test_the_normalizer_is_identity_at_first_and_part_of_the_state() -> None:
         np.testing.assert_array_equal(arrays(copy)[name], array)
 
 
-# -- handed over --------------------------------------------------------------------------------
+# -- handoff to another run -----------------------------------------------------------------
 
 
 def of_music_u(rng: np.random.Generator, rows: int, constant: float) -> Numbers:
@@ -121,8 +121,8 @@ def test_constants_of_the_source_run_are_reset_and_other_moments_kept(
     rng = np.random.default_rng(0)
     before = [of_music_u(rng, rows, constant) for rows in (51, 20_000)]
     source = fed(*before)
-    handed = going_on(for_another_run(arrays(source)))
-    # Until the first update the agent acts as it did.
+    handed = restored(for_another_run(arrays(source)))
+    # Until the first update, outputs are those of the source.
     seen = torch.tensor([[1.0, constant + 0.4]])
     torch.testing.assert_close(handed(seen), source(seen), rtol=0, atol=0)
     goals = rng.normal([2.0, constant - 5], [3.0, 0.15], (204, 2)).astype(np.float32)
