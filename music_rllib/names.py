@@ -29,7 +29,7 @@ EVAL_RATES = frozenset({EVAL_SUCCESS, EVAL_SUCCESS_ANY, EVAL_TOUCHED})
 
 
 def primary_metric(success_key: str | None) -> str:
-    """The metric that runs on a task are compared by: success rate where declared, else return.
+    """The metric for comparing runs on a task: success rate if declared, otherwise return.
 
     Args:
         success_key: that of the task; None, or `None` as text in MLflow, if it declares no success.

@@ -243,7 +243,7 @@ def _interpolated(points: Sequence[tuple[float, float]], at: float) -> float:
 
 
 def _between(value: float, one: float, other: float) -> float:
-    """The value, limited to both ends, beyond which rounding may have moved it."""
+    """Limit the value to both ends, because rounding can move it beyond them."""
     return min(max(value, min(one, other)), max(one, other))
 
 

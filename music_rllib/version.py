@@ -1,8 +1,8 @@
-"""Version of everything that determines what a training run computes."""
+"""Version of the computation of a training run."""
 
 ALGORITHM_VERSION = "4"
-"""Raised with every change of what is computed: runs of older versions are not reused.
+"""Increased when the computation changes; runs of older versions are not reused.
 
-A change of rounding does not count: rounding differs between CPUs and releases of PyTorch anyway,
+Changes of rounding do not increase it: rounding also differs between CPUs and releases of PyTorch,
 and runs of different machines are compared with each other.
 """

@@ -162,9 +162,9 @@ def _runs_above(above: Stage, point: PlacedPoint, findings: Findings) -> Mapping
 
 
 def _check_points_to_evaluate(search: SearchSettings, findings: Findings) -> None:
-    """Each given value must be in the space, and beside the values that it depends on.
+    """Each given value must be in the space, beside the given values that it depends on.
 
-    The sampler chooses what a point omits: a setting that depends on that might be dropped.
+    The sampler chooses omitted values, so a setting that depends on them could be dropped.
     """
     for position, point in enumerate(search.points_to_evaluate):
         for name, value in point.items():

@@ -10,14 +10,7 @@ import copy
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-from music_rllib.config.problems import (
-    KeyPath,
-    Problem,
-    known_fields,
-    lookup,
-    shown,
-    unknown,
-)
+from music_rllib.config.problems import KeyPath, Problem, known_fields, lookup, shown, unknown
 from music_rllib.config.run_settings import (
     LAYER_KEYS,
     SECTIONS,
@@ -34,7 +27,7 @@ PlacedPoint = Mapping[str, tuple[KeyPath, Any]]
 
 
 def all_settings() -> list[str]:
-    """Names of all settings of a run, dotted for those in groups."""
+    """Names of all settings of a run; settings in groups have dotted names."""
     return [
         *LAYER_KEYS,
         *(
@@ -148,7 +141,7 @@ def merge(
         for path, value in _settings(settings):
             if ".".join(path) not in rules.without_effect:
                 layers.put(path, value, (*place, *path))
-            elif settings is not defaults:  # in `defaults` it may have an effect in other stages
+            elif settings is not defaults:  # `defaults` can have an effect in other stages
                 problems.append(Problem((*place, *path), idle))
     for dotted, (below, value) in point.items():
         place = (*stage_path, *below)

@@ -119,7 +119,7 @@ def _list_seeds(document: Document, findings: Findings) -> None:
 
 
 def _parsed_seeds(text: str, given: Any) -> list[float]:
-    """The seeds of `10` or `0,1,7`; a number keeps those `given` in the file."""
+    """The seeds of `10` or `0,1,7`; a number keeps the seeds `given` in the file."""
     digits = re.fullmatch(r"\d{1,9}(,\d{1,9})*,?", text)
     if digits and "," not in text and int(text) > MOST_SEEDS:
         raise ConfigError([f"--seeds must be at most {MOST_SEEDS:,} seeds, got {text}"])

@@ -9,7 +9,7 @@ import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
-from pydantic import BaseModel, TypeAdapter, ValidationError
+from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from music_rllib.envs.tasks import closest
@@ -90,7 +90,7 @@ def unknown(key: str, known: Iterable[str]) -> str:
 
 
 def known_fields(model: type[BaseModel], path: KeyPath) -> Iterable[str]:
-    """Names of the fields at `path` below `model`; empty where the type is a union."""
+    """Names of the fields at `path` below `model`; empty if the type is a union."""
     for part in path:
         field = model.model_fields.get(str(part))
         kind = field.annotation if field else None
@@ -143,9 +143,8 @@ def from_json(kind: type[Model], value: Any) -> Model:
         pydantic.ValidationError: It is invalid.
     """
     # Through JSON, because only there strict mode accepts lists for tuples.
-    adapter = TypeAdapter(kind)
     try:
-        return adapter.validate_json(json.dumps(value), strict=True)
+        return kind.model_validate_json(json.dumps(value), strict=True)
     except ValidationError as error:
         whole_numbers = [
             _without_tags(details["loc"], value)
@@ -161,7 +160,7 @@ def from_json(kind: type[Model], value: Any) -> Model:
     for path in whole_numbers:
         parent = lookup(document, path[:-1])
         parent[path[-1]] = int(parent[path[-1]])
-    return adapter.validate_json(json.dumps(document), strict=True)
+    return kind.model_validate_json(json.dumps(document), strict=True)
 
 
 def problems_of(error: ValidationError, document: Any, kind: type[BaseModel]) -> Iterator[Problem]:

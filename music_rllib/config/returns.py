@@ -7,12 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from music_rllib.config.tac_settings import (
-    LearnedAlpha,
-    MatchedAlpha,
-    NormalisedAlpha,
-    TACSettings,
-)
+from music_rllib.config.tac_settings import LearnedAlpha, MatchedAlpha, NormalisedAlpha, TACSettings
 from music_rllib.intrinsic.settings import MusicSettings
 from music_rllib.schedules import extremes
 

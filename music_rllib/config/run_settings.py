@@ -74,7 +74,7 @@ VARIANTS: Mapping[Variant, VariantRules] = MappingProxyType(
             | {"mi_reward_weight": 0.0, "prioritise_replay": True},
             without_effect=_TRAINING_OF_ESTIMATOR
             | {"music.mi_reward_weight", "music.reward_scale"}
-            # The ranks of the trajectories decide what is replayed.
+            # Replay is by the ranks of the trajectories.
             | {"replay.hindsight_episodes", "replay.priority"}
             | {"replay.priority_exponent", "replay.importance_exponent"},
             starts_from="estimator",
@@ -101,7 +101,7 @@ def contradiction(variant: Variant, fixed: Any, got: Any) -> str:
 SECTIONS = ("evaluation", "tac", "music", "replay")
 """Groups of settings, whose fields layers replace one by one."""
 LAYER_KEYS = ("env_steps", "num_envs", *SECTIONS)
-"""Keys that `defaults`, a stage, its `per_task` and a grid point may set."""
+"""Keys that `defaults`, a stage, its `per_task` and a grid point can set."""
 
 YOUNGER: tuple[tuple[str, str], ...] = (("tac", "log_std_form"), ("tac", "warmup_steps"))
 """Group and name of settings that are newer than the node keys of finished runs."""

@@ -84,7 +84,7 @@ Objectives = Annotated[
 
 
 class Rung(StrictModel):
-    """A point of a trial at which the trial may be pruned."""
+    """A point at which a trial can be pruned."""
 
     seeds: int | None = Field(None, gt=0)
     """Number of the sweep's first seeds that have run up to this point; null: all."""
@@ -235,7 +235,7 @@ class SearchSettings(StrictModel):
                 yield ("compare", name, position), {name: value}
 
     def _existing(self, point: dict[str, Any], keep: str) -> dict[str, Any]:
-        """The settings of `point` that apply after those that `keep` depends on are set."""
+        """Set the settings that `keep` depends on; return the settings of `point` that apply."""
         todo = [keep]
         while todo:
             for name, wanted in self.space[todo.pop()].when.items():
@@ -289,7 +289,7 @@ class SearchSettings(StrictModel):
             f"space.{name}": {name, *varied_by(name, at.ends())} for name, at in self.space.items()
         }
         for one, other in itertools.combinations(varied, 2):
-            # With `when`, one may exist only where the other has no such field: the ends show it.
+            # With `when`, one can exist only where the other lacks the field: the ends show it.
             below = self.space.get(other.removeprefix("space."))
             apart = below is not None and one.removeprefix("space.") in below.when
             if (both := varied[one] & varied[other]) and not apart:

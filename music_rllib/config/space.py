@@ -13,11 +13,11 @@ from music_rllib.schedules import StrictModel
 
 class _Dimension(StrictModel):
     when: dict[str, JsonValue] = Field(default_factory=dict)
-    """The dimension exists only where each of these settings, which stand above it in the space,
-    has this value, or one of a list of values."""
+    """Restricts the dimension to points where each of these settings, which must be above it in the
+    space, has this value or one of a list of values."""
 
     def applies(self, chosen: Mapping[str, Any]) -> bool:
-        """Whether this dimension exists beside the values that are already chosen."""
+        """Whether this dimension exists at a point with the `chosen` values."""
         return all(
             name in chosen and any(same(chosen[name], value) for value in listed(wanted))
             for name, wanted in self.when.items()
@@ -25,7 +25,7 @@ class _Dimension(StrictModel):
 
 
 def listed(wanted: JsonValue) -> list[JsonValue]:
-    """The values that one setting of `when` may have."""
+    """The allowed values of a setting in `when`."""
     return wanted if isinstance(wanted, list) else [wanted]
 
 

@@ -13,13 +13,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from music_rllib.config.checks import check_search
-from music_rllib.config.layers import (
-    PlacedPoint,
-    all_settings,
-    field_by_field,
-    for_a_grid,
-    merge,
-)
+from music_rllib.config.layers import PlacedPoint, all_settings, field_by_field, for_a_grid, merge
 from music_rllib.config.problems import (
     ConfigError,
     Findings,
@@ -30,13 +24,7 @@ from music_rllib.config.problems import (
     shown,
     unknown,
 )
-from music_rllib.config.run_settings import (
-    LAYER_KEYS,
-    VARIANTS,
-    RunSettings,
-    Variant,
-    handed_over,
-)
+from music_rllib.config.run_settings import LAYER_KEYS, VARIANTS, RunSettings, Variant, handed_over
 from music_rllib.config.schema import ImportedHandoff, Point, Source, Stage, StageHeader
 from music_rllib.config.search import of_stage
 from music_rllib.envs.tasks import BUILT_IN_TASKS, Task, closest
@@ -133,7 +121,7 @@ class _StageSettings:
     def at(self, point: PlacedPoint, findings: Findings) -> Point:
         """Settings at a point of the grid or the search."""
         runs, point = {}, field_by_field(point)
-        # Settings are checked even where no task is valid.
+        # Settings are checked even if no task is valid.
         for task in self.tasks or (BUILT_IN_TASKS["FetchPush"],):
             layers, problems = merge(self.variant, task, self.defaults, self.own, self.path, point)
             findings.problems += problems
@@ -311,7 +299,7 @@ def _check_fit(
     origin: str,
     findings: Findings,
 ) -> None:
-    """Settings that shape the handed-over arrays must equal those of the source."""
+    """The architecture and the split must equal those of the source."""
     starts_from = VARIANTS[stage.variant].starts_from
     theirs = (len(task.agent_indices), len(task.surrounding_indices))
     for run in point.runs.values():

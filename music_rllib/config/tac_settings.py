@@ -4,13 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import (
-    Discriminator,
-    Field,
-    Tag,
-    model_serializer,
-    model_validator,
-)
+from pydantic import Discriminator, Field, Tag, model_serializer, model_validator
 
 from music_rllib.functional.entropy_scale import matched_alpha, normalised_alpha
 from music_rllib.schedules import (

@@ -74,7 +74,7 @@ def read_value(text: str) -> Any:
 def _parse(text: str) -> tuple[Any, dict[KeyPath, int]]:
     """The content of a text, and the lines of its values."""
     _check_white_space(text)
-    loader = _StrictLoader(text.replace("\t", " "))  # in YAML 1.2 tabs may separate tokens
+    loader = _StrictLoader(text.replace("\t", " "))  # in YAML 1.2 tabs can separate tokens
     root = loader.get_single_node()
     if root is None:
         return None, {}
