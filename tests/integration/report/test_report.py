@@ -1,14 +1,12 @@
-"""Reports on a sweep in its storage, and their page in a real browser."""
+"""The `report` command on a sweep in its storage and on its exports."""
 
 from __future__ import annotations
 
 import dataclasses
-import json
 import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import get_args
 
@@ -25,7 +23,7 @@ from music_rllib.experiment.scheduler import Failure
 from music_rllib.program import app
 from music_rllib.report.build import PAGE
 from music_rllib.results.archive import Format, read_archive, write_archive
-from music_rllib.results.data import RunRecord, Sweep
+from music_rllib.results.data import Sweep
 from music_rllib.results.read import read_sweep
 from music_rllib.store.history import HISTORY, Report, RunResult, last_values, to_json_lines
 from music_rllib.sweep.listeners.state_file import StateFile
@@ -172,7 +170,7 @@ def searched(sweep_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 @pytest.fixture(scope="module")
 def page(sweep_folder: Path) -> Path:
-    """As a user makes it."""
+    """The report that the command makes."""
     done = subprocess.run(
         [sys.executable, "-m", "music_rllib", "report", str(sweep_folder)],
         capture_output=True,
@@ -196,7 +194,7 @@ def run(*arguments: str | Path) -> Result:
 
 
 def check_content(sweep: Sweep, nodes: list[Node]) -> None:
-    """Everything that was reported, and nothing else."""
+    """Check that the sweep has everything that was reported, and nothing else."""
     begun = [run for run in sweep.runs if run.status != "SCHEDULED"]
     assert [record.node_key for record in begun] == [node.key for node in nodes[:-1]]
     assert [record.status for record in begun[FAILED:]] == ["FAILED", "FINISHED"]
@@ -217,7 +215,7 @@ def check_content(sweep: Sweep, nodes: list[Node]) -> None:
 # Reading ----------------------------------------------------------------------------------------
 
 
-def test_what_was_reported_is_what_is_read(
+def test_a_stored_sweep_is_read_as_it_was_reported(
     sweep_folder: Path, nodes: list[Node], tmp_path: Path
 ) -> None:
     check_content(read_sweep(str(sweep_folder)).sweep, nodes)
@@ -228,7 +226,7 @@ def test_what_was_reported_is_what_is_read(
 
 
 @pytest.mark.parametrize("table_format", get_args(Format))
-def test_an_exported_sweep_is_the_same_sweep(
+def test_an_export_has_the_same_runs_and_values(
     table_format: str, sweep_folder: Path, nodes: list[Node], tmp_path: Path
 ) -> None:
     exported = tmp_path / "published"
@@ -261,7 +259,7 @@ def test_an_export_of_another_sweep_is_not_replaced(sweep_folder: Path, tmp_path
     assert read_archive(exported).name == "tiny"
 
 
-def test_the_page_shows_what_a_search_found(searched: Path, tmp_path: Path) -> None:
+def test_the_page_shows_the_results_of_a_search(searched: Path, tmp_path: Path) -> None:
     assert read_archive(searched).searches == [
         SEARCHES[0] | {"storage": "sqlite:///studies/all.db"}
     ]
@@ -296,12 +294,12 @@ def test_a_report_needs_neither_ray_nor_mlflow(
         assert [line for line in one.splitlines() if ",waiting," not in line] == other.splitlines()
 
 
-def test_there_is_no_such_sweep(sweep_folder: Path, tmp_path: Path) -> None:
+def test_a_sweep_that_does_not_exist_or_fit_is_refused(sweep_folder: Path, tmp_path: Path) -> None:
     other = run("other", "--storage", sweep_folder.parent)
     assert other.exit_code == 2
     assert "SWEEP must be a sweep that was started, got other" in other.stderr
     assert "(sweeps there: tiny)" in other.stderr
-    # A folder is not taken for the name of a sweep in the storage.
+    # A folder is not the name of a sweep in the storage.
     for place in (f"{tmp_path}/tiny", "..", "~nobody-at-all/tiny"):
         nowhere = run(place, "--storage", sweep_folder.parent)
         assert (nowhere.exit_code, nowhere.stderr.startswith("error: ")) == (2, True)
@@ -315,131 +313,3 @@ def test_there_is_no_such_sweep(sweep_folder: Path, tmp_path: Path) -> None:
     )
     never = run(sweep_folder, "--attach", "--no-videos")
     assert (never.exit_code, "a sweep that was tracked" in never.stderr) == (2, True)
-
-
-# In a browser -----------------------------------------------------------------------------------
-
-_OWN = "not an origin"
-
-
-class Browser:
-    """Headless Chromium, each time with a profile of its own."""
-
-    def __init__(self, program: Path, folder: Path) -> None:
-        self._program = program
-        self._folder = folder
-
-    def open(self, page: Path, *, dark: bool = False) -> str:
-        """The page's elements once it is loaded; `console` and `requests` say what happened."""
-        shutil.rmtree(self._folder / "profile", ignore_errors=True)
-        log = self._folder / "net.json"
-        done = subprocess.run(
-            [
-                self._program,
-                *("--headless", "--no-sandbox", "--disable-gpu", "--no-first-run"),
-                *("--disable-background-networking", "--disable-component-update"),
-                *("--disable-sync", "--hide-scrollbars", "--enable-logging=stderr"),
-                f"--user-data-dir={self._folder / 'profile'}",
-                f"--log-net-log={log}",
-                # Whatever asks for the network gets no answer.
-                "--host-resolver-rules=MAP * ~NOTFOUND",
-                "--window-size=1300,2400",
-                f"--blink-settings=preferredColorScheme={0 if dark else 1}",
-                "--dump-dom",
-                page.as_uri(),
-            ],
-            capture_output=True,
-            text=True,
-            check=True,
-            timeout=60,
-        )
-        self.console = [line for line in done.stderr.splitlines() if "CONSOLE" in line]
-        self.requests = {
-            found["url"]
-            for event in json.loads(log.read_text())["events"]
-            if not (found := event.get("params", {})).get("url", "file:").startswith("file:")
-            # Chromium asks for its own updates, whatever its options say.
-            and found.get("initiator", _OWN) != _OWN
-        }
-        return done.stdout
-
-
-@pytest.fixture
-def browser(require_service: Callable[[str], Path], tmp_path: Path) -> Browser:
-    return Browser(require_service("chromium"), tmp_path)
-
-
-def test_the_page_opens_without_an_error_and_without_the_network(
-    browser: Browser, page: Path
-) -> None:
-    dom = browser.open(page)
-    assert not browser.console
-    assert not browser.requests
-    for title in ("success-rate", "mutual-information-bound", "tsallis-entropy-of-the-policy"):
-        assert f'<div class="static" id="finetune-{title}"' in dom
-    assert "the &lt;simulation&gt; broke" in dom
-
-
-def test_the_console_and_the_network_are_watched(browser: Browser, tmp_path: Path) -> None:
-    """The test above could not fail otherwise."""
-    bad = tmp_path / "bad.html"
-    bad.write_text('<img src="http://127.0.0.1:9/x.png"><script>nothing.there()</script>')
-    browser.open(bad)
-    assert any("nothing is not defined" in line for line in browser.console)
-    assert browser.requests == {"http://127.0.0.1:9/x.png"}
-
-
-SCRIPT = """"'><script>document.body.dataset.ran = 1</script>
-<img src=x onerror="document.body.dataset.ran = 1"><svg onload="document.body.dataset.ran = 1">"""
-
-
-@pytest.fixture(scope="module")
-def hostile_export(searched: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Somebody's export, with a script in each tag, param and name that a report shows."""
-    shown = {names.TAG_STAGE, names.TAG_TASK, names.TAG_ENTROPIC_INDEX, names.TAG_FAILURE}
-    shown |= {names.TAG_VARIANT, names.TAG_GIT_COMMIT}
-
-    def hostile(run: RunRecord) -> RunRecord:
-        return dataclasses.replace(
-            run,
-            name=run.name + SCRIPT,
-            params={name: value + SCRIPT for name, value in run.params.items()},
-            tags={
-                tag: value + SCRIPT if tag in shown else value for tag, value in run.tags.items()
-            },
-        )
-
-    sweep, folder = read_archive(searched), tmp_path_factory.mktemp("hostile")
-    runs = [hostile(run) for run in sweep.runs]
-    write_archive(dataclasses.replace(sweep, name=f"tiny{SCRIPT}", runs=runs), folder)
-    return folder
-
-
-def test_a_script_in_somebody_s_sweep_does_not_run(
-    browser: Browser, hostile_export: Path, tmp_path: Path
-) -> None:
-    made = run(hostile_export, "--output", tmp_path / "report")
-    assert made.exit_code == 0, made.output
-    page = tmp_path / "report" / PAGE
-    # Without the page's policy, which would stop a script that got into it.
-    bare = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", page.read_text())
-    (tmp_path / "bare.html").write_text(bare)
-    for one in (page, tmp_path / "bare.html"):
-        dom = browser.open(one)
-        assert "data-ran" not in dom.partition("<body")[2].partition(">")[0]
-        assert dom.count("&lt;script&gt;") > 20
-        assert not browser.console
-        assert not browser.requests
-
-
-def test_the_page_s_policy_stops_a_script_that_got_into_it(
-    browser: Browser, page: Path, tmp_path: Path
-) -> None:
-    """And the test above could not fail otherwise."""
-    injected = page.read_text().replace("</body>", f"{SCRIPT}</body>")
-    (tmp_path / "injected.html").write_text(injected)
-    assert "<body>" in browser.open(tmp_path / "injected.html")
-    assert any("Content Security Policy" in line for line in browser.console)
-    bare = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", injected)
-    (tmp_path / "bare.html").write_text(bare)
-    assert '<body data-ran="1">' in browser.open(tmp_path / "bare.html")

@@ -1,9 +1,10 @@
-"""The report's page as a reader has it: in every size, pointed at, printed, without a script."""
+"""The report's page in a browser: sizes, pointer, keyboard, print, no script, hostile text."""
 
 from __future__ import annotations
 
 import asyncio
 import json
+import re
 import threading
 import time
 from collections import Counter
@@ -27,6 +28,7 @@ from music_rllib.results.archive import merged, read_archive
 from music_rllib.results.data import Sweep
 from tests.integration.devtools import Page
 from tests.unit.report.test_live import write_state
+from tests.unit.report.test_page import SCRIPT, hostile
 
 DATA = Path(__file__).parents[3] / "docs" / "results" / "data"
 LOOK = Path(__file__).with_name("look.js").read_text()
@@ -83,7 +85,7 @@ def open_page(require_service: Callable[[str], Path], tmp_path: Path) -> Callabl
     return lambda: Page(require_service("chromium"), tmp_path)
 
 
-def test_the_page_can_be_read_in_every_size_light_and_dark(
+def test_the_page_is_readable_in_every_size_light_and_dark(
     open_page: Callable[[], Page], page: Path, tmp_path: Path
 ) -> None:
     async def look() -> list[tuple[int, dict[str, Any]]]:
@@ -109,9 +111,7 @@ def test_the_page_can_be_read_in_every_size_light_and_dark(
             assert not seen[fault], (width, fault)
 
 
-def test_every_control_is_reached_and_used_by_keyboard(
-    open_page: Callable[[], Page], page: Path
-) -> None:
+def test_every_control_works_with_the_keyboard(open_page: Callable[[], Page], page: Path) -> None:
     async def use() -> None:
         async with open_page() as tab:
             await tab.view(1400, 1200)
@@ -137,7 +137,7 @@ def test_every_control_is_reached_and_used_by_keyboard(
     asyncio.run(use())
 
 
-def test_what_the_reader_chooses_is_drawn(open_page: Callable[[], Page], page: Path) -> None:
+def test_selections_change_the_curves(open_page: Callable[[], Page], page: Path) -> None:
     async def use() -> None:
         async with open_page() as tab:
             await tab.view(1400, 1200)
@@ -189,7 +189,7 @@ def test_what_the_reader_chooses_is_drawn(open_page: Callable[[], Page], page: P
     asyncio.run(use())
 
 
-def test_printed_and_without_a_script_everything_is_there(
+def test_print_and_pages_without_script_have_all_figures(
     open_page: Callable[[], Page], page: Path
 ) -> None:
     async def use() -> tuple[int, dict[str, Any]]:
@@ -218,6 +218,35 @@ def test_printed_and_without_a_script_everything_is_there(
     assert not seen["faint"]
 
 
+def test_a_script_in_a_sweep_does_not_run(open_page: Callable[[], Page], tmp_path: Path) -> None:
+    """Neither escaped text nor, thanks to the policy of the page, injected text runs."""
+    page = render(build_report(hostile()))
+    bare = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", page)
+    injected = f"{SCRIPT[2:]}--><img src=http://127.0.0.1:9/x.png></body>"
+
+    async def seen(tab: Page, text: str) -> tuple[str, list[str]]:
+        tab.errors.clear()
+        tab.requests.clear()
+        (tmp_path / "page.html").write_text(text)
+        await tab.go((tmp_path / "page.html").as_uri())
+        await tab.wait_for("Method")
+        await asyncio.sleep(1.0)
+        return " ".join(tab.errors), list(tab.requests)
+
+    async def look() -> None:
+        async with open_page() as tab:
+            for text in (page, bare):
+                assert await seen(tab, text) == ("", [])
+            errors, requests = await seen(tab, bare.replace("</body>", injected))
+            assert "steal is not defined" in errors, "a script that runs would be noticed"
+            assert requests == ["http://127.0.0.1:9/x.png"], "so would a request"
+            errors, _ = await seen(tab, page.replace("</body>", injected))
+            assert "Content Security Policy" in errors
+            assert "steal is not defined" not in errors
+
+    asyncio.run(look())
+
+
 @pytest.fixture
 def serve(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -240,7 +269,7 @@ def serve(
         yield start
 
 
-def test_the_live_page_takes_up_what_is_new_and_leaves_the_reader_where_he_is(
+def test_the_live_page_updates_in_place(
     open_page: Callable[[], Page],
     serve: Callable[[Callable[[], str]], str],
     report: SweepReport,
@@ -274,7 +303,7 @@ def test_the_live_page_takes_up_what_is_new_and_leaves_the_reader_where_he_is(
     asyncio.run(use())
 
 
-def test_a_study_half_way(
+def test_the_live_page_of_a_study_half_way(
     open_page: Callable[[], Page], serve: Callable[[Callable[[], str]], str], tmp_path: Path
 ) -> None:
     """FetchPush on fresh seeds as it was when half of its runs had ended."""
