@@ -23,8 +23,8 @@ from mlflow.models import Model
 from mlflow.tracking._tracking_service import utils as tracking_utils
 
 from music_rllib import names
-from music_rllib.experiment import sweep_files
 from music_rllib.experiment.run_info import RunInfo
+from music_rllib.experiment.sweep_files import SweepLocation
 from music_rllib.policy import PolicyNetwork
 from music_rllib.store.history import Report
 from music_rllib.tracking.policy_model import write_model
@@ -278,9 +278,9 @@ def test_another_driver_continues_the_runs_from_the_storage_alone(
 ) -> None:
     """As in a new pod, with only the bucket and the server of the first."""
     kept: dict[str, str] = {}  # stands for a bucket
-    monkeypatch.setattr(sweep_files, "write", lambda _, path, text: kept.update({path: text}))
+    monkeypatch.setattr(SweepLocation, "write", lambda _, path, text: kept.update({path: text}))
     monkeypatch.setattr(
-        sweep_files, "read", lambda _, path: json.loads(kept[path]) if path in kept else None
+        SweepLocation, "read", lambda _, path: json.loads(kept[path]) if path in kept else None
     )
     uri = f"sqlite:///{storage}/mlflow.db"
     for driver, steps in (("one", STEPS[:6]), ("two", STEPS)):
@@ -539,6 +539,7 @@ import sys, time
 from music_rllib import names
 from music_rllib.store.history import Report
 from music_rllib.experiment.run_info import RunInfo
+from music_rllib.experiment.sweep_files import SweepLocation
 from music_rllib.tracking.tracker import Tracker
 tracker = Tracker(sweep_name="smoke", storage=sys.argv[1], config={"name": "smoke", "seeds": [0]})
 tracker.start(RunInfo(node_key="a", name="finetune/a", config={"seed": 0}))
