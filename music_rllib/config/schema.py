@@ -269,13 +269,13 @@ class SweepConfig:
     stages: tuple[Stage, ...]
 
     def stage(self, name: str | None = None) -> Stage:
-        """The stage with this name; the last one without a name.
+        """The stage with this name; without a name, the stage of the analysis, or the last one.
 
         Raises:
             BadInputError: The sweep has no such stage.
         """
         stages = {stage.name: stage for stage in self.stages}
-        name = name or self.stages[-1].name
+        name = name or (self.analysis and self.analysis.stage) or self.stages[-1].name
         if name not in stages:
             raise BadInputError(f"--stage must be one of {', '.join(stages)}, got {name!r}")
         return stages[name]

@@ -112,11 +112,6 @@ class Plan:
         return list(self._nodes.values())
 
     @property
-    def last_stage(self) -> Stage:
-        """The last stage of the sweep."""
-        return list(self._stages.values())[-1]
-
-    @property
     def searched(self) -> tuple[Stage, ...]:
         """Stages with a search."""
         return tuple(stage for stage in self._stages.values() if stage.search is not None)

@@ -48,7 +48,9 @@ def open_tracker(opened: OpenSweep) -> Tracker:
         config=opened.config.document,
         tracking_uri=opened.config.mlflow.tracking_uri,
     )
-    tracker.keep_view(comparison_view(opened.plan, tracker.sweep_id, time.time()), VERSIONS)
+    tracker.keep_view(
+        comparison_view(opened.plan, opened.config.stage(), tracker.sweep_id, time.time()), VERSIONS
+    )
     return tracker
 
 

@@ -19,5 +19,8 @@ Storage = Annotated[
     typer.Option(metavar="PLACE", help="Folder or URI of results, if SWEEP is a name."),
 ]
 StageName = Annotated[
-    str | None, typer.Option(metavar="STAGE", help="Stage; the last one by default.")
+    str | None,
+    typer.Option(
+        metavar="STAGE", help="Stage. Default: the stage of the analysis, or the last one."
+    ),
 ]

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from music_rllib import names
+from music_rllib.config.schema import Stage
 from music_rllib.experiment.plan import Plan
 
 VERSIONS = ("3.17", "3.18")
@@ -26,16 +27,16 @@ METRICS = (names.EVAL_RETURN, names.SHANNON_ENTROPY, names.ENTROPY, names.MI_BOU
 SECTION = "comparison"
 
 
-def comparison_view(plan: Plan, sweep_id: str, now: float) -> str:
-    """The view of a sweep's last stage: a line per condition, its primary metric first.
+def comparison_view(plan: Plan, stage: Stage, sweep_id: str, now: float) -> str:
+    """The view of a stage: a line per condition, its primary metric first.
 
     Args:
         plan: The sweep's plan.
+        stage: The stage to compare.
         sweep_id: The value of its runs' tag `sweep_id`.
         now: Seconds since the epoch.
     """
     runs = [node.run for node in plan.nodes]
-    stage = plan.last_stage
     tasks = list({run.task.name: run.task for run in runs}.values())
     metrics = list(dict.fromkeys((*(task.primary_metric for task in tasks), *METRICS)))
     varied = {name for node in plan.nodes if node.stage == stage.name for name in node.values}

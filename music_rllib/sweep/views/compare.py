@@ -35,7 +35,7 @@ def compare_document(
 
     Args:
         location: The sweep.
-        stage: Name of the stage; None: the last one.
+        stage: Name of the stage; None: the stage of the analysis, or the last one.
         metric: The compared metric; None: the objective's, or the primary one of each task.
         minimize: Lower values of the metric are better.
 

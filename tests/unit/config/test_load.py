@@ -248,6 +248,18 @@ def asking(hypothesis: str, **analysis: Any) -> Document:
     return changed(analysis={"hypotheses": [hypothesis], **analysis})
 
 
+def test_the_compared_stage_is_the_one_of_the_analysis(load: Callable[..., SweepConfig]) -> None:
+    stages = [
+        {"name": "reach", "variant": "tac", "grid": {"tac.entropic_index": [1.0, 1.5]}},
+        {"name": "other", "variant": "tac"},
+    ]
+    assert load(changed(stages=stages)).stage().name == "other"
+    analysis = {"hypotheses": ["q = 1.5 against q = 1"], "stage": "reach"}
+    config = load(changed(stages=stages, analysis=analysis))
+    assert config.stage().name == "reach"
+    assert config.stage("other").name == "other"
+
+
 def without_success(document: Document) -> Document:
     task = {"env_id": "Pendulum-v1", "horizon": 50, "success_key": None}
     grid = {"tac.entropic_index": [1.0, 1.5]}

@@ -10,6 +10,7 @@ import yaml
 
 from music_rllib import names
 from music_rllib.config.load import load_sweep
+from music_rllib.config.schema import SweepConfig
 from music_rllib.experiment.plan import Plan, make_plan
 from music_rllib.experiment.run_info import run_name
 from music_rllib.sweep.listeners.mlflow_view import comparison_view
@@ -30,10 +31,14 @@ STAGES: list[dict[str, Any]] = [
 ]
 
 
-def plan(folder: Path, tasks: list[str]) -> Plan:
+def config(folder: Path, tasks: list[str]) -> SweepConfig:
     file = folder / "sweep.yaml"
     file.write_text(yaml.safe_dump({"name": "s", "tasks": tasks, "seeds": 2, "stages": STAGES}))
-    return make_plan(load_sweep(file))
+    return load_sweep(file)
+
+
+def plan(folder: Path, tasks: list[str]) -> Plan:
+    return make_plan(config(folder, tasks))
 
 
 def test_a_run_s_name_begins_with_what_differs(tmp_path: Path) -> None:
@@ -43,8 +48,9 @@ def test_a_run_s_name_begins_with_what_differs(tmp_path: Path) -> None:
     assert "q=1.5 alpha=0.2 lr=0.001 seed 0 FetchPush finetune" in called
 
 
-def test_the_view_has_a_line_for_each_condition_of_the_last_stage(tmp_path: Path) -> None:
-    view = json.loads(comparison_view(plan(tmp_path, ["FetchPush", "FetchSlide"]), "c0ffee", 1.5))
+def test_the_view_has_a_line_for_each_condition_of_the_compared_stage(tmp_path: Path) -> None:
+    loaded = config(tmp_path, ["FetchPush", "FetchSlide"])
+    view = json.loads(comparison_view(make_plan(loaded), loaded.stage(), "c0ffee", 1.5))
     assert (view["name"], view["createdAt"]) == ("s: comparison", 1500)
     state = json.loads(view["state"])
     current = "tags.sweep_id = 'c0ffee' and tags.current = 'yes'"
@@ -59,9 +65,11 @@ def test_the_view_has_a_line_for_each_condition_of_the_last_stage(tmp_path: Path
 
 
 def test_the_view_of_a_search_has_its_trials_of_which_none_is_planned_yet() -> None:
-    searched = make_plan(load_sweep(ROOT / "tune_configs" / "search.yaml"))
-    state = json.loads(json.loads(comparison_view(searched, "c0ffee", 1.5))["state"])
-    stage = searched.searched[-1]
+    loaded = load_sweep(ROOT / "tune_configs" / "search.yaml")
+    stage = loaded.stage()
+    state = json.loads(
+        json.loads(comparison_view(make_plan(loaded), stage, "c0ffee", 1.5))["state"]
+    )
     assert state["searchFilter"].endswith(f"tags.stage = '{stage.name}'")
     assert stage.search is not None
     assert "tac.alpha" in stage.search.space
