@@ -46,7 +46,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@touch $@
 	@echo "$(VENV) is ready"
 
-sweep: venv  ## the first picture: FetchReach over q, MUSIC on FetchPush (minutes)
+sweep: venv  ## train the packaged sweep and write its report (minutes)
 	@$(BIN)/python -m music_rllib.sweep $(CONFIG)
 
 test: venv  ## run the whole suite (CI=true: a missing service is a failure, not a skip)

@@ -210,10 +210,19 @@ BUILT_IN_TASKS: Mapping[str, Task] = MappingProxyType(
             # The original MUSIC halves the weight on Slide.
             _fetch("FetchSlide", mi_reward_weight=0.5),
             _hand("HandManipulateBlock"),
+            Task(
+                name="PointCarry",
+                env_id="music_rllib.envs.point_carry:PointCarry-v0",
+                horizon=50,
+                agent_indices=(0, 1),
+                surrounding_indices=(2, 3),
+                reward_range=_SPARSE,
+                mi_reward_weight=0.5,
+            ),
         )
     }
 )
-"""Tasks of Gymnasium-Robotics; tests compare each with its environment."""
+"""Tasks of Gymnasium-Robotics, and PointCarry; tests compare each with its environment."""
 
 
 class UnknownTaskError(LookupError):
