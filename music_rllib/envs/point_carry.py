@@ -93,4 +93,4 @@ class PointCarry(gym.Env[dict[str, NDArray[np.float32]], NDArray[np.float32]]):
         }
 
 
-gym.register("PointCarry-v0", PointCarry, max_episode_steps=50)
+gym.register("PointCarry-v0", f"{__name__}:PointCarry", max_episode_steps=50)

@@ -49,7 +49,9 @@ def log_published_sweep(folder: Path) -> str:
             key = (f"{node.values['tac.entropic_index']:g}", str(node.run.seed))
             publish(opened, node, _reports(sweep, of_seed[key]))
             tracker.mirror(run_info(node), partial(finished_run, opened.store, node))
-        tracker.keep_view(comparison_view(plan, tracker.sweep_id, time.time()), VERSIONS)
+        tracker.keep_view(
+            comparison_view(plan, config.stage(), tracker.sweep_id, time.time()), VERSIONS
+        )
         assert tracker.flush(60.0)
     arguments = ["report", str(folder / NAME), "--attach", "--no-videos"]
     assert CliRunner().invoke(app, arguments).exit_code == 0
