@@ -1,4 +1,4 @@
-"""What two sweeps have in common where nothing was lost: every number, in store and MLflow."""
+"""Comparison of an interrupted sweep with an uninterrupted one, in the store and in MLflow."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Numbers = dict[str, list[tuple[int, dict[str, float]]]]
 
 
 def nodes(storage: Path) -> Numbers:
-    """Node key to its reports: environment steps and metrics, but for those about the machine."""
+    """Node key to its reports: environment steps and metrics, except those of the machine."""
     store = NodeStore(str(storage))
     return {
         folder.name: [
@@ -28,7 +28,7 @@ def nodes(storage: Path) -> Numbers:
 
 
 def weights(storage: Path) -> dict[str, bytes]:
-    """Every file of weights that was handed over or could be."""
+    """Every file of network weights in a handoff."""
     return {
         str(path.relative_to(storage)): path.read_bytes()
         for path in sorted((storage / "nodes").rglob("*.safetensors"))
@@ -40,12 +40,12 @@ def without_machine(metrics: dict[str, float]) -> dict[str, float]:
 
 
 def logged(tracking_uri: str, experiment: str = "points") -> Numbers:
-    """Run name to its metrics in MLflow, by step; fails where a step is there twice."""
+    """Run name to its metrics in MLflow, by step; fails if a step occurs twice."""
     client = MlflowClient(tracking_uri)
     found = client.get_experiment_by_name(experiment)
     assert found is not None
     runs = client.search_runs([found.experiment_id])
-    assert len({run.info.run_name for run in runs}) == len(runs), "a run is there twice"
+    assert len({run.info.run_name for run in runs}) == len(runs), "a run occurs twice"
     return {run.info.run_name: _steps(client, run) for run in runs if _is_of_a_node(run)}
 
 
@@ -65,9 +65,9 @@ def _steps(client: MlflowClient, run: Any) -> list[tuple[int, dict[str, float]]]
 
 
 def same(one: Path, other: Path, *, uri: str = "sqlite:///{}/mlflow.db") -> None:
-    """Both storages hold the same numbers, bit for bit."""
+    """Check that both storages have the same numbers, bit for bit."""
     assert nodes(one) == nodes(other)
     assert weights(one) == weights(other)
     assert logged(uri.format(one)) == logged(uri.format(other))
-    assert not list((other / "work").iterdir()), "nothing is left of finished runs"
-    assert not list((other / "nodes").glob(".*")), "nothing is left of killed attempts"
+    assert not list((other / "work").iterdir()), "finished runs leave nothing in work/"
+    assert not list((other / "nodes").glob(".*")), "killed attempts leave nothing"

@@ -1,4 +1,4 @@
-"""The fault-injection suite: `make test-faults` runs all of it, a plain `pytest` its quick half."""
+"""Fault injection: `make test-faults` runs all tests, a plain `pytest` the fast ones."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["mlflow_runs", "sweep_document", "sweep_program"]
 
 @pytest.fixture(scope="session")
 def unbroken(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The storage of `sweeps.document()`, run in one go."""
+    """The storage of `sweeps.document()`, run without interruption."""
     program = sweeps.program(tmp_path_factory.mktemp("unbroken"))
     program.write(sweeps.document())
     sweeps.finish(program)
@@ -24,7 +24,7 @@ def unbroken(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def program(tmp_path: Path) -> Iterator[Program]:
-    """The program in a folder of its own, with `sweeps.document()` to run."""
+    """The program in its own folder, with `sweeps.document()` to run."""
     own = sweeps.program(tmp_path)
     own.write(sweeps.document())
     yield own

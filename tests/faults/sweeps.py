@@ -1,4 +1,4 @@
-"""The small sweep that faults are injected into, as a program of its own."""
+"""The small sweep into which faults are injected, and the processes that run it."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ import yaml
 from tests.integration.conftest import SWEEP, Program, end, program_environment
 
 FIRST_SIGN = 400.0
-"""Seconds that a start may take on a busy machine."""
+"""Timeout of a start on a busy machine, in seconds."""
 PATIENCE = 900.0
-"""Seconds that a whole sweep may take there."""
+"""Timeout of a whole sweep, in seconds."""
 
 
 def document(**changes: Any) -> dict[str, Any]:
-    """A sweep of three runs with a checkpoint at every report; some seconds of training each."""
+    """A sweep of three runs of some seconds, with a checkpoint at every report."""
     whole: dict[str, Any] = yaml.safe_load(yaml.safe_dump(SWEEP))
     whole["defaults"]["env_steps"] = 4000
     whole["checkpoints"] = {"minutes": 0.0001}
@@ -33,7 +33,7 @@ def document(**changes: Any) -> dict[str, Any]:
 
 @dataclass
 class OwnProgram(Program):
-    """A program whose processes end with the test, however that ends."""
+    """A program whose processes end with the test in any case."""
 
     started: list[subprocess.Popen[str]] = field(default_factory=list)
 
@@ -50,19 +50,19 @@ class OwnProgram(Program):
 
 
 def program(folder: Path) -> OwnProgram:
-    """What runs it in `folder`."""
+    """The program in `folder`."""
     return OwnProgram(folder, program_environment())
 
 
 def start_until(program: Program, *signs: str) -> subprocess.Popen[str]:
-    """Start and read until a line has one of `signs`, or the end."""
+    """Start the program and read until a line contains one of `signs`, or to the end."""
     process = program.start()
     read_until(process, *signs)
     return process
 
 
 def read_until(process: subprocess.Popen[str], *signs: str) -> str:
-    """Read on until a line has one of `signs`; what was read."""
+    """Read until a line contains one of `signs`; returns the lines."""
     assert process.stdout is not None
     deadline, seen = time.monotonic() + FIRST_SIGN, []
     for line in process.stdout:
@@ -73,13 +73,13 @@ def read_until(process: subprocess.Popen[str], *signs: str) -> str:
 
 
 def kill(process: subprocess.Popen[str]) -> None:
-    """`kill -9` the driver alone; Ray's processes must notice by themselves."""
+    """`kill -9` only the driver; Ray's processes must notice it."""
     os.kill(process.pid, signal.SIGKILL)
     process.communicate(timeout=PATIENCE)
 
 
 def workers(process: subprocess.Popen[str]) -> Iterator[psutil.Process]:
-    """Processes that train for a driver with a local Ray."""
+    """Worker processes of a driver with a local Ray."""
     for child in psutil.Process(process.pid).children(recursive=True):
         try:
             if child.cmdline()[0].startswith("ray::RunTrainable"):
@@ -89,7 +89,7 @@ def workers(process: subprocess.Popen[str]) -> Iterator[psutil.Process]:
 
 
 def kill_a_worker(process: subprocess.Popen[str]) -> None:
-    """`kill -9` one that trains, as soon as there is one."""
+    """`kill -9` a worker as soon as one is training."""
     deadline = time.monotonic() + FIRST_SIGN
     while time.monotonic() < deadline:
         for worker in workers(process):
@@ -100,7 +100,7 @@ def kill_a_worker(process: subprocess.Popen[str]) -> None:
 
 
 def finish(program: Program, timeout: float = PATIENCE) -> str:
-    """Run to the end, which is good; what was said."""
+    """Run to the successful end; returns the output."""
     code, output, errors = program.run(timeout=timeout)
     assert code == 0, output + errors
     return output

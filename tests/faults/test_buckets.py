@@ -1,4 +1,4 @@
-"""A driver in a pod that is gone: another one has the bucket and MLflow, and nothing else."""
+"""A driver in a new pod, which has only the bucket and MLflow."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ pytestmark = pytest.mark.thorough
 
 @pytest.fixture
 def bucket(program: Program) -> Iterator[str]:
-    """A URI below a bucket of an S3 server, which `program` may write to."""
+    """A URI in a bucket of an S3 server that `program` can write."""
     port = free_port()
     logging.getLogger("werkzeug").setLevel(logging.ERROR)  # a line for each request
     own = ThreadedMotoServer("127.0.0.1", port, verbose=False)

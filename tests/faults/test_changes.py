@@ -56,7 +56,7 @@ def test_changed_settings_and_affected_runs_are_listed(
 
     sweep_document["stages"][1]["grid"]["tac.entropic_index"] = [1.0, 1.5, 2.0]
     sweep_document["seeds"] = [0, 1]
-    assert changes_since(opened(tmp_path, sweep_document)) is None, "what is new costs nothing"
+    assert changes_since(opened(tmp_path, sweep_document)) is None, "additions change nothing"
 
     sweep_document["defaults"]["tac"]["lr"] = 0.01
     changes = changes_since(opened(tmp_path, sweep_document))
@@ -98,7 +98,7 @@ def test_more_env_steps_continue_finished_runs_without_a_question(
         "1 run continues a finished run with fewer env_steps: 1,200 env steps less to train."
     ]
 
-    # With a schedule over the budget it can't: everything before would have been otherwise.
+    # A schedule over the budget would have had other values from the start.
     q = {"schedule": "linear", "start": 2.0, "end": 1.0}
     sweep_document["defaults"] |= {"env_steps": 1200}
     sweep_document["defaults"]["tac"]["entropic_index"] = q
@@ -185,7 +185,7 @@ def test_a_second_driver_is_refused_and_a_dead_one_does_not_count(
 def test_a_suspended_driver_exits_if_another_one_has_its_sweep(
     tmp_path: Path, sweep_document: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """And goes on where that one has ended since."""
+    """It continues if the other driver has ended."""
     monkeypatch.setattr(lease_module, "EXPIRES_SECONDS", 0.4)
     sweep = opened(tmp_path, sweep_document)
     file = LeaseFile(open_storage(str(sweep.folder)), "driver.json")

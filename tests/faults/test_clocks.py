@@ -1,4 +1,4 @@
-"""A time of day that is set while a sweep runs, for its driver and all of its workers.
+"""The system time changes while a sweep runs, for its driver and all of its workers.
 
 By a module that Python imports when it starts. Not by libfaketime: with it, `time.sleep` of Python
 3.11 fails where only the time of day is to be another (EINVAL, version 0.9.10 of Debian 12).
@@ -29,7 +29,7 @@ time.time_ns = lambda: _time_ns() + ahead() * 10**9
 
 
 class Clock:
-    """The time of day of a program and of whatever it starts."""
+    """The system time of a program and of the processes that it starts."""
 
     def __init__(self, program: Program, folder: Path) -> None:
         self._file = folder / "clock"
@@ -39,7 +39,7 @@ class Clock:
         program.environment |= {"PYTHONPATH": paths, "TEST_CLOCK": str(self._file)}
 
     def set(self, seconds: int) -> None:
-        """So much later than it is."""
+        """Shift the time by some seconds."""
         fresh = self._file.with_suffix(".new")
         fresh.write_text(str(seconds))
         fresh.replace(self._file)
@@ -68,7 +68,7 @@ def test_a_clock_that_jumps_forward_and_back(
 def test_killed_with_a_fast_clock_and_resumed(
     program: Program, clock: Clock, unbroken: Path, tmp_path: Path
 ) -> None:
-    """What the dead ones hold in an hour's time keeps nobody waiting."""
+    """Leases of dead processes that expire in an hour delay nobody."""
     process = sweeps.start_until(program, "pretrain/seed0: 8")
     clock.set(HOUR)
     sweeps.read_until(process, "pretrain/seed0: finished")

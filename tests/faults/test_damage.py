@@ -1,4 +1,4 @@
-"""Damaged checkpoints and handoffs: noticed, named, never executed, and survived where that can be.
+"""Damaged checkpoints and handoffs are found, named, never executed, and survived if possible.
 
 One node as a trial, in this process; what is damaged is what a cut run has left.
 """
@@ -42,7 +42,7 @@ BOMB = "TOUCHED-BY-A-PICKLE"
 
 @pytest.fixture(scope="module")
 def cut(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, NodeJob]:
-    """The storages of an unbroken run and of the same one after 400 of 600 steps."""
+    """The storages of an uninterrupted run, and of the same run after 400 of 600 steps."""
     whole, broken = tmp_path_factory.mktemp("whole"), tmp_path_factory.mktemp("broken")
     compute(job(whole, settings("tac")))
     node = job(broken, settings("tac"))
@@ -51,7 +51,7 @@ def cut(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, NodeJob]:
 
 
 class Bomb:
-    """Unpickled, it leaves a file behind."""
+    """An object that creates a file when it is unpickled."""
 
     def __init__(self, target: Path) -> None:
         self.target = target
@@ -71,7 +71,7 @@ def truncate(path: Path) -> None:
 
 
 def bomb(path: Path) -> None:
-    """With hashes that fit: only the format keeps it from being executed."""
+    """The hashes match, so only the format prevents its execution."""
     path.write_bytes(pickle.dumps(Bomb(path.with_name(BOMB))))
     manifest = path.parent / "manifest.json"
     content = json.loads(manifest.read_text())
@@ -181,13 +181,13 @@ def test_a_run_refuses_a_damaged_handoff(tmp_path: Path) -> None:
     _of_another_task(folder)
     assert "handoff.json must have" in refused(), "a changed task changes the hash"
     assert not (tmp_path / BOMB).exists()
-    assert compute(node)[-1].get(CAUSE) is None, "the good one trains"
+    assert compute(node)[-1].get(CAUSE) is None, "an intact handoff is used"
 
 
 def test_a_run_of_another_process_is_waited_for(
     cut: tuple[Path, Path, NodeJob], tmp_path: Path
 ) -> None:
-    """A worker that outlived its driver, or another sweep: no collision, and no second training."""
+    """A worker that outlived its driver, or another sweep, is not disturbed or repeated."""
     whole, _, _ = cut
     node = job(tmp_path, settings("tac"))
     store = NodeStore(str(tmp_path))
@@ -226,7 +226,7 @@ def test_a_dead_owner_with_a_fast_clock_is_not_waited_for(
 def test_a_worker_that_lost_its_lease_stops_writing_and_reuses(
     cut: tuple[Path, Path, NodeJob], tmp_path: Path
 ) -> None:
-    """It was suspended; the other one finishes the run, and deletes the folder that it had."""
+    """It was suspended; the new owner finishes the run and deletes its folder."""
     whole, _, _ = cut
     node = job(tmp_path, settings("tac"))
     trial = RunTrainable(config=node.to_tune())
@@ -256,7 +256,7 @@ def test_a_worker_that_lost_its_lease_stops_writing_and_reuses(
 def test_a_worker_whose_lease_nobody_took_continues(
     theirs: str, cut: tuple[Path, Path, NodeJob], tmp_path: Path
 ) -> None:
-    """Whoever took the run over has stopped; or somebody deleted the folder below a checkpoint."""
+    """The new owner has stopped, or the folder was deleted during a checkpoint."""
     whole, _, _ = cut
     node = job(tmp_path, settings("tac"))
     trial = RunTrainable(config=node.to_tune())
@@ -278,7 +278,7 @@ def test_a_worker_whose_lease_nobody_took_continues(
 def test_a_run_saved_between_reports_loses_nothing(
     cut: tuple[Path, Path, NodeJob], tmp_path: Path
 ) -> None:
-    """As on a signal: saved after whatever round of training, and continued."""
+    """As after a signal: saved after any round of training, and resumed."""
     whole, _, node = cut
     asked = {"rounds": 0}
 

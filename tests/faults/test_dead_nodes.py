@@ -1,4 +1,4 @@
-"""A node of a cluster that goes away with what runs on it."""
+"""A node of a cluster dies with the runs on it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A Ray that dies below its driver: which says so, keeps everything, and ends within a minute."""
+"""Ray dies: the driver prints a message, keeps everything and ends within a minute."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_the_driver_exits_when_the_head_of_a_cluster_dies(
     two_nodes: tuple[str, int], program: Program, unbroken: Path
 ) -> None:
     address, raylet = two_nodes
-    # In place of a minute, of which two thirds are waited for a head that may come back.
+    # Instead of a minute; the driver waits two thirds of it for the head to return.
     program.environment |= {
         "RAY_ADDRESS": address,
         "RAY_gcs_rpc_server_reconnect_timeout_s": "20",

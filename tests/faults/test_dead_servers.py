@@ -1,4 +1,4 @@
-"""An MLflow server that is killed while a sweep goes on, fails, or takes its password no more."""
+"""An MLflow server is killed, fails, or refuses the password while a sweep runs."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_a_server_that_is_away_for_a_minute(
     server.wait()
     output, _ = process.communicate(timeout=sweeps.PATIENCE)
     assert process.returncode == 0, output
-    if "did not reach MLflow" in output:  # the sweep was over before the server was back
+    if "did not reach MLflow" in output:  # the sweep ended before the server returned
         resume(program)
     same(unbroken, program, server.uri)
 
@@ -68,12 +68,12 @@ def test_a_server_that_stays_away(program: Program, unbroken: Path, server: Mlfl
     server.start()
     server.wait()
     resume(program)
-    resume(program)  # twice changes nothing
+    resume(program)  # the second time changes nothing
     same(unbroken, program, server.uri)
 
 
 def test_a_server_that_answers_500(program: Program, unbroken: Path, server: MlflowServer) -> None:
-    """To everything, from the first run on; what it is to get follows when it is well again."""
+    """It fails every request from the first run on; `resume` sends everything later."""
     program.write(sweeps.document(mlflow={"tracking_uri": server.uri}))
     process = sweeps.start_until(program, "pretrain/seed0: started")
     server.signal(signal.SIGKILL)
@@ -92,7 +92,7 @@ def test_a_server_that_answers_500(program: Program, unbroken: Path, server: Mlf
 def test_a_password_that_is_changed(
     program: Program, unbroken: Path, mlflow_server: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The sweep continues with the old one; a later `resume` uses the new one."""
+    """The sweep continues with the old password; a later `resume` uses the new one."""
     monkeypatch.setenv("MLFLOW_TRACKING_USERNAME", USER)
     program.environment |= {
         "MLFLOW_TRACKING_USERNAME": USER,

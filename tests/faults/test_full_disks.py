@@ -1,4 +1,4 @@
-"""Disks that are full or read-only: a message that names the path, and nothing lost."""
+"""Full and read-only disks: a message names the path, and nothing is lost."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MakeDisk = Callable[[str], Path]
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[MakeDisk]:
-    """`small_disk("2m")` mounts a disk of that size; needs the right to."""
+    """`small_disk("2m")` mounts a disk of that size; skipped without the right to mount."""
     mounted: list[Path] = []
 
     def make(size: str) -> Path:
@@ -44,14 +44,14 @@ def small_disk(tmp_path: Path) -> Iterator[MakeDisk]:
 
 
 def fill(disk: Path) -> Path:
-    """Take all that is free there with one file."""
+    """Fill the disk with one file."""
     ballast = disk / "ballast"
     deadline = time.monotonic() + 30
     while True:
         try:
             handle = os.open(ballast, os.O_CREAT | os.O_WRONLY)
             break
-        except OSError:  # what was deleted just now may not be free yet
+        except OSError:  # recently deleted space may not be free yet
             assert time.monotonic() < deadline
             time.sleep(0.1)
     try:
@@ -108,7 +108,7 @@ def test_a_read_only_disk_is_named(small_disk: MakeDisk) -> None:
 def test_a_disk_that_fills_up_during_a_sweep(
     program: Program, unbroken: Path, small_disk: MakeDisk
 ) -> None:
-    """The runs fail and say why; with room again, the same command ends with the same numbers."""
+    """The runs fail with the reason; with free space, the same command has the same numbers."""
     disk = small_disk("64m")
     program.write(sweeps.document(storage=str(disk / "results")))
     process = sweeps.start_until(program, "pretrain/seed0: 4", "pretrain/seed0: 8")
@@ -125,7 +125,7 @@ def test_a_disk_that_fills_up_during_a_sweep(
 
 @pytest.mark.thorough
 def test_a_full_disk_below_mlflow(program: Program, unbroken: Path, small_disk: MakeDisk) -> None:
-    """Training goes on, the sweep says what is missing, and the command that it names sends it."""
+    """Training continues; the sweep prints what is missing and the command that sends it."""
     disk = small_disk("8m")
     uri = f"sqlite:///{disk}/mlflow.db"
     program.write(sweeps.document(mlflow={"tracking_uri": uri}))

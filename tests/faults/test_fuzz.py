@@ -1,4 +1,4 @@
-"""Files changed at random: briefly, a minute by `make test-faults`, longer by `make fuzz`."""
+"""Randomly changed files: some seconds, a minute with `make test-faults`, or `make fuzz`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SEED = os.environ.get("FUZZ_SEED", "0")
 
 
 def test_randomly_changed_files_are_handled_safely(pytestconfig: pytest.Config) -> None:
-    """See `tests/fuzz.py`; it says which case of which seed, and where its files are."""
+    """See `tests/fuzz.py`, which prints the case, the seed and the place of the files."""
     seconds = 60 if "thorough" in pytestconfig.option.markexpr else 6
     done = subprocess.run(
         [sys.executable, "-m", "tests.fuzz", "--seconds", str(seconds), "--seed", SEED],
@@ -27,7 +27,7 @@ def test_randomly_changed_files_are_handled_safely(pytestconfig: pytest.Config) 
     )
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout.splitlines()[-1])
-    # Some files of each kind are still sound after their change, and others are not.
+    # Some changed files of each kind are still valid, and others are not.
     for kind in ("sealed_policy", "packed_policy", "export", "sweep_file", "state"):
         outcomes = {name for name in found if name.startswith(f"{kind}:")}
         assert f"{kind}: read" in outcomes

@@ -1,4 +1,4 @@
-"""Environments that do not return from a call: named, with their stack, and the others go on."""
+"""An environment that hangs is named with its stack, and the other runs continue."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if sys.argv[2] == "works":
     for _ in range(30):
         with in_environment:
             time.sleep(0.05)
-    time.sleep(2.5)  # a long update, as far as the environment is concerned
+    time.sleep(2.5)  # like a long update
 else:
     with in_environment:
         if sys.argv[2] == "stopped":
@@ -47,7 +47,7 @@ def temporary_folder(storage: Path) -> Path:
 
 
 def leaves_nothing_behind(storage: Path) -> bool:
-    """The watching process ends a moment after the one it watches."""
+    """The watching process ends shortly after the watched one."""
     deadline = time.monotonic() + 10
     while any(temporary_folder(storage).iterdir()) and time.monotonic() < deadline:
         time.sleep(0.05)
@@ -83,7 +83,7 @@ def test_a_call_that_does_not_return_ends_the_worker_and_leaves_its_stack(
 
 @pytest.mark.parametrize("what", ["works", "stopped"])
 def test_slow_calls_and_updates_are_not_hangs(what: str, tmp_path: Path) -> None:
-    """Many short calls, a long update, and a process that was stopped within a call."""
+    """Many short calls, a long update, and a process that was stopped during a call."""
     with worker(tmp_path, what) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "watched\n"

@@ -1,4 +1,4 @@
-"""Files from strangers: each is refused in time, in few bytes, and in words."""
+"""Hostile files are refused quickly, with little memory, and with a message."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]]:
-    """What the programs made of each file of the corpus, one after the other."""
+    """The result of the programs for each file of the corpus."""
     folder = tmp_path_factory.mktemp("corpus")
     done = subprocess.run(
         [sys.executable, "-m", "tests.hostile_files", str(folder)],
@@ -34,7 +34,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]]
 
 @pytest.mark.parametrize("name", CORPUS)
 def test_a_hostile_file_is_refused(found: dict[str, dict[str, Any]], name: str) -> None:
-    """With exit code 2 and a message, before it has cost a second or 300 MB."""
+    """Exit code 2 and a message, within a second and 300 MB."""
     result = found[name]
     assert CORPUS[name].said in result["said"]
     assert "Traceback" not in result["said"]

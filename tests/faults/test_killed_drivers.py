@@ -1,4 +1,4 @@
-"""Drivers and workers that are killed or told to stop: the sweep ends with the same numbers."""
+"""Killed and stopped drivers and workers: the sweep ends with the same numbers."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_stopped_in_each_stage(
         assert process.returncode in {128 + number, -number}, output + errors
     else:
         assert process.returncode == 128 + number, output + errors
-    # What was saved on the signal is where it goes on: not a step is computed again.
+    # It resumes from the state saved on the signal: no step is repeated.
     saved = dict(re.findall(r"\] (\S+): saved at ([\d,]+) env steps", output))
     output = sweeps.finish(program)
     continued = dict(re.findall(r"\] (\S+): continues at ([\d,]+) env steps", output))
@@ -62,7 +62,7 @@ def test_stopped_in_each_stage(
 
 @pytest.mark.thorough
 def test_a_signal_to_the_process_group_changes_no_number(program: Program, unbroken: Path) -> None:
-    """As `timeout` and Slurm send it: Ray ends as well, before anything can be saved."""
+    """As sent by `timeout` and Slurm: Ray ends too, before anything can be saved."""
     process = sweeps.start_until(program, "pretrain/seed0: started")
     time.sleep(1.0)
     os.killpg(process.pid, signal.SIGTERM)
@@ -110,12 +110,12 @@ def test_a_run_whose_worker_dies_repeatedly_fails_with_the_cause(
 @pytest.mark.thorough
 @pytest.mark.timeout(5400)
 def test_killed_twenty_times_at_random_moments(program: Program, unbroken: Path) -> None:
-    """In the plan, while Ray starts, in each stage, in checkpoints and while MLflow is fed."""
+    """During planning, the start of Ray, each stage, checkpoints and sending to MLflow."""
     seed = int(os.environ.get("FAULT_SEED", random.randrange(10**6)))
     print(f"FAULT_SEED={seed}")
     rng, kills, results = random.Random(seed), 0, program.folder / "results"
     while kills < 20:
-        # Before Ray is up there is little to break: mostly a moment in training.
+        # Before Ray runs there is little to break, so mostly during training.
         signs = rng.choice([("starting a local Ray",), *[(": started", ": continues")] * 4])
         process = sweeps.start_until(program, *signs, "Results of")
         time.sleep(rng.uniform(0.0, 10.0))
@@ -126,6 +126,6 @@ def test_killed_twenty_times_at_random_moments(program: Program, unbroken: Path)
         output, errors = process.communicate()
         assert process.returncode == 0, output + errors
         comparison.same(unbroken, results)
-        results.rename(program.folder / f"done-{kills}")  # once more, from nothing
+        results.rename(program.folder / f"done-{kills}")  # again, from scratch
     sweeps.finish(program)
     comparison.same(unbroken, results)

@@ -1,4 +1,4 @@
-"""`kill -9` of remote environment runners, whose episodes go on where they were."""
+"""`kill -9` of remote environment runners, whose episodes are played again identically."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def kill_runner(algo: TAC) -> None:
 
 
 @pytest.mark.thorough
-@pytest.mark.filterwarnings("ignore")  # Ray says what happened
+@pytest.mark.filterwarnings("ignore")  # Ray prints warnings
 def test_a_killed_runner_changes_no_number(tmp_path: Path) -> None:
     unbroken = remote_runner()
     expected = [fingerprint(unbroken, 1) for _ in range(4)]

@@ -1,4 +1,4 @@
-"""A sqlite file that another program is writing into, for longer than anybody waits for it."""
+"""An SQLite file that another program locks for longer than the timeouts."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.played_search import Driver, document, searched
 
 @contextlib.contextmanager
 def locked(file: Path) -> Iterator[None]:
-    """Be its only writer for this `with`."""
+    """Hold the write lock for this `with`."""
     assert file.is_file()
     connection = sqlite3.connect(file, isolation_level=None, timeout=30)
     connection.execute("BEGIN IMMEDIATE")

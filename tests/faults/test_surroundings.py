@@ -1,4 +1,4 @@
-"""A user with nothing of their own: no rights, no home folder, nobody else's umask or language."""
+"""A user without rights and home folder, with another umask and language."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ pytestmark = pytest.mark.thorough
 
 NOBODY = ("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups")
 READS_ALL = ("--inh-caps=+dac_read_search", "--ambient-caps=+dac_read_search")
-"""For a tree, or a Python, in somebody's home: it may read everything, and write nothing."""
+"""Right to read everything and write nothing, if the code is in a home folder."""
 
 
 @pytest.fixture
 def public() -> Iterator[Path]:
-    """A folder that everybody reaches, which pytest's own isn't."""
+    """A folder that every user can reach, unlike pytest's."""
     folder = Path(tempfile.mkdtemp(prefix="music-nobody-", dir="/tmp"))
     folder.chmod(0o777)
     yield folder
@@ -35,7 +35,7 @@ def public() -> Iterator[Path]:
 
 @pytest.fixture
 def turkish(public: Path) -> dict[str, str]:
-    """The language in which the small letter of I is not i."""
+    """Turkish, in which the lowercase letter of I is not i."""
     made = subprocess.run(
         ["localedef", "-i", "tr_TR", "-f", "UTF-8", str(public / "tr_TR.UTF-8")],
         capture_output=True,
@@ -81,11 +81,11 @@ def test_another_user_without_home_in_another_language(
     for arguments in (("sweep.yaml",), ("status", "results/points"), ("best", "results/points")):
         code, output, errors = as_nobody(home, environment, *command, *arguments)
         assert code == 0, output + errors
-        # It says which folder it takes in place of one in the home folder.
+        # It prints the folder that replaces the home folder.
         assert all("atplotlib" in line for line in errors.splitlines()), errors
     comparison.same(unbroken, home / "results")
     assert sorted(path.name for path in home.iterdir()) == ["results", "sweep.yaml"]
     readable = [
         path for path in (home / "results").rglob("*") if path.stat().st_mode & stat.S_IRWXO
     ]
-    assert not readable, "whoever says umask 077 keeps it all to themselves"
+    assert not readable, "with umask 077 only the owner can read"

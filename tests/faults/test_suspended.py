@@ -1,4 +1,4 @@
-"""Sweeps that are suspended, as a laptop that sleeps does it, while another one takes over."""
+"""A sweep is suspended, like a sleeping laptop, while another one takes over."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.thorough
 
 @pytest.fixture
 def other(tmp_path: Path) -> Iterator[sweeps.OwnProgram]:
-    """Another sweep, elsewhere, with the storage of `program` and an MLflow of its own."""
+    """Another sweep in the storage of `program`, with its own MLflow."""
     folder = tmp_path / "other"
     folder.mkdir()
     own = sweeps.program(folder)
@@ -36,13 +36,13 @@ def other(tmp_path: Path) -> Iterator[sweeps.OwnProgram]:
 
 
 def signal_all(process: subprocess.Popen[str], number: signal.Signals) -> None:
-    """The driver and all that it has started."""
+    """The driver and its child processes."""
     for each in (driver := psutil.Process(process.pid), *driver.children(recursive=True)):
         os.kill(each.pid, number)
 
 
 def let_expire(*leases: Path) -> None:
-    """As time would."""
+    """Let the lease expire."""
     for lease in leases:
         content = json.loads(lease.read_text())
         lease.write_text(json.dumps(content | {"expires": time.time() - 1}))
@@ -71,7 +71,7 @@ def test_a_suspended_sweep_waits_for_the_new_owner_of_its_runs(
 def test_a_suspended_driver_continues_if_nobody_took_its_sweep(
     program: Program, other: sweeps.OwnProgram, unbroken: Path, tmp_path: Path
 ) -> None:
-    """A second one finds its lease expired, and is refused by what it keeps for MLflow."""
+    """A second driver finds the lease expired, and is refused by the lock of MLflow's records."""
     process = sweeps.start_until(program, "pretrain/seed0: started")
     wait_for_lease(tmp_path / "results")
     signal_all(process, signal.SIGSTOP)
@@ -85,7 +85,7 @@ def test_a_suspended_driver_continues_if_nobody_took_its_sweep(
 
 
 def wait_for_lease(storage: Path) -> list[Path]:
-    """The run's, which its worker acquires in its first step."""
+    """The lease of the run, which its worker acquires in the first step."""
     deadline = time.monotonic() + sweeps.FIRST_SIGN
     while not (found := list((storage / "work").glob("*/lease.json"))):
         assert time.monotonic() < deadline

@@ -1,4 +1,4 @@
-"""Results and checkpoints of another environment are never used unasked."""
+"""Results and checkpoints of a different environment are not used without consent."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ RESULT = RunResult(label="l", env_steps=400, seconds=1.0, metrics={})
 
 
 def opened(folder: Path, environment: Fingerprint, name: str = "s", **defaults: Any) -> OpenSweep:
-    """Two tasks; the second stage starts each of its runs from one on Lab."""
+    """A sweep of two tasks; runs of the second stage start from runs on Lab."""
     lab = {"horizon": 20, "agent_indices": [0], "surrounding_indices": [1]}
     document = {
         "name": name,

@@ -1,4 +1,4 @@
-"""The plan: its order, its keys, and what is shared."""
+"""The plan: its order, its keys, and shared nodes."""
 
 import json
 import subprocess
@@ -206,11 +206,11 @@ def test_keys_are_the_same_in_another_process_with_other_hash_seeds(tmp_path: Pa
 
 
 def test_keys_are_the_same_on_another_machine(tmp_path: Path) -> None:
-    """Finished runs are found again by these strings, wherever and whenever they were made.
+    """Finished runs are found by these strings, on any machine and at any time.
 
     They change with a setting's default, a new setting that is not in `YOUNGER`, or
-    `ALGORITHM_VERSION`, and then every run is trained anew: put new ones in only where that is
-    meant. Runs of version 2 are found by theirs for docs/lab/appendix.md.
+    `ALGORITHM_VERSION`, and then every run is retrained: change them only if that is
+    intended. Runs of version 2 are found by theirs for docs/lab/appendix.md.
     """
     sweep = plan(tmp_path, stages=[PRETRAIN, FINETUNE])
     assert {node.label: node.key for node in sweep.nodes} == KEYS

@@ -1,4 +1,4 @@
-"""Who may start when, and what a failure takes with it."""
+"""The order of nodes, and the effects of a failure."""
 
 import random
 from pathlib import Path
@@ -16,7 +16,7 @@ from music_rllib.tune.runner import DagSearcher
 
 @pytest.fixture
 def plan(tmp_path: Path) -> Plan:
-    """Two pretrained nodes; three finetuned from each; one more behind each of those."""
+    """Two pretrained nodes, three finetuned nodes from each, and one more from each of those."""
     document: dict[str, Any] = {
         "name": "s",
         "tasks": ["FetchPush"],
@@ -93,7 +93,7 @@ def test_a_failure_skips_exactly_its_dependents(plan: Plan) -> None:
 
 @pytest.mark.parametrize("seed", range(20))
 def test_every_node_starts_once_and_after_its_input(plan: Plan, seed: int) -> None:
-    """Plays Tune: asks the searcher, completes or fails running nodes in random order."""
+    """Imitates Tune: asks the searcher, finishes or fails running nodes in random order."""
     rng = random.Random(seed)
     scheduler = Scheduler(plan, finished=())
     searcher = DagSearcher(scheduler, lambda node: {"key": node.key})

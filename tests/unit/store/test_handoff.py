@@ -1,4 +1,4 @@
-"""Handoffs give back the same weights, and a changed handoff is refused."""
+"""Handoffs return the same weights, and a changed handoff is refused."""
 
 import json
 import pickle
@@ -48,7 +48,7 @@ def test_weights_round_trip(handoff: Path) -> None:
             expected = WEIGHTS[name][key]
             assert (array.shape, array.dtype) == (expected.shape, expected.dtype)
             np.testing.assert_array_equal(array, expected)
-            array += 1  # writable, and nobody else's
+            array += 1  # writable, and not shared
 
 
 @given(

@@ -68,7 +68,7 @@ def test_an_expired_lease_is_taken_over_and_its_old_owner_stops_writing(place: L
         held.check()
     assert not place.renew(theirs)
     held.release()
-    assert place.is_owned_by(mine.owner), "who lost it removes nothing"
+    assert place.is_owned_by(mine.owner), "the old owner removes nothing"
 
 
 def test_a_lease_is_renewed_while_it_is_held(place: LeaseFile) -> None:
@@ -143,7 +143,7 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
 def test_a_live_owner_keeps_its_lease_when_the_clock_jumps(
     place: LeaseFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """After a jump forwards or backwards the lease is renewed at once, by the new time."""
+    """After a jump, the lease is renewed at once with the new time."""
     monkeypatch.setattr(lease_module, "LOOK_SECONDS", 0.1)
     mine, day, jump = Lease.of_this_process("mine"), time.time, [0.0]
     place.acquire(mine)
@@ -155,7 +155,7 @@ def test_a_live_owner_keeps_its_lease_when_the_clock_jumps(
         while (now := place.read()) is None or not 0 < now.seconds <= 60:
             assert time.monotonic() < deadline
             time.sleep(0.05)
-        assert now.holds(), "the process is the same, whatever the time of day"
+        assert now.holds(), "the clock does not change the process"
     held.check()
     held.release()
 
@@ -163,7 +163,7 @@ def test_a_live_owner_keeps_its_lease_when_the_clock_jumps(
 def test_a_lease_dated_in_the_future_is_valid_while_renewed(
     place: LeaseFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The owner's clock is ahead, or this clock was set back after the owner died."""
+    """The owner's clock is fast, or this clock was set back after the owner died."""
     theirs, mine = elsewhere(seconds=3700.0), Lease.of_this_process("mine")
     steady, passed = time.monotonic, [0.0]
     monkeypatch.setattr(time, "monotonic", lambda: steady() + passed[0])
@@ -228,11 +228,11 @@ def test_a_lease_is_acquired_while_its_folder_is_deleted(tmp_path: Path) -> None
 def test_a_process_is_recognized_after_the_clock_changed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """psutil's time of the boot, from which it computes start times, jumps by an hour too."""
+    """psutil computes start times from the boot time, which jumps by an hour too."""
     mine = Lease.of_this_process("mine")
     boot = psutil.boot_time()
     for hours in (1, -1):
         monkeypatch.setattr(psutil._psplatform, "boot_time", lambda h=hours: boot + 3600 * h)
         assert mine.holds()
         assert runs_here(mine.pid, mine.process_started)
-    assert not runs_here(mine.pid, mine.process_started + 5), "another one with its number"
+    assert not runs_here(mine.pid, mine.process_started + 5), "another process with the same id"

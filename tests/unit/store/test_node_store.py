@@ -1,4 +1,4 @@
-"""The node store on a disk and in an object store."""
+"""The node store on a disk and in a bucket."""
 
 import errno
 import os
@@ -186,7 +186,7 @@ def test_verified_files_are_read_once_and_later_damage_is_found(
         local_store(tmp_path).publish(key, produced, RESULT)
     for _ in range(3):
         assert local_store(tmp_path).damage(keys) == {}
-    assert read == keys, "each once, by whatever process"
+    assert read == keys, "each is read once, by any process"
 
     weights = tmp_path / "storage" / "nodes" / keys[1] / "handoff" / "w.bin"
     times = weights.stat()
@@ -255,7 +255,7 @@ def test_sizes_are_checked_without_reading(store: NodeStore, produced: Path) -> 
 
 @pytest.mark.parametrize("mask", [0o022, 0o077, 0o007])
 def test_the_umask_decides_who_can_read_a_node(tmp_path: Path, produced: Path, mask: int) -> None:
-    """So a group can share a storage, and a single user can keep it private."""
+    """A group can share a storage, and a user can keep it private."""
     shutil.rmtree(tmp_path / "storage", ignore_errors=True)
     before = os.umask(mask)
     try:
@@ -392,7 +392,7 @@ def test_a_damaged_checkpoint_is_skipped_with_a_warning(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("keep", [1, 2])
 def test_checkpoints_after_damage_replace_the_damaged_ones(store: NodeStore, keep: int) -> None:
-    """The run begins anew, and has fewer steps than the damaged checkpoint for a while."""
+    """The run restarts, and has fewer steps than the damaged checkpoint for a while."""
     work = store.work_folder("0" * 20, keep)
     parts: list[str] = []
 
@@ -435,7 +435,7 @@ def test_storage_paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert open_storage("~/results").path == "/home/somebody/results"
     assert open_storage("file:///data/results").path == "/data/results"
     assert open_storage("/data/q%201?#").path == "/data/q%201?#"
-    for key in ("q%201", "a b#c", "ü/50%", "x+y=1,z"):  # as other clients of a bucket take it
+    for key in ("q%201", "a b#c", "ü/50%", "x+y=1,z"):  # as other clients of a bucket read them
         assert open_storage(f"s3://k:s%2F1@bucket/{key}?region=x").path == f"bucket/{key}"
 
 

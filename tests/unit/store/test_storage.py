@@ -1,4 +1,4 @@
-"""A storage that cannot be written is reported before anything starts, without leaving files."""
+"""Addresses of storages, and the checks before anything starts, which leave no files."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_devices_and_system_folders_are_refused(place: str) -> None:
 def test_a_folder_of_another_user_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The error is simulated, because root may write everywhere."""
+    """The error is simulated, because root can write everywhere."""
 
     def refuse(dir: Path) -> None:  # noqa: A002
         raise PermissionError(13, "Permission denied", str(dir))
@@ -99,7 +99,7 @@ def test_unknown_homes_and_invalid_text_are_refused() -> None:
 
 
 def test_a_bucket_that_does_not_answer_times_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The system accepts the connection, and nothing answers; the client would wait for minutes."""
+    """The connection is accepted but nothing answers; the client would wait for minutes."""
     monkeypatch.setattr(storage_module, "ANSWER_SECONDS", 1.0)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         uri = f"s3://key:secret@b/x?endpoint_override=127.0.0.1:{silent.getsockname()[1]}"
