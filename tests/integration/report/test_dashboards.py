@@ -1,4 +1,4 @@
-"""The dashboards against what they show: a real sweep, scraped by a real Prometheus."""
+"""The dashboards, with a sweep that Prometheus scrapes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def dashboard() -> dict[str, Any]:
 
 
 def queries() -> dict[str, str]:
-    """Every panel's query, with Grafana's variables as they are when all is chosen."""
+    """The query of each panel, with all values of Grafana's variables."""
     return {
         f"{panel['title']} {target['refId']}": re.sub(r"\$\w+", ".*", target["expr"])
         for panel in dashboard()["panels"]
@@ -39,7 +39,7 @@ def queries() -> dict[str, str]:
 
 
 def variables() -> list[tuple[str, str]]:
-    """(metric, label) of each variable's list of values."""
+    """(metric, label) of each variable."""
     found = [
         re.fullmatch(r"label_values\((\w+), (\w+)\)", variable["query"]["query"])
         for variable in dashboard()["templating"]["list"]
@@ -49,12 +49,12 @@ def variables() -> list[tuple[str, str]]:
 
 def test_the_dashboard_shows_every_gauge_and_no_other() -> None:
     shown = {name for query in queries().values() for name in re.findall(r"ray_(\w+)", query)}
-    # The updates that a run has done are for other dashboards.
+    # The number of updates is exported for other dashboards.
     assert shown | {"music_grad_updates"} == set(GAUGES)
     assert len(variables()) == 3
 
 
-def test_the_provisioning_belongs_together() -> None:
+def test_the_provisioning_is_consistent() -> None:
     grafana = DASHBOARDS / "grafana"
     sources = yaml.safe_load((grafana / "provisioning/datasources/prometheus.yml").read_text())
     (source,) = sources["datasources"]
@@ -71,7 +71,7 @@ def test_the_provisioning_belongs_together() -> None:
 
 
 class Prometheus:
-    """A server on the sweep's targets, with the repository's own configuration."""
+    """A server that scrapes the sweep with the repository's configuration."""
 
     def __init__(self, program: Path, folder: Path) -> None:
         self.address = f"127.0.0.1:{free_port()}"
@@ -97,7 +97,7 @@ class Prometheus:
             )
 
     def ask(self, query: str) -> list[dict[str, Any]]:
-        """An instant query's series; none while it starts."""
+        """The series of an instant query; empty while the server starts."""
         assert self.process.poll() is None, self.log.read_text()
         url = f"http://{self.address}/api/v1/query?{urlencode({'query': query})}"
         try:
@@ -119,7 +119,7 @@ def test_every_query_returns_data_of_a_running_sweep(
     prometheus: Prometheus, sweep_program: Any, sweep_document: dict[str, Any]
 ) -> None:
     sweep_document["name"] = "watched"
-    # Long enough to be looked at; it is stopped when everything has been seen.
+    # The sweep is stopped when every query has returned data.
     sweep_document["stages"] = sweep_document["stages"][:1]
     sweep_document["defaults"]["env_steps"] = 2_000_000
     sweep_program.write(sweep_document)
@@ -139,7 +139,7 @@ def test_every_query_returns_data_of_a_running_sweep(
     finally:
         process.terminate()
         output, errors = process.communicate(timeout=120)
-    assert ended is None, f"the sweep must not end before it is seen:\n{output}{errors}"
+    assert ended is None, f"the sweep must not end early:\n{output}{errors}"
     assert process.returncode == 128 + signal.SIGTERM
     assert "continue with: python -m music_rllib.sweep run sweep.yaml" in output
     assert not waiting, f"no data for {list(waiting)}"
@@ -148,7 +148,7 @@ def test_every_query_returns_data_of_a_running_sweep(
     assert success["metric"] == {"q": "1", "stage": "pretrain", "task": "Point"}
     assert 0 <= float(success["value"][1]) <= 1
     targets = sweep_program.folder / "results" / TARGETS
-    assert not list(targets.iterdir()), "what has ended is not scraped"
+    assert not list(targets.iterdir()), "a sweep that has ended is not scraped"
     states = {one["metric"]["state"]: one["value"][1] for one in seen["Runs by state A"]}
     assert states["started"] == "1"
     assert seen["Failed runs A"][0]["value"][1] == "0"
