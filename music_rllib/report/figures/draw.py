@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import re
+import textwrap
 from collections.abc import Sequence
 from itertools import chain
 from typing import Any
@@ -17,14 +18,15 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 
 from music_rllib.report.figures.choice import Drawing
-from music_rllib.report.figures.plots import Legend, Subplot, legend_handles
+from music_rllib.report.figures.plots import HEIGHT, Legend, Subplot, legend_handles
 
 TEXT_WIDTH = 7.16
 """Width in inches of a paper's text."""
 _ON_PAGE = 4.3
 """Width in inches, at which 10 pt are readable on a page of 400 px."""
 _PAGE_FONT, _PAPER_FONT = 10.0, 8.0
-_IN_A_ROW = 3
+_LETTER = 0.07
+"""Width in inches of a letter in a legend."""
 
 # Matplotlib draws with the first colors, and the page's own colors then replace them in the SVG.
 _STAND_INS = ("#010203", "#040506", "#070809")
@@ -100,13 +102,15 @@ def _settings(font: float, colors: tuple[str, str, str]) -> Any:
 
 def drawn_figure(subplots: Sequence[Subplot], legend: Legend, width: float) -> Figure:
     """A figure with the subplots in rows and the legend below them."""
-    columns = min(len(subplots), _IN_A_ROW) if width > _ON_PAGE else 1
+    has_rows = any(subplot.height > HEIGHT for subplot in subplots)
+    columns = min(len(subplots), 2 if has_rows else 3) if width > _ON_PAGE else 1
     rows = [subplots[i : i + columns] for i in range(0, len(subplots), columns)]
     scale = min(1.1, max(0.8, width / (columns * _ON_PAGE)))
     heights = [scale * max(subplot.height for subplot in row) for row in rows]
-    longest = max((len(label) for label, _ in legend), default=0)
-    entries = max(1, int(width / (0.5 + 0.07 * longest)))
-    lines = -(-len(legend) // entries)
+    legend = [(textwrap.fill(label, int(width / _LETTER)), style) for label, style in legend]
+    longest = max((len(line) for label, _ in legend for line in label.split("\n")), default=0)
+    entries = max(1, int(width / (0.5 + _LETTER * longest)))
+    lines = sum(label.count("\n") + 1 for label, _ in legend) / entries
     figure = Figure(figsize=(width, sum(heights) + 0.2 * lines), layout="constrained")
     grid = figure.subplots(len(rows), columns, squeeze=False, height_ratios=heights)
     for axes in grid.flat[len(subplots) :]:

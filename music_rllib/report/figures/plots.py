@@ -121,9 +121,9 @@ def _draw_curve(axes: Axes, curve: Curve, style: Style, stagger: float) -> None:
         linestyle=style.line,
         lw=1.8,
         marker=style.marker,
-        # Markers of lines that coincide stand beside each other.
+        # Markers of lines that coincide are at different points, or smaller on top of larger ones.
         markevery=(int(stagger * every), every),
-        markersize=5,
+        markersize=7.5 - 3 * stagger,
     )
 
 
