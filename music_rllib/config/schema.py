@@ -246,7 +246,8 @@ class Stage:
         """
         yield from (({}, point) for point in self.points)
         if self.search is not None:
-            for values in (*(at for _, at in self.search.examples()), *self.search.compared()):
+            ends = [at for place, at in self.search.examples() if place[0] == "space"]
+            for values in (*ends, *self.search.compared()):
                 own = {name: value for name, value in values.items() if ":" not in name}
                 with contextlib.suppress(ConfigError):
                     yield values, self.resolve(own)
