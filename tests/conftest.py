@@ -65,7 +65,7 @@ LONG = (
     "integration/report/test_report.py",
     "integration/sweep/test_sweep_trainable.py",
     "integration/search/test_search_played.py",
-    "integration/algorithm/test_direct_updates.py",
+    "integration/algorithm/test_compiled_updates.py",
     "integration/tracking/test_mlflow_tracking.py",
     "integration/project/test_first_hour.py",
     "integration/algorithm/test_learning.py",

@@ -114,24 +114,31 @@ class FusedAdam(torch.optim.Adam):
     """
 
     add_param_group = unwrap(torch.optim.Adam.add_param_group)
-    load_state_dict = unwrap(torch.optim.Adam.load_state_dict)
     state_dict = unwrap(torch.optim.Adam.state_dict)
     zero_grad = unwrap(torch.optim.Adam.zero_grad)
 
     def __init__(self, parameters: Iterable[Tensor], lr: float) -> None:
         super().__init__(list(parameters), lr=lr, fused=True)
-        self._flat_state: Any = None
-        """The `state` whose tensors are views of `_moments`; loading a state replaces it."""
         self._moments: tuple[Tensor, Tensor, Tensor] | None = None
-        """Flat first and second moments [S], and the number of steps [1]."""
+        """Flat first and second moments [S] and the number of steps [1], of which the state's
+        tensors are views; None before the first compiled step and after a loaded state."""
 
     @torch.no_grad()
     def step(self, closure: Any = None) -> Any:
         """Take one step by the parameters' gradients, without compiled code."""
+        if self._moments is not None:
+            self._separate_counters()
+        return unwrap(torch.optim.Adam.step)(self, closure)
+
+    def load_state_dict(self, state_dict: Any) -> None:
+        unwrap(torch.optim.Adam.load_state_dict)(self, state_dict)
+        self._separate_counters()
+
+    def _separate_counters(self) -> None:
+        """Give each parameter its own step counter; compiled steps share one."""
         self._moments = None
         for state in self.state.values():
-            state["step"] = state["step"].clone()  # compiled steps share one counter
-        return unwrap(torch.optim.Adam.step)(self, closure)
+            state["step"] = state["step"].clone()
 
     def step_of(self, flat: FlatParameters) -> AdamStep:
         """The arguments of `adam_step` for a step of all parameters by the gradients of `flat`.
@@ -139,8 +146,8 @@ class FusedAdam(torch.optim.Adam):
         `flat` has this optimizer's parameters, in their order, on a CPU.
         """
         group = self.param_groups[0]
-        if self._moments is None or self._flat_state is not self.state:
-            self._moments, self._flat_state = self._flattened(flat), self.state
+        if self._moments is None:
+            self._moments = self._flattened(flat)
         means, squares, steps = (moments.numpy() for moments in self._moments)
         beta1, beta2 = group["betas"]
         return AdamStep(
