@@ -113,7 +113,7 @@ def test_mlflows_own_variable_stands_in_for_an_absent_setting(
     monkeypatch.setenv("MLFLOW_TRACKING_URI", "./mlruns")
     result = program(document(), command="plan")
     assert result.exit_code == 2
-    assert "MLFLOW_TRACKING_URI) must be null (a sqlite file" in result.stderr
+    assert "MLFLOW_TRACKING_URI) must be null (an SQLite file" in result.stderr
 
 
 BAD: list[tuple[Document, str]] = [
@@ -357,9 +357,9 @@ def test_values_of_the_command_line_are_recorded(
 
 
 def test_without_a_file_the_command_line_changes_the_packaged_sweep(program: Program) -> None:
-    result = program(None, "plan", "seeds=2", "stages.reach.grid.tac.entropic_index=[3]")
+    result = program(None, "plan", "seeds=2", "stages.reach.grid.tac.entropic_index=[1, 1.5, 2, 3]")
     assert result.exit_code == 0, result.stderr
-    assert "2 seeds\n  tac.entropic_index: 3\n" in result.output
+    assert "2 seeds\n  tac.entropic_index: 1, 1.5, 2, 3\n" in result.output
 
 
 LONG = "x" * 300
