@@ -122,11 +122,9 @@ class NodeStore(SealedFolders):
 
     @contextlib.contextmanager
     def files(self, key: str) -> Iterator[Path]:
-        """Yield a finished node's folder; of a bucket, a verified copy that is deleted at the end.
-
-        On a disk, the caller verifies what it reads: a handoff has hashes of its own.
-        """
+        """Yield a finished node's verified folder; of a bucket, a copy that is deleted at the end."""
         if self._root.is_local:
+            self.check(key)
             yield Path(self.path(key))
             return
         with TemporaryDirectory(prefix="music-rllib-node-") as copy:
