@@ -122,7 +122,7 @@ class NodeStore(SealedFolders):
 
     @contextlib.contextmanager
     def files(self, key: str) -> Iterator[Path]:
-        """Yield a finished node's verified folder; of a bucket, a copy that is deleted at the end."""
+        """Yield a finished node's folder, verified; of a bucket, a temporary copy."""
         if self._root.is_local:
             self.check(key)
             yield Path(self.path(key))
