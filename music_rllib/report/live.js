@@ -2,7 +2,7 @@
 "use strict";
 
 const asked = (path) => fetch(path, { cache: "no-store" });
-const PARTS = ["facts", "notes", "answer", "curves", "groups", "searches", "origin"];
+const PARTS = ["facts", "notes", "answer", "curves", "details", "groups", "searches", "origin"];
 let version = 0;
 
 function time(seconds) {
@@ -60,9 +60,11 @@ function showState(state) {
   }
   const bars = element("div", { class: "bars" }, box);
   for (const stage of state.stages ?? []) {
-    const counts = Object.entries(stage.runs), all = counts.reduce((sum, [, n]) => sum + n, 0);
-    const over = (stage.runs.finished ?? 0) + (stage.runs.reused ?? 0) + (stage.runs.failed ?? 0) + (stage.runs.pruned ?? 0);
-    bar(bars, stage.name, over, all, counts.map(([name, n]) => `${n} ${name}`).join(", "));
+    const { finished: own = 0, reused = 0, ...others } = stage.runs;  // a reused run is a finished one
+    const finished = own + reused, counts = Object.entries(others);
+    const all = counts.reduce((sum, [, n]) => sum + n, finished);
+    const texts = [`${finished} of ${all} finished${reused ? ` (${reused} reused)` : ""}`, ...counts.map(([name, n]) => `${n} ${name}`)];
+    bar(bars, stage.name, finished + (stage.runs.failed ?? 0) + (stage.runs.pruned ?? 0), all, texts.join(", "));
   }
   for (const run of state.running ?? []) {
     const steps = `${run.env_steps.toLocaleString("en")} of ${run.budget.toLocaleString("en")}`;

@@ -48,6 +48,7 @@ def study_tables(study: Study) -> list[Table]:
     claims = (*study.planned, *study.unplanned)
     measures = " or ".join(dict.fromkeys(claim.measure.words for claim in claims))
     comparisons = Table(
+        name="comparisons",
         title=f"Comparisons by the {kind}",
         header=("Task", "Pair", "Difference", "Interval", "p", "Verdict", "Planned", "Seeds"),
         rows=[
@@ -69,6 +70,7 @@ def study_tables(study: Study) -> list[Table]:
         "for all comparisons if there is no plan. A failed run counts with the worst value.",
     )
     means = Table(
+        name="area_under_curve",
         title=f"{kind.capitalize()} of each condition",
         header=("Task", "Condition", "Measure", "Mean", "Each seed", "Finished", "Runs"),
         rows=[

@@ -62,7 +62,9 @@ def answer(sweep: Sweep, study: Study) -> list[str]:
     sentences.append(f"Control: {_control(sweep, study, study.stage)}.")
     undecided = (Verdict.UNDECIDED, Verdict.NONE)
     if any(claim.verdict in undecided and not claim.unfinished for claim in study.claims):
-        sentences += filter(None, [seeds_needed(shown, study.means, study.family)])
+        alike = _alike(shown)
+        means = [one for one in study.means if _is_alike(one, alike)]
+        sentences += filter(None, [seeds_needed(alike, means, study.family)])
     return [*sentences, *(f"Not tested: {text}." for text in study.untested[:1])]
 
 
@@ -147,12 +149,22 @@ def _metric(study: Study, shown: Sequence[Claim]) -> str:
     measure = (shown[0] if shown else study.means[0]).measure
     area = " (area under the learning curve)" if measure.kind == "auc" else ""
     text = f"Metric: {measure.words}{area}"
-    margins = {one.margin for one in shown if one.margin is not None}
+    # A margin of success rates is none of returns.
+    margins = {one.margin for one in _alike(shown) if one.margin is not None}
     if margins:
         text += f"; equivalence margin {max(margins):g}"
     if study.family > 1:
         text += f"; p-values adjusted for {study.family} comparisons (Holm)"
     return f"{text}."
+
+
+def _is_alike(one: Claim | Mean, shown: Sequence[Claim]) -> bool:
+    return not shown or one.measure.metric == shown[0].measure.metric
+
+
+def _alike(shown: Sequence[Claim]) -> list[Claim]:
+    """The claims about the metric of the first one."""
+    return [claim for claim in shown if _is_alike(claim, shown)]
 
 
 def _seeds(sweep: Sweep, study: Study, shown: Sequence[Claim]) -> str:

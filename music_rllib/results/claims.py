@@ -227,6 +227,8 @@ class Claim:
     contrast: Contrast
     pairs: Pairs = field(repr=False)
     """Pairs of conditions over which the difference is averaged."""
+    asked: int = 0
+    """Number of planned runs of both sides."""
     unfinished: int = 0
     """Number of planned runs of both sides that are neither finished nor failed."""
     p_value: float | None = None
@@ -298,6 +300,7 @@ def claims_of(
                 for side in (0, 1)
             ]
             tested = _contrast(*sides, margin=own_margin)
+            asked = [max(one.runs, seeds) for side in sides for one in side]
             if tested is not None:
                 yield Claim(
                     first=first,
@@ -307,6 +310,7 @@ def claims_of(
                     margin=own_margin,
                     contrast=tested,
                     pairs=pairs,
+                    asked=sum(asked),
                     unfinished=sum(
                         max(one.unfinished, seeds - len(one.by_seed))
                         for side in sides
@@ -360,8 +364,9 @@ def _decided(claim: Claim) -> Claim:
     """The claim with its verdict, or with the reason for having none."""
     seeds = min(claim.contrast.seeds)
     if claim.unfinished:
-        runs = "1 run is" if claim.unfinished == 1 else f"{claim.unfinished} runs are"
-        return replace(claim, why=f"{runs} not finished")
+        are = "is" if claim.unfinished == 1 else "are"
+        runs = f"{claim.unfinished} of {claim.asked} planned runs {are} not finished"
+        return replace(claim, why=runs)
     if seeds < FEWEST_SEEDS:
         count = "1 seed" if seeds == 1 else f"{seeds} seeds"
         return replace(claim, why=f"{count}: no verdict below {FEWEST_SEEDS}")

@@ -67,6 +67,8 @@ class Scores:
     """Mean variance of a rate's score from its evaluation episodes alone; 0 if unknown."""
     failed: int
     """Number of failed runs."""
+    runs: int
+    """Number of all runs."""
     unfinished: int
     """Number of runs that are neither finished nor failed."""
 
@@ -181,6 +183,7 @@ def scores_of(sweep: Sweep, condition: Condition, task: str, measure: Measure) -
         episodes=float(np.mean(episodes)) if episodes else np.inf,
         noise=float(np.mean(noise)) if noise and measure.is_rate else 0.0,
         failed=failed,
+        runs=sum(sweep.runs[run].task == task for run in condition.runs),
         unfinished=unfinished,
     )
 

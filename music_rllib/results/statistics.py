@@ -311,17 +311,20 @@ def number(value: float | Array) -> str:
 
 
 def with_interval(value: float | None, ends: Sequence[float | None] | None) -> str:
-    """`0.45 [0.3, 0.6]`, or `0.45` without an interval; digits beyond the width are rounded off."""
+    """`0.45 [0.30, 0.60]`, or `0.45` without an interval.
+
+    Two decimals, none from 100 on, and as many as a narrower interval needs.
+    """
     if value is None:
         return "-"
     low, high = ends or (None, None)
     if low is None or high is None or low != low or high != high:
-        return f"{value:.3g}"
-    if not 0 < high - low < math.inf:
-        return f"{value:.3g} [{low:.3g}, {high:.3g}]"
-    digits = 1 - math.floor(math.log10(high - low))
-    value, low, high = (round(number, digits) + 0.0 for number in (value, low, high))
-    return f"{value:.10g} [{low:.10g}, {high:.10g}]"
+        return number(value) if abs(value) >= 100 else f"{value:.3g}"
+    decimals = 0 if max(abs(value), abs(low), abs(high)) >= 100 else 2
+    if 0 < high - low < math.inf:
+        decimals = max(decimals, -math.floor(math.log10(high - low)))
+    value, low, high = (round(one, decimals) + 0.0 for one in (value, low, high))
+    return f"{value:,.{decimals}f} [{low:,.{decimals}f}, {high:,.{decimals}f}]"
 
 
 def interval_text(estimate: Estimate) -> str:

@@ -225,11 +225,12 @@ def best_text(best: Mapping[str, Any]) -> str:
     )
     number = with_interval(best["value"], best["interval"])
     runs, planned = best["runs"], best.get("planned", best["runs"])
-    level = f" and {best['level']} more" if best.get("level") else ""  # they tie
+    level = f", tied with {best['level']} more" if best.get("level") else ""
     text = f"{best['stage']} {values}".rstrip() + f"{level}: {best.get('by', 'success')} {number}, "
     if runs < planned:
         text += f"{runs} of {planned} runs (no condition has all of its runs yet)"
     else:
         text += f"{in_runs(runs)}{' on fresh seeds' if best['on_fresh_seeds'] else ''}"
     entropy = best.get("entropies", {}).get(names.SHANNON_ENTROPY)
-    return text if entropy is None else f"{text}, entropy {entropy['value']:.3g} nats"
+    # Conditions with the same value differ in their entropies.
+    return text if entropy is None or level else f"{text}, entropy {entropy['value']:.3g} nats"

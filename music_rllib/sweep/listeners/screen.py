@@ -209,13 +209,13 @@ class Display(Listener):
         return Group(table, *texts, *([Text(best)] if best else []))
 
     def _summary(self) -> str:
-        """`1 of 4 runs done, 8,000 of 24,000 env steps, 1:02 passed, about 2:10 left`."""
+        """`1 of 4 runs finished, 8,000 of 24,000 env steps, 1:02 passed, about 2:10 left`."""
         done = self._scheduler.having(Status.FINISHED, Status.REUSED)
         steps = sum(node.run.env_steps for node in done)
         steps += sum(throughput.env_steps for _, throughput in self._running.values())
         steps += sum(self._spent.values())
         text = (
-            f"{len(done)} of {len(self._plan.nodes)} runs done, "
+            f"{len(done)} of {len(self._plan.nodes)} runs finished, "
             f"{steps:,} of {self._plan.env_steps:,} env steps, "
             f"{clock(self._now() - self._began)} passed"
         )

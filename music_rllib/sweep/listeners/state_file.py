@@ -13,7 +13,7 @@ import socket
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Self
 
 from music_rllib.config.run_settings import VARIANTS
@@ -138,8 +138,7 @@ class StateFile(Listener):
     def headline(self) -> tuple[list[str], str | None]:
         """A line for each stage and for each study of a search, and the best condition so far."""
         lines = [
-            f"{stage['name']}: "
-            + ", ".join(f"{count} {status}" for status, count in stage["runs"].items())
+            f"{stage['name']}: {_counts_text(stage['runs'])}"
             for stage in self._state["stages"]
             if stage["runs"]
         ]
@@ -257,6 +256,15 @@ class StateFile(Listener):
             self._written_trials = trials
             plan = sweep_files.as_json(plan_document(self._sweep))
             self._sweep.location.keep(sweep_files.PLAN, plan)
+
+
+def _counts_text(runs: Mapping[str, int]) -> str:
+    """`5 finished (4 reused), 3 waiting`: a reused run is a finished one."""
+    reused = runs.get("reused", 0)
+    finished = runs.get("finished", 0) + reused
+    counts = {name: n for name, n in runs.items() if name not in ("finished", "reused")}
+    texts = [f"{finished} finished" + (f" ({reused} reused)" if reused else "")] * (finished > 0)
+    return ", ".join([*texts, *(f"{count} {status}" for status, count in counts.items())])
 
 
 def _checkpointed_steps(sweep: OpenSweep) -> dict[str, int]:

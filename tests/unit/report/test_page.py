@@ -722,3 +722,23 @@ def test_subplots_with_many_lines_have_no_bands() -> None:
         assert ("95% confidence band" in drawing.caption) is has_bands
         axes = drawn_figure(drawing.subplots, [], TEXT_WIDTH).axes[0]
         assert any(isinstance(one, PolyCollection) for one in axes.collections) is has_bands
+
+
+def test_the_curve_comes_before_small_text_and_each_file_is_linked(tmp_path: Path) -> None:
+    report = build_report(compared({"1": LOW, "1.5": HIGH}))
+    page = write_report(report, tmp_path).read_text()
+    curve, details, groups = (
+        page.index(f'id="{name}"') for name in ("curves", "details", "groups")
+    )
+    assert curve < details < groups
+    links = re.findall(r'<a href="([^"#]+)" download>', page)
+    assert {Path(link).suffix for link in links} == {".svg", ".png", ".csv"}
+    assert {"tables/comparisons.csv", "tables/runs.csv"} <= set(links)
+    assert all((tmp_path / link).is_file() for link in links)
+    assert "download>" not in render(report, live=True)
+
+
+def test_paper_shows_whole_tables() -> None:
+    css = Path(music_rllib.__file__).with_name("report").joinpath("page.css").read_text()
+    printed = css.partition("@media print {")[2]
+    assert re.search(r"th, td, td\.long \{ white-space: normal;", printed)

@@ -280,7 +280,7 @@ def test_damaged_runs_raise_or_count_as_unfinished(tmp_path: Path) -> None:
     assert bad.label in read.damaged
     assert [run.status for run in read.sweep.runs].count("FINISHED") == 5
     study = study_of(read.sweep)
-    assert [claim.why for claim in study.claims] == ["1 run is not finished"]
+    assert [claim.why for claim in study.claims] == ["1 of 6 planned runs is not finished"]
     assert sum(mean.scores.failed for mean in study.means) == 0, "a damaged run is no bad one"
     (row,) = failures_table(read.sweep).rows
     assert row[0] == bad.label

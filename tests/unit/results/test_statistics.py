@@ -165,3 +165,19 @@ def test_the_interval_of_a_median_leaves_out_as_many_runs_as_possible() -> None:
     assert median(steps[:5], [True] * 5)[1:] == (1, 5)
     assert median(steps[:11], [True] * 11)[1:] == (3, 9)
     assert median(steps, [True] * 12)[1:] == (3, 10)
+
+
+@pytest.mark.parametrize(
+    ("value", "ends", "text"),
+    [
+        (0.7, (5.83e-42, 1.0), "0.70 [0.00, 1.00]"),
+        (1.0, (0.964, 1.0), "1.00 [0.96, 1.00]"),
+        (-458.0, (-3030.0, 2110.0), "-458 [-3,030, 2,110]"),
+        (0.3004, (0.3, 0.301), "0.300 [0.300, 0.301]"),
+        (-3030.0, None, "-3,030"),
+    ],
+)
+def test_a_value_and_its_interval_have_the_same_decimals(
+    value: float, ends: tuple[float, float] | None, text: str
+) -> None:
+    assert s.with_interval(value, ends) == text

@@ -330,11 +330,11 @@ def test_failed_runs_have_the_worst_score_and_unfinished_ones_block_a_verdict(
     assert worse.scores.finished == 9
     assert "3 failed runs count with the worst value" in " ".join(answer(sweep, found))
     _, found = with_status("RUNNING")
-    assert found.planned[0].why == "3 runs are not finished"
+    assert found.planned[0].why == "3 of 24 planned runs are not finished"
     # A planned seed that has not started counts as unfinished.
     more = with_plan((), plan("q = 1.5 against q = 1", seeds=", ".join(map(str, range(13)))), 5)
     (claim,) = study_of(sweep_of(runs, more)).planned
-    assert claim.why == "2 runs are not finished"
+    assert claim.why == "2 of 26 planned runs are not finished"
 
 
 @pytest.mark.parametrize("reward_range, worst", [("[-1.0, 0.0]", -50.0), ("None", -20.0)])
@@ -496,3 +496,22 @@ def test_an_edited_plan_is_refused() -> None:
     document[0]["plan"]["margin"] = 0.2
     with pytest.raises(ValueError, match="the hash that it was recorded with"):
         checked_plans(document)
+
+
+def test_a_margin_of_success_is_not_named_beside_a_return(rng: np.random.Generator) -> None:
+    def of_task(task: str, key: str, metric: str) -> list[tuple[RunRecord, Points]]:
+        settings = [{"tac.entropic_index": q, "task.success_key": key} for q in ("1", "1.5")]
+        made = [run(own, seed, 0.3, rng, task) for own in settings for seed in range(6)]
+        swapped = {names.EVAL_SUCCESS: metric}
+        return [
+            (record, points._replace(metrics=[swapped.get(one, one) for one in points.metrics]))
+            for record, points in made
+        ]
+
+    runs = of_task("Reacher", "None", names.EVAL_RETURN)
+    runs += of_task("FetchPush", "is_success", names.EVAL_SUCCESS)
+    sweep = sweep_of(runs)
+    said = " ".join(answer(sweep, study_of(sweep)))
+    assert "Metric: mean return" in said
+    assert "margin" not in said
+    assert "standard deviation" not in said

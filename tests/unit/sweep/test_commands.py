@@ -354,7 +354,7 @@ def test_the_first_of_equals_is_not_named_alone(
             finish(sweep, state_file, node, value, tmp_path / "made")
         state_file.end("finished")
     said = program("status", f"{storage}/mine").output
-    assert "Best so far: train q = 1.5 and 1 more: success 1" in said
+    assert "Best so far: train q = 1.5, tied with 1 more: success 1, 1 run\n" in said
 
 
 def test_tasks_without_success_are_judged_by_their_return(
@@ -837,3 +837,11 @@ def test_a_search_asks_for_no_more_once_its_finalists_run(tmp_path: Path) -> Non
     assert env_steps_to_come() == (3 + 2) * 4000
     sweep.plan.add_trial("train", 0, {"tac.lr": 1e-3}, [1000, 1001], "final0")
     assert env_steps_to_come() == 0
+
+
+def test_reused_runs_count_as_finished_in_the_lines_of_stages(tmp_path: Path, storage: str) -> None:
+    with StateFile(opened(storage, tmp_path)) as state_file:
+        state_file._state["stages"] = [
+            {"name": "train", "runs": {"waiting": 3, "reused": 4, "finished": 1}}
+        ]
+        assert state_file.headline()[0] == ["train: 5 finished (4 reused), 3 waiting"]

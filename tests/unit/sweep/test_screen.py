@@ -241,7 +241,7 @@ def test_a_terminal_shows_a_live_table(plan: Plan) -> None:
     assert "1,000 / 2,000" in live
     assert "100" in live
     assert "20 %" in live
-    assert "0 of 6 runs done, 1,000 of 24,000 env steps, 0:12 passed" in live
+    assert "0 of 6 runs finished, 1,000 of 24,000 env steps, 0:12 passed" in live
     # What is left is 1,000 steps of this run and two of 5,000, at 100 a second.
     assert "about 1:50 left" in live
 
@@ -316,7 +316,7 @@ def test_what_a_failed_run_has_spent_stays_spent(plan: Plan) -> None:
         play(display, plan, scheduler, time)
         scheduler.fail(plan.nodes[0].key)
         display.failed(plan.nodes[0], Failure("RuntimeError: it broke", Path("/logs/x.txt")))
-        assert display._summary().startswith("0 of 6 runs done, 1,000 of 24,000 env steps")
+        assert display._summary().startswith("0 of 6 runs finished, 1,000 of 24,000 env steps")
 
 
 def test_pace_is_that_of_the_last_reports() -> None:
