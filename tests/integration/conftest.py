@@ -63,15 +63,17 @@ class Program:
 
     folder: Path
     environment: dict[str, str]
+    file: str = "sweep.yaml"
+    """The sweep's file below `folder`."""
 
     def write(self, document: dict[str, Any]) -> None:
         """Put `document` where the program reads it."""
-        (self.folder / "sweep.yaml").write_text(yaml.safe_dump(document, sort_keys=False))
+        (self.folder / self.file).write_text(yaml.safe_dump(document, sort_keys=False))
 
     def start(self, *options: str, command: str = "run") -> subprocess.Popen[str]:
         """Start it, in a process group of its own."""
         return subprocess.Popen(
-            [sys.executable, "-m", "music_rllib.sweep", command, "sweep.yaml", *options],
+            [sys.executable, "-m", "music_rllib.sweep", command, self.file, *options],
             cwd=self.folder,
             env=self.environment,
             stdout=subprocess.PIPE,

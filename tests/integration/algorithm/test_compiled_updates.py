@@ -350,19 +350,41 @@ def test_learning_rates_of_rllibs_schedulers_are_used() -> None:
     assert algo.learner_group._learner._adam["networks"].param_groups[0]["lr"] == 1e-3 / 4
 
 
-def test_the_learner_accepts_read_only_arrays() -> None:
+def read_only(value: Any) -> Any:
+    """Nested dictionaries with copies of their arrays, as RLlib gets them from another process."""
+    if isinstance(value, dict):
+        return {key: read_only(inner) for key, inner in value.items()}
+    if isinstance(value, np.ndarray):
+        value = value.copy()
+        value.flags.writeable = False
+    return value
+
+
+def test_the_learner_accepts_read_only_arrays(monkeypatch: pytest.MonkeyPatch) -> None:
     """RLlib's arrays from another process are read-only; PyTorch would print a warning."""
     algo = build(music={"estimator": "frozen", "prioritise_replay": True})
     learner_ = algo.learner_group._learner
+    update = learner_.update
+
+    def from_afar(*args: Any, training_data: Any, **kwargs: Any) -> Any:
+        for columns in training_data.batch.policy_batches.values():
+            columns.update({name: read_only(values) for name, values in columns.items()})
+        return update(*args, training_data=training_data, **kwargs)
+
+    monkeypatch.setattr(learner_, "update", from_afar)
     episodes = algo.env_runner.sample(random_actions=True)
     for episode in episodes:
         for array in (episode.frames, episode.actions, episode.rewards):
             array.flags.writeable = False
+    torch.set_warn_always(True)  # by default PyTorch prints this warning once per process
     with warnings.catch_warnings():
-        warnings.simplefilter("error")
+        warnings.filterwarnings("error", ".*not writable")
         learner_.observe_inputs(episodes[0].frames[:, : learner_._policy_module.input_size])
         learner_.trajectory_priorities(episodes)
         learner_.diagnose(episodes)
+        learner_.set_state(read_only(learner_.get_state()))
+        algo.train()
+    assert algo.grad_updates
 
 
 def test_a_converted_module_keeps_learning() -> None:

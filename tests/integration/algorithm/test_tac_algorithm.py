@@ -310,6 +310,22 @@ def test_own_networks_act_learn_and_are_restored(tmp_path: Path) -> None:
     assert fingerprint(resumed, 1) == fingerprint(algo, 1)
 
 
+def test_a_module_acts_in_unit_bounds_that_scale_to_those_of_pendulum() -> None:
+    """`forward_inference` as docs/api.md describes it: [-1, 1] for the torques of [-2, 2]."""
+    algo: TAC = TACConfig().environment("Pendulum-v1").training(hidden_sizes=[8]).build_algo()
+    module, box = algo.env_runner.module, gym.spaces.Box(-2.0, 2.0, (1,))
+    inputs = torch.linspace(-1.0, 1.0, 24).reshape(8, 3)
+    for bias, torque in ((20.0, 2.0), (-20.0, -2.0)):
+        with torch.no_grad():
+            list(module.policy.parameters())[-1][0] = bias  # the mean before tanh
+        for forward in (module.forward_inference, module.forward_exploration):
+            action = forward({"obs": inputs})["actions"].numpy()
+            np.testing.assert_allclose(action, np.sign(bias), atol=1e-3)
+            scaled = box.low + (action + 1) / 2 * (box.high - box.low)
+            np.testing.assert_array_equal(scaled, algo.env_runner._to_env(action))
+            np.testing.assert_allclose(scaled, torque, atol=2e-3)
+
+
 @pytest.mark.parametrize("settings", [HER, DDPG], ids=["tac", "ddpg"])
 def test_target_networks_have_no_autograd_history(settings: dict[str, Any]) -> None:
     """Otherwise each update of the averages would stay in memory, half a kilobyte per tensor."""

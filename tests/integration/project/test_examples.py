@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
@@ -33,6 +34,11 @@ def printed(folder: Path, program: str, *arguments: str) -> str:
 def test_an_own_environment_is_learned(tmp_path: Path) -> None:
     rates = re.findall(r"success (\d+)%", printed(tmp_path, "own_environment.py"))
     assert int(rates[-1]) >= 80 > int(rates[0])
+
+
+def test_own_networks_learn(tmp_path: Path) -> None:
+    first, *_, last = json.loads(printed(tmp_path, "own_networks.py"))
+    assert first < -900 < -600 < last
 
 
 def test_a_restored_algorithm_continues(tmp_path: Path) -> None:

@@ -300,8 +300,10 @@ class Jobs:
             folder / "music_rllib",
             ignore=shutil.ignore_patterns("__pycache__"),
         )
-        shutil.copy(ENVIRONMENTS / "point_env.py", folder)
-        (folder / "sweep.yaml").write_text(yaml.safe_dump(sweep, sort_keys=False))
+        lab = folder / "lab"  # the module lies beside the sweep's file, not in the job's folder
+        lab.mkdir()
+        shutil.copy(ENVIRONMENTS / "point_env.py", lab)
+        (lab / "sweep.yaml").write_text(yaml.safe_dump(sweep, sort_keys=False))
 
     def call(
         self, head: Head, *arguments: str, token: str = TOKEN
@@ -321,7 +323,7 @@ class Jobs:
         arguments = ["--working-dir", str(self.folder), "--submission-id", job]
         arguments += ["--runtime-env-json", json.dumps({"env_vars": STOP})]
         arguments += [] if wait else ["--no-wait"]
-        program = ["python", "-m", "music_rllib.sweep", "sweep.yaml", *options]
+        program = ["python", "-m", "music_rllib.sweep", "lab/sweep.yaml", *options]
         return self.call(head, "submit", *arguments, "--", *program, token=token)
 
     def wait_for_log(self, head: Head, job: str, wanted: str) -> str:

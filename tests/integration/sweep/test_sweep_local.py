@@ -49,7 +49,8 @@ class Ended(NamedTuple):
 def ended(tmp_path_factory: pytest.TempPathFactory) -> Ended:
     """A sweep on two tasks without success, one of which fails in its 300th step.
 
-    Their module lies beside the file, as do some with the names of Python's own.
+    Their module lies beside the file, in another folder than the current one, as do some with the
+    names of Python's own.
     """
     point = POINT | {"success_key": None}
     document = SWEEP | {
@@ -57,11 +58,13 @@ def ended(tmp_path_factory: pytest.TempPathFactory) -> Ended:
         "environments": {"Broken": point | {"env_kwargs": {"fail_at": 300}}, "Point": point},
         "defaults": SWEEP["defaults"] | {"env_steps": 800},
     }
-    program = Program(tmp_path_factory.mktemp("ended"), program_environment())
+    folder = tmp_path_factory.mktemp("ended")
+    program = Program(folder, program_environment(), "lab/sweep.yaml")
+    (folder / "lab").mkdir()
     program.write(document)
-    shutil.copy(ENVIRONMENTS / "point_env.py", program.folder)
+    shutil.copy(ENVIRONMENTS / "point_env.py", folder / "lab")
     for name in ("random", "types", "queue", "secrets"):
-        (program.folder / f"{name}.py").write_text("raise RuntimeError('not this one')")
+        (folder / "lab" / f"{name}.py").write_text("raise RuntimeError('not this one')")
     # `python -m` finds modules in the current folder first, where `music-rllib` does not.
     program.environment |= {"PYTHONPATH": str(REPOSITORY), "PYTHONSAFEPATH": "1"}
     program.environment[names.VARIABLE_REPORT] = "on"
