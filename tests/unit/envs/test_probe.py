@@ -42,6 +42,7 @@ def probed(
     monkeypatch: pytest.MonkeyPatch, kind: type[Sound], *, hindsight: bool = False, **task: Any
 ) -> Probe:
     monkeypatch.setattr(probe, "MOST_STEPS", 3000)
+    monkeypatch.setattr(probe, "MOST_SECONDS", 60.0)  # on a busy machine, too
     # An id of its own: Gymnasium warns of one that is registered again.
     name = f"Probed{kind.__name__}{id(kind)}-v0"
     gym.register(name, entry_point=lambda **_: kind(), max_episode_steps=20)
