@@ -52,8 +52,8 @@ def make_importable(module: str) -> None:
     if spec is None and top not in sys.modules:
         raise ModuleNotFoundError(
             f"there is no module {top!r}: it must be installed, on PYTHONPATH, beside the sweep's "
-            f"file or in the current folder (it is not in {', '.join(_folders)}). A sweep that is "
-            "resumed from its storage has no file: resume it from the module's folder",
+            f"file or in the current folder (it is not in {', '.join(_folders)}). Start a "
+            "resumed sweep, or the run.yaml of `best`, in the module's folder",
             name=top,
         )
     origin = spec.origin if spec else getattr(sys.modules[top], "__file__", "built-in")

@@ -155,7 +155,8 @@ def test_a_module_that_is_missing_or_hidden_is_named(
     monkeypatch.setattr("music_rllib.envs.modules._folders", {})
     monkeypatch.setattr(sys, "path", [*sys.path])
     search_in(tmp_path)
-    with pytest.raises(ModuleNotFoundError, match=rf"no module 'lab_nowhere'.*{tmp_path}"):
+    said = rf"no module 'lab_nowhere'.*{tmp_path}.*run\.yaml of `best`, in the module's folder"
+    with pytest.raises(ModuleNotFoundError, match=said):
         make_env("lab_nowhere:Lab-v0")
     (tmp_path / "queue.py").write_text("raise RuntimeError('hidden')")
     with pytest.raises(ImportError, match=r"'queue' of .* must have another name: Python has one"):
