@@ -596,6 +596,9 @@ def server(
 
 def test_a_view_is_saved_if_mlflow_has_a_known_version(tracker_on: MakeTracker) -> None:
     tracker = tracker_on()
+    # Without a kind, MLflow shows the pages of language models.
+    tags = tracker._experiment.client.get_experiment(tracker.experiment_id).tags
+    assert tags["mlflow.experimentKind"] == "custom_model_development"
     plain = tracker.comparison_url()
     tracker.keep_view("{}", ["2.0", "3"])
     assert tracker.comparison_url() == f"{plain}&viewStateShareKey={tracker.sweep_id}"
