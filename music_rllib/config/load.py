@@ -24,11 +24,11 @@ from music_rllib.config.document import (
 )
 from music_rllib.config.layers import all_settings
 from music_rllib.config.problems import ConfigError, Findings, shown, unknown
-from music_rllib.config.returns import Range, cut_off
 from music_rllib.config.run_settings import LAYER_KEYS, RunSettings
 from music_rllib.config.schema import Header, Stage, SweepConfig
 from music_rllib.config.search import FINAL_SEED
 from music_rllib.config.stages import resolve_stage
+from music_rllib.config.tac_settings import Range, cut_off
 from music_rllib.envs.modules import search_in
 from music_rllib.envs.tasks import BUILT_IN_TASKS, Task, TaskRegistry, UnknownTaskError
 from music_rllib.limits import MOST_RUNS, MOST_SEEDS

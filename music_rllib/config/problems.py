@@ -14,7 +14,7 @@ from pydantic_core import ErrorDetails
 
 from music_rllib.envs.tasks import closest
 from music_rllib.errors import BadInputError, shorten
-from music_rllib.labels import SYMBOLS
+from music_rllib.names import SYMBOLS
 
 Model = TypeVar("Model", bound=BaseModel)
 

@@ -12,7 +12,7 @@ from music_rllib.experiment.open_sweep import FINISHED, SAME_ENVIRONMENTS, OpenS
 from music_rllib.experiment.plan import continuation_key
 from music_rllib.experiment.scheduler import Scheduler
 from music_rllib.experiment.sweep_files import as_json, read_json
-from music_rllib.labels import in_runs, label_matches
+from music_rllib.names import in_runs, label_matches
 from music_rllib.store.storage import open_storage
 
 SHOWN = 10

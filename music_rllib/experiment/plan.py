@@ -19,7 +19,7 @@ from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.schema import ImportedHandoff, Source, Stage, SweepConfig
 from music_rllib.config.search import of_stage
 from music_rllib.envs.tasks import Task
-from music_rllib.labels import in_runs
+from music_rllib.names import in_runs
 from music_rllib.schedules import Linear
 from music_rllib.store.serialization import content_key
 from music_rllib.version import ALGORITHM_VERSION

@@ -26,7 +26,7 @@ from music_rllib.experiment.sweep_files import (
     SweepLocation,
     as_json,
 )
-from music_rllib.labels import in_runs
+from music_rllib.names import in_runs
 from music_rllib.redaction import redact, without_secrets
 from music_rllib.store.node_store import NodeStore
 from music_rllib.store.storage import StorageError, database_url

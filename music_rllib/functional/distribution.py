@@ -110,3 +110,46 @@ def ln_q_of_policy(log_density: Tensor, q: float, form: str) -> Tensor:
     if form == "per_dimension":
         return ln_q_of_log(log_density, q, max_exponent=MAX_EXPONENT).sum(-1)
     return ln_q_of_log(log_density.sum(-1), q, max_exponent=MAX_EXPONENT)
+
+
+_SHANNON = 1e-9
+"""|q - 1| below which S_q is Shannon's entropy."""
+
+
+def entropy_pressure(
+    q: float, width: float, actions: int = 1, form: str = "per_dimension"
+) -> float:
+    """dS_q / d ln sigma of one action dimension of a Gaussian policy of standard deviation `width`.
+
+    Per dimension it is G = q^(-1/2) (sqrt(2 pi) sigma)^(1-q), the integral of p^q; for the joint
+    entropy (1 - G^A)/(q-1) it is G^A; for Shannon's entropy it is 1 at every width. This is the
+    Gaussian before tanh, which changes little at widths below 0.3.
+    """
+    log_integral = -0.5 * math.log(q) + (1.0 - q) * math.log(math.sqrt(2.0 * math.pi) * width)
+    return math.exp(log_integral * (actions if form == "joint" else 1))
+
+
+def matched_alpha(
+    alpha: float, q: float, width: float, actions: int = 1, form: str = "per_dimension"
+) -> float:
+    """The alpha at which q has the pressure at `width` that `alpha` has at q = 1."""
+    return alpha / entropy_pressure(q, width, actions, form)
+
+
+def largest_entropy(q: float, actions: int = 1, form: str = "per_dimension") -> float:
+    """S_q of the uniform density on [-1, 1]^A, the largest of all policies there.
+
+    Per dimension A (1 - 2^(1-q))/(q-1), joint (1 - 2^(A (1-q)))/(q-1); A ln 2 at q = 1.
+    """
+    copies, dimensions = (1, actions) if form == "joint" else (actions, 1)
+    order, log_volume = q - 1.0, dimensions * math.log(2.0)
+    if abs(order) < _SHANNON:
+        return copies * log_volume
+    return -copies * math.expm1(-order * log_volume) / order
+
+
+def normalised_alpha(
+    alpha: float, q: float, actions: int = 1, form: str = "per_dimension"
+) -> float:
+    """The alpha that weighs S_q as a share of its largest value, relative to q = 1."""
+    return alpha * largest_entropy(1.0, actions, form) / largest_entropy(q, actions, form)

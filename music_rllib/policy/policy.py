@@ -20,8 +20,8 @@ from music_rllib.config.problems import shown
 from music_rllib.envs.make import Known, known_environment
 from music_rllib.envs.tasks import Task
 from music_rllib.errors import BadInputError
-from music_rllib.labels import label_matches
 from music_rllib.limits import MOST_WEIGHTS_BYTES
+from music_rllib.names import label_matches
 from music_rllib.policy.network import Floats, PolicyFileError, PolicyNetwork
 from music_rllib.redaction import redact
 from music_rllib.store.handoff import MANIFEST as HANDOFF_FILE

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from music_rllib import names
-from music_rllib.config.returns import Range, have_diverged
+from music_rllib.config.tac_settings import Range, have_diverged
 from music_rllib.envs.tasks import Task
 from music_rllib.experiment.environments import mixed
-from music_rllib.labels import ShortLabels, in_runs
+from music_rllib.names import ShortLabels, in_runs
 from music_rllib.report.charts import curves_csv
 from music_rllib.report.figures.choice import (
     Drawing,

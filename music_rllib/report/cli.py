@@ -133,7 +133,7 @@ def report(
 def _export(
     place: str, storage: str | None, folder: Path, table_format: TableFormat, *, add: bool
 ) -> None:
-    from music_rllib.labels import in_runs
+    from music_rllib.names import in_runs
     from music_rllib.results.archive import is_archive, merged, read_archive, write_archive
     from music_rllib.results.data import ReportError
     from music_rllib.results.read import read_sweep

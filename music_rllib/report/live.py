@@ -23,7 +23,7 @@ from music_rllib.command_line import plain
 from music_rllib.errors import BadInputError, first_line
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.sweep_files import SweepLocation
-from music_rllib.labels import ShortLabels
+from music_rllib.names import ShortLabels
 from music_rllib.redaction import for_people, redact
 from music_rllib.store.storage import StorageError
 

@@ -28,8 +28,14 @@ from music_rllib.experiment.sweep_files import SweepLocation, find_sweep
 from music_rllib.redaction import redact
 from music_rllib.results.analysis_plan import plans_in
 from music_rllib.results.archive import is_archive, read_archive
-from music_rllib.results.data import Points, RunRecord, Sweep, checked_searches, columns
-from music_rllib.results.planned import planned_run
+from music_rllib.results.data import (
+    Points,
+    RunRecord,
+    Sweep,
+    checked_searches,
+    columns,
+    planned_run,
+)
 from music_rllib.store.node_store import damage_in_words
 from music_rllib.store.storage import DamagedError, StorageError, folder_at, sweep_folder
 

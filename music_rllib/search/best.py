@@ -17,7 +17,7 @@ from music_rllib import names
 from music_rllib.config.schema import Stage
 from music_rllib.config.search import SearchSettings
 from music_rllib.experiment.plan import Plan, short
-from music_rllib.labels import in_runs, symbol
+from music_rllib.names import in_runs, symbol
 from music_rllib.results import statistics as st
 from music_rllib.results.conditions import AVERAGED, Condition, final_scores, find_stages
 from music_rllib.results.data import Sweep

@@ -20,13 +20,23 @@ from music_rllib.sweep.listeners.mlflow_view import VERSIONS, comparison_view
 from music_rllib.sweep.listeners.prometheus import PrometheusListener
 from music_rllib.sweep.listeners.screen import Display
 from music_rllib.sweep.listeners.state_file import StateFile
-from music_rllib.sweep.report_at_end import report_at_end
 from music_rllib.sweep.views.results import results_table, search_views
-from music_rllib.tracking.listener import MlflowListener
-from music_rllib.tracking.tracker import Tracker
+from music_rllib.tracking.tracker import MlflowListener, Tracker
 
 if TYPE_CHECKING:
     from music_rllib.search.controller import SearchController
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from music_rllib.experiment.plan import Node
+from music_rllib.experiment.sweep_files import SEARCH
+from music_rllib.redaction import redact
+from music_rllib.search.controller import SearchController
+from music_rllib.search.outcome import outcome
+from music_rllib.search.searches import open_searches, warm_starts
+from music_rllib.store.storage import below, is_remote, sweep_folder
 
 LAST_SECONDS = 20.0
 """Time to write the last state and to close MLflow's runs after Ray has died."""
@@ -76,7 +86,7 @@ def compute_and_report(
         _take_over_reused(opened, display, mlflow_log)
         controller = None
         if opened.plan.searched:
-            from music_rllib.sweep.searches import begin_searches, end_searches
+            from music_rllib.sweep.execution import begin_searches, end_searches
 
             controller = begin_searches(opened, display, mlflow_log, state_file)
         tracker.keep_current(node.key for node in opened.plan.nodes)
@@ -183,3 +193,90 @@ def _show_results(
         console.print(undelivered, style="yellow", soft_wrap=True)
     console.print(f"Compare in MLflow: {tracker.comparison_url()}", soft_wrap=True)
     console.print(f"Open MLflow's pages with: {tracker.store.ui_command()}", soft_wrap=True)
+
+
+def begin_searches(
+    opened: OpenSweep, display: Display, mlflow_log: MlflowListener, state_file: StateFile
+) -> SearchController:
+    """Open the searches, add their earlier trials, and plan the first runs."""
+
+    def reused(node: Node) -> None:
+        mlflow_log.finished(node)
+        state_file.reused(node)
+
+    searches = open_searches(opened)
+    for line in warm_starts(searches):
+        display.say(line)
+    controller = SearchController(
+        opened, searches, reused=reused, pruned=mlflow_log.pruned, say=display.say
+    )
+    state_file.searches = lambda: outcome(controller, thorough=False)
+    controller.recall()
+    controller.propose()
+    return controller
+
+
+def end_searches(
+    opened: OpenSweep, controller: SearchController, tracker: Tracker
+) -> list[dict[str, Any]]:
+    """Stop the searches, and save their outcome in the sweep's folder and in MLflow."""
+    controller.stop()
+    searches = outcome(controller)
+    if searches:
+        text = as_json(searches)
+        tracker.put_sweep_artifact(names.ARTIFACT_SEARCH, text)
+        opened.location.keep(SEARCH, text)
+    return searches
+
+
+TIMEOUT_SECONDS = 900.0
+"""After this time the sweep ends without a report."""
+
+
+def report_at_end(storage: str, name: str, tracking_uri: str | None, config: Path) -> str | None:
+    """Make the report of a sweep and attach it to the sweep's run in MLflow.
+
+    It runs in a process of its own: whatever happens in it, the results of the sweep are kept.
+
+    Args:
+        storage: Folder or URI of a bucket.
+        name: The sweep's name.
+        tracking_uri: MLflow's, password included; None for the file in the storage.
+        config: The sweep's YAML file, whose environments are recorded in videos.
+
+    Returns:
+        A message with the paths of the page and its picture, or with the reason why there is no
+        report; None if `MUSIC_RLLIB_REPORT=off` is set.
+    """
+    if os.environ.get(names.VARIABLE_REPORT, "").lower() in {"off", "0", "no", "false"}:
+        return None
+    environment = dict(os.environ)
+    if tracking_uri is not None:
+        environment[names.VARIABLE_TRACKING_URI] = tracking_uri
+    place = str(sweep_folder(storage, name))
+    if is_remote(storage):
+        # Its URI may hold a key, which everyone on the machine could read on a command line.
+        environment[names.VARIABLE_STORAGE], place = storage, name
+    command = [sys.executable, "-m", "music_rllib", "report", place]
+    if config.is_file():
+        command += ["--env", str(config.absolute())]
+    try:
+        done = subprocess.run(  # noqa: S603
+            [*command, "--attach"],
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=TIMEOUT_SECONDS,
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        reason = redact(str(error))
+    else:
+        marks = ("Report: ", "Picture: ")
+        made = [line for line in done.stdout.splitlines() if line.startswith(marks)]
+        errors = done.stderr.strip().splitlines()
+        if made:  # even if it could not be attached, or if runs are damaged
+            return "\n".join(made if done.returncode == 0 else [*made, *errors[-1:]])
+        reason = errors[-1] if errors else f"it ended with exit code {done.returncode}"
+    place = below(redact(storage), name)
+    return f"No report: {reason}. Make it with: music-rllib report {place}"

@@ -19,11 +19,10 @@ from music_rllib.experiment import sweep_files
 from music_rllib.experiment.open_sweep import OpenSweep, open_started
 from music_rllib.experiment.plan import Node
 from music_rllib.experiment.sweep_files import SweepLocation
-from music_rllib.labels import in_runs
+from music_rllib.names import in_runs
 from music_rllib.redaction import redact
 from music_rllib.results.conditions import Condition
-from music_rllib.results.data import RunRecord, Sweep
-from music_rllib.results.planned import LastValues
+from music_rllib.results.data import LastValues, RunRecord, Sweep
 from music_rllib.results.read import searches_of
 from music_rllib.results.statistics import with_interval
 from music_rllib.search.best import (

@@ -13,9 +13,8 @@ from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 
 from music_rllib.config.problems import problems_of
-from music_rllib.config.returns import Range, cut_off
 from music_rllib.config.run_settings import ReplaySettings
-from music_rllib.config.tac_settings import TACSettings
+from music_rllib.config.tac_settings import Range, TACSettings, cut_off
 from music_rllib.envs.tasks import BUILT_IN_TASKS, LAST_SEED, Indices, check_split
 from music_rllib.intrinsic.interface import IntrinsicReward
 from music_rllib.intrinsic.music import Music

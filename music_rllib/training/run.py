@@ -14,16 +14,21 @@ from ray.rllib.core import DEFAULT_MODULE_ID
 from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, EPISODE_RETURN_MEAN, LEARNER_RESULTS
 
 from music_rllib import names
-from music_rllib.config.returns import Range, have_diverged, reward_of_step
 from music_rllib.config.run_settings import RunSettings
+from music_rllib.config.tac_settings import Range, have_diverged, reward_of_step
 from music_rllib.experiment.plan import REPORT_INTERVAL
 from music_rllib.intrinsic.music import HELD_OUT_STEPS
 from music_rllib.kernels.compiling import is_kept
 from music_rllib.kernels.update import learn
 from music_rllib.replay.ring import Segment, new_segments
 from music_rllib.store.handoff import Spaces
-from music_rllib.store.history import Report
-from music_rllib.store.serialization import read_arrays, read_state, write_arrays, write_state
+from music_rllib.store.serialization import (
+    Report,
+    read_arrays,
+    read_state,
+    write_arrays,
+    write_state,
+)
 from music_rllib.store.work_folder import NewCheckpoint, SavedCheckpoint
 from music_rllib.tac.algorithm import TAC, TACConfig
 from music_rllib.tac.config import AlgorithmSettings, Split

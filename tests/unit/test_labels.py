@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 
-from music_rllib.labels import ShortLabels, label_matches, symbol
+from music_rllib.names import ShortLabels, label_matches, symbol
 
 LABEL = "finetune/FetchPush/pretrain:tac.alpha=0.1,tac.entropic_index=1.5,tac.tau=0.05/seed0"
 

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from music_rllib.command_line import Json, console_for, print_json
-from music_rllib.sweep.commands.arguments import Place, StageName, Storage
+from music_rllib.sweep.commands import Place, StageName, Storage
 
 EXAMPLES = """\
 Examples:

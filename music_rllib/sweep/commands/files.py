@@ -10,7 +10,7 @@ import typer
 
 from music_rllib.command_line import Json, console_for, print_json
 from music_rllib.errors import BadInputError
-from music_rllib.sweep.commands.arguments import Place, StageName, Storage
+from music_rllib.sweep.commands import Place, StageName, Storage
 
 BEST_EXAMPLES = """\
 Examples:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from music_rllib.command_line import Json
-from music_rllib.sweep.commands.arguments import Place, Storage
+from music_rllib.sweep.commands import Place, Storage
 
 if TYPE_CHECKING:
     from music_rllib.config.schema import SweepConfig

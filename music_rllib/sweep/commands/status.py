@@ -9,7 +9,7 @@ import typer
 
 from music_rllib.command_line import Json, console_for, print_json
 from music_rllib.errors import FAILED, BadInputError
-from music_rllib.sweep.commands.arguments import Place, Storage
+from music_rllib.sweep.commands import Place, Storage
 
 if TYPE_CHECKING:
     from music_rllib.experiment.sweep_files import SweepLocation

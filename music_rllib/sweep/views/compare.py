@@ -14,7 +14,7 @@ from music_rllib.command_line import new_table, percent
 from music_rllib.errors import BadInputError
 from music_rllib.experiment.environments import mixed
 from music_rllib.experiment.sweep_files import SweepLocation
-from music_rllib.labels import ShortLabels, symbol
+from music_rllib.names import ShortLabels, symbol
 from music_rllib.results.analysis import FinalScores, Scope, stage_scopes
 from music_rllib.results.answer import answer, study_data
 from music_rllib.results.conditions import Condition, find_stages
@@ -22,7 +22,7 @@ from music_rllib.results.read import StoredSweep, read_stored
 from music_rllib.results.statistics import SHOW_SEEDS_BELOW, Estimate, difference, with_interval
 from music_rllib.results.study import study_of
 from music_rllib.search.best import ranking_metric
-from music_rllib.sweep.views.text import setting_cells
+from music_rllib.sweep.views.results import setting_cells
 
 IN_THE_SEARCH = "in the search"
 """Part of a group of trials on the seeds that they were chosen by."""

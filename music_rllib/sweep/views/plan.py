@@ -22,7 +22,7 @@ from music_rllib.envs.tasks import Task
 from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.plan import Node, Plan, shared_runs, short
 from music_rllib.experiment.record import plan_document
-from music_rllib.labels import in_runs
+from music_rllib.names import in_runs
 from music_rllib.redaction import redact
 from music_rllib.schedules import QUANTITIES, Linear, Measured, Piecewise, value_at
 

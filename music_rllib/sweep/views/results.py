@@ -11,12 +11,12 @@ from rich.text import Text
 
 from music_rllib import names
 from music_rllib.command_line import clock, new_table, percent
+from music_rllib.envs.tasks import Task
 from music_rllib.experiment.plan import Plan, short
 from music_rllib.experiment.scheduler import Status
-from music_rllib.labels import ShortLabels
+from music_rllib.names import ShortLabels
 from music_rllib.results.statistics import with_interval
-from music_rllib.store.history import RunResult
-from music_rllib.sweep.views.text import measured, setting_cells
+from music_rllib.store.serialization import RunResult
 
 _STYLES = {Status.FAILED: "red", Status.SKIPPED: "yellow", Status.WAITING: "yellow"}
 _STATES = {Status.STARTED: "interrupted", Status.WAITING: "not started"}
@@ -133,3 +133,22 @@ def _ranking_table(search: Mapping[str, Any]) -> Table:
         chance = percent(row.get("best_is_better_with"))
         table.add_row(str(rank), str(row["trial"]), *values, *numbers, chance)
     return table
+
+
+def setting_cells(settings: Iterable[str], values: Mapping[str, Any]) -> list[str]:
+    """A cell for each setting: its value, or `-` if it has none."""
+    return [short(values[name], name) if name in values else "-" for name in settings]
+
+
+def measured(metric: str, value: float | None) -> str:
+    """`35 %` for a rate, `-5.2` for another metric, or `-` for None."""
+    return percent(value) if value is None or metric in names.EVAL_RATES else f"{value:.4g}"
+
+
+def evaluation_text(task: Task, metrics: Mapping[str, float]) -> str:
+    """A run's last evaluation by its task's primary metric: `success 35 % (any step 40 %)`."""
+    metric = task.primary_metric
+    text = f"{names.word_of(metric)} {measured(metric, metrics.get(metric))}"
+    if metric != names.EVAL_SUCCESS:
+        return text
+    return f"{text} (any step {percent(metrics.get(names.EVAL_SUCCESS_ANY))})"

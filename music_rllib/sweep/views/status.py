@@ -13,10 +13,10 @@ from rich.text import Text
 from music_rllib import names
 from music_rllib.command_line import clock, new_table
 from music_rllib.experiment.plan import short
-from music_rllib.labels import ShortLabels
+from music_rllib.names import ShortLabels
 from music_rllib.search.best import best_text
 from music_rllib.store.node_store import TRAIN_AGAIN
-from music_rllib.sweep.views.text import measured
+from music_rllib.sweep.views.results import measured
 
 _STATUSES = (
     *("finished", "reused", "started", "interrupted", "waiting", "paused", "pruned"),

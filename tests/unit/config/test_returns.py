@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from music_rllib.config.load import load_sweep, warnings_of
-from music_rllib.config.returns import Range, cut_off, have_diverged
-from music_rllib.config.tac_settings import TACSettings
+from music_rllib.config.tac_settings import Range, TACSettings, cut_off, have_diverged
 from music_rllib.intrinsic.settings import MusicSettings
 
 SPARSE = Range(-1.0, 0.0)

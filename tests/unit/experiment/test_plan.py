@@ -12,7 +12,7 @@ from music_rllib.config.run_settings import RunSettings, variant_music
 from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.experiment import plan as plan_module
 from music_rllib.experiment.plan import Plan, make_plan, node_key, shared_runs
-from music_rllib.labels import label_matches
+from music_rllib.names import label_matches
 
 Document = dict[str, Any]
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import integrate
 
-from music_rllib.functional.entropy_scale import (
+from music_rllib.functional.distribution import (
     entropy_pressure,
     largest_entropy,
     matched_alpha,

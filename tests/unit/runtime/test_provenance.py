@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from music_rllib import names
-from music_rllib.runtime.provenance import git_commit, provenance_tags
+from music_rllib.runtime.machine import git_commit, provenance_tags
 
 
 def git(folder: Path, *arguments: str) -> str:

@@ -26,7 +26,7 @@ from music_rllib.experiment.plan import Node, continuation_key, make_plan
 from music_rllib.experiment.record import keep_record
 from music_rllib.experiment.scheduler import Status
 from music_rllib.experiment.sweep_files import as_json
-from music_rllib.labels import ShortLabels
+from music_rllib.names import ShortLabels
 from music_rllib.program import main
 from music_rllib.results.analysis import analyse
 from music_rllib.results.answer import answer, claim_rows, mean_rows
@@ -35,7 +35,7 @@ from music_rllib.results.study import study_of
 from music_rllib.store import node_store
 from music_rllib.store import storage as storage_module
 from music_rllib.store.handoff import write_handoff
-from music_rllib.store.history import HISTORY, Report, RunResult, to_json_lines
+from music_rllib.store.serialization import HISTORY, Report, RunResult, to_json_lines
 from music_rllib.store.storage import DamagedError, StorageFolder
 from music_rllib.sweep import clean, driver, driver_lock
 from music_rllib.sweep.export import sweep_of_run
